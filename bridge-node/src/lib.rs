@@ -31,8 +31,8 @@ pub use actions::{ActionGraph, Actions};
 pub use arguments::{Arguments, Flags, WithoutMapping};
 pub use bridge_core::{
     ActionFamily, Answered, AskError, AskErrorKind, AskId, CallDescription, CallField, CallMap,
-    CallRole, CallStructure, Described, Executed, ExecutionId, Kept, Offered, OfferedType, Owned,
-    PublisherKey, Reason, Refusal, Room, ValueDescription, ValueNote,
+    CallRole, CallStructure, Counters, Described, Executed, ExecutionId, Kept, Offered,
+    OfferedType, Owned, PublisherKey, Reason, Refusal, Room, Router, ValueDescription, ValueNote,
 };
 pub use busy_poll::BusyPoll;
 pub use calls::{Asker, CallGraph, Calls};

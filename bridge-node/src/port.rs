@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use bridge_core::{
     Answered, AskId, CallDescription, CallMap, Described, Executed, ExecutionId, Kept, Offered,
-    OfferedType, PublisherKey, Reason, ValueDescription, ValueNote,
+    OfferedType, PublisherKey, Reason, Router, ValueDescription, ValueNote,
 };
 use bytes::Bytes;
 use mappings::{Mapping, TopicId};
@@ -92,6 +92,11 @@ pub trait Port: Send + 'static {
     /// while the program runs, by its keys in the mapping and with the reason, for people. `types` are the definitions of
     /// its `type_paths`, which may be others although the mapping is the same.
     fn reload(&mut self, mapping: &Arc<Mapping>, types: &Arc<TypePaths>) -> Vec<String>;
+
+    /// What the Router has counted by now, told every second: for sides that show it.
+    fn counted(&mut self, router: &Router) {
+        let _shown_by_the_shell = router;
+    }
 
     /// What keeps this side from doing its work now, such as a ROS master that does not answer: for people.
     fn hindrance(&self) -> Option<String> {

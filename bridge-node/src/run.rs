@@ -124,6 +124,7 @@ impl<P: Port> Shell<P> {
                 _ = looks.tick() => {
                     self.follow_group();
                     self.look_at_held()?;
+                    self.port.counted(&self.router);
                 }
                 Ok(()) = self.changes.changed() => self.reload(),
                 Some(NewKeys { group, delivery }) = self.keys.next() => {

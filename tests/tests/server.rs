@@ -2,6 +2,8 @@
 
 #[path = "server/access.rs"]
 mod access;
+#[path = "server/pubsub.rs"]
+mod pubsub;
 
 use std::{
     fs,

@@ -6,7 +6,7 @@ use mappings::{Mapping, Permissions as Said};
 use opcua::server::address_space::AccessLevel;
 use opcua::server::node_manager::RequestContext;
 use opcua::sync::Mutex;
-use opcua::types::{NodeId, StatusCode};
+use opcua::types::{MethodId, NodeId, StatusCode};
 use plant_opcua::certificates::application_uri;
 use plant_opcua::users::{Anonymous, Permissions, Role, Roles, Rules};
 use tracing::warn;
@@ -92,11 +92,21 @@ pub(crate) fn rules(mapping: &Mapping, layout: &Layout) -> Rules {
             nodes.insert(address::unmapped_call(topic), permissions);
         }
     }
+    // Those of the core namespace are for everybody otherwise.
+    let switches = SWITCHES.map(|method| (method.into(), Permissions::default()));
+    nodes.extend(switches);
     Rules {
         anonymous: anonymous(mapping.server().anonymous),
         nodes,
     }
 }
+
+/// Methods that change what is sent and heard.
+const SWITCHES: [MethodId; 3] = [
+    MethodId::PublishSubscribe_Status_Enable,
+    MethodId::PublishSubscribe_Status_Disable,
+    MethodId::PublishSubscribe_Diagnostics_Reset,
+];
 
 /// Whether who asks may write the value of a node.
 pub(crate) fn may_write(context: &RequestContext, node: &NodeId) -> bool {

@@ -8,8 +8,8 @@
 //! `nodes` (the node manager), `browse` (in which order), `budget` (what clients may take up), `space` (values in),
 //! `components` (which servers are there), `methods` and `argument_types` (calls of the space as Methods), `executing` (Methods of other servers as calls), `sources` (their
 //! nodes as values), `clients` (the sessions for both), `others` (all of these), `port` (the shell's side),
-//! `endpoint` (how clients get in), `access` (what each may do), `auditing` (what is told of it), `sks` (keys of secured groups), `value` (between the two codecs),
-//! `verbs` (certificates and users by hand).
+//! `endpoint` (how clients get in), `access` (what each may do), `auditing` (what is told of it), `sks` (keys of secured groups),
+//! `pubsub` (the PubSub configuration as nodes), `value` (between the two codecs), `verbs` (certificates and users by hand).
 
 mod access;
 mod address;
@@ -27,6 +27,7 @@ mod nodes;
 mod others;
 mod port;
 mod properties;
+mod pubsub;
 mod sks;
 mod sources;
 mod space;

@@ -24,6 +24,7 @@ use opcua::sync::{Mutex, RwLock};
 use opcua::types::{
     AttributeId, DataValue, DateTime, NodeId, NumericRange, StatusCode, TimestampsToReturn, Variant,
 };
+use plant_opcua::server::Caller;
 use plant_opcua::users::Access;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 use tracing::warn;
@@ -35,6 +36,7 @@ use crate::budget::{Answers, LARGEST, SMALL, Watched};
 use crate::layout::{FieldNode, Layout, TopicNode};
 use crate::methods::{Questions, Refused, Table};
 use crate::properties;
+use crate::pubsub::PubSub;
 use crate::value;
 use crate::values::{self, Shown, Stamp, Values, View};
 
@@ -78,6 +80,8 @@ pub(crate) struct Exits {
     pub(crate) questions: Questions,
     /// What users may do.
     pub(crate) access: Arc<Access>,
+    /// The PubSub configuration, which clients can disable parts of.
+    pub(crate) pubsub: Arc<PubSub>,
 }
 
 /// A value a client wrote to a topic of the OPC UA side.
@@ -416,6 +420,10 @@ impl SpaceNodes {
         if !access::may_write(context, &write.node_id) {
             return Err(StatusCode::BadUserAccessDenied);
         }
+        if self.exits.pubsub.is_off(topic.topic) {
+            // Its writer is disabled, so it would not go out.
+            return Err(StatusCode::BadInvalidState);
+        }
         if write
             .value
             .status
@@ -467,6 +475,18 @@ impl SpaceNodes {
             room,
         };
         self.exits.writes.try_send(write).map_err(|_| full)
+    }
+
+    /// Calls a method of the PubSub configuration.
+    fn call_pubsub(&self, context: &RequestContext, method: &NodeId) -> StatusCode {
+        let may = context
+            .authenticator
+            .is_user_executable(&context.token, method);
+        if !may {
+            return StatusCode::BadUserAccessDenied;
+        }
+        let called = self.exits.pubsub.call(method, &Caller::of(context).user);
+        called.unwrap_or(StatusCode::BadNodeIdUnknown)
     }
 
     fn place(&self, node: &NodeId) -> Option<(Arc<TopicNode>, Option<usize>)> {
@@ -723,7 +743,10 @@ impl InMemoryNodeManagerImpl for SpaceNodes {
                     let arguments = method.arguments().to_vec();
                     callable.call(&arguments, &self.exits.questions, gone).await
                 }
-                None => Err(Refused::Status(StatusCode::BadNodeIdUnknown)),
+                None => match self.call_pubsub(context, method.method_id()) {
+                    StatusCode::Good => Ok(Vec::new()),
+                    refused => Err(Refused::Status(refused)),
+                },
             };
             match called {
                 Ok(outputs) => {

@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use bridge_node::{
     Answered, AskId, CallDescription, Delivery, Described, Execution, Failure, FailureKind, Kept,
-    LinkState, Port, PortEvent, TypePaths,
+    LinkState, Port, PortEvent, Router, TypePaths,
 };
 use bytes::Bytes;
 use discovery::{AnnounceSettings, Announced, MdnsFault, WatchSettings, announce, watch};
@@ -21,7 +21,7 @@ use opcua::server::{MonitoredItemHandle, ServerHandle, SubscriptionCache};
 use opcua::types::{NodeId, NumericRange, StatusCode, VariableId};
 use plant_opcua::endpoint::EndpointUrl;
 use plant_opcua::pki::Pki;
-use plant_opcua::server::{Security, core_with};
+use plant_opcua::server::{Security, core_of, core_with};
 use plant_opcua::users::{self, Access, UserFault};
 use tokio::runtime::Runtime;
 use tokio::sync::{Semaphore, mpsc};
@@ -39,6 +39,7 @@ use crate::layout::Layout;
 use crate::methods::{Heard, Methods, Questions, Wish};
 use crate::nodes::{ClientWrite, Exits, SpaceManager, SpaceNodes, look_again};
 use crate::others::Others;
+use crate::pubsub::{Places, PubSub, Readers, State};
 use crate::sks::Sks;
 use crate::sources::{self, Sourced};
 use crate::space::Space;
@@ -66,8 +67,8 @@ pub(crate) struct ServerPort {
     runtime: Option<Runtime>,
     serving: Option<JoinHandle<Result<(), String>>>,
     writes: mpsc::Receiver<ClientWrite>,
-    /// The topics clients can write, not yet said to have a producer.
-    live: VecDeque<TopicId>,
+    /// The topics clients can write, not yet said to have a producer, or to have none.
+    live: VecDeque<(TopicId, bool)>,
     /// Topics that are gone, or others now.
     unbound: VecDeque<TopicId>,
     /// As the server was started.
@@ -88,6 +89,9 @@ pub(crate) struct ServerPort {
     others: Others,
     /// What is to be reported before anything else.
     events: VecDeque<PortEvent>,
+    /// The PubSub configuration, and how the readers of it are.
+    pubsub: Arc<PubSub>,
+    readers: Readers,
 }
 
 impl ServerPort {
@@ -117,7 +121,8 @@ impl ServerPort {
         let access = users(&setup.pki, address)?;
         access.set_rules(access::rules(mapping, &layout));
 
-        let (exits, (writes, created_items, asked)) = exits(&access);
+        let pubsub = Arc::new(PubSub::new());
+        let (exits, (writes, created_items, asked)) = exits(&access, &pubsub);
         let nodes = NodesBuilder {
             layout: Arc::new(layout),
             exits,
@@ -127,12 +132,17 @@ impl ServerPort {
             .pki_dir(setup.pki.root())
             .trust_client_certs(setup.trust_any_client)
             .with_authenticator(Arc::clone(&access) as Arc<dyn AuthManager>)
-            .with_node_manager(core_with(setup.sks.methods(), audits))
+            .with_node_manager(core_with(
+                [setup.sks.methods(), pubsub.methods()].concat(),
+                audits,
+            ))
             .with_node_manager(Ordered::around(nodes))
             .build()
             .map_err(configuration)?;
         let manager = manager(&handle, &layout).map_err(configuration)?;
         manager.inner().limit_writes(largest_write(mapping));
+        pubsub.stand(places(&handle, &manager));
+        pubsub.show(mapping, &layout);
 
         let (runtime, listener) = threads(listener).map_err(|error| io(error.to_string()))?;
         let serving = runtime.spawn(server.run_with(listener));
@@ -143,12 +153,7 @@ impl ServerPort {
             Arc::clone(&subscriptions),
             created_items,
         )));
-        info!(
-            topics = layout.topics.len(),
-            pki = %setup.pki.root().display(),
-            "serving at {} (port {port})",
-            setup.url
-        );
+        tell_serving(&layout, &setup.pki, (&setup.url, port));
         let others = Others::new(mapping, &described.application_uri, setup.pki.root());
         let methods = Methods::new(Arc::clone(&manager), mapping, (asked, &layout.structures));
         let nodes = (Arc::clone(&manager), Arc::clone(&subscriptions));
@@ -164,7 +169,9 @@ impl ServerPort {
             runtime: Some(runtime),
             serving: Some(serving),
             writes,
-            live: written(layout.topics.iter().map(|node| node.topic)).collect(),
+            live: written(layout.topics.iter().map(|node| node.topic))
+                .map(|topic| (topic, true))
+                .collect(),
             types,
             pki: setup.pki,
             sks: setup.sks,
@@ -175,7 +182,24 @@ impl ServerPort {
             methods,
             others,
             events: VecDeque::new(),
+            pubsub,
+            readers: Readers::default(),
         })
+    }
+}
+
+impl ServerPort {
+    /// Carries out what has become of writers and readers that somebody enabled or disabled.
+    fn switch(&mut self) {
+        for (topic, on) in self.pubsub.switched() {
+            if topic.space == SpaceId::UA {
+                self.live.push_back((topic, on));
+            } else {
+                // What is shown is no longer kept up.
+                let silent = !on || self.readers.of(topic) == State::Error;
+                self.space.set_silent(topic, silent);
+            }
+        }
     }
 }
 
@@ -185,13 +209,13 @@ impl Port for ServerPort {
         if let Some(topic) = self.unbound.pop_front() {
             return PortEvent::Unbound { topic };
         }
-        if let Some(topic) = self.live.pop_front() {
-            return PortEvent::Live { topic, live: true };
-        }
         if let Some(event) = self.events.pop_front() {
             return event;
         }
         loop {
+            if let Some((topic, live)) = self.live.pop_front() {
+                return PortEvent::Live { topic, live };
+            }
             tokio::select! {
                 Some(write) = self.writes.recv() => {
                     let ClientWrite { topic, block, source, room } = write;
@@ -208,6 +232,7 @@ impl Port for ServerPort {
                 },
                 event = self.others.executing.next() => return event,
                 sourced = self.others.sources.next() => return self.sourced(sourced),
+                () = self.pubsub.called() => self.switch(),
                 () = next(&mut self.components) => {}
                 _ = self.look.tick() => {
                     self.pki.report_rejected();
@@ -218,6 +243,13 @@ impl Port for ServerPort {
     }
 
     fn publish(&mut self, sample: Delivery) -> Result<(), &'static str> {
+        if self.space.is_mapped(sample.topic) {
+            self.readers.heard(sample.topic);
+        }
+        if self.pubsub.is_off(sample.topic) {
+            self.readers.ignored(sample.topic);
+            return Err("its reader is disabled");
+        }
         if sample.kept == Kept::Again {
             // A variable has one value, and shows the last one.
             return Ok(());
@@ -246,10 +278,18 @@ impl Port for ServerPort {
     }
 
     fn silent(&mut self, topic: TopicId, silent: bool) {
-        self.space.set_silent(topic, silent);
+        if self.space.is_mapped(topic) {
+            self.readers.silent(topic, silent);
+        }
         if silent {
             self.others.sources.set_silent(topic);
         }
+        self.space
+            .set_silent(topic, silent || self.pubsub.is_off(topic));
+    }
+
+    fn counted(&mut self, router: &Router) {
+        self.pubsub.look(&self.readers, router);
     }
 
     fn call_known(&mut self, topic: TopicId, description: &Arc<CallDescription>) {
@@ -292,9 +332,14 @@ impl Port for ServerPort {
                 restart.extend(namespaces);
                 self.access.set_rules(access::rules(mapping, &layout));
                 let (gone, new) = self.space.exchange(&layout);
-                self.live.retain(|topic| !gone.contains(topic));
+                self.live.retain(|(topic, _)| !gone.contains(topic));
+                self.readers.forget(&gone);
                 self.unbound.extend(gone);
-                self.live.extend(written(new.into_iter()));
+                self.live
+                    .extend(written(new.into_iter()).map(|topic| (topic, true)));
+                self.pubsub.show(mapping, &layout);
+                // Those that are disabled stay so.
+                self.switch();
             }
             Err(error) => restart.push(format!("variables ({error})")),
         }
@@ -443,8 +488,32 @@ fn audits(core: &mut AddressSpace) {
     }
 }
 
+/// Where the nodes of the PubSub configuration are to stand.
+fn places(handle: &ServerHandle, manager: &Arc<SpaceManager>) -> Places {
+    Places {
+        core: core_of(handle),
+        space: Arc::clone(manager),
+        subscriptions: Arc::clone(handle.subscriptions()),
+    }
+}
+
+fn tell_serving(layout: &Layout, pki: &Pki, (url, port): (&EndpointUrl, u16)) {
+    info!(
+        topics = layout.topics.len(),
+        pki = %pki.root().display(),
+        "serving at {url} (port {port})"
+    );
+}
+
+/// When to look at certificates that were refused.
+fn looks() -> Interval {
+    let mut look = tokio::time::interval(LOOK_AT_REJECTED);
+    look.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    look
+}
+
 /// What leaves the node manager, and the other ends of that.
-fn exits(access: &Arc<Access>) -> (Exits, Entries) {
+fn exits(access: &Arc<Access>, pubsub: &Arc<PubSub>) -> (Exits, Entries) {
     let (writes, written) = mpsc::channel(MOST_WRITES);
     let (created, created_items) = mpsc::channel(MOST_CREATED);
     let (questions, heard) = Questions::channel();
@@ -454,6 +523,7 @@ fn exits(access: &Arc<Access>) -> (Exits, Entries) {
         created,
         questions,
         access: Arc::clone(access),
+        pubsub: Arc::clone(pubsub),
     };
     (exits, (written, created_items, heard))
 }

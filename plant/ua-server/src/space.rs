@@ -175,6 +175,11 @@ impl Space {
         }
     }
 
+    /// Whether the mapping has a variable of a topic.
+    pub(crate) fn is_mapped(&self, topic: TopicId) -> bool {
+        self.topics.get(&topic).is_some_and(|known| known.mapped)
+    }
+
     /// The topics whose nodes had to go for others, since this was asked.
     pub(crate) fn take_gave_way(&mut self) -> Vec<TopicId> {
         std::mem::take(&mut self.gave_way)

@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use opcua::nodes::{NodeType, ReferenceDirection};
+use opcua::server::ServerHandle;
 use opcua::server::address_space::AddressSpace;
 use opcua::server::node_manager::memory::{
     CoreNodeManager, CoreNodeManagerBuilder, InMemoryNodeManagerBuilder,
@@ -68,6 +69,16 @@ pub fn core_with(
             front: Front::Core(Arc::new(Overlay { methods, core })),
             last: None,
         }
+    }
+}
+
+/// The nodes of the core namespace of a server whose methods are carried out so.
+#[must_use]
+pub fn core_of(handle: &ServerHandle) -> Option<Arc<CoreNodeManager>> {
+    let routed = handle.node_managers().get_of_type::<Routed>()?;
+    match &routed.front {
+        Front::Core(overlay) => overlay.core.clone(),
+        Front::Calls(_) => None,
     }
 }
 

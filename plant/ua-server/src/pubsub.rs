@@ -1,0 +1,401 @@
+//! The PubSub configuration in the address space (OPC 10000-14, 9.1): below the object PublishSubscribe stand the one
+//! connection of the program, a WriterGroup for each namespace it writes in, a ReaderGroup for each it hears, and a
+//! DataSetWriter or DataSetReader for each value of the mapping, with their states and counters.
+//!
+//! One lock guards the states; with it held the address spaces are written, one after the other.
+
+mod counts;
+mod insert;
+mod readers;
+mod states;
+mod tree;
+
+use std::collections::{HashMap, HashSet};
+use std::sync::{Arc, OnceLock};
+
+use bridge_node::{Counters, Router};
+use mappings::{Mapping, SpaceId, TopicId};
+use opcua::server::SubscriptionCache;
+use opcua::server::address_space::AddressSpace;
+use opcua::server::node_manager::memory::CoreNodeManager;
+use opcua::sync::{Mutex, RwLock};
+use opcua::types::{
+    AttributeId, DataValue, MethodId, NodeId, ObjectId, StatusCode, TimestampsToReturn, Variant,
+};
+use plant_opcua::server::{CoreMethod, MethodHandler, Refusal, method};
+use tokio::sync::Notify;
+use tracing::info;
+
+use self::counts::{Counts, Diagnostics};
+pub(crate) use self::readers::Readers;
+pub(crate) use self::states::State;
+use self::states::{Change, States};
+use crate::layout::Layout;
+use crate::nodes::SpaceManager;
+
+/// The configuration as it stands in the address spaces.
+pub(crate) struct PubSub {
+    inner: Mutex<Inner>,
+    /// The topics that are neither sent nor taken now.
+    off: RwLock<HashSet<TopicId>>,
+    /// Somebody has enabled or disabled something.
+    called: Notify,
+    /// Once there are any.
+    places: OnceLock<Places>,
+}
+
+/// Where the nodes are, and who is told of them.
+#[derive(Clone)]
+pub(crate) struct Places {
+    /// Those of the object PublishSubscribe itself.
+    pub(crate) core: Option<Arc<CoreNodeManager>>,
+    pub(crate) space: Arc<SpaceManager>,
+    pub(crate) subscriptions: Arc<SubscriptionCache>,
+}
+
+#[derive(Default)]
+struct Inner {
+    states: States,
+    parts: Vec<Part>,
+    /// By the nodes of their methods.
+    methods: HashMap<NodeId, (usize, Ask)>,
+    /// The nodes of all of them.
+    made: Vec<NodeId>,
+    /// What has become of topics since somebody asked: whether they are sent, or taken.
+    switched: HashMap<TopicId, bool>,
+}
+
+/// A component of the configuration.
+struct Part {
+    kind: Kind,
+    parent: Option<usize>,
+    state: NodeId,
+    diagnostics: Option<Diagnostics>,
+    /// Of a group: how many are below it, and how many of those are operational, as it is shown.
+    live: Option<([NodeId; 2], [u16; 2])>,
+    counts: Counts,
+}
+
+/// What a component is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Kind {
+    Whole,
+    Connection,
+    Writers(u16),
+    Readers(SpaceId, u16),
+    Writer(TopicId),
+    Reader(TopicId),
+}
+
+/// What a client asks of a component.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Ask {
+    Enable,
+    Disable,
+    Reset,
+}
+
+impl PubSub {
+    pub(crate) fn new() -> Self {
+        Self {
+            inner: Mutex::default(),
+            off: RwLock::default(),
+            called: Notify::new(),
+            places: OnceLock::new(),
+        }
+    }
+
+    /// The methods of the object PublishSubscribe itself.
+    pub(crate) fn methods(self: &Arc<Self>) -> Vec<CoreMethod> {
+        let status: NodeId = ObjectId::PublishSubscribe_Status.into();
+        let diagnostics: NodeId = ObjectId::PublishSubscribe_Diagnostics.into();
+        let asked = |ask| {
+            let whole = Arc::clone(self);
+            let handler: Arc<dyn MethodHandler> = method(move |request| {
+                let done = whole.ask((0, ask), &request.caller.user);
+                done.map(|()| Vec::new()).map_err(Refusal::Status)
+            });
+            handler
+        };
+        let enable: [NodeId; 2] = [
+            MethodId::PublishSubscribe_Status_Enable.into(),
+            MethodId::PubSubStatusType_Enable.into(),
+        ];
+        let disable: [NodeId; 2] = [
+            MethodId::PublishSubscribe_Status_Disable.into(),
+            MethodId::PubSubStatusType_Disable.into(),
+        ];
+        let reset: [NodeId; 2] = [
+            MethodId::PublishSubscribe_Diagnostics_Reset.into(),
+            MethodId::PubSubDiagnosticsType_Reset.into(),
+        ];
+        vec![
+            CoreMethod::new(status.clone(), enable, "Enable", asked(Ask::Enable)),
+            CoreMethod::new(status, disable, "Disable", asked(Ask::Disable)),
+            CoreMethod::new(diagnostics, reset, "Reset", asked(Ask::Reset)),
+        ]
+    }
+
+    /// Has the nodes stand there from now on.
+    pub(crate) fn stand(&self, places: Places) {
+        if let Some(core) = &places.core {
+            let mut address_space = core.address_space().write();
+            for (method, name) in WHOLE {
+                tree::core_method(&mut address_space, method, name);
+            }
+        }
+        drop(self.places.set(places));
+    }
+
+    /// Shows the configuration of a mapping, in the place of the one before. What was disabled and is there again stays so.
+    pub(crate) fn show(&self, mapping: &Mapping, layout: &Layout) {
+        let Some(places) = self.places.get() else {
+            return;
+        };
+        let mut inner = self.inner.lock();
+        let disabled: Vec<Kind> = inner
+            .parts
+            .iter()
+            .enumerate()
+            .filter(|(at, _)| !inner.states.is_enabled(*at))
+            .map(|(_, part)| part.kind)
+            .collect();
+        {
+            let mut address_space = places.space.address_space().write();
+            for node in inner.made.drain(..) {
+                drop(address_space.delete(&node, true));
+            }
+            let switched = std::mem::take(&mut inner.switched);
+            *inner = insert::all(mapping, layout, &mut address_space);
+            inner.switched = switched;
+        }
+        let again: Vec<usize> = inner
+            .parts
+            .iter()
+            .enumerate()
+            .filter(|(_, part)| disabled.contains(&part.kind))
+            .map(|(at, _)| at)
+            .collect();
+        for at in again {
+            inner.states.enable(at, false);
+        }
+        self.settle(&mut inner);
+        self.show_states(&inner);
+    }
+
+    /// Whether a client means a method of a component, and if so what becomes of it.
+    pub(crate) fn call(&self, method: &NodeId, user: &str) -> Option<StatusCode> {
+        let asked = self.inner.lock().methods.get(method).copied()?;
+        Some(self.ask(asked, user).err().unwrap_or(StatusCode::Good))
+    }
+
+    fn ask(&self, (at, ask): (usize, Ask), user: &str) -> Result<(), StatusCode> {
+        let mut inner = self.inner.lock();
+        let inner = &mut *inner;
+        let part = inner
+            .parts
+            .get_mut(at)
+            .ok_or(StatusCode::BadNodeIdUnknown)?;
+        let kind = part.kind;
+        match ask {
+            Ask::Enable | Ask::Disable => {
+                if !inner.states.enable(at, ask == Ask::Enable) {
+                    return Err(StatusCode::BadInvalidState);
+                }
+                info!(?kind, user, "{ask:?} of a PubSub component");
+                self.settle(inner);
+            }
+            Ask::Reset => {
+                let counts = part.counts;
+                if let Some(diagnostics) = &mut part.diagnostics {
+                    diagnostics.reset(counts);
+                }
+                self.show_counts(inner);
+            }
+        }
+        Ok(())
+    }
+
+    /// Waits until something was enabled or disabled; cancel-safe.
+    pub(crate) async fn called(&self) {
+        self.called.notified().await;
+    }
+
+    /// What has become of topics since this was asked last: whether they are sent, or taken.
+    pub(crate) fn switched(&self) -> Vec<(TopicId, bool)> {
+        self.inner.lock().switched.drain().collect()
+    }
+
+    /// Whether a topic is neither sent nor taken.
+    pub(crate) fn is_off(&self, topic: TopicId) -> bool {
+        self.off.read().contains(&topic)
+    }
+
+    /// Takes in how the readers are, and what was counted of each topic.
+    pub(crate) fn look(&self, readers: &Readers, router: &Router) {
+        let counted: HashMap<TopicId, &Counters> = router.topics().collect();
+        let counts = |topic| {
+            let counters = counted.get(&topic)?;
+            Some(Counts::of(counters, readers.count_ignored(topic)))
+        };
+        let mut inner = self.inner.lock();
+        let inner = &mut *inner;
+        let mut sums: Vec<Counts> = vec![Counts::default(); inner.parts.len()];
+        for (at, part) in inner.parts.iter().enumerate().rev() {
+            match part.kind {
+                Kind::Writer(topic) | Kind::Reader(topic) => {
+                    let counts = counts(topic).unwrap_or_default();
+                    if let Some(sum) = sums.get_mut(at) {
+                        sum.add(counts);
+                    }
+                }
+                Kind::Whole | Kind::Connection | Kind::Writers(_) | Kind::Readers(..) => {}
+            }
+            if let Kind::Reader(topic) = part.kind {
+                inner.states.set_own(at, readers.of(topic));
+            }
+            let sum = sums.get(at).copied().unwrap_or_default();
+            if let Some(above) = part.parent.and_then(|parent| sums.get_mut(parent)) {
+                above.add(sum);
+            }
+        }
+        for (part, sum) in inner.parts.iter_mut().zip(sums) {
+            part.counts = sum;
+        }
+        self.settle(inner);
+        self.show_counts(inner);
+    }
+
+    /// Works the states out anew, and shows and carries out what is other than before.
+    fn settle(&self, inner: &mut Inner) {
+        let changes = inner.states.settle();
+        if changes.is_empty() {
+            return;
+        }
+        let mut off = self.off.write();
+        let mut called = false;
+        for change in &changes {
+            let Some(part) = inner.parts.get_mut(change.at) else {
+                continue;
+            };
+            if let Some(diagnostics) = &mut part.diagnostics {
+                diagnostics.note(change);
+            }
+            let (Kind::Writer(topic) | Kind::Reader(topic)) = part.kind else {
+                continue;
+            };
+            let (was, is) = (is_on(change.was), is_on(change.is));
+            if was != is {
+                called = true;
+                inner.switched.insert(topic, is);
+                if is {
+                    off.remove(&topic);
+                } else {
+                    off.insert(topic);
+                }
+            }
+        }
+        drop(off);
+        let shown = changes.iter().filter_map(|Change { at, is, .. }| {
+            let part = inner.parts.get(*at)?;
+            Some((part.state.clone(), Variant::Int32(*is as i32)))
+        });
+        self.write(shown.collect());
+        if called {
+            self.called.notify_one();
+        }
+    }
+
+    fn show_states(&self, inner: &Inner) {
+        let states = inner.parts.iter().enumerate();
+        let states = states.map(|(at, part)| {
+            let state = Variant::Int32(inner.states.of(at) as i32);
+            (part.state.clone(), state)
+        });
+        self.write(states.collect());
+    }
+
+    fn show_counts(&self, inner: &mut Inner) {
+        let mut below: Vec<([u16; 2], bool)> = vec![([0; 2], false); inner.parts.len()];
+        let mut changes = Vec::new();
+        for at in (0..inner.parts.len()).rev() {
+            let state = inner.states.of(at);
+            let (numbers, errors) = below.get(at).copied().unwrap_or_default();
+            let Some(part) = inner.parts.get_mut(at) else {
+                continue;
+            };
+            let mut any = errors;
+            if let Some(diagnostics) = &mut part.diagnostics {
+                changes.extend(diagnostics.changes(part.counts, errors));
+                any |= diagnostics.has_errors();
+            }
+            if let Some((nodes, shown)) = &mut part.live
+                && *shown != numbers
+            {
+                *shown = numbers;
+                let values = numbers.map(Variant::UInt16);
+                changes.extend(nodes.clone().into_iter().zip(values));
+            }
+            let operational = u16::from(state == State::Operational);
+            if let Some(([all, live], failed)) = part.parent.and_then(|at| below.get_mut(at)) {
+                if matches!(part.kind, Kind::Writer(_) | Kind::Reader(_)) {
+                    *all = all.saturating_add(1);
+                    *live = live.saturating_add(operational);
+                }
+                *failed |= any;
+            }
+        }
+        self.write(changes);
+    }
+
+    /// Shows values of variables of the core namespace and of ours.
+    fn write(&self, values: Vec<(NodeId, Variant)>) {
+        let Some(places) = self.places.get() else {
+            return;
+        };
+        let subscriptions = &places.subscriptions;
+        let (core, own): (Vec<_>, Vec<_>) = values
+            .into_iter()
+            .partition(|(node, _)| node.namespace == 0);
+        write(places.space.address_space(), subscriptions, own);
+        if let Some(manager) = &places.core {
+            write(manager.address_space(), subscriptions, core);
+        }
+    }
+}
+
+/// Whether something is sent or taken in that state.
+const fn is_on(state: State) -> bool {
+    !matches!(state, State::Disabled | State::Paused)
+}
+
+fn write(
+    address_space: &RwLock<AddressSpace>,
+    subscriptions: &SubscriptionCache,
+    values: Vec<(NodeId, Variant)>,
+) {
+    if values.is_empty() {
+        return;
+    }
+    let mut address_space = address_space.write();
+    let mut shown = Vec::with_capacity(values.len());
+    for (node, value) in values {
+        if let Some(opcua::nodes::NodeType::Variable(variable)) = address_space.find_mut(&node) {
+            variable.set_data_value(DataValue::new_now(value));
+            shown.push(node);
+        }
+    }
+    subscriptions.maybe_notify(
+        shown.iter().map(|node| (node, AttributeId::Value)),
+        |node, attribute, range, encoding| {
+            let node = address_space.find(node)?.as_node();
+            node.get_attribute(TimestampsToReturn::Both, attribute, range, encoding)
+        },
+    );
+}
+
+/// Methods of the object PublishSubscribe that the library leaves out, as they are optional.
+const WHOLE: [(MethodId, &str); 2] = [
+    (MethodId::PublishSubscribe_Status_Enable, "Enable"),
+    (MethodId::PublishSubscribe_Status_Disable, "Disable"),
+];

@@ -1,0 +1,315 @@
+//! PubSubDiagnostics (OPC 10000-14, 9.1.11): the counters of a component, from the same numbers as `/metrics`.
+
+use bridge_node::{Counters, Reason};
+use opcua::types::{DataTypeId, NodeId, ObjectTypeId, ReferenceTypeId, VariableTypeId, Variant};
+
+use super::states::{Cause, Change, State};
+use super::tree::{At, Tree};
+
+/// What was counted of a topic, or of all topics of a group.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(crate) struct Counts {
+    /// Messages sent, with those that say something again or nothing.
+    pub(crate) sent: u64,
+    /// Messages that the network did not take.
+    pub(crate) failed: u64,
+    /// Messages that could not be secured.
+    pub(crate) unsealed: u64,
+    /// Messages taken.
+    pub(crate) received: u64,
+    /// Messages heard and not taken, for what is wrong with them.
+    pub(crate) wrong: u64,
+}
+
+impl Counts {
+    /// Those of a topic. What came for a reader that is disabled, `ignored`, was not wrong.
+    pub(super) fn of(counters: &Counters, ignored: u64) -> Self {
+        let dropped = |reasons: &[Reason]| -> u64 {
+            reasons.iter().map(|reason| counters.dropped(*reason)).sum()
+        };
+        Self {
+            sent: counters.sent + counters.repeated + counters.keep_alives,
+            failed: dropped(&FAILED),
+            unsealed: counters.dropped(Reason::NoKeys),
+            received: counters.delivered,
+            wrong: dropped(&WRONG).saturating_sub(ignored),
+        }
+    }
+
+    pub(super) fn add(&mut self, other: Self) {
+        self.sent += other.sent;
+        self.failed += other.failed;
+        self.unsealed += other.unsealed;
+        self.received += other.received;
+        self.wrong += other.wrong;
+    }
+}
+
+/// A counter of the standard.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Counter {
+    StateError,
+    OperationalByMethod,
+    OperationalByParent,
+    OperationalFromError,
+    PausedByParent,
+    DisabledByMethod,
+    Sent,
+    FailedTransmissions,
+    EncryptionErrors,
+    Received,
+    InvalidReceived,
+    FailedMessages,
+}
+
+impl Counter {
+    /// Those of every component.
+    pub(super) const OF_ALL: [Self; 6] = [
+        Self::StateError,
+        Self::OperationalByMethod,
+        Self::OperationalByParent,
+        Self::OperationalFromError,
+        Self::PausedByParent,
+        Self::DisabledByMethod,
+    ];
+    pub(super) const OF_WRITERS: [Self; 3] = [
+        Self::Sent,
+        Self::FailedTransmissions,
+        Self::EncryptionErrors,
+    ];
+    pub(super) const OF_READERS: [Self; 2] = [Self::Received, Self::InvalidReceived];
+
+    const fn name(self) -> &'static str {
+        match self {
+            Self::StateError => "StateError",
+            Self::OperationalByMethod => "StateOperationalByMethod",
+            Self::OperationalByParent => "StateOperationalByParent",
+            Self::OperationalFromError => "StateOperationalFromError",
+            Self::PausedByParent => "StatePausedByParent",
+            Self::DisabledByMethod => "StateDisabledByMethod",
+            Self::Sent => "SentNetworkMessages",
+            Self::FailedTransmissions => "FailedTransmissions",
+            Self::EncryptionErrors => "EncryptionErrors",
+            Self::Received => "ReceivedNetworkMessages",
+            Self::InvalidReceived => "ReceivedInvalidNetworkMessages",
+            Self::FailedMessages => "FailedDataSetMessages",
+        }
+    }
+
+    const fn is_error(self) -> bool {
+        matches!(
+            self,
+            Self::StateError
+                | Self::FailedTransmissions
+                | Self::EncryptionErrors
+                | Self::InvalidReceived
+                | Self::FailedMessages
+        )
+    }
+
+    const fn of(self, states: &[u64; 6], counts: Counts) -> u64 {
+        let [error, by_method, by_parent, from_error, paused, disabled] = *states;
+        match self {
+            Self::StateError => error,
+            Self::OperationalByMethod => by_method,
+            Self::OperationalByParent => by_parent,
+            Self::OperationalFromError => from_error,
+            Self::PausedByParent => paused,
+            Self::DisabledByMethod => disabled,
+            Self::Sent => counts.sent,
+            Self::FailedTransmissions => counts.failed,
+            Self::EncryptionErrors => counts.unsealed,
+            Self::Received => counts.received,
+            Self::InvalidReceived => counts.wrong,
+            Self::FailedMessages => counts.failed + counts.wrong + counts.unsealed,
+        }
+    }
+}
+
+/// The counters of a component as they stand in the address space.
+pub(super) struct Diagnostics {
+    counters: Vec<Shown>,
+    information: NodeId,
+    error: NodeId,
+    sub_error: NodeId,
+    /// Whether something below it has errors, as it is shown.
+    below: bool,
+    /// Changes of the state, by their kinds.
+    states: [u64; 6],
+    totals: (u32, u32),
+}
+
+struct Shown {
+    counter: Counter,
+    node: NodeId,
+    /// What had been counted when they were reset.
+    base: u64,
+    shown: u32,
+}
+
+impl Diagnostics {
+    /// Puts the counters below a component; also gives the method that resets them.
+    pub(super) fn insert(
+        tree: &mut Tree<'_>,
+        above: &At,
+        kind: ObjectTypeId,
+        more: &[Counter],
+    ) -> (Self, NodeId) {
+        let object = tree.part("Diagnostics", kind, above);
+        let level = (DataTypeId::DiagnosticsLevel, -1);
+        tree.value("DiagnosticsLevel", level, BASIC, &object);
+        let information = total(tree, "TotalInformation", false, &object);
+        let error = total(tree, "TotalError", true, &object);
+        let sub_error = tree.value("SubError", (DataTypeId::Boolean, -1), false, &object);
+        let reset = tree.method("Reset", &object);
+        let counters = tree.part("Counters", ObjectTypeId::BaseObjectType, &object);
+        let all = Counter::OF_ALL.iter().chain(more);
+        let counters = all.map(|counter| Shown {
+            counter: *counter,
+            node: total(tree, counter.name(), counter.is_error(), &counters),
+            base: 0,
+            shown: 0,
+        });
+        let made = Self {
+            counters: counters.collect(),
+            information,
+            error,
+            sub_error,
+            below: false,
+            states: [0; 6],
+            totals: (0, 0),
+        };
+        (made, reset)
+    }
+
+    /// Those of the object PublishSubscribe, which stand in the core namespace.
+    pub(super) fn of_the_whole() -> Self {
+        let node = |id: u32| NodeId::new(0, id);
+        let counters = Counter::OF_ALL.iter().zip(WHOLE);
+        let counters = counters.map(|(counter, id)| Shown {
+            counter: *counter,
+            node: node(id),
+            base: 0,
+            shown: 0,
+        });
+        Self {
+            counters: counters.collect(),
+            information: node(WHOLE_INFORMATION),
+            error: node(WHOLE_ERROR),
+            sub_error: node(WHOLE_SUB_ERROR),
+            below: false,
+            states: [0; 6],
+            totals: (0, 0),
+        }
+    }
+
+    /// Counts a change of the component's state.
+    pub(super) fn note(&mut self, change: &Change) {
+        let [error, by_method, by_parent, from_error, paused, disabled] = &mut self.states;
+        let which = match (change.is, change.cause) {
+            (State::Error, _) => error,
+            (State::Operational | State::PreOperational, Cause::Method) => by_method,
+            (State::Operational | State::PreOperational, Cause::Parent) => by_parent,
+            (State::Operational, Cause::Itself) if change.was == State::Error => from_error,
+            (State::Operational | State::PreOperational, Cause::Itself) => return,
+            (State::Paused, _) => paused,
+            (State::Disabled, _) => disabled,
+        };
+        *which = which.saturating_add(1);
+    }
+
+    /// Begins to count from nothing.
+    pub(super) fn reset(&mut self, counts: Counts) {
+        self.states = [0; 6];
+        for shown in &mut self.counters {
+            shown.base = shown.counter.of(&self.states, counts);
+        }
+    }
+
+    /// What is another number now.
+    pub(super) fn changes(&mut self, counts: Counts, below: bool) -> Vec<(NodeId, Variant)> {
+        let mut changes = Vec::new();
+        let mut totals = (0_u32, 0_u32);
+        for shown in &mut self.counters {
+            let counted = shown.counter.of(&self.states, counts);
+            let now = u32::try_from(counted.saturating_sub(shown.base)).unwrap_or(u32::MAX);
+            let total = match shown.counter.is_error() {
+                true => &mut totals.1,
+                false => &mut totals.0,
+            };
+            *total = total.saturating_add(now);
+            if now != shown.shown {
+                shown.shown = now;
+                changes.push((shown.node.clone(), Variant::UInt32(now)));
+            }
+        }
+        if totals != self.totals {
+            self.totals = totals;
+            changes.push((self.information.clone(), Variant::UInt32(totals.0)));
+            changes.push((self.error.clone(), Variant::UInt32(totals.1)));
+        }
+        if below != self.below {
+            self.below = below;
+            changes.push((self.sub_error.clone(), Variant::Boolean(below)));
+        }
+        changes
+    }
+
+    /// Whether anything went wrong so far.
+    pub(super) const fn has_errors(&self) -> bool {
+        self.totals.1 > 0
+    }
+}
+
+/// A counter with what the standard says of it.
+fn total(tree: &mut Tree<'_>, name: &str, is_error: bool, above: &At) -> NodeId {
+    let as_ = (
+        VariableTypeId::PubSubDiagnosticsCounterType,
+        ReferenceTypeId::HasComponent,
+    );
+    let kind = (DataTypeId::UInt32, -1);
+    let node = tree.variable(name, kind, 0_u32, (above, as_));
+    let at = At::core(node.clone(), &node_text(&node));
+    let class = (DataTypeId::PubSubDiagnosticsCounterClassification, -1);
+    tree.property("Active", (DataTypeId::Boolean, -1), true, &at);
+    tree.property("Classification", class, i32::from(is_error), &at);
+    let level = (DataTypeId::DiagnosticsLevel, -1);
+    tree.property("DiagnosticsLevel", level, BASIC, &at);
+    node
+}
+
+/// The identifier of a node that has a text for one.
+fn node_text(node: &NodeId) -> String {
+    match &node.identifier {
+        opcua::types::Identifier::String(text) => text.as_ref().to_owned(),
+        opcua::types::Identifier::Numeric(_)
+        | opcua::types::Identifier::Guid(_)
+        | opcua::types::Identifier::ByteString(_) => node.to_string(),
+    }
+}
+
+/// DiagnosticsLevel Basic.
+const BASIC: i32 = 0;
+/// StateError and so on below PublishSubscribe.Diagnostics.Counters.
+const WHOLE: [u32; 6] = [17_424, 17_431, 17_436, 17_441, 17_446, 17_451];
+const WHOLE_INFORMATION: u32 = 17_411;
+const WHOLE_ERROR: u32 = 17_416;
+const WHOLE_SUB_ERROR: u32 = 17_422;
+/// Why the network does not take a message.
+const FAILED: [Reason; 2] = [Reason::NotSent, Reason::TooBig];
+/// Why a message that was heard is not taken although it was meant for here.
+const WRONG: [Reason; 13] = [
+    Reason::Malformed,
+    Reason::Unsupported,
+    Reason::Invalid,
+    Reason::Mismatch,
+    Reason::Incomplete,
+    Reason::NoKeyFrame,
+    Reason::Undescribed,
+    Reason::NotPublished,
+    Reason::Unsecured,
+    Reason::Downgraded,
+    Reason::Signature,
+    Reason::Replayed,
+    Reason::UnknownKey,
+];

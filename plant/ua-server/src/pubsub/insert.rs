@@ -1,0 +1,458 @@
+//! A mapping as PubSub components, and their nodes.
+
+use std::collections::BTreeMap;
+
+use mappings::{GroupMode, KeySource, Mapping, SecurityGroup, SpaceId};
+use opcua::server::address_space::AddressSpace;
+use opcua::types::{
+    AttributeId, ConfigurationVersionDataType, DataSetMetaDataType, DataTypeId,
+    EndpointDescription, ExtensionObject, FieldMetaData, FieldTargetDataType, Guid, LocalizedText,
+    ObjectId, ObjectTypeId, PublishedVariableDataType, ReferenceTypeId, UAString, VariableId,
+    Variant,
+};
+use tracing::warn;
+
+use super::counts::{Counter, Counts, Diagnostics};
+use super::states::State;
+use super::tree::{At, Tree};
+use super::{Ask, Inner, Kind, Part};
+use crate::layout::{Layout, TopicNode};
+
+/// Puts the components of a mapping and their nodes in.
+pub(super) fn all(mapping: &Mapping, layout: &Layout, address_space: &mut AddressSpace) -> Inner {
+    let mut insert = Insert {
+        mapping,
+        inner: Inner::default(),
+        tree: Tree {
+            address_space,
+            made: Vec::new(),
+        },
+    };
+    let whole = insert.whole();
+    let (connection, object) = insert.connection(whole);
+    let mut groups: BTreeMap<(SpaceId, u16), (usize, At)> = BTreeMap::new();
+    if layout.topics.len() > MOST_SHOWN {
+        warn!(
+            topics = layout.topics.len(),
+            "the PubSub configuration shows the first {MOST_SHOWN} of them"
+        );
+    }
+    for (at, topic) in layout.topics.iter().take(MOST_SHOWN).enumerate() {
+        let (space, namespace) = (topic.topic.space, topic.topic.namespace.get());
+        let (group, above) = groups
+            .entry((space, namespace))
+            .or_insert_with(|| insert.group((space, namespace), (connection, &object)))
+            .clone();
+        let detailed = at < MOST_DETAILED;
+        if space == SpaceId::UA {
+            insert.writer(topic, (group, &above), detailed);
+        } else {
+            insert.reader(topic, (group, &above), detailed);
+        }
+    }
+    let Insert { inner, tree, .. } = insert;
+    Inner {
+        made: tree.made,
+        ..inner
+    }
+}
+
+struct Insert<'a> {
+    mapping: &'a Mapping,
+    inner: Inner,
+    tree: Tree<'a>,
+}
+
+impl Insert<'_> {
+    /// The object PublishSubscribe, which is there.
+    fn whole(&mut self) -> usize {
+        let at = self.inner.states.add(None, State::Operational);
+        self.inner.parts.push(Part {
+            kind: Kind::Whole,
+            parent: None,
+            state: VariableId::PublishSubscribe_Status_State.into(),
+            diagnostics: Some(Diagnostics::of_the_whole()),
+            live: None,
+            counts: Counts::default(),
+        });
+        at
+    }
+
+    /// A component with its Status, and with counters where it has any.
+    fn part(
+        &mut self,
+        kind: Kind,
+        (parent, own): (usize, State),
+        object: &At,
+        counters: Option<(ObjectTypeId, &[Counter])>,
+    ) -> usize {
+        let at = self.inner.states.add(Some(parent), own);
+        let status = self
+            .tree
+            .part("Status", ObjectTypeId::PubSubStatusType, object);
+        let state = (DataTypeId::PubSubState, -1);
+        let state = self.tree.value("State", state, own as i32, &status);
+        let mut methods = vec![
+            (self.tree.method("Enable", &status), Ask::Enable),
+            (self.tree.method("Disable", &status), Ask::Disable),
+        ];
+        let diagnostics = counters.map(|(kind, counters)| {
+            let (made, reset) = Diagnostics::insert(&mut self.tree, object, kind, counters);
+            methods.push((reset, Ask::Reset));
+            made
+        });
+        let asked = methods.into_iter().map(|(node, ask)| (node, (at, ask)));
+        self.inner.methods.extend(asked);
+        self.inner.parts.push(Part {
+            kind,
+            parent: Some(parent),
+            state,
+            diagnostics,
+            live: None,
+            counts: Counts::default(),
+        });
+        at
+    }
+
+    /// The one connection: the group that all programs send to.
+    fn connection(&mut self, whole: usize) -> (usize, At) {
+        let pubsub = self.mapping.pubsub();
+        let root = At::core(ObjectId::PublishSubscribe, "PubSub");
+        let how = (&root, ReferenceTypeId::HasPubSubConnection);
+        let object = self
+            .tree
+            .object("space", ObjectTypeId::PubSubConnectionType, how);
+        let tree = &mut self.tree;
+        let publisher = Variant::UInt16(u16::from(SpaceId::UA.get()));
+        tree.property(
+            "PublisherId",
+            (DataTypeId::BaseDataType, -1),
+            publisher,
+            &object,
+        );
+        tree.selection("TransportProfileUri", UDP_UADP, &object);
+        properties(tree, "ConnectionProperties", &object);
+        let address = tree.part("Address", ObjectTypeId::NetworkAddressUrlType, &object);
+        let interface = pubsub.interface.as_deref().unwrap_or_default();
+        tree.selection("NetworkInterface", interface, &address);
+        let url = format!("opc.udp://{}", pubsub.address);
+        tree.value("Url", (DataTypeId::String, -1), url, &address);
+        let counters = (ObjectTypeId::PubSubDiagnosticsConnectionType, &[][..]);
+        let at = self.part(
+            Kind::Connection,
+            (whole, State::Operational),
+            &object,
+            Some(counters),
+        );
+        (at, object)
+    }
+
+    /// The writers or readers of one namespace.
+    fn group(
+        &mut self,
+        (space, namespace): (SpaceId, u16),
+        (above, connection): (usize, &At),
+    ) -> (usize, At) {
+        let writes = space == SpaceId::UA;
+        let (kind, reference, counted, type_, name) = if writes {
+            (
+                Kind::Writers(namespace),
+                ReferenceTypeId::HasWriterGroup,
+                &Counter::OF_WRITERS[..],
+                (
+                    ObjectTypeId::WriterGroupType,
+                    ObjectTypeId::PubSubDiagnosticsWriterGroupType,
+                ),
+                format!("writers {namespace}"),
+            )
+        } else {
+            (
+                Kind::Readers(space, namespace),
+                ReferenceTypeId::HasReaderGroup,
+                &Counter::OF_READERS[..],
+                (
+                    ObjectTypeId::ReaderGroupType,
+                    ObjectTypeId::PubSubDiagnosticsReaderGroupType,
+                ),
+                format!("readers {space} {namespace}"),
+            )
+        };
+        let object = self.tree.object(&name, type_.0, (connection, reference));
+        let pubsub = self.mapping.pubsub();
+        let tree = &mut self.tree;
+        security(tree, self.mapping.group_of(namespace), &object);
+        tree.property(
+            "MaxNetworkMessageSize",
+            UINT32,
+            u32::from(pubsub.max_datagram),
+            &object,
+        );
+        properties(tree, "GroupProperties", &object);
+        if writes {
+            self.writer_group(namespace, &object);
+        }
+        let at = self.part(
+            kind,
+            (above, State::Operational),
+            &object,
+            Some((type_.1, counted)),
+        );
+        self.live(at, &object, writes);
+        (at, object)
+    }
+
+    /// What a group of writers has besides.
+    fn writer_group(&mut self, namespace: u16, object: &At) {
+        let milliseconds = |time: std::time::Duration| time.as_secs_f64() * 1e3;
+        let pubsub = self.mapping.pubsub();
+        let tree = &mut self.tree;
+        tree.property("WriterGroupId", UINT16, namespace, object);
+        let period = milliseconds(pubsub.key_frame_period);
+        tree.property("PublishingInterval", DURATION, period, object);
+        let alive = milliseconds(pubsub.keep_alive_period);
+        tree.property("KeepAliveTime", DURATION, alive, object);
+        tree.property("Priority", (DataTypeId::Byte, -1), 0_u8, object);
+        let none: Vec<UAString> = Vec::new();
+        tree.property("LocaleIds", (DataTypeId::LocaleId, 1), none, object);
+        tree.property("HeaderLayoutUri", (DataTypeId::String, -1), "", object);
+        let settings = ObjectTypeId::UadpWriterGroupMessageType;
+        let settings = tree.part("MessageSettings", settings, object);
+        let version = (DataTypeId::VersionTime, -1);
+        tree.property("GroupVersion", version, 0_u32, &settings);
+        let ordering = (DataTypeId::DataSetOrderingType, -1);
+        tree.property("DataSetOrdering", ordering, 0_i32, &settings);
+        let mask = (DataTypeId::UadpNetworkMessageContentMask, -1);
+        tree.property(
+            "NetworkMessageContentMask",
+            mask,
+            NETWORK_MESSAGE,
+            &settings,
+        );
+        let offsets = (DataTypeId::Duration, 1);
+        tree.property("PublishingOffset", offsets, Vec::<f64>::new(), &settings);
+    }
+
+    /// How many are below a group, and how many of them are operational.
+    fn live(&mut self, group: usize, object: &At, writes: bool) {
+        let id = format!("{}.Diagnostics", text(object));
+        let values = At::core(object.below("Diagnostics"), &id);
+        let live = self
+            .tree
+            .part("LiveValues", ObjectTypeId::BaseObjectType, &values);
+        let names = if writes {
+            ["ConfiguredDataSetWriters", "OperationalDataSetWriters"]
+        } else {
+            ["ConfiguredDataSetReaders", "OperationalDataSetReaders"]
+        };
+        let nodes = names.map(|name| self.tree.value(name, UINT16, 0_u16, &live));
+        if let Some(part) = self.inner.parts.get_mut(group) {
+            part.live = Some((nodes, [0; 2]));
+        }
+    }
+
+    /// A value that this program sends: its writer, and what is published.
+    fn writer(&mut self, topic: &TopicNode, (above, group): (usize, &At), detailed: bool) {
+        let name = topic.topic.to_string();
+        let how = (group, ReferenceTypeId::HasDataSetWriter);
+        let object = self
+            .tree
+            .object(&name, ObjectTypeId::DataSetWriterType, how);
+        let (_, _, identifier) = topic.topic.triple();
+        let tree = &mut self.tree;
+        tree.property("DataSetWriterId", UINT16, identifier, &object);
+        tree.property("DataSetFieldContentMask", FIELDS, 0_u32, &object);
+        tree.property("KeyFrameCount", UINT32, 1_u32, &object);
+        properties(tree, "DataSetWriterProperties", &object);
+        let settings = ObjectTypeId::UadpDataSetWriterMessageType;
+        let settings = tree.part("MessageSettings", settings, &object);
+        let mask = (DataTypeId::UadpDataSetMessageContentMask, -1);
+        tree.property(
+            "DataSetMessageContentMask",
+            mask,
+            DATA_SET_MESSAGE,
+            &settings,
+        );
+        for zero in ["ConfiguredSize", "NetworkMessageNumber", "DataSetOffset"] {
+            tree.property(zero, UINT16, 0_u16, &settings);
+        }
+        let sets = At::core(
+            ObjectId::PublishSubscribe_PublishedDataSets,
+            "PubSub.DataSets",
+        );
+        let set = tree.part(&name, ObjectTypeId::PublishedDataItemsType, &sets);
+        let version = ConfigurationVersionDataType::default();
+        let kind = (DataTypeId::ConfigurationVersionDataType, -1);
+        tree.property("ConfigurationVersion", kind, object_of(version), &set);
+        meta_data(tree, topic, &set);
+        let published = topic
+            .places()
+            .filter(|(_, field)| field.is_some() || !topic.compound);
+        let published = published.map(|(node, _)| PublishedVariableDataType {
+            published_variable: node.clone(),
+            attribute_id: AttributeId::Value as u32,
+            ..PublishedVariableDataType::default()
+        });
+        let published: Vec<ExtensionObject> =
+            published.map(ExtensionObject::from_message).collect();
+        let kind = (DataTypeId::PublishedVariableDataType, 1);
+        tree.property("PublishedData", kind, published, &set);
+        tree.refer(&set.node, &object.node, ReferenceTypeId::DataSetToWriter);
+        let counters = (
+            ObjectTypeId::PubSubDiagnosticsDataSetWriterType,
+            &[Counter::FailedMessages][..],
+        );
+        self.part(
+            Kind::Writer(topic.topic),
+            (above, State::Operational),
+            &object,
+            detailed.then_some(counters),
+        );
+    }
+
+    /// A value that this program hears.
+    fn reader(&mut self, topic: &TopicNode, (above, group): (usize, &At), detailed: bool) {
+        let name = topic.topic.to_string();
+        let how = (group, ReferenceTypeId::HasDataSetReader);
+        let object = self
+            .tree
+            .object(&name, ObjectTypeId::DataSetReaderType, how);
+        let (space, namespace, identifier) = topic.topic.triple();
+        let pubsub = self.mapping.pubsub();
+        let tree = &mut self.tree;
+        let publisher = Variant::UInt16(space);
+        tree.property(
+            "PublisherId",
+            (DataTypeId::BaseDataType, -1),
+            publisher,
+            &object,
+        );
+        tree.property("WriterGroupId", UINT16, namespace, &object);
+        tree.property("DataSetWriterId", UINT16, identifier, &object);
+        meta_data(tree, topic, &object);
+        tree.property("DataSetFieldContentMask", FIELDS, 0_u32, &object);
+        let timeout = pubsub.receive_timeout.as_secs_f64() * 1e3;
+        tree.property("MessageReceiveTimeout", DURATION, timeout, &object);
+        tree.property("KeyFrameCount", UINT32, 1_u32, &object);
+        tree.property("HeaderLayoutUri", (DataTypeId::String, -1), "", &object);
+        properties(tree, "DataSetReaderProperties", &object);
+        let targets = tree.part(
+            "SubscribedDataSet",
+            ObjectTypeId::TargetVariablesType,
+            &object,
+        );
+        let written = topic
+            .places()
+            .filter(|(_, field)| field.is_some() || !topic.compound);
+        let written = written.map(|(node, _)| FieldTargetDataType {
+            target_node_id: node.clone(),
+            attribute_id: AttributeId::Value as u32,
+            ..FieldTargetDataType::default()
+        });
+        let written: Vec<ExtensionObject> = written.map(ExtensionObject::from_message).collect();
+        let kind = (DataTypeId::FieldTargetDataType, 1);
+        tree.property("TargetVariables", kind, written, &targets);
+        let counters = (
+            ObjectTypeId::PubSubDiagnosticsDataSetReaderType,
+            &[Counter::FailedMessages][..],
+        );
+        self.part(
+            Kind::Reader(topic.topic),
+            (above, State::PreOperational),
+            &object,
+            detailed.then_some(counters),
+        );
+    }
+}
+
+/// The fields of a DataSet, as they are known before anybody sends them.
+fn meta_data(tree: &mut Tree<'_>, topic: &TopicNode, above: &At) {
+    let fields = topic.fields.iter().map(|field| FieldMetaData {
+        name: UAString::from(field.name.as_str()),
+        built_in_type: field.shape.0.map_or(VARIANT, |(builtin, _)| builtin as u8),
+        data_type: field.data_type(),
+        value_rank: field.shape.value_rank(),
+        data_set_field_id: Guid::null(),
+        ..FieldMetaData::default()
+    });
+    let data = DataSetMetaDataType {
+        name: UAString::from(topic.name.as_str()),
+        description: LocalizedText::from(topic.topic.to_string().as_str()),
+        fields: Some(fields.collect()),
+        ..DataSetMetaDataType::default()
+    };
+    let kind = (DataTypeId::DataSetMetaDataType, -1);
+    tree.property("DataSetMetaData", kind, object_of(data), above);
+}
+
+/// How a group is secured, and who has its keys.
+fn security(tree: &mut Tree<'_>, group: Option<&SecurityGroup>, above: &At) {
+    let mode = match group.map(|group| group.mode) {
+        None | Some(GroupMode::None) => 1_i32,
+        Some(GroupMode::Sign) => 2,
+        Some(GroupMode::SignAndEncrypt) => 3,
+    };
+    tree.property(
+        "SecurityMode",
+        (DataTypeId::MessageSecurityMode, -1),
+        mode,
+        above,
+    );
+    let Some(group) = group.filter(|group| group.mode != GroupMode::None) else {
+        return;
+    };
+    tree.property(
+        "SecurityGroupId",
+        (DataTypeId::String, -1),
+        group.id.as_str(),
+        above,
+    );
+    let endpoint = match &group.keys {
+        Some(KeySource::Own(served)) => Some(served.endpoint.to_string()),
+        Some(KeySource::Sks(endpoint)) => Some(endpoint.to_string()),
+        Some(KeySource::File(_) | KeySource::Credential(_)) | None => None,
+    };
+    let services = endpoint.into_iter().map(|url| EndpointDescription {
+        endpoint_url: UAString::from(url.as_str()),
+        ..EndpointDescription::default()
+    });
+    let services: Vec<ExtensionObject> = services.map(ExtensionObject::from_message).collect();
+    let kind = (DataTypeId::EndpointDescription, 1);
+    tree.property("SecurityKeyServices", kind, services, above);
+}
+
+/// A list of properties, which is empty.
+fn properties(tree: &mut Tree<'_>, name: &str, above: &At) {
+    let none: Vec<ExtensionObject> = Vec::new();
+    tree.property(name, (DataTypeId::KeyValuePair, 1), none, above);
+}
+
+fn object_of<T>(value: T) -> Variant
+where
+    T: opcua::types::DynEncodable,
+{
+    Variant::from(ExtensionObject::from_message(value))
+}
+
+fn text(at: &At) -> String {
+    match &at.node.identifier {
+        opcua::types::Identifier::String(text) => text.as_ref().to_owned(),
+        opcua::types::Identifier::Numeric(_)
+        | opcua::types::Identifier::Guid(_)
+        | opcua::types::Identifier::ByteString(_) => at.node.to_string(),
+    }
+}
+
+const UDP_UADP: &str = "http://opcfoundation.org/UA-Profile/Transport/pubsub-udp-uadp";
+const UINT16: (DataTypeId, i32) = (DataTypeId::UInt16, -1);
+const UINT32: (DataTypeId, i32) = (DataTypeId::UInt32, -1);
+const DURATION: (DataTypeId, i32) = (DataTypeId::Duration, -1);
+const FIELDS: (DataTypeId, i32) = (DataTypeId::DataSetFieldContentMask, -1);
+/// PublisherId, GroupHeader, WriterGroupId, PayloadHeader (OPC 10000-14, 6.3.1.1.4).
+const NETWORK_MESSAGE: u32 = 0b0100_0111;
+/// Timestamp, PicoSeconds, Status, MajorVersion, SequenceNumber (OPC 10000-14, 6.3.1.2.2).
+const DATA_SET_MESSAGE: u32 = 0b0010_1111;
+/// The BuiltInType of a field that can be anything.
+const VARIANT: u8 = 24;
+/// Writers and readers that are shown, and those of them that have counters.
+const MOST_SHOWN: usize = 5_000;
+const MOST_DETAILED: usize = 500;

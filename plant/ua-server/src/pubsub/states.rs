@@ -1,0 +1,182 @@
+//! The states of PubSub components (OPC 10000-14, 6.2.1): each has its own, and none is operational while the one above it
+//! is not.
+
+/// PubSubState (OPC 10000-14, 6.2.1), by its number.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum State {
+    /// Somebody has disabled it.
+    Disabled = 0,
+    /// What is above it is not operational.
+    Paused = 1,
+    /// It does its work.
+    Operational = 2,
+    /// It cannot.
+    Error = 3,
+    /// It waits for what it needs at first.
+    PreOperational = 4,
+}
+
+/// Why a state is another one than before.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Cause {
+    /// Somebody called Enable or Disable of it.
+    Method,
+    /// What is above it has another state.
+    Parent,
+    /// What it meets with.
+    Itself,
+}
+
+/// A state that is another one now.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Change {
+    /// Of which component.
+    pub(crate) at: usize,
+    pub(crate) was: State,
+    pub(crate) is: State,
+    pub(crate) cause: Cause,
+}
+
+#[derive(Debug)]
+struct Component {
+    parent: Option<usize>,
+    enabled: bool,
+    /// Whether `enabled` was changed since the last look.
+    called: bool,
+    /// What it meets with, while it is enabled and what is above it is operational.
+    own: State,
+    state: State,
+}
+
+/// All components; one that is above another has the lower number.
+#[derive(Debug, Default)]
+pub(crate) struct States {
+    all: Vec<Component>,
+}
+
+impl States {
+    /// One more below `parent`; its number.
+    pub(crate) fn add(&mut self, parent: Option<usize>, own: State) -> usize {
+        let component = Component {
+            parent,
+            enabled: true,
+            called: false,
+            own,
+            state: own,
+        };
+        self.all.push(component);
+        self.all.len() - 1
+    }
+
+    /// The state of a component.
+    pub(crate) fn of(&self, at: usize) -> State {
+        let component = self.all.get(at);
+        component.map_or(State::Disabled, |component| component.state)
+    }
+
+    /// Says what a component meets with.
+    pub(crate) fn set_own(&mut self, at: usize, own: State) {
+        if let Some(component) = self.all.get_mut(at) {
+            component.own = own;
+        }
+    }
+
+    /// Enables or disables a component; false where it is so already (OPC 10000-14, 9.1.10).
+    pub(crate) fn enable(&mut self, at: usize, enabled: bool) -> bool {
+        let Some(component) = self.all.get_mut(at) else {
+            return false;
+        };
+        let other = component.enabled != enabled;
+        component.enabled = enabled;
+        component.called |= other;
+        other
+    }
+
+    /// Which components are enabled by themselves.
+    pub(crate) fn is_enabled(&self, at: usize) -> bool {
+        self.all.get(at).is_some_and(|component| component.enabled)
+    }
+
+    /// Works out all states anew, and gives those that are others now.
+    pub(crate) fn settle(&mut self) -> Vec<Change> {
+        let mut changes = Vec::new();
+        for at in 0..self.all.len() {
+            let Some(component) = self.all.get(at) else {
+                continue;
+            };
+            let above = component.parent.map(|parent| self.of(parent));
+            let is = match above {
+                _ if !component.enabled => State::Disabled,
+                Some(State::Disabled | State::Paused | State::Error) => State::Paused,
+                Some(State::Operational | State::PreOperational) | None => component.own,
+            };
+            let was = component.state;
+            let called = component.called;
+            if let Some(component) = self.all.get_mut(at) {
+                component.called = false;
+                component.state = is;
+            }
+            if was != is {
+                let cause = match (called, was, is) {
+                    (true, _, _) => Cause::Method,
+                    (false, State::Paused, _) | (false, _, State::Paused) => Cause::Parent,
+                    (false, _, _) => Cause::Itself,
+                };
+                changes.push(Change { at, was, is, cause });
+            }
+        }
+        changes
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_below_one_that_is_disabled_is_paused_and_goes_on_with_it() {
+        let mut states = States::default();
+        let connection = states.add(None, State::Operational);
+        let group = states.add(Some(connection), State::Operational);
+        let writer = states.add(Some(group), State::Operational);
+        assert_eq!(states.settle(), []);
+        assert!(states.enable(connection, false));
+        assert!(!states.enable(connection, false), "it is already");
+        let changes = states.settle();
+        let seen: Vec<_> = changes
+            .iter()
+            .map(|change| (change.at, change.is, change.cause))
+            .collect();
+        assert_eq!(
+            seen,
+            [
+                (connection, State::Disabled, Cause::Method),
+                (group, State::Paused, Cause::Parent),
+                (writer, State::Paused, Cause::Parent),
+            ]
+        );
+        states.enable(connection, true);
+        states.settle();
+        assert_eq!(states.of(writer), State::Operational);
+    }
+
+    #[test]
+    fn one_that_is_disabled_stays_so_whatever_is_above_it() {
+        let mut states = States::default();
+        let group = states.add(None, State::Operational);
+        let reader = states.add(Some(group), State::PreOperational);
+        states.enable(reader, false);
+        states.enable(group, false);
+        states.settle();
+        states.enable(group, true);
+        states.settle();
+        assert_eq!(states.of(reader), State::Disabled);
+        states.set_own(reader, State::Error);
+        assert_eq!(states.settle(), [], "what it meets with is no matter");
+        states.enable(reader, true);
+        let changes = states.settle();
+        assert_eq!(changes[0].is, State::Error);
+        states.set_own(reader, State::Operational);
+        assert_eq!(states.settle()[0].cause, Cause::Itself);
+    }
+}

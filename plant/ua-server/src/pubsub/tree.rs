@@ -1,0 +1,170 @@
+//! Objects, variables and methods of the PubSub configuration, as they are put into the address space.
+
+use opcua::nodes::{MethodBuilder, ObjectBuilder, ReferenceDirection, VariableBuilder};
+use opcua::server::address_space::AddressSpace;
+use opcua::types::{
+    DataTypeId, LocalizedText, MethodId, NodeId, ObjectId, ObjectTypeId, QualifiedName,
+    ReferenceTypeId, UAString, VariableTypeId, Variant,
+};
+
+/// Puts nodes in, and remembers which.
+pub(super) struct Tree<'a> {
+    pub(super) address_space: &'a mut AddressSpace,
+    pub(super) made: Vec<NodeId>,
+}
+
+/// An object that nodes are put below.
+#[derive(Clone)]
+pub(super) struct At {
+    pub(super) node: NodeId,
+    id: String,
+}
+
+impl At {
+    /// A node of the core namespace; what is put below it has identifiers that begin with `id`.
+    pub(super) fn core(node: impl Into<NodeId>, id: &str) -> Self {
+        Self {
+            node: node.into(),
+            id: id.to_owned(),
+        }
+    }
+
+    /// The node of that name below it.
+    pub(super) fn below(&self, name: &str) -> NodeId {
+        NodeId::new(APPLICATION, format!("{}.{name}", self.id))
+    }
+}
+
+impl Tree<'_> {
+    /// An object below another.
+    pub(super) fn object(
+        &mut self,
+        name: &str,
+        kind: ObjectTypeId,
+        (above, reference): (&At, ReferenceTypeId),
+    ) -> At {
+        let node = above.below(name);
+        ObjectBuilder::new(&node, browse_name(name), LocalizedText::from(name))
+            .has_type_definition(kind)
+            .reference(above.node.clone(), reference, ReferenceDirection::Inverse)
+            .insert(self.address_space);
+        self.made.push(node.clone());
+        At {
+            node,
+            id: format!("{}.{name}", above.id),
+        }
+    }
+
+    /// A component below an object.
+    pub(super) fn part(&mut self, name: &str, kind: ObjectTypeId, above: &At) -> At {
+        self.object(name, kind, (above, ReferenceTypeId::HasComponent))
+    }
+
+    /// A property.
+    pub(super) fn property(
+        &mut self,
+        name: &str,
+        kind: (DataTypeId, i32),
+        value: impl Into<Variant>,
+        above: &At,
+    ) {
+        let as_ = (VariableTypeId::PropertyType, ReferenceTypeId::HasProperty);
+        self.variable(name, kind, value, (above, as_));
+    }
+
+    /// A variable that is a component.
+    pub(super) fn value(
+        &mut self,
+        name: &str,
+        kind: (DataTypeId, i32),
+        value: impl Into<Variant>,
+        above: &At,
+    ) -> NodeId {
+        let as_ = (
+            VariableTypeId::BaseDataVariableType,
+            ReferenceTypeId::HasComponent,
+        );
+        self.variable(name, kind, value, (above, as_))
+    }
+
+    /// A variable of which one of several texts is chosen.
+    pub(super) fn selection(&mut self, name: &str, text: &str, above: &At) {
+        let as_ = (
+            VariableTypeId::SelectionListType,
+            ReferenceTypeId::HasComponent,
+        );
+        let node = self.variable(name, (DataTypeId::String, -1), text, (above, as_));
+        let list = At {
+            node,
+            id: format!("{}.{name}", above.id),
+        };
+        let texts = vec![UAString::from(text)];
+        self.property("Selections", (DataTypeId::BaseDataType, 1), texts, &list);
+    }
+
+    /// A variable.
+    pub(super) fn variable(
+        &mut self,
+        name: &str,
+        (data_type, rank): (DataTypeId, i32),
+        value: impl Into<Variant>,
+        (above, (kind, reference)): (&At, (VariableTypeId, ReferenceTypeId)),
+    ) -> NodeId {
+        let node = above.below(name);
+        VariableBuilder::new(&node, browse_name(name), LocalizedText::from(name))
+            .data_type(data_type)
+            .value_rank(rank)
+            .value(value)
+            .has_type_definition(kind)
+            .reference(above.node.clone(), reference, ReferenceDirection::Inverse)
+            .insert(self.address_space);
+        self.made.push(node.clone());
+        node
+    }
+
+    /// A method that takes and gives nothing.
+    pub(super) fn method(&mut self, name: &str, above: &At) -> NodeId {
+        let node = above.below(name);
+        MethodBuilder::new(&node, browse_name(name), LocalizedText::from(name))
+            .component_of(above.node.clone())
+            .executable(true)
+            .user_executable(true)
+            .insert(self.address_space);
+        self.made.push(node.clone());
+        node
+    }
+
+    /// Says that a node is to be found from another one too.
+    pub(super) fn refer(&mut self, from: &NodeId, to: &NodeId, reference: ReferenceTypeId) {
+        self.address_space.insert_reference(from, to, reference);
+    }
+}
+
+/// A method of the Status of the object PublishSubscribe, where it has none.
+pub(super) fn core_method(address_space: &mut AddressSpace, method: MethodId, name: &str) {
+    let node: NodeId = method.into();
+    if !address_space.node_exists(&node) {
+        MethodBuilder::new(
+            &node,
+            QualifiedName::new(0, name),
+            LocalizedText::from(name),
+        )
+        .component_of(NodeId::from(ObjectId::PublishSubscribe_Status))
+        .executable(true)
+        .user_executable(true)
+        .insert(address_space);
+    }
+}
+
+/// The names are those of the standard.
+fn browse_name(name: &str) -> QualifiedName {
+    let namespace = if name.starts_with(|c: char| c.is_ascii_uppercase()) {
+        0
+    } else {
+        APPLICATION
+    };
+    QualifiedName::new(namespace, name)
+}
+
+/// The namespace index of the application's own URI.
+const APPLICATION: u16 = 1;

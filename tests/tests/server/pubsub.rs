@@ -1,0 +1,229 @@
+//! The PubSub configuration as it stands in the address space, judged by asyncua.
+
+use std::time::{Duration, Instant};
+
+use serde_json::{Value, json};
+use system_tests::{Cell, Child, Peer, SERVER_ENDPOINT, UadpSocket, eventually};
+
+use super::{
+    DataSetHeader, SOON, TEMPERATURE, TEMPERATURE_NODE, key_frame, server, shows, watch, write,
+    written,
+};
+
+const WRITER: &str = "space/writers 2/ua_0_2_30";
+const READER: &str = "space/readers 2 2/ua_2_2_10";
+const SETPOINT: &str = "ns=2;i=30";
+
+/// PubSubState, OPC 10000-14, 6.2.1.
+const DISABLED: i32 = 0;
+const PAUSED: i32 = 1;
+const OPERATIONAL: i32 = 2;
+const PRE_OPERATIONAL: i32 = 4;
+
+/// A client at the configuration.
+struct Client {
+    asyncua: Child,
+    orders: u64,
+}
+
+impl Client {
+    fn of(cell: &Cell) -> Self {
+        let started = cell.asyncua_started("opcua_pubsub.py", &[SERVER_ENDPOINT]);
+        Self {
+            asyncua: started.told().start().ready(SOON),
+            orders: 0,
+        }
+    }
+
+    /// What becomes of an order.
+    fn told(&mut self, order: &str) -> Value {
+        self.asyncua.tell(order);
+        self.orders += 1;
+        self.asyncua.wait_for_json(order, SOON, |line| {
+            (line["order"] == self.orders).then(|| line.clone())
+        })
+    }
+
+    fn read(&mut self, path: &str) -> Value {
+        let mut read = self.told(&format!("read {path}"));
+        assert_eq!(read["status"], "Good", "{path}: {read}");
+        read["value"].take()
+    }
+
+    /// Calls a method; its status.
+    fn call(&mut self, path: &str) -> Value {
+        self.told(&format!("call {path}"))["called"].take()
+    }
+
+    fn state(&mut self, path: &str) -> Value {
+        self.read(&format!("{path}/Status/State"))
+    }
+
+    fn becomes(&mut self, path: &str, value: &Value) {
+        eventually(&format!("{value} at {path}"), SOON, || {
+            (self.read(path) == *value).then_some(())
+        });
+    }
+
+    fn is_in(&mut self, path: &str, state: i32) {
+        self.becomes(&format!("{path}/Status/State"), &json!(state));
+    }
+}
+
+#[test]
+fn a_client_finds_what_is_sent_and_heard_with_its_metadata_below_publish_subscribe() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let _server = server(&cell);
+    let mut client = Client::of(&cell);
+    let walked = client.told("walk");
+    assert_eq!(walked["bad"], json!([]), "{walked}");
+    assert!(
+        walked["walked"]["Variable"].as_u64().unwrap() > 100,
+        "{walked}"
+    );
+
+    assert_eq!(client.read("space/PublisherId"), 0);
+    let url = client.read("space/Address/Url");
+    assert!(url.as_str().unwrap().starts_with("opc.udp://"), "{url}");
+    let profile = client.read("space/TransportProfileUri");
+    assert_eq!(
+        profile,
+        "http://opcfoundation.org/UA-Profile/Transport/pubsub-udp-uadp"
+    );
+    assert_eq!(client.read("space/writers 2/WriterGroupId"), 2);
+    assert_eq!(client.read("space/writers 2/SecurityMode"), 1);
+    assert_eq!(client.read(&format!("{WRITER}/DataSetWriterId")), 30);
+    assert_eq!(client.read(&format!("{READER}/PublisherId")), 2);
+    assert_eq!(client.read(&format!("{READER}/WriterGroupId")), 2);
+    assert_eq!(client.read(&format!("{READER}/DataSetWriterId")), 10);
+    for (place, name) in [
+        ("PublishedDataSets/ua_0_2_30", "setpoint"),
+        (READER, "temperature"),
+    ] {
+        let data = client.read(&format!("{place}/DataSetMetaData"));
+        assert_eq!(data["Name"], name, "{data}");
+        let fields = data["Fields"].as_array().unwrap();
+        assert_eq!(fields.len(), 1);
+        assert_eq!(
+            (&fields[0]["BuiltInType"], &fields[0]["DataType"]),
+            (&json!(11), &json!("i=11")),
+            "a Double"
+        );
+    }
+    let published = client.read("PublishedDataSets/ua_0_2_30/PublishedData");
+    assert_eq!(published[0]["PublishedVariable"], SETPOINT);
+    let targets = client.read(&format!("{READER}/SubscribedDataSet/TargetVariables"));
+    assert_eq!(targets[0]["TargetNodeId"], TEMPERATURE_NODE);
+}
+
+#[test]
+fn a_reader_that_is_disabled_takes_nothing_and_goes_on_when_it_is_enabled() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let _server = server(&cell);
+    let mut client = Client::of(&cell);
+    let group = UadpSocket::join();
+    let mut watch = watch(&cell, TEMPERATURE_NODE);
+    let mut sequence = 0;
+    let mut send = |value: f64| {
+        sequence += 1;
+        group.send(&key_frame(
+            TEMPERATURE,
+            sequence,
+            value,
+            DataSetHeader::default(),
+        ));
+    };
+    assert_eq!(
+        client.state(READER),
+        PRE_OPERATIONAL,
+        "nothing was heard yet"
+    );
+    send(1.5);
+    shows(&mut watch, "Good", &json!(1.5));
+    client.is_in(READER, OPERATIONAL);
+    let received = "space/readers 2 2/Diagnostics/Counters/ReceivedNetworkMessages";
+    client.becomes(received, &json!(1));
+    client.becomes(
+        "space/readers 2 2/Diagnostics/LiveValues/OperationalDataSetReaders",
+        &json!(1),
+    );
+
+    assert_eq!(client.call(&format!("{READER}/Status/Disable")), "Good");
+    assert_eq!(client.state(READER), DISABLED);
+    let again = client.call(&format!("{READER}/Status/Disable"));
+    assert_eq!(again, "BadInvalidState");
+    shows(&mut watch, "UncertainLastUsableValue", &json!(1.5));
+    send(2.5);
+    assert_eq!(client.call(&format!("{READER}/Status/Enable")), "Good");
+    client.is_in(READER, OPERATIONAL);
+    send(3.5);
+    shows(&mut watch, "Good", &json!(3.5));
+    let told: Vec<Value> = watch.json_lines();
+    assert!(
+        !told.iter().any(|line| line["value"] == 2.5),
+        "what came meanwhile was not taken: {told:?}"
+    );
+    let by_method = format!("{READER}/Diagnostics/Counters/StateDisabledByMethod");
+    client.becomes(&by_method, &json!(1));
+    assert_eq!(client.call(&format!("{READER}/Diagnostics/Reset")), "Good");
+    assert_eq!(client.read(&by_method), 0);
+}
+
+#[test]
+fn what_is_below_a_group_that_is_disabled_sends_nothing() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let _server = server(&cell);
+    let mut client = Client::of(&cell);
+    let group = UadpSocket::join();
+    assert_eq!(write(&cell, SETPOINT, "Double", "1.5"), "Good");
+    let sent = |value: f64| {
+        eventually("a key frame", SOON, || {
+            let frame = written(&group.receive(Duration::from_millis(100))?)?;
+            (frame == ((0, 2, 30), vec![value])).then_some(())
+        });
+    };
+    sent(1.5);
+    let counter = "space/writers 2/Diagnostics/Counters/SentNetworkMessages";
+    eventually("the message is counted", SOON, || {
+        (client.read(counter).as_u64()? >= 1).then_some(())
+    });
+
+    for (above, state) in [
+        ("space", PAUSED),
+        ("space/writers 2", PAUSED),
+        (WRITER, DISABLED),
+    ] {
+        assert_eq!(client.call(&format!("{above}/Status/Disable")), "Good");
+        assert_eq!(client.state(above), DISABLED, "{above}");
+        assert_eq!(client.state(WRITER), state, "{above}");
+        assert_eq!(write(&cell, SETPOINT, "Double", "9"), "BadInvalidState");
+        // What was sent before waits in this socket still.
+        while group.receive(Duration::from_millis(100)).is_some() {}
+        // What was under way may still come; then nothing does, for as long as a value is repeated in.
+        let quiet = Instant::now();
+        let mut late = 0;
+        while quiet.elapsed() < Duration::from_millis(2_500) {
+            let frame = group.receive(Duration::from_millis(100));
+            let frame = frame.and_then(|frame| written(&frame));
+            late += usize::from(frame.is_some_and(|(topic, _)| topic == (0, 2, 30)));
+        }
+        assert!(late <= 1, "{late} messages with {above} disabled");
+        assert_eq!(client.call(&format!("{above}/Status/Enable")), "Good");
+        assert_eq!(client.state(WRITER), OPERATIONAL);
+        eventually("clients can write again", SOON, || {
+            (write(&cell, SETPOINT, "Double", "2.5") == "Good").then_some(())
+        });
+        sent(2.5);
+    }
+    assert_eq!(client.call("Status/Disable"), "Good");
+    assert_eq!(client.state(WRITER), PAUSED);
+    client.becomes("Status/State", &json!(DISABLED));
+    assert_eq!(client.call("Status/Enable"), "Good");
+    assert_eq!(client.state(WRITER), OPERATIONAL);
+}
