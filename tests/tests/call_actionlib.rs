@@ -710,7 +710,7 @@ fn skills_have_their_work_done_by_an_action_of_ros_2_and_a_service_of_ros_1() {
     let mut base = cell.cyclone("calls/ros2_navigate.py", &["/navigate_to_pose"]);
     let mut belt = cell.rospy("ros1_serve.py", &["/ua_1_2_61"]);
     let bridge = cell.bridge_ros2_alone(&[NAVIGATION]);
-    let bridge = bridge.env("AMENT_PREFIX_PATH", ament_prefix(&cell));
+    let bridge = bridge.env("AMENT_PREFIX_PATH", cell.nav2_prefix());
     let _bridges = (cell.bridge_ros1(&[]), bridge.start());
     let _component = component(&cell, LINE, url);
     let (code, lines) = run(&["line.Go.Reset"]);

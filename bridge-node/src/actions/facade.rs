@@ -16,6 +16,7 @@ use tracing::debug;
 use super::graph::{ActionServer, CancelRequest, GoalId, NewGoal, ServedGoal, ServerEvent};
 use super::wire;
 use crate::calls::AskFault;
+use crate::clock::now;
 use crate::{Asker, PortEvent};
 
 /// What asks in the space, and how long for.
@@ -25,7 +26,9 @@ pub(super) struct Asks {
     pub(super) goal: Asker,
     pub(super) cancel: Asker,
     pub(super) result: Asker,
-    /// Since when who executes the action is gone.
+    /// How long a goal waits for who executes the action to be back.
+    pub(super) silence: Duration,
+    /// Since when it is gone.
     pub(super) gone: watch::Receiver<Option<Instant>>,
 }
 

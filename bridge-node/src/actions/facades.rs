@@ -263,7 +263,8 @@ impl Facades {
                 });
                 continue;
             }
-            let with = (&asker, report, tasks);
+            let waits = policy.mapping().pubsub().receive_timeout;
+            let with = (&asker, report, waits, tasks);
             let offered = match known.variable(topic, policy.mapping()) {
                 Some(variable) => Err(format!("its {variable} is a variable of the mapping")),
                 None => known.offer(graph, (topic, target), with),
@@ -326,8 +327,13 @@ impl Facades {
     }
 }
 
-/// What a facade is made with: what asks, where it reports, and where it runs.
-type With<'w, F> = (&'w F, &'w mpsc::Sender<PortEvent>, &'w mut JoinSet<()>);
+/// What a facade is made with: what asks, where it reports, how long it waits, and where it runs.
+type With<'w, F> = (
+    &'w F,
+    &'w mpsc::Sender<PortEvent>,
+    Duration,
+    &'w mut JoinSet<()>,
+);
 
 impl Known {
     /// What of the values of its family the mapping has as a variable.
@@ -342,7 +348,7 @@ impl Known {
         &mut self,
         graph: &mut G,
         (topic, target): (TopicId, Target),
-        (asker, report, tasks): With<'_, F>,
+        (asker, report, silence, tasks): With<'_, F>,
     ) -> Result<Vec<PortEvent>, String> {
         let said = (target.type_name.as_ref(), &*target.goal);
         let calls = action_type(&self.described, said, |name| graph.action_calls(name))?;
@@ -359,6 +365,7 @@ impl Known {
                 goal: asker(topic).within(target.timeout),
                 cancel: asker(cancel),
                 result: asker(result),
+                silence,
                 gone: is_gone,
             },
             server,

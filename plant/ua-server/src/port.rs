@@ -128,14 +128,12 @@ impl ServerPort {
             exits,
         };
         let layout = Arc::clone(&nodes.layout);
+        let methods = [setup.sks.methods(), pubsub.methods()].concat();
         let (server, handle) = endpoint::server(described, (&setup.url, port), &security)
             .pki_dir(setup.pki.root())
             .trust_client_certs(setup.trust_any_client)
             .with_authenticator(Arc::clone(&access) as Arc<dyn AuthManager>)
-            .with_node_manager(core_with(
-                [setup.sks.methods(), pubsub.methods()].concat(),
-                audits,
-            ))
+            .with_node_manager(core_with(methods, audits))
             .with_node_manager(Ordered::around(nodes))
             .build()
             .map_err(configuration)?;
@@ -583,13 +581,6 @@ fn told_of(described: &Server, url: String) -> discovery::Server {
 fn largest_write(mapping: &Mapping) -> usize {
     let message = usize::try_from(mapping.pubsub().max_message).unwrap_or(usize::MAX);
     message.saturating_sub(MESSAGE_HEADER)
-}
-
-/// When it is looked whether certificates were rejected.
-fn looks() -> Interval {
-    let mut look = tokio::time::interval(LOOK_AT_REJECTED);
-    look.set_missed_tick_behavior(MissedTickBehavior::Delay);
-    look
 }
 
 /// Those topics that clients can write.

@@ -280,10 +280,11 @@ mod tests {
         );
         let component = Component::from_yaml(&document, Path::new(""))
             .map_err(|findings| findings.render("base.yaml", &document))?;
-        match &component.skills[0].driver {
-            DriverSetup::Space(work) => Ok(SpaceWork::clone(work)),
-            other => Err(format!("{other:?}")),
-        }
+        let driver = &component.skills[0].driver;
+        let DriverSetup::Space(work) = driver else {
+            return Err(format!("{driver:?}"));
+        };
+        Ok(SpaceWork::clone(work))
     }
 
     #[test]
@@ -305,7 +306,7 @@ mod tests {
              results: {Pose: {parameter: Goal}, Code: {field: code}}, succeeds: {status: 1}}}",
         )
         .unwrap();
-        let goal = ("Goal".to_owned(), crate::Value::from([1.0, 2.0, 3.0]));
+        let goal = ("Goal".to_owned(), crate::Value::from(vec![1.0, 2.0, 3.0]));
         let declared = crate::model::find("NavigateToSkillType")
             .unwrap()
             .parameters();
