@@ -66,7 +66,7 @@ struct UaServer {
     #[arg(long)]
     trust_any_client_certificate: bool,
     /// Register with this Local Discovery Server, now or when it comes, as opc.tcp://127.0.0.1:4840; with --announce also one
-    /// that is heard of, as `any` (the only one there), uri=<ApplicationUri> or name=<mDNS name> (both may end with *)
+    /// that is heard of, as `any` (the only one there), `uri=<ApplicationUri>` or `name=<mDNS name>` (both may end with *)
     #[arg(long, value_name = "URL|CHOICE", env = "UA_LDS")]
     lds: Option<String>,
     /// Announce the server by mDNS on the network interface of --interface, and show the servers that are there; without
