@@ -106,20 +106,26 @@ fn a_mapping_of_two_graphs_and_a_server_ties_what_belongs_together() {
     everything_is_there(name);
 }
 
-/// The mapping is of what is there, so nothing of it is missing.
+/// The mapping is of what is there, so nothing of it is missing but the cell's own server, which is not started yet.
 fn everything_is_there(name: &str) {
     let ended = ua_space(&["check", "--environment", "--json", name]);
-    assert_eq!(ended.code, 0, "{}", ended.text());
+    assert_eq!(ended.code, 69, "{}", ended.text());
     let told = ended.object();
     let asked = told["environment"].as_array().unwrap();
-    assert!(asked.len() == 3 && asked.iter().all(|one| one["there"] == true));
-    // Values of ROS that have no node in that server, and their namespace.
-    let findings = told["findings"].as_array().unwrap();
-    let other: Vec<&Value> = findings
-        .iter()
-        .filter(|one| one["code"] != "M123")
+    let away = asked.iter().filter(|one| one["there"] == false);
+    let away: Vec<&Value> = away.map(|one| &one["whom"]).collect();
+    assert_eq!(away, ["OPC UA server opc.tcp://127.0.0.1:4841"], "{told}");
+    // The graphs, and the server for its Method and for its nodes.
+    assert_eq!(asked.len(), 5, "{told}");
+    // A robot knows whether the conveyor runs, and that server lets nobody write it.
+    let findings = told["findings"].as_array().unwrap().iter();
+    let found: Vec<(&Value, bool)> = findings
+        .map(|one| {
+            let message = one["message"].as_str().unwrap();
+            (&one["code"], message.contains("line;i=10` of the server"))
+        })
         .collect();
-    assert!(other.is_empty() && findings.len() == 1, "{findings:?}");
+    assert_eq!(found, [(&Value::from("M129"), true)], "{told}");
 }
 
 #[test]
@@ -163,7 +169,9 @@ fn what_is_new_is_put_behind_what_somebody_has_edited() {
         let (_, nodes) = text.split_once("variables:").unwrap();
         let calls = "\n# What one space executes";
         let (nodes, calls) = nodes.split_once(calls).unwrap_or((nodes, ""));
-        (nodes.to_owned(), calls.to_owned())
+        // Only a server that runs has values.
+        let nodes = nodes.lines().filter(|line| !line.contains(" from: {"));
+        (nodes.collect::<Vec<_>>().join("\n"), calls.to_owned())
     };
     let (of_server, of_file) = (nodes(&of_server), nodes(&of_set));
     assert_eq!(of_server.0, of_file.0);
@@ -186,6 +194,53 @@ fn what_is_new_is_put_behind_what_somebody_has_edited() {
     let after = fs::read_to_string(&of_set).unwrap();
     let added = after.strip_prefix(&edited).unwrap();
     assert!(added.contains("node: ns=2;i=10\n"), "{added}");
+}
+
+#[test]
+fn a_server_that_announces_itself_to_nobody_is_found_where_somebody_asks_for_that() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    // At 4840 it would be asked as the discovery server of this host.
+    let endpoint = "opc.tcp://127.0.0.1:4841";
+    let _server = cell.asyncua("opcua_line.py", &[endpoint]);
+    let look = ["discover", "--seconds", "1", "--json"];
+    let ended = ua_space(&look);
+    assert_eq!((ended.code, ended.object()), (0, serde_json::json!([])));
+    let scan = ["--scan", "127.0.0.0/30", "--port", "4840,4841"];
+    let ended = ua_space(&[&look[..], &scan].concat());
+    assert_eq!(ended.code, 0, "{}", ended.text());
+    let told = ended.object();
+    let [found] = told.as_array().unwrap().as_slice() else {
+        panic!("{told}")
+    };
+    assert_eq!(found["kind"], "server");
+    assert_eq!(found["uri"], "urn:freeopcua:python:server");
+    assert_eq!(found["security"], serde_json::json!(["None"]));
+    assert_eq!(found["foundBy"], serde_json::json!(["scan"]));
+    let url = found["urls"][0].as_str().unwrap();
+    assert!(url.starts_with(endpoint), "{told}");
+    // What is too much to be tried is not tried.
+    let ended = ua_space(&["discover", "--scan", "127.0.0.0/8"]);
+    assert_eq!(ended.code, 64, "{}", ended.text());
+    assert!(
+        ended.text().contains("/16 is the widest"),
+        "{}",
+        ended.text()
+    );
+    // A mapping of whoever is found.
+    let file = path(&cell, "found.yaml");
+    let init = ["init", "--discover", "-o", file.to_str().unwrap()];
+    let ended = ua_space(&[&init[..], &["--seconds", "1", "--wait", "1"], &scan].concat());
+    assert_eq!(ended.code, 0, "{}", ended.text());
+    let text = fs::read_to_string(&file).unwrap();
+    let mapping = Mapping::from_yaml(&text, "found.yaml").mapping.unwrap();
+    let [server] = mapping.servers() else {
+        panic!("{text}")
+    };
+    assert_eq!(server.access.endpoint.port, 4841, "{text}");
+    let from = mapping.variables().iter().filter(|one| one.from.is_some());
+    assert_eq!(from.count(), 5, "{text}");
 }
 
 #[test]

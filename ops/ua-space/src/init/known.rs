@@ -5,6 +5,7 @@ use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 use mappings::{Mapping, NodeIdText, SpaceId, TopicId};
 use messages::TypeName;
 
+use super::nodes::is_same;
 use super::yaml;
 use crate::survey::UaSource;
 
@@ -168,7 +169,8 @@ impl Known {
     /// What the mapping calls the server at an endpoint, or is to call it.
     pub(super) fn server(&mut self, endpoint: &str, wanted: &str) -> Named {
         let servers = self.mapping.servers().iter();
-        let mut there = servers.filter(|server| server.access.endpoint.to_string() == endpoint);
+        let mut there =
+            servers.filter(|server| is_same(&server.access.endpoint.to_string(), endpoint));
         if let Some(there) = there.next() {
             return Named::Known(there.name.clone());
         }

@@ -27,10 +27,9 @@ impl Indexes {
         }
     }
 
-    /// Gives every namespace of variables its index in the mapping, by that in the source: the same for the cell's server, from
-    /// 2 on for those of files and other servers, since 1 is each server's own.
+    /// Gives every namespace of variables its index in the mapping: that at the server, from 2 on for files and for servers other
+    /// than the cell's, since 1 is each server's own.
     pub(super) fn give(&mut self, source: &Nodes) -> HashMap<u16, u16> {
-        let is_cell = source.server.as_ref().is_some_and(|server| server.is_cell);
         let variables = source.variables.iter();
         let used: HashSet<u16> = variables.map(|one| one.node.namespace).collect();
         let mut indexes = HashMap::new();
@@ -41,7 +40,11 @@ impl Indexes {
                 continue;
             }
             let given = self.by_uri.get(uri).copied().or_else(|| {
-                let wanted = index.saturating_add(u16::from(!is_cell));
+                let wanted = match &source.server {
+                    None => index.saturating_add(1),
+                    Some(server) if server.is_cell => index,
+                    Some(_) => index.max(2),
+                };
                 let free = |at: &u16| !self.all.contains_key(at);
                 above = wanted.max(above);
                 let found = match (above..=u16::MAX).find(free) {
@@ -88,11 +91,36 @@ pub(super) fn source_of(server: &str, node: &NodeIdText, namespaces: &[String]) 
 
 /// Whether an endpoint is at that port of this host.
 pub(super) fn is_at(endpoint: &str, port: u16) -> bool {
-    let place = endpoint.trim_start_matches("opc.tcp://");
-    let place = place.split('/').next().unwrap_or_default();
-    let hosts = ["127.0.0.1", "localhost", "[::1]"];
-    hosts.iter().any(|host| {
-        let rest = place.strip_prefix(host);
-        rest.and_then(|rest| rest.strip_prefix(':')) == Some(&port.to_string())
-    })
+    let (host, at, _) = place(endpoint);
+    at == port.to_string() && ["127.0.0.1", "localhost", "[::1]"].contains(&host.as_str())
+}
+
+/// Whether both endpoints are the same, however they are written.
+pub(super) fn is_same(one: &str, other: &str) -> bool {
+    place(one) == place(other)
+}
+
+/// Host, port and path; without a port it is 4840 (OPC 10000-6, 7.2).
+fn place(endpoint: &str) -> (String, String, &str) {
+    let rest = endpoint.trim_start_matches("opc.tcp://");
+    let (place, path) = rest.split_once('/').unwrap_or((rest, ""));
+    let (host, port) = match place.rsplit_once(':') {
+        Some((host, port)) if !port.contains(']') => (host, port),
+        Some(_) | None => (place, "4840"),
+    };
+    (host.to_ascii_lowercase(), port.to_owned(), path)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_endpoint_is_the_same_however_it_is_written() {
+        assert!(is_same("opc.tcp://PLC", "opc.tcp://plc:4840"));
+        assert!(is_same("opc.tcp://[::1]/a", "opc.tcp://[::1]:4840/a"));
+        assert!(!is_same("opc.tcp://plc:4841", "opc.tcp://plc"));
+        assert!(!is_same("opc.tcp://plc/a", "opc.tcp://plc/b"));
+        assert!(is_at("opc.tcp://localhost/a", 4840) && !is_at("opc.tcp://plc", 4840));
+    }
 }

@@ -8,7 +8,7 @@ use uadp::BuiltinType;
 
 use super::calls::{self, CallEntry, Untyped};
 use super::known::{Known, Named, Whose};
-use super::nodes::{Indexes, is_at, source_of};
+use super::nodes::{Indexes, is_at, is_same, source_of};
 use super::topics::{Form, LeftOut, camel, normal, registry};
 use crate::survey::{Graph, Nodes, UaServer, UaSource, UaVariable};
 
@@ -140,7 +140,7 @@ impl Planner<'_> {
     fn server(&mut self, server: &UaServer) -> String {
         let endpoint = &server.endpoint;
         let mut planned = self.plan.servers.iter();
-        if let Some((name, _)) = planned.find(|(_, other)| other == endpoint) {
+        if let Some((name, _)) = planned.find(|(_, other)| is_same(other, endpoint)) {
             return name.clone();
         }
         match self.known.server(endpoint, &server.name) {
