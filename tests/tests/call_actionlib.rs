@@ -566,10 +566,8 @@ fn goals_of_either_ros_run_skills_and_are_refused_with_the_reason_of_the_compone
     let told = hold.wait_for_json("feedback", SOON, |line| {
         (line["goal"] == 0).then(|| line.get("feedback").cloned())?
     });
-    assert_eq!(
-        (&told["state"], &told["run"]),
-        (&json!("Running"), &json!(1))
-    );
+    assert_eq!(told["state"], "Running");
+    assert!(told["run"].as_u64() > Some(0), "{told}");
     stands(&cell, url, "Running");
     // A component does one thing at a time.
     let mut moves = actionlib_client(

@@ -224,10 +224,10 @@ fn the_mes_knows_no_devices() {
 }
 
 #[test]
-fn a_station_knows_neither_skills_nor_rdf_nor_the_space() {
+fn a_station_knows_neither_skills_nor_rdf_nor_ros() {
     does_not_reach(
         "ua-station",
-        &["skills", "devices", "knowledge", "oxigraph", "transport"],
+        &["skills", "devices", "knowledge", "oxigraph", "tcpros"],
     );
 }
 

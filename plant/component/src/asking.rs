@@ -110,10 +110,10 @@ impl Asking {
     }
 
     pub(crate) fn known(&mut self, topic: TopicId, description: &Arc<CallDescription>) {
-        if !self.wanted.contains(&topic) {
-            return;
-        }
-        if let CallRole::Goal(family) = description.role {
+        // Also what nobody wants yet: the calls of an action are told of once, in any order.
+        if self.wanted.contains(&topic)
+            && let CallRole::Goal(family) = description.role
+        {
             let (space, namespace, _) = topic.triple();
             for id in [family.cancel, family.result] {
                 if let Some(part) = TopicId::new(space, namespace, id) {
