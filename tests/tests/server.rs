@@ -2,6 +2,8 @@
 
 #[path = "server/access.rs"]
 mod access;
+#[path = "server/history.rs"]
+mod history;
 #[path = "server/pubsub.rs"]
 mod pubsub;
 

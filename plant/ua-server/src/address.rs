@@ -31,6 +31,7 @@ pub(crate) fn add_topic(address_space: &mut AddressSpace, topic: &TopicNode, fol
     .value_rank(rank)
     .access_level(access(writable))
     .user_access_level(access(writable))
+    .historizing(true)
     .has_type_definition(VariableTypeId::BaseDataVariableType)
     .organized_by(folder.clone())
     .insert(address_space);
@@ -48,6 +49,7 @@ pub(crate) fn add_topic(address_space: &mut AddressSpace, topic: &TopicNode, fol
         .value_rank(field.shape.value_rank())
         .access_level(access(writable))
         .user_access_level(access(writable))
+        .historizing(true)
         .has_type_definition(VariableTypeId::BaseDataVariableType)
         .component_of(topic.node.clone())
         .insert(address_space);
@@ -63,10 +65,11 @@ pub(crate) fn retype(address_space: &mut AddressSpace, node: &NodeId, shape: Sha
 }
 
 fn access(writable: bool) -> AccessLevel {
+    let read = AccessLevel::CURRENT_READ | AccessLevel::HISTORY_READ;
     if writable {
-        AccessLevel::CURRENT_READ | AccessLevel::CURRENT_WRITE
+        read | AccessLevel::CURRENT_WRITE
     } else {
-        AccessLevel::CURRENT_READ
+        read
     }
 }
 

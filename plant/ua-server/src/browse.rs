@@ -12,11 +12,12 @@ use opcua::server::node_manager::memory::{
 };
 use opcua::server::node_manager::{
     AddReferenceResult, BrowseNode, BrowsePathItem, DynNodeManager, ExternalReference,
-    ExternalReferenceRequest, MethodCall, MonitoredItemRef, MonitoredItemUpdateRef, NodeManager,
-    NodeManagerBuilder as _, ReadNode, RequestContext, ServerContext, WriteNode,
+    ExternalReferenceRequest, HistoryNode, MethodCall, MonitoredItemRef, MonitoredItemUpdateRef,
+    NodeManager, NodeManagerBuilder as _, ReadNode, RequestContext, ServerContext, WriteNode,
 };
 use opcua::types::{
-    BrowseDirection, ExpandedNodeId, MonitoringMode, NodeId, ReferenceDescription, ReferenceTypeId,
+    BrowseDirection, ExpandedNodeId, MonitoringMode, NodeId, ReadAtTimeDetails,
+    ReadProcessedDetails, ReadRawModifiedDetails, ReferenceDescription, ReferenceTypeId,
     StatusCode, TimestampsToReturn,
 };
 
@@ -205,6 +206,66 @@ impl NodeManager for Ordered {
         inner
             .read(context, max_age, timestamps_to_return, nodes_to_read)
             .await
+    }
+
+    async fn history_read_raw_modified(
+        &self,
+        context: &RequestContext,
+        details: &ReadRawModifiedDetails,
+        nodes: &mut [&mut HistoryNode],
+        wanted: TimestampsToReturn,
+    ) -> Result<(), StatusCode> {
+        let inner = &self.inner;
+        inner
+            .history_read_raw_modified(context, details, nodes, wanted)
+            .await
+    }
+
+    async fn history_read_at_time(
+        &self,
+        context: &RequestContext,
+        details: &ReadAtTimeDetails,
+        nodes: &mut [&mut HistoryNode],
+        wanted: TimestampsToReturn,
+    ) -> Result<(), StatusCode> {
+        let inner = &self.inner;
+        inner
+            .history_read_at_time(context, details, nodes, wanted)
+            .await
+    }
+
+    /// There is an aggregate for each node, and the node manager is told neither which of the nodes it has nor which are left
+    /// out on the way to it: so it gets the nodes one by one, or all of them for one aggregate.
+    async fn history_read_processed(
+        &self,
+        context: &RequestContext,
+        details: &ReadProcessedDetails,
+        nodes: &mut [&mut HistoryNode],
+        wanted: TimestampsToReturn,
+    ) -> Result<(), StatusCode> {
+        let inner = &self.inner;
+        let kinds = details.aggregate_type.as_deref().unwrap_or_default();
+        let Some((first, others)) = kinds.split_first() else {
+            return Err(StatusCode::BadAggregateListMismatch);
+        };
+        if others.iter().all(|kind| kind == first) && kinds.len() >= nodes.len() {
+            return inner
+                .history_read_processed(context, details, nodes, wanted)
+                .await;
+        }
+        if kinds.len() != nodes.len() {
+            return Err(StatusCode::BadAggregateListMismatch);
+        }
+        for (node, kind) in nodes.chunks_mut(1).zip(kinds) {
+            let details = ReadProcessedDetails {
+                aggregate_type: Some(vec![kind.clone()]),
+                ..details.clone()
+            };
+            inner
+                .history_read_processed(context, &details, node, wanted)
+                .await?;
+        }
+        Ok(())
     }
 
     async fn write(

@@ -64,6 +64,7 @@ pub(crate) fn server(
 /// How much clients may take up.
 fn within(told: ServerLimits) -> Limits {
     let mut limits = limits::server();
+    limits.max_history_continuation_points = MOST_HISTORY_GOES_ON;
     if let Some(sessions) = told.sessions {
         limits.max_sessions = usize::from(sessions);
     }
@@ -83,3 +84,5 @@ fn within(told: ServerLimits) -> Limits {
 
 const APPLICATION_NAME: &str = "UA bridge server";
 pub(crate) const PRODUCT_URI: &str = "urn:ua-bridge:server";
+/// Answers of a session from the history that are not at their end.
+const MOST_HISTORY_GOES_ON: usize = 100;

@@ -5,7 +5,7 @@
 //! no ROS.
 //!
 //! Reading order: `layout` (which nodes), `structures` (their DataTypes), `address` (as they stand in the address space), `values` (what they show),
-//! `nodes` (the node manager), `browse` (in which order), `budget` (what clients may take up), `space` (values in),
+//! `history` (what they showed), `nodes` (the node manager), `browse` (in which order), `budget` (what clients may take up), `space` (values in),
 //! `components` (which servers are there), `methods` and `argument_types` (calls of the space as Methods), `executing` (Methods of other servers as calls), `sources` (their
 //! nodes as values), `clients` (the sessions for both), `others` (all of these), `port` (the shell's side),
 //! `endpoint` (how clients get in), `access` (what each may do), `auditing` (what is told of it), `sks` (keys of secured groups),
@@ -21,6 +21,7 @@ mod clients;
 mod components;
 mod endpoint;
 mod executing;
+mod history;
 mod layout;
 mod methods;
 mod nodes;

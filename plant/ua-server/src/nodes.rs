@@ -1,6 +1,6 @@
 //! The node manager of the space: what the nodes show, what clients may write, and who watches.
 //!
-//! Locks are taken in this order and never across an await: the address space, the places, the values, the
+//! Locks are taken in this order and never across an await: the address space, the places, the values, the past, the
 //! subscriptions, the watched items. Nothing here calls out while one is held but the subscriptions: a write leaves through a
 //! bounded channel.
 
@@ -16,13 +16,14 @@ use opcua::server::address_space::AddressSpace;
 use opcua::server::diagnostics::NamespaceMetadata;
 use opcua::server::node_manager::memory::{InMemoryNodeManager, InMemoryNodeManagerImpl};
 use opcua::server::node_manager::{
-    MethodCall, MonitoredItemRef, MonitoredItemUpdateRef, ParsedReadValueId, ParsedWriteValue,
-    RequestContext, ServerContext, WriteNode,
+    HistoryNode, MethodCall, MonitoredItemRef, MonitoredItemUpdateRef, ParsedReadValueId,
+    ParsedWriteValue, RequestContext, ServerContext, WriteNode,
 };
 use opcua::server::{CreateMonitoredItem, MonitoredItemHandle, SubscriptionCache};
 use opcua::sync::{Mutex, RwLock};
 use opcua::types::{
-    AttributeId, DataValue, DateTime, NodeId, NumericRange, StatusCode, TimestampsToReturn, Variant,
+    AttributeId, DataValue, DateTime, NodeId, NumericRange, ReadAtTimeDetails,
+    ReadProcessedDetails, ReadRawModifiedDetails, StatusCode, TimestampsToReturn, Variant,
 };
 use plant_opcua::server::Caller;
 use plant_opcua::users::Access;
@@ -33,6 +34,7 @@ use uadp::Timestamp;
 use crate::access::{self, Genuine};
 use crate::address;
 use crate::budget::{Answers, LARGEST, SMALL, Watched};
+use crate::history::{Past, Room, Series};
 use crate::layout::{FieldNode, Layout, TopicNode};
 use crate::methods::{Questions, Refused, Table};
 use crate::properties;
@@ -50,6 +52,7 @@ pub(crate) struct SpaceNodes {
     /// Where each node is among those with its parent.
     order: RwLock<HashMap<NodeId, usize>>,
     values: RwLock<Values>,
+    past: RwLock<Past>,
     watched: Mutex<Watched>,
     answers: Mutex<Answers>,
     genuine: Genuine,
@@ -134,6 +137,7 @@ impl SpaceNodes {
             places: RwLock::new(places),
             order: RwLock::new(address::order(layout)),
             values: RwLock::new(Values::new(MOST_HELD)),
+            past: RwLock::new(Past::new(MOST_PAST, MOST_PAST_HELD)),
             watched: Mutex::new(Watched::default()),
             answers: Mutex::new(Answers::default()),
             genuine: Genuine::default(),
@@ -160,9 +164,12 @@ impl SpaceNodes {
         let mut address_space = address_space.write();
         let mut places = self.places.write();
         let mut values = self.values.write();
+        let mut past = self.past.write();
         for topic in gone {
             values.remove(topic.topic);
+            past.remove(topic.topic);
         }
+        drop(past);
         for node in gone.iter().flat_map(TopicNode::nodes) {
             drop(address_space.delete(node, true));
             places.remove(node);
@@ -235,7 +242,7 @@ impl SpaceNodes {
         shown.unwrap_or_else(Shown::waiting)
     }
 
-    /// Shows something else for a topic, and tells who watches its nodes.
+    /// Shows a value that is new for a topic, tells who watches its nodes, and keeps it for its history.
     ///
     /// # Errors
     /// `BadOutOfMemory` where there is no room for the value; the nodes show that then.
@@ -245,12 +252,35 @@ impl SpaceNodes {
         topic: &TopicNode,
         shown: Shown,
     ) -> Result<(), StatusCode> {
+        self.put(subscriptions, topic, (shown, true))
+    }
+
+    /// Shows what a topic shows already, with another status.
+    pub(crate) fn show_again(
+        &self,
+        subscriptions: &SubscriptionCache,
+        topic: &TopicNode,
+        shown: Shown,
+    ) {
+        // It is there already, so there is room for it.
+        let _kept = self.put(subscriptions, topic, (shown, false));
+    }
+
+    fn put(
+        &self,
+        subscriptions: &SubscriptionCache,
+        topic: &TopicNode,
+        (shown, is_new): (Shown, bool),
+    ) -> Result<(), StatusCode> {
         // Until all are told, so that nobody is told in another order.
         let mut values = self.values.write();
         let (before, kept) = values.put(topic.topic, shown);
         let Some(shown) = values.get(topic.topic) else {
             return kept;
         };
+        if is_new {
+            self.past.write().keep(topic.topic, shown);
+        }
         let before = before.unwrap_or_else(Shown::waiting);
         let views = before.views(topic).zip(shown.views(topic));
         for (node, (before, view)) in topic.nodes().zip(views) {
@@ -489,6 +519,39 @@ impl SpaceNodes {
         called.unwrap_or(StatusCode::BadNodeIdUnknown)
     }
 
+    /// The past values of a node.
+    fn series(&self, node: &NodeId) -> Option<Series> {
+        let place = self.place(node)?;
+        let kept = self.past.read().of(place.0.topic);
+        Some(Series::new(place, kept))
+    }
+
+    /// Has each node answered from its past values.
+    fn answer_past(
+        &self,
+        context: &RequestContext,
+        nodes: &mut [&mut &mut HistoryNode],
+        wanted: TimestampsToReturn,
+        answer: impl Fn(&Series, &mut HistoryNode, &mut Room<'_>),
+    ) -> Result<(), StatusCode> {
+        self.genuine.check(context)?;
+        if matches!(
+            wanted,
+            TimestampsToReturn::Neither | TimestampsToReturn::Invalid
+        ) {
+            return Err(StatusCode::BadTimestampsToReturnInvalid);
+        }
+        let large = |weight| self.answers.lock().take(weight, now());
+        let mut room = Room::new(&large);
+        for node in nodes {
+            match self.series(node.node_id()) {
+                Some(series) => answer(&series, node, &mut room),
+                None => node.set_status(StatusCode::BadHistoryOperationUnsupported),
+            }
+        }
+        Ok(())
+    }
+
     fn place(&self, node: &NodeId) -> Option<(Arc<TopicNode>, Option<usize>)> {
         self.places.read().get(node).cloned()
     }
@@ -722,6 +785,48 @@ impl InMemoryNodeManagerImpl for SpaceNodes {
         Ok(())
     }
 
+    async fn history_read_raw_modified(
+        &self,
+        context: &RequestContext,
+        details: &ReadRawModifiedDetails,
+        nodes: &mut [&mut &mut HistoryNode],
+        wanted: TimestampsToReturn,
+    ) -> Result<(), StatusCode> {
+        self.answer_past(context, nodes, wanted, |series, node, room| {
+            series.raw(details, node, (wanted, room));
+        })
+    }
+
+    async fn history_read_processed(
+        &self,
+        context: &RequestContext,
+        details: &ReadProcessedDetails,
+        nodes: &mut [&mut &mut HistoryNode],
+        wanted: TimestampsToReturn,
+    ) -> Result<(), StatusCode> {
+        // All of them are the same one.
+        let kind = details
+            .aggregate_type
+            .as_ref()
+            .and_then(|kinds| kinds.first());
+        let kind = kind.ok_or(StatusCode::BadAggregateListMismatch)?;
+        self.answer_past(context, nodes, wanted, |series, node, room| {
+            series.processed((details, kind), node, (wanted, room));
+        })
+    }
+
+    async fn history_read_at_time(
+        &self,
+        context: &RequestContext,
+        details: &ReadAtTimeDetails,
+        nodes: &mut [&mut &mut HistoryNode],
+        wanted: TimestampsToReturn,
+    ) -> Result<(), StatusCode> {
+        self.answer_past(context, nodes, wanted, |series, node, room| {
+            series.at_times(details, node, (wanted, room));
+        })
+    }
+
     async fn call(
         &self,
         context: &RequestContext,
@@ -795,3 +900,7 @@ const AS_IT_COMES_MS: f64 = 0.000_1;
 const SECOND_LOOK: Duration = Duration::from_millis(100);
 /// Bytes of all values that are shown.
 const MOST_HELD: usize = 512 << 20;
+/// Past values of each topic.
+const MOST_PAST: usize = 1_000;
+/// Bytes of all past values.
+const MOST_PAST_HELD: usize = 64 << 20;

@@ -35,6 +35,7 @@ use crate::auditing;
 use crate::browse::Ordered;
 use crate::components::Components;
 use crate::endpoint;
+use crate::history;
 use crate::layout::Layout;
 use crate::methods::{Heard, Methods, Questions, Wish};
 use crate::nodes::{ClientWrite, Exits, SpaceManager, SpaceNodes, look_again};
@@ -133,7 +134,7 @@ impl ServerPort {
             .pki_dir(setup.pki.root())
             .trust_client_certs(setup.trust_any_client)
             .with_authenticator(Arc::clone(&access) as Arc<dyn AuthManager>)
-            .with_node_manager(core_with(methods, audits))
+            .with_node_manager(core_with(methods, history::capabilities(), prepared))
             .with_node_manager(Ordered::around(nodes))
             .build()
             .map_err(configuration)?;
@@ -477,8 +478,9 @@ fn audit(access: &Access, handle: &ServerHandle) {
     access.on_login(move |login| auditing::came_in(login, &server).tell(&subscriptions));
 }
 
-/// Has the server say that there is an audit.
-fn audits(core: &mut AddressSpace) {
+/// Has the server say that there is an audit, and how it works out what was.
+fn prepared(core: &mut AddressSpace) {
+    history::list_aggregates(core);
     let auditing: NodeId = VariableId::Server_Auditing.into();
     if let Some(NodeType::Variable(variable)) = core.find_mut(&auditing) {
         // A constant of the node set takes every value.
@@ -573,7 +575,7 @@ fn told_of(described: &Server, url: String) -> discovery::Server {
         product_uri: endpoint::PRODUCT_URI.to_owned(),
         name: "ua-server".to_owned(),
         url,
-        capabilities: vec!["DA".to_owned()],
+        capabilities: ["DA", "HD"].map(str::to_owned).to_vec(),
     }
 }
 

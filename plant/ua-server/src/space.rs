@@ -238,8 +238,7 @@ impl Space {
         }
         shown.stamp.status = status.unwrap_or(known.status);
         shown.stamp.server = DateTime::now();
-        // It is there already, so there is room for it.
-        let _kept = nodes.show(&self.subscriptions, &known.node, shown);
+        nodes.show_again(&self.subscriptions, &known.node, shown);
     }
 
     /// Takes out the nodes of topics that nobody mapped and whose writers fell silent, of those first that are silent

@@ -9,9 +9,12 @@ use opcua::server::node_manager::memory::{
     CoreNodeManager, CoreNodeManagerBuilder, InMemoryNodeManagerBuilder,
 };
 use opcua::server::node_manager::{
-    DynNodeManager, MethodCall, NodeManagerBuilder, RequestContext, ServerContext,
+    DynNodeManager, MethodCall, NodeManagerBuilder, ReadNode, RequestContext, ServerContext,
 };
-use opcua::types::{Argument, BrowseDirection, NodeId, ReferenceTypeId, StatusCode};
+use opcua::types::{
+    Argument, AttributeId, BrowseDirection, DataValue, NodeId, ReferenceTypeId, StatusCode,
+    VariableId, Variant,
+};
 use tokio::time::Instant;
 
 use super::calls::{self, MethodHandler, MethodRequest, Refusal, check_arguments, within};
@@ -51,10 +54,12 @@ impl CoreMethod {
     }
 }
 
-/// The node manager of the core namespace, with these methods carried out, and its nodes `prepared`.
+/// The node manager of the core namespace, with these methods carried out, these values of variables, and its nodes `prepared`.
+/// The library has values of its own for some variables, whatever their nodes have; `values` take their places.
 #[must_use]
 pub fn core_with(
     methods: Vec<CoreMethod>,
+    values: Vec<(VariableId, Variant)>,
     prepared: impl FnOnce(&mut AddressSpace) + Send + 'static,
 ) -> impl NodeManagerBuilder + 'static {
     move |context: ServerContext| {
@@ -66,7 +71,11 @@ pub fn core_with(
         }
         Routed {
             inner,
-            front: Front::Core(Arc::new(Overlay { methods, core })),
+            front: Front::Core(Arc::new(Overlay {
+                methods,
+                values,
+                core,
+            })),
             last: None,
         }
     }
@@ -85,10 +94,25 @@ pub fn core_of(handle: &ServerHandle) -> Option<Arc<CoreNodeManager>> {
 /// The methods, and where what they take is declared.
 pub(crate) struct Overlay {
     methods: Vec<CoreMethod>,
+    values: Vec<(VariableId, Variant)>,
     core: Option<Arc<CoreNodeManager>>,
 }
 
 impl Overlay {
+    /// Puts the values that are others than the library's in the place of those.
+    pub(crate) fn correct(&self, nodes: &mut [&mut ReadNode]) {
+        for node in nodes {
+            let asked = node.node();
+            let is_value = asked.attribute_id == AttributeId::Value;
+            let plain = is_value && !asked.index_range.has_range();
+            let id = asked.node_id.as_variable_id().ok().filter(|_| plain);
+            let known = id.and_then(|id| self.values.iter().find(|(known, _)| *known == id));
+            if let Some((_, value)) = known {
+                node.set_result(DataValue::value_only(value.clone()));
+            }
+        }
+    }
+
     /// Answers the calls of these methods, one after the other, and gives back the rest.
     pub(crate) async fn answer<'a>(
         &self,

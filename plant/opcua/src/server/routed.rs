@@ -90,7 +90,12 @@ impl NodeManager for Routed {
         timestamps: TimestampsToReturn,
         nodes: &mut [&mut ReadNode],
     ) -> Done {
-        self.inner.read(context, max_age, timestamps, nodes).await
+        self.inner.read(context, max_age, timestamps, nodes).await?;
+        match &self.front {
+            Front::Core(overlay) => overlay.correct(nodes),
+            Front::Calls(_) => {}
+        }
+        Ok(())
     }
 
     async fn history_read_raw_modified(

@@ -1,0 +1,664 @@
+//! History of the values (OPC 10000-11): the last ones of each variable, in memory, raw and as aggregates (OPC 10000-13).
+
+mod aggregate;
+mod past;
+
+use std::collections::HashMap;
+use std::sync::Arc;
+
+use opcua::server::ContinuationPoint;
+use opcua::server::address_space::AddressSpace;
+use opcua::server::node_manager::HistoryNode;
+use opcua::types::{
+    AggregateConfiguration, DataValue, DateTime, HistoryData, NodeId, NumericRange, ObjectId,
+    ReadAtTimeDetails, ReadProcessedDetails, ReadRawModifiedDetails, ReferenceTypeId, StatusCode,
+    TimestampsToReturn, VariableId, Variant, VariantScalarTypeId, VariantTypeId,
+};
+
+use self::aggregate::{Aggregate, Outcome, Quality, Rules, Sample};
+pub(crate) use self::past::Past;
+use crate::budget::{LARGEST, SMALL};
+use crate::layout::TopicNode;
+use crate::value;
+use crate::values::{Shown, View};
+
+/// The past values of one node, in the order of their times.
+pub(crate) struct Series {
+    topic: Arc<TopicNode>,
+    field: Option<usize>,
+    shown: Vec<One>,
+}
+
+/// A past value.
+struct One {
+    time: i64,
+    /// What no other has.
+    number: u64,
+    shown: Shown,
+}
+
+/// One value of an answer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Step {
+    Value(usize),
+    /// There is none before or behind that time.
+    NoBound(i64),
+}
+
+/// What is left of an answer. The values are not held: what has gone meanwhile is not in the rest of it.
+struct Rest(Vec<Left>);
+
+#[derive(Clone, Copy)]
+enum Left {
+    /// The value of that number.
+    Value(u64),
+    NoBound(i64),
+}
+
+/// How many bytes the values of one answer may take up.
+pub(crate) struct Room<'a> {
+    used: usize,
+    /// Whether there is room for a large value beside all other answers.
+    large: &'a (dyn Fn(usize) -> bool + Send + Sync),
+}
+
+/// What becomes of a value of an answer.
+enum Fit {
+    Fits,
+    /// The answer is as large as it gets.
+    Full,
+    /// It is too large by itself.
+    Refused(StatusCode),
+}
+
+impl<'a> Room<'a> {
+    pub(crate) const fn new(large: &'a (dyn Fn(usize) -> bool + Send + Sync)) -> Self {
+        Self { used: 0, large }
+    }
+
+    fn take(&mut self, weight: usize) -> Fit {
+        if weight >= LARGEST {
+            return Fit::Refused(StatusCode::BadResponseTooLarge);
+        }
+        if self.used > 0 && self.used + weight > MOST_WEIGHT {
+            return Fit::Full;
+        }
+        if weight > SMALL && !(self.large)(weight) {
+            return Fit::Refused(StatusCode::BadOutOfMemory);
+        }
+        self.used += weight;
+        Fit::Fits
+    }
+}
+
+impl Series {
+    /// Of what is kept of the topic of a node.
+    pub(crate) fn new(
+        (topic, field): (Arc<TopicNode>, Option<usize>),
+        kept: Vec<(u64, Shown)>,
+    ) -> Self {
+        let mut shown: Vec<One> = kept
+            .into_iter()
+            .map(|(number, shown)| One {
+                time: time(&shown),
+                number,
+                shown,
+            })
+            .collect();
+        // Those of one time stay in the order they came.
+        shown.sort_by_key(|one| one.time);
+        Self {
+            topic,
+            field,
+            shown,
+        }
+    }
+
+    fn view(&self, at: usize) -> Option<View<'_>> {
+        let one = self.shown.get(at)?;
+        Some(one.shown.view(&self.topic, self.field))
+    }
+
+    /// ReadRaw (OPC 10000-11, 6.4.3.2).
+    pub(crate) fn raw(
+        &self,
+        details: &ReadRawModifiedDetails,
+        node: &mut HistoryNode,
+        (wanted, room): (TimestampsToReturn, &mut Room<'_>),
+    ) {
+        let steps = match self.begun(details, node) {
+            Ok(steps) => steps,
+            Err(status) => {
+                node.set_status(status);
+                return;
+            }
+        };
+        let most = usize::try_from(details.num_values_per_node).unwrap_or(usize::MAX);
+        let most = match most {
+            0 => MOST_VALUES,
+            most => most.min(MOST_VALUES),
+        };
+        let range = node.index_range().clone();
+        let values = self.values(&steps, (most, &range), (wanted, room));
+        let rest: Vec<Left> = steps
+            .iter()
+            .skip(values.len())
+            .filter_map(|step| match step {
+                Step::Value(at) => self.shown.get(*at).map(|one| Left::Value(one.number)),
+                Step::NoBound(time) => Some(Left::NoBound(*time)),
+            })
+            .collect();
+        node.set_status(if steps.is_empty() {
+            StatusCode::GoodNoData
+        } else {
+            StatusCode::Good
+        });
+        if !rest.is_empty() {
+            let rest = ContinuationPoint::new(Box::new(Rest(rest)));
+            node.set_next_continuation_point(Some(rest));
+        }
+        node.set_result(HistoryData {
+            data_values: Some(values),
+        });
+    }
+
+    /// All that is asked for, or what is left of it.
+    fn begun(
+        &self,
+        details: &ReadRawModifiedDetails,
+        node: &HistoryNode,
+    ) -> Result<Vec<Step>, StatusCode> {
+        if details.is_read_modified {
+            return Err(StatusCode::BadHistoryOperationUnsupported);
+        }
+        let Some(point) = node.continuation_point() else {
+            let times: Vec<i64> = self.shown.iter().map(|one| one.time).collect();
+            let span = (given(details.start_time), given(details.end_time));
+            return steps(
+                &times,
+                span,
+                (details.num_values_per_node, details.return_bounds),
+            );
+        };
+        let rest: &Rest = point.get().ok_or(StatusCode::BadContinuationPointInvalid)?;
+        let numbers = self.shown.iter().enumerate();
+        let places: HashMap<u64, usize> = numbers.map(|(at, one)| (one.number, at)).collect();
+        let steps = rest.0.iter().filter_map(|left| match left {
+            Left::Value(number) => places.get(number).map(|at| Step::Value(*at)),
+            Left::NoBound(time) => Some(Step::NoBound(*time)),
+        });
+        Ok(steps.collect())
+    }
+
+    /// The values of the first steps, as many as one answer has.
+    fn values(
+        &self,
+        steps: &[Step],
+        (most, range): (usize, &NumericRange),
+        (wanted, room): (TimestampsToReturn, &mut Room<'_>),
+    ) -> Vec<DataValue> {
+        let mut values = Vec::new();
+        for step in steps.iter().take(most) {
+            let value = match step {
+                Step::NoBound(time) => no_value(StatusCode::BadBoundNotFound, *time),
+                Step::Value(at) => {
+                    let Some(view) = self.view(*at) else {
+                        break;
+                    };
+                    let (view, range) = view.narrowed(range);
+                    match room.take(view.weight() + BESIDE) {
+                        Fit::Fits => view.data_value(&range),
+                        Fit::Refused(status) => view.refused(status),
+                        Fit::Full => break,
+                    }
+                }
+            };
+            values.push(stamped(value, wanted));
+        }
+        values
+    }
+
+    /// ReadProcessed (OPC 10000-11, 6.4.4), with the aggregate of that node.
+    pub(crate) fn processed(
+        &self,
+        (details, kind): (&ReadProcessedDetails, &NodeId),
+        node: &mut HistoryNode,
+        (wanted, room): (TimestampsToReturn, &mut Room<'_>),
+    ) {
+        let values = self.intervals(details, kind, room);
+        answer(node, values, wanted);
+    }
+
+    fn intervals(
+        &self,
+        details: &ReadProcessedDetails,
+        kind: &NodeId,
+        room: &mut Room<'_>,
+    ) -> Result<Vec<DataValue>, StatusCode> {
+        let aggregate = aggregate_of(kind).ok_or(StatusCode::BadAggregateNotSupported)?;
+        let (start, end) = (given(details.start_time), given(details.end_time));
+        let (Some(start), Some(end)) = (start, end) else {
+            return Err(StatusCode::BadInvalidArgument);
+        };
+        let whole = end.abs_diff(start);
+        let step = ticks(details.processing_interval).ok_or(StatusCode::BadInvalidArgument)?;
+        let step = if step == 0 { whole } else { step };
+        if whole == 0 || whole.div_ceil(step) > MOST_INTERVALS {
+            return Err(StatusCode::BadInvalidArgument);
+        }
+        let rules = rules(&details.aggregate_configuration);
+        let samples = self.samples();
+        let mut values = Vec::new();
+        let mut done = 0;
+        while done < whole {
+            let next = done.saturating_add(step).min(whole);
+            let place = |part: u64| {
+                if start <= end {
+                    start.saturating_add_unsigned(part)
+                } else {
+                    start.saturating_sub_unsigned(part)
+                }
+            };
+            let interval = (place(done), place(next));
+            let outcome = aggregate::of(aggregate, &samples, interval, rules);
+            let mut value = self.outcome(outcome, interval.0, room)?;
+            let calculated = aggregate != Aggregate::Interpolative;
+            if calculated && next - done < step {
+                value.status = value.status.map(partial);
+            }
+            values.push(value);
+            done = next;
+        }
+        Ok(values)
+    }
+
+    /// ReadAtTime (OPC 10000-11, 6.4.5).
+    pub(crate) fn at_times(
+        &self,
+        details: &ReadAtTimeDetails,
+        node: &mut HistoryNode,
+        (wanted, room): (TimestampsToReturn, &mut Room<'_>),
+    ) {
+        let times = details.req_times.as_deref().unwrap_or_default();
+        if times.is_empty() || times.len() > MOST_VALUES {
+            node.set_status(StatusCode::BadInvalidArgument);
+            return;
+        }
+        let samples = self.samples();
+        let values = times.iter().map(|time| {
+            let time = time.ticks();
+            let outcome = aggregate::at(&samples, time, Rules::default());
+            self.outcome(outcome, time, room)
+        });
+        answer(node, values.collect(), wanted);
+    }
+
+    fn samples(&self) -> Vec<Sample> {
+        let samples = self.shown.iter().map(|one| {
+            let view = one.shown.view(&self.topic, self.field);
+            let status = view.stamp().status;
+            Sample {
+                time: one.time,
+                value: decoded(&view).and_then(|value| number(&value)),
+                quality: if status.is_good() {
+                    Quality::Good
+                } else if status.is_uncertain() {
+                    Quality::Uncertain
+                } else {
+                    Quality::Bad
+                },
+            }
+        });
+        samples.collect()
+    }
+
+    /// What an aggregate comes to, at the time it is of.
+    ///
+    /// # Errors
+    /// `BadResponseTooLarge` where the answer has no room for it.
+    fn outcome(
+        &self,
+        outcome: Outcome,
+        time: i64,
+        room: &mut Room<'_>,
+    ) -> Result<DataValue, StatusCode> {
+        let mut sample = |at: usize| {
+            let Some(view) = self.view(at) else {
+                return Ok(no_value(StatusCode::BadNoData, time));
+            };
+            match room.take(view.weight()) {
+                Fit::Fits => Ok(view.data_value(&NumericRange::None)),
+                Fit::Refused(status) => Ok(view.refused(status)),
+                Fit::Full => Err(StatusCode::BadResponseTooLarge),
+            }
+        };
+        let value = match outcome {
+            Outcome::Raw(at) => sample(at)?,
+            Outcome::Picked(at, quality) => made(sample(at)?.value, (quality, CALCULATED), time),
+            Outcome::Held(at) => made(sample(at)?.value, (Quality::Good, INTERPOLATED), time),
+            Outcome::Calculated(value, quality) => {
+                made(Some(Variant::Double(value)), (quality, CALCULATED), time)
+            }
+            Outcome::Count(count, quality) => {
+                let count = i32::try_from(count).unwrap_or(i32::MAX);
+                made(Some(Variant::Int32(count)), (quality, CALCULATED), time)
+            }
+            Outcome::Interpolated(value, quality) => {
+                let views = (0..self.shown.len()).filter_map(|at| self.view(at));
+                let alike = views
+                    .filter_map(|view| decoded(&view))
+                    .find(|value| number(value).is_some());
+                let value = like(value, alike.as_ref());
+                made(Some(value), (quality, INTERPOLATED), time)
+            }
+            Outcome::NoData => no_value(StatusCode::BadNoData, time),
+            Outcome::Bad => no_value(StatusCode::Bad, time),
+        };
+        match room.take(BESIDE) {
+            Fit::Fits => Ok(value),
+            Fit::Refused(_) | Fit::Full => Err(StatusCode::BadResponseTooLarge),
+        }
+    }
+}
+
+/// Gives a node these values, or says why it gets none.
+fn answer(
+    node: &mut HistoryNode,
+    values: Result<Vec<DataValue>, StatusCode>,
+    wanted: TimestampsToReturn,
+) {
+    match values {
+        Ok(values) => {
+            node.set_status(StatusCode::Good);
+            let values = values.into_iter().map(|value| stamped(value, wanted));
+            node.set_result(HistoryData {
+                data_values: Some(values.collect()),
+            });
+        }
+        Err(status) => node.set_status(status),
+    }
+}
+
+/// What an interval comes to, and how it was found.
+fn made(value: Option<Variant>, (quality, how): (Quality, u32), time: i64) -> DataValue {
+    let base = match quality {
+        Quality::Good => StatusCode::Good,
+        Quality::Uncertain => StatusCode::UncertainDataSubNormal,
+        Quality::Bad => StatusCode::Bad,
+    };
+    DataValue {
+        value,
+        ..no_value(StatusCode::from(base.bits() | how), time)
+    }
+}
+
+/// Of an interval that is shorter than the others; one that has no value stays as it is.
+fn partial(status: StatusCode) -> StatusCode {
+    match status.is_bad() {
+        true => status,
+        false => StatusCode::from(status.bits() | PARTIAL),
+    }
+}
+
+/// A value that is small enough to be a number.
+fn decoded(view: &View<'_>) -> Option<Variant> {
+    let small = view.weight() <= SMALL;
+    small.then(|| view.data_value(&NumericRange::None).value)?
+}
+
+fn rules(asked: &AggregateConfiguration) -> Rules {
+    if asked.use_server_capabilities_defaults {
+        return Rules::default();
+    }
+    Rules {
+        uncertain_is_bad: asked.treat_uncertain_as_bad,
+        percent_bad: asked.percent_data_bad,
+        percent_good: asked.percent_data_good,
+    }
+}
+
+/// The values of a span: from the start on, or from the end back where there is no start or it is the later one. Its end is
+/// not in it. With bounds there is one at or before the start, and one at or behind the end (OPC 10000-11, 6.4.3.2).
+fn steps(
+    times: &[i64],
+    (start, end): (Option<i64>, Option<i64>),
+    (count, bounds): (u32, bool),
+) -> Result<Vec<Step>, StatusCode> {
+    let (start, end) = match (start, end) {
+        (Some(start), Some(end)) => (start, Some(end)),
+        (Some(start), None) if count > 0 => (start, None),
+        (None, Some(end)) if count > 0 => return Ok(backwards(times, (end, None), bounds)),
+        (Some(_) | None, None) | (None, Some(_)) => {
+            return Err(StatusCode::BadHistoryOperationInvalid);
+        }
+    };
+    if end.is_some_and(|end| end < start) {
+        return Ok(backwards(times, (start, end), bounds));
+    }
+    let first = times.partition_point(|time| *time < start);
+    let last = match end {
+        Some(end) if end == start => times.partition_point(|time| *time <= end),
+        Some(end) => times.partition_point(|time| *time < end),
+        None => times.len(),
+    };
+    let mut steps = Vec::new();
+    if bounds && times.get(first) != Some(&start) {
+        steps.push(
+            first
+                .checked_sub(1)
+                .map_or(Step::NoBound(start), Step::Value),
+        );
+    }
+    steps.extend((first..last).map(Step::Value));
+    if let Some(end) = end.filter(|end| bounds && *end != start) {
+        let behind = (last < times.len()).then_some(Step::Value(last));
+        steps.push(behind.unwrap_or(Step::NoBound(end)));
+    }
+    Ok(steps)
+}
+
+/// From `start` back to `end`, which is earlier.
+fn backwards(times: &[i64], (start, end): (i64, Option<i64>), bounds: bool) -> Vec<Step> {
+    let behind = times.partition_point(|time| *time <= start);
+    let first = end.map_or(0, |end| times.partition_point(|time| *time <= end));
+    let mut steps = Vec::new();
+    if bounds && behind.checked_sub(1).and_then(|last| times.get(last)) != Some(&start) {
+        let after = (behind < times.len()).then_some(Step::Value(behind));
+        steps.push(after.unwrap_or(Step::NoBound(start)));
+    }
+    steps.extend((first..behind).rev().map(Step::Value));
+    if let Some(end) = end.filter(|_| bounds) {
+        steps.push(first.checked_sub(1).map_or(Step::NoBound(end), Step::Value));
+    }
+    steps
+}
+
+/// When a value is of: the time of its source, or when it came.
+fn time(shown: &Shown) -> i64 {
+    let source = shown.stamp.source;
+    let time = source.map_or_else(
+        || shown.stamp.server,
+        |source| value::date_time(source.time),
+    );
+    time.ticks()
+}
+
+/// A time, where there is one.
+fn given(time: DateTime) -> Option<i64> {
+    (time != DateTime::null()).then(|| time.ticks())
+}
+
+/// A Duration in ticks of 100 ns; `None` for what is none.
+fn ticks(milliseconds: f64) -> Option<u64> {
+    let time = std::time::Duration::try_from_secs_f64(milliseconds / 1e3).ok()?;
+    u64::try_from(time.as_nanos() / 100).ok()
+}
+
+fn no_value(status: StatusCode, time: i64) -> DataValue {
+    DataValue {
+        value: None,
+        status: Some(status),
+        source_timestamp: Some(DateTime::from(time)),
+        server_timestamp: Some(DateTime::now()),
+        ..DataValue::default()
+    }
+}
+
+/// Without the timestamps that were not asked for.
+fn stamped(mut value: DataValue, wanted: TimestampsToReturn) -> DataValue {
+    let both = wanted == TimestampsToReturn::Both;
+    if !both && wanted != TimestampsToReturn::Source {
+        value.source_timestamp = None;
+    }
+    if !both && wanted != TimestampsToReturn::Server {
+        value.server_timestamp = None;
+    }
+    value
+}
+
+/// The aggregates, by their nodes.
+const AGGREGATES: [(ObjectId, Aggregate); 5] = [
+    (
+        ObjectId::AggregateFunction_Interpolative,
+        Aggregate::Interpolative,
+    ),
+    (ObjectId::AggregateFunction_Average, Aggregate::Average),
+    (ObjectId::AggregateFunction_Minimum, Aggregate::Minimum),
+    (ObjectId::AggregateFunction_Maximum, Aggregate::Maximum),
+    (ObjectId::AggregateFunction_Count, Aggregate::Count),
+];
+
+/// Has the server list the aggregates where clients look for them.
+pub(crate) fn list_aggregates(core: &mut AddressSpace) {
+    let folders = [
+        ObjectId::HistoryServerCapabilities_AggregateFunctions,
+        ObjectId::Server_ServerCapabilities_AggregateFunctions,
+    ];
+    for folder in folders {
+        for (aggregate, _) in AGGREGATES {
+            core.insert_reference(
+                &folder.into(),
+                &aggregate.into(),
+                ReferenceTypeId::Organizes,
+            );
+        }
+    }
+}
+
+/// What the server says of its history.
+pub(crate) fn capabilities() -> Vec<(VariableId, Variant)> {
+    let most = u32::try_from(MOST_VALUES).unwrap_or(u32::MAX);
+    vec![
+        (
+            VariableId::HistoryServerCapabilities_AccessHistoryDataCapability,
+            true.into(),
+        ),
+        (
+            VariableId::HistoryServerCapabilities_MaxReturnDataValues,
+            most.into(),
+        ),
+        (
+            VariableId::HistoryServerCapabilities_ServerTimestampSupported,
+            true.into(),
+        ),
+    ]
+}
+
+fn aggregate_of(kind: &NodeId) -> Option<Aggregate> {
+    AGGREGATES
+        .into_iter()
+        .find(|(id, _)| *kind == *id)
+        .map(|(_, aggregate)| aggregate)
+}
+
+fn number(value: &Variant) -> Option<f64> {
+    if matches!(value, Variant::String(_) | Variant::Boolean(_)) {
+        return None;
+    }
+    let double = VariantTypeId::Scalar(VariantScalarTypeId::Double);
+    if let Variant::Double(number) = value.cast(double) {
+        Some(number)
+    } else {
+        None
+    }
+}
+
+/// A number in the type of others, where it fits that.
+fn like(number: f64, others: Option<&Variant>) -> Variant {
+    let given = Variant::Double(number);
+    match others.map(Variant::type_id) {
+        Some(VariantTypeId::Scalar(VariantScalarTypeId::Double)) | None => given,
+        Some(VariantTypeId::Scalar(VariantScalarTypeId::Float)) => {
+            given.cast(VariantTypeId::Scalar(VariantScalarTypeId::Float))
+        }
+        Some(kind) => {
+            let cast = Variant::Double(number.round()).cast(kind);
+            if matches!(cast, Variant::Empty) {
+                given
+            } else {
+                cast
+            }
+        }
+    }
+}
+
+/// InfoType DataValue with the bits of a historian (OPC 10000-4, 7.39.1).
+const CALCULATED: u32 = 0x0401;
+const INTERPOLATED: u32 = 0x0402;
+const PARTIAL: u32 = 0x0404;
+/// What a value of an answer takes up beside itself.
+const BESIDE: usize = size_of::<DataValue>();
+/// Values of one answer.
+const MOST_VALUES: usize = 10_000;
+const MOST_INTERVALS: u64 = 10_000;
+/// Bytes that the values of one answer take up.
+const MOST_WEIGHT: usize = 16 << 20;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const TIMES: [i64; 4] = [10, 20, 30, 40];
+
+    fn read(start: Option<i64>, end: Option<i64>, count: u32, bounds: bool) -> Vec<Step> {
+        steps(&TIMES, (start, end), (count, bounds)).unwrap()
+    }
+
+    fn values(list: &[usize]) -> Vec<Step> {
+        list.iter().map(|at| Step::Value(*at)).collect()
+    }
+
+    #[test]
+    fn a_span_has_its_start_and_not_its_end_in_either_direction() {
+        assert_eq!(read(Some(10), Some(30), 0, false), values(&[0, 1]));
+        assert_eq!(read(Some(30), Some(10), 0, false), values(&[2, 1]));
+        assert_eq!(read(Some(20), Some(20), 0, false), values(&[1]));
+        assert_eq!(read(Some(20), None, 2, false), values(&[1, 2, 3]));
+        assert_eq!(read(None, Some(30), 2, false), values(&[2, 1, 0]));
+        assert_eq!(read(Some(50), Some(60), 0, false), []);
+    }
+
+    #[test]
+    fn bounds_are_the_values_at_the_ends_or_beyond_them() {
+        assert_eq!(read(Some(10), Some(30), 0, true), values(&[0, 1, 2]));
+        assert_eq!(read(Some(15), Some(35), 0, true), values(&[0, 1, 2, 3]));
+        assert_eq!(read(Some(35), Some(15), 0, true), values(&[3, 2, 1, 0]));
+        assert_eq!(
+            read(Some(5), Some(50), 0, true),
+            [
+                &[Step::NoBound(5)][..],
+                &values(&[0, 1, 2, 3]),
+                &[Step::NoBound(50)]
+            ]
+            .concat()
+        );
+    }
+
+    #[test]
+    fn two_of_start_end_and_count_are_needed() {
+        for (start, end, count) in [(None, None, 5), (Some(1), None, 0), (None, Some(1), 0)] {
+            let refused = steps(&TIMES, (start, end), (count, false));
+            assert_eq!(refused, Err(StatusCode::BadHistoryOperationInvalid));
+        }
+    }
+}

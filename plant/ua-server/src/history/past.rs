@@ -1,0 +1,184 @@
+//! The last values of each topic, within a bound for each and one for all together.
+
+use std::collections::{HashMap, VecDeque};
+
+use mappings::TopicId;
+
+use crate::values::Shown;
+
+/// Past values, the oldest of each topic first.
+#[derive(Debug)]
+pub(crate) struct Past {
+    /// For each topic.
+    most_values: usize,
+    /// Of all together.
+    most_bytes: usize,
+    bytes: usize,
+    /// The number of the next value.
+    next: u64,
+    topics: HashMap<TopicId, Kept>,
+}
+
+#[derive(Debug, Default)]
+struct Kept {
+    values: VecDeque<(u64, Shown)>,
+    bytes: usize,
+}
+
+impl Past {
+    /// Keeps so many values of each topic, in so many bytes for all.
+    pub(crate) fn new(most_values: usize, most_bytes: usize) -> Self {
+        Self {
+            most_values,
+            most_bytes,
+            bytes: 0,
+            next: 0,
+            topics: HashMap::new(),
+        }
+    }
+
+    /// Takes in the value that a topic shows now. Where there is no room for all, topics that take up about their share of it or
+    /// more give up the older half of their values.
+    pub(crate) fn keep(&mut self, topic: TopicId, shown: &Shown) {
+        let size = size(shown);
+        if self.most_values == 0 || size > self.most_bytes {
+            return;
+        }
+        let kept = self.topics.entry(topic).or_default();
+        kept.values.push_back((self.next, shown.clone()));
+        self.next += 1;
+        kept.bytes += size;
+        self.bytes += size;
+        if kept.values.len() > self.most_values {
+            self.bytes -= kept.drop_oldest(1);
+        }
+        while self.bytes > self.most_bytes {
+            self.make_room();
+        }
+    }
+
+    /// Those below three quarters of their share have less than three quarters of all, so each pass sets free a good part of
+    /// the rest, and the next one is far.
+    fn make_room(&mut self) {
+        let share = self.most_bytes / self.topics.len().max(1);
+        for kept in self.topics.values_mut() {
+            if kept.bytes > share / 4 * 3 {
+                let half = kept.values.len().div_ceil(2);
+                self.bytes -= kept.drop_oldest(half);
+            }
+        }
+    }
+
+    /// What is kept of a topic, in the order it came, each with a number that no other has.
+    pub(crate) fn of(&self, topic: TopicId) -> Vec<(u64, Shown)> {
+        let kept = self.topics.get(&topic);
+        kept.map_or_else(Vec::new, |kept| kept.values.iter().cloned().collect())
+    }
+
+    /// Forgets a topic.
+    pub(crate) fn remove(&mut self, topic: TopicId) {
+        if let Some(gone) = self.topics.remove(&topic) {
+            self.bytes -= gone.bytes;
+        }
+    }
+}
+
+impl Kept {
+    /// How many bytes that sets free.
+    fn drop_oldest(&mut self, count: usize) -> usize {
+        let gone = self.values.drain(..count.min(self.values.len()));
+        let freed: usize = gone.map(|(_, gone)| size(&gone)).sum();
+        self.bytes -= freed;
+        freed
+    }
+}
+
+/// What a value takes up here.
+fn size(shown: &Shown) -> usize {
+    shown.block.as_ref().map_or(0, bytes::Bytes::len) + BESIDE
+}
+
+/// Stamps, room for more of them, and what the bytes are held by.
+const BESIDE: usize = 2 * size_of::<(u64, Shown)>() + 48;
+
+#[cfg(test)]
+mod tests {
+    use bytes::Bytes;
+    use opcua::types::StatusCode;
+
+    use super::*;
+
+    fn value(size: usize, mark: u8) -> Shown {
+        Shown {
+            block: Some(Bytes::from(vec![mark; size])),
+            ..Shown::nothing(StatusCode::Good)
+        }
+    }
+
+    fn marks(past: &Past, topic: TopicId) -> Vec<u8> {
+        let all = past.of(topic);
+        all.iter()
+            .map(|(_, shown)| shown.block.as_ref().unwrap()[0])
+            .collect()
+    }
+
+    #[test]
+    fn each_topic_keeps_its_last_values() {
+        let (one, other) = (
+            TopicId::new(1, 2, 3).unwrap(),
+            TopicId::new(1, 2, 4).unwrap(),
+        );
+        let mut past = Past::new(3, 1 << 20);
+        for mark in 0..5 {
+            past.keep(one, &value(4, mark));
+        }
+        past.keep(other, &value(4, 9));
+        assert_eq!(marks(&past, one), [2, 3, 4]);
+        assert_eq!(marks(&past, other), [9]);
+        past.remove(one);
+        assert_eq!(past.bytes, 4 + BESIDE);
+    }
+
+    #[test]
+    fn large_values_of_one_topic_do_not_drive_out_those_of_others() {
+        let (small, large) = (
+            TopicId::new(1, 2, 3).unwrap(),
+            TopicId::new(1, 2, 4).unwrap(),
+        );
+        let mut past = Past::new(1000, 10 * (1000 + BESIDE));
+        for mark in 0..5 {
+            past.keep(small, &value(4, mark));
+        }
+        for mark in 0..100 {
+            past.keep(large, &value(1000, mark));
+            assert!(past.bytes <= past.most_bytes);
+        }
+        assert_eq!(marks(&past, small), [0, 1, 2, 3, 4]);
+        assert_eq!(marks(&past, large).last(), Some(&99));
+        past.keep(large, &value(1 << 20, 1));
+        assert_eq!(
+            marks(&past, large).last(),
+            Some(&99),
+            "what is larger than all is not kept"
+        );
+    }
+
+    #[test]
+    fn where_all_topics_want_more_than_their_share_each_has_about_as_much() {
+        let topics: Vec<TopicId> = (1..=100)
+            .map(|id| TopicId::new(1, 2, id).unwrap())
+            .collect();
+        let mut past = Past::new(1000, 1000 * (4 + BESIDE));
+        for mark in 0..100 {
+            for topic in &topics {
+                past.keep(*topic, &value(4, mark));
+                assert!(past.bytes <= past.most_bytes);
+            }
+        }
+        for topic in topics {
+            let kept = marks(&past, topic);
+            assert!((4..=11).contains(&kept.len()), "{kept:?}");
+            assert_eq!(kept.last(), Some(&99));
+        }
+    }
+}
