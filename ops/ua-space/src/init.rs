@@ -296,7 +296,10 @@ const CALLS: [&str; 5] = [
 
 fn section(lines: &mut Vec<String>, title: &str, key: &str, block: Vec<String>) {
     if !block.is_empty() {
-        lines.extend([String::new(), format!("# {title}"), format!("{key}:")]);
+        lines.push(String::new());
+        // Places are counted in lines.
+        lines.extend(format!("# {title}").lines().map(str::to_owned));
+        lines.push(format!("{key}:"));
         lines.extend(block);
     }
 }
