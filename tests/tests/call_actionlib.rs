@@ -587,7 +587,10 @@ fn goals_of_either_ros_run_skills_and_are_refused_with_the_reason_of_the_compone
     let halted = end(&mut hold, 0);
     assert_eq!(
         (&halted[0], &halted[2]),
-        (&json!("PREEMPTED"), &json!({"run": 1, "gripped": false}))
+        (
+            &json!("PREEMPTED"),
+            &json!({"run": told["run"], "gripped": false})
+        )
     );
     stands(&cell, url, "Halted");
 
@@ -601,10 +604,8 @@ fn goals_of_either_ros_run_skills_and_are_refused_with_the_reason_of_the_compone
     assert!(why.contains("MaxVelocity is from"), "{why}");
     send(&mut moves, &json!({"target_position": target}));
     let moved = end(&mut moves, 2);
-    assert_eq!(
-        (&moved[0], &moved[2]["run"]),
-        (&json!("SUCCEEDED"), &json!(1))
-    );
+    assert_eq!(moved[0], "SUCCEEDED");
+    let first = moved[2]["run"].as_u64().unwrap();
     let near = |(at, of): (&Value, &Value)| (at.as_f64().unwrap() - of.as_f64().unwrap()).abs();
     let position = moved[2]["position"].as_array().unwrap();
     let off = position.iter().zip(target.as_array().unwrap()).map(near);
@@ -618,7 +619,7 @@ fn goals_of_either_ros_run_skills_and_are_refused_with_the_reason_of_the_compone
     let moved = asked(ask(&goal));
     let (code, status) = (moved.0, &moved.1);
     assert_eq!((code, status), (0, &json!("SUCCEEDED")), "{:?}", moved.3);
-    assert_eq!(moved.2["run"], 2);
+    assert_eq!(moved.2["run"], first + 1);
     let unsaid = asked(ask(&["bench.Move.Goal"]));
     assert_eq!(unsaid.0, 64, "where to is not made up: {:?}", unsaid.3);
 
