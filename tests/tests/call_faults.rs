@@ -393,7 +393,8 @@ fn slow_calls_do_not_delay_values_at_1_khz() {
     };
     let _core = cell.roscore();
     let service = format!("empty={SERVICE}");
-    let mut executor = cell.rospy_executor(&[&service, "--delay", "10"]);
+    // Long enough for the last of them to begin before the first has ended, on a busy machine too.
+    let mut executor = cell.rospy_executor(&[&service, "--delay", "15"]);
     let plant = concat!(env!("CARGO_MANIFEST_DIR"), "/cells/plant.yaml");
     let _bridges = (cell.bridge_ros1(&[plant]), cell.bridge_ros2(&[plant]));
     let mut asker = cell.rclpy_asker(Distribution::Jazzy);
