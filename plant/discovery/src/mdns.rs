@@ -171,8 +171,11 @@ impl Mdns {
                     && let Some((announcement, start_time)) = self.there.remove(&instance)
                 {
                     let until = Instant::now() + DOUBT;
-                    self.doubted
-                        .insert(instance.clone(), (announcement, start_time, until));
+                    // Of more than that, whoever is back is heard with its next change.
+                    if self.doubted.len() < MOST {
+                        self.doubted
+                            .insert(instance.clone(), (announcement, start_time, until));
+                    }
                     return Heard::Withdrawn { instance };
                 }
             }
