@@ -60,5 +60,5 @@ pub use rtps::{Mutator, announced, claims_too_much, queued};
 pub use stamp::{Stamp, now};
 pub use times::{Times, micros, per_message, processor_time};
 pub use ua_side::{Triple, UaSide};
-pub use usage::{cpu_share, peak, resident, threads};
+pub use usage::{anonymous, cpu_share, peak, resident, threads};
 pub use wait::{eventually, holds_for};

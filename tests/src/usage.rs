@@ -23,6 +23,15 @@ pub fn resident(process: u32) -> u64 {
     status(process, "VmRSS:") * 1024
 }
 
+/// The memory of a process in RAM that is its own, without the pages of its program file, in bytes.
+///
+/// # Panics
+/// When it is gone.
+#[must_use]
+pub fn anonymous(process: u32) -> u64 {
+    status(process, "RssAnon:") * 1024
+}
+
 /// The most memory of a process that was ever in RAM, in bytes.
 ///
 /// # Panics

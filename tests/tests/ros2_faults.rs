@@ -5,8 +5,8 @@ use std::time::{Duration, Instant};
 
 use nix::sys::signal::Signal;
 use system_tests::{
-    Announcer, Cell, Child, METRICS_ROS2, Peer, Started, Triple, UaSide, cpu_share, eventually,
-    metrics, program, resident, threads,
+    Announcer, Cell, Child, METRICS_ROS2, Peer, Started, Triple, UaSide, anonymous, cpu_share,
+    eventually, metrics, program, resident, threads,
 };
 use uadp::Scalar;
 
@@ -268,7 +268,10 @@ fn five_thousand_routes_of_a_mapping_take_little_memory() {
         memory / 1_000_000,
         idle * 100.0
     );
-    assert!(memory < 95_000_000, "{memory} bytes");
+    // What the routes take is its own; some 25 MB are pages of the program file.
+    let own = anonymous(bridge.id());
+    assert!(own < 60_000_000, "{own} bytes");
+    assert!(memory < 85_000_000, "{memory} bytes");
     assert!(idle < 0.04, "{:.1} %", idle * 100.0);
     assert!(bridge.runs());
 }
