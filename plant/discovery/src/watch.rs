@@ -259,6 +259,8 @@ impl Servers {
             server.instances.insert(instance);
             return None;
         }
+        // Whoever was called so has lost that name since.
+        self.renamed(&instance);
         let name = match self.known.contains_key(&instance) {
             true => format!("{instance} at {url}"),
             false => instance.clone(),
@@ -465,6 +467,17 @@ mod tests {
         servers.vanished("arm", Loss::Goodbye);
         servers.vanished("arm (2)", Loss::Goodbye);
         assert_eq!(told(&mut servers), ["gone arm", "gone arm (2)"]);
+    }
+
+    #[test]
+    fn a_name_that_was_taken_back_is_free_for_another() {
+        let mut servers = Servers::default();
+        seen(&mut servers, robot("arm", 2));
+        seen(&mut servers, robot("arm (2)", 2));
+        servers.vanished("arm", Loss::Goodbye);
+        assert_eq!(told(&mut servers), ["seen arm"]);
+        seen(&mut servers, robot("arm", 1));
+        assert_eq!(told(&mut servers), ["seen arm (2)", "gone arm", "seen arm"]);
     }
 
     #[test]
