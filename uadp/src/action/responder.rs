@@ -1,6 +1,7 @@
 //! The answering side: each request executed at most once, and answered as often as it is asked for.
 
 mod entry;
+mod over;
 mod settings;
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -15,6 +16,7 @@ use super::{
 };
 use crate::{OwnedPublisherId, StatusCode};
 use entry::{Entry, Key, Phase};
+use over::Over;
 pub use settings::{
     ExecutionId, FinishRefusal, RequestDrop, Requested, ResponderCounters, ResponderSettings,
 };
@@ -31,8 +33,9 @@ pub use settings::{
 /// What was asked is remembered for [`remember`](ResponderSettings::remember) after it was heard of last, refusals and
 /// acknowledged answers too: a request that the network doubles and delays for longer than that is executed again, as is
 /// one repeated to a Responder that started anew. With message security [`Opener`](crate::Opener) lets no message
-/// through twice, however late. While there is no room to remember one more, new requests are dropped and not answered:
-/// a refusal that is forgotten could be executed by a repetition after all.
+/// through twice, however late. Of those that are over a few bytes are kept where room is wanted, so that thousands a second
+/// can be remembered; they are not acknowledged again then. While there is no room to remember one more, new requests are
+/// dropped and not answered: a refusal that is forgotten could be executed by a repetition after all.
 ///
 /// Where answers go is the owner's matter: `P` is whatever it takes to send there, given with the request. To answer
 /// where a request asks to be answered lets everybody send the answers to others.
@@ -99,6 +102,8 @@ pub struct Responder<P> {
     /// What each Requestor takes up.
     usage: BTreeMap<Option<OwnedPublisherId>, Usage>,
     total: Usage,
+    /// Requests that are over, and are remembered by little else than that.
+    over: Over,
     executing: usize,
     /// Executions past their deadline that were not told yet.
     overdue: BTreeSet<u64>,
@@ -106,10 +111,12 @@ pub struct Responder<P> {
 }
 
 /// Room that is taken up.
-#[derive(Debug, Clone, Copy, Default)]
+#[derive(Debug, Default)]
 struct Usage {
     requests: usize,
     bytes: usize,
+    /// Those of the requests that are over, the oldest first.
+    closed: BTreeSet<u64>,
 }
 
 impl<P> Responder<P> {
@@ -124,6 +131,7 @@ impl<P> Responder<P> {
             timers: Timers::new(),
             usage: BTreeMap::new(),
             total: Usage::default(),
+            over: Over::default(),
             executing: 0,
             overdue: BTreeSet::new(),
             counters: ResponderCounters::default(),
@@ -204,6 +212,7 @@ impl<P> Responder<P> {
 
     /// Forgets what is too old, and notes which executions are past their deadline.
     pub fn handle_timeout(&mut self, now: Duration) {
+        self.over.forget_until(now);
         while let Some(id) = self.timers.due(now) {
             let Some(entry) = self.entries.get_mut(&id) else {
                 return;
@@ -275,8 +284,12 @@ impl<P> Responder<P> {
 
     /// Requests that are remembered, and bytes they take up.
     #[must_use]
-    pub const fn held(&self) -> (usize, usize) {
-        (self.total.requests, self.total.bytes)
+    pub fn held(&self) -> (usize, usize) {
+        let over = self.over.len();
+        (
+            self.total.requests + over,
+            self.total.bytes + over * over::COST,
+        )
     }
 
     /// What was counted so far.
@@ -302,6 +315,7 @@ impl<P> Responder<P> {
         let known = self.ids.get(&key).copied();
         match (request.state, known) {
             (ActionState::Done, _) => Err(RequestDrop::State),
+            (_, None) if self.over.has(&key) => Err(RequestDrop::Over),
             (ActionState::Idle, _) if request.dialect != ActionDialect::Standard => {
                 Err(RequestDrop::State)
             }
@@ -321,23 +335,9 @@ impl<P> Responder<P> {
         reply_to: P,
         now: Duration,
     ) -> Result<Requested, RequestDrop> {
-        let settings = &self.settings;
-        let used = self
-            .usage
-            .get(&key.requestor_id)
-            .copied()
-            .unwrap_or_default();
         let cost = key.cost();
-        if used.requests >= settings.max_requests_per_requestor
-            || used.bytes + cost > settings.max_bytes_per_requestor
-        {
-            return Err(RequestDrop::RequestorFull);
-        }
-        if self.total.requests >= settings.max_requests
-            || self.total.bytes + cost > settings.max_bytes
-        {
-            return Err(RequestDrop::Full);
-        }
+        self.make_room(&key.requestor_id, cost)?;
+        let settings = &self.settings;
         let id = self.next;
         self.next += 1;
         let execution = ExecutionId(id);
@@ -361,6 +361,7 @@ impl<P> Responder<P> {
             }
         };
         self.executing += usize::from(matches!(phase, Phase::Executing { .. }));
+        let is_closed = matches!(phase, Phase::Closed);
         let interval = self.interval();
         let mut entry = Entry {
             key: key.clone(),
@@ -379,11 +380,46 @@ impl<P> Responder<P> {
         self.account(&key.requestor_id, |usage| {
             usage.requests += 1;
             usage.bytes += cost;
+            if is_closed {
+                usage.closed.insert(id);
+            }
         });
         self.ids.insert(key, id);
         self.entries.insert(id, entry);
         self.schedule(id);
         Ok(requested)
+    }
+
+    /// Makes room for one more request, at the cost of what is known of those that are over.
+    fn make_room(
+        &mut self,
+        requestor: &Option<OwnedPublisherId>,
+        cost: usize,
+    ) -> Result<(), RequestDrop> {
+        let settings = self.settings;
+        while let Some(used) = self.usage.get(requestor)
+            && (used.requests >= settings.max_requests_per_requestor
+                || used.bytes + cost > settings.max_bytes_per_requestor)
+        {
+            let oldest = used.closed.first().copied();
+            self.shrink(oldest.ok_or(RequestDrop::RequestorFull)?)?;
+        }
+        while self.total.requests >= settings.max_requests
+            || self.total.bytes + cost > settings.max_bytes
+        {
+            let oldest = self.total.closed.first().copied();
+            self.shrink(oldest.ok_or(RequestDrop::Full)?)?;
+        }
+        Ok(())
+    }
+
+    /// Keeps of a request that is over no more than that.
+    fn shrink(&mut self, id: u64) -> Result<(), RequestDrop> {
+        let entry = self.entries.get(&id).ok_or(RequestDrop::Full)?;
+        let until = entry.expires(self.settings.remember);
+        self.over.keep(&entry.key, until, &self.settings)?;
+        self.forget(id);
+        Ok(())
     }
 
     /// A request that was heard before.
@@ -439,7 +475,7 @@ impl<P> Responder<P> {
                 entry.last_sent = None;
                 entry.next_send = None;
                 entry.answer(now, interval);
-                self.drop_answer(id);
+                self.closed(id);
                 Requested::Closed(execution)
             }
             Phase::Closed => {
@@ -465,6 +501,7 @@ impl<P> Responder<P> {
         if abandoned {
             entry.phase = Phase::Closed;
             entry.next_send = None;
+            self.closed(id);
         } else {
             let bytes = fields.bytes().len();
             entry.answer_bytes = bytes;
@@ -491,11 +528,14 @@ impl<P> Responder<P> {
     }
 
     /// Frees the bytes of an answer nobody will ask for again.
-    fn drop_answer(&mut self, id: u64) {
+    fn closed(&mut self, id: u64) {
         if let Some(entry) = self.entries.get_mut(&id) {
             let bytes = std::mem::take(&mut entry.answer_bytes);
             let requestor = entry.key.requestor_id.clone();
-            self.account(&requestor, |usage| usage.bytes -= bytes);
+            self.account(&requestor, |usage| {
+                usage.bytes -= bytes;
+                usage.closed.insert(id);
+            });
         }
     }
 
@@ -511,6 +551,7 @@ impl<P> Responder<P> {
         self.account(&entry.key.requestor_id, |usage| {
             usage.requests -= 1;
             usage.bytes -= bytes;
+            usage.closed.remove(&id);
         });
     }
 

@@ -287,6 +287,98 @@ fn requests_beyond_the_memory_are_dropped_by_reason_and_not_answered() {
 }
 
 #[test]
+fn requests_that_are_over_make_room_for_others_and_are_still_known() {
+    let mut responder = Responder::new(ResponderSettings {
+        max_requests: 4,
+        max_requests_per_requestor: 2,
+        max_over: 10,
+        max_over_per_requestor: 8,
+        ..ResponderSettings::default()
+    });
+    let (one, two) = (many(1, 11), many(2, 3));
+    let play = |responder: &mut Responder<u16>, asked: &[u8]| {
+        let execution = execute(ask(responder, asked, at(0)));
+        let told = responder.finish(execution, answered(&block(1)), at(0));
+        told.unwrap();
+        let closed = ask(responder, &idle(asked), at(0));
+        assert_eq!(closed, Ok(Requested::Closed(execution)));
+    };
+    // Two with all that is known of them, and 8 more.
+    for asked in &one[..10] {
+        play(&mut responder, asked);
+    }
+    let full = ask(&mut responder, &one[10], at(0));
+    assert_eq!(full, Err(RequestDrop::RequestorFull));
+    for asked in &two {
+        play(&mut responder, asked);
+    }
+    assert_eq!(responder.held().0, 13);
+    for asked in one[..10].iter().chain(&two) {
+        for late in [asked.clone(), idle(asked)] {
+            let heard = ask(&mut responder, &late, at(9_000));
+            let known = matches!(heard, Ok(Requested::Repeated(_)) | Err(RequestDrop::Over));
+            assert!(known, "{heard:?}");
+        }
+    }
+    while responder.poll_transmit(at(9_000)).is_some() {}
+    // Those that were kept whole were heard of again.
+    responder.handle_timeout(at(10_000));
+    assert_eq!(responder.held().0, 4);
+    execute(ask(&mut responder, &one[10], at(10_000)));
+    responder.handle_timeout(at(80_000));
+    assert_eq!(responder.held(), (0, 0));
+}
+
+#[test]
+fn a_requestor_that_takes_all_answers_can_ask_thousands_of_times_a_second() {
+    let mut responder = responder();
+    let mut requestor = Requestor::new(
+        OwnedPublisherId::UInt16(1),
+        [7; 16],
+        RequestorSettings::default(),
+    );
+    let mut first = None;
+    for number in 0..20_000 {
+        let arguments = block(number);
+        let now = at(u64::from(number.unsigned_abs()) / 20);
+        requestor.call(request(&arguments, at(5000)), now).unwrap();
+        for asked in requests(&mut requestor, now) {
+            let execution = execute(ask(&mut responder, &asked, now));
+            responder
+                .finish(execution, answered(&arguments), now)
+                .unwrap();
+            first.get_or_insert(asked);
+        }
+        exchange(&mut requestor, &mut responder, now);
+    }
+    assert_eq!(requestor.counters().answered, 20_000);
+    let (held, bytes) = responder.held();
+    assert_eq!(held, 20_000);
+    assert!(bytes < 4 << 20, "{bytes}");
+    let late = ask(&mut responder, &first.unwrap(), at(2_000));
+    assert_eq!(late, Err(RequestDrop::Over));
+}
+
+/// Has each hear what the other says until both are silent.
+fn exchange(requestor: &mut Requestor, responder: &mut Responder<u16>, now: Duration) {
+    loop {
+        let said = responses(responder, now);
+        for datagram in &said {
+            message(datagram, STANDARD, |response| {
+                let _told = requestor.handle_response(response, now);
+            });
+        }
+        let asked = requests(requestor, now);
+        for datagram in &asked {
+            let _heard = ask(responder, datagram, now);
+        }
+        if said.is_empty() && asked.is_empty() {
+            return;
+        }
+    }
+}
+
+#[test]
 fn requests_beyond_what_can_be_executed_are_refused_as_busy() {
     let mut responder = Responder::new(ResponderSettings {
         max_executing: 1,

@@ -56,6 +56,9 @@ impl Sum {
         self.lost += TURN - times.len() as u64;
         self.seconds += told["seconds"].as_f64().unwrap();
         self.used += used;
+        if let Some(why) = told["failed"].get(0) {
+            println!("a call came to nothing: {why}");
+        }
     }
 }
 

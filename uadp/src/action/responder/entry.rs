@@ -7,7 +7,7 @@ use crate::action::{ActionAddress, ActionDialect, ActionFields, ActionMessage};
 use crate::{OwnedPublisherId, StatusCode};
 
 /// What a request is known by (OPC 10000-14, 6.2.11.2.2).
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub(super) struct Key {
     pub(super) requestor_id: Option<OwnedPublisherId>,
     pub(super) correlation_data: Option<Box<[u8]>>,

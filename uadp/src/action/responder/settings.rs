@@ -21,10 +21,14 @@ pub struct ResponderSettings {
     pub max_timeout: Duration,
     /// Requests executed at a time; further ones are refused as [`Refusal::Busy`]. Default 256.
     pub max_executing: usize,
-    /// Requests remembered. Default 8192.
+    /// Requests remembered with all that is known of them. Default 8192.
     pub max_requests: usize,
-    /// Requests remembered of one RequestorId. Default 2048.
+    /// Those of one RequestorId. Default 2048.
     pub max_requests_per_requestor: usize,
+    /// Requests beside those that are over, of which no more is remembered; each takes up about 100 bytes. Default 131072.
+    pub max_over: usize,
+    /// Those of one RequestorId. Default 65536.
+    pub max_over_per_requestor: usize,
     /// Bytes of all that is remembered. Default 16 MiB.
     pub max_bytes: usize,
     /// Bytes remembered of one RequestorId. Default 4 MiB.
@@ -78,6 +82,9 @@ pub enum RequestDrop {
     /// Another request had the same ids.
     #[error("the ids of another request")]
     Reused,
+    /// It is over, and not answered any more.
+    #[error("a request that is over")]
+    Over,
     /// The Requestor has as much as it may have.
     #[error("too many requests of this requestor")]
     RequestorFull,
@@ -142,6 +149,8 @@ impl Default for ResponderSettings {
             max_executing: 256,
             max_requests: 8192,
             max_requests_per_requestor: 2048,
+            max_over: 131_072,
+            max_over_per_requestor: 65_536,
             max_bytes: 16 << 20,
             max_bytes_per_requestor: 4 << 20,
             max_answer: 60_000,
