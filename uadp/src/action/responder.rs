@@ -408,7 +408,9 @@ impl<P> Responder<P> {
             || self.total.bytes + cost > settings.max_bytes
         {
             let oldest = self.total.closed.first().copied();
-            self.shrink(oldest.ok_or(RequestDrop::Full)?)?;
+            let shrunk = self.shrink(oldest.ok_or(RequestDrop::Full)?);
+            // It is not for this requestor that there is no room.
+            shrunk.map_err(|_| RequestDrop::Full)?;
         }
         Ok(())
     }
@@ -527,7 +529,7 @@ impl<P> Responder<P> {
             && used + bytes <= self.settings.max_bytes_per_requestor
     }
 
-    /// Frees the bytes of an answer nobody will ask for again.
+    /// A request is over: nobody will ask for its answer again, whose bytes are freed.
     fn closed(&mut self, id: u64) {
         if let Some(entry) = self.entries.get_mut(&id) {
             let bytes = std::mem::take(&mut entry.answer_bytes);

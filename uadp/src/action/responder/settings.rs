@@ -25,11 +25,11 @@ pub struct ResponderSettings {
     pub max_requests: usize,
     /// Those of one RequestorId. Default 2048.
     pub max_requests_per_requestor: usize,
-    /// Requests beside those that are over, of which no more is remembered; each takes up about 100 bytes. Default 131072.
+    /// Requests that are over, beside those: enough of each is kept to know it again, about 100 bytes. Default 131072.
     pub max_over: usize,
     /// Those of one RequestorId. Default 65536.
     pub max_over_per_requestor: usize,
-    /// Bytes of all that is remembered. Default 16 MiB.
+    /// Bytes of all that is remembered, but for those of [`max_over`](Self::max_over). Default 16 MiB.
     pub max_bytes: usize,
     /// Bytes remembered of one RequestorId. Default 4 MiB.
     pub max_bytes_per_requestor: usize,
