@@ -16,6 +16,11 @@ use crate::input::Input;
 const MESSAGES: usize = 256;
 const REQUESTS: usize = 6;
 const BYTES: usize = 4000;
+/// Requests that are over, and what each may take up.
+const OVER: usize = 4;
+const OVER_BYTES: usize = OVER * 100;
+/// Longer than the time of any input.
+const REMEMBER: Duration = Duration::from_secs(3600);
 
 /// Operations, a byte each: call, send, deliver, deliver changed, deliver anything, finish, refuse, abandon, let time
 /// pass. Each call ends once at most, what is held stays within the limits, no wait is in the past, and without changed
@@ -100,8 +105,9 @@ impl World {
                 max_executing: 3,
                 max_bytes: BYTES,
                 max_bytes_per_requestor: BYTES - 500,
-                // Longer than the time of any input.
-                remember: Duration::from_secs(3600),
+                max_over: OVER,
+                max_over_per_requestor: OVER - 1,
+                remember: REMEMBER,
                 ..ResponderSettings::default()
             }),
             now: Duration::ZERO,
@@ -199,7 +205,7 @@ impl World {
         assert!(self.requestor.open_calls() <= REQUESTS);
         let (requests, bytes) = self.responder.held();
         assert!(
-            requests <= REQUESTS && bytes <= BYTES,
+            requests <= REQUESTS + OVER && bytes <= BYTES + OVER_BYTES,
             "{requests} requests, {bytes} bytes"
         );
         let twice = self.executed.values().any(|executed| *executed > 1);
@@ -218,6 +224,8 @@ impl World {
             let waits = [self.requestor.poll_timeout(), self.responder.poll_timeout()];
             let Some(next) = waits.into_iter().flatten().min() else {
                 assert_eq!(self.ended.len(), self.calls.len(), "a call without an end");
+                // Nobody is woken to forget those that are over.
+                self.responder.handle_timeout(self.now + REMEMBER);
                 assert_eq!(self.responder.held(), (0, 0));
                 return;
             };
