@@ -245,6 +245,14 @@ impl Counting {
         self.0.ask("counts", PATIENCE)
     }
 
+    /// Has all that it executes end at once.
+    ///
+    /// # Panics
+    /// As [`Self::counts`].
+    pub fn end(&mut self) {
+        self.0.ask("end", PATIENCE);
+    }
+
     /// The process.
     pub const fn child(&mut self) -> &mut Child {
         &mut self.0

@@ -393,8 +393,8 @@ fn slow_calls_do_not_delay_values_at_1_khz() {
     };
     let _core = cell.roscore();
     let service = format!("empty={SERVICE}");
-    // Long enough for the last of them to begin before the first has ended, on a busy machine too.
-    let mut executor = cell.rospy_executor(&[&service, "--delay", "15"]);
+    // They go on until they are told to end.
+    let mut executor = cell.rospy_executor(&[&service, "--delay", "1000"]);
     let plant = concat!(env!("CARGO_MANIFEST_DIR"), "/cells/plant.yaml");
     let _bridges = (cell.bridge_ros1(&[plant]), cell.bridge_ros2(&[plant]));
     let mut asker = cell.rclpy_asker(Distribution::Jazzy);
@@ -427,6 +427,7 @@ fn slow_calls_do_not_delay_values_at_1_khz() {
         .map(|line| line["value"]["data"].as_str().unwrap().parse().unwrap())
         .collect();
     assert_eq!(numbers, (0..4000).collect::<Vec<u32>>());
+    executor.end();
     let told = asker.told();
     assert_eq!(told["right"], AT_ONCE, "{told}");
     assert_eq!(executor.counts()["executed"], AT_ONCE);
