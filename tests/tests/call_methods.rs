@@ -500,3 +500,67 @@ fn asyncua_drives_an_action_of_ros_2_by_its_methods() {
     let result = ask("ua_2_2_72", &json!([ids[0]]));
     assert_eq!((&result[0], &result[2]), (&json!(5), &json!([1, 1, 2])));
 }
+
+#[test]
+fn asyncua_drives_an_action_of_ros_2_as_a_program() {
+    let Some(cell) = Cell::with(&[Peer::Ros2, Peer::Python]) else {
+        return;
+    };
+    let args = ["serve", "/ua_2_2_70"];
+    let server = cell.rclpy_started(Distribution::Kilted, "ros2_rclpy_action.py", &args);
+    let _server = server.told().start().ready(SOON);
+    let _bridge = cell.bridge_ros2(&[]);
+    let _ua_server = cell.ua_server(&[]);
+    let program = "UaSpace/Programs/ua_2_2_70";
+    let ask = |method: &str, values: &Value| {
+        let (method, values) = (format!("{program}/{method}"), values.to_string());
+        let args = [
+            SERVER_ENDPOINT,
+            &method,
+            "--value",
+            &values,
+            "--patience",
+            "40",
+        ];
+        let mut client = cell.asyncua_started("opcua_call.py", &args).start();
+        line(&mut client, "status")["status"].clone()
+    };
+    let shown = |path: &str| {
+        let node = format!("ns=1;s=ua_2_2_70.program.{path}");
+        let read = cell.asyncua_try("opcua_read.py", &[SERVER_ENDPOINT, &node]);
+        read.map_or_else(String::new, |read| {
+            read[0]["value"].to_string().replace(" ", "")
+        })
+    };
+    let becomes = |path: &str, value: &str| {
+        eventually(path, SOON, || shown(path).contains(value).then_some(()));
+    };
+    // It reports the first three numbers, and goes on until it is cancelled.
+    assert_eq!(ask("Start", &json!([100])), "Good");
+    assert!(shown("CurrentState").contains("Running"));
+    assert_eq!(ask("Start", &json!([100])), "BadInvalidState");
+    becomes("Feedback", "[1,1,2]");
+    assert_eq!(ask("Halt", &json!([])), "Good");
+    assert!(shown("CurrentState").contains("Halted"));
+    let came_out =
+        ["Status", "Message", "sequence"].map(|name| shown(&format!("FinalResultData.{name}")));
+    assert_eq!(
+        came_out,
+        ["5", "\"\"", "[1,1,2]"],
+        "{:?}",
+        cell.asyncua_try(
+            "opcua_read.py",
+            &[
+                SERVER_ENDPOINT,
+                "--children",
+                "ns=1;s=ua_2_2_70.program.FinalResultData"
+            ]
+        )
+    );
+    assert_eq!(ask("Reset", &json!([])), "Good");
+    assert_eq!(ask("Start", &json!([-1])), "BadRequestNotAllowed");
+    assert!(shown("CurrentState").contains("Ready"));
+    assert_eq!(ask("Start", &json!([3])), "Good");
+    becomes("CurrentState", "Ready");
+    becomes("FinalResultData.Status", "4");
+}

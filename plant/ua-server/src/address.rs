@@ -97,6 +97,7 @@ pub(crate) fn add_folders(layout: &Layout, address_space: &mut AddressSpace) {
 pub(crate) fn order(layout: &Layout) -> HashMap<NodeId, usize> {
     let mut order = HashMap::from([
         (root(), 1),
+        (programs_folder(), usize::MAX - 2),
         (components_folder(), usize::MAX - 1),
         (unmapped_folder(), usize::MAX),
     ]);
@@ -158,6 +159,22 @@ pub(crate) fn calls_folder() -> NodeId {
 /// An object with calls in it, or in others in it, by the names of those around it and its own.
 pub(crate) fn call_object(names: &[&str]) -> NodeId {
     NodeId::new(APPLICATION, format!("UaSpace.Calls/{}", names.join("/")))
+}
+
+/// Of the actions of other spaces.
+pub(crate) fn programs_folder() -> NodeId {
+    NodeId::new(APPLICATION, "UaSpace.Programs")
+}
+
+/// An object with Programs in it, or in others in it, by the names of those around it and its own.
+pub(crate) fn program_folder(names: &[&str]) -> NodeId {
+    NodeId::new(APPLICATION, format!("UaSpace.Programs/{}", names.join("/")))
+}
+
+/// A node of the Program of an action; that of the Program itself has no path.
+pub(crate) fn program(action: TopicId, path: &str) -> NodeId {
+    let dot = if path.is_empty() { "" } else { "." };
+    NodeId::new(APPLICATION, format!("{action}.program{dot}{path}"))
 }
 
 /// The node of a topic that the mapping does not name.

@@ -27,6 +27,7 @@ mod methods;
 mod nodes;
 mod others;
 mod port;
+mod programs;
 mod properties;
 mod pubsub;
 mod sks;

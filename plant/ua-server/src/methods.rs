@@ -7,11 +7,12 @@ use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
 
-use bridge_node::{Answered, AskId, CallDescription, CallField};
+use bridge_node::{Answered, AskError, AskId, CallDescription, CallField};
 use bytes::Bytes;
 use mappings::{Mapping, TopicId};
 use messages::Rank;
 use opcua::nodes::{MethodBuilder, ObjectBuilder};
+use opcua::server::SubscriptionCache;
 use opcua::server::address_space::AddressSpace;
 use opcua::sync::Mutex;
 use opcua::types::{
@@ -25,6 +26,7 @@ use crate::address;
 use crate::argument_types::ArgumentTypes;
 use crate::layout::Shape;
 use crate::nodes::SpaceManager;
+use crate::programs::Programs;
 use crate::structures::Structure;
 use crate::value;
 
@@ -90,6 +92,8 @@ pub(crate) struct Methods {
     /// The objects around each Method, the outermost first.
     around: HashMap<TopicId, Vec<NodeId>>,
     types: ArgumentTypes,
+    /// Actions, as Programs beside their Methods.
+    programs: Programs,
     asked: HashMap<AskId, oneshot::Sender<Answered<Bytes>>>,
     /// Those whose clients wait no longer, to be told.
     given_up: VecDeque<AskId>,
@@ -119,11 +123,13 @@ pub(crate) enum Refused {
     Arguments(Vec<StatusCode>),
     /// Nothing can be asked.
     Status(StatusCode),
+    /// It was asked, and there is no response.
+    Asked(AskError),
 }
 
 impl Methods {
     pub(crate) fn new(
-        manager: Arc<SpaceManager>,
+        (manager, subscriptions): (Arc<SpaceManager>, Arc<SubscriptionCache>),
         mapping: &Arc<Mapping>,
         (heard, structures): (Heard, &[Structure]),
     ) -> Self {
@@ -136,6 +142,7 @@ impl Methods {
             &mut manager.address_space().write(),
         );
         Self {
+            programs: Programs::new(Arc::clone(&manager), subscriptions),
             manager,
             mapping: Arc::clone(mapping),
             heard,
@@ -151,9 +158,14 @@ impl Methods {
         }
     }
 
-    /// Shows a call, in the place of what it was. The parts of an action are Methods too.
+    /// Shows a call, in the place of what it was. The parts of an action are Methods too, and together a Program.
     pub(crate) fn known(&mut self, topic: TopicId, description: &Arc<CallDescription>) {
-        self.gone(topic);
+        self.show(topic, description);
+        self.programs.known(topic, description, &self.types);
+    }
+
+    fn show(&mut self, topic: TopicId, description: &Arc<CallDescription>) {
+        self.remove(topic);
         if self.shown.len() + self.refused.len() >= MOST_METHODS {
             self.tell_full();
             return;
@@ -196,10 +208,7 @@ impl Methods {
         }
         let around = add(&mut address_space, node, (topic, description), &self.types);
         drop(address_space);
-        let callable = Callable {
-            topic,
-            description: Arc::clone(description),
-        };
+        let callable = Callable::new(topic, description);
         let mut methods = self.manager.inner().methods().lock();
         methods.insert(node.clone(), callable);
         Some(around)
@@ -223,6 +232,16 @@ impl Methods {
 
     /// Takes a call away. What was asked is still answered.
     pub(crate) fn gone(&mut self, topic: TopicId) {
+        self.programs.gone(topic);
+        self.remove(topic);
+    }
+
+    /// What an action reports of one of its goals.
+    pub(crate) fn reported(&self, topic: TopicId, block: &[u8]) {
+        self.programs.reported(topic, block);
+    }
+
+    fn remove(&mut self, topic: TopicId) {
         self.refused.remove(&topic);
         let Some(node) = self.shown.remove(&topic) else {
             return;
@@ -260,7 +279,7 @@ impl Methods {
         };
         let mut moved: Vec<_> = moved.filter_map(callable).collect();
         for (topic, _) in &moved {
-            self.gone(*topic);
+            self.remove(*topic);
         }
         moved.extend(self.refused.drain());
         Moved(moved)
@@ -270,7 +289,7 @@ impl Methods {
     pub(crate) fn put(&mut self, Moved(moved): Moved, structures: &[Structure]) {
         self.types.set_variables(structures);
         for (topic, description) in moved {
-            self.known(topic, &description);
+            self.show(topic, &description);
         }
     }
 
@@ -354,9 +373,24 @@ impl Waiting {
 }
 
 impl Callable {
+    pub(crate) fn new(topic: TopicId, description: &Arc<CallDescription>) -> Self {
+        Self {
+            topic,
+            description: Arc::clone(description),
+        }
+    }
+
+    pub(crate) const fn topic(&self) -> TopicId {
+        self.topic
+    }
+
+    pub(crate) fn description(&self) -> &CallDescription {
+        &self.description
+    }
+
     /// Asks with those arguments, and gives what comes back. Given up when it is dropped, or when the client is gone.
     pub(crate) async fn call(
-        self,
+        &self,
         arguments: &[Variant],
         questions: &Questions,
         gone: impl Fn() -> bool,
@@ -378,10 +412,7 @@ impl Callable {
             .try_send(question)
             .map_err(|_| Refused::Status(StatusCode::BadTooManyOperations))?;
         let answer = waiting.answer(gone).await.map_err(Refused::Status)?;
-        let response = answer.map_err(|error| {
-            info!(topic = %self.topic, "a call came to nothing: {error}");
-            Refused::Status(StatusCode::from(error.status.0))
-        })?;
+        let response = answer.map_err(Refused::Asked)?;
         let fields = Fields::parse(&response);
         let fields = fields.map_err(|_| Refused::Status(StatusCode::BadDecodingError))?;
         let outputs = fields.map(|field| field.map(|field| value::from_field(&field)));
@@ -468,7 +499,11 @@ fn add(
     around
 }
 
-fn arguments(topic: TopicId, fields: &[CallField], types: &ArgumentTypes) -> Vec<Argument> {
+pub(crate) fn arguments(
+    topic: TopicId,
+    fields: &[CallField],
+    types: &ArgumentTypes,
+) -> Vec<Argument> {
     let argument = |field: &CallField| Argument {
         name: field.name.as_str().into(),
         data_type: types.data_type(topic, field),

@@ -28,7 +28,7 @@ use opcua::types::{
 use plant_opcua::server::Caller;
 use plant_opcua::users::Access;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
-use tracing::warn;
+use tracing::{info, warn};
 use uadp::Timestamp;
 
 use crate::access::{self, Genuine};
@@ -37,6 +37,7 @@ use crate::budget::{Answers, LARGEST, SMALL, Watched};
 use crate::history::{Past, Room, Series};
 use crate::layout::{FieldNode, Layout, TopicNode};
 use crate::methods::{Questions, Refused, Table};
+use crate::programs;
 use crate::properties;
 use crate::pubsub::PubSub;
 use crate::value;
@@ -59,6 +60,7 @@ pub(crate) struct SpaceNodes {
     exits: Exits,
     /// What clients can call.
     methods: Table,
+    programs: programs::Table,
     /// One client writes at a time.
     writing: Mutex<()>,
     /// Bytes of the largest value that may be written.
@@ -143,6 +145,7 @@ impl SpaceNodes {
             genuine: Genuine::default(),
             exits,
             methods: Table::default(),
+            programs: programs::Table::default(),
             writing: Mutex::new(()),
             largest_write: AtomicUsize::new(usize::MAX),
             refused: AtomicU64::new(0),
@@ -152,6 +155,16 @@ impl SpaceNodes {
     /// What clients can call.
     pub(crate) const fn methods(&self) -> &Table {
         &self.methods
+    }
+
+    /// The Programs they can drive, by their methods.
+    pub(crate) const fn programs(&self) -> &programs::Table {
+        &self.programs
+    }
+
+    /// What clients ask of calls.
+    pub(crate) const fn questions(&self) -> &Questions {
+        &self.exits.questions
     }
 
     /// Takes the nodes of some topics out and puts those of others in. Who watches a node that is gone is told.
@@ -507,6 +520,29 @@ impl SpaceNodes {
         self.exits.writes.try_send(write).map_err(|_| full)
     }
 
+    fn program(&self, method: &NodeId) -> Option<programs::Asked> {
+        self.programs.lock().get(method).cloned()
+    }
+
+    /// Calls a method of a Program, which goes on when its client does not.
+    async fn drive(
+        &self,
+        context: &RequestContext,
+        asked: programs::Asked,
+        arguments: &[Variant],
+    ) -> Result<Vec<Variant>, Refused> {
+        // Whoever may send goals may.
+        let may = context
+            .authenticator
+            .is_user_executable(&context.token, asked.goal());
+        if !may {
+            return Err(Refused::Status(StatusCode::BadUserAccessDenied));
+        }
+        let asked = asked.carry_out(arguments.to_vec());
+        let ended = tokio::spawn(asked).await;
+        ended.unwrap_or(Err(Refused::Status(StatusCode::BadInternalError)))
+    }
+
     /// Calls a method of the PubSub configuration.
     fn call_pubsub(&self, context: &RequestContext, method: &NodeId) -> StatusCode {
         let may = context
@@ -848,6 +884,9 @@ impl InMemoryNodeManagerImpl for SpaceNodes {
                     let arguments = method.arguments().to_vec();
                     callable.call(&arguments, &self.exits.questions, gone).await
                 }
+                None if let Some(asked) = self.program(method.method_id()) => {
+                    self.drive(context, asked, method.arguments()).await
+                }
                 None => match self.call_pubsub(context, method.method_id()) {
                     StatusCode::Good => Ok(Vec::new()),
                     refused => Err(Refused::Status(refused)),
@@ -861,6 +900,10 @@ impl InMemoryNodeManagerImpl for SpaceNodes {
                 Err(Refused::Arguments(statuses)) => {
                     method.set_argument_error(statuses);
                     method.set_status(StatusCode::BadInvalidArgument);
+                }
+                Err(Refused::Asked(error)) => {
+                    info!(method = %method.method_id(), "a call came to nothing: {error}");
+                    method.set_status(StatusCode::from(error.status.0));
                 }
                 Err(Refused::Status(status)) => method.set_status(status),
             }

@@ -154,8 +154,8 @@ impl ServerPort {
         )));
         tell_serving(&layout, &setup.pki, (&setup.url, port));
         let others = Others::new(mapping, &described.application_uri, setup.pki.root());
-        let methods = Methods::new(Arc::clone(&manager), mapping, (asked, &layout.structures));
         let nodes = (Arc::clone(&manager), Arc::clone(&subscriptions));
+        let methods = Methods::new(nodes.clone(), mapping, (asked, &layout.structures));
         let server = told_of(described, setup.url.advertised(port));
         let (told, components) = tell(server, setup.announce, nodes)?;
         Ok(Self {
@@ -259,6 +259,7 @@ impl Port for ServerPort {
         }
         if sample.status & BAD == 0 {
             self.others.sources.put(sample.topic, &sample.payload);
+            self.methods.reported(sample.topic, &sample.payload);
         }
         let shown = self
             .space

@@ -4,6 +4,7 @@
 //! each of the three types of the core namespace and of the declared type.
 
 use opcua::nodes::{BaseEventType, Event, EventField};
+use opcua::server::SubscriptionCache;
 use opcua::types::{
     AttributeId, ByteString, DateTime, LocalizedText, NodeId, NumericRange, ObjectTypeId,
     QualifiedName, Variant,
@@ -45,6 +46,22 @@ pub struct TransitionEvent {
     pub fields: Vec<(QualifiedName, Variant)>,
     /// When it happened.
     pub time: DateTime,
+}
+
+impl TransitionEvent {
+    /// Raises it on its source and on the Server object, as a ProgramTransitionEventType that has no subtype. A server that is
+    /// [`Server`](super::Server) raises events of types of its own, too.
+    pub fn raise(&self, subscriptions: &SubscriptionCache) {
+        let types = [
+            ObjectTypeId::ProgramTransitionEventType,
+            ObjectTypeId::TransitionEventType,
+            ObjectTypeId::BaseEventType,
+        ];
+        let types = types.map(NodeId::from).to_vec();
+        let id = opcua::crypto::random::byte_string(16);
+        let raised = Raised::new(self, types, id);
+        subscriptions.notify_events([(&raised as &dyn Event, &self.source)].into_iter());
+    }
 }
 
 /// An event on its way to clients.

@@ -1,0 +1,199 @@
+//! Actions of other spaces as Programs (OPC 10000-10): a client starts one with a goal, and watches and halts it, without a
+//! word of goals and their ids.
+//!
+//! A Program stands under the dotted name of its action below the folder `Programs`, while all three calls of the action are
+//! there. It is Ready at first and after success, Halted after anything else. Others may send goals of the same action
+//! meanwhile: it shows its own only.
+
+mod nodes;
+mod run;
+
+use std::collections::HashMap;
+use std::sync::Arc;
+
+use bridge_node::{ActionFamily, CallDescription, CallRole};
+use mappings::TopicId;
+use opcua::server::SubscriptionCache;
+use opcua::sync::Mutex;
+use opcua::types::NodeId;
+use tracing::{info, warn};
+
+use self::nodes::Nodes;
+pub(crate) use self::run::Asked;
+use self::run::Run;
+use crate::address;
+use crate::argument_types::ArgumentTypes;
+use crate::methods::Callable;
+use crate::nodes::SpaceManager;
+
+/// What clients can call, by the nodes of the methods.
+pub(crate) type Table = Mutex<HashMap<NodeId, Asked>>;
+
+/// Shows the actions of other spaces.
+pub(crate) struct Programs {
+    manager: Arc<SpaceManager>,
+    subscriptions: Arc<SubscriptionCache>,
+    /// The calls that are parts of actions.
+    parts: HashMap<TopicId, Arc<CallDescription>>,
+    /// By the calls that send goals.
+    shown: HashMap<TopicId, Shown>,
+    /// Whose feedback each value is.
+    feedback: HashMap<TopicId, TopicId>,
+    told_full: bool,
+}
+
+struct Shown {
+    run: Arc<Run>,
+    /// The objects around it, the outermost first.
+    around: Vec<NodeId>,
+    feedback: Option<TopicId>,
+}
+
+impl Programs {
+    pub(crate) fn new(manager: Arc<SpaceManager>, subscriptions: Arc<SubscriptionCache>) -> Self {
+        address::add_folder(
+            &address::programs_folder(),
+            "Programs",
+            address::root(),
+            &mut manager.address_space().write(),
+        );
+        Self {
+            manager,
+            subscriptions,
+            parts: HashMap::new(),
+            shown: HashMap::new(),
+            feedback: HashMap::new(),
+            told_full: false,
+        }
+    }
+
+    /// Takes note of a call. One that is no part of an action is none of ours.
+    pub(crate) fn known(
+        &mut self,
+        topic: TopicId,
+        description: &Arc<CallDescription>,
+        types: &ArgumentTypes,
+    ) {
+        if self.parts.get(&topic) == Some(description) {
+            return;
+        }
+        self.gone(topic);
+        let Some(goal) = goal_of(topic, description.role) else {
+            return;
+        };
+        if self.parts.len() >= MOST_PARTS {
+            if !std::mem::replace(&mut self.told_full, true) {
+                warn!("more than {MOST_PARTS} calls of actions: the rest is shown as no Programs");
+            }
+            return;
+        }
+        self.parts.insert(topic, Arc::clone(description));
+        self.show(goal, types);
+    }
+
+    fn show(&mut self, goal: TopicId, types: &ArgumentTypes) {
+        let Some(description) = self.parts.get(&goal) else {
+            return;
+        };
+        let CallRole::Goal(family) = description.role else {
+            return;
+        };
+        let part = |id| {
+            let topic = beside(goal, id)?;
+            Some(Callable::new(topic, self.parts.get(&topic)?))
+        };
+        let ActionFamily { cancel, result, .. } = family;
+        let (Some(cancel), Some(result)) = (part(cancel), part(result)) else {
+            return;
+        };
+        let send = Callable::new(goal, description);
+        let name = match &description.name[..] {
+            "" => goal.to_string(),
+            name => name.to_owned(),
+        };
+        let places = (Arc::clone(&self.manager), Arc::clone(&self.subscriptions));
+        let described = (&**description, result.description());
+        let (nodes, around) = Nodes::insert(places, (goal, &name), described, types);
+        let node = nodes.program();
+        let feedback = beside(goal, family.feedback);
+        let methods = nodes.methods();
+        let run = Run::new(name, nodes, [send, cancel, result]);
+        let inner = self.manager.inner();
+        let asked = |method| Asked::new(&run, method, inner.questions(), goal_node(goal, inner));
+        let all = methods.map(|(node, method)| (node, asked(method)));
+        inner.programs().lock().extend(all);
+        if let Some(feedback) = feedback {
+            self.feedback.insert(feedback, goal);
+        }
+        info!(topic = %goal, %node, "shown as a Program");
+        let shown = Shown {
+            run,
+            around,
+            feedback,
+        };
+        self.shown.insert(goal, shown);
+    }
+
+    /// Takes a call away, and the Program of which it was a part. What that was at has ended for its clients.
+    pub(crate) fn gone(&mut self, topic: TopicId) {
+        let Some(part) = self.parts.remove(&topic) else {
+            return;
+        };
+        let Some(goal) = goal_of(topic, part.role) else {
+            return;
+        };
+        let Some(shown) = self.shown.remove(&goal) else {
+            return;
+        };
+        if let Some(feedback) = shown.feedback {
+            self.feedback.remove(&feedback);
+        }
+        shown.run.leave();
+        let nodes = shown.run.nodes();
+        let mut programs = self.manager.inner().programs().lock();
+        for (method, _) in nodes.methods() {
+            programs.remove(&method);
+        }
+        drop(programs);
+        let taken = |object: &NodeId| {
+            let mut others = self.shown.values();
+            others.any(|other| other.around.contains(object))
+        };
+        let around = shown.around.iter().filter(|object| !taken(object));
+        nodes.remove(&around.collect::<Vec<_>>());
+    }
+
+    /// Shows what an action reports of a goal, if that is a Program's.
+    pub(crate) fn reported(&self, topic: TopicId, block: &[u8]) {
+        let goal = self.feedback.get(&topic);
+        if let Some(shown) = goal.and_then(|goal| self.shown.get(goal)) {
+            shown.run.reported(block);
+        }
+    }
+}
+
+/// The node of the Method that sends goals: who may call it may drive the Program.
+fn goal_node(goal: TopicId, nodes: &crate::nodes::SpaceNodes) -> NodeId {
+    let methods = nodes.methods().lock();
+    let mut all = methods.iter();
+    let found = all.find(|(_, callable)| callable.topic() == goal);
+    found.map_or_else(|| address::unmapped_call(goal), |(node, _)| node.clone())
+}
+
+/// The call that sends the goals of the action that a call is a part of.
+fn goal_of(topic: TopicId, role: CallRole) -> Option<TopicId> {
+    match role {
+        CallRole::Call => None,
+        CallRole::Goal(_) => Some(topic),
+        CallRole::Cancel { of } | CallRole::Result { of } => beside(topic, of),
+    }
+}
+
+/// The topic of another DataSetWriterId in the same namespace.
+fn beside(topic: TopicId, id: u16) -> Option<TopicId> {
+    let (space, namespace, _) = topic.triple();
+    TopicId::new(space, namespace, id)
+}
+
+/// Calls that are parts of actions: anybody in the space can announce some.
+const MOST_PARTS: usize = 3 * 256;

@@ -1,0 +1,486 @@
+//! The nodes of a Program, and what they show (OPC 10000-10, 5.2).
+
+use std::sync::Arc;
+
+use bridge_node::{CallDescription, CallField};
+use mappings::TopicId;
+use opcua::nodes::{MethodBuilder, NodeType, ObjectBuilder, ReferenceDirection, VariableBuilder};
+use opcua::server::SubscriptionCache;
+use opcua::server::address_space::{AddressSpace, EventNotifier};
+use opcua::types::{
+    Argument, AttributeId, ByteString, DataTypeId, DataValue, DateTime, LocalizedText, NodeId,
+    ObjectTypeId, QualifiedName, ReferenceTypeId, StatusCode, TimestampsToReturn, VariableTypeId,
+    Variant,
+};
+use plant_opcua::server::{StateRef, TransitionEvent};
+use program::{Method, State, Transition};
+
+use super::run::{SUCCEEDED, whole};
+use crate::address;
+use crate::argument_types::ArgumentTypes;
+use crate::methods::arguments;
+use crate::nodes::SpaceManager;
+
+/// The nodes of one Program.
+pub(super) struct Nodes {
+    manager: Arc<SpaceManager>,
+    subscriptions: Arc<SubscriptionCache>,
+    topic: TopicId,
+    name: String,
+    /// The fields of a result that have a node.
+    results: Vec<String>,
+    /// All of them, the Program first.
+    made: Vec<NodeId>,
+}
+
+/// What came out of a goal.
+pub(super) struct Outcome {
+    /// Of `action_msgs/GoalStatus`; 0 where it is not known.
+    pub(super) status: i64,
+    message: String,
+    fields: Vec<Variant>,
+}
+
+impl Outcome {
+    /// Of the answer: status, message, and the fields of the result.
+    pub(super) fn of(answer: Vec<Variant>) -> Self {
+        let mut fields = answer.into_iter();
+        let status = fields.next().as_ref().and_then(whole).unwrap_or_default();
+        let message = match fields.next() {
+            Some(Variant::String(text)) => text.as_ref().trim_end().to_owned(),
+            Some(_) | None => String::new(),
+        };
+        Self {
+            status,
+            message,
+            fields: fields.collect(),
+        }
+    }
+
+    /// Nothing is known of it.
+    pub(super) const fn lost(message: String) -> Self {
+        Self {
+            status: 0,
+            message,
+            fields: Vec::new(),
+        }
+    }
+
+    /// For people.
+    pub(super) fn said(&self) -> String {
+        match (&self.message[..], self.status) {
+            ("", SUCCEEDED) => "the goal is reached".to_owned(),
+            ("", 5) => "the goal was cancelled".to_owned(),
+            ("", 6) => "the goal was aborted".to_owned(),
+            ("", _) => "the goal is lost".to_owned(),
+            (message, _) => message.to_owned(),
+        }
+    }
+}
+
+impl Nodes {
+    /// Puts the Program of an action in, and the objects around it. Gives those too, the outermost first.
+    pub(super) fn insert(
+        (manager, subscriptions): (Arc<SpaceManager>, Arc<SubscriptionCache>),
+        (topic, name): (TopicId, &str),
+        (goal, result): (&CallDescription, &CallDescription),
+        types: &ArgumentTypes,
+    ) -> (Self, Vec<NodeId>) {
+        let mut address_space = manager.address_space().write();
+        let (around, last) = around(&mut address_space, name);
+        let parent = around.last().cloned();
+        let mut tree = Tree {
+            address_space: &mut address_space,
+            topic,
+            made: Vec::new(),
+        };
+        tree.program(last, parent.unwrap_or_else(address::programs_folder));
+        let taken = goal.request.get(1..).unwrap_or_default();
+        let takes = without(GOAL, arguments(topic, taken, types));
+        let gives = Argument {
+            name: "GoalId".into(),
+            data_type: DataTypeId::ByteString.into(),
+            value_rank: -1,
+            ..Argument::default()
+        };
+        tree.method(Method::Start, (&takes, &[gives]));
+        tree.method(Method::Halt, (&[], &[]));
+        tree.method(Method::Reset, (&[], &[]));
+        let shown = result.response.get(2..).unwrap_or_default();
+        let results = tree.results(shown, types);
+        let made = tree.made;
+        drop(address_space);
+        let nodes = Self {
+            manager,
+            subscriptions,
+            topic,
+            name: name.to_owned(),
+            results,
+            made,
+        };
+        (nodes, around)
+    }
+
+    pub(super) fn program(&self) -> NodeId {
+        self.node("")
+    }
+
+    pub(super) fn methods(&self) -> [(NodeId, Method); 3] {
+        METHODS.map(|method| (self.node(method.name()), method))
+    }
+
+    fn node(&self, path: &str) -> NodeId {
+        address::program(self.topic, path)
+    }
+
+    /// Takes them out, and what was around them alone. Who watches one is told.
+    pub(super) fn remove(&self, around: &[&NodeId]) {
+        let mut address_space = self.manager.address_space().write();
+        for node in &self.made {
+            drop(address_space.delete(node, true));
+        }
+        for object in around.iter().rev() {
+            drop(address_space.delete(object, true));
+        }
+        drop(address_space);
+        let mut notifier = self.subscriptions.data_notifier();
+        for node in &self.made {
+            let gone = DataValue::new_now_status(Variant::Empty, StatusCode::BadNodeIdUnknown);
+            notifier.notify(node, AttributeId::Value, gone);
+        }
+    }
+
+    /// What is so before anything happens.
+    pub(super) fn show_first(&self, now: State) {
+        self.show(state(now).to_vec());
+    }
+
+    /// The goal that is at work, before anything is known of its end.
+    pub(super) fn show_goal(&self, id: &ByteString) {
+        self.show(vec![
+            ("FinalResultData.GoalId", Variant::from(id.clone())),
+            ("FinalResultData.Status", Variant::Int32(EXECUTING)),
+            ("FinalResultData.Message", Variant::from("")),
+        ]);
+    }
+
+    pub(super) fn show_outcome(&self, outcome: &Outcome) {
+        let status = i32::try_from(outcome.status).unwrap_or_default();
+        self.show(vec![
+            ("FinalResultData.Status", Variant::Int32(status)),
+            (
+                "FinalResultData.Message",
+                Variant::from(outcome.message.as_str()),
+            ),
+        ]);
+        let nodes = self.results.iter().map(|name| self.node(&result(name)));
+        self.write(nodes.zip(outcome.fields.iter().cloned()).collect());
+    }
+
+    /// What its action reports: the only field, or all of them.
+    pub(super) fn show_feedback(&self, fields: &[Variant]) {
+        let value = match fields {
+            [one] => one.clone(),
+            all => Variant::from(all.to_vec()),
+        };
+        self.show(vec![("Feedback", value)]);
+    }
+
+    pub(super) fn show_transition(&self, transition: &Transition, message: &str) {
+        let time = DateTime::now();
+        let mut values = state(transition.to).to_vec();
+        values.extend([
+            (
+                "LastTransition",
+                Variant::from(LocalizedText::new("en", transition.name)),
+            ),
+            (
+                "LastTransition.Id",
+                Variant::from(NodeId::new(0, transition.node_id)),
+            ),
+            ("LastTransition.Number", Variant::from(transition.number)),
+            ("LastTransition.TransitionTime", Variant::from(time)),
+        ]);
+        self.show(values);
+        let of = |name: &str, node_id, number| StateRef {
+            name: name.to_owned(),
+            id: NodeId::new(0, node_id),
+            number,
+        };
+        let of_state = |state: State| of(state.name(), state.node_id(), state.number());
+        let event = TransitionEvent {
+            source: self.program(),
+            source_name: self.name.clone(),
+            event_type: ObjectTypeId::ProgramTransitionEventType.into(),
+            message: match message {
+                "" => transition.name.to_owned(),
+                message => message.to_owned(),
+            },
+            severity: match transition.to {
+                State::Halted => FAILED,
+                State::Ready | State::Running | State::Suspended => USUAL,
+            },
+            from_state: of_state(transition.from),
+            to_state: of_state(transition.to),
+            transition: of(transition.name, transition.node_id, transition.number),
+            intermediate_result: Variant::Empty,
+            fields: Vec::new(),
+            time,
+        };
+        event.raise(&self.subscriptions);
+    }
+
+    fn show(&self, values: Vec<(&str, Variant)>) {
+        let values = values.into_iter();
+        self.write(
+            values
+                .map(|(path, value)| (self.node(path), value))
+                .collect(),
+        );
+    }
+
+    fn write(&self, values: Vec<(NodeId, Variant)>) {
+        let mut address_space = self.manager.address_space().write();
+        let mut shown = Vec::with_capacity(values.len());
+        for (node, value) in values {
+            if let Some(NodeType::Variable(variable)) = address_space.find_mut(&node) {
+                variable.set_data_value(DataValue::new_now(value));
+                shown.push(node);
+            }
+        }
+        self.subscriptions.maybe_notify(
+            shown.iter().map(|node| (node, AttributeId::Value)),
+            |node, attribute, range, encoding| {
+                let node = address_space.find(node)?.as_node();
+                node.get_attribute(TimestampsToReturn::Both, attribute, range, encoding)
+            },
+        );
+    }
+}
+
+/// The objects that the dots of a name say, made where they are not there, and what is behind the last dot.
+fn around<'n>(address_space: &mut AddressSpace, name: &'n str) -> (Vec<NodeId>, &'n str) {
+    let mut parts = name
+        .split('.')
+        .map(str::trim)
+        .filter(|part| !part.is_empty());
+    let last = parts.next_back().unwrap_or(name);
+    let (mut around, mut path) = (Vec::new(), Vec::new());
+    let mut parent = address::programs_folder();
+    for part in parts.take(MOST_PARTS) {
+        path.push(part);
+        let object = address::program_folder(&path);
+        if !address_space.node_exists(&object) {
+            address::add_folder(&object, part, parent, address_space);
+        }
+        around.push(object.clone());
+        parent = object;
+    }
+    (around, last)
+}
+
+/// Puts nodes in, and remembers which.
+struct Tree<'a> {
+    address_space: &'a mut AddressSpace,
+    topic: TopicId,
+    made: Vec<NodeId>,
+}
+
+impl Tree<'_> {
+    fn program(&mut self, name: &str, parent: NodeId) {
+        let node = self.made("");
+        ObjectBuilder::new(&node, names(name), LocalizedText::from(name))
+            .description(LocalizedText::from(self.topic.to_string()))
+            .has_type_definition(ObjectTypeId::ProgramStateMachineType)
+            .event_notifier(EventNotifier::SUBSCRIBE_TO_EVENTS)
+            .organized_by(parent)
+            .insert(self.address_space);
+        for (path, type_, kind) in [
+            ("CurrentState", DataTypeId::LocalizedText, STATE),
+            ("CurrentState.Id", DataTypeId::NodeId, PROPERTY),
+            ("CurrentState.Number", DataTypeId::UInt32, PROPERTY),
+            ("LastTransition", DataTypeId::LocalizedText, TRANSITION),
+            ("LastTransition.Id", DataTypeId::NodeId, PROPERTY),
+            ("LastTransition.Number", DataTypeId::UInt32, PROPERTY),
+            (
+                "LastTransition.TransitionTime",
+                DataTypeId::UtcTime,
+                PROPERTY,
+            ),
+            ("Deletable", DataTypeId::Boolean, PROPERTY),
+            ("AutoDelete", DataTypeId::Boolean, PROPERTY),
+            ("RecycleCount", DataTypeId::Int32, PROPERTY),
+        ] {
+            let value = if type_ == DataTypeId::Boolean {
+                Some(Variant::from(false))
+            } else {
+                (type_ == DataTypeId::Int32).then(|| Variant::from(0_i32))
+            };
+            self.variable(path, (type_.into(), -1), kind, value);
+        }
+        self.variable(
+            "Feedback",
+            (DataTypeId::BaseDataType.into(), -2),
+            VALUE,
+            None,
+        );
+    }
+
+    /// What is shown of a result: the goal, its end, and its fields under their names.
+    fn results(&mut self, fields: &[CallField], types: &ArgumentTypes) -> Vec<String> {
+        let node = self.made("FinalResultData");
+        let parent = address::program(self.topic, "");
+        ObjectBuilder::new(
+            &node,
+            core("FinalResultData"),
+            LocalizedText::from("FinalResultData"),
+        )
+        .has_type_definition(ObjectTypeId::BaseObjectType)
+        .component_of(parent)
+        .insert(self.address_space);
+        for (name, type_) in OWN_RESULTS {
+            self.variable(&result(name), (type_.into(), -1), VALUE, None);
+        }
+        let arguments = without(RESULT, arguments(self.topic, fields, types));
+        let named = arguments.into_iter().map(|field| {
+            let mut name = field.name.as_ref().to_owned();
+            if OWN_RESULTS.iter().any(|(own, _)| *own == name) {
+                name.push('_');
+            }
+            let type_ = (field.data_type, field.value_rank);
+            self.variable(&result(&name), type_, VALUE, None);
+            name
+        });
+        named.collect()
+    }
+
+    fn variable(
+        &mut self,
+        path: &str,
+        (data_type, rank): (NodeId, i32),
+        (kind, reference): (VariableTypeId, ReferenceTypeId),
+        value: Option<Variant>,
+    ) {
+        let (above, name) = path.split_once('.').unwrap_or(("", path));
+        let node = address::program(self.topic, path);
+        if self.address_space.node_exists(&node) {
+            return;
+        }
+        let is_core = kind != VariableTypeId::BaseDataVariableType;
+        let browse_name = if is_core { core(name) } else { names(name) };
+        VariableBuilder::new(&node, browse_name, LocalizedText::from(name))
+            .data_type(data_type)
+            .value_rank(rank)
+            .has_type_definition(kind)
+            .reference(
+                address::program(self.topic, above),
+                reference,
+                ReferenceDirection::Inverse,
+            )
+            .insert(self.address_space);
+        let waiting = StatusCode::BadWaitingForInitialData;
+        let value = value.map_or_else(
+            || DataValue::new_now_status(Variant::Empty, waiting),
+            DataValue::new_now,
+        );
+        if let Some(NodeType::Variable(variable)) = self.address_space.find_mut(&node) {
+            variable.set_data_value(value);
+        }
+        self.made.push(node);
+    }
+
+    fn method(&mut self, method: Method, (takes, gives): (&[Argument], &[Argument])) {
+        let name = method.name();
+        let node = self.made(name);
+        let mut builder = MethodBuilder::new(&node, core(name), LocalizedText::from(name))
+            .component_of(address::program(self.topic, ""))
+            .executable(true)
+            .user_executable(true);
+        if !takes.is_empty() {
+            let id = self.made(&format!("{name}.InputArguments"));
+            builder = builder.input_args(self.address_space, &id, takes);
+        }
+        if !gives.is_empty() {
+            let id = self.made(&format!("{name}.OutputArguments"));
+            builder = builder.output_args(self.address_space, &id, gives);
+        }
+        // It stays executable: the library refuses others as BadUserAccessDenied, where OPC 10000-10 has BadInvalidState.
+        builder.insert(self.address_space);
+    }
+
+    fn made(&mut self, path: &str) -> NodeId {
+        let node = address::program(self.topic, path);
+        self.made.push(node.clone());
+        node
+    }
+}
+
+fn state(state: State) -> [(&'static str, Variant); 3] {
+    [
+        (
+            "CurrentState",
+            Variant::from(LocalizedText::new("en", state.name())),
+        ),
+        (
+            "CurrentState.Id",
+            Variant::from(NodeId::new(0, state.node_id())),
+        ),
+        ("CurrentState.Number", Variant::from(state.number())),
+    ]
+}
+
+/// The fields of a message under their own names.
+fn without(message: &str, mut fields: Vec<Argument>) -> Vec<Argument> {
+    for field in &mut fields {
+        if let Some(name) = field.name.as_ref().strip_prefix(message) {
+            field.name = name.into();
+        }
+    }
+    fields
+}
+
+fn result(name: &str) -> String {
+    format!("FinalResultData.{name}")
+}
+
+/// A name that OPC 10000-10 gives.
+fn core(name: &str) -> QualifiedName {
+    QualifiedName::new(0, name)
+}
+
+/// A name of our own.
+fn names(name: &str) -> QualifiedName {
+    QualifiedName::new(address::programs_folder().namespace, name)
+}
+
+/// Beside the fields of a result.
+const OWN_RESULTS: [(&str, DataTypeId); 3] = [
+    ("GoalId", DataTypeId::ByteString),
+    ("Status", DataTypeId::Int32),
+    ("Message", DataTypeId::String),
+];
+const METHODS: [Method; 3] = [Method::Start, Method::Halt, Method::Reset];
+const PROPERTY: (VariableTypeId, ReferenceTypeId) =
+    (VariableTypeId::PropertyType, ReferenceTypeId::HasProperty);
+const VALUE: (VariableTypeId, ReferenceTypeId) = (
+    VariableTypeId::BaseDataVariableType,
+    ReferenceTypeId::HasComponent,
+);
+const STATE: (VariableTypeId, ReferenceTypeId) = (
+    VariableTypeId::FiniteStateVariableType,
+    ReferenceTypeId::HasComponent,
+);
+const TRANSITION: (VariableTypeId, ReferenceTypeId) = (
+    VariableTypeId::FiniteTransitionVariableType,
+    ReferenceTypeId::HasComponent,
+);
+/// Objects around one Program.
+const MOST_PARTS: usize = 8;
+/// What the fields of a goal and of a result are announced behind.
+const GOAL: &str = "goal.";
+const RESULT: &str = "result.";
+/// Of `action_msgs/GoalStatus`.
+const EXECUTING: i32 = 2;
+/// Severities from 1 to 1000 (OPC 10000-5, 6.4.2).
+const USUAL: u16 = 100;
+const FAILED: u16 = 400;
