@@ -1,7 +1,7 @@
 """Who is let into an OPC UA server, and what each may do there: a JSON line for each try.
 
 `pairs FOLDER` makes the keys and certificates that the tries use: of a client (`client`), of one whose time is over
-(`expired`), and of a user (`user`). `tries URL FOLDER NODE TYPE VALUE USER PASSWORD` tries each security policy and mode with
+(`expired`), and of a user (`user`). `issued FOLDER` makes authorities and what they issue, with their revocation lists. `tries URL FOLDER NODE TYPE VALUE USER PASSWORD` tries each security policy and mode with
 each kind of user, reading and writing the node. `endpoints URL` says which
 policies a server offers. `audit URL` tells of the events of the Server object. `crowd URL COUNT` opens that many sessions at once and
 says how many came in; with `--vanish` each has a subscription, and its connection breaks off as that of a client that is killed.
@@ -10,6 +10,7 @@ says how many came in; with `--vanish` each has a subscription, and its connecti
 import argparse
 import asyncio
 import datetime
+import logging
 import os
 import pathlib
 import socket
@@ -27,8 +28,8 @@ import opcua_session
 DAY = datetime.timedelta(days=1)
 
 
-def make(folder, name, uri, begin, end):
-    """A key and a self-signed certificate of an application, valid from the one day to the other from now."""
+def make(folder, name, uri, begin, end, above=None):
+    """A key and a certificate of an application, valid from the one day to the other from now: self-signed, or by an authority."""
     key = rsa.generate_private_key(public_exponent=65537, key_size=2048)
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
     now = datetime.datetime.now(datetime.timezone.utc)
@@ -40,7 +41,7 @@ def make(folder, name, uri, begin, end):
     builder = (
         x509.CertificateBuilder()
         .subject_name(subject)
-        .issuer_name(subject)
+        .issuer_name(above[1].subject if above else subject)
         .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
         .not_valid_before(now + begin * DAY)
@@ -50,13 +51,78 @@ def make(folder, name, uri, begin, end):
         .add_extension(x509.KeyUsage(**usage), critical=False)
         .add_extension(x509.ExtendedKeyUsage([ExtendedKeyUsageOID.CLIENT_AUTH]), critical=False)
     )
-    certificate = builder.sign(key, hashes.SHA256())
+    certificate = builder.sign(above[0] if above else key, hashes.SHA256())
     folder.mkdir(parents=True, exist_ok=True)
     pem = key.private_bytes(
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )
     (folder / f"{name}_key.pem").write_bytes(pem)
     (folder / f"{name}_certificate.der").write_bytes(certificate.public_bytes(serialization.Encoding.DER))
+    return certificate
+
+
+def authority(folder, name, above=None, end=365):
+    """The key and the certificate of an authority, which another one may have issued."""
+    key = rsa.generate_private_key(public_exponent=65537, key_size=2048)
+    subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+    issuer, signs = (above[1].subject, above[0]) if above else (subject, key)
+    now = datetime.datetime.now(datetime.timezone.utc)
+    usage = dict.fromkeys(
+        ["content_commitment", "key_encipherment", "data_encipherment", "key_agreement", "encipher_only", "decipher_only"],
+        False,
+    ) | dict.fromkeys(["digital_signature", "key_cert_sign", "crl_sign"], True)
+    builder = (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - 30 * DAY)
+        .not_valid_after(now + end * DAY)
+        .add_extension(x509.BasicConstraints(ca=True, path_length=None), critical=True)
+        .add_extension(x509.KeyUsage(**usage), critical=True)
+    )
+    certificate = builder.sign(signs, hashes.SHA256())
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / f"{name}.der").write_bytes(certificate.public_bytes(serialization.Encoding.DER))
+    return key, certificate
+
+
+def revocations(folder, name, of, revoked, end=30):
+    """The revocation list of an authority."""
+    now = datetime.datetime.now(datetime.timezone.utc)
+    builder = (
+        x509.CertificateRevocationListBuilder()
+        .issuer_name(of[1].subject)
+        .last_update(now - 20 * DAY if end < 0 else now - datetime.timedelta(seconds=5))
+        .next_update(now + end * DAY)
+    )
+    for one in revoked:
+        builder = builder.add_revoked_certificate(
+            x509.RevokedCertificateBuilder().serial_number(one.serial_number).revocation_date(now).build()
+        )
+    made = builder.sign(of[0], hashes.SHA256())
+    (folder / name).write_bytes(made.public_bytes(serialization.Encoding.DER))
+
+
+def issued(folder):
+    uri = opcua_session.APPLICATION_URI
+    plant = authority(folder, "plant")
+    between = authority(folder, "between", plant)
+    over = authority(folder, "over", end=-1)
+    client = make(folder, "client", uri, -1, 365, plant)
+    make(folder, "late", uri, -30, -1, plant)
+    gone = make(folder, "gone", uri, -1, 365, plant)
+    make(folder, "below", uri, -1, 365, between)
+    make(folder, "orphan", uri, -1, 365, over)
+    make(folder, "stranger", uri, -1, 365, authority(folder, "strange"))
+    revocations(folder, "plant.crl", plant, [gone])
+    revocations(folder, "plant-old.crl", plant, [], -1)
+    revocations(folder, "plant-all.crl", plant, [gone, between[1]])
+    revocations(folder, "plant-now.crl", plant, [gone, client])
+    revocations(folder, "between.crl", between, [])
+    revocations(folder, "over.crl", over, [])
+    lifetime.say(made=str(folder))
 
 
 def pairs(folder):
@@ -76,9 +142,24 @@ def status_of(error):
     return None
 
 
+class Refusals(logging.Handler):
+    """The error that ends a connection: the client logs it, and raises another one."""
+
+    def __init__(self):
+        super().__init__()
+        self.last = None
+        logging.getLogger("asyncua").addHandler(self)
+
+    def emit(self, record):
+        for one in record.args if isinstance(record.args, tuple) else ():
+            if isinstance(one, ua.ErrorMessage):
+                self.last = ua.StatusCode(one.Error.value).name
+
+
 async def tried(args, client, about):
     """Connects, reads and writes, and says how each ended."""
     said = dict(about)
+    refusals = Refusals()
     try:
         async with client:
             said["connected"] = "Good"
@@ -94,7 +175,7 @@ async def tried(args, client, about):
                 said.setdefault("write", status_of(refused))
     except Exception as error:  # whatever it is, it is the outcome
         if "connected" not in said:
-            said["connected"] = status_of(error) or repr(error)
+            said["connected"] = refusals.last or status_of(error) or repr(error)
     lifetime.say(**said)
 
 
@@ -206,6 +287,21 @@ async def crowd(args):
     lifetime.say(**said)
 
 
+async def hold(args):
+    """Stays until the connection is cut off."""
+    security, mode = args.with_security[0]
+    client = await secured(args, args.client, security, mode)
+    await client.connect()
+    lifetime.say(ready=True)
+    try:
+        while True:
+            await client.get_node(ua.NodeId(ua.ObjectIds.Server_ServerStatus_CurrentTime)).read_value()
+            await asyncio.sleep(0.2)
+    except Exception as error:  # whatever it is, the connection is gone
+        lifetime.say(cut_off=repr(error))
+        os._exit(0)
+
+
 def ways(text):
     """`None,Basic256Sha256/Sign`"""
     for one in text.split(","):
@@ -218,6 +314,8 @@ def main():
     verbs = parser.add_subparsers(dest="verb", required=True)
     making = verbs.add_parser("pairs")
     making.add_argument("folder", type=pathlib.Path)
+    issuing = verbs.add_parser("issued")
+    issuing.add_argument("folder", type=pathlib.Path)
     trying = verbs.add_parser("tries")
     trying.add_argument("endpoint")
     trying.add_argument("folder")
@@ -230,6 +328,12 @@ def main():
     trying.add_argument("--users", default="anonymous")
     trying.add_argument("--user")
     trying.add_argument("--password")
+    holding = verbs.add_parser("hold")
+    holding.add_argument("endpoint")
+    holding.add_argument("folder")
+    holding.add_argument("--client", default="client")
+    holding.add_argument("--application-uri", default=opcua_session.APPLICATION_URI)
+    holding.add_argument("--ways", dest="with_security", type=lambda text: list(ways(text)), required=True)
     telling = verbs.add_parser("endpoints")
     telling.add_argument("endpoint")
     auditing = verbs.add_parser("audit")
@@ -242,10 +346,14 @@ def main():
     lifetime.bound(120.0)
     if args.verb == "pairs":
         pairs(args.folder)
+    elif args.verb == "issued":
+        issued(args.folder)
     elif args.verb == "endpoints":
         asyncio.run(endpoints(args.endpoint))
     elif args.verb == "audit":
         asyncio.run(audit(args.endpoint))
+    elif args.verb == "hold":
+        asyncio.run(hold(args))
     elif args.verb == "crowd":
         asyncio.run(crowd(args))
     else:

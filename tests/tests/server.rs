@@ -2,6 +2,8 @@
 
 #[path = "server/access.rs"]
 mod access;
+#[path = "server/authorities.rs"]
+mod authorities;
 #[path = "server/history.rs"]
 mod history;
 #[path = "server/pubsub.rs"]

@@ -17,6 +17,8 @@ pub enum Standing {
     Own,
     /// Who has it is let in.
     Trusted,
+    /// Of an authority that others are checked with, and that is not trusted itself.
+    Issuer,
     /// Who has it was refused, and is refused until it is trusted.
     Rejected,
 }
@@ -28,6 +30,7 @@ impl Standing {
         match self {
             Self::Own => "own",
             Self::Trusted => "trusted",
+            Self::Issuer => "issuers",
             Self::Rejected => "rejected",
         }
     }
@@ -50,6 +53,8 @@ pub struct Stored {
     pub until: String,
     /// Whether it is valid now.
     pub is_valid: bool,
+    /// Whether it is one of an authority, with which all that it issues are trusted.
+    pub is_authority: bool,
 }
 
 /// Why a certificate is not where it is to be.
@@ -89,13 +94,13 @@ pub enum StoreFault {
     Several(String),
 }
 
-/// The certificates of a store: its own, those that are trusted, those that were refused. A file that is none is left out.
+/// The certificates of a store: its own, those that are trusted, those of authorities between, those that were refused. A file that is none is left out.
 ///
 /// # Errors
 /// A directory that is there and cannot be read.
 pub fn list(root: &Path) -> Result<Vec<Stored>, StoreFault> {
     let mut found: Vec<Stored> = stored(&root.join(OWN), Standing::Own).into_iter().collect();
-    for standing in [Standing::Trusted, Standing::Rejected] {
+    for standing in [Standing::Trusted, Standing::Issuer, Standing::Rejected] {
         let folder = root.join(standing.name());
         let entries = match fs::read_dir(&folder) {
             Ok(entries) => entries,
@@ -242,7 +247,28 @@ pub fn stored(path: &Path, standing: Standing) -> Option<Stored> {
             .not_after()
             .map_or_else(|_| String::new(), |day| day.format("%Y-%m-%d").to_string()),
         is_valid: certificate.is_time_valid(&now).is_ok(),
+        is_authority: is_authority(&certificate),
     })
+}
+
+fn is_authority(certificate: &X509) -> bool {
+    let der = certificate.to_der().unwrap_or_default();
+    trust::Certificate::read(&der).is_ok_and(|one| one.is_authority())
+}
+
+/// Keeps the certificate of an authority that others are checked with, from a file in DER or PEM.
+///
+/// # Errors
+/// It is none of an authority, or the store cannot be written.
+pub fn keep_issuer(root: &Path, file: &Path) -> Result<Stored, StoreFault> {
+    let certificate = read(file)?;
+    if !is_authority(&certificate) {
+        return Err(StoreFault::Certificate {
+            path: file.to_owned(),
+            why: "it is not of an authority".to_owned(),
+        });
+    }
+    keep(root, &certificate, Standing::Issuer)
 }
 
 /// The ApplicationUri in a certificate: the one URI among its alternative names (OPC 10000-6, 6.2.2).

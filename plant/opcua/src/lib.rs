@@ -1,13 +1,15 @@
 //! OPC UA for the programs of the plant: servers whose address space is made of NodeSets and of instances of their
 //! types, and clients that come back by themselves. It knows no skills, no discovery, no space and no ROS.
 //!
-//! Reading order: `limits` (the bounds of both sides), `endpoint`, `pki` and `certificates` (how clients get in), `nodeset` (types from
+//! Reading order: `limits` (the bounds of both sides), `endpoint`, `pki`, `certificates`, `known` and `door` (how clients get in), `nodeset` (types from
 //! files), `users` and `audit`, `server` and `client`.
 
 pub mod audit;
 pub mod certificates;
 pub mod client;
+pub mod door;
 pub mod endpoint;
+pub mod known;
 pub mod limits;
 pub mod nodeset;
 pub mod pki;

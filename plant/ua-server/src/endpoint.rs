@@ -1,14 +1,18 @@
 //! What clients may choose of the server: its endpoints and their security.
 
-use std::net::SocketAddr;
+use std::net::{SocketAddr, TcpListener};
 
+use bridge_node::{Failure, FailureKind};
 use mappings::{SecurityPolicy, Server, ServerLimits};
 use opcua::server::{Limits, ServerBuilder};
 use opcua::types::{BuildInfo, UAString};
+use plant_opcua::door::Door;
 use plant_opcua::endpoint::EndpointUrl;
 use plant_opcua::limits;
-use plant_opcua::pki::{OWN_CERTIFICATE, OWN_KEY};
+use plant_opcua::pki::{OWN_CERTIFICATE, OWN_KEY, Pki};
 use plant_opcua::server::Security;
+use tokio::runtime::Runtime;
+use tracing::warn;
 
 /// What the server offers of what the mapping says, listening at `address`.
 pub(crate) fn security(described: &Server, address: SocketAddr) -> Vec<Security> {
@@ -82,7 +86,66 @@ fn within(told: ServerLimits) -> Limits {
     limits
 }
 
+/// The server's own threads, and the listener as they take it.
+pub(crate) fn threads(
+    listener: TcpListener,
+) -> Result<(Runtime, tokio::net::TcpListener), Failure> {
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(SERVER_THREADS)
+        .thread_name("opcua")
+        .enable_all()
+        .build()
+        .map_err(io_fault)?;
+    let listener = taken_by(&runtime, listener).map_err(io_fault)?;
+    Ok((runtime, listener))
+}
+
+/// A listener as the threads of the server take it.
+fn taken_by(runtime: &Runtime, listener: TcpListener) -> std::io::Result<tokio::net::TcpListener> {
+    let _inside = runtime.enter();
+    tokio::net::TcpListener::from_std(listener)
+}
+
+pub(crate) type Standing = Option<(Door, TcpListener)>;
+
+/// The door in front of the server with the listener that clients reach, where the store wants one; the server's own listener; and the
+/// server with the store that it is to look into.
+pub(crate) fn door(
+    pki: &Pki,
+    trust_any: bool,
+    (listener, builder): (TcpListener, ServerBuilder),
+) -> Result<(Standing, TcpListener, ServerBuilder), Failure> {
+    let builder = builder.trust_client_certs(trust_any);
+    let wanted = if trust_any {
+        warn!("every client certificate is trusted, and kept as trusted: for tests only");
+        None
+    } else {
+        Door::of(pki.root()).map_err(io_fault)?
+    };
+    Ok(match wanted {
+        Some((door, behind)) => {
+            let builder = door.behind().used_by(builder);
+            (Some((door, listener)), behind, builder)
+        }
+        None => (None, listener, builder.pki_dir(pki.root())),
+    })
+}
+
+/// Lets clients in through the door.
+pub(crate) fn stand(runtime: &Runtime, door: Standing) -> Result<(), Failure> {
+    if let Some((door, listener)) = door {
+        let listener = taken_by(runtime, listener).map_err(io_fault)?;
+        drop(runtime.spawn(door.stand(listener)));
+    }
+    Ok(())
+}
+
+fn io_fault(error: std::io::Error) -> Failure {
+    Failure::new(FailureKind::Io, error.to_string())
+}
+
 const APPLICATION_NAME: &str = "UA bridge server";
 pub(crate) const PRODUCT_URI: &str = "urn:ua-bridge:server";
 /// Answers of a session from the history that are not at their end.
 const MOST_HISTORY_GOES_ON: usize = 100;
+const SERVER_THREADS: usize = 2;

@@ -103,7 +103,6 @@ impl ServerPort {
     /// used.
     pub(crate) fn start(mapping: &Arc<Mapping>, setup: Setup) -> Result<Self, Failure> {
         let configuration = |error: String| Failure::new(FailureKind::Configuration, error);
-        let io = |error: String| Failure::new(FailureKind::Io, error);
 
         let mut types = setup.types;
         let layout =
@@ -113,9 +112,6 @@ impl ServerPort {
         let (listener, address) = listen(&setup.pki, &setup.url, described)?;
         let port = address.port();
         let security = endpoint::security(described, address);
-        if setup.trust_any_client {
-            warn!("every client certificate is trusted, and kept as trusted: for tests only");
-        }
         if !address.ip().is_loopback() {
             tell_open(&setup.url, described, &security);
         }
@@ -130,9 +126,10 @@ impl ServerPort {
         };
         let layout = Arc::clone(&nodes.layout);
         let methods = [setup.sks.methods(), pubsub.methods()].concat();
-        let (server, handle) = endpoint::server(described, (&setup.url, port), &security)
-            .pki_dir(setup.pki.root())
-            .trust_client_certs(setup.trust_any_client)
+        let builder = endpoint::server(described, (&setup.url, port), &security);
+        let (door, listener, builder) =
+            endpoint::door(&setup.pki, setup.trust_any_client, (listener, builder))?;
+        let (server, handle) = builder
             .with_authenticator(Arc::clone(&access) as Arc<dyn AuthManager>)
             .with_node_manager(core_with(methods, history::capabilities(), prepared))
             .with_node_manager(Ordered::around(nodes))
@@ -143,8 +140,9 @@ impl ServerPort {
         pubsub.stand(places(&handle, &manager));
         pubsub.show(mapping, &layout);
 
-        let (runtime, listener) = threads(listener).map_err(|error| io(error.to_string()))?;
+        let (runtime, listener) = endpoint::threads(listener)?;
         let serving = runtime.spawn(server.run_with(listener));
+        endpoint::stand(&runtime, door)?;
         let subscriptions = Arc::clone(handle.subscriptions());
         audit(&access, &handle);
         drop(runtime.spawn(look_again(
@@ -591,20 +589,6 @@ fn written(topics: impl Iterator<Item = TopicId>) -> impl Iterator<Item = TopicI
     topics.filter(|topic| topic.space == SpaceId::UA)
 }
 
-/// The server's own threads, and the listener as they take it.
-fn threads(listener: TcpListener) -> std::io::Result<(Runtime, tokio::net::TcpListener)> {
-    let runtime = tokio::runtime::Builder::new_multi_thread()
-        .worker_threads(SERVER_THREADS)
-        .thread_name("opcua")
-        .enable_all()
-        .build()?;
-    let listener = {
-        let _inside = runtime.enter();
-        tokio::net::TcpListener::from_std(listener)?
-    };
-    Ok((runtime, listener))
-}
-
 /// Ready, once, when the server has ended by itself.
 async fn ended(serving: &mut Option<JoinHandle<Result<(), String>>>) -> String {
     let Some(running) = serving else {
@@ -656,7 +640,6 @@ fn manager(handle: &ServerHandle, layout: &Layout) -> Result<Arc<SpaceManager>, 
 
 /// The severity of what is no value, in the upper half of a StatusCode.
 const BAD: u16 = 0x8000;
-const SERVER_THREADS: usize = 2;
 /// How many values clients wrote wait for the run loop; a client is refused when that many do.
 const MOST_WRITES: usize = 1_024;
 /// How many KiB all of these may have together.

@@ -3,13 +3,14 @@
 //! A server that runs takes notice by itself: certificates are looked for at each connection, and users within a second.
 
 use std::io::{self, BufRead as _, IsTerminal as _, Write as _};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use bridge_node::FailureKind;
 use clap::Parser as _;
 use clap::error::ErrorKind;
 use plant_opcua::certificates::{self, StoreFault, Stored};
+use plant_opcua::known;
 use plant_opcua::pki;
 use plant_opcua::users::{self, Credential, Roles, User, UserFault, Users};
 
@@ -23,11 +24,15 @@ struct Verbs {
 
 #[derive(Debug, clap::Subcommand)]
 enum Verb {
-    /// Trust the certificate of a client: one that was refused, or that of a file
+    /// Trust the certificate of a client: one that was refused, or that of a file. With that of an authority, all that it has
+    /// issued and not revoked; its revocation list is taken up in the same way
     Trust {
         /// The first digits of its thumbprint, as the log of the server has them, or a file in DER or PEM
         #[arg(value_name = "THUMBPRINT|FILE")]
         which: String,
+        /// The file is of an authority that others are checked with, and that is not trusted for itself
+        #[arg(long)]
+        issuer: bool,
         #[command(flatten)]
         store: Store,
     },
@@ -182,10 +187,11 @@ fn kind(fault: &VerbFault) -> FailureKind {
 
 fn run(verb: Verb) -> Result<(), VerbFault> {
     match verb {
-        Verb::Trust { which, store } => {
-            let trusted = certificates::trust(&store.root(), &which)?;
-            say(&format!("trusted: {}", line(&trusted)))
-        }
+        Verb::Trust {
+            which,
+            issuer,
+            store,
+        } => trust(&store.root(), &which, issuer),
         Verb::Reject { which, store } => {
             let rejected = certificates::reject(&store.root(), &which)?;
             say(&format!("no longer trusted: {}", line(&rejected)))
@@ -198,6 +204,32 @@ fn run(verb: Verb) -> Result<(), VerbFault> {
         }
         Verb::User(verb) => user(verb),
     }
+}
+
+fn trust(root: &Path, which: &str, issuer: bool) -> Result<(), VerbFault> {
+    let file = Path::new(which);
+    if known::is_crl(file) {
+        let kept = known::keep_crl(root, file)?;
+        return say(&format!("revocation list taken up: {}", kept.display()));
+    }
+    if issuer {
+        let kept = certificates::keep_issuer(root, file)?;
+        return say(&format!("known: {}", line(&kept)));
+    }
+    let is_first = !known::trusts_authorities(root);
+    let trusted = certificates::trust(root, which)?;
+    say(&format!("trusted: {}", line(&trusted)))?;
+    if trusted.is_authority {
+        say(
+            "all that it issues are trusted, as long as its revocation list is here and up to date (`ua-server trust FILE.crl`)",
+        )?;
+        if is_first {
+            say(
+                "it is the first authority here: a server that runs takes notice of it when it is started again",
+            )?;
+        }
+    }
+    Ok(())
 }
 
 fn user(verb: UserVerb) -> Result<(), VerbFault> {
@@ -305,8 +337,9 @@ fn line(one: &Stored) -> String {
     } else {
         "NOT VALID, until"
     };
+    let authority = if one.is_authority { "authority " } else { "" };
     format!(
-        "{:<8} {} {} {} {:?} {:?}",
+        "{:<8} {authority}{} {} {} {:?} {:?}",
         one.standing.name(),
         one.thumbprint,
         now,
@@ -322,12 +355,13 @@ fn as_json(one: &Stored) -> String {
         .as_deref()
         .map_or_else(|| "null".to_owned(), quoted);
     format!(
-        "{{\"standing\":{},\"thumbprint\":{},\"name\":{},\"application_uri\":{uri},\"until\":{},\"valid\":{},\"file\":{}}}",
+        "{{\"standing\":{},\"thumbprint\":{},\"name\":{},\"application_uri\":{uri},\"until\":{},\"valid\":{},\"authority\":{},\"file\":{}}}",
         quoted(one.standing.name()),
         quoted(&one.thumbprint),
         quoted(&one.name),
         quoted(&one.until),
         one.is_valid,
+        one.is_authority,
         quoted(&one.path.display().to_string()),
     )
 }
@@ -354,7 +388,7 @@ fn say(text: &str) -> Result<(), VerbFault> {
 const VERBS: [&str; 4] = ["trust", "reject", "certificates", "user"];
 /// What the help of the server says of them.
 pub(crate) const HELP: &str = "Certificates and users (each with --help):
-  ua-server trust THUMBPRINT|FILE        let a client in that was refused
+  ua-server trust THUMBPRINT|FILE        let a client in that was refused, or all that an authority has issued
   ua-server reject THUMBPRINT            let it in no longer
   ua-server certificates                 list its own, trusted and refused certificates
   ua-server user add|password|role|remove|list";

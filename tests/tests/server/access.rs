@@ -24,9 +24,9 @@ variables:
   - {node: ns=2;i=31, name: limit, type: Double, origin: 0, permissions: {write: engineer}}
 ";
 
-struct Site {
-    cell: Cell,
-    server: Child,
+pub(super) struct Site {
+    pub(super) cell: Cell,
+    pub(super) server: Child,
 }
 
 impl Site {
@@ -53,7 +53,7 @@ impl Site {
         verb(&self.cell, args, line)
     }
 
-    fn told(&self, args: &[&str], line: &str) -> String {
+    pub(super) fn told(&self, args: &[&str], line: &str) -> String {
         let output = self.verb(args, line);
         let told = String::from_utf8(output.stdout).unwrap();
         let error = String::from_utf8_lossy(&output.stderr).into_owned();
@@ -61,7 +61,7 @@ impl Site {
         told
     }
 
-    fn tries(&self, node: &str, ways: &str, users: &str, more: &[&str]) -> Vec<Value> {
+    pub(super) fn tries(&self, node: &str, ways: &str, users: &str, more: &[&str]) -> Vec<Value> {
         let folder = self.cell.folder().join("pairs");
         let fixed = ["tries", SERVER_ENDPOINT, path(&folder), node, "Double", "5"];
         let named = [
@@ -92,7 +92,7 @@ impl Site {
     }
 }
 
-fn verb(cell: &Cell, args: &[&str], line: &str) -> Output {
+pub(super) fn verb(cell: &Cell, args: &[&str], line: &str) -> Output {
     let mut child = Command::new(program("ua-server"))
         .args(args)
         .arg("--pki")
@@ -107,7 +107,7 @@ fn verb(cell: &Cell, args: &[&str], line: &str) -> Output {
     child.wait_with_output().unwrap()
 }
 
-fn path(path: &Path) -> &str {
+pub(super) fn path(path: &Path) -> &str {
     path.to_str().unwrap()
 }
 

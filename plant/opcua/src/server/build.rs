@@ -20,6 +20,7 @@ use super::calls::Calls;
 use super::nodes::{Nodes, Spaces};
 use super::routed::{Front, Routed};
 use super::{Inner, Server, Waiting};
+use crate::door::Door;
 use crate::endpoint::{BindError, EndpointUrl};
 use crate::limits;
 use crate::nodeset::{self, NodeSet, NodeSetError, Source};
@@ -199,12 +200,25 @@ impl ServerBuilder {
         };
         let listener = config.endpoint.bind()?;
         let port = listener.local_addr()?.port();
-        let listener = tokio::net::TcpListener::from_std(listener)?;
+        let mut listener = tokio::net::TcpListener::from_std(listener)?;
+        let root = pki.as_ref().filter(|_| !config.trust_unknown_clients);
+        let door = root.map(|pki| Door::of(pki.root())).transpose()?.flatten();
+        let door = match door {
+            Some((door, behind)) => {
+                let behind = tokio::net::TcpListener::from_std(behind)?;
+                Some((door, std::mem::replace(&mut listener, behind)))
+            }
+            None => None,
+        };
 
         let made = Arc::new(Made::default());
         let calls = Arc::new(Calls::default());
-        let builder = described(&config, port)
-            .pki_dir(pki.as_ref().map_or_else(|| Path::new(NO_PKI), Pki::root))
+        let builder = described(&config, port);
+        let builder = match &door {
+            Some((door, _)) => door.behind().used_by(builder),
+            None => builder.pki_dir(pki.as_ref().map_or_else(|| Path::new(NO_PKI), Pki::root)),
+        };
+        let builder = builder
             .with_node_manager(Core {
                 made: Arc::clone(&made),
                 calls: Arc::clone(&calls),
@@ -245,6 +259,7 @@ impl ServerBuilder {
                     server,
                     listener,
                     pki,
+                    door,
                 })),
                 running: Mutex::default(),
             }),

@@ -46,6 +46,7 @@ pub use crate::endpoint::EndpointUrl;
 
 use self::calls::Calls;
 use self::nodes::{Nodes, Spaces};
+use crate::door::Door;
 use crate::pki::Pki;
 
 /// What is known of a variable, or of a variable in a type.
@@ -87,6 +88,8 @@ struct Waiting {
     server: opcua::server::Server,
     listener: TcpListener,
     pki: Option<Pki>,
+    /// Where clients come to first, if the server listens for that alone.
+    door: Option<(Door, TcpListener)>,
 }
 
 impl Drop for Inner {
@@ -109,6 +112,7 @@ impl Server {
             server,
             listener,
             mut pki,
+            door,
         } = waiting;
         let serving = tokio::spawn(async move {
             if let Err(error) = server.run_with(listener).await {
@@ -129,7 +133,10 @@ impl Server {
                 }
             }
         });
-        self.inner.running.lock().extend([serving, looking]);
+        let standing = door.map(|(door, listener)| tokio::spawn(door.stand(listener)));
+        let mut running = self.inner.running.lock();
+        running.extend([serving, looking]);
+        running.extend(standing);
     }
 
     /// Closes all connections and stops listening, within [`LONGEST_STOP`].
@@ -137,7 +144,7 @@ impl Server {
         self.inner.handle.cancel();
         drop(self.inner.waiting.lock().take());
         let tasks: Vec<_> = self.inner.running.lock().drain(..).collect();
-        for (task, is_serving) in tasks.into_iter().zip([true, false]) {
+        for (task, is_serving) in tasks.into_iter().zip([true, false, false]) {
             let abort = task.abort_handle();
             if !is_serving {
                 abort.abort();

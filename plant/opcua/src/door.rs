@@ -1,0 +1,435 @@
+//! Where clients are looked at before they reach the server: the library compares certificates with files, and knows neither
+//! authorities nor revocation lists.
+//!
+//! A [`Door`] listens in the place of the server, which listens for the door alone. It lets the greeting through, judges the
+//! certificate that opens the channel ([`trust::check`]), and either hands on what both say from then on or tells the client what is
+//! wrong. Whom it lets in the library finds among those that it trusts, in a store of its own, for as long as the connection is open. What
+//! is trusted or revoked later counts for open connections too.
+//!
+//! Only a store that trusts an authority has a door: it costs each message another way through the system.
+
+use std::collections::HashMap;
+use std::fs;
+use std::io;
+use std::net::{Ipv4Addr, SocketAddr};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+
+use opcua::crypto::{CertificateStore, X509};
+use opcua::sync::{Mutex, RwLock};
+use opcua::types::StatusCode;
+use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::{Semaphore, watch};
+use tokio::task::JoinSet;
+use tokio::time::timeout;
+use tracing::{debug, info, warn};
+use trust::{Certificate, Fault, Known};
+
+use crate::known::{self, Stamp};
+use crate::pki::{OWN_CERTIFICATE, OWN_KEY};
+
+/// In front of a server that lets in whom a trusted authority has issued a certificate.
+#[derive(Debug)]
+pub struct Door {
+    shared: Arc<Shared>,
+}
+
+/// Where the library finds what it needs behind a door.
+#[derive(Debug, Clone)]
+pub struct Behind {
+    /// Its store.
+    pub pki: PathBuf,
+    /// The server's own certificate.
+    pub certificate: PathBuf,
+    /// Its key.
+    pub key: PathBuf,
+}
+
+impl Behind {
+    /// Has a server of the library use it.
+    #[must_use]
+    pub fn used_by(&self, builder: opcua::server::ServerBuilder) -> opcua::server::ServerBuilder {
+        builder
+            .pki_dir(&self.pki)
+            .certificate_path(&self.certificate)
+            .private_key_path(&self.key)
+    }
+}
+
+#[derive(Debug)]
+struct Shared {
+    root: PathBuf,
+    behind: Behind,
+    /// Where the server listens.
+    inner: SocketAddr,
+    known: RwLock<Arc<Known>>,
+    /// How many connections each of those has that the library trusts now, by the file.
+    admitted: Mutex<HashMap<PathBuf, usize>>,
+    /// Counts the changes of what is known.
+    changes: watch::Sender<u64>,
+}
+
+impl Door {
+    /// A door for the store at `root`, whose own certificate is there, and where the server is to listen behind it; `None` where the store trusts no authority.
+    ///
+    /// # Errors
+    /// The store or the address behind the door cannot be used.
+    pub fn of(root: &Path) -> io::Result<Option<(Self, std::net::TcpListener)>> {
+        if !known::trusts_authorities(root) {
+            return Ok(None);
+        }
+        let root = std::path::absolute(root)?;
+        let pki = root.join(BEHIND);
+        // What an earlier run let in does not count.
+        match fs::remove_dir_all(&pki) {
+            Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
+            Ok(()) | Err(_) => {}
+        }
+        for folder in [known::TRUSTED, "rejected"] {
+            fs::create_dir_all(pki.join(folder))?;
+        }
+        let behind = Behind {
+            pki,
+            certificate: root.join(OWN_CERTIFICATE),
+            key: root.join(OWN_KEY),
+        };
+        let listener = std::net::TcpListener::bind((Ipv4Addr::LOCALHOST, 0))?;
+        listener.set_nonblocking(true)?;
+        socket2::SockRef::from(&listener).set_tcp_nodelay(true)?;
+        let shared = Shared {
+            known: RwLock::new(Arc::new(known::read(&root))),
+            root,
+            behind,
+            inner: listener.local_addr()?,
+            admitted: Mutex::default(),
+            changes: watch::Sender::new(0),
+        };
+        info!("those whom a trusted authority issued certificates are let in");
+        Ok(Some((
+            Self {
+                shared: Arc::new(shared),
+            },
+            listener,
+        )))
+    }
+
+    /// Where the library is to look.
+    #[must_use]
+    pub fn behind(&self) -> &Behind {
+        &self.shared.behind
+    }
+
+    /// Lets clients in, until it is dropped.
+    pub async fn stand(self, listener: TcpListener) {
+        let places = Arc::new(Semaphore::new(MOST_CONNECTIONS));
+        let shared = self.shared;
+        let mut tasks = JoinSet::new();
+        let mut look = tokio::time::interval(LOOK);
+        look.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+        let mut stamp = known::stamp(&shared.root);
+        loop {
+            tokio::select! {
+                accepted = listener.accept() => match accepted {
+                    Ok((client, peer)) => shared.take(&mut tasks, &places, (client, peer)),
+                    Err(error) => {
+                        warn!(%error, "a connection cannot be taken");
+                        tokio::time::sleep(PAUSE).await;
+                    }
+                },
+                _ = look.tick() => shared.look(&mut stamp),
+                Some(_ended) = tasks.join_next() => {}
+            }
+        }
+    }
+}
+
+impl Shared {
+    /// Serves a client as one of the tasks, if there is a place.
+    fn take(
+        self: &Arc<Self>,
+        tasks: &mut JoinSet<()>,
+        places: &Arc<Semaphore>,
+        (client, peer): (TcpStream, SocketAddr),
+    ) {
+        let Ok(place) = Arc::clone(places).try_acquire_owned() else {
+            warn!(%peer, "a client is sent away: {MOST_CONNECTIONS} connections are open");
+            return;
+        };
+        let shared = Arc::clone(self);
+        tasks.spawn(async move {
+            if let Err(error) = shared.serve(client, peer).await {
+                debug!(%peer, %error, "a connection has ended");
+            }
+            drop(place);
+        });
+    }
+
+    /// Reads what the store knows where that has changed, and has each connection judged anew.
+    fn look(&self, stamp: &mut Stamp) {
+        let now = known::stamp(&self.root);
+        if now == *stamp {
+            return;
+        }
+        *stamp = now;
+        *self.known.write() = Arc::new(known::read(&self.root));
+        self.changes.send_modify(|changes| *changes += 1);
+    }
+
+    async fn serve(&self, mut client: TcpStream, peer: SocketAddr) -> io::Result<()> {
+        client.set_nodelay(true)?;
+        let mut server = TcpStream::connect(self.inner).await?;
+        server.set_nodelay(true)?;
+        let greeted = timeout(GREETING, async {
+            let hello = message(&mut client).await?;
+            server.write_all(&hello).await?;
+            let answer = message(&mut server).await?;
+            client.write_all(&answer).await?;
+            message(&mut client).await
+        });
+        let open = greeted
+            .await
+            .map_err(|_| io::Error::from(io::ErrorKind::TimedOut))??;
+        let mut changes = self.changes.subscribe();
+        let shown = match shown(&open) {
+            Ok(shown) => shown,
+            Err(status) => return refuse(&mut client, status).await,
+        };
+        let admitted = match &shown {
+            None => None,
+            Some(shown) => match self.admit(shown, peer) {
+                Ok(admitted) => Some(admitted),
+                Err(status) => return refuse(&mut client, status).await,
+            },
+        };
+        server.write_all(&open).await?;
+        let said =
+            tokio::io::copy_bidirectional_with_sizes(&mut client, &mut server, AT_ONCE, AT_ONCE);
+        tokio::pin!(said);
+        loop {
+            tokio::select! {
+                ended = &mut said => return ended.map(drop),
+                Ok(()) = changes.changed() => {
+                    if let Some(shown) = &shown
+                        && let Err(fault) = self.judge(shown)
+                    {
+                        tell(&shown.0, fault, peer, "is cut off");
+                        // The library drops its session when the connection is gone.
+                        break;
+                    }
+                }
+            }
+        }
+        drop(admitted);
+        Ok(())
+    }
+
+    fn judge(&self, (certificate, sent): &Shown) -> Result<(), Fault> {
+        let known = Arc::clone(&self.known.read());
+        trust::check(certificate, sent, &known, known::now())
+    }
+
+    /// Has the library trust a certificate, if it is to be trusted.
+    fn admit(&self, shown: &Shown, peer: SocketAddr) -> Result<Admitted<'_>, StatusCode> {
+        let certificate = &shown.0;
+        let Ok(of_library) = X509::from_der(certificate.der()) else {
+            return Err(StatusCode::BadCertificateInvalid);
+        };
+        let file = CertificateStore::cert_file_name(&of_library);
+        if let Err(fault) = self.judge(shown) {
+            let unknown = matches!(fault, Fault::Untrusted | Fault::Incomplete);
+            if unknown {
+                // Told from there, with what is to be typed.
+                self.keep_refused(&file, certificate);
+            } else {
+                tell(certificate, fault, peer, "is refused");
+            }
+            // A stranger is not told which of the checks it was (OPC 10000-4, 6.1.3).
+            let status = match fault.may_be_told() {
+                true => StatusCode::from(fault.status()),
+                false => StatusCode::BadSecurityChecksFailed,
+            };
+            return Err(status);
+        }
+        if !shown.1.is_empty() {
+            // The library reads one certificate where a client sends several.
+            tell_chain(certificate, peer);
+            return Err(StatusCode::BadCertificateInvalid);
+        }
+        let path = self.behind.pki.join(known::TRUSTED).join(file);
+        let mut all = self.admitted.lock();
+        let count = all.entry(path.clone()).or_default();
+        if *count == 0
+            && let Err(error) = fs::write(&path, certificate.der())
+        {
+            warn!(path = %path.display(), %error, "a client cannot be let in");
+            all.remove(&path);
+            return Err(StatusCode::BadInternalError);
+        }
+        *count += 1;
+        Ok(Admitted { shared: self, path })
+    }
+
+    fn keep_refused(&self, file: &str, certificate: &Certificate) {
+        let path = self.root.join("rejected").join(file);
+        if !path.exists()
+            && let Err(error) = fs::write(&path, certificate.der())
+        {
+            warn!(path = %path.display(), %error, "a refused certificate is not kept");
+        }
+    }
+}
+
+/// Trusted by the library until it is dropped.
+struct Admitted<'s> {
+    shared: &'s Shared,
+    path: PathBuf,
+}
+
+impl Drop for Admitted<'_> {
+    fn drop(&mut self) {
+        let mut all = self.shared.admitted.lock();
+        let Some(count) = all.get_mut(&self.path) else {
+            return;
+        };
+        *count -= 1;
+        if *count == 0 {
+            all.remove(&self.path);
+            if let Err(error) = fs::remove_file(&self.path) {
+                warn!(path = %self.path.display(), %error, "the library goes on trusting a client that is gone");
+            }
+        }
+    }
+}
+
+/// A certificate, and those sent along with it.
+type Shown = (Certificate, Vec<Certificate>);
+
+fn tell(certificate: &Certificate, fault: Fault, peer: SocketAddr, what: &str) {
+    let help = match fault {
+        Fault::Revoked | Fault::IssuerRevoked => "it needs another certificate",
+        Fault::RevocationUnknown | Fault::IssuerRevocationUnknown => {
+            "take up the authority's list: `ua-server trust FILE.crl`"
+        }
+        Fault::Time => "it is to be issued anew, or one of the clocks is wrong",
+        Fault::IssuerTime => "the authority needs a new certificate",
+        Fault::Invalid
+        | Fault::Incomplete
+        | Fault::Policy
+        | Fault::Untrusted
+        | Fault::Use
+        | Fault::IssuerUse => "it needs another certificate, as OPC 10000-6, 6.2.2 has it",
+    };
+    warn!(
+        name = ?certificate.name(), issuer = ?certificate.issuer_name(), serial = %certificate.serial(), %peer,
+        "a client {what}: {fault}; {help}"
+    );
+}
+
+fn tell_chain(certificate: &Certificate, peer: SocketAddr) {
+    warn!(
+        name = ?certificate.name(), %peer,
+        "a client is refused: it sends certificates of authorities along with its own; have it send its own alone"
+    );
+}
+
+/// The certificate that opens a channel; `None` for one without security.
+fn shown(open: &[u8]) -> Result<Option<Shown>, StatusCode> {
+    // Type and size, and the number of the channel (OPC 10000-6, 6.7.2).
+    let Some(after) = open.get(12..).filter(|_| open.starts_with(b"OPN")) else {
+        // The server says what is wrong with it.
+        return Ok(None);
+    };
+    let bad = StatusCode::BadTcpMessageTypeInvalid;
+    let (_policy, rest) = bytes(after).ok_or(bad)?;
+    let (certificate, _) = bytes(rest).ok_or(bad)?;
+    if certificate.is_empty() {
+        return Ok(None);
+    }
+    let read = Certificate::read_chain(certificate);
+    read.map(Some)
+        .map_err(|_| StatusCode::BadCertificateInvalid)
+}
+
+/// A ByteString, and what is behind it.
+fn bytes(from: &[u8]) -> Option<(&[u8], &[u8])> {
+    let (length, rest) = from.split_first_chunk::<4>()?;
+    let length = i32::from_le_bytes(*length);
+    // Null is empty.
+    rest.split_at_checked(usize::try_from(length.max(0)).ok()?)
+}
+
+/// A message of the protocol, which is a chunk of one.
+async fn message(from: &mut TcpStream) -> io::Result<Vec<u8>> {
+    let mut head = [0; 8];
+    from.read_exact(&mut head).await?;
+    let [.., a, b, c, d] = head;
+    let size = usize::try_from(u32::from_le_bytes([a, b, c, d])).unwrap_or(usize::MAX);
+    if !(head.len()..=LARGEST_OPENING).contains(&size) {
+        return Err(io::ErrorKind::InvalidData.into());
+    }
+    let mut all = vec![0; size];
+    let (first, rest) = all.split_at_mut(head.len());
+    first.copy_from_slice(&head);
+    from.read_exact(rest).await?;
+    Ok(all)
+}
+
+/// Tells a client what is wrong, and ends the connection (OPC 10000-6, 7.1.2.5).
+async fn refuse(client: &mut TcpStream, status: StatusCode) -> io::Result<()> {
+    let mut error = b"ERRF".to_vec();
+    error.extend(16_u32.to_le_bytes());
+    error.extend(status.bits().to_le_bytes());
+    // No reason beside it.
+    error.extend((-1_i32).to_le_bytes());
+    client.write_all(&error).await?;
+    client.shutdown().await
+}
+
+/// The library's store behind a door, below the server's.
+const BEHIND: &str = "admitted";
+const MOST_CONNECTIONS: usize = 1000;
+/// From the connection to the certificate.
+const GREETING: Duration = Duration::from_secs(5);
+const LOOK: Duration = Duration::from_secs(1);
+const PAUSE: Duration = Duration::from_millis(100);
+/// What opens a channel has a certificate and a signature, and little else.
+const LARGEST_OPENING: usize = 64 << 10;
+/// Bytes that are handed on at once.
+const AT_ONCE: usize = 16 << 10;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_certificate_is_found_in_what_opens_a_channel() {
+        let text =
+            |text: &[u8]| [&i32::try_from(text.len()).unwrap().to_le_bytes()[..], text].concat();
+        let open = |certificate: &[u8]| {
+            [
+                &b"OPNF\0\0\0\0\0\0\0\0"[..],
+                &text(b"http://policy"),
+                &text(certificate),
+                &text(b""),
+            ]
+            .concat()
+        };
+        assert_eq!(shown(&open(b"")), Ok(None));
+        assert_eq!(shown(b"MSGF\0\0\0\0\0\0\0\0"), Ok(None));
+        assert_eq!(
+            shown(&open(b"nothing")),
+            Err(StatusCode::BadCertificateInvalid)
+        );
+        let whole = open(b"nothing");
+        for cut in 12..whole.len() - 4 {
+            assert!(shown(&whole[..cut]).is_err(), "{cut}");
+        }
+        // A length that is larger than what there is.
+        let mut long = open(b"");
+        long[12] = 0xff;
+        long[14] = 0x7f;
+        assert_eq!(shown(&long), Err(StatusCode::BadTcpMessageTypeInvalid));
+    }
+}

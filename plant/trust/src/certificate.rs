@@ -1,0 +1,417 @@
+//! A certificate, and what it says.
+
+use std::fmt;
+use std::time::Duration;
+
+use rsa::RsaPublicKey;
+use rsa::pkcs1v15::{Signature, VerifyingKey};
+use rsa::sha2::{Digest as _, Sha256, Sha384, Sha512};
+use rsa::signature::Verifier as _;
+use rsa::traits::PublicKeyParts as _;
+use x509_cert::attr::AttributeTypeAndValue;
+use x509_cert::der::asn1::{Any, BitString, ObjectIdentifier, SetOfVec};
+use x509_cert::der::{Decode as _, DecodePem as _, Encode as _, EncodePem as _, Tag};
+use x509_cert::ext::pkix::name::GeneralName;
+use x509_cert::ext::pkix::{BasicConstraints, ExtendedKeyUsage, KeyUsage, SubjectAltName};
+use x509_cert::name::{Name, RelativeDistinguishedName};
+use x509_cert::spki::AlgorithmIdentifierOwned;
+
+use crate::Unfit;
+
+/// The number that an authority has given a certificate: unlike those of all others of that authority.
+#[derive(Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct Serial(Vec<u8>);
+
+impl Serial {
+    /// One of 16 bytes that are random: positive, and never zero.
+    #[must_use]
+    pub fn random(mut bytes: [u8; 16]) -> Self {
+        bytes[0] = (bytes[0] & 0x7f) | 0x40;
+        Self(bytes.to_vec())
+    }
+
+    /// From big-endian bytes.
+    #[must_use]
+    pub fn of(bytes: &[u8]) -> Self {
+        let zeros = bytes.iter().take_while(|byte| **byte == 0).count();
+        Self(bytes.get(zeros..).unwrap_or_default().to_vec())
+    }
+
+    /// From hexadecimal digits, as [`fmt::Display`] has them.
+    #[must_use]
+    pub fn parse(digits: &str) -> Option<Self> {
+        if digits.is_empty() || !digits.len().is_multiple_of(2) || digits.len() > 40 {
+            return None;
+        }
+        let pairs = digits.as_bytes().chunks(2);
+        let bytes: Option<Vec<u8>> = pairs
+            .map(|pair| u8::from_str_radix(std::str::from_utf8(pair).ok()?, 16).ok())
+            .collect();
+        bytes.map(|bytes| Self::of(&bytes))
+    }
+
+    pub(crate) fn bytes(&self) -> &[u8] {
+        &self.0
+    }
+}
+
+impl fmt::Display for Serial {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.0.iter().try_for_each(|byte| write!(f, "{byte:02x}"))
+    }
+}
+
+impl fmt::Debug for Serial {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        fmt::Display::fmt(self, f)
+    }
+}
+
+/// A certificate of X.509. Equal to one of the same bytes.
+#[derive(Clone)]
+pub struct Certificate {
+    pub(crate) inner: x509_cert::Certificate,
+    der: Vec<u8>,
+}
+
+impl PartialEq for Certificate {
+    fn eq(&self, other: &Self) -> bool {
+        self.der == other.der
+    }
+}
+
+impl Eq for Certificate {}
+
+impl fmt::Debug for Certificate {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "Certificate({} of {:?})", self.serial(), self.name())
+    }
+}
+
+impl Certificate {
+    /// Reads one in DER, or in PEM.
+    ///
+    /// # Errors
+    /// It is neither.
+    pub fn read(bytes: &[u8]) -> Result<Self, Unfit> {
+        let inner = if bytes.starts_with(b"-----BEGIN") {
+            x509_cert::Certificate::from_pem(bytes)
+        } else {
+            x509_cert::Certificate::from_der(bytes)
+        };
+        Self::of(inner.map_err(|_| Unfit::Unreadable)?)
+    }
+
+    /// Reads those of a chain in DER, one behind the other (OPC 10000-6, 6.2.6): the certificate itself, and those of issuers.
+    ///
+    /// # Errors
+    /// There is none, or something else is between or behind them.
+    pub fn read_chain(bytes: &[u8]) -> Result<(Self, Vec<Self>), Unfit> {
+        let mut rest = bytes;
+        let mut all = Vec::new();
+        while !rest.is_empty() && all.len() < LONGEST_CHAIN {
+            let length = der_length(rest).ok_or(Unfit::Unreadable)?;
+            let (one, behind) = rest.split_at_checked(length).ok_or(Unfit::Unreadable)?;
+            all.push(Self::read(one)?);
+            rest = behind;
+        }
+        if all.is_empty() || !rest.is_empty() {
+            return Err(Unfit::Unreadable);
+        }
+        let own = all.remove(0);
+        Ok((own, all))
+    }
+
+    pub(crate) fn of(inner: x509_cert::Certificate) -> Result<Self, Unfit> {
+        let der = inner.to_der().map_err(|_| Unfit::Unreadable)?;
+        Ok(Self { inner, der })
+    }
+
+    /// Its DER.
+    #[must_use]
+    pub fn der(&self) -> &[u8] {
+        &self.der
+    }
+
+    /// Its PEM.
+    #[must_use]
+    pub fn pem(&self) -> String {
+        // What was read is written again.
+        self.inner
+            .to_pem(x509_cert::der::pem::LineEnding::LF)
+            .unwrap_or_default()
+    }
+
+    /// The number its issuer gave it.
+    #[must_use]
+    pub fn serial(&self) -> Serial {
+        Serial::of(self.inner.tbs_certificate.serial_number.as_bytes())
+    }
+
+    /// The common name of its subject, which whoever asked for it chose; empty without one.
+    #[must_use]
+    pub fn name(&self) -> String {
+        common_name(&self.inner.tbs_certificate.subject)
+    }
+
+    /// The common name of its issuer.
+    #[must_use]
+    pub fn issuer_name(&self) -> String {
+        common_name(&self.inner.tbs_certificate.issuer)
+    }
+
+    /// The ApplicationUri: the one URI among its alternative names (OPC 10000-6, 6.2.2).
+    #[must_use]
+    pub fn application_uri(&self) -> Option<String> {
+        let (uri, _) = alternative(&self.names()?);
+        uri
+    }
+
+    /// The hosts among its alternative names: names of DNS, and addresses.
+    #[must_use]
+    pub fn hosts(&self) -> Vec<String> {
+        self.names()
+            .map(|names| alternative(&names).1)
+            .unwrap_or_default()
+    }
+
+    /// Whether it says that its application is reached at that host: by a name of DNS, whatever its case, or an address.
+    #[must_use]
+    pub fn is_for_host(&self, host: &str) -> bool {
+        let host = host.trim_matches(['[', ']']).trim_end_matches('.');
+        self.hosts()
+            .iter()
+            .any(|one| one.eq_ignore_ascii_case(host))
+    }
+
+    /// The first moment and the last of its validity.
+    #[must_use]
+    pub fn validity(&self) -> (Duration, Duration) {
+        let validity = &self.inner.tbs_certificate.validity;
+        (
+            validity.not_before.to_unix_duration(),
+            validity.not_after.to_unix_duration(),
+        )
+    }
+
+    /// Whether it is valid at that time.
+    #[must_use]
+    pub fn is_valid_at(&self, now: Duration) -> bool {
+        let (from, until) = self.validity();
+        (from..=until).contains(&now)
+    }
+
+    /// Whether it is one of an authority: it may have issued others.
+    #[must_use]
+    pub fn is_authority(&self) -> bool {
+        self.constraints().is_some_and(|one| one.ca)
+    }
+
+    /// Whether it was issued by itself.
+    #[must_use]
+    pub fn is_self_signed(&self) -> bool {
+        self.is_named_issuer_of(self) && self.has_signed(self)
+    }
+
+    /// Bits of its key; `None` where that is not of RSA.
+    #[must_use]
+    pub fn key_bits(&self) -> Option<usize> {
+        Some(self.public_key()?.size() * 8)
+    }
+
+    /// Whether both have the same key.
+    #[must_use]
+    pub fn has_key_of(&self, key: &RsaPublicKey) -> bool {
+        self.public_key().is_some_and(|own| own == *key)
+    }
+
+    /// The names of issuer and subject agree.
+    pub(crate) fn is_named_issuer_of(&self, other: &Self) -> bool {
+        self.inner.tbs_certificate.subject == other.inner.tbs_certificate.issuer
+    }
+
+    /// Whether the signature of `other` is of this one's key.
+    pub(crate) fn has_signed(&self, other: &Self) -> bool {
+        let Ok(signed) = other.inner.tbs_certificate.to_der() else {
+            return false;
+        };
+        self.verify(
+            &signed,
+            &other.inner.signature_algorithm,
+            &other.inner.signature,
+        )
+    }
+
+    /// Whether a signature is of this one's key.
+    pub(crate) fn verify(
+        &self,
+        signed: &[u8],
+        algorithm: &AlgorithmIdentifierOwned,
+        signature: &BitString,
+    ) -> bool {
+        self.public_key()
+            .is_some_and(|key| verify(key, signed, algorithm, signature))
+    }
+
+    pub(crate) fn public_key(&self) -> Option<RsaPublicKey> {
+        use x509_cert::der::referenced::OwnedToRef as _;
+        let info = &self.inner.tbs_certificate.subject_public_key_info;
+        RsaPublicKey::try_from(info.owned_to_ref()).ok()
+    }
+
+    pub(crate) fn constraints(&self) -> Option<BasicConstraints> {
+        Some(
+            self.inner
+                .tbs_certificate
+                .get::<BasicConstraints>()
+                .ok()??
+                .1,
+        )
+    }
+
+    /// `None` where it does not say.
+    pub(crate) fn usage(&self) -> Option<KeyUsage> {
+        Some(self.inner.tbs_certificate.get::<KeyUsage>().ok()??.1)
+    }
+
+    /// Whether it may be that of an application: where it says whom it is for, that is a client or a server.
+    pub(crate) fn is_for_applications(&self) -> bool {
+        match self.inner.tbs_certificate.get::<ExtendedKeyUsage>() {
+            Ok(None) => true,
+            Ok(Some((_, ExtendedKeyUsage(all)))) => all
+                .iter()
+                .any(|one| [CLIENT_AUTH, SERVER_AUTH, ANY_USAGE].contains(one)),
+            Err(_) => false,
+        }
+    }
+
+    /// Whether its signature is of a kind that nobody forges.
+    pub(crate) fn has_strong_signature(&self) -> bool {
+        [SHA256, SHA384, SHA512].contains(&self.inner.signature_algorithm.oid)
+    }
+
+    fn names(&self) -> Option<SubjectAltName> {
+        Some(self.inner.tbs_certificate.get::<SubjectAltName>().ok()??.1)
+    }
+}
+
+/// Whether a signature is of a key.
+pub(crate) fn verify(
+    key: RsaPublicKey,
+    signed: &[u8],
+    algorithm: &AlgorithmIdentifierOwned,
+    signature: &BitString,
+) -> bool {
+    let Some(signature) = signature
+        .as_bytes()
+        .and_then(|bytes| Signature::try_from(bytes).ok())
+    else {
+        return false;
+    };
+    match algorithm.oid {
+        SHA256 => VerifyingKey::<Sha256>::new(key)
+            .verify(signed, &signature)
+            .is_ok(),
+        SHA384 => VerifyingKey::<Sha384>::new(key)
+            .verify(signed, &signature)
+            .is_ok(),
+        SHA512 => VerifyingKey::<Sha512>::new(key)
+            .verify(signed, &signature)
+            .is_ok(),
+        _ => false,
+    }
+}
+
+/// The ApplicationUri and the hosts among alternative names.
+pub(crate) fn alternative(names: &SubjectAltName) -> (Option<String>, Vec<String>) {
+    let mut uri = None;
+    let mut hosts = Vec::new();
+    for name in &names.0 {
+        match name {
+            GeneralName::UniformResourceIdentifier(one) => {
+                uri.get_or_insert_with(|| one.as_str().to_owned());
+            }
+            GeneralName::DnsName(one) => hosts.push(one.as_str().to_owned()),
+            GeneralName::IpAddress(bytes) => hosts.extend(address(bytes.as_bytes())),
+            GeneralName::OtherName(_)
+            | GeneralName::Rfc822Name(_)
+            | GeneralName::DirectoryName(_)
+            | GeneralName::EdiPartyName(_)
+            | GeneralName::RegisteredId(_) => {}
+        }
+    }
+    (uri, hosts)
+}
+
+fn address(bytes: &[u8]) -> Option<String> {
+    if let Ok(four) = <[u8; 4]>::try_from(bytes) {
+        return Some(std::net::Ipv4Addr::from(four).to_string());
+    }
+    let sixteen = <[u8; 16]>::try_from(bytes).ok()?;
+    Some(std::net::Ipv6Addr::from(sixteen).to_string())
+}
+
+/// The last common name of a name.
+pub(crate) fn common_name(name: &Name) -> String {
+    let each = name.0.iter().flat_map(|part| part.0.iter());
+    let mut named = each.filter(|one| one.oid == COMMON_NAME);
+    // Whatever kind of string it is.
+    let text = named
+        .next_back()
+        .map(|one| String::from_utf8_lossy(one.value.value()).into_owned());
+    text.unwrap_or_default()
+}
+
+/// A name of these parts, from the most general one on.
+pub(crate) fn name_of(parts: &[(ObjectIdentifier, &str)]) -> Result<Name, Unfit> {
+    let mut all = Vec::new();
+    for (oid, text) in parts.iter().filter(|(_, text)| !text.is_empty()) {
+        if text.len() > LONGEST_NAME {
+            return Err(Unfit::Name);
+        }
+        let value = Any::new(Tag::Utf8String, text.as_bytes()).map_err(|_| Unfit::Name)?;
+        let one = AttributeTypeAndValue { oid: *oid, value };
+        let set = SetOfVec::try_from(vec![one]).map_err(|_| Unfit::Name)?;
+        all.push(RelativeDistinguishedName(set));
+    }
+    Ok(x509_cert::name::RdnSequence(all))
+}
+
+/// The identifier of a key: 160 bits of its hash (RFC 7093, 2, method 1).
+pub(crate) fn key_id(key: &[u8]) -> Vec<u8> {
+    let hash = Sha256::digest(key);
+    hash.iter().take(20).copied().collect()
+}
+
+/// Bytes of the first element of DER.
+fn der_length(bytes: &[u8]) -> Option<usize> {
+    let (tag, rest) = bytes.split_first()?;
+    let (first, rest) = rest.split_first()?;
+    if *tag != 0x30 {
+        return None;
+    }
+    if *first < 0x80 {
+        return Some(usize::from(*first) + 2);
+    }
+    let count = usize::from(first & 0x7f);
+    let digits = rest
+        .get(..count)
+        .filter(|digits| (1..=3).contains(&digits.len()))?;
+    let length = digits
+        .iter()
+        .fold(0, |sum, digit| (sum << 8) | usize::from(*digit));
+    length.checked_add(2 + count)
+}
+
+pub(crate) const SHA256: ObjectIdentifier = ObjectIdentifier::new_unwrap("1.2.840.113549.1.1.11");
+const SHA384: ObjectIdentifier = ObjectIdentifier::new_unwrap("1.2.840.113549.1.1.12");
+const SHA512: ObjectIdentifier = ObjectIdentifier::new_unwrap("1.2.840.113549.1.1.13");
+pub(crate) const COMMON_NAME: ObjectIdentifier = ObjectIdentifier::new_unwrap("2.5.4.3");
+pub(crate) const ORGANIZATION: ObjectIdentifier = ObjectIdentifier::new_unwrap("2.5.4.10");
+pub(crate) const SERVER_AUTH: ObjectIdentifier = ObjectIdentifier::new_unwrap("1.3.6.1.5.5.7.3.1");
+pub(crate) const CLIENT_AUTH: ObjectIdentifier = ObjectIdentifier::new_unwrap("1.3.6.1.5.5.7.3.2");
+const ANY_USAGE: ObjectIdentifier = ObjectIdentifier::new_unwrap("2.5.29.37.0");
+/// Certificates of a chain.
+pub(crate) const LONGEST_CHAIN: usize = 10;
+/// Bytes of a part of a name that other stacks read (RFC 5280, appendix A).
+const LONGEST_NAME: usize = 64;

@@ -1,0 +1,154 @@
+//! A request for a certificate (PKCS #10), made by who has the key.
+
+use std::net::IpAddr;
+
+use rsa::RsaPrivateKey;
+use rsa::pkcs1v15::{Signature, SigningKey};
+use rsa::pkcs8::DecodePrivateKey as _;
+use rsa::sha2::Sha256;
+use rsa::traits::PublicKeyParts as _;
+use x509_cert::builder::{Builder as _, RequestBuilder};
+use x509_cert::der::asn1::{Ia5String, OctetString};
+use x509_cert::der::{Decode as _, DecodePem as _, Encode as _};
+use x509_cert::ext::pkix::SubjectAltName;
+use x509_cert::ext::pkix::name::GeneralName;
+use x509_cert::name::Name;
+use x509_cert::request::{CertReq, ExtensionReq};
+use x509_cert::spki::SubjectPublicKeyInfoOwned;
+
+use crate::certificate::{COMMON_NAME, ORGANIZATION, alternative, common_name, name_of, verify};
+use crate::{KEY_BITS, Unfit};
+
+/// A request whose signature is that of the key it is for.
+#[derive(Debug, Clone)]
+pub struct Request {
+    pub(crate) subject: Name,
+    pub(crate) key: SubjectPublicKeyInfoOwned,
+    application_uri: String,
+    hosts: Vec<String>,
+    der: Vec<u8>,
+}
+
+impl Request {
+    /// Asks for a certificate of an application that is called `name` and reached at `hosts`, for a private key in the DER of
+    /// PKCS #8.
+    ///
+    /// # Errors
+    /// A key that is none, or a name or URI that a certificate cannot have.
+    pub fn make(
+        key: &[u8],
+        application_uri: &str,
+        (name, organization): (&str, &str),
+        hosts: &[String],
+    ) -> Result<Self, Unfit> {
+        let key = RsaPrivateKey::from_pkcs8_der(key).map_err(|_| Unfit::Key)?;
+        let signer = SigningKey::<Sha256>::new(key);
+        let subject = name_of(&[(ORGANIZATION, organization), (COMMON_NAME, name)])?;
+        let mut builder = RequestBuilder::new(subject, &signer).map_err(|_| Unfit::Name)?;
+        let names = alternatives(application_uri, hosts)?;
+        builder.add_extension(&names).map_err(|_| Unfit::Name)?;
+        let made = builder.build::<Signature>().map_err(|_| Unfit::Signature)?;
+        Self::of(made)
+    }
+
+    /// Reads one in DER, or in PEM.
+    ///
+    /// # Errors
+    /// It is neither, has no ApplicationUri, or is not signed with the key it is for.
+    pub fn read(bytes: &[u8]) -> Result<Self, Unfit> {
+        let read = if bytes.starts_with(b"-----BEGIN") {
+            CertReq::from_pem(bytes)
+        } else {
+            CertReq::from_der(bytes)
+        };
+        Self::of(read.map_err(|_| Unfit::Unreadable)?)
+    }
+
+    fn of(read: CertReq) -> Result<Self, Unfit> {
+        use x509_cert::der::referenced::OwnedToRef as _;
+        let der = read.to_der().map_err(|_| Unfit::Unreadable)?;
+        let signed = read.info.to_der().map_err(|_| Unfit::Unreadable)?;
+        let public = rsa::RsaPublicKey::try_from(read.info.public_key.owned_to_ref());
+        let public = public.map_err(|_| Unfit::Key)?;
+        let bits = public.size() * 8;
+        if !KEY_BITS.contains(&bits) {
+            return Err(Unfit::Length(bits));
+        }
+        if !verify(public, &signed, &read.algorithm, &read.signature) {
+            return Err(Unfit::Signature);
+        }
+        let (uri, hosts) = names(&read).map_or((None, Vec::new()), |names| alternative(&names));
+        Ok(Self {
+            application_uri: uri.ok_or(Unfit::NoUri)?,
+            hosts,
+            subject: read.info.subject,
+            key: read.info.public_key,
+            der,
+        })
+    }
+
+    /// Its DER.
+    #[must_use]
+    pub fn der(&self) -> &[u8] {
+        &self.der
+    }
+
+    /// The common name that is asked for.
+    #[must_use]
+    pub fn name(&self) -> String {
+        common_name(&self.subject)
+    }
+
+    /// The ApplicationUri that is asked for.
+    #[must_use]
+    pub fn application_uri(&self) -> &str {
+        &self.application_uri
+    }
+
+    /// The hosts that are asked for.
+    #[must_use]
+    pub fn hosts(&self) -> &[String] {
+        &self.hosts
+    }
+}
+
+fn names(read: &CertReq) -> Option<SubjectAltName> {
+    let mut wanted = read.info.attributes.iter();
+    let extensions = wanted
+        .find(|one| one.oid == EXTENSIONS)?
+        .values
+        .iter()
+        .next()?;
+    let ExtensionReq(all) = ExtensionReq::from_der(&extensions.to_der().ok()?).ok()?;
+    let one = all
+        .into_iter()
+        .find(|one| one.extn_id == ALTERNATIVE_NAMES)?;
+    SubjectAltName::from_der(one.extn_value.as_bytes()).ok()
+}
+
+/// The ApplicationUri and hosts as alternative names. What is an address becomes one.
+pub(crate) fn alternatives(
+    application_uri: &str,
+    hosts: &[String],
+) -> Result<SubjectAltName, Unfit> {
+    let text = |text: &str| Ia5String::new(text).map_err(|_| Unfit::Name);
+    let mut names = vec![GeneralName::UniformResourceIdentifier(text(
+        application_uri,
+    )?)];
+    for host in hosts {
+        let bare = host.trim_matches(['[', ']']);
+        let name = match bare.parse::<IpAddr>() {
+            Ok(IpAddr::V4(four)) => OctetString::new(four.octets()).map(GeneralName::IpAddress),
+            Ok(IpAddr::V6(six)) => OctetString::new(six.octets()).map(GeneralName::IpAddress),
+            Err(_) => Ok(GeneralName::DnsName(text(bare)?)),
+        };
+        names.push(name.map_err(|_| Unfit::Name)?);
+    }
+    Ok(SubjectAltName(names))
+}
+
+/// extensionRequest of PKCS #9.
+const EXTENSIONS: x509_cert::der::asn1::ObjectIdentifier =
+    x509_cert::der::asn1::ObjectIdentifier::new_unwrap("1.2.840.113549.1.9.14");
+const ALTERNATIVE_NAMES: x509_cert::der::asn1::ObjectIdentifier =
+    x509_cert::der::asn1::ObjectIdentifier::new_unwrap("2.5.29.17");
