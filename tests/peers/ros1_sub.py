@@ -5,6 +5,7 @@ import argparse
 import rospy
 
 import lifetime
+import ros1_definitions
 import ros1_messages
 
 
@@ -13,6 +14,7 @@ def main():
     parser.add_argument("topic")
     parser.add_argument("type")
     parser.add_argument("--node", default="rospy_sub")
+    parser.add_argument("--definitions", help="a folder with the definition of the type")
     parser.add_argument("--limit", type=float, default=120.0)
     args = parser.parse_args()
     lifetime.limit(args.limit)
@@ -27,9 +29,13 @@ def main():
             value=ros1_messages.plain(message),
         )
 
+    if args.definitions:
+        kind = ros1_definitions.Definitions(args.definitions).message(args.type)
+    else:
+        kind = ros1_messages.message_class(args.type)
     rospy.init_node(args.node, disable_rosout=True)
     subscriber = rospy.Subscriber(
-        args.topic, ros1_messages.message_class(args.type), heard, queue_size=None, tcp_nodelay=True
+        args.topic, kind, heard, queue_size=None, tcp_nodelay=True
     )
     lifetime.say(ready=args.topic)
     rospy.spin()

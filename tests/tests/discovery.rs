@@ -4,6 +4,8 @@
 mod faults;
 #[path = "discovery/levels.rs"]
 mod levels;
+#[path = "discovery/presence.rs"]
+mod presence;
 #[path = "discovery/rules.rs"]
 mod rules;
 

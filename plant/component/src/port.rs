@@ -1,6 +1,7 @@
 //! The local side of a component: its OPC UA server and skills, with values and calls of the space.
 
 use std::collections::{BTreeMap, VecDeque};
+use std::num::NonZeroU16;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
@@ -379,6 +380,7 @@ fn announce(component: &Component, url: &str, options: &Options) -> Option<Annou
         name: component.name.clone(),
         url: url.to_owned(),
         capabilities: options.capabilities.clone(),
+        number: NonZeroU16::new(component.namespace),
     };
     let lds = match &component.lds {
         Lds::Local => Some(discovery::DEFAULT_LDS.to_owned()),

@@ -90,6 +90,7 @@ impl Presence {
             name: self.name,
             url: format!("opc.tcp://{at}{}", self.path),
             capabilities: self.capabilities,
+            number: None,
         };
         let settings = AnnounceSettings {
             lds: self.lds,

@@ -1,5 +1,6 @@
 //! Telling of a server: [`announce`].
 
+use std::num::NonZeroU16;
 use std::path::PathBuf;
 use std::pin::Pin;
 use std::time::{Duration, SystemTime};
@@ -16,7 +17,7 @@ use crate::client::{self, AskFault};
 use crate::clock;
 use crate::host_name;
 use crate::interface::Interface;
-use crate::mdns::{Heard, Mdns, MdnsFault, Ours, same_place};
+use crate::mdns::{Aside, Heard, Mdns, MdnsFault, Ours, same_place};
 use crate::url::Url;
 
 /// A server to tell of.
@@ -32,6 +33,8 @@ pub struct Server {
     pub url: String,
     /// Codes of OPC 10000-12, Annex D.
     pub capabilities: Vec<String>,
+    /// Its number in the space, the namespace of what it produces there; `None` where it produces nothing.
+    pub number: Option<NonZeroU16>,
 }
 
 /// To whom a server is told of.
@@ -270,7 +273,10 @@ impl Telling {
                 url: server.url,
                 capabilities: server.capabilities,
             },
-            start_time: Some(self.start_time),
+            aside: Aside {
+                start_time: Some(self.start_time),
+                number: server.number,
+            },
         });
         self.state.send_modify(|state| {
             state.announced.get_or_insert_with(clock::wall);
@@ -288,7 +294,7 @@ impl Telling {
             }
             Heard::Announced {
                 announcement,
-                start_time,
+                aside: Aside { start_time, .. },
             } => {
                 let lds = self.settings.lds.as_deref();
                 if lds.is_some_and(|lds| same_place(lds, &announcement.url)) {

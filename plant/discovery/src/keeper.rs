@@ -1,6 +1,7 @@
 //! One registry with everything around it: what mDNS hears goes in, endpoints are tried, what is to be announced goes out.
 
 use std::collections::BTreeMap;
+use std::num::NonZeroU16;
 use std::time::{Duration, Instant};
 
 use registry::{Announcement, Event, Loss, Outcome, Registry, Settings};
@@ -8,7 +9,7 @@ use tokio::time::sleep_until;
 
 use crate::clock::now;
 use crate::liveness::{Liveness, Told, Try};
-use crate::mdns::{Heard, Mdns, Ours, same_place};
+use crate::mdns::{Aside, Heard, Mdns, Ours, same_place};
 
 /// See the module's page. Drive it by [`step`](Self::step), then take every [`event`](Self::event).
 pub(crate) struct Keeper {
@@ -30,6 +31,8 @@ pub(crate) struct Keeper {
     started: BTreeMap<String, Started>,
     /// What servers said when they were asked for that, not told of yet.
     new_starts: Vec<(String, i64)>,
+    /// The numbers in the space of those that tell.
+    numbers: BTreeMap<String, NonZeroU16>,
     most: usize,
 }
 
@@ -69,6 +72,7 @@ impl Keeper {
             answered: BTreeMap::new(),
             started: BTreeMap::new(),
             new_starts: Vec::new(),
+            numbers: BTreeMap::new(),
             most: settings.most,
         }
     }
@@ -131,7 +135,10 @@ impl Keeper {
             match (&event, &mut self.mdns) {
                 (Event::Announce(announcement), Some(mdns)) => mdns.put(Ours {
                     announcement: announcement.clone(),
-                    start_time: self.started.get(&announcement.url).map(|known| known.at),
+                    aside: Aside {
+                        start_time: self.started.get(&announcement.url).map(|known| known.at),
+                        number: self.numbers.get(&announcement.url).copied(),
+                    },
                 }),
                 (Event::Withdraw { instance }, Some(mdns)) => drop(mdns.take_back(instance)),
                 (Event::Announce(_) | Event::Withdraw { .. }, None) => {}
@@ -161,6 +168,11 @@ impl Keeper {
         self.started.get(url).map(|known| known.at)
     }
 
+    /// Its number in the space, where it tells.
+    pub(crate) fn number(&self, url: &str) -> Option<NonZeroU16> {
+        self.numbers.get(url).copied()
+    }
+
     /// Of whom it has become known by asking when they started, and when. To be asked after each step.
     pub(crate) fn take_started(&mut self) -> Vec<(String, i64)> {
         std::mem::take(&mut self.new_starts)
@@ -171,10 +183,16 @@ impl Keeper {
         match heard {
             Heard::Announced {
                 announcement,
-                start_time,
+                aside: Aside { start_time, number },
             } => {
                 self.asleep.remove(&announcement.instance);
                 let url = announcement.url.clone();
+                match number {
+                    Some(number) => keep(&mut self.numbers, self.most, &url, number),
+                    // A discovery server that announces it, too, may not know.
+                    None if start_time.is_none() => {}
+                    None => drop(self.numbers.remove(&url)),
+                }
                 if let Some(start_time) = start_time {
                     let started = Started {
                         at: start_time,

@@ -21,7 +21,7 @@ use crate::endpoint;
 use crate::host_name;
 use crate::interface::Interface;
 use crate::keeper::Keeper;
-use crate::mdns::{Mdns, Ours};
+use crate::mdns::{Aside, Mdns, Ours};
 use crate::security::Security;
 use crate::services::{Answer, Own, Question, semaphore};
 use crate::url::Url;
@@ -301,7 +301,7 @@ impl Lds {
                 url: url.clone(),
                 capabilities: vec!["LDS".to_owned()],
             },
-            start_time: Some(clock::ticks(started)),
+            aside: Aside::of_start(clock::ticks(started)),
         });
         let (ask, questions) = mpsc::channel(64);
         let shared = Arc::new(Shared::new(own, security, ask).secured_only(settings.secured_only));

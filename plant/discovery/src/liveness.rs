@@ -287,6 +287,7 @@ mod tests {
             name: "here".to_owned(),
             url: url.clone(),
             capabilities: Vec::new(),
+            number: None,
         };
         // A runtime of its own, which takes all its connections along when it ends.
         let runtime = std::thread::spawn(|| {

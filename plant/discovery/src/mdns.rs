@@ -5,6 +5,7 @@
 
 use std::collections::BTreeMap;
 use std::net::{IpAddr, Ipv4Addr};
+use std::num::NonZeroU16;
 use std::time::Duration;
 
 use mdns_sd::{
@@ -36,8 +37,8 @@ pub(crate) enum Heard {
     /// Of a server, for the first time or with something new.
     Announced {
         announcement: Announcement,
-        /// When the program started, in 100 ns since 1601, where it tells.
-        start_time: Option<i64>,
+        /// What programs of this project tell beside it.
+        aside: Aside,
     },
     /// Of the end of a server: a goodbye, or what was heard has run out.
     Withdrawn { instance: String },
@@ -49,8 +50,26 @@ pub(crate) enum Heard {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Ours {
     pub(crate) announcement: Announcement,
-    /// When the program started, in 100 ns since 1601; ours alone tell it.
+    pub(crate) aside: Aside,
+}
+
+/// What programs of this project tell in keys of their own, which others pass over.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(crate) struct Aside {
+    /// When the program started, in 100 ns since 1601.
     pub(crate) start_time: Option<i64>,
+    /// Its number in the space: the namespace of what it produces there.
+    pub(crate) number: Option<NonZeroU16>,
+}
+
+impl Aside {
+    /// That of a program without a number.
+    pub(crate) const fn of_start(start_time: i64) -> Self {
+        Self {
+            start_time: Some(start_time),
+            number: None,
+        }
+    }
 }
 
 /// One interface, with a thread of its own that answers and asks.
@@ -67,10 +86,10 @@ pub(crate) struct Mdns {
     /// Goodbyes that have not been told of yet.
     left: Vec<String>,
     /// Instances that are there, as they were heard last: a new one has not heard of ours.
-    there: BTreeMap<String, (Announcement, Option<i64>)>,
+    there: BTreeMap<String, (Announcement, Aside)>,
     /// What a goodbye was heard of that the daemon has not taken yet, and when it must have. A goodbye may be that of another
     /// host to a name that two had, or the server is back at once: what stays in the daemon's cache is told by nobody.
-    doubted: BTreeMap<String, (Announcement, Option<i64>, Instant)>,
+    doubted: BTreeMap<String, (Announcement, Aside, Instant)>,
     ignored: u64,
 }
 
@@ -168,13 +187,13 @@ impl Mdns {
         loop {
             while let Some(instance) = self.left.pop() {
                 if !self.ours.contains_key(&instance)
-                    && let Some((announcement, start_time)) = self.there.remove(&instance)
+                    && let Some((announcement, aside)) = self.there.remove(&instance)
                 {
                     let until = Instant::now() + DOUBT;
                     // Of more than that, whoever is back is heard with its next change.
                     if self.doubted.len() < MOST {
                         self.doubted
-                            .insert(instance.clone(), (announcement, start_time, until));
+                            .insert(instance.clone(), (announcement, aside, until));
                     }
                     return Heard::Withdrawn { instance };
                 }
@@ -229,12 +248,11 @@ impl Mdns {
             .iter()
             .filter(|(_, (_, _, until))| *until <= now);
         let instance = due.next()?.0.clone();
-        let (announcement, start_time, _) = self.doubted.remove(&instance)?;
-        self.there
-            .insert(instance, (announcement.clone(), start_time));
+        let (announcement, aside, _) = self.doubted.remove(&instance)?;
+        self.there.insert(instance, (announcement.clone(), aside));
         Some(Heard::Announced {
             announcement,
-            start_time,
+            aside,
         })
     }
 
@@ -308,7 +326,7 @@ impl Mdns {
         match event {
             ServiceEvent::ServiceResolved(service) => {
                 let heard = heard(&service, self.interface.is_loopback());
-                let Some((announcement, start_time)) = heard else {
+                let Some((announcement, aside)) = heard else {
                     self.ignored += 1;
                     debug!(name = ?service.fullname, "an announcement that is none of a server");
                     return None;
@@ -318,7 +336,7 @@ impl Mdns {
                     return match same_place(&ours.place, theirs) {
                         true => Some(Heard::Announced {
                             announcement,
-                            start_time,
+                            aside,
                         }),
                         false => self.conflict(&announcement.instance, theirs),
                     };
@@ -326,7 +344,7 @@ impl Mdns {
                 self.doubted.remove(&announcement.instance);
                 let is_known = self.there.contains_key(&announcement.instance);
                 if is_known || self.there.len() < MOST {
-                    let heard = (announcement.clone(), start_time);
+                    let heard = (announcement.clone(), aside);
                     self.there.insert(announcement.instance.clone(), heard);
                 }
                 if !is_known && self.there.len() < MOST {
@@ -335,7 +353,7 @@ impl Mdns {
                 }
                 Some(Heard::Announced {
                     announcement,
-                    start_time,
+                    aside,
                 })
             }
             ServiceEvent::ServiceRemoved(_, fullname) => {
@@ -412,7 +430,9 @@ impl Mdns {
             ("path".to_owned(), path.to_owned()),
             ("caps".to_owned(), capabilities.join(",")),
         ];
-        texts.extend(ours.start_time.map(|at| (START.to_owned(), at.to_string())));
+        let Aside { start_time, number } = ours.aside;
+        texts.extend(start_time.map(|at| (START.to_owned(), at.to_string())));
+        texts.extend(number.map(|number| (NUMBER.to_owned(), number.to_string())));
         let info = ServiceInfo::new(SERVICE, instance, &host, &*addresses, url.port, &*texts);
         let mut info = info.ok()?;
         info.set_requires_probe(false);
@@ -457,10 +477,7 @@ pub(crate) fn same_place(one: &str, other: &str) -> bool {
 }
 
 /// An announcement as the registry takes it.
-pub(crate) fn heard(
-    service: &ResolvedService,
-    loopback: bool,
-) -> Option<(Announcement, Option<i64>)> {
+pub(crate) fn heard(service: &ResolvedService, loopback: bool) -> Option<(Announcement, Aside)> {
     let instance = instance(&service.fullname)?;
     let text = |key| service.get_property_val(key).flatten();
     let path = match text("path").map(std::str::from_utf8) {
@@ -489,8 +506,11 @@ pub(crate) fn heard(
         url,
         capabilities: capabilities.map(str::to_owned).collect(),
     };
-    let start_time = texts(START).and_then(|at| at.parse().ok());
-    Some((announcement, start_time))
+    let aside = Aside {
+        start_time: texts(START).and_then(|at| at.parse().ok()),
+        number: texts(NUMBER).and_then(|number| number.parse().ok()),
+    };
+    Some((announcement, aside))
 }
 
 /// The address to try: on a network never one that means the host itself.
@@ -524,6 +544,8 @@ fn instance(fullname: &str) -> Option<String> {
 pub(crate) const SERVICE: &str = "_opcua-tcp._tcp.local.";
 /// The key of the TXT record that tells one run of a program from the next. Ours alone; others pass over it.
 const START: &str = "start";
+/// The key of the number in the space. Likewise.
+const NUMBER: &str = "ns";
 const ANNOUNCE_EVERY: Duration = Duration::from_secs(5);
 const SETTLE: Duration = Duration::from_millis(200);
 /// The daemon keeps a server that left for a second (RFC 6762, 10.1).
@@ -546,13 +568,19 @@ mod tests {
 
     #[test]
     fn an_announcement_is_read_as_a_url_and_capabilities() {
-        let texts = [("path", "/arm"), ("caps", "DA, HD,,AC"), ("start", "17")];
-        let (announcement, start) =
+        let texts = [
+            ("path", "/arm"),
+            ("caps", "DA, HD,,AC"),
+            ("start", "17"),
+            ("ns", "7"),
+        ];
+        let (announcement, aside) =
             heard(&resolved("arm.left", "127.0.0.1", &texts), true).unwrap();
         assert_eq!(announcement.instance, "arm.left");
         assert_eq!(announcement.url, "opc.tcp://127.0.0.1:4841/arm");
         assert_eq!(announcement.capabilities, ["DA", "HD", "AC"]);
-        assert_eq!(start, Some(17));
+        assert_eq!(aside.start_time, Some(17));
+        assert_eq!(aside.number, NonZeroU16::new(7));
     }
 
     #[test]
@@ -612,7 +640,7 @@ mod tests {
                     url: url.to_owned(),
                     capabilities: Vec::new(),
                 },
-                start_time: None,
+                aside: Aside::default(),
             });
             mdns
         };

@@ -1,6 +1,7 @@
 //! Who is there, for a program: [`watch`].
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::num::NonZeroU16;
 use std::time::{Duration, SystemTime};
 
 use registry::{Announcement, Event, Loss, Settings};
@@ -51,6 +52,8 @@ pub struct Known {
     pub since: SystemTime,
     /// When its program started, where it tells: by mDNS, or as the StartTime of its ServerStatus.
     pub started: Option<SystemTime>,
+    /// Its number in the space, the namespace of what it produces there, where it tells.
+    pub number: Option<NonZeroU16>,
 }
 
 impl Known {
@@ -172,6 +175,7 @@ impl Watching {
                 let url = record.announcement.url.clone();
                 let ask = self.servers.seen(record.announcement, clock::wall());
                 self.ask.extend(ask);
+                self.servers.numbered(&url, self.keeper.number(&url));
                 if let Some(started) = self.keeper.started(&url) {
                     self.servers.started(&url, clock::of_ticks(started));
                 }
@@ -272,6 +276,7 @@ impl Servers {
             application_uri: None,
             since,
             started: None,
+            number: None,
         };
         let server = Server {
             known,
@@ -322,6 +327,17 @@ impl Servers {
         {
             let known = server.known;
             self.push(Found::Gone { known, loss });
+        }
+    }
+
+    /// What number a server has in the space is known, or that it has none.
+    fn numbered(&mut self, url: &str, number: Option<NonZeroU16>) {
+        if let Some((_, server)) = self.of_url(url)
+            && std::mem::replace(&mut server.known.number, number) != number
+            && server.asked
+        {
+            let known = server.known.clone();
+            self.push(Found::Seen(known));
         }
     }
 

@@ -337,6 +337,7 @@ fn server(name: &str, uri: &str, face: &Face) -> Server {
         name: name.to_owned(),
         url: face.server.url().to_owned(),
         capabilities: vec!["NA".to_owned()],
+        number: None,
     }
 }
 

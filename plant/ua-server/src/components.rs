@@ -1,10 +1,13 @@
-//! The servers that are there, as objects: what each is called, where it is, and whether it still is.
+//! The servers that are there, as objects and as values of the space: what each is called, where it is, and whether it
+//! still is.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
-use discovery::{Found, Known, Watcher};
+use bridge_node::{PortEvent, now};
+use discovery::{Found, Interface, Known, Watcher};
+use mappings::TopicId;
 use opcua::nodes::{ObjectBuilder, VariableBuilder};
 use opcua::server::SubscriptionCache;
 use opcua::server::address_space::AddressSpace;
@@ -16,6 +19,7 @@ use tracing::info;
 
 use crate::address;
 use crate::nodes::SpaceManager;
+use crate::presence::Presence;
 
 /// Shows each server that a watcher tells of, and those that have gone for some time after.
 pub(crate) struct Components {
@@ -26,11 +30,12 @@ pub(crate) struct Components {
     own_uri: String,
     /// Those that are gone, the one that has been so longest first.
     gone: VecDeque<String>,
+    presence: Presence,
 }
 
 impl Components {
     pub(crate) fn new(
-        watcher: Watcher,
+        (watcher, heard_on): (Watcher, &Interface),
         (manager, subscriptions): (Arc<SpaceManager>, Arc<SubscriptionCache>),
         own_uri: String,
     ) -> Self {
@@ -46,14 +51,21 @@ impl Components {
             subscriptions,
             own_uri,
             gone: VecDeque::new(),
+            presence: Presence::new(heard_on.to_string()),
         }
     }
 
-    /// Waits for the next thing to happen, and shows it. Whoever drops it before loses nothing.
-    pub(crate) async fn next(&mut self) {
-        match self.watcher.next().await {
-            Some(found) => self.show(&found),
-            None => std::future::pending().await,
+    /// Waits for the next thing to happen, shows it, and gives what is to be reported of it. Whoever drops it before loses
+    /// nothing.
+    pub(crate) async fn next(&mut self) -> PortEvent {
+        loop {
+            if let Some(event) = self.presence.event() {
+                return event;
+            }
+            match self.watcher.next().await {
+                Some(found) => self.show(&found),
+                None => std::future::pending().await,
+            }
         }
     }
 
@@ -63,32 +75,24 @@ impl Components {
             return;
         }
         let name = &known.name;
-        let online = match found {
-            Found::Seen(_) | Found::Restarted(_) => {
-                info!(
-                    ?name,
-                    url = known.url,
-                    uri = known.application_uri,
-                    "a server is seen"
-                );
-                self.gone.retain(|gone| gone != name);
-                true
-            }
-            Found::Gone { loss, .. } => {
-                info!(
-                    ?name,
-                    url = known.url,
-                    loss = loss.label(),
-                    "a server is gone"
-                );
-                self.gone.push_back(name.clone());
-                false
-            }
+        log(found);
+        let online = !matches!(found, Found::Gone { .. });
+        match online {
+            true => self.gone.retain(|gone| gone != name),
+            false => self.gone.push_back(name.clone()),
+        }
+        let since = match online {
+            true => known.since,
+            false => wall(),
         };
+        let topic = self.presence.show(known, (online, since));
         let oldest = (self.gone.len() > MOST_GONE)
             .then(|| self.gone.pop_front())
             .flatten();
-        let values = values(known, online);
+        if let Some(oldest) = &oldest {
+            self.presence.forget(oldest);
+        }
+        let values = values(known, (online, since), (topic, self.presence.level()));
         {
             let mut address_space = self.manager.address_space().write();
             if let Some(oldest) = oldest {
@@ -105,9 +109,30 @@ impl Components {
     }
 }
 
+fn log(found: &Found) {
+    match found {
+        Found::Seen(known) | Found::Restarted(known) => info!(
+            name = ?known.name,
+            url = known.url,
+            uri = known.application_uri,
+            "a server is seen"
+        ),
+        Found::Gone { known, loss } => info!(
+            name = ?known.name,
+            url = known.url,
+            loss = loss.label(),
+            "a server is gone"
+        ),
+    }
+}
+
 type Property = (&'static str, DataTypeId, i32, Variant);
 
-fn values(known: &Known, online: bool) -> [Property; 5] {
+fn values(
+    known: &Known,
+    (online, since): (bool, SystemTime),
+    (topic, level): (Option<TopicId>, &str),
+) -> [Property; 9] {
     let capabilities: Vec<_> = known
         .capabilities
         .iter()
@@ -115,12 +140,19 @@ fn values(known: &Known, online: bool) -> [Property; 5] {
         .collect();
     let capabilities: Vec<opcua::types::UAString> = capabilities;
     let uri = known.application_uri.as_deref().unwrap_or_default();
+    let started = known.started.map_or_else(DateTime::null, time);
+    let number = known.number.map_or(0, u16::from);
+    let topic = topic.map_or_else(String::new, |topic| topic.to_string());
     [
         ("ApplicationUri", DataTypeId::String, -1, uri.into()),
         ("Url", DataTypeId::String, -1, known.url.as_str().into()),
         ("Capabilities", DataTypeId::String, 1, capabilities.into()),
         ("Online", DataTypeId::Boolean, -1, online.into()),
-        ("Since", DataTypeId::UtcTime, -1, time(known.since).into()),
+        ("Since", DataTypeId::UtcTime, -1, time(since).into()),
+        ("StartTime", DataTypeId::UtcTime, -1, started.into()),
+        ("Number", DataTypeId::UInt16, -1, number.into()),
+        ("Level", DataTypeId::String, -1, level.into()),
+        ("Topic", DataTypeId::String, -1, topic.as_str().into()),
     ]
 }
 
@@ -155,6 +187,12 @@ fn node(name: &str, property: &str) -> NodeId {
         folder.namespace,
         format!("UaSpace.Components.{name}{dot}{property}"),
     )
+}
+
+/// Now.
+fn wall() -> SystemTime {
+    let nanos = u64::try_from(now().utc.unix_nanos()).unwrap_or_default();
+    SystemTime::UNIX_EPOCH + Duration::from_nanos(nanos)
 }
 
 fn time(at: SystemTime) -> DateTime {

@@ -6,7 +6,7 @@
 //!
 //! Reading order: `layout` (which nodes), `structures` (their DataTypes), `address` (as they stand in the address space), `values` (what they show),
 //! `history` (what they showed), `nodes` (the node manager), `browse` (in which order), `budget` (what clients may take up), `space` (values in),
-//! `components` (which servers are there), `methods` and `argument_types` (calls of the space as Methods), `executing` (Methods of other servers as calls), `sources` (their
+//! `components` and `presence` (which servers are there), `methods` and `argument_types` (calls of the space as Methods), `executing` (Methods of other servers as calls), `sources` (their
 //! nodes as values), `clients` (the sessions for both), `others` (all of these), `port` (the shell's side),
 //! `endpoint` (how clients get in), `access` (what each may do), `auditing` (what is told of it), `sks` (keys of secured groups),
 //! `pubsub` (the PubSub configuration as nodes), `value` (between the two codecs), `verbs` (certificates and users by hand).
@@ -27,6 +27,7 @@ mod methods;
 mod nodes;
 mod others;
 mod port;
+mod presence;
 mod programs;
 mod properties;
 mod pubsub;
@@ -134,9 +135,10 @@ impl Program for UaServer {
         &self.arguments
     }
 
-    /// Those of the mapping: in all others of space 0 components publish.
+    /// Those of the mapping and the server's own: in all others of space 0 components publish.
     fn owned(mapping: &Mapping) -> Owned {
-        Owned::Only(mapping.namespaces().keys().copied().collect())
+        let own = std::iter::once(presence::NAMESPACE);
+        Owned::Only(mapping.namespaces().keys().copied().chain(own).collect())
     }
 
     fn spaces(&self, _mapping: &Mapping) -> Result<Vec<SpaceId>, Failure> {

@@ -230,7 +230,7 @@ impl Port for ServerPort {
                 event = self.others.executing.next() => return event,
                 sourced = self.others.sources.next() => return self.sourced(sourced),
                 () = self.pubsub.called() => self.switch(),
-                () = next(&mut self.components) => {}
+                event = next(&mut self.components) => return event,
                 _ = self.look.tick() => {
                     self.pki.report_rejected();
                     self.access.look();
@@ -535,7 +535,7 @@ type Entries = (
 );
 
 /// What happens next to the servers that are there.
-async fn next(components: &mut Option<Components>) {
+async fn next(components: &mut Option<Components>) -> PortEvent {
     match components {
         Some(components) => components.next().await,
         None => std::future::pending().await,
@@ -553,16 +553,17 @@ fn tell(
         return Ok((None, None));
     };
     let own_uri = server.application_uri.clone();
-    let heard = settings.mdns.clone().map(|interface| {
-        watch(WatchSettings {
-            mdns: Some(interface),
-            ..WatchSettings::default()
-        })
-    });
-    let components = heard
-        .transpose()
-        .map_err(unavailable)?
-        .map(|watcher| Components::new(watcher, nodes, own_uri));
+    let components = match &settings.mdns {
+        None => None,
+        Some(interface) => {
+            let watcher = watch(WatchSettings {
+                mdns: Some(interface.clone()),
+                ..WatchSettings::default()
+            });
+            let watcher = watcher.map_err(unavailable)?;
+            Some(Components::new((watcher, interface), nodes, own_uri))
+        }
+    };
     let told = announce(server, settings).map_err(unavailable)?;
     Ok((Some(told), components))
 }
@@ -575,6 +576,7 @@ fn told_of(described: &Server, url: String) -> discovery::Server {
         name: "ua-server".to_owned(),
         url,
         capabilities: ["DA", "HD"].map(str::to_owned).to_vec(),
+        number: None,
     }
 }
 

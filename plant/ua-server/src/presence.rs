@@ -1,0 +1,305 @@
+//! Who is there as values of the space: `ua_0_1_<n>` for the component with the number n (`ua_msgs/Component`).
+//!
+//! Namespace 1 is that of the server's own URI (OPC 10000-5, 6.3.1), so that it is nobody else's.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::time::{SystemTime, UNIX_EPOCH};
+
+use bridge_core::ValueDescription;
+use bridge_node::{PortEvent, now};
+use bytes::Bytes;
+use discovery::Known;
+use mappings::{Overflow, TopicId};
+use messages::{Leaf, Rank, TypeName};
+use opcua::types::{UAString, Variant};
+use tracing::warn;
+use uadp::BuiltinType;
+
+use crate::value;
+
+/// A server that is told of.
+#[derive(Debug)]
+struct Told {
+    identifier: u16,
+    /// The name it has on the network: another with each port it is started at.
+    name: String,
+    online: bool,
+}
+
+/// The values, and what is to be reported of them.
+#[derive(Debug)]
+pub(crate) struct Presence {
+    /// The network the servers are heard of on.
+    level: String,
+    /// Those that are told of, by who they are.
+    told: BTreeMap<String, Told>,
+    /// Those of servers without a number, by who they are: they are the same as long as this program runs.
+    given: BTreeMap<String, u16>,
+    events: VecDeque<PortEvent>,
+    told_full: bool,
+}
+
+impl Presence {
+    /// Without anybody, for those that will be heard of on that network.
+    pub(crate) const fn new(level: String) -> Self {
+        Self {
+            level,
+            told: BTreeMap::new(),
+            given: BTreeMap::new(),
+            events: VecDeque::new(),
+            told_full: false,
+        }
+    }
+
+    /// The network.
+    pub(crate) fn level(&self) -> &str {
+        &self.level
+    }
+
+    /// A server is there, or is so no longer since then. Gives its name in the space.
+    pub(crate) fn show(
+        &mut self,
+        known: &Known,
+        (online, since): (bool, SystemTime),
+    ) -> Option<TopicId> {
+        let who = who(known);
+        let before = self.told.get(who);
+        let other = before.filter(|before| before.name != known.name && before.online);
+        if let Some(other) = other.filter(|_| !online) {
+            // It is there under another name by now.
+            return TopicId::new(0, NAMESPACE, other.identifier);
+        }
+        let before = before.map(|before| before.identifier);
+        let identifier = self.identifier(known, before.filter(|_| !online))?;
+        if let Some(before) = before.filter(|before| *before != identifier) {
+            self.withdraw(before);
+        }
+        // Whoever is gone gives way to one that is there.
+        let is_new = self.give_way(identifier, who) || before != Some(identifier);
+        let told = Told {
+            identifier,
+            name: known.name.clone(),
+            online,
+        };
+        self.told.insert(who.to_owned(), told);
+        let topic = TopicId::new(0, NAMESPACE, identifier)?;
+        if is_new {
+            let description = description(known.application_uri.as_deref());
+            self.events
+                .push_back(PortEvent::Described { topic, description });
+            self.events.push_back(PortEvent::Live { topic, live: true });
+        }
+        // What is to be said of it and was not yet is no longer true.
+        let of_it = |event: &PortEvent| matches!(event, PortEvent::Sample { topic: of, .. } if *of == topic);
+        self.events.retain(|event| !of_it(event));
+        let fields = fields(known, (online, since), &self.level);
+        match value::fields_block(&fields) {
+            Ok(block) => self.events.push_back(PortEvent::Sample {
+                topic,
+                payload: Bytes::from(block),
+                received: now().utc,
+                latched_by: None,
+            }),
+            Err(status) => warn!(name = known.name, %status, "a server cannot be told of"),
+        }
+        Some(topic)
+    }
+
+    /// A server of that name that is gone is not told of any longer.
+    pub(crate) fn forget(&mut self, name: &str) {
+        let is_it = |told: &Told| told.name == name && !told.online;
+        let gone = self.told.values().filter(|told| is_it(told));
+        let gone: Vec<u16> = gone.map(|told| told.identifier).collect();
+        self.told.retain(|_, told| !is_it(told));
+        for identifier in gone {
+            self.withdraw(identifier);
+        }
+    }
+
+    /// What is to be reported next.
+    pub(crate) fn event(&mut self) -> Option<PortEvent> {
+        self.events.pop_front()
+    }
+
+    fn withdraw(&mut self, identifier: u16) {
+        if let Some(topic) = TopicId::new(0, NAMESPACE, identifier) {
+            self.events.push_back(PortEvent::Withdrawn { topic });
+        }
+    }
+
+    /// Takes an identifier from one that is gone; whether there was one.
+    fn give_way(&mut self, identifier: u16, to: &str) -> bool {
+        let before = self.told.len();
+        self.told
+            .retain(|who, told| told.identifier != identifier || who == to);
+        self.told.len() < before
+    }
+
+    /// What it was where it is only taken back; else its number, where it tells one that no other has that is there; else one
+    /// that is its own from now on.
+    fn identifier(&mut self, known: &Known, before: Option<u16>) -> Option<u16> {
+        if before.is_some() {
+            return before;
+        }
+        let own = who(known);
+        let has = |identifier: u16| {
+            let mut others = self.told.iter();
+            others.any(|(who, told)| told.identifier == identifier && told.online && who != own)
+        };
+        let number = known.number.map(u16::from);
+        if let Some(number) = number.filter(|number| *number < FIRST_GIVEN && !has(*number)) {
+            return Some(number);
+        }
+        if let Some(given) = self.given.get(own) {
+            return Some(*given);
+        }
+        let next = (FIRST_GIVEN..=u16::MAX).nth(self.given.len());
+        if next.is_none() && !std::mem::replace(&mut self.told_full, true) {
+            warn!(
+                "more servers were heard of than there are names for: the others are not told of in the space"
+            );
+        }
+        self.given.insert(own.to_owned(), next?);
+        next
+    }
+}
+
+/// What a server is told apart by.
+fn who(known: &Known) -> &str {
+    known.application_uri.as_deref().unwrap_or(&known.name)
+}
+
+fn description(uri: Option<&str>) -> ValueDescription {
+    let leaf = |(name, builtin, rank): (&str, BuiltinType, Rank)| Leaf {
+        path: name.to_owned(),
+        builtin,
+        rank,
+    };
+    let many = Rank::Array { fixed: None };
+    let fields = [
+        ("online", BuiltinType::Boolean, Rank::Scalar),
+        ("since", BuiltinType::Double, Rank::Scalar),
+        ("started", BuiltinType::Double, Rank::Scalar),
+        ("number", BuiltinType::UInt16, Rank::Scalar),
+        ("name", BuiltinType::String, Rank::Scalar),
+        ("uri", BuiltinType::String, Rank::Scalar),
+        ("urls", BuiltinType::String, many),
+        ("capabilities", BuiltinType::String, many),
+        ("level", BuiltinType::String, Rank::Scalar),
+    ];
+    ValueDescription {
+        name: format!("Components.{}", uri.unwrap_or_default()),
+        message_type: TypeName::new("ua_msgs", "Component").ok(),
+        about: "who is there".to_owned(),
+        fields: fields.into_iter().map(leaf).collect(),
+        overflow: Overflow::KeepLatest,
+    }
+}
+
+fn fields(known: &Known, (online, since): (bool, SystemTime), level: &str) -> [Variant; 9] {
+    let text = |text: &str| Variant::from(text);
+    let texts = |all: &[String]| {
+        let all: Vec<UAString> = all.iter().map(|one| one.as_str().into()).collect();
+        Variant::from(all)
+    };
+    [
+        online.into(),
+        seconds(since).into(),
+        known.started.map_or(0.0, seconds).into(),
+        known.number.map_or(0, u16::from).into(),
+        text(&known.name),
+        text(known.application_uri.as_deref().unwrap_or_default()),
+        texts(std::slice::from_ref(&known.url)),
+        texts(&known.capabilities),
+        text(level),
+    ]
+}
+
+/// Since 1970.
+fn seconds(at: SystemTime) -> f64 {
+    at.duration_since(UNIX_EPOCH)
+        .unwrap_or_default()
+        .as_secs_f64()
+}
+
+/// The server's own namespace.
+pub(crate) const NAMESPACE: u16 = 1;
+/// Those without a number get theirs from here on.
+const FIRST_GIVEN: u16 = 60_001;
+
+#[cfg(test)]
+mod tests {
+    use std::num::NonZeroU16;
+
+    use super::*;
+
+    fn known(name: &str, number: u16) -> Known {
+        Known {
+            name: name.to_owned(),
+            url: "opc.tcp://127.0.0.1:4841/".to_owned(),
+            capabilities: vec!["DA".to_owned()],
+            application_uri: Some(format!("urn:{name}")),
+            since: UNIX_EPOCH,
+            started: None,
+            number: NonZeroU16::new(number),
+        }
+    }
+
+    fn shown(presence: &mut Presence, known: &Known) -> u16 {
+        let topic = presence.show(known, (true, UNIX_EPOCH)).unwrap();
+        topic.triple().2
+    }
+
+    #[test]
+    fn a_component_has_its_number_and_others_keep_what_they_are_given() {
+        let mut presence = Presence::new("lo".to_owned());
+        assert_eq!(shown(&mut presence, &known("gripper", 7)), 7);
+        assert_eq!(shown(&mut presence, &known("plc", 0)), FIRST_GIVEN);
+        assert_eq!(shown(&mut presence, &known("thief", 7)), FIRST_GIVEN + 1);
+        assert_eq!(shown(&mut presence, &known("gripper", 7)), 7);
+        assert_eq!(shown(&mut presence, &known("plc", 0)), FIRST_GIVEN);
+        // The gripper is gone: its number is free for whoever is there.
+        presence.show(&known("gripper", 7), (false, UNIX_EPOCH));
+        assert_eq!(shown(&mut presence, &known("thief", 7)), 7);
+    }
+
+    #[test]
+    fn a_component_that_is_started_anew_at_another_port_is_the_same() {
+        let mut presence = Presence::new("lo".to_owned());
+        let first = known("gripper", 7);
+        let again = Known {
+            name: "gripper at another port".to_owned(),
+            ..first.clone()
+        };
+        assert_eq!(shown(&mut presence, &first), 7);
+        assert_eq!(shown(&mut presence, &again), 7);
+        while presence.event().is_some() {}
+        // The one before is missed only now.
+        let topic = presence.show(&first, (false, UNIX_EPOCH));
+        assert_eq!(topic.unwrap().triple(), (0, 1, 7));
+        assert!(presence.event().is_none(), "it is there");
+        presence.forget(&first.name);
+        assert!(presence.event().is_none(), "and is told of");
+    }
+
+    #[test]
+    fn what_has_not_been_reported_gives_way_to_what_is_true_now() {
+        let mut presence = Presence::new("lo".to_owned());
+        let gripper = known("gripper", 7);
+        for online in [true, false, true] {
+            presence.show(&gripper, (online, UNIX_EPOCH)).unwrap();
+        }
+        let events: Vec<PortEvent> = std::iter::from_fn(|| presence.event()).collect();
+        assert!(
+            matches!(
+                &events[..],
+                [
+                    PortEvent::Described { .. },
+                    PortEvent::Live { live: true, .. },
+                    PortEvent::Sample { .. }
+                ]
+            ),
+            "{events:?}"
+        );
+    }
+}
