@@ -1,7 +1,8 @@
 """Who is let into an OPC UA server, and what each may do there: a JSON line for each try.
 
 `pairs FOLDER` makes the keys and certificates that the tries use: of a client (`client`), of one whose time is over
-(`expired`), and of a user (`user`). `issued FOLDER` makes authorities and what they issue, with their revocation lists. `tries URL FOLDER NODE TYPE VALUE USER PASSWORD` tries each security policy and mode with
+(`expired`), of a user (`user`), and of a server that the peers can be (`server`). `issued FOLDER` makes authorities and what they issue, with their
+revocation lists. `tries URL FOLDER NODE TYPE VALUE USER PASSWORD` tries each security policy and mode with
 each kind of user, reading and writing the node. `endpoints URL` says which
 policies a server offers. `audit URL` tells of the events of the Server object. `crowd URL COUNT` opens that many sessions at once and
 says how many came in; with `--vanish` each has a subscription, and its connection breaks off as that of a client that is killed.
@@ -10,6 +11,7 @@ says how many came in; with `--vanish` each has a subscription, and its connecti
 import argparse
 import asyncio
 import datetime
+import ipaddress
 import logging
 import os
 import pathlib
@@ -28,7 +30,7 @@ import opcua_session
 DAY = datetime.timedelta(days=1)
 
 
-def make(folder, name, uri, begin, end, above=None):
+def make(folder, name, uri, begin, end, above=None, purpose=ExtendedKeyUsageOID.CLIENT_AUTH):
     """A key and a certificate of an application, valid from the one day to the other from now: self-signed, or by an authority."""
     key = rsa.generate_private_key(public_exponent=65537, key_size=2048)
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
@@ -37,7 +39,11 @@ def make(folder, name, uri, begin, end, above=None):
     usage |= dict.fromkeys(
         ["digital_signature", "content_commitment", "key_encipherment", "data_encipherment", "key_cert_sign"], True
     )
-    names = [x509.UniformResourceIdentifier(uri), x509.DNSName(socket.gethostname())]
+    names = [
+        x509.UniformResourceIdentifier(uri),
+        x509.DNSName(socket.gethostname()),
+        x509.IPAddress(ipaddress.ip_address("127.0.0.1")),
+    ]
     builder = (
         x509.CertificateBuilder()
         .subject_name(subject)
@@ -49,7 +55,7 @@ def make(folder, name, uri, begin, end, above=None):
         .add_extension(x509.SubjectAlternativeName(names), critical=False)
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=False)
         .add_extension(x509.KeyUsage(**usage), critical=False)
-        .add_extension(x509.ExtendedKeyUsage([ExtendedKeyUsageOID.CLIENT_AUTH]), critical=False)
+        .add_extension(x509.ExtendedKeyUsage([purpose]), critical=False)
     )
     certificate = builder.sign(above[0] if above else key, hashes.SHA256())
     folder.mkdir(parents=True, exist_ok=True)
@@ -130,6 +136,7 @@ def pairs(folder):
     make(folder, "expired", opcua_session.APPLICATION_URI, -30, -1)
     make(folder, "user", "urn:ua-bridge:system-tests:user", -1, 365)
     make(folder, "old", "urn:ua-bridge:system-tests:user", -30, -1)
+    make(folder, "server", opcua_session.SERVER_URI, -1, 365, purpose=ExtendedKeyUsageOID.SERVER_AUTH)
     lifetime.say(made=str(folder))
 
 

@@ -1,6 +1,7 @@
 """An asyncua server as a PLC that knows nothing of the space: variables that are set by JSON lines on standard input, as
 {"set": "Speed", "value": 1.5, "status": "UncertainLastUsableValue", "age": 60}, and one that clients write, which is said.
-`--before N` puts N namespaces in front of its own; `--user NAME PASSWORD` has it refuse all others."""
+`--before N` puts N namespaces in front of its own; `--user NAME PASSWORD` has it refuse all others. With `--only POLICY`, and the folder
+of `opcua_access.py pairs`, it takes nobody without that security policy."""
 
 import argparse
 import asyncio
@@ -12,8 +13,9 @@ from asyncua import Server, ua
 from asyncua.server.user_managers import User, UserManager, UserRole
 
 import lifetime
+import opcua_session
 
-URI = "urn:ua-bridge:system-tests:plc"
+URI = opcua_session.SERVER_URI
 
 
 class Heard:
@@ -49,7 +51,10 @@ async def run(args):
     server = Server(user_manager=One(*args.user) if args.user else None)
     await server.init()
     server.set_endpoint(args.endpoint)
-    server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
+    if args.only:
+        await opcua_session.secure(server, args.pairs, args.only)
+    else:
+        server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
     if args.user:
         server.set_identity_tokens([ua.UserNameIdentityToken])
     for number in range(args.before):
@@ -80,6 +85,8 @@ def main():
     parser.add_argument("endpoint")
     parser.add_argument("--before", type=int, default=0)
     parser.add_argument("--user", nargs=2)
+    parser.add_argument("--only", choices=list(opcua_session.POLICIES))
+    parser.add_argument("--pairs")
     parser.add_argument("--limit", type=float, default=120.0)
     args = parser.parse_args()
     lifetime.bound(args.limit)

@@ -15,6 +15,7 @@ from asyncua.crypto.security_policies import (
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
 APPLICATION_URI = "urn:ua-bridge:system-tests:client"
+SERVER_URI = "urn:ua-bridge:system-tests:plc"
 POLICIES = {
     "Basic256Sha256": SecurityPolicyBasic256Sha256,
     "Aes128_Sha256_RsaOaep": SecurityPolicyAes128Sha256RsaOaep,
@@ -72,6 +73,19 @@ async def client_of(args):
         mode=ua.MessageSecurityMode[args.mode],
     )
     return client
+
+
+async def secure(server, folder, only=None):
+    """Has a server offer no security and each policy we know, or one policy only, with the pair of `opcua_access.py pairs` in
+    the folder."""
+    folder = pathlib.Path(folder)
+    await server.load_certificate(str(folder / "server_certificate.der"))
+    await server.load_private_key(str(folder / "server_key.pem"))
+    await server.set_application_uri(SERVER_URI)
+    offered = [only] if only else ["None", *POLICIES]
+    types = ua.SecurityPolicyType
+    named = {name: types[f"{name.replace('_', '')}_SignAndEncrypt"] for name in POLICIES}
+    server.set_security_policy([types.NoSecurity if name == "None" else named[name] for name in offered])
 
 
 def plain(value):

@@ -31,8 +31,18 @@ pub(crate) fn ros1(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<
 
 /// Measures relays of DDS samples beside a UDP echo, and both bridges between ROS 1 and ROS 2, all in one run.
 pub(crate) fn ros2(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
-    let packages = ["bridge-ros1", "bridge-ros2", "system-tests"];
+    let packages = ["bridge-ros1", "bridge-ros2", "ua-space", "system-tests"];
     measured(workspace, "bench-ros2", &packages, arguments)
+}
+
+/// Measures ua-server beside servers of other makers, and values from the space to clients, all in one run.
+pub(crate) fn opcua(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
+    measured(
+        workspace,
+        "bench-opcua",
+        &["ua-server", "system-tests"],
+        arguments,
+    )
 }
 
 /// Measures what clients wait for of skills, and many skills in one server.

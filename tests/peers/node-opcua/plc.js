@@ -1,10 +1,12 @@
 "use strict";
-// plc.js PORT: a server of node-opcua that knows nothing of the space. Line.Speed is set by JSON lines on standard input, as
-// {"set": 1.5}; what clients write to Line.Setpoint is said.
+// plc.js PORT [POLICY PAIRS]: a server of node-opcua that knows nothing of the space. Line.Speed is set by JSON lines on standard
+// input, as {"set": 1.5}; what clients write to Line.Setpoint is said. With a POLICY, and the folder of `opcua_access.py pairs`, it
+// takes nobody without that security policy.
 const { OPCUAServer } = require("node-opcua-server");
 const { OPCUACertificateManager } = require("node-opcua-certificate-manager");
 const { DataType, Variant } = require("node-opcua-variant");
 const { StatusCodes } = require("node-opcua-status-code");
+const { MessageSecurityMode, SecurityPolicy } = require("node-opcua-client");
 const path = require("path");
 const readline = require("readline");
 
@@ -12,13 +14,28 @@ function say(line) {
   console.log(JSON.stringify(line));
 }
 
-async function main([port]) {
+// What a server needs that takes one policy only.
+function only(policy, pairs) {
+  return {
+    securityPolicies: [SecurityPolicy[policy]],
+    securityModes: [MessageSecurityMode.SignAndEncrypt],
+    serverInfo: { applicationUri: "urn:ua-bridge:system-tests:plc" },
+    certificateFile: path.join(pairs, "server_certificate.der"),
+    privateKeyFile: path.join(pairs, "server_key.pem"),
+  };
+}
+
+async function main([port, policy, pairs]) {
   const serverCertificateManager = new OPCUACertificateManager({
-    rootFolder: path.join(process.env.HOME, "plc-pki"),
+    rootFolder: path.join(process.env.HOME, `plc-pki-${port}`),
     automaticallyAcceptUnknownCertificate: true,
   });
   await serverCertificateManager.initialize();
-  const server = new OPCUAServer({ port: Number(port), serverCertificateManager });
+  const server = new OPCUAServer({
+    port: Number(port),
+    serverCertificateManager,
+    ...(policy ? only(policy, pairs) : {}),
+  });
   await server.initialize();
   const addressSpace = server.engine.addressSpace;
   const space = addressSpace.registerNamespace("urn:ua-bridge:system-tests:plc");

@@ -2,12 +2,14 @@
 
 use std::fs;
 use std::path::Path;
+use std::process::Command;
 use std::time::Duration;
 
 use nix::sys::signal::Signal;
 use serde_json::{Value, json};
 use system_tests::{
     Cell, Child, METRICS_SERVER, Peer, SERVER_ENDPOINT, UadpSocket, eventually, http_get, metrics,
+    program,
 };
 use uadp::{NetworkMessage, Scalar, Variant};
 
@@ -255,4 +257,86 @@ fn a_password_goes_over_no_session_without_security_unless_told() {
     assert_eq!(times(&watch, speed, "Good"), 0);
     save(&file, &text("security: None, ", "right"));
     shows(&mut watch, speed, "Good", &json!(0.5));
+}
+
+/// The three, each at a server that takes no other: who is heard there has spoken it.
+const POLICIES: [&str; 3] = [
+    "Basic256Sha256",
+    "Aes128_Sha256_RsaOaep",
+    "Aes256_Sha256_RsaPss",
+];
+
+#[test]
+fn each_security_policy_is_spoken_with_servers_of_two_makers_once_they_are_trusted() {
+    let Some(cell) = Cell::with(&[Peer::Python, Peer::NodeOpcua]) else {
+        return;
+    };
+    let folder = cell.folder().join("pairs");
+    let pairs = folder.to_str().unwrap();
+    let made = cell.asyncua_once("opcua_access.py", &["pairs", pairs]);
+    assert_eq!(made.len(), 1);
+    let (mut plcs, mut servers, mut variables) = (Vec::new(), String::new(), String::new());
+    for (number, policy) in POLICIES.into_iter().cycle().take(6).enumerate() {
+        let port = format!("{}", 4841 + number);
+        let url = format!("opc.tcp://127.0.0.1:{port}");
+        let plc = if number < POLICIES.len() {
+            cell.asyncua_started("opcua_plc.py", &[&url, "--only", policy, "--pairs", pairs])
+        } else {
+            cell.node_opcua_started("plc.js", &[&port, policy, pairs])
+        };
+        plcs.push(plc.told().start());
+        servers += &format!("  - {{name: plc{number}, endpoint: '{url}', security: {policy}}}\n");
+        let node = |name: &str| format!("{{server: plc{number}, node: 'nsu={URI};s=Line.{name}'}}");
+        variables += &format!(
+            "  - {{node: ns=2;i={}, name: speed{number}, type: Double, origin: 0, from: {}}}\n\
+             \x20 - {{node: ns=2;i={}, name: wish{number}, type: Double, origin: 0, to: {}}}\n",
+            10 + number,
+            node("Speed"),
+            20 + number,
+            node("Setpoint"),
+        );
+    }
+    let mut plcs: Vec<Child> = plcs.into_iter().map(|plc| plc.ready(SOON)).collect();
+    let mapping = format!(
+        "namespaces: {{2: 'urn:ua-bridge:system-tests'}}\nservers:\n{servers}variables:\n{variables}"
+    );
+    let file = cell.file("policies.yaml", &mapping);
+    let _server = cell.ua_server(&[file.to_str().unwrap()]);
+    let links = |pick: &dyn Fn(&Value) -> bool| {
+        eventually("the links are told as they are", SOON, || {
+            let told = metrics(METRICS_SERVER)?["servers"].clone();
+            let all = told.as_array()?;
+            (all.len() == 6 && all.iter().all(pick)).then_some(())
+        });
+    };
+    // Nobody is trusted for having a certificate.
+    links(&|told| told["up"] == false && told["why"].is_string());
+    let trusted = Command::new(program("ua-server"))
+        .arg("trust")
+        .arg(folder.join("server_certificate.der"))
+        .arg("--pki")
+        .arg(cell.folder().join("pki"))
+        .output()
+        .unwrap();
+    assert!(trusted.status.success(), "{trusted:?}");
+    links(&|told| told["up"] == true && told["secured"] == true);
+    for (number, plc) in plcs.iter_mut().enumerate() {
+        let value = 1.5 + f64::from(u8::try_from(number).unwrap());
+        let (speed, wish) = (
+            format!("ns=2;i={}", 10 + number),
+            format!("ns=2;i={}", 20 + number),
+        );
+        let set = if number < POLICIES.len() {
+            json!({"set": "Speed", "value": value})
+        } else {
+            json!({"set": value})
+        };
+        plc.ask(&set.to_string(), SOON);
+        let mut watch = cell.asyncua("opcua_subscribe.py", &[SERVER_ENDPOINT, &speed]);
+        shows(&mut watch, &speed, "Good", &json!(value));
+        let write = [SERVER_ENDPOINT, &wish, "Double", &value.to_string()];
+        let wrote = cell.asyncua_once("opcua_write.py", &write).remove(0);
+        assert_eq!(wrote["status"], "Good");
+        written(plc, value);
+    }
 }

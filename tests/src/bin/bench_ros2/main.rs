@@ -12,6 +12,7 @@ mod idle;
 mod joining;
 mod many;
 mod relays;
+mod sealed;
 mod through;
 
 use std::process::ExitCode;
@@ -46,13 +47,16 @@ fn main() -> ExitCode {
     if plan.has("many") {
         many::measure(&cell, plan.seconds);
     }
-    if ["through", "bursts", "floods", "calls", "goals"]
+    if ["through", "sealed", "bursts", "floods", "calls", "goals"]
         .iter()
         .any(|part| plan.has(part))
     {
         let _core = cell.roscore();
         if plan.has("through") {
             through::measure(&cell, plan.seconds);
+        }
+        if plan.has("sealed") {
+            sealed::measure(&cell, plan.seconds);
         }
         if plan.has("bursts") {
             bursts::measure(&cell, plan.turns);
@@ -128,13 +132,14 @@ impl Plan {
 
 /// Each takes seconds.
 const FLOODS: u64 = 3;
-const PARTS: [&str; 10] = [
+const PARTS: [&str; 11] = [
     "round-trip",
     "throughput",
     "joining",
     "idle",
     "many",
     "through",
+    "sealed",
     "bursts",
     "floods",
     "calls",
@@ -147,5 +152,5 @@ bench-ros2 [--quick] [--seconds N] [--turn N] [PART..]
   --quick      a trial of a minute; its figures are no measurement
   --seconds N  how long each path gets messages at 1 kHz, 20 unless told
   --turn N     samples through one relay before the next has its turn, 50 unless told
-  PART         round-trip, throughput, joining, idle, many, through, bursts, floods, calls, goals; all unless told
+  PART         round-trip, throughput, joining, idle, many, through, sealed, bursts, floods, calls, goals; all unless told
 ";

@@ -55,7 +55,12 @@ pub(crate) struct Ways {
 impl Ways {
     /// Starts all, with topics in whose queues so many may wait, and waits until each way carries.
     pub(crate) fn stand(cell: &Cell, waiting: u32) -> Self {
-        let mapping = MAPPING.replace("WAITING", &waiting.to_string());
+        Self::secured(cell, waiting, "")
+    }
+
+    /// The same with what else the mapping of both bridges has.
+    pub(crate) fn secured(cell: &Cell, waiting: u32, security: &str) -> Self {
+        let mapping = MAPPING.replace("WAITING", &waiting.to_string()) + security;
         let mapping = cell.file("through.yaml", &mapping);
         let mapping = mapping.to_string_lossy();
         let bridges = [cell.bridge_ros1(&[&mapping]), cell.bridge_ros2(&[&mapping])];
@@ -129,7 +134,7 @@ impl Ways {
         })
     }
 
-    fn used(&self, way: usize) -> Duration {
+    pub(crate) fn used(&self, way: usize) -> Duration {
         if way == 0 {
             return processor_time(self.relay.id());
         }

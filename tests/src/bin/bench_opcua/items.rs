@@ -1,0 +1,157 @@
+//! A thousand monitored items that change about as often as their subscription is published, each 100 ms.
+
+use std::collections::BTreeSet;
+use std::time::{Duration, Instant};
+
+use plant_opcua::client::{Client, Notice, Sampled, Subscription, Watch};
+use plant_opcua::types::Variant;
+use system_tests::{Times, micros, now, resident};
+use tokio::runtime::Runtime;
+
+use crate::feed::PERIOD;
+use crate::servers::{ITEMS, START, Server, plain, variable};
+
+pub(crate) fn measure(runtime: &Runtime, servers: &mut [Server], seconds: u64) {
+    println!(
+        "\n{ITEMS} items that change each {} ms, published each {} ms, each change wanted, {seconds} s for each server; \
+         milliseconds from the change:\n",
+        PERIOD.as_millis(),
+        PUBLISHING.as_millis()
+    );
+    println!(
+        "| server | all told after | changes due | changes seen | lost of these | p50 | p99 | later than {} ms | CPU share | in RAM |",
+        LATE.as_millis()
+    );
+    println!("|---|---|---|---|---|---|---|---|---|---|");
+    for server in servers {
+        row(runtime, server, seconds);
+    }
+}
+
+fn row(runtime: &Runtime, server: &mut Server, seconds: u64) {
+    let began = Instant::now();
+    let (client, mut values) = runtime.block_on(subscribed(server.endpoint));
+    let made = began.elapsed();
+    server.change(true);
+    let seconds = Duration::from_secs(seconds);
+    let watched = runtime.block_on(async {
+        watch(&mut values, SETTLING).await;
+        let (from, used) = (now(), server.used());
+        let mut seen = watch(&mut values, seconds).await;
+        let (to, used) = (now(), server.used() - used);
+        // What changed before the end may be on its way.
+        seen.extend(watch(&mut values, SETTLING).await);
+        Seen::within(seen, micros(from), micros(to), used)
+    });
+    server.change(false);
+    let Seen {
+        ticks,
+        distinct,
+        mut delays,
+        late,
+        used,
+    } = watched;
+    let (due, changes) = (
+        ITEMS * (seconds.as_millis() / PERIOD.as_millis()) as usize,
+        ticks * ITEMS,
+    );
+    println!(
+        "| {} | {:.0} | {due} | {changes} | {} | {:.1} | {:.1} | {late} | {:.0} % | {:.0} MB |",
+        server.name,
+        made.as_secs_f64() * 1e3,
+        changes.saturating_sub(distinct),
+        delays.at(0.5) / 1e3,
+        delays.at(0.99) / 1e3,
+        used.as_secs_f64() / seconds.as_secs_f64() * 100.0,
+        resident(server.id()) as f64 / 1e6
+    );
+    assert_eq!(values.dropped(), 0, "the client itself has lost some");
+    runtime.block_on(client.close());
+}
+
+/// A subscription whose items have all told their first value.
+async fn subscribed(endpoint: &str) -> (Client, Subscription) {
+    let client = Client::open(plain(), endpoint);
+    client.up(START).await.unwrap();
+    let watches = (0..ITEMS).map(|number| {
+        Watch::Sampled(Sampled {
+            node: variable(number),
+            // Each change, as it comes.
+            interval: Duration::ZERO,
+            queue: 10,
+            deadband: 0.0,
+        })
+    });
+    let mut values = client.subscribe(watches.collect(), PUBLISHING, ROOM);
+    let mut told = BTreeSet::new();
+    while told.len() < ITEMS {
+        let next = tokio::time::timeout(START, values.next()).await;
+        match next.unwrap().unwrap() {
+            Notice::Value { watch, .. } => {
+                told.insert(watch);
+            }
+            Notice::Refused { watch, status } => panic!("item {watch} is refused: {status}"),
+            Notice::Subscribed | Notice::Event { .. } => {}
+        }
+    }
+    (client, values)
+}
+
+/// Item, time of its change, and when that was told.
+type Told = (usize, f64, f64);
+
+async fn watch(values: &mut Subscription, during: Duration) -> Vec<Told> {
+    let until = tokio::time::Instant::now() + during;
+    let mut seen = Vec::new();
+    while let Ok(notice) = tokio::time::timeout_at(until, values.next()).await {
+        if let Some(Notice::Value { watch, value }) = notice
+            && let Some(Variant::Double(changed)) = value.value
+        {
+            seen.push((watch, changed, micros(now())));
+        }
+    }
+    seen
+}
+
+/// What was told of the changes of a time.
+struct Seen {
+    /// How often all changed.
+    ticks: usize,
+    /// How many different changes were told.
+    distinct: usize,
+    delays: Times,
+    late: usize,
+    used: Duration,
+}
+
+impl Seen {
+    fn within(told: Vec<Told>, from: f64, to: f64, used: Duration) -> Self {
+        let mut seen = Self {
+            ticks: 0,
+            distinct: 0,
+            delays: Times::default(),
+            late: 0,
+            used,
+        };
+        let (mut ticks, mut distinct) = (BTreeSet::new(), BTreeSet::new());
+        for (item, changed, at) in told {
+            // All times here are positive, and their bits in the order of the numbers.
+            if changed < from || changed >= to || !distinct.insert((changed.to_bits(), item)) {
+                continue;
+            }
+            ticks.insert(changed.to_bits());
+            let delay = Duration::from_secs_f64((at - changed).max(0.0) / 1e6);
+            seen.late += usize::from(delay > LATE);
+            seen.delays.add(delay);
+        }
+        (seen.ticks, seen.distinct) = (ticks.len(), distinct.len());
+        seen
+    }
+}
+
+const PUBLISHING: Duration = Duration::from_millis(100);
+/// A change waits for the next publishing, 100 ms at most, and may miss one.
+const LATE: Duration = Duration::from_millis(200);
+/// Notices that may wait in the client.
+const ROOM: usize = 200_000;
+const SETTLING: Duration = Duration::from_secs(2);

@@ -1,0 +1,151 @@
+//! Reads, writes and calls, one at a time.
+
+use std::time::{Duration, Instant};
+
+use plant_opcua::client::{Browse, Client, SecurityChoice};
+use plant_opcua::types::{NodeId, ReferenceTypeId, Variant};
+use system_tests::{Cell, Times, per_message};
+
+use crate::servers::{METHOD, SPACE, Server, WRITTEN, connected, variable};
+
+pub(crate) async fn measure(cell: &Cell, servers: &[Server], requests: usize) {
+    println!(
+        "\n{requests} requests of each kind to each server, one at a time, in turns of {TURN}; microseconds:\n"
+    );
+    println!("| what | security | server | p50 | p99 | p50 / asyncua | CPU of the server |");
+    println!("|---|---|---|---|---|---|---|");
+    for (security, shown) in [
+        (SecurityChoice::None, "None"),
+        (SecurityChoice::Basic256Sha256, "Basic256Sha256"),
+    ] {
+        let mut asked = Vec::new();
+        for server in servers {
+            asked.push(Asked::of(server, connected(cell, server.endpoint, security).await).await);
+        }
+        for what in [What::ReadOne, What::ReadMany, What::Write, What::Call] {
+            kind(&mut asked, what, shown, requests).await;
+        }
+        for one in asked {
+            one.client.close().await;
+        }
+    }
+}
+
+/// One kind of request, to all servers.
+async fn kind(asked: &mut [Asked<'_>], what: What, security: &str, requests: usize) {
+    // The first of a kind is another thing: it may have to be looked up.
+    for one in &mut *asked {
+        one.ask(what, 0).await;
+    }
+    let mut all: Vec<(Times, Duration)> = asked.iter().map(|_| Default::default()).collect();
+    let mut left = requests;
+    while left > 0 {
+        let turn = left.min(TURN);
+        left -= turn;
+        for (one, (times, used)) in asked.iter_mut().zip(&mut all) {
+            let before = one.server.used();
+            for number in 0..turn {
+                let began = Instant::now();
+                one.ask(what, left + number).await;
+                times.add(began.elapsed());
+            }
+            *used += one.server.used() - before;
+        }
+    }
+    let measured = asked.iter().zip(&mut all);
+    let rows: Vec<(&str, f64, f64, f64)> = measured
+        .map(|(one, (times, used))| {
+            let each = per_message(*used, times.count());
+            (one.server.name, times.at(0.5), times.at(0.99), each)
+        })
+        .collect();
+    let other = rows.iter().find(|row| row.0 == "asyncua");
+    let other = other.map_or(f64::NAN, |row| row.1);
+    for (name, p50, p99, used) in &rows {
+        let (what, ratio) = (what.shown(), p50 / other);
+        println!("| {what} | {security} | {name} | {p50:.0} | {p99:.0} | {ratio:.2} | {used:.0} |");
+    }
+}
+
+#[derive(Clone, Copy)]
+enum What {
+    ReadOne,
+    ReadMany,
+    Write,
+    Call,
+}
+
+impl What {
+    const fn shown(self) -> &'static str {
+        match self {
+            Self::ReadOne => "read 1",
+            Self::ReadMany => "read 100",
+            Self::Write => "write 1",
+            Self::Call => "call",
+        }
+    }
+}
+
+/// A server, and the session with it.
+struct Asked<'a> {
+    server: &'a Server,
+    client: Client,
+    nodes: Vec<NodeId>,
+    object: NodeId,
+}
+
+impl<'a> Asked<'a> {
+    async fn of(server: &'a Server, client: Client) -> Self {
+        let parents = Browse::of(ReferenceTypeId::HasComponent).inverse();
+        let until = Instant::now() + METHOD_THERE;
+        let object = loop {
+            // That of a call of the space comes with the announcement of who executes it.
+            let found = client.browse(&method(), parents.clone()).await;
+            match found.unwrap_or_default().first() {
+                Some(parent) => break parent.node_id.node_id.clone(),
+                None => assert!(Instant::now() < until, "{} has no method", server.name),
+            }
+            tokio::time::sleep(Duration::from_millis(100)).await;
+        };
+        Self {
+            server,
+            client,
+            nodes: (0..MANY).map(variable).collect(),
+            object,
+        }
+    }
+
+    async fn ask(&mut self, what: What, number: usize) {
+        match what {
+            What::ReadOne => {
+                let one = self.nodes.get(number % MANY..=number % MANY).unwrap();
+                assert_eq!(self.client.read(one).await.unwrap().len(), 1);
+            }
+            What::ReadMany => {
+                let read = self.client.read(&self.nodes).await.unwrap();
+                assert_eq!(read.len(), MANY);
+            }
+            What::Write => {
+                let written = NodeId::new(SPACE, WRITTEN);
+                let value = Variant::Double(number as f64);
+                let told = self.client.write(&[(written, value)]).await.unwrap();
+                assert!(told.iter().all(|status| status.is_good()), "{told:?}");
+            }
+            What::Call => {
+                let called = self.client.call(&self.object, &method(), Vec::new()).await;
+                let told = called.unwrap();
+                assert_eq!(told.first(), Some(&Variant::Boolean(true)), "{told:?}");
+            }
+        }
+    }
+}
+
+fn method() -> NodeId {
+    NodeId::new(SPACE, u32::from(METHOD))
+}
+
+/// Requests to one server, then to the next.
+const TURN: usize = 50;
+/// Values of a large Read.
+const MANY: usize = 100;
+const METHOD_THERE: Duration = Duration::from_secs(10);
