@@ -204,7 +204,7 @@ impl Checked {
 impl Mapping {
     /// Checks the text of a document that stands alone: it includes no other, and no environment variable is set. `file`
     /// is how the findings name it. Never panics, and takes time and room in proportion to the text, of which at most
-    /// 4 MiB are read.
+    /// 32 MiB are read.
     #[must_use]
     pub fn from_yaml(text: &str, file: &str) -> Checked {
         Self::from_text(text, file, &Alone)

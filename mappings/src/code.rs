@@ -42,7 +42,7 @@ macro_rules! codes {
 
 codes! {
     Syntax = "M001", "The text is not YAML, or uses what is not read here: several documents, tags, references to nothing. Nothing after the place has been looked at.";
-    TooLarge = "M002", "The document passes a limit: 4 MiB, 500 000 values, 20 000 variables, 24 levels of nesting.";
+    TooLarge = "M002", "The document passes a limit: 32 MiB, 2 500 000 values, 100 000 variables, 24 levels of nesting.";
     UnknownKey = "M003", "No key of that name is read at this place. Keys are spelt in lower case with underscores.";
     DuplicateKey = "M004", "A key occurs twice in one map. The first one counts, which is seldom what was meant.";
     WrongValue = "M005", "The value is not what its key takes: a list, a map, a number of a range, or one of a few words.";

@@ -42,7 +42,7 @@ document! {
         /// Namespace index in node ids -> namespace URI. A server may number its namespaces otherwise; the URI counts.
         #[schemars(with = "Option<BTreeMap<u16, String>>")]
         namespaces: Namespaces,
-        /// The values of the cell, at most 20 000.
+        /// The values of the cell, at most 100 000.
         variables: Vec<At<VariableEntry>>,
         /// Topics that become values as they appear, at most 1000; the first that fits counts, and an entry of `variables`
         /// with the same topic before all.

@@ -6,7 +6,7 @@ use crate::document::{self, Document};
 use crate::findings::Findings;
 use crate::read::{At, Field, Reader};
 use crate::surroundings::{Readers, Surroundings, beside, fits};
-use crate::tree::{self, MAX_BYTES, Place};
+use crate::tree::{self, MAX_BYTES, MAX_EXPANDED, Place};
 
 /// Reads files into one document.
 pub(crate) struct Loader<'a> {
@@ -73,7 +73,7 @@ impl<'a> Loader<'a> {
         }
         self.secrets(&tree.secrets, &path);
         self.expanded = self.expanded.saturating_add(tree.expanded);
-        if self.expanded > MAX_BYTES {
+        if self.expanded > MAX_EXPANDED {
             let place = Place {
                 file,
                 ..Place::START

@@ -12,7 +12,7 @@ use crate::nearest::nearest;
 use crate::tree::{Kind, Node, Place};
 
 /// Most nodes that are read: an alias may lead to one node many times.
-const MAX_READ: usize = 2_000_000;
+const MAX_READ: usize = 4_000_000;
 
 /// Keys of a map that are told apart without a table.
 const FEW: usize = 16;

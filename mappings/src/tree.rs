@@ -15,9 +15,11 @@ use crate::code::Code;
 use crate::{secret, variables};
 
 /// Largest text, in bytes.
-pub(crate) const MAX_BYTES: usize = 4 * 1024 * 1024;
+pub(crate) const MAX_BYTES: usize = 32 << 20;
+/// Most bytes that the values of environment variables come to, each time that one is named.
+pub(crate) const MAX_EXPANDED: usize = 4 << 20;
 /// Most nodes a text may hold, with what its merge keys bring.
-const MAX_NODES: usize = 500_000;
+const MAX_NODES: usize = 2_500_000;
 /// Deepest nesting, aliases followed.
 const MAX_DEPTH: usize = 24;
 /// So many bytes of a key that a merge key brings count as one node more.
@@ -306,7 +308,7 @@ impl<'t> Builder<'_, 't> {
         };
         let expanded = variables::expand(&text, &variable);
         self.expanded = self.expanded.saturating_add(taken.get());
-        if self.expanded > MAX_BYTES {
+        if self.expanded > MAX_EXPANDED {
             return Err(too_expanded(place));
         }
         Ok(match expanded {
@@ -410,10 +412,10 @@ impl<'t> Builder<'_, 't> {
     }
 }
 
-/// That values of variables come to more than a document may have.
+/// That values of variables come to more than they may.
 pub(crate) fn too_expanded(place: Place) -> Fault {
     let message =
-        format!("the values of its environment variables have more than {MAX_BYTES} bytes");
+        format!("the values of its environment variables have more than {MAX_EXPANDED} bytes");
     too_large(place, message)
 }
 

@@ -163,6 +163,49 @@ fn a_large_array_takes_up_no_more_than_three_times_its_size_and_can_be_read_by_p
 }
 
 #[test]
+fn thirty_thousand_variables_are_served_and_the_last_of_them_gets_its_value() {
+    const MANY: u32 = 30_000;
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let entries: String = (1..=MANY)
+        .map(|n| format!("  - {{node: ns=2;i={n}, name: v{n}, type: Double, origin: 2}}\n"))
+        .collect();
+    let text = format!(
+        "namespaces: {{2: 'urn:ua-bridge:system-tests'}}\nspaces: [{{id: 2}}]\nvariables:\n{entries}"
+    );
+    let mapping = cell.file("many.yaml", &text);
+    let server = cell.ua_server(&[mapping.to_str().unwrap()]);
+    let last = format!("ns=2;i={MANY}");
+    let wait = Duration::from_secs(60);
+    let status = |wanted: &str| {
+        let shown = cell.asyncua_try("opcua_read.py", &[SERVER_ENDPOINT, &last])?;
+        (shown.first()?["status"] == wanted).then(|| shown[0]["value"].clone())
+    };
+    eventually("the last one waits for its value", wait, || {
+        status("BadWaitingForInitialData")
+    });
+    let group = UadpSocket::join();
+    let writer = u16::try_from(MANY).unwrap();
+    let mut sequence = 0;
+    let value = eventually("the last one has its value", wait, || {
+        sequence += 1;
+        group.send(&key_frame(writer, sequence, |fields| {
+            fields.scalar(Scalar::Double(30.5)).unwrap();
+        }));
+        status("Good")
+    });
+    assert_eq!(value, json!(30.5));
+    let below = read(&cell, &["--children", "ns=1;s=UaSpace.2"])["children"].clone();
+    let below = below.as_array().unwrap();
+    assert_eq!(below.len(), usize::try_from(MANY).unwrap());
+    assert_eq!(below[0], "ns=2;i=1");
+    assert_eq!(below[below.len() - 1], json!(last));
+    let held = resident(server.id());
+    assert!(held < 700 << 20, "{held} bytes");
+}
+
+#[test]
 fn a_value_whose_messages_are_all_dropped_is_not_good_until_a_value_comes() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;

@@ -22,7 +22,7 @@ use crate::topic::{SpaceId, TopicId};
 use crate::tree::Place;
 
 /// Most variables of one document.
-const MAX_VARIABLES: usize = 20_000;
+const MAX_VARIABLES: usize = 100_000;
 
 /// The WriterGroupId of nodes of namespace 0, whose own index is the null value: the highest, which no server reaches.
 pub(super) const NAMESPACE_ZERO: NonZeroU16 = NonZeroU16::MAX;

@@ -346,7 +346,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Conversation<S> {
         // The one before is good until a message comes with the new one (OPC 10000-4, 5.5.2).
         let token = self.channel.token_id();
         match number(MESSAGE_CHUNK_HEADER_SIZE) {
-            Some(its) if its == token || its + 1 == token => Ok(()),
+            Some(its) if its == token || its.checked_add(1) == Some(token) => Ok(()),
             _ => Err(WireFault::bad(
                 StatusCode::BadSecureChannelTokenUnknown,
                 "no token of this channel",
