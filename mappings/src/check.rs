@@ -296,7 +296,8 @@ fn compile(
     let namespaces = cell::namespaces(document.namespaces.as_ref(), findings);
     let pubsub = network::pubsub(document.pubsub.as_ref(), findings);
     let server = network::server(document.server.as_ref(), findings);
-    let servers = servers::check(document.servers.as_ref(), &server.endpoint, findings);
+    let near = (&server.endpoint, &namespaces);
+    let servers = servers::check(document.servers.as_ref(), near, findings);
     let variables = match &document.variables {
         Some(entries) => {
             let entries = entries.value.as_deref().unwrap_or_default();
@@ -326,6 +327,8 @@ fn compile(
         }
         None => Vec::new(),
     };
+    let entries = document.servers.as_ref();
+    servers::alone(&servers, &variables, &calls, entries, findings);
     let groups = document.security.as_ref();
     let groups = groups
         .and_then(|at| at.value.as_deref())

@@ -44,7 +44,7 @@ pub use mapping::{
 pub use node_id::{ExpandedNodeIdText, Identifier, NamespaceText, NodeIdError, NodeIdText};
 pub use pattern::{Pattern, PatternFault, PatternReason, PatternVariable};
 pub use permission::{Anonymous, Permissions, Role};
-pub use remote::{Access, NodeSource, NodeTarget, Password, RemoteServer, User};
+pub use remote::{Access, NodeSource, NodeTarget, Password, RemoteServer, SkillsPlace, User};
 pub use schema::schema;
 pub use security::{GroupMode, GroupPolicy, KeySource, Replay, SecurityGroup, Served};
 pub use surroundings::{Readers, Surroundings};

@@ -14,6 +14,17 @@ pub struct RemoteServer {
     pub name: String,
     /// How it is reached.
     pub access: Access,
+    /// Where its skills are in the space, if they are to be.
+    pub skills: Option<SkillsPlace>,
+}
+
+/// The place in the space that the skills of a server have which knows nothing of it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct SkillsPlace {
+    /// Their namespace, which is theirs alone.
+    pub namespace: u16,
+    /// Whether they are run for other hosts too.
+    pub open: bool,
 }
 
 /// How an OPC UA server is reached, and as whom.

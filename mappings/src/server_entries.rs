@@ -20,6 +20,12 @@ document! {
         user: String,
         /// The user's password, as ${PLC_PASSWORD:-}: the environment of ua-server has it, and not the file; other programs need none.
         password: String,
+        /// The namespace of `namespaces`, which nothing else is in, that its skills have in the space: ua-server shows them there and has
+        /// them run, as a component does its own. Left out: they are not looked for.
+        #[schemars(range(min = 1, max = 65_535))]
+        skills: u16,
+        /// Whether these skills are run for other hosts too where the group is not secured; default false.
+        open: bool,
     }
 
     /// The node of another server that the value comes from.

@@ -6,6 +6,7 @@ opcua_skill.py ENDPOINT execute    Execute and ReadOutcome of skills 1 and 2, fr
 opcua_skill.py ENDPOINT begin      makes skill 1 run, says its number and ends
 opcua_skill.py ENDPOINT after:RUN  how skill 1 is, what is known of that run, and what number the next one has
 opcua_skill.py ENDPOINT idle       how long the second of two sessions waits for the lease of the first, which does nothing
+opcua_skill.py ENDPOINT quick      the states that a subscription with a queue shows of ten runs of skill 2
 opcua_skill.py ENDPOINT race       twenty times two sessions begin skill 2 at once
 opcua_skill.py ENDPOINT uses       what skill 1 of the server's own namespace refers to with UsesSkill
 opcua_skill.py ENDPOINT find:TYPE  the objects whose type is that one of urn:ua-bridge:skills or a subtype
@@ -259,6 +260,38 @@ async def race(client, ns, other):
         await locks[winner].call_method(f"{di}:ExitLock")
 
 
+class States:
+    def __init__(self):
+        self.seen = []
+
+    def datachange_notification(self, _node, value, _data):
+        self.seen.append(value.Text)
+
+
+async def quick(client, ns, _other):
+    skill, states = Skill(client, ns, 2), States()
+    await skill.call("Reset")
+    subscription = await client.create_subscription(100, states)
+    await subscription.subscribe_data_change(await skill.child("CurrentState"), queuesize=50, sampling_interval=100)
+    for _ in range(10):
+        status, _run = await asked(skill, "Execute", names(), values(), timeout(0))
+        assert status == "Good", status
+
+        async def ended():
+            return await skill.state() in ("Ready", "Halted")
+
+        await until(ended)
+
+    async def all_seen():
+        return states.seen.count("Running") >= 10 and states.seen[-1] != "Running"
+
+    try:
+        await until(all_seen, 5)
+    except TimeoutError:
+        pass
+    say(seen=states.seen)
+
+
 async def execute(client, ns, other):
     hold, quick = Skill(client, ns, 1), Skill(client, ns, 2)
     theirs = Skill(other, ns, 2)
@@ -348,7 +381,7 @@ async def main():
         if args.part.startswith("after:"):
             await after(client, ns, int(args.part.removeprefix("after:")))
             return
-        of_two = {"begin": begin, "execute": execute, "idle": idle, "race": race}
+        of_two = {"begin": begin, "quick": quick, "execute": execute, "idle": idle, "race": race}
         if args.part in of_two:
             async with await client_of(args) as other:
                 await of_two[args.part](client, ns, other)

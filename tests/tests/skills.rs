@@ -78,6 +78,25 @@ fn state(name: &str) -> (u32, &'static str) {
 
 #[path = "skills/faults.rs"]
 mod faults;
+#[path = "skills/foreign.rs"]
+mod foreign;
+
+#[test]
+fn a_client_with_a_queue_sees_each_state_of_runs_that_are_over_at_once() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    // Several runs begin and end within one sampling interval of the client.
+    let yaml = COMPONENT.replace("50 ms", "1 ms");
+    let _component = component(&cell.file("component.yaml", &yaml));
+    let lines = cell.asyncua_once("opcua_skill.py", &[ENDPOINT, "quick"]);
+    let seen = lines[0]["seen"].as_array().unwrap();
+    let mut expected = vec![json!("Ready")];
+    for _ in 0..10 {
+        expected.extend([json!("Running"), json!("Ready")]);
+    }
+    assert_eq!(*seen, expected);
+}
 
 #[test]
 fn clients_walk_all_states_and_methods_and_see_nine_kinds_of_transition() {

@@ -77,7 +77,7 @@ impl Default for OwnActions {
 }
 
 impl OwnActions {
-    /// Offers an action, whose goals go to `client`. Reports its calls and values. Needs a tokio runtime. `None` where there are
+    /// Offers an action, whose goals go to `client`, in the place of what was offered as it. Reports its calls and values. Needs a tokio runtime. `None` where there are
     /// no identifiers behind that of its goals.
     pub fn add<C: ActionClient>(
         &mut self,
@@ -102,6 +102,8 @@ impl OwnActions {
             latched_by: None,
         });
         let (commands, told) = mpsc::channel(MOST_COMMANDS);
+        // Those that others took the place of.
+        while self.tasks.try_join_next().is_some() {}
         let serving = Action {
             encoding,
             topic,

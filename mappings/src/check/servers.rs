@@ -4,14 +4,17 @@ use std::collections::HashMap;
 use std::num::NonZeroU16;
 
 use super::network::{duration, is_own, policy, remote_endpoint};
+use super::variables::Namespaces;
 use super::{Declared, required};
+use crate::call::Call;
 use crate::code::Code;
 use crate::findings::Findings;
-use crate::mapping::{Endpoint, SecurityPolicy};
+use crate::mapping::{Endpoint, SecurityPolicy, Variable};
 use crate::node_id::ExpandedNodeIdText;
 use crate::read::{At, Field, given, short};
-use crate::remote::{Access, NodeSource, NodeTarget, Password, RemoteServer, User};
+use crate::remote::{Access, NodeSource, NodeTarget, Password, RemoteServer, SkillsPlace, User};
 use crate::server_entries::{FromEntry, RemoteServerEntry, ToEntry};
+use crate::topic::SpaceId;
 use crate::tree::Place;
 
 /// Most entries of `servers`.
@@ -22,7 +25,7 @@ pub(super) type Servers = Declared<Vec<RemoteServer>>;
 /// The servers; `own` is where the cell's own server is.
 pub(super) fn check(
     entries: Option<&At<Vec<At<RemoteServerEntry>>>>,
-    own: &Endpoint,
+    (own, namespaces): (&Endpoint, &Namespaces),
     findings: &mut Findings,
 ) -> Servers {
     let mut servers = Servers {
@@ -43,9 +46,11 @@ pub(super) fn check(
         return servers;
     }
     let mut names: HashMap<String, Place> = HashMap::new();
+    let mut numbers: HashMap<u16, Place> = HashMap::new();
     for at in entries {
         let entry = at.value.as_ref();
-        let server = entry.and_then(|entry| server(entry, at.place, own, findings));
+        let known = (own, namespaces, &mut numbers);
+        let server = entry.and_then(|entry| server(entry, at.place, known, findings));
         let Some((server, place)) = server else {
             servers.partial = true;
             continue;
@@ -65,7 +70,7 @@ pub(super) fn check(
 fn server(
     entry: &RemoteServerEntry,
     place: Place,
-    own: &Endpoint,
+    (own, namespaces, numbers): (&Endpoint, &Namespaces, &mut HashMap<u16, Place>),
     findings: &mut Findings,
 ) -> Option<(RemoteServer, Place)> {
     const OF: &str = "the server";
@@ -74,6 +79,7 @@ fn server(
     let endpoint = required(&entry.endpoint, "endpoint", OF, place, findings)
         .and_then(|(text, place)| other_endpoint((text, place), own, findings));
     let security = given(&entry.security).map(|(entry, place)| (policy(*entry), place));
+    let skills = skills(entry, namespaces, numbers, findings);
     let user = user(entry, findings)?;
     if let (Some((SecurityPolicy::None, place)), Some(_)) = (security, &user) {
         let message = "the password of a user goes over a session without security";
@@ -87,7 +93,92 @@ fn server(
         security: security.map(|(security, _)| security),
         user,
     };
-    Some((RemoteServer { name, access }, place))
+    let server = RemoteServer {
+        name,
+        access,
+        skills: skills?,
+    };
+    Some((server, place))
+}
+
+/// The place of its skills. `None` when it is faulty, which is noted.
+#[expect(clippy::option_option, reason = "faulty, left out, or there")]
+fn skills(
+    entry: &RemoteServerEntry,
+    namespaces: &Namespaces,
+    numbers: &mut HashMap<u16, Place>,
+    findings: &mut Findings,
+) -> Option<Option<SkillsPlace>> {
+    let open = match (&entry.open, given(&entry.open)) {
+        (None, _) => false,
+        (Some(_), given) => *given?.0,
+    };
+    let Some(at) = &entry.skills else {
+        if let Some(open) = &entry.open {
+            let message = "`open` without `skills`: it says who may have skills of the server run";
+            findings.error(Code::Servers, open.place, message);
+            return None;
+        }
+        return Some(None);
+    };
+    let (namespace, place) = (*at.value.as_ref()?, at.place);
+    if !namespaces.known.contains_key(&namespace) && !namespaces.partial {
+        let message = format!("the skills are in namespace {namespace}, which is not listed");
+        findings
+            .error(Code::UndeclaredNamespace, place, message)
+            .help(format!(
+                "namespaces: {{{namespace}: urn:...}}, with the ApplicationUri of the server"
+            ));
+        return None;
+    }
+    if let Some(first) = numbers.insert(namespace, place) {
+        let line = findings.line(first, place);
+        let message = format!("the skills of another server are in namespace {namespace} too");
+        findings
+            .error(Code::Servers, place, message)
+            .label(format!("first at {line}"))
+            .help("the names of skills are ua_0_<namespace>_<100 for each skill>: each server needs a namespace of its own");
+        return None;
+    }
+    Some(Some(SkillsPlace { namespace, open }))
+}
+
+/// Nothing else may be where skills are: what is there has its identifiers from the skills.
+pub(super) fn alone(
+    servers: &Servers,
+    variables: &[Variable],
+    calls: &[Call],
+    entries: Option<&At<Vec<At<RemoteServerEntry>>>>,
+    findings: &mut Findings,
+) {
+    let all = variables
+        .iter()
+        .map(|variable| (variable.topic, &variable.name))
+        .chain(calls.iter().map(|call| (call.topic, &call.name)));
+    let all: Vec<_> = all.collect();
+    let entries = entries.and_then(|entries| entries.value.as_deref());
+    for entry in entries.unwrap_or_default() {
+        let at = entry.value.as_ref().and_then(|entry| given(&entry.skills));
+        let Some((namespace, place)) = at else {
+            continue;
+        };
+        let is_in = servers
+            .known
+            .iter()
+            .any(|server| server.skills.is_some_and(|of| of.namespace == *namespace));
+        let other = all
+            .iter()
+            .find(|(topic, _)| topic.space == SpaceId::UA && topic.namespace.get() == *namespace);
+        if let (true, Some((topic, name))) = (is_in, other) {
+            let message = format!(
+                "namespace {namespace} is that of the skills of a server, and `{}` ({topic}) is in it",
+                short(name)
+            );
+            findings
+                .error(Code::Servers, place, message)
+                .help("give the skills a namespace that nothing else is in");
+        }
+    }
 }
 
 fn name_of(name: &str, place: Place, findings: &mut Findings) -> Option<String> {

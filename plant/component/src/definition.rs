@@ -49,6 +49,11 @@ pub fn action_type(types: &[TypeName]) -> Option<String> {
     Some(format!("{PACKAGE}/{}", action_name(nearest)))
 }
 
+/// The action of the type that all skills are of.
+pub(crate) fn of_all() -> String {
+    format!("{PACKAGE}/RunSkill")
+}
+
 /// A name of OPC UA as ROS spells those of fields: `target_position` of `TargetPosition`.
 #[must_use]
 pub fn field_name(name: &str) -> String {

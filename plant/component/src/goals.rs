@@ -13,19 +13,21 @@ use bridge_node::{CallFault, Ran, now};
 use bytes::Bytes;
 use mappings::TopicId;
 use program::{Method, State};
-use skills::{Facts, Observer, Outcome, Owner, Parameters, Refusal, Shown, Skill, Told, Value};
+use skills::{Facts, Observer, Outcome, Owner, Parameters, Shown, Told, Value};
 use tokio::sync::broadcast;
 use tokio::task::JoinHandle;
 use tokio::time::{Instant, sleep_until};
 
 use crate::definition;
+use crate::executor::Executor;
 use crate::fields;
 
 /// What a skill is as an action. `name` is that of the skill in its component.
 pub(crate) fn action(topic: TopicId, (component, open): (&str, bool), facts: &Facts) -> OwnAction {
     let of = facts.types.first();
     let of = of.map(|of| format!("{} nsu={}", of.name, of.namespace));
-    let ros = definition::action_type(&facts.types).unwrap_or_default();
+    // A Program that is no skill is run as one of the type that all are of.
+    let ros = definition::action_type(&facts.types).unwrap_or_else(definition::of_all);
     OwnAction {
         topic,
         name: format!("{component}.{}.Goal", facts.name),
@@ -58,6 +60,8 @@ enum Heard {
         passing: bool,
     },
     Ended(Arc<Outcome>),
+    /// Nothing more is known of them.
+    Lost(String),
 }
 
 /// Hears what happens to a skill, for its goals.
@@ -81,6 +85,10 @@ impl Observer for Reporter {
         // Without any goal nobody hears it.
         let _heard_by = self.0.send(heard);
     }
+
+    fn lost(&self, why: &str) {
+        let _heard_by = self.0.send(Heard::Lost(why.to_owned()));
+    }
 }
 
 fn stands(shown: &Shown, passing: bool) -> Heard {
@@ -100,7 +108,7 @@ fn stands(shown: &Shown, passing: bool) -> Heard {
 /// Has goals done by a skill.
 #[derive(Debug)]
 pub(crate) struct Doer {
-    skill: Skill,
+    skill: Executor,
     reporter: Reporter,
     current: Arc<Mutex<Option<Current>>>,
 }
@@ -114,7 +122,7 @@ struct Current {
 }
 
 impl Doer {
-    pub(crate) fn new(skill: Skill, reporter: Reporter) -> Self {
+    pub(crate) fn new(skill: Executor, reporter: Reporter) -> Self {
         Self {
             skill,
             reporter,
@@ -194,16 +202,16 @@ impl ActionClient for Doer {
 }
 
 /// Begins a run: gives its number.
-async fn begin(skill: &Skill, body: &[u8]) -> Result<u32, String> {
+async fn begin(skill: &Executor, body: &[u8]) -> Result<u32, String> {
     let given =
         parameters(skill.facts(), body).map_err(|why| format!("BadInvalidArgument: {why}"))?;
-    let told = |refusal: Refusal| refusal.to_string();
     // Looked at before anything moves; Start looks again.
-    Parameters::complete(&skill.facts().parameters, given.clone()).map_err(told)?;
+    let complete = Parameters::complete(&skill.facts().parameters, given.clone());
+    complete.map_err(|refusal| refusal.to_string())?;
     if skill.shown().state == State::Halted {
-        skill.call(OWNER, Method::Reset).await.map_err(told)?;
+        skill.call(OWNER, Method::Reset).await?;
     }
-    skill.start_with(OWNER, given).await.map_err(told)
+    skill.start_with(OWNER, given).await
 }
 
 /// The parameters of a goal. What is null is not given, and neither is what is zero or empty and has a default: a message of
@@ -230,7 +238,7 @@ fn parameters(facts: &Facts, body: &[u8]) -> Result<Vec<(String, Value)>, String
 /// A goal that was sent.
 #[derive(Debug)]
 pub(crate) struct Sent {
-    skill: Skill,
+    skill: Executor,
     current: Arc<Mutex<Option<Current>>>,
     heard: broadcast::Receiver<Heard>,
     stage: Stage,
@@ -335,6 +343,7 @@ impl Sent {
                 }
             }
             Ok(Heard::Stands { .. } | Heard::Ended(_)) => {}
+            Ok(Heard::Lost(why)) => self.lost(why),
             // Too much of it was not taken: its end may have been among that.
             Err(broadcast::error::RecvError::Lagged(_)) => {
                 if let Some(outcome) = self.skill.outcome(run) {
@@ -343,15 +352,15 @@ impl Sent {
             }
             Err(broadcast::error::RecvError::Closed) => match self.skill.outcome(run) {
                 Some(outcome) => self.end(&outcome),
-                None => {
-                    self.stage = Stage::Ended;
-                    self.events.push_back(GoalEvent::Lost {
-                        text: "the component ends".to_owned(),
-                        ran: Ran::Perhaps,
-                    });
-                }
+                None => self.lost("the component ends".to_owned()),
             },
         }
+    }
+
+    fn lost(&mut self, text: String) {
+        self.stage = Stage::Ended;
+        let ran = Ran::Perhaps;
+        self.events.push_back(GoalEvent::Lost { text, ran });
     }
 
     /// Tells that feedback, or what waits to be told, or the last once more.

@@ -14,19 +14,20 @@ use bridge_node::{
 use bytes::Bytes;
 use discovery::{AnnounceSettings, Announced, Interface};
 use mappings::{Mapping, PubSub, TopicId};
-use program::Method;
+use program::{Method, State};
 use skills::server::{ComponentServer, ServeFault, ServeSettings};
-use skills::{Component, Lds, Owner, Refusal, Skill, Value};
+use skills::{Component, Lds, Owner, Skill};
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 use tracing::{info, warn};
 use uadp::BuiltinType;
 
 use crate::asking::Asking;
+use crate::executor::Executor;
 use crate::fields;
 use crate::goals::{self, Doer, Reporter};
 use crate::partners;
-use crate::space::{GOAL, Outbox, Place, Speaker};
+use crate::space::{GOAL, MOST_IN_SPACE, Outbox, Place, Speaker};
 use crate::work::with_drivers;
 
 /// What a component is started with beside what it is.
@@ -94,11 +95,11 @@ impl ComponentPort {
         let server = ComponentServer::build(component, &settings, |number, facts| {
             let reporter = Reporter::new();
             reporters.push(reporter.clone());
-            first.extend(place.announce(number, facts));
+            first.extend(place.announce(number, facts, &Method::ALL));
             let Some(speaker) = Speaker::new(outbox.clone(), &place, number) else {
                 return vec![Box::new(reporter)];
             };
-            speaker.at_first(facts);
+            speaker.at_first(facts, Some(State::Halted));
             vec![Box::new(speaker), Box::new(reporter)]
         });
         let server = server.map_err(|fault| failure(fault, options))?;
@@ -107,7 +108,7 @@ impl ComponentPort {
             if let Some(topic) = place.topic(number, GOAL) {
                 let with = (&*place.component, place.open);
                 let action = goals::action(topic, with, skill.facts());
-                let added = actions.add(&action, Doer::new(skill.clone(), reporter));
+                let added = actions.add(&action, Doer::new(Executor::Own(skill.clone()), reporter));
                 first.extend(added.unwrap_or_default());
             }
         }
@@ -227,8 +228,9 @@ impl Port for ComponentPort {
                 Owner::Space(space.get().into())
             });
         let Execution { id, request, .. } = execution;
+        let skill = Executor::Own(skill);
         drop(tokio::spawn(async move {
-            let answer = call(&skill, by, method, &request).await;
+            let answer = skill.answer(by, method, &request).await;
             let outcome = Executed::Answered(fields::block(&answer));
             drop(room.send(PortEvent::Executed {
                 execution: id,
@@ -292,51 +294,10 @@ pub fn check(component: &Component, options: &Options) -> Result<(), Failure> {
     clippy::disallowed_methods,
     reason = "what a host remembers over a restart without a file is its clock"
 )]
-fn run_number_of_now() -> u32 {
+pub(crate) fn run_number_of_now() -> u32 {
     let since = SystemTime::now().duration_since(UNIX_EPOCH);
     let number = since.unwrap_or_default().as_millis() / 16;
     u32::try_from(number % (1 << 32)).unwrap_or_default()
-}
-
-/// Success, message and run of a call.
-async fn call(skill: &Skill, by: Owner, method: Method, request: &[u8]) -> [Value; 3] {
-    let answer = match method {
-        Method::Start => match parameters(skill, request) {
-            Ok(parameters) => skill
-                .start_with(by, parameters)
-                .await
-                .map_err(|refusal| refusal.to_string()),
-            Err(why) => Err(format!("BadInvalidArgument: {why}")),
-        },
-        Method::Suspend | Method::Resume | Method::Halt | Method::Reset => skill
-            .call(by, method)
-            .await
-            .map_err(|refusal: Refusal| refusal.to_string()),
-    };
-    match answer {
-        Ok(run) => [true.into(), "".into(), run.into()],
-        Err(message) => [false.into(), message.into(), skill.shown().run.into()],
-    }
-}
-
-/// The parameters of a request: a field for each of the type's, in its order, or none at all. What is null is not given.
-fn parameters(skill: &Skill, request: &[u8]) -> Result<Vec<(String, Value)>, String> {
-    let values = fields::values(request)?;
-    let declared = &skill.facts().parameters;
-    if values.is_empty() {
-        return Ok(Vec::new());
-    }
-    if values.len() != declared.len() {
-        return Err(format!(
-            "the request has {} fields, and the skill {} parameters",
-            values.len(),
-            declared.len()
-        ));
-    }
-    let given = declared.iter().zip(values);
-    Ok(given
-        .filter_map(|(parameter, value)| Some((parameter.name.clone(), value?)))
-        .collect())
 }
 
 fn failure(fault: ServeFault, options: &Options) -> Failure {
@@ -407,7 +368,5 @@ fn announce(component: &Component, url: &str, options: &Options) -> Option<Annou
 
 /// Within the 2 s a port has to end.
 const SHUTDOWN: Duration = Duration::from_millis(1_900);
-/// Identifiers are 16 bit wide, and a skill has a hundred.
-const MOST_IN_SPACE: usize = 654;
 /// So many calls may be executed at once; more are refused.
 const MOST_EXECUTIONS: usize = 64;

@@ -64,8 +64,13 @@ impl Place {
         Some((number, method))
     }
 
-    /// What is said of a skill before anything is sent of it.
-    pub(crate) fn announce(&self, number: u16, facts: &Facts) -> Vec<PortEvent> {
+    /// What is said of a skill that has these methods, before anything is sent of it.
+    pub(crate) fn announce(
+        &self,
+        number: u16,
+        facts: &Facts,
+        methods: &[Method],
+    ) -> Vec<PortEvent> {
         let mut events = Vec::new();
         for (n, description) in self.values(facts) {
             if let Some(topic) = self.topic(number, n) {
@@ -74,7 +79,9 @@ impl Place {
             }
         }
         for (n, method) in CALLS {
-            if let Some(topic) = self.topic(number, n) {
+            if let Some(topic) = self.topic(number, n)
+                && methods.contains(&method)
+            {
                 let description = self.method(facts, method);
                 let open = self.open;
                 events.push(PortEvent::Offer {
@@ -333,8 +340,8 @@ impl Speaker {
         })
     }
 
-    /// How it is before anything has happened.
-    pub(crate) fn at_first(&self, facts: &Facts) {
+    /// How it is before anything has happened, in that state where it is known.
+    pub(crate) fn at_first(&self, facts: &Facts, state: Option<State>) {
         let defaults = facts
             .parameters
             .iter()
@@ -347,10 +354,11 @@ impl Speaker {
             results: Vec::new(),
             trace: Vec::new(),
         });
-        let [state, ..] = self.topics;
-        let halted = State::Halted;
-        self.outbox
-            .put(state, &state_of(halted, "", (0.0, "", 0)), false);
+        let [topic, ..] = self.topics;
+        if let Some(state) = state {
+            self.outbox
+                .put(topic, &state_of(state, "", (0.0, "", 0)), false);
+        }
     }
 
     fn state(&self, shown: &Shown, passing: bool) {
@@ -459,6 +467,8 @@ fn named(of: &[(String, Value)]) -> [Value; 2] {
     ]
 }
 
+/// Identifiers are 16 bit wide, and a skill has a hundred.
+pub(crate) const MOST_IN_SPACE: usize = 654;
 /// Identifiers of a skill.
 const PER_SKILL: u16 = 100;
 /// So many events of a skill wait for the network beside the first.

@@ -1,11 +1,12 @@
 //! The skills of other components: found by their types, run to their end.
 //!
-//! Reading order: this, `find` (which skills a server has), `handle` (one of them), `detector` (those of all servers),
-//! `remote` (a composite of several).
+//! Reading order: this, `find` (which skills a server has), `handle` (one of them), `mirror` (those of a server as if they were
+//! executed here), `detector` (those of all servers), `remote` (a composite of several).
 
 mod detector;
 mod find;
 mod handle;
+mod mirror;
 mod remote;
 
 use std::path::PathBuf;
@@ -17,6 +18,7 @@ use plant_opcua::types::StatusCode;
 pub use detector::{Detected, Detector};
 pub use find::{FoundParameter, FoundSkill, FoundType};
 pub use handle::{RemoteState, SkillHandle};
+pub use mirror::{Mirror, Mirrors, Watchable};
 pub use remote::Remote;
 
 use crate::parameters::TypeName;
@@ -76,6 +78,15 @@ impl SkillClient {
             client,
             endpoint: endpoint.to_owned(),
         })
+    }
+
+    /// Over a client that somebody else has, and that is not closed with this one.
+    #[must_use]
+    pub fn over(client: &Client, endpoint: &str) -> Self {
+        Self {
+            client: client.clone(),
+            endpoint: endpoint.to_owned(),
+        }
     }
 
     /// Where.

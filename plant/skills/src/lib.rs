@@ -24,8 +24,8 @@ pub mod yaml;
 
 pub use authority::{Authority, Owner};
 pub use client::{
-    ClientOptions, Detected, Detector, FoundParameter, FoundSkill, FoundType, RemoteState,
-    SkillClient, SkillHandle,
+    ClientOptions, Detected, Detector, FoundParameter, FoundSkill, FoundType, Mirror, Mirrors,
+    RemoteState, SkillClient, SkillHandle, Watchable,
 };
 pub use component::{
     Asked, Component, Device, DeviceKinds, DriverFault, DriverSetup, Drivers, Form, LEASE, Lds,

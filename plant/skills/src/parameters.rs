@@ -171,6 +171,11 @@ impl Parameters {
         Ok(Self(complete.into_iter().filter_map(named).collect()))
     }
 
+    /// As another server shows them, which has checked them.
+    pub(crate) const fn shown(of: Vec<(String, Value)>) -> Self {
+        Self(of)
+    }
+
     /// A value by the name of its parameter.
     #[must_use]
     pub fn get(&self, name: &str) -> Option<&Value> {

@@ -106,4 +106,9 @@ pub enum Told<'a> {
 pub trait Observer: Send + Sync + 'static {
     /// Something has happened, after which the skill is as `shown`.
     fn told(&self, what: Told<'_>, shown: &Shown);
+
+    /// Nothing more is told of it, since its server cannot be reached: of one that is executed elsewhere.
+    fn lost(&self, why: &str) {
+        let _is_told_otherwise = why;
+    }
 }

@@ -6,8 +6,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use bridge_node::{
-    Answered, AskId, CallDescription, Delivery, Described, Execution, Failure, FailureKind, Kept,
-    LinkState, Port, PortEvent, Router, TypePaths,
+    Answered, AskId, CallDescription, Delivery, Described, Execution, ExecutionId, Failure,
+    FailureKind, Kept, LinkState, Port, PortEvent, Router, TypePaths,
 };
 use bytes::Bytes;
 use discovery::{AnnounceSettings, Announced, MdnsFault, WatchSettings, announce, watch};
@@ -228,6 +228,7 @@ impl Port for ServerPort {
                     Wish::GiveUp(ask) => PortEvent::AskGivenUp { ask },
                 },
                 event = self.others.executing.next() => return event,
+                event = self.others.skills.next() => return event,
                 sourced = self.others.sources.next() => return self.sourced(sourced),
                 () = self.pubsub.called() => self.switch(),
                 event = next(&mut self.components) => return event,
@@ -291,6 +292,7 @@ impl Port for ServerPort {
     }
 
     fn call_known(&mut self, topic: TopicId, description: &Arc<CallDescription>) {
+        self.others.skills.others(topic, &description.name);
         self.methods.known(topic, description);
     }
 
@@ -303,7 +305,15 @@ impl Port for ServerPort {
     }
 
     fn execute(&mut self, execution: Execution) -> bool {
-        self.others.executing.execute(&execution)
+        match self.others.skills.serves(execution.topic) {
+            true => self.others.skills.execute(execution),
+            false => self.others.executing.execute(&execution),
+        }
+    }
+
+    fn abandoned(&mut self, execution: ExecutionId, _topic: TopicId) {
+        // A Method that was called goes on.
+        self.others.skills.abandoned(execution);
     }
 
     fn reload(&mut self, mapping: &Arc<Mapping>, types: &Arc<TypePaths>) -> Vec<String> {
@@ -355,7 +365,7 @@ impl Port for ServerPort {
     }
 
     fn links(&self) -> Vec<LinkState> {
-        self.others.sources.links()
+        self.others.links()
     }
 
     async fn shutdown(mut self) {

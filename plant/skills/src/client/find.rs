@@ -38,6 +38,8 @@ pub struct FoundSkill {
     pub results: Vec<FoundParameter>,
     /// The IRIs of the capabilities it provides.
     pub capabilities: Vec<String>,
+    /// What of its parameters and results is not among those, and why.
+    pub strange: Vec<String>,
     pub(super) nodes: Nodes,
 }
 
@@ -276,8 +278,10 @@ async fn read(
             ));
         }
     }
-    let parameters = group(client, nodes.get("ParameterSet"), &[]).await?;
-    let results = group(client, nodes.get("FinalResultData"), &OUTCOME).await?;
+    let mut strange = Vec::new();
+    let parameters = group(client, nodes.get("ParameterSet"), &[], &mut strange).await?;
+    let results = nodes.get("FinalResultData");
+    let results = group(client, results, &OUTCOME, &mut strange).await?;
     let capabilities = match nodes.get("Capabilities") {
         Some(node) => texts(value(client, node).await?),
         None => Vec::new(),
@@ -299,6 +303,7 @@ async fn read(
         parameters,
         results,
         capabilities,
+        strange,
         nodes,
     })
 }
@@ -369,6 +374,7 @@ async fn group(
     client: &Client,
     node: Option<&NodeId>,
     without: &[&str],
+    strange: &mut Vec<String>,
 ) -> Result<Vec<FoundParameter>, SkillFault> {
     let Some(node) = node else {
         return Ok(Vec::new());
@@ -400,13 +406,18 @@ async fn group(
             .map_err(|error| lost(&error))?
             .into_iter();
         let mut next = || values.next().and_then(|value| value.value);
-        let builtin = match next() {
-            Some(Variant::NodeId(of)) => builtin_of(&of),
+        let data_type = match next() {
+            Some(Variant::NodeId(of)) => Some(of),
             _ => None,
         };
         let array = matches!(next(), Some(Variant::Int32(rank)) if rank >= 0);
         let default = next().as_ref().and_then(from_variant);
-        let Some(builtin) = builtin else {
+        let Some(builtin) = data_type.as_deref().and_then(builtin_of) else {
+            let data_type = data_type.map_or("nothing".to_owned(), |of| text_of(client, &of));
+            strange.push(format!(
+                "{} is of the DataType {data_type}, and a skill is told Booleans, numbers and texts",
+                name_of(&child)
+            ));
             continue;
         };
         found.push(FoundParameter {

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use plant_opcua::client::{CallError, Client, ClientError, Link, Notice, Watch};
-use plant_opcua::types::{NodeId, QualifiedName, StatusCode, UAString, Variant};
+use plant_opcua::types::{DataValue, NodeId, QualifiedName, StatusCode, UAString, Variant};
 use program::{Method, State};
 
 use super::find::FoundSkill;
@@ -51,20 +51,55 @@ impl SkillHandle {
     /// # Errors
     /// No answer, or it is no Program.
     pub async fn state(&self) -> Result<RemoteState, SkillFault> {
-        let paths = ["CurrentState/Id", "RunId", "Progress", "SkillStep"];
-        let [state, run, progress, step] = self.read(paths).await?;
-        Ok(RemoteState {
-            state: state
-                .as_ref()
-                .and_then(state_of)
-                .ok_or_else(|| self.unexpected("its state is none of a Program"))?,
-            run: run.as_ref().map_or(0, number),
-            progress: match progress {
+        Ok(self.seen().await?.0)
+    }
+
+    /// How it is, and when it came to that state by the clock of its server.
+    pub(super) async fn seen(&self) -> Result<(RemoteState, Option<i64>), SkillFault> {
+        let [id, name, kind] = STATE_PATHS;
+        let paths = [id, name, kind, "RunId", "Progress", "SkillStep"];
+        let [id, name, kind, run, progress, step] = self.read_all(paths).await?;
+        let state = [&id, &name, &kind].into_iter().find_map(|value| {
+            let said = value.value.as_ref()?;
+            Some((state_in(said)?, value.source_timestamp.map(|at| at.ticks())))
+        });
+        let (state, since) =
+            state.ok_or_else(|| self.unexpected("its state is none of a Program"))?;
+        let state = RemoteState {
+            state,
+            run: run.value.as_ref().map_or(0, number),
+            progress: match progress.value {
                 Some(Variant::Float(progress)) => progress,
                 _ => 0.0,
             },
-            step: step.as_ref().map(text).unwrap_or_default(),
-        })
+            step: step.value.as_ref().map(text).unwrap_or_default(),
+        };
+        Ok((state, since))
+    }
+
+    /// Whether its runs have numbers.
+    pub(super) fn numbers_runs(&self) -> bool {
+        self.found.nodes.get("RunId").is_some()
+    }
+
+    /// The number of its newest run; 0 where there is none, or no answer.
+    pub(super) async fn run_id(&self) -> u32 {
+        match self.read(["RunId"]).await {
+            Ok([run]) => run.as_ref().map_or(0, number),
+            Err(_) => 0,
+        }
+    }
+
+    /// What its parameters show; nothing without an answer.
+    pub(super) async fn parameters(&self) -> Vec<(String, Value)> {
+        let declared = &self.found.parameters;
+        let ids: Vec<NodeId> = declared.iter().map(|of| of.id.clone()).collect();
+        let values = self.client.read(&ids).await.unwrap_or_default();
+        let shown = declared.iter().zip(values);
+        let shown = shown.filter_map(|(of, value)| {
+            Some((of.name.clone(), from_variant(value.value.as_ref()?)?))
+        });
+        shown.collect()
     }
 
     /// Takes the lease of its component before anything is done, and has it until the session closes (OPC 10000-100, 7). Says
@@ -284,7 +319,7 @@ impl SkillHandle {
             let state = tokio::select! {
                 _ = look.tick() => self.state().await?.state,
                 notice = watch.next() => match notice {
-                    Some(Notice::Value { value, .. }) => match value.value.as_ref().and_then(state_of) {
+                    Some(Notice::Value { value, .. }) => match value.value.as_ref().and_then(state_in) {
                         Some(state) => state,
                         None => continue,
                     },
@@ -303,7 +338,7 @@ impl SkillHandle {
         }
     }
 
-    async fn outcome(&self, run: u32, state: State) -> Result<Outcome, SkillFault> {
+    pub(super) async fn outcome(&self, run: u32, state: State) -> Result<Outcome, SkillFault> {
         let paths = [
             "FinalResultData/Succeeded",
             "FinalResultData/Message",
@@ -348,6 +383,14 @@ impl SkillHandle {
         &self,
         paths: [&str; N],
     ) -> Result<[Option<Variant>; N], SkillFault> {
+        Ok(self.read_all(paths).await?.map(|value| value.value))
+    }
+
+    /// The same with their times; without any where they are not there.
+    async fn read_all<const N: usize>(
+        &self,
+        paths: [&str; N],
+    ) -> Result<[DataValue; N], SkillFault> {
         let nodes: Vec<(usize, NodeId)> = paths
             .iter()
             .enumerate()
@@ -358,10 +401,10 @@ impl SkillHandle {
         let mut all = [const { None }; N];
         for ((at, _), value) in nodes.into_iter().zip(values) {
             if let Some(slot) = all.get_mut(at) {
-                *slot = value.value;
+                *slot = Some(value);
             }
         }
-        Ok(all)
+        Ok(all.map(Option::unwrap_or_default))
     }
 
     fn unexpected(&self, what: &str) -> SkillFault {
@@ -425,12 +468,21 @@ fn why(link: Option<&Link>) -> String {
     }
 }
 
-fn state_of(id: &Variant) -> Option<State> {
-    let Variant::NodeId(id) = id else {
-        return None;
-    };
-    let id = (id.namespace == 0).then(|| id.as_u32())??;
-    State::ALL.into_iter().find(|state| state.node_id() == id)
+/// The state that a variable says: by the node of namespace 0, by its name or by its number.
+pub(super) fn state_in(said: &Variant) -> Option<State> {
+    let mut all = State::ALL.into_iter();
+    match said {
+        Variant::NodeId(id) => {
+            let id = (id.namespace == 0).then(|| id.as_u32())??;
+            all.find(|state| state.node_id() == id)
+        }
+        Variant::LocalizedText(text) => all.find(|state| state.name() == text.text.as_ref()),
+        Variant::String(text) => all.find(|state| state.name() == text.as_ref()),
+        _ => {
+            let number = from_variant(said)?.as_f64()?;
+            all.find(|state| f64::from(state.number()) == number)
+        }
+    }
 }
 
 fn number(value: &Variant) -> u32 {
@@ -452,6 +504,9 @@ fn text(value: &Variant) -> String {
         .to_owned()
 }
 
+/// What says the state of a skill, best first.
+pub(super) const STATE_PATHS: [&str; 3] =
+    ["CurrentState/Id", "CurrentState", "CurrentState/Number"];
 /// How often a server tells of changes.
 const PUBLISHING: Duration = Duration::from_millis(20);
 /// How often it is asked, in case it does not.

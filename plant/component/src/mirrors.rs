@@ -1,0 +1,502 @@
+//! Skills of servers that know nothing of the space, in the space: as values, calls and actions under the number of each server,
+//! with the identifiers that a component's own have.
+
+use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
+use std::time::Duration;
+
+use bridge_node::actions::OwnActions;
+use bridge_node::{Executed, Execution, ExecutionId, PortEvent};
+use mappings::TopicId;
+use plant_opcua::client::{Client, Link};
+use program::Method;
+use skills::{Facts, Mirrors, Observer, Owner, SkillClient, Watchable};
+use tokio::sync::mpsc;
+use tokio::task::AbortHandle;
+use tracing::{info, warn};
+
+use crate::executor::Executor;
+use crate::fields;
+use crate::goals::{self, Doer, Reporter};
+use crate::port::run_number_of_now;
+use crate::space::{GOAL, MOST_IN_SPACE, Outbox, Place, Speaker};
+
+/// A server with skills that knows nothing of the space.
+#[derive(Clone)]
+pub struct Foreign {
+    /// What it is called; its skills are `<name>.<skill>`, or `<name>.<object>.<skill>` where it has several objects with skills.
+    pub name: String,
+    /// Its number in the space.
+    pub namespace: u16,
+    /// Whether its skills are run for other hosts too.
+    pub open: bool,
+    /// Where it is, for people.
+    pub endpoint: String,
+    /// The session with it.
+    pub client: Client,
+}
+
+impl Foreign {
+    fn is_as(&self, other: &Self) -> bool {
+        let of = |one: &Self| {
+            (
+                one.name.clone(),
+                one.namespace,
+                one.open,
+                one.endpoint.clone(),
+            )
+        };
+        of(self) == of(other)
+    }
+}
+
+/// What of the skills of a server is not in the space, and why, by their names.
+pub type ForeignFaults = BTreeMap<String, String>;
+
+/// The skills of such servers, for the port of a program that speaks for them.
+pub struct ForeignSkills {
+    servers: HashMap<String, Server>,
+    outbox: Outbox,
+    first: VecDeque<PortEvent>,
+    actions: OwnActions,
+    heard: mpsc::Receiver<News>,
+    tell: mpsc::Sender<News>,
+    executed: mpsc::Receiver<PortEvent>,
+    executes: mpsc::Sender<PortEvent>,
+}
+
+struct Server {
+    of: Foreign,
+    looking: AbortHandle,
+    mirrors: Option<Mirrors>,
+    skills: BTreeMap<u16, Shown>,
+    faults: ForeignFaults,
+}
+
+/// A skill as it is in the space.
+struct Shown {
+    /// As `press.Grasp`.
+    name: String,
+    executor: Executor,
+    values: Vec<TopicId>,
+    calls: Vec<TopicId>,
+}
+
+impl Drop for Server {
+    fn drop(&mut self) {
+        self.looking.abort();
+    }
+}
+
+/// What is new of a server, by its name.
+struct News {
+    name: String,
+    what: Change,
+}
+
+enum Change {
+    Found(Watchable),
+    Gone(String),
+}
+
+impl Default for ForeignSkills {
+    fn default() -> Self {
+        let (tell, heard) = mpsc::channel(MOST_NEWS);
+        let (executes, executed) = mpsc::channel(MOST_EXECUTIONS);
+        Self {
+            servers: HashMap::new(),
+            outbox: Outbox::default(),
+            first: VecDeque::new(),
+            actions: OwnActions::default(),
+            heard,
+            tell,
+            executed,
+            executes,
+        }
+    }
+}
+
+impl ForeignSkills {
+    /// Speaks for these servers from now on, and for no others. Those that are as before go on undisturbed. Needs a tokio
+    /// runtime.
+    pub fn follow(&mut self, servers: Vec<Foreign>) {
+        let stays = |name: &String, server: &Server| {
+            let mut servers = servers.iter();
+            servers.any(|one| one.name == *name && one.is_as(&server.of))
+        };
+        let gone: Vec<Server> = self
+            .servers
+            .extract_if(|name, server| !stays(name, server))
+            .map(|(_, server)| server)
+            .collect();
+        for mut server in gone {
+            withdraw(&mut server, &mut self.first, "the mapping has it no longer");
+        }
+        for of in servers {
+            if self.servers.contains_key(&of.name) {
+                continue;
+            }
+            let looking = tokio::spawn(look(of.clone(), self.tell.clone())).abort_handle();
+            self.servers.insert(
+                of.name.clone(),
+                Server {
+                    of,
+                    looking,
+                    mirrors: None,
+                    skills: BTreeMap::new(),
+                    faults: BTreeMap::new(),
+                },
+            );
+        }
+    }
+
+    /// What happens next. Cancel-safe; pends without any server.
+    pub async fn next(&mut self) -> PortEvent {
+        loop {
+            if let Some(event) = self.first.pop_front() {
+                return event;
+            }
+            tokio::select! {
+                biased;
+                Some(news) = self.heard.recv() => self.take(news),
+                Some(event) = self.executed.recv() => return event,
+                event = self.actions.recv() => return event,
+                event = self.outbox.next() => return event,
+            }
+        }
+    }
+
+    /// Whether a call is one of a skill of these servers.
+    #[must_use]
+    pub fn serves(&self, topic: TopicId) -> bool {
+        let namespace = topic.namespace.get();
+        let mut servers = self.servers.values();
+        topic.space == mappings::SpaceId::UA
+            && servers.any(|server| server.of.namespace == namespace)
+    }
+
+    /// Executes a call. False where it is none that can be executed now.
+    pub fn execute(&mut self, execution: Execution) -> bool {
+        if self.actions.serves(execution.topic) {
+            let id = execution.id;
+            if let Err(refusal) = self.actions.execute(execution) {
+                self.first.push_back(PortEvent::Executed {
+                    execution: id,
+                    outcome: Executed::Refused(refusal),
+                });
+            }
+            return true;
+        }
+        let Some((executor, method)) = self.skill(execution.topic) else {
+            return false;
+        };
+        // Room for the answer before anything moves.
+        let Ok(room) = self.executes.clone().try_reserve_owned() else {
+            return false;
+        };
+        let by = Owner::Local("a call of the space");
+        let Execution { id, request, .. } = execution;
+        drop(tokio::spawn(async move {
+            let answer = executor.answer(by, method, &request).await;
+            let outcome = Executed::Answered(fields::block(&answer));
+            drop(room.send(PortEvent::Executed {
+                execution: id,
+                outcome,
+            }));
+        }));
+        true
+    }
+
+    fn skill(&self, topic: TopicId) -> Option<(Executor, Method)> {
+        let (number, method) = Place::call(topic)?;
+        let namespace = topic.namespace.get();
+        let mut servers = self.servers.values();
+        let server = servers.find(|server| server.of.namespace == namespace)?;
+        let shown = server.skills.get(&number)?;
+        Some((shown.executor.clone(), method))
+    }
+
+    /// Who asked for an execution does not want it any longer; a run goes on.
+    pub fn abandoned(&mut self, execution: ExecutionId) {
+        self.actions.abandoned(execution);
+    }
+
+    /// A call of another program is heard of: people are told where it is called like one of these servers.
+    pub fn others(&mut self, topic: TopicId, name: &str) {
+        for server in self.servers.values_mut() {
+            let mut skills = server.skills.values();
+            let same = skills.find(|shown| {
+                let method = name
+                    .strip_prefix(&*shown.name)
+                    .and_then(|rest| rest.strip_prefix('.'));
+                method.is_some_and(|method| Method::ALL.iter().any(|known| known.name() == method))
+            });
+            let Some(same) = same.map(|shown| shown.name.clone()) else {
+                continue;
+            };
+            let why = format!(
+                "another component has a skill of that name too, at {topic}: `ua-space call` takes either by its number"
+            );
+            if server.faults.insert(same.clone(), why.clone()).is_none() {
+                warn!(server = server.of.name, skill = same, "{why}");
+            }
+        }
+    }
+
+    /// What is not as it should be, by the names of the servers.
+    pub fn faults(&self) -> impl Iterator<Item = (&str, &ForeignFaults)> {
+        let servers = self.servers.iter();
+        servers.map(|(name, server)| (name.as_str(), &server.faults))
+    }
+
+    fn take(&mut self, news: News) {
+        let Some(server) = self.servers.get_mut(&news.name) else {
+            return;
+        };
+        match news.what {
+            Change::Gone(why) => withdraw(server, &mut self.first, &why),
+            Change::Found(found) => {
+                withdraw(server, &mut self.first, "it has other skills now");
+                show(
+                    server,
+                    &found,
+                    &self.outbox,
+                    (&mut self.actions, &mut self.first),
+                );
+            }
+        }
+    }
+}
+
+/// Puts the skills of a server into the space.
+fn show(
+    server: &mut Server,
+    found: &Watchable,
+    outbox: &Outbox,
+    (actions, first): (&mut OwnActions, &mut VecDeque<PortEvent>),
+) {
+    let of = server.of.clone();
+    let (named, faults) = names(&of.name, found);
+    for (name, why) in &faults {
+        warn!(
+            server = of.name,
+            url = of.endpoint,
+            skill = name,
+            "not as it should be in the space: {why}"
+        );
+    }
+    server.faults = faults;
+    let mut reporters = Vec::new();
+    let mirrors = Mirrors::begin(found, run_number_of_now(), |at, facts| {
+        let Some(named) = named.get(at).and_then(Option::as_ref) else {
+            reporters.push(None);
+            return Vec::new();
+        };
+        let place = named.place(&of);
+        let facts = named.facts(facts);
+        let methods = found.found().nth(at).map(skills::FoundSkill::methods);
+        first.extend(place.announce(named.number, &facts, &methods.unwrap_or_default()));
+        let reporter = Reporter::new();
+        reporters.push(Some(reporter.clone()));
+        let mut observers: Vec<Box<dyn Observer>> = vec![Box::new(reporter)];
+        if let Some(speaker) = Speaker::new(outbox.clone(), &place, named.number) {
+            speaker.at_first(&facts, None);
+            observers.push(Box::new(speaker));
+        }
+        observers
+    });
+    for ((mirror, reporter), named) in mirrors.skills().iter().zip(reporters).zip(&named) {
+        let (Some(reporter), Some(named)) = (reporter, named) else {
+            continue;
+        };
+        let place = named.place(&of);
+        let executor = Executor::Theirs(mirror.clone());
+        let topic = |n| place.topic(named.number, n);
+        let mut calls: Vec<TopicId> = (5..10).filter_map(topic).collect();
+        let mut values: Vec<TopicId> = (1..5).filter_map(topic).collect();
+        // An action halts what is cancelled, and resets what has ended.
+        let runs = [Method::Start, Method::Halt, Method::Reset];
+        if let Some(goal) = topic(GOAL)
+            && runs.iter().all(|method| mirror.methods().contains(method))
+        {
+            let facts = named.facts(mirror.facts());
+            let action = goals::action(goal, (&place.component, of.open), &facts);
+            let added = actions.add(&action, Doer::new(executor.clone(), reporter));
+            first.extend(added.unwrap_or_default());
+            calls.extend((GOAL..GOAL + 3).filter_map(topic));
+            values.extend((GOAL + 3..GOAL + 5).filter_map(topic));
+        }
+        let shown = Shown {
+            name: format!("{}.{}", place.component, named.skill),
+            executor,
+            values,
+            calls,
+        };
+        server.skills.insert(named.number, shown);
+    }
+    info!(
+        server = of.name,
+        url = of.endpoint,
+        namespace = of.namespace,
+        skills = server.skills.len(),
+        "its skills are in the space"
+    );
+    server.mirrors = Some(mirrors);
+}
+
+/// Takes the skills of a server out of the space.
+fn withdraw(server: &mut Server, first: &mut VecDeque<PortEvent>, why: &str) {
+    if let Some(mirrors) = &server.mirrors {
+        mirrors.lose(why);
+    }
+    for shown in std::mem::take(&mut server.skills).into_values() {
+        let calls = shown.calls.into_iter();
+        first.extend(calls.map(|topic| PortEvent::Withdrawn { topic }));
+        let live = false;
+        let values = shown.values.into_iter();
+        first.extend(values.map(|topic| PortEvent::Live { topic, live }));
+    }
+}
+
+/// Where a skill is in the space, and what it is called there.
+struct Named {
+    number: u16,
+    component: String,
+    skill: String,
+}
+
+impl Named {
+    fn place(&self, of: &Foreign) -> Place {
+        Place {
+            component: self.component.clone(),
+            namespace: of.namespace,
+            open: of.open,
+        }
+    }
+
+    fn facts(&self, facts: &Facts) -> Facts {
+        Facts {
+            name: self.skill.clone(),
+            ..facts.clone()
+        }
+    }
+}
+
+/// Names and numbers of the skills of a server; none for those that have no place. And what people are to know of them.
+fn names(server: &str, found: &Watchable) -> (Vec<Option<Named>>, ForeignFaults) {
+    let all: Vec<_> = found.found().collect();
+    let components: HashSet<&str> = all.iter().map(|of| of.component.as_str()).collect();
+    // Those of a component that has numbers; of others an identifier of a node says nothing.
+    let own = all
+        .iter()
+        .filter_map(|of| of.number.filter(|_| of.namespace.is_some()));
+    let numbered = own.collect::<HashSet<u16>>().len() == all.len();
+    let mut faults = ForeignFaults::new();
+    let mut taken: HashSet<String> = HashSet::new();
+    let mut named = Vec::new();
+    for (at, of) in all.iter().enumerate() {
+        let component = match components.len() {
+            1 => server.to_owned(),
+            _ => format!("{server}.{}", plain(&of.component)),
+        };
+        let called = plain(&of.name);
+        let skill = (1..)
+            .map(|nth| match nth {
+                1 => called.clone(),
+                nth => format!("{called}_{nth}"),
+            })
+            .find(|skill| !taken.contains(&format!("{component}.{skill}")))
+            .unwrap_or_default();
+        let name = format!("{component}.{skill}");
+        taken.insert(name.clone());
+        let mut why = found.faults(at);
+        if skill != called {
+            why.push(format!(
+                "another one is called {called} too; this one, {}, has the name {skill} in the space",
+                of.node
+            ));
+        }
+        let number = match of.number.filter(|_| numbered) {
+            Some(number) => Some(number),
+            None => u16::try_from(at + 1).ok(),
+        };
+        let number = number.filter(|number| usize::from(*number) <= MOST_IN_SPACE);
+        if number.is_none() {
+            why.push(format!(
+                "only {MOST_IN_SPACE} skills have a place in the space"
+            ));
+        }
+        let number = number.filter(|_| found.is_watchable(at));
+        if !why.is_empty() {
+            faults.insert(name, why.join("; "));
+        }
+        named.push(number.map(|number| Named {
+            number,
+            component,
+            skill,
+        }));
+    }
+    (named, faults)
+}
+
+/// A name without what parts names.
+fn plain(name: &str) -> String {
+    let parts = |c: char| c == '.' || c.is_whitespace() || c.is_control();
+    name.chars()
+        .map(|c| if parts(c) { '_' } else { c })
+        .collect()
+}
+
+/// Looks which skills a server has, with each connection and from time to time.
+async fn look(of: Foreign, tell: mpsc::Sender<News>) {
+    let mut link = of.client.link();
+    let mut told: Option<(u64, Watchable)> = None;
+    let mut trouble = String::new();
+    loop {
+        let now = link.borrow_and_update().clone();
+        let what = match now {
+            Link::Up { connects, .. } => {
+                match Watchable::of(SkillClient::over(&of.client, &of.endpoint)).await {
+                    Ok(found) => {
+                        trouble.clear();
+                        let known = told.as_ref();
+                        let is_new =
+                            known.is_none_or(|(at, known)| *at != connects || !known.is_as(&found));
+                        told = Some((connects, found.clone()));
+                        is_new.then_some(Change::Found(found))
+                    }
+                    Err(fault) => {
+                        let fault = fault.to_string();
+                        if trouble != fault {
+                            warn!(
+                                server = of.name,
+                                url = of.endpoint,
+                                "it does not tell its skills: {fault}"
+                            );
+                            trouble = fault;
+                        }
+                        None
+                    }
+                }
+            }
+            Link::Down { reason } => told.take().map(|_| Change::Gone(reason)),
+            Link::Connecting | Link::Closed => None,
+        };
+        if let Some(what) = what {
+            let name = of.name.clone();
+            if tell.send(News { name, what }).await.is_err() {
+                return;
+            }
+        }
+        let again = tokio::time::timeout(LOOK_AGAIN, link.changed());
+        if matches!(again.await, Ok(Err(_))) {
+            return;
+        }
+    }
+}
+
+/// How often a server is asked for its skills anew.
+const LOOK_AGAIN: Duration = Duration::from_secs(30);
+/// What was found out and waits for the run loop.
+const MOST_NEWS: usize = 16;
+/// So many calls may be executed at once; more are refused.
+const MOST_EXECUTIONS: usize = 64;

@@ -1,0 +1,353 @@
+//! One skill of another server: what is seen of it, and what is called there.
+
+use std::collections::VecDeque;
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, SystemTime};
+
+use plant_opcua::types::{DataValue, Variant};
+use program::{Method, State, Transition};
+use tokio::sync::{mpsc, watch};
+use tokio::time::{Instant, sleep, sleep_until};
+use tracing::debug;
+
+use super::super::handle::{SkillHandle, state_in};
+use super::{Order, leads_to, way};
+use crate::parameters::Parameters;
+use crate::runs::SkillFault;
+use crate::shown::{Diagnostic, Observer, Outcome, Shown, Told, Transitioned};
+use crate::skill::lock;
+use crate::value::Value;
+use crate::variant::from_variant;
+
+/// What a variable says of a skill.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Part {
+    State,
+    Progress,
+    Step,
+}
+
+pub(super) struct Seen {
+    handle: SkillHandle,
+    observers: Vec<Box<dyn Observer>>,
+    outcomes: Arc<Mutex<VecDeque<Arc<Outcome>>>>,
+    shown: watch::Sender<Arc<Shown>>,
+    now: Shown,
+    next_run: u32,
+    /// When the server came to the state that is shown, by its own clock: what it says of before is old.
+    since: Option<i64>,
+    /// A run was begun from here, and the server has not shown yet that it goes on.
+    begun: bool,
+    /// When it is looked at next while it is at work.
+    look_at: Instant,
+}
+
+type Outcomes = Arc<Mutex<VecDeque<Arc<Outcome>>>>;
+
+impl Seen {
+    pub(super) fn new(
+        handle: SkillHandle,
+        observers: Vec<Box<dyn Observer>>,
+        outcomes: Outcomes,
+        first_run: u32,
+    ) -> (Self, watch::Receiver<Arc<Shown>>) {
+        let created = clock();
+        let now = Shown {
+            state: State::Halted,
+            last: None,
+            since: created,
+            run: 0,
+            progress: 0.0,
+            step: String::new(),
+            parameters: Arc::default(),
+            outcome: None,
+            diagnostic: Diagnostic {
+                created,
+                last_call: None,
+            },
+            executable: [false; 5],
+        };
+        let (shown, watched) = watch::channel(Arc::new(now.clone()));
+        let seen = Self {
+            handle,
+            observers,
+            outcomes,
+            shown,
+            now,
+            next_run: first_run.max(1),
+            since: None,
+            begun: false,
+            look_at: Instant::now(),
+        };
+        (seen, watched)
+    }
+
+    /// Tells what happens until the connection is gone.
+    pub(super) async fn run(
+        mut self,
+        mut notices: mpsc::Receiver<(Part, DataValue)>,
+        mut orders: mpsc::Receiver<Order>,
+        mut gone: watch::Receiver<Option<String>>,
+    ) {
+        let lives = async {
+            self.first().await;
+            loop {
+                let look = self.look_at;
+                tokio::select! {
+                    biased;
+                    order = orders.recv() => match order {
+                        Some(order) => self.order(order).await,
+                        None => return,
+                    },
+                    notice = notices.recv() => match notice {
+                        Some((part, value)) => self.take(part, &value).await,
+                        None => return,
+                    },
+                    () = sleep_until(look), if is_work(self.now.state) => self.look().await,
+                }
+            }
+        };
+        let why = tokio::select! {
+            lost = gone.wait_for(Option::is_some) => lost.ok().and_then(|why| why.clone()),
+            () = lives => None,
+        };
+        let why = why.unwrap_or_else(|| "nobody looks any more".to_owned());
+        for observer in &self.observers {
+            observer.lost(&why);
+        }
+    }
+
+    /// How it is before anything is seen to happen.
+    async fn first(&mut self) {
+        loop {
+            match self.handle.seen().await {
+                Ok((state, since)) => {
+                    self.since = since;
+                    self.now.state = state.state;
+                    self.now.progress = state.progress;
+                    self.now.step = state.step;
+                    self.now.run = match (state.run, is_work(self.now.state)) {
+                        // One goes on that has no number.
+                        (0, true) => self.number(),
+                        (run, _) => run,
+                    };
+                    self.tell(Told::Step);
+                    return;
+                }
+                Err(fault) => debug!("a skill does not say how it is: {fault}"),
+            }
+            sleep(LOOK).await;
+        }
+    }
+
+    async fn look(&mut self) {
+        self.look_at = Instant::now() + LOOK;
+        if let Ok((state, since)) = self.handle.seen().await {
+            self.since = since.or(self.since);
+            self.begun = false;
+            self.go(state.state).await;
+        }
+    }
+
+    async fn take(&mut self, part: Part, value: &DataValue) {
+        let Some(said) = &value.value else {
+            return;
+        };
+        match part {
+            Part::State => self.state(said, value).await,
+            Part::Progress => {
+                let progress = from_variant(said).and_then(|value| value.as_f64());
+                if let Some(progress) = progress {
+                    // Between 0 and 1, for which there is room.
+                    #[expect(clippy::cast_possible_truncation, reason = "a share of 1")]
+                    let progress = progress.clamp(0.0, 1.0) as f32;
+                    self.now.progress = progress;
+                    self.tell(Told::Progress);
+                }
+            }
+            Part::Step => {
+                if let Some(Value::String(step)) = from_variant(said)
+                    && step != self.now.step
+                {
+                    self.now.step = step;
+                    self.tell(Told::Step);
+                }
+            }
+        }
+    }
+
+    async fn state(&mut self, said: &Variant, value: &DataValue) {
+        let Some(state) = state_in(said) else {
+            return;
+        };
+        let at = value.source_timestamp.map(|at| at.ticks());
+        if let (Some(at), Some(since)) = (at, self.since)
+            && at <= since
+        {
+            return;
+        }
+        if state == self.now.state {
+            self.begun = false;
+            self.since = at.or(self.since);
+            return;
+        }
+        if self.begun && at.is_none() {
+            // It may be of before the run, and be told only now.
+            self.look().await;
+            return;
+        }
+        self.begun = false;
+        self.since = at.or(self.since);
+        self.go(state).await;
+    }
+
+    async fn order(&mut self, order: Order) {
+        let Order {
+            method,
+            parameters,
+            reply,
+        } = order;
+        let called = self.call(method, parameters).await;
+        let begun = called.is_ok() && is_work(self.now.state);
+        // Whoever asked may wait no longer.
+        let _told = reply.send(called);
+        if begun {
+            // Who looks only when it is answered is told too.
+            self.tell(Told::Step);
+        }
+    }
+
+    async fn call(
+        &mut self,
+        method: Method,
+        parameters: Vec<(String, Value)>,
+    ) -> Result<u32, SkillFault> {
+        // What the server takes that it should not, such as a Start of what is suspended, is not asked for.
+        self.look().await;
+        let from = self.now.state;
+        let Some(to) = leads_to(from, method) else {
+            return Err(SkillFault::Refused {
+                status: "BadInvalidState".to_owned(),
+                text: format!("{method} is not possible in the state {from}"),
+            });
+        };
+        if method == Method::Start {
+            self.handle.start(parameters).await?;
+            self.look_at = Instant::now() + LOOK;
+            // The server shows it before or after.
+            self.go(to).await;
+            match self.handle.seen().await {
+                Ok((state, at)) if at > self.since || is_work(state.state) => {
+                    self.since = at.or(self.since);
+                    self.go(state.state).await;
+                }
+                Ok(_) | Err(_) => self.begun = true,
+            }
+        } else {
+            self.handle.call(method).await?;
+            if let Ok((state, at)) = self.handle.seen().await
+                && state.state != from
+            {
+                self.since = at.or(self.since);
+                self.go(state.state).await;
+            }
+        }
+        Ok(self.now.run)
+    }
+
+    /// Tells all that lies between the state that is shown and this one.
+    async fn go(&mut self, to: State) {
+        for transition in way(self.now.state, to) {
+            self.pass(transition).await;
+        }
+    }
+
+    async fn pass(&mut self, transition: &'static Transition) {
+        let begins = (transition.from, transition.to) == (State::Ready, State::Running);
+        let ends = is_work(transition.from) && !is_work(transition.to);
+        let mut message = String::new();
+        if begins {
+            self.now.progress = 0.0;
+            self.now.step.clear();
+            self.now.run = match self.handle.run_id().await {
+                0 => self.number(),
+                run => run,
+            };
+            let parameters = Arc::new(Parameters::shown(self.handle.parameters().await));
+            self.now.parameters = Arc::clone(&parameters);
+            self.tell(Told::Parameters(&parameters));
+        }
+        if ends {
+            let outcome = Arc::new(self.ended(transition.to).await);
+            message.clone_from(&outcome.message);
+            let mut outcomes = lock(&self.outcomes);
+            outcomes.push_back(Arc::clone(&outcome));
+            if outcomes.len() > MOST_OUTCOMES {
+                outcomes.pop_front();
+            }
+            drop(outcomes);
+            self.now.outcome = Some(Arc::clone(&outcome));
+            self.tell(Told::Outcome(&outcome));
+        }
+        self.now.state = transition.to;
+        self.now.last = Some(transition);
+        self.now.since = clock();
+        let happened = Transitioned {
+            transition,
+            run: self.now.run,
+            message,
+            at: self.now.since,
+        };
+        self.tell(Told::Transition(&happened));
+    }
+
+    /// How the run ended, that the server has left for this state.
+    async fn ended(&self, state: State) -> Outcome {
+        let run = self.now.run;
+        let numbered = if self.handle.numbers_runs() { run } else { 0 };
+        let outcome = self.handle.outcome(numbered, state).await;
+        let mut outcome = outcome.unwrap_or_else(|fault| Outcome {
+            run,
+            succeeded: false,
+            message: fault.to_string(),
+            results: Vec::new(),
+            trace: Vec::new(),
+        });
+        outcome.run = run;
+        if !outcome.succeeded && outcome.message.is_empty() {
+            outcome.message = format!("it ended in {state}, which says nothing of why");
+        }
+        outcome
+    }
+
+    /// The number of a run that the server gives none.
+    fn number(&mut self) -> u32 {
+        let number = self.next_run;
+        self.next_run = number.wrapping_add(1).max(1);
+        number
+    }
+
+    fn tell(&self, what: Told<'_>) {
+        self.shown.send_replace(Arc::new(self.now.clone()));
+        for observer in &self.observers {
+            observer.told(what, &self.now);
+        }
+    }
+}
+
+fn is_work(state: State) -> bool {
+    matches!(state, State::Running | State::Suspended)
+}
+
+#[expect(
+    clippy::disallowed_methods,
+    reason = "when a machine did something is told by the clock of its host"
+)]
+fn clock() -> SystemTime {
+    SystemTime::now()
+}
+
+/// How often a skill at work is looked at, in case its server does not tell.
+const LOOK: Duration = Duration::from_secs(1);
+/// Outcomes that are kept of one skill.
+const MOST_OUTCOMES: usize = 64;

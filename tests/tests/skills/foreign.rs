@@ -1,0 +1,204 @@
+//! Skills of a server of another maker, which knows Programs of OPC 10000-10 and nothing of the space: `ua-server` speaks for it.
+
+use std::time::Duration;
+
+use serde_json::{Value, json};
+use system_tests::{Cell, Child, METRICS_SERVER, Peer, Started, eventually, metrics, program};
+
+/// asyncua needs seconds to start on a busy machine.
+const SOON: Duration = Duration::from_secs(40);
+const MACHINE: &str = "opc.tcp://127.0.0.1:4857";
+const MAPPING: &str = "
+namespaces: {12: 'urn:ua-bridge:system-tests:machine'}
+servers:
+  - {name: press, endpoint: 'opc.tcp://127.0.0.1:4857', security: None, skills: 12}
+";
+
+fn machine(cell: &Cell, more: &[&str]) -> Child {
+    let machine = cell.asyncua_started("opcua_programs.py", &[&[MACHINE], more].concat());
+    machine.start().ready(SOON)
+}
+
+fn ua_space(words: &[&str]) -> (i32, Vec<String>) {
+    let mut child = Started::new("ua-space", &program("ua-space"))
+        .args(words)
+        .args(["--interface", "lo"])
+        .start();
+    let code = child.wait_for_end(SOON).code().unwrap();
+    (code, child.lines())
+}
+
+fn objects(lines: &[String]) -> Vec<Value> {
+    let lines = lines.iter();
+    lines
+        .filter_map(|line| serde_json::from_str(line).ok())
+        .collect()
+}
+
+/// The skills that are listed, when there are so many whose state and calls are known.
+fn listed(count: usize) -> Vec<Value> {
+    eventually("the skills of the machine are listed", SOON, || {
+        let (_, lines) = ua_space(&["skills", "press", "--seconds", "1.5", "--json"]);
+        let all = objects(&lines).pop()?.as_array()?.clone();
+        let whole = |skill: &&Value| {
+            skill["state"].is_string() && skill["calls"].as_object().unwrap().len() == 5
+        };
+        (all.len() == count && all.iter().filter(whole).count() == count).then_some(all)
+    })
+}
+
+/// Of a run by `ua-space skills start`: how it ended, the states that were seen, and the result.
+fn run(words: &[&str]) -> (i32, Vec<String>, Value) {
+    let (code, lines) = ua_space(&[&["skills", "start"], words, &["--json"]].concat());
+    let events = objects(&lines);
+    let of = |kind: &'static str| {
+        let events = events.iter();
+        events.filter(move |event| event["event"] == kind)
+    };
+    let states = of("state").filter_map(|event| event["state"].as_str().map(str::to_owned));
+    let states: Vec<String> = states.collect();
+    let result = of("result")
+        .next()
+        .cloned()
+        .unwrap_or(json!({"lines": lines}));
+    (code, states, result)
+}
+
+#[test]
+fn a_machine_that_knows_programs_only_is_in_the_space_as_a_component_is() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let mapping = cell.file("press.yaml", MAPPING);
+    let _server = cell.ua_server(&[mapping.to_str().unwrap()]);
+    let mut machine = machine(&cell, &[]);
+
+    let skills = listed(4);
+    let shown: Vec<[&Value; 4]> = skills
+        .iter()
+        .map(|skill| {
+            [
+                &skill["skill"],
+                &skill["type"],
+                &skill["topic"],
+                &skill["state"],
+            ]
+        })
+        .collect();
+    let halted = json!("Halted");
+    let expected = [
+        ("Stamp", "ProgramStateMachineType", "ua_0_12_101"),
+        ("Blink", "ProgramStateMachineType", "ua_0_12_201"),
+        ("Grasp", "GraspGripperSkillType", "ua_0_12_301"),
+        ("Stamp_2", "ProgramStateMachineType", "ua_0_12_401"),
+    ]
+    .map(|(name, of, topic)| [json!(name), json!(of), json!(topic)]);
+    for (shown, expected) in shown.iter().zip(&expected) {
+        let [name, of, topic] = expected;
+        assert_eq!(*shown, [name, of, topic, &halted]);
+    }
+    // What is not understood, and who is called alike, is listed with the reason.
+    let faults = metrics(METRICS_SERVER).unwrap()["servers"][0]["faults"].clone();
+    let fault = |name: &str| faults[name].as_str().unwrap_or_default().to_owned();
+    assert!(fault("press.Odd").contains("CurrentState"), "{faults}");
+    let second = fault("press.Stamp_2");
+    assert!(
+        second.contains("another one is called Stamp") && second.contains("Where is of"),
+        "{faults}"
+    );
+    assert_eq!(faults.as_object().unwrap().len(), 2, "{faults}");
+
+    // It is made ready, given its parameter and run; what it says at its end comes back.
+    let (code, states, result) = run(&["press.Stamp", "Force=33.5"]);
+    assert_eq!((code, &result["succeeded"]), (0, &json!(true)), "{result}");
+    assert_eq!(states, ["Running", "Ready"]);
+    assert_eq!(result["results"], json!({"Parts": 1}));
+    let started = machine.wait_for_json("the machine says what it was given", SOON, |line| {
+        (line.get("started")? == "Stamp").then(|| line.clone())
+    });
+    assert_eq!(
+        (&started["state"], &started["force"]),
+        (&json!("Ready"), &json!(33.5))
+    );
+    // A run that ends at once was one all the same.
+    let echo = Started::new("ua-space", &program("ua-space"))
+        .args(["echo", "ua_0_12_202", "--json", "--interface", "lo"])
+        .start();
+    eventually("both transitions of a run are told", SOON, || {
+        let (code, _, result) = run(&["press.Blink"]);
+        assert_eq!((code, &result["succeeded"]), (0, &json!(true)), "{result}");
+        let told = echo.lines().join(" ");
+        let parts = ["ReadyToRunning", "RunningToReady"].map(|name| told.find(name));
+        (parts[0].is_some() && parts[0] < parts[1]).then_some(())
+    });
+    let (code, _, result) = run(&["press.Grasp", "Force=5"]);
+    assert_eq!((code, &result["succeeded"]), (0, &json!(true)), "{result}");
+    // One that fails says so.
+    let (code, states, result) = run(&["press.Stamp", "Force=99"]);
+    assert_eq!((code, &result["succeeded"]), (1, &json!(false)), "{result}");
+    assert_eq!(states, ["Running", "Halted"]);
+
+    // Its own Start takes every state; the space does not.
+    let (code, lines) = ua_space(&["call", "press.Stamp.Start"]);
+    assert!(
+        code == 1 && lines.iter().any(|line| line.contains("BadInvalidState")),
+        "{lines:?}"
+    );
+    let starts = machine.json_lines();
+    let of_stamp = |line: &&Value| line["started"] == "Stamp" && line["first"] == 1000;
+    assert_eq!(starts.iter().filter(of_stamp).count(), 2, "{starts:?}");
+}
+
+#[test]
+fn goals_for_a_machine_run_it_are_cancelled_and_end_when_it_is_gone() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let mapping = cell.file("press.yaml", MAPPING);
+    let _server = cell.ua_server(&[mapping.to_str().unwrap()]);
+    let mut first = machine(&cell, &["--seconds", "100"]);
+    listed(4);
+    let goal = |words: &[&str]| {
+        Started::new("ua-space", &program("ua-space"))
+            .args(["call", "press.Stamp.Goal", "--json", "--interface", "lo"])
+            .args(words)
+            .start()
+    };
+    let runs = |child: &mut Child| {
+        child.wait_for_json("it runs", SOON, |line| {
+            (line["event"] == "feedback" && line["fields"]["state"] == "Running").then_some(())
+        });
+    };
+    let mut cancelled = goal(&["{force: 12.5}", "--run-timeout", "3"]);
+    runs(&mut cancelled);
+    let started = first.wait_for_json("the machine is started", SOON, |line| {
+        line.get("started").map(|_| line.clone())
+    });
+    assert_eq!(started["force"], 12.5, "{started}");
+    first.wait_for_json("the machine is halted", SOON, |line| {
+        (line.get("halted")? == "Stamp").then_some(())
+    });
+    cancelled.wait_for_end(SOON);
+    let ended = |child: &Child| {
+        let lines = child.json_lines();
+        let mut ended = lines.iter().filter(|line| line["event"] == "result");
+        ended.next().cloned().unwrap_or(json!({"lines": lines}))
+    };
+    assert_eq!(ended(&cancelled)["status"], "CANCELED", "{cancelled}");
+
+    let mut lost = goal(&["{force: 12.5}"]);
+    runs(&mut lost);
+    drop(first);
+    let code = lost.wait_for_end(SOON).code();
+    assert_ne!(code, Some(0), "{lost}");
+    eventually("nobody can call it", SOON, || {
+        let (_, lines) = ua_space(&["skills", "press", "--seconds", "1", "--json"]);
+        let all = objects(&lines).pop()?.as_array()?.clone();
+        let none = |skill: &Value| skill["calls"].as_object().unwrap().is_empty();
+        all.iter().all(none).then_some(())
+    });
+    let _second = machine(&cell, &[]);
+    listed(4);
+    let (code, _, result) = run(&["press.Stamp"]);
+    assert_eq!((code, &result["succeeded"]), (0, &json!(true)), "{result}");
+}
