@@ -60,7 +60,7 @@ fn run(words: &[&str]) -> (i32, Vec<String>, Value) {
     let result = of("result")
         .next()
         .cloned()
-        .unwrap_or(json!({"lines": lines}));
+        .unwrap_or_else(|| json!({"lines": lines}));
     (code, states, result)
 }
 
@@ -182,7 +182,10 @@ fn goals_for_a_machine_run_it_are_cancelled_and_end_when_it_is_gone() {
     let ended = |child: &Child| {
         let lines = child.json_lines();
         let mut ended = lines.iter().filter(|line| line["event"] == "result");
-        ended.next().cloned().unwrap_or(json!({"lines": lines}))
+        ended
+            .next()
+            .cloned()
+            .unwrap_or_else(|| json!({"lines": lines}))
     };
     assert_eq!(ended(&cancelled)["status"], "CANCELED", "{cancelled}");
 

@@ -413,7 +413,8 @@ async fn group(
         let array = matches!(next(), Some(Variant::Int32(rank)) if rank >= 0);
         let default = next().as_ref().and_then(from_variant);
         let Some(builtin) = data_type.as_deref().and_then(builtin_of) else {
-            let data_type = data_type.map_or("nothing".to_owned(), |of| text_of(client, &of));
+            let data_type =
+                data_type.map_or_else(|| "nothing".to_owned(), |of| text_of(client, &of));
             strange.push(format!(
                 "{} is of the DataType {data_type}, and a skill is told Booleans, numbers and texts",
                 name_of(&child)

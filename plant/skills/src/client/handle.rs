@@ -471,18 +471,16 @@ fn why(link: Option<&Link>) -> String {
 /// The state that a variable says: by the node of namespace 0, by its name or by its number.
 pub(super) fn state_in(said: &Variant) -> Option<State> {
     let mut all = State::ALL.into_iter();
-    match said {
-        Variant::NodeId(id) => {
-            let id = (id.namespace == 0).then(|| id.as_u32())??;
-            all.find(|state| state.node_id() == id)
-        }
-        Variant::LocalizedText(text) => all.find(|state| state.name() == text.text.as_ref()),
-        Variant::String(text) => all.find(|state| state.name() == text.as_ref()),
-        _ => {
-            let number = from_variant(said)?.as_f64()?;
-            all.find(|state| f64::from(state.number()) == number)
-        }
+    if let Variant::NodeId(id) = said {
+        let id = (id.namespace == 0).then(|| id.as_u32())??;
+        return all.find(|state| state.node_id() == id);
     }
+    if matches!(said, Variant::LocalizedText(_) | Variant::String(_)) {
+        let said = text(said);
+        return all.find(|state| state.name() == said);
+    }
+    let number = from_variant(said)?.as_f64()?;
+    all.find(|state| f64::from(state.number()) == number)
 }
 
 fn number(value: &Variant) -> u32 {
