@@ -134,6 +134,11 @@ impl Reader {
         self.heard
     }
 
+    /// Whether anything was ever heard of the writer.
+    pub(crate) const fn was_heard(&self) -> bool {
+        self.from.is_some()
+    }
+
     /// Whether the topic is held to be silent.
     pub(crate) const fn is_silent(&self) -> bool {
         self.silent

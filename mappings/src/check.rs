@@ -9,6 +9,7 @@ mod names;
 mod network;
 mod patterns;
 mod permissions;
+mod quality;
 mod remote;
 mod security;
 mod selection;

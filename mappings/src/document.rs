@@ -117,6 +117,10 @@ document! {
         /// What users without a name may be: `off` (they are not let in), `observer`, `operator` or `engineer`. Left out:
         /// observer; and operator where the endpoint is a loopback address and the server has no users.
         anonymous: AnonymousEntry,
+        /// A value of another program that has been uncertain for this long is bad (BadNoCommunication), where its own `quality`
+        /// says nothing else. Left out: it stays uncertain.
+        #[schemars(regex(pattern = DURATION))]
+        bad_after: String,
         /// How much clients may take up.
         limits: LimitsEntry,
     }
@@ -185,8 +189,22 @@ document! {
         /// is over.
         #[schemars(regex(pattern = r"^[0-9]+(\.[0-9]+)? ?Hz$"))]
         at_most: String,
+        /// When the server no longer shows the value as good, because no newer one comes.
+        quality: QualityEntry,
         /// Which roles may do what with the node.
         permissions: PermissionsEntry,
+    }
+
+    /// When the server no longer shows a value as good, because no newer one comes.
+    struct QualityEntry {
+        /// A value that no newer one follows for this long is uncertain (UncertainLastUsableValue), even while its writer is
+        /// heard: for values that come regularly. Left out: a value may be of any age as long as its writer is heard.
+        #[schemars(regex(pattern = DURATION))]
+        uncertain_after: String,
+        /// A value that has been uncertain for this long, for its age or because its writer is silent, is bad
+        /// (BadNoCommunication) and is not shown. Left out: as `server.bad_after` says.
+        #[schemars(regex(pattern = DURATION))]
+        bad_after: String,
     }
 
     /// Which roles may do what with a variable.

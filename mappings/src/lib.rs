@@ -15,6 +15,7 @@ mod nearest;
 mod node_id;
 mod pattern;
 mod permission;
+mod quality;
 mod read;
 mod remote;
 mod schema;
@@ -44,6 +45,7 @@ pub use mapping::{
 pub use node_id::{ExpandedNodeIdText, Identifier, NamespaceText, NodeIdError, NodeIdText};
 pub use pattern::{Pattern, PatternFault, PatternReason, PatternVariable};
 pub use permission::{Anonymous, Permissions, Role};
+pub use quality::Ages;
 pub use remote::{Access, NodeSource, NodeTarget, Password, RemoteServer, SkillsPlace, User};
 pub use schema::schema;
 pub use security::{GroupMode, GroupPolicy, KeySource, Replay, SecurityGroup, Served};

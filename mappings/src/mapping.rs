@@ -13,6 +13,7 @@ use crate::call::{Call, CallBinding};
 use crate::node_id::NodeIdText;
 use crate::pattern::{Pattern, PatternFault, PatternReason, PatternVariable};
 use crate::permission::{Anonymous, Permissions};
+use crate::quality::Ages;
 use crate::remote::{NodeSource, NodeTarget, RemoteServer};
 use crate::security::SecurityGroup;
 use crate::topic::{SpaceId, TopicId};
@@ -438,6 +439,8 @@ pub struct Server {
     pub security: Option<Vec<SecurityPolicy>>,
     /// What users without a name may be.
     pub anonymous: Anonymous,
+    /// When uncertain values of other programs are bad, where they do not say it themselves.
+    pub bad_after: Option<Duration>,
     /// How much clients may take up.
     pub limits: ServerLimits,
 }
@@ -476,6 +479,7 @@ impl Default for Server {
             application_uri: "urn:ua-bridge:server".to_owned(),
             security: None,
             anonymous: Anonymous::Usual,
+            bad_after: None,
             limits: ServerLimits::default(),
         }
     }
@@ -586,6 +590,8 @@ pub struct Variable {
     pub meaning: Meaning,
     /// Who may read and write it at the server.
     pub permissions: Permissions,
+    /// How old it may become.
+    pub ages: Ages,
     /// The node of another OPC UA server it comes from; its origin is the OPC UA side then.
     pub from: Option<Box<NodeSource>>,
     /// The node of another OPC UA server it is written to.

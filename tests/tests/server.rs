@@ -8,6 +8,8 @@ mod authorities;
 mod history;
 #[path = "server/pubsub.rs"]
 mod pubsub;
+#[path = "server/quality.rs"]
+mod quality;
 
 use std::{
     fs,

@@ -66,6 +66,16 @@ impl Router {
         self.topics.get_mut(&topic)
     }
 
+    /// When anything was last heard of each topic of other spaces that was heard at all.
+    pub fn heard(&self) -> impl Iterator<Item = (TopicId, Instant)> {
+        self.topics
+            .iter()
+            .filter_map(|(topic, entry)| match &entry.role {
+                Role::Theirs(reader) if reader.was_heard() => Some((*topic, reader.heard_at())),
+                Role::Theirs(_) | Role::Ours(_) => None,
+            })
+    }
+
     fn take_place(&mut self, now: Now) -> bool {
         if self.room.wants_look(now.monotonic) {
             let strays = self.let_strays_go(now.monotonic);

@@ -260,6 +260,7 @@ pub(super) fn server(entry: Option<&At<ServerEntry>>, findings: &mut Findings) -
         application_uri: application_uri.unwrap_or(default.application_uri),
         security,
         anonymous: permissions::anonymous(entry),
+        bad_after: duration(&entry.bad_after, findings),
         limits: limits(&entry.limits, findings),
     };
     permissions::left_open(entry, &server, findings);

@@ -11,7 +11,7 @@ use super::bindings::{self, Bindings};
 use super::servers::Servers;
 use super::services::Calls;
 use super::types::{self, Types, ValueType};
-use super::{Declared, meaning, permissions, remote, required};
+use super::{Declared, meaning, permissions, quality, remote, required};
 use crate::code::Code;
 use crate::document::{PublishEntry, Queue, UaFieldEntry, VariableEntry};
 use crate::findings::Findings;
@@ -344,6 +344,7 @@ fn variable(
     let several = fields.len() > 1;
     let meaning = meaning::check(entry, (value_type, several), findings);
     let permissions = permissions::of_variable(&entry.permissions, draft.origin, findings);
+    let ages = quality::check(entry, draft.origin, publish.as_ref(), findings);
     let service = bound
         .service
         .map(|service| Box::new(service.settled(value_type, findings)));
@@ -380,6 +381,7 @@ fn variable(
         publish: publish?,
         meaning: meaning?,
         permissions: permissions?,
+        ages: ages?,
         from,
         to,
     })

@@ -4,7 +4,7 @@
 //! and of components come by UADP and are read here; what clients write to the variables of origin 0 goes out by UADP. It knows
 //! no ROS.
 //!
-//! Reading order: `layout` (which nodes), `structures` (their DataTypes), `address` (as they stand in the address space), `values` (what they show),
+//! Reading order: `layout` (which nodes), `structures` (their DataTypes), `address` (as they stand in the address space), `values` (what they show), `wear` (how that grows old),
 //! `history` (what they showed), `nodes` (the node manager), `browse` (in which order), `budget` (what clients may take up), `space` (values in),
 //! `components` and `presence` (which servers are there), `methods` and `argument_types` (calls of the space as Methods), `executing` (Methods of other servers as calls), `sources` (their
 //! nodes as values), `clients` (the sessions for both), `others` (all of these), `port` (the shell's side),
@@ -38,6 +38,7 @@ mod structures;
 mod value;
 mod values;
 mod verbs;
+mod wear;
 
 use std::path::PathBuf;
 use std::process::ExitCode;

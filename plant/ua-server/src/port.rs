@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 use std::net::{SocketAddr, TcpListener};
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use bridge_node::{
     Answered, AskId, CallDescription, Delivery, Described, Execution, ExecutionId, Failure,
@@ -93,6 +93,8 @@ pub(crate) struct ServerPort {
     /// The PubSub configuration, and how the readers of it are.
     pubsub: Arc<PubSub>,
     readers: Readers,
+    /// When a publisher that is not heard counts as away.
+    receive_timeout: Duration,
 }
 
 impl ServerPort {
@@ -161,7 +163,7 @@ impl ServerPort {
             namespaces: layout.namespaces.clone(),
             described: described.clone(),
             mapped_url: setup.mapped_url,
-            space: Space::new(&layout, manager, subscriptions),
+            space: Space::new(&layout, manager, subscriptions).with_ages(mapping),
             handle,
             runtime: Some(runtime),
             serving: Some(serving),
@@ -181,6 +183,7 @@ impl ServerPort {
             events: VecDeque::new(),
             pubsub,
             readers: Readers::default(),
+            receive_timeout: mapping.pubsub().receive_timeout,
         })
     }
 }
@@ -232,6 +235,7 @@ impl Port for ServerPort {
                 sourced = self.others.sources.next() => return self.sourced(sourced),
                 () = self.pubsub.called() => self.switch(),
                 event = next(&mut self.components) => return event,
+                () = at(self.space.due()) => self.space.grow_old(),
                 _ = self.look.tick() => {
                     self.pki.report_rejected();
                     self.access.look();
@@ -289,6 +293,7 @@ impl Port for ServerPort {
 
     fn counted(&mut self, router: &Router) {
         self.pubsub.look(&self.readers, router);
+        self.space.hear(router.heard(), self.receive_timeout);
     }
 
     fn call_known(&mut self, topic: TopicId, description: &Arc<CallDescription>) {
@@ -332,6 +337,7 @@ impl Port for ServerPort {
         .filter(|(_, differs)| *differs)
         .map(|(key, _)| key.to_owned())
         .collect();
+        self.receive_timeout = mapping.pubsub().receive_timeout;
         self.space.limit_writes(largest_write(mapping));
         self.types.replace(types);
         let moved = self.methods.take_moved(mapping);
@@ -340,6 +346,7 @@ impl Port for ServerPort {
                 restart.extend(namespaces);
                 self.access.set_rules(access::rules(mapping, &layout));
                 let (gone, new) = self.space.exchange(&layout);
+                self.space.set_ages(mapping);
                 self.live.retain(|(topic, _)| !gone.contains(topic));
                 self.readers.forget(&gone);
                 self.unbound.extend(gone);
@@ -543,6 +550,14 @@ type Entries = (
     mpsc::Receiver<(NodeId, MonitoredItemHandle)>,
     Heard,
 );
+
+/// Ready at that time; never without one.
+async fn at(time: Option<Instant>) {
+    match time {
+        Some(time) => tokio::time::sleep_until(time.into()).await,
+        None => std::future::pending().await,
+    }
+}
 
 /// What happens next to the servers that are there.
 async fn next(components: &mut Option<Components>) -> PortEvent {

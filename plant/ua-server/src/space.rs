@@ -2,11 +2,11 @@
 
 use std::collections::HashMap;
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use bridge_node::{Room, now};
 use bytes::Bytes;
-use mappings::TopicId;
+use mappings::{Ages, Mapping, SpaceId, TopicId};
 use opcua::server::SubscriptionCache;
 use opcua::types::{DateTime, StatusCode};
 use uadp::{Fields, Scalar, Timestamp};
@@ -16,6 +16,7 @@ use crate::layout::{Layout, Shape, TopicNode};
 use crate::nodes::SpaceManager;
 use crate::structures::Structure;
 use crate::values::{self, Shown, Stamp};
+use crate::wear::{Looks, Wear, Worn};
 
 /// The writing end of the address space for values that come from the space.
 pub(crate) struct Space {
@@ -29,6 +30,9 @@ pub(crate) struct Space {
     returned: Vec<TopicId>,
     /// Topics whose nodes had to go for others.
     gave_way: Vec<TopicId>,
+    looks: Looks,
+    /// When uncertain values of those that nobody mapped are bad.
+    unmapped_ages: Ages,
 }
 
 /// A topic of another space, and what was last heard of it.
@@ -37,8 +41,9 @@ struct Known {
     mapped: bool,
     /// The status of the last sample.
     status: StatusCode,
-    /// Since when its writer is silent.
-    silent: Option<Instant>,
+    /// The last sample, while it is too old to be shown.
+    over: Option<Bytes>,
+    wear: Wear,
 }
 
 impl Space {
@@ -60,6 +65,35 @@ impl Space {
             room: Room::new(MOST_UNMAPPED),
             returned: Vec::new(),
             gave_way: Vec::new(),
+            looks: Looks::default(),
+            unmapped_ages: Ages::default(),
+        }
+    }
+
+    /// The same, with how old values may become.
+    pub(crate) fn with_ages(mut self, mapping: &Mapping) -> Self {
+        self.set_ages(mapping);
+        self
+    }
+
+    /// Takes over how old values may become.
+    pub(crate) fn set_ages(&mut self, mapping: &Mapping) {
+        let usual = mapping.server().bad_after;
+        self.unmapped_ages = Ages::default().or(usual);
+        let now = now().monotonic;
+        let mut others = Vec::new();
+        for (topic, known) in &mut self.topics {
+            let ages = match mapping.variable(*topic) {
+                Some(variable) if !known.node.writable() => variable.ages.or(usual),
+                Some(_) => Ages::default(),
+                None => self.unmapped_ages,
+            };
+            known.wear.set_ages(ages);
+            self.looks.plan(*topic, &mut known.wear, now);
+            others.extend(known.wear.turn(now).map(|worn| (*topic, worn)));
+        }
+        for (topic, worn) in others {
+            self.show_worn(topic, worn);
         }
     }
 
@@ -158,7 +192,10 @@ impl Space {
         {
             known.retype(block, &self.manager);
         }
-        known.silent = None;
+        let now = now().monotonic;
+        known.wear.came(now);
+        known.over = None;
+        self.looks.plan(topic, &mut known.wear, now);
         known.status = stamp.status;
         self.returned.retain(|returned| *returned != topic);
         let shown = Shown {
@@ -201,12 +238,12 @@ impl Space {
         let Some(known) = self.topics.get_mut(&topic) else {
             return;
         };
-        if known.silent.is_some() == silent {
+        if known.wear.silent().is_some() == silent {
             return;
         }
-        known.silent = silent.then(|| now().monotonic);
+        known.wear.set_silent(silent, now().monotonic);
         if silent {
-            self.set_status(topic, Some(StatusCode::UncertainLastUsableValue));
+            self.wear(topic);
         } else {
             // Most likely a sample follows at once, which says more than the one before.
             self.returned.push(topic);
@@ -216,27 +253,88 @@ impl Space {
     /// Gives the last values their own status back where a writer speaks again but has nothing new to say.
     pub(crate) fn settle(&mut self) {
         for topic in std::mem::take(&mut self.returned) {
-            if self
-                .topics
-                .get(&topic)
-                .is_some_and(|known| known.silent.is_none())
-            {
-                self.set_status(topic, None);
+            self.wear(topic);
+        }
+    }
+
+    /// Says when anything was last heard of each topic: values whose publisher is not heard at all for `timeout` are shown so.
+    pub(crate) fn hear(
+        &mut self,
+        heard: impl Iterator<Item = (TopicId, Instant)>,
+        timeout: Duration,
+    ) {
+        if self
+            .topics
+            .values()
+            .all(|known| known.wear.silent().is_none())
+        {
+            return;
+        }
+        let mut last: HashMap<(SpaceId, Option<u16>), Instant> = HashMap::new();
+        for (topic, at) in heard {
+            let of = last.entry(publisher(topic)).or_insert(at);
+            *of = at.max(*of);
+        }
+        let now = now().monotonic;
+        let mut silent = Vec::new();
+        for (topic, known) in &mut self.topics {
+            if known.wear.silent().is_some() {
+                let at = last.get(&publisher(*topic));
+                let away = at.is_none_or(|at| now.saturating_duration_since(*at) >= timeout);
+                known.wear.set_away(away);
+                silent.push(*topic);
+            }
+        }
+        for topic in silent {
+            self.wear(topic);
+        }
+    }
+
+    /// When a value becomes too old.
+    pub(crate) fn due(&self) -> Option<Instant> {
+        self.looks.due()
+    }
+
+    /// Looks at the values that have become too old.
+    pub(crate) fn grow_old(&mut self) {
+        let now = now().monotonic;
+        while let Some((at, topic)) = self.looks.take(now) {
+            let known = self.topics.get_mut(&topic);
+            if known.is_some_and(|known| known.wear.looked(at)) {
+                self.wear(topic);
             }
         }
     }
 
-    /// Shows the last sample anew, under another status than its own or, without one, under its own.
-    fn set_status(&mut self, topic: TopicId, status: Option<StatusCode>) {
-        let Some(known) = self.topics.get(&topic) else {
+    /// Shows a topic as what has become of its value meanwhile.
+    fn wear(&mut self, topic: TopicId) {
+        let Some(known) = self.topics.get_mut(&topic) else {
+            return;
+        };
+        let now = now().monotonic;
+        self.looks.plan(topic, &mut known.wear, now);
+        if let Some(worn) = known.wear.turn(now) {
+            self.show_worn(topic, worn);
+        }
+    }
+
+    /// Shows the last sample anew, under another status than its own or under its own; one that is too old is kept here.
+    fn show_worn(&mut self, topic: TopicId, worn: Worn) {
+        let Some(known) = self.topics.get_mut(&topic) else {
             return;
         };
         let nodes = self.manager.inner();
         let mut shown = nodes.shown(topic);
         if shown.block.is_none() {
+            shown.block = known.over.take();
+        }
+        if shown.block.is_none() {
             return;
         }
-        shown.stamp.status = status.unwrap_or(known.status);
+        if worn == Worn::Over {
+            known.over = shown.block.take();
+        }
+        shown.stamp.status = worn.status().unwrap_or(known.status);
         shown.stamp.server = DateTime::now();
         nodes.show_again(&self.subscriptions, &known.node, shown);
     }
@@ -251,7 +349,7 @@ impl Space {
         let unmapped = self.topics.iter().filter(|(_, known)| !known.mapped);
         let there = unmapped.clone().count();
         let mut silent: Vec<(Instant, TopicId)> = unmapped
-            .filter_map(|(topic, known)| known.silent.map(|since| (since, *topic)))
+            .filter_map(|(topic, known)| known.wear.silent().map(|since| (since, *topic)))
             .collect();
         silent.sort_unstable();
         silent.truncate(MOST_LET_GO);
@@ -288,7 +386,9 @@ impl Space {
             &address::unmapped_folder(),
         );
         self.manager.inner().know(&node);
-        self.topics.insert(topic, Known::new(node, false));
+        let mut known = Known::new(node, false);
+        known.wear.set_ages(self.unmapped_ages);
+        self.topics.insert(topic, known);
         Ok(())
     }
 }
@@ -299,7 +399,8 @@ impl Known {
             node,
             mapped,
             status: StatusCode::Good,
-            silent: None,
+            over: None,
+            wear: Wear::new(Ages::default()),
         }
     }
 
@@ -338,6 +439,12 @@ impl Known {
             manager.inner().know(&self.node);
         }
     }
+}
+
+/// Whose values a topic is of: a program writes a space, and of space 0 a namespace.
+fn publisher(topic: TopicId) -> (SpaceId, Option<u16>) {
+    let namespace = (topic.space == SpaceId::UA).then(|| topic.namespace.get());
+    (topic.space, namespace)
 }
 
 /// The shape of the only field; of several, none.

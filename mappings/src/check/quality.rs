@@ -1,0 +1,67 @@
+//! How old values may become.
+
+use super::network;
+use crate::code::Code;
+use crate::document::VariableEntry;
+use crate::findings::Findings;
+use crate::mapping::Publish;
+use crate::quality::Ages;
+use crate::read::given;
+use crate::topic::SpaceId;
+
+/// `None` when something is faulty, which is noted.
+pub(super) fn check(
+    entry: &VariableEntry,
+    origin: Option<SpaceId>,
+    publish: Option<&Publish>,
+    findings: &mut Findings,
+) -> Option<Ages> {
+    let Some(at) = &entry.quality else {
+        return Some(Ages::default());
+    };
+    let said = at.value.as_ref()?;
+    if origin == Some(SpaceId::UA) && entry.from.is_none() {
+        findings
+            .error(
+                Code::Quality,
+                at.place,
+                "the server has this value from its clients, and it does not age",
+            )
+            .help("`quality` goes with values of other spaces, and with those that come `from` a server");
+        return None;
+    }
+    let ages = Ages {
+        uncertain_after: network::duration(&said.uncertain_after, findings),
+        bad_after: network::duration(&said.bad_after, findings),
+    };
+    let faulty = (said.uncertain_after.is_some() && ages.uncertain_after.is_none())
+        || (said.bad_after.is_some() && ages.bad_after.is_none());
+    if faulty {
+        return None;
+    }
+    let Some((publish, (after, place))) = publish.zip(
+        ages.uncertain_after
+            .zip(given(&said.uncertain_after).map(|(_, place)| place)),
+    ) else {
+        return Some(ages);
+    };
+    if publish.on_change {
+        findings
+            .warning(
+                Code::Quality,
+                place,
+                "the value is sent on change only, so one that stays the same is taken for old",
+            )
+            .help("leave `publish: on_change` and `deadband` out, or `uncertain_after`");
+    } else if publish.period >= after {
+        let message = format!(
+            "at most every {:?} a value is sent, and after {after:?} it is taken for old",
+            publish.period
+        );
+        findings
+            .error(Code::Quality, place, message)
+            .help("a longer time, or leave `at_most` out");
+        return None;
+    }
+    Some(ages)
+}
