@@ -367,4 +367,5 @@ def main():
         asyncio.run(tries(args))
 
 
-main()
+if __name__ == "__main__":
+    main()

@@ -2,6 +2,8 @@
 
 #[path = "discovery/faults.rs"]
 mod faults;
+#[path = "discovery/gds.rs"]
+mod gds;
 #[path = "discovery/levels.rs"]
 mod levels;
 #[path = "discovery/presence.rs"]

@@ -11,11 +11,12 @@ use crate::{
 };
 
 /// Packages, and the program of each that is handed out.
-const PROGRAMS: [(&str, &str); 8] = [
+const PROGRAMS: [(&str, &str); 9] = [
     ("bridge-ros1", "bridge-ros1"),
     ("bridge-ros2", "bridge-ros2"),
     ("discovery", "ua-lds"),
     ("ua-component", "ua-component"),
+    ("ua-gds", "ua-gds"),
     ("ua-mes", "ua-mes"),
     ("ua-server", "ua-server"),
     ("ua-space", "ua-space"),

@@ -2,7 +2,8 @@
 //! types, and clients that come back by themselves. It knows no skills, no discovery, no space and no ROS.
 //!
 //! Reading order: `limits` (the bounds of both sides), `endpoint`, `pki`, `certificates`, `known` and `door` (how clients get in), `nodeset` (types from
-//! files), `users` and `audit`, `server` and `client`.
+//! files), `users` and `audit`, `server` and `client`, `trust_file` (lists of
+//! certificates as files of a server).
 
 pub mod audit;
 pub mod certificates;
@@ -14,6 +15,7 @@ pub mod limits;
 pub mod nodeset;
 pub mod pki;
 pub mod server;
+pub mod trust_file;
 pub mod users;
 
 pub use opcua::types;

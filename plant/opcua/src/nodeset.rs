@@ -7,9 +7,12 @@ use std::path::PathBuf;
 use std::str::FromStr as _;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-use opcua::nodes::{ImportedItem, NodeSet2Import, NodeSetImport};
+use opcua::nodes::{ImportedItem, NodeBase as _, NodeSet2Import, NodeSetImport, NodeType};
 use opcua::server::address_space::AddressSpace;
-use opcua::types::{NamespaceMap, NodeId, NodeSetNamespaceMapper};
+use opcua::types::{
+    DataTypeDefinition, NamespaceMap, NodeId, NodeSetNamespaceMapper, ReferenceTypeId,
+    StructureDefinition,
+};
 use opcua::xml::load_nodeset2_file;
 use opcua::xml::schema::ua_node_set::{UANode, UANodeSet};
 
@@ -246,11 +249,53 @@ impl NodeSetImport for Counted<'_> {
         namespaces: &'a NodeSetNamespaceMapper<'_>,
     ) -> Box<dyn Iterator<Item = ImportedItem> + 'a> {
         let items = self.set.import.load(namespaces);
-        Box::new(items.inspect(|_| {
-            self.loaded.fetch_add(1, Ordering::Relaxed);
-        }))
+        let mut items: Vec<ImportedItem> = items
+            .inspect(|_| {
+                self.loaded.fetch_add(1, Ordering::Relaxed);
+            })
+            .collect();
+        encoded(&mut items);
+        Box::new(items.into_iter())
     }
 }
+
+/// Has each structure say by which id it is encoded, which the library leaves out: clients that make a type of its definition
+/// send that id.
+fn encoded(items: &mut [ImportedItem]) {
+    let has_encoding: NodeId = ReferenceTypeId::HasEncoding.into();
+    let mut ids = HashMap::new();
+    for item in items.iter() {
+        let node = item.node.as_node();
+        if node.browse_name().name.as_ref() == BINARY {
+            let of = item
+                .references
+                .iter()
+                .filter(|one| one.type_id == has_encoding && !one.is_forward);
+            ids.extend(of.map(|one| (one.target_id.clone(), node.node_id().clone())));
+        }
+    }
+    for item in items {
+        let NodeType::DataType(data_type) = &mut item.node else {
+            continue;
+        };
+        let Some(DataTypeDefinition::Structure(definition)) = data_type.data_type_definition()
+        else {
+            continue;
+        };
+        if let Some(id) = ids.get(data_type.node_id())
+            && definition.default_encoding_id.is_null()
+        {
+            let definition = StructureDefinition {
+                default_encoding_id: id.clone(),
+                ..definition.clone()
+            };
+            data_type.set_data_type_definition(Some(DataTypeDefinition::Structure(definition)));
+        }
+    }
+}
+
+/// The BrowseName of what stands for the binary encoding of a structure (OPC 10000-3, 5.8.4).
+const BINARY: &str = "Default Binary";
 
 /// What the library would panic at, or leave out without saying so.
 struct Check<'a> {

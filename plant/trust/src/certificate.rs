@@ -3,11 +3,12 @@
 use std::fmt;
 use std::time::Duration;
 
-use rsa::RsaPublicKey;
 use rsa::pkcs1v15::{Signature, VerifyingKey};
+use rsa::pkcs8::DecodePrivateKey as _;
 use rsa::sha2::{Digest as _, Sha256, Sha384, Sha512};
 use rsa::signature::Verifier as _;
 use rsa::traits::PublicKeyParts as _;
+use rsa::{RsaPrivateKey, RsaPublicKey};
 use x509_cert::attr::AttributeTypeAndValue;
 use x509_cert::der::asn1::{Any, BitString, ObjectIdentifier, SetOfVec};
 use x509_cert::der::{Decode as _, DecodePem as _, Encode as _, EncodePem as _, Tag};
@@ -223,6 +224,13 @@ impl Certificate {
     #[must_use]
     pub fn has_key_of(&self, key: &RsaPublicKey) -> bool {
         self.public_key().is_some_and(|own| own == *key)
+    }
+
+    /// Whether it is of that private key, in the DER of PKCS #8.
+    #[must_use]
+    pub fn is_of_private_key(&self, key: &[u8]) -> bool {
+        let key = RsaPrivateKey::from_pkcs8_der(key);
+        key.is_ok_and(|key| self.has_key_of(&key.to_public_key()))
     }
 
     /// The names of issuer and subject agree.

@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use opcua::crypto::SecurityPolicy;
 use opcua::server::address_space::AddressSpace;
+use opcua::server::authenticator::AuthManager;
 use opcua::server::diagnostics::NamespaceMetadata;
 use opcua::server::node_manager::memory::{
     CoreNodeManager, CoreNodeManagerBuilder, InMemoryNodeManager, InMemoryNodeManagerBuilder,
@@ -14,7 +15,7 @@ use opcua::server::node_manager::memory::{
 use opcua::server::node_manager::{DynNodeManager, NodeManagerBuilder, ServerContext};
 use opcua::server::{ANONYMOUS_USER_TOKEN_ID, ServerEndpoint};
 use opcua::sync::Mutex;
-use opcua::types::{BuildInfo, DateTime, MessageSecurityMode, UAString};
+use opcua::types::{BuildInfo, DateTime, MessageSecurityMode, TypeLoader, UAString};
 
 use super::calls::Calls;
 use super::nodes::{Nodes, Spaces};
@@ -25,6 +26,7 @@ use crate::endpoint::{BindError, EndpointUrl};
 use crate::limits;
 use crate::nodeset::{self, NodeSet, NodeSetError, Source};
 use crate::pki::{OWN_CERTIFICATE, OWN_KEY, Pki, PkiError};
+use crate::users::Access;
 
 /// A security policy that clients may choose.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -68,7 +70,7 @@ impl Security {
     }
 }
 
-/// What a server is, and how clients get in. All users are anonymous.
+/// What a server is, and how clients get in. All users are anonymous, unless [`ServerBuilder::users`] has some.
 #[derive(Debug, Clone)]
 pub struct ServerConfig {
     /// The ApplicationUri.
@@ -136,11 +138,20 @@ pub enum ServerError {
 }
 
 /// Collects what a server is made of.
-#[derive(Debug)]
 pub struct ServerBuilder {
     config: ServerConfig,
     sources: Vec<Source>,
     namespaces: Vec<String>,
+    users: Option<Arc<Access>>,
+    loaders: Vec<Arc<dyn TypeLoader>>,
+}
+
+impl std::fmt::Debug for ServerBuilder {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("ServerBuilder")
+            .field("config", &self.config)
+            .finish_non_exhaustive()
+    }
 }
 
 impl ServerBuilder {
@@ -151,7 +162,23 @@ impl ServerBuilder {
             namespaces: vec![config.application_uri.clone()],
             config,
             sources: Vec::new(),
+            users: None,
+            loaders: Vec::new(),
         }
+    }
+
+    /// Has users, who are looked for anew when their file changes.
+    #[must_use]
+    pub fn users(mut self, users: Arc<Access>) -> Self {
+        self.users = Some(users);
+        self
+    }
+
+    /// Reads structures of these types in what clients send.
+    #[must_use]
+    pub fn types(mut self, loader: Arc<dyn TypeLoader>) -> Self {
+        self.loaders.push(loader);
+        self
     }
 
     /// Loads a NodeSet2 document, which errors call `name`. The order of NodeSets does not matter.
@@ -210,10 +237,9 @@ impl ServerBuilder {
             }
             None => None,
         };
-
         let made = Arc::new(Made::default());
         let calls = Arc::new(Calls::default());
-        let builder = described(&config, port);
+        let builder = with(described(&config, port), &self.users, self.loaders);
         let builder = match &door {
             Some((door, _)) => door.behind().used_by(builder),
             None => builder.pki_dir(pki.as_ref().map_or_else(|| Path::new(NO_PKI), Pki::root)),
@@ -260,6 +286,7 @@ impl ServerBuilder {
                     listener,
                     pki,
                     door,
+                    users: self.users,
                 })),
                 running: Mutex::default(),
             }),
@@ -295,6 +322,20 @@ fn described(config: &ServerConfig, port: u16) -> opcua::server::ServerBuilder {
         for (name, endpoint) in security.endpoints(config.endpoint.path()) {
             builder = builder.add_endpoint(name, endpoint);
         }
+    }
+    builder
+}
+
+fn with(
+    mut builder: opcua::server::ServerBuilder,
+    users: &Option<Arc<Access>>,
+    loaders: Vec<Arc<dyn TypeLoader>>,
+) -> opcua::server::ServerBuilder {
+    if let Some(users) = users {
+        builder = builder.with_authenticator(Arc::clone(users) as Arc<dyn AuthManager>);
+    }
+    for loader in loaders {
+        builder = builder.with_type_loader(loader);
     }
     builder
 }

@@ -48,6 +48,7 @@ use self::calls::Calls;
 use self::nodes::{Nodes, Spaces};
 use crate::door::Door;
 use crate::pki::Pki;
+use crate::users::Access;
 
 /// What is known of a variable, or of a variable in a type.
 #[derive(Debug, Clone)]
@@ -90,6 +91,7 @@ struct Waiting {
     pki: Option<Pki>,
     /// Where clients come to first, if the server listens for that alone.
     door: Option<(Door, TcpListener)>,
+    users: Option<Arc<Access>>,
 }
 
 impl Drop for Inner {
@@ -113,6 +115,7 @@ impl Server {
             listener,
             mut pki,
             door,
+            users,
         } = waiting;
         let serving = tokio::spawn(async move {
             if let Err(error) = server.run_with(listener).await {
@@ -126,9 +129,13 @@ impl Server {
             for looks in 1_u64.. {
                 look.tick().await;
                 sessions.look();
-                if let Some(pki) = &mut pki
-                    && looks.is_multiple_of(LOOKS_AT_REJECTED)
-                {
+                if !looks.is_multiple_of(LOOKS_AT_REJECTED) {
+                    continue;
+                }
+                if let Some(users) = &users {
+                    users.look();
+                }
+                if let Some(pki) = &mut pki {
                     pki.report_rejected();
                 }
             }
@@ -359,7 +366,7 @@ pub(crate) fn value_of(variable: &Variable) -> DataValue {
     )
 }
 
-/// How many looks at sessions there are to one at refused certificates.
+/// How many looks at sessions there are to one at refused certificates and users.
 const LOOKS_AT_REJECTED: u64 = 20;
 /// How long stopping may take.
 pub const LONGEST_STOP: Duration = Duration::from_secs(2);

@@ -1,0 +1,259 @@
+//! What people type about the authority: `ua-gds ca init|issue|revoke|list`.
+
+use std::fs;
+use std::io::{self, Write as _};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use bridge_node::{Failure, FailureKind};
+use trust::{Certificate, Request, Serial};
+
+use crate::Folders;
+use crate::serve::of_store;
+use crate::service::now;
+use crate::store::{Issued, Store, new_key, pem_of, write_key};
+
+#[derive(Debug, clap::Subcommand)]
+pub(crate) enum CaVerb {
+    /// Make the authority of a plant: its key and its certificate, which everybody is to trust
+    Init {
+        /// What it is called
+        #[arg(long, value_name = "NAME", default_value = "Plant authority")]
+        name: String,
+        /// Whose it is
+        #[arg(long, value_name = "NAME", default_value = "")]
+        organization: String,
+        /// How many days it is valid
+        #[arg(long, value_name = "DAYS", default_value = "3650", value_parser = clap::value_parser!(u32).range(1..=36_500))]
+        days: u32,
+        #[command(flatten)]
+        folders: Folders,
+    },
+    /// Issue a certificate for a signing request in DER or PEM; without one for a key that is made
+    Issue {
+        /// The signing request
+        #[arg(value_name = "REQUEST", required_unless_present = "application_uri", conflicts_with_all = ["application_uri", "host", "name"])]
+        request: Option<PathBuf>,
+        /// The ApplicationUri of an application that is to get a key, too
+        #[arg(long, value_name = "URI", requires = "key")]
+        application_uri: Option<String>,
+        /// What it is called
+        #[arg(long, value_name = "NAME", default_value = "")]
+        name: String,
+        /// A host it is reached under; may be given several times
+        #[arg(long, value_name = "HOST")]
+        host: Vec<String>,
+        /// Where its key goes, as PEM
+        #[arg(long, value_name = "FILE")]
+        key: Option<PathBuf>,
+        /// Where the certificate goes: DER, or PEM for a name that ends with .pem
+        #[arg(long, value_name = "FILE")]
+        out: PathBuf,
+        /// How many days it is valid
+        #[arg(long, value_name = "DAYS", default_value = "365", value_parser = clap::value_parser!(u32).range(1..=36_500))]
+        days: u32,
+        #[command(flatten)]
+        folders: Folders,
+    },
+    /// Revoke a certificate that was issued. A server that runs knows at once; others when they have the new list
+    Revoke {
+        /// Its number, as `list` has it, or its file
+        #[arg(value_name = "SERIAL|FILE")]
+        which: String,
+        #[command(flatten)]
+        folders: Folders,
+    },
+    /// List what was issued, with what is revoked
+    List {
+        /// A JSON line for each
+        #[arg(long)]
+        json: bool,
+        #[command(flatten)]
+        folders: Folders,
+    },
+}
+
+/// Does what is asked.
+pub(crate) fn run(verb: CaVerb) -> Result<(), Failure> {
+    match verb {
+        CaVerb::Init {
+            name,
+            organization,
+            days,
+            folders,
+        } => {
+            let folder = folders.authority();
+            let made = Store::init(&folder, (&name, &organization), now(), of_days(days));
+            let store = made.map_err(|fault| of_store(&fault))?;
+            say(&format!(
+                "made: {:?}, valid until {}",
+                store.certificate().name(),
+                day(store.certificate().validity().1)
+            ))?;
+            say(&format!(
+                "to be trusted by servers and clients: {} with the list {}",
+                store.certificate_path().display(),
+                store.list_path().display()
+            ))
+        }
+        CaVerb::Issue {
+            request,
+            application_uri,
+            name,
+            host,
+            key,
+            out,
+            days,
+            folders,
+        } => {
+            let store = open(&folders)?;
+            let wanted = match (&request, &application_uri) {
+                (Some(file), _) => read_request(file)?,
+                (None, uri) => {
+                    let uri = uri.as_deref().unwrap_or_default();
+                    with_key(uri, &name, &host, key.as_deref())?
+                }
+            };
+            let issued = store.issue(&wanted, now(), of_days(days));
+            let issued = issued.map_err(|fault| of_store(&fault))?;
+            write(&out, &issued)?;
+            say(&line(&Issued {
+                certificate: issued,
+                revoked: None,
+            }))
+        }
+        CaVerb::Revoke { which, folders } => {
+            let store = open(&folders)?;
+            let serial = serial(&which)?;
+            store
+                .revoke(&serial, now())
+                .map_err(|fault| of_store(&fault))?;
+            say(&format!("revoked: {serial}"))?;
+            say(&format!(
+                "the new list, for those that do not fetch it: {}",
+                store.list_path().display()
+            ))
+        }
+        CaVerb::List { json, folders } => {
+            let all = open(&folders)?.list().map_err(|fault| of_store(&fault))?;
+            for one in &all {
+                say(&if json { as_json(one) } else { line(one) })?;
+            }
+            Ok(())
+        }
+    }
+}
+
+fn open(folders: &Folders) -> Result<Store, Failure> {
+    Store::open(&folders.authority()).map_err(|fault| of_store(&fault))
+}
+
+fn read_request(file: &Path) -> Result<Request, Failure> {
+    let bytes = fs::read(file).map_err(|error| io_fault(file, &error))?;
+    Request::read(&bytes).map_err(|why| {
+        let message = format!("{} is no signing request: {why}", file.display());
+        Failure::new(FailureKind::Usage, message)
+    })
+}
+
+fn with_key(
+    uri: &str,
+    name: &str,
+    hosts: &[String],
+    file: Option<&Path>,
+) -> Result<Request, Failure> {
+    let usage = |why: String| Failure::new(FailureKind::Usage, why);
+    let Some(file) = file else {
+        return Err(usage("--key FILE: where the key is to go".to_owned()));
+    };
+    let key = new_key(KEY_BITS).map_err(|fault| of_store(&fault))?;
+    let name = if name.is_empty() { uri } else { name };
+    let name: String = name.chars().take(LONGEST_NAME).collect();
+    let wanted = Request::make(&key, uri, (&name, ""), hosts);
+    let wanted = wanted.map_err(|why| usage(format!("no certificate of {uri:?}: {why}")))?;
+    let pem = pem_of(&key).map_err(|fault| of_store(&fault))?;
+    write_key(file, &pem).map_err(|error| io_fault(file, &error))?;
+    Ok(wanted)
+}
+
+fn serial(which: &str) -> Result<Serial, Failure> {
+    let file = Path::new(which);
+    if file.is_file() {
+        let bytes = fs::read(file).map_err(|error| io_fault(file, &error))?;
+        let read = Certificate::read(&bytes);
+        return read.map(|one| one.serial()).map_err(|why| {
+            Failure::new(
+                FailureKind::Usage,
+                format!("{which} is no certificate: {why}"),
+            )
+        });
+    }
+    Serial::parse(which).ok_or_else(|| {
+        let message = format!("`{which}` is neither a number of `ua-gds ca list` nor a file");
+        Failure::new(FailureKind::Usage, message)
+    })
+}
+
+fn write(file: &Path, issued: &Certificate) -> Result<(), Failure> {
+    let is_pem = file.extension().is_some_and(|end| end == "pem");
+    let written = match is_pem {
+        true => fs::write(file, issued.pem()),
+        false => fs::write(file, issued.der()),
+    };
+    written.map_err(|error| io_fault(file, &error))
+}
+
+/// What was issued for people. What its owner chose is escaped.
+fn line(one: &Issued) -> String {
+    let certificate = &one.certificate;
+    let standing = match one.revoked {
+        Some(since) => format!("REVOKED since {}", day(since)),
+        None if !certificate.is_valid_at(now()) => "NOT VALID".to_owned(),
+        None => "valid".to_owned(),
+    };
+    format!(
+        "{} until {} {standing} {:?} {:?}",
+        certificate.serial(),
+        day(certificate.validity().1),
+        certificate.name(),
+        certificate.application_uri().unwrap_or_default()
+    )
+}
+
+fn as_json(one: &Issued) -> String {
+    let certificate = &one.certificate;
+    serde_json::json!({
+        "serial": certificate.serial().to_string(),
+        "name": certificate.name(),
+        "application_uri": certificate.application_uri(),
+        "hosts": certificate.hosts(),
+        "until": day(certificate.validity().1),
+        "revoked": one.revoked.map(day),
+    })
+    .to_string()
+}
+
+/// A day, as 2031-11-25.
+fn day(at: Duration) -> String {
+    let seconds = i64::try_from(at.as_secs()).unwrap_or_default();
+    let ticks = seconds * 10_000_000 + 116_444_736_000_000_000;
+    let time = opcua::types::DateTime::from(ticks).as_chrono();
+    time.format("%Y-%m-%d").to_string()
+}
+
+fn of_days(days: u32) -> Duration {
+    Duration::from_secs(u64::from(days) * 86_400)
+}
+
+fn io_fault(file: &Path, error: &io::Error) -> Failure {
+    Failure::new(FailureKind::Io, format!("{}: {error}", file.display()))
+}
+
+fn say(text: &str) -> Result<(), Failure> {
+    writeln!(io::stdout(), "{text}")
+        .map_err(|error| Failure::new(FailureKind::Io, error.to_string()))
+}
+
+const KEY_BITS: u32 = 2048;
+/// Characters of a common name.
+const LONGEST_NAME: usize = 64;

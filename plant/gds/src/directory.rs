@@ -1,0 +1,155 @@
+//! The register of applications (OPC 10000-12, 6.6).
+
+use opcua::types::{ExtensionObject, StatusCode, Variant};
+use plant_opcua::server::MethodRequest;
+use tracing::info;
+
+use crate::record::ApplicationRecord;
+use crate::records::{Query, Record};
+use crate::service::{Answer, Gds, id, number, refused, texts, time, unregistered};
+
+/// FindApplications: those of an ApplicationUri.
+pub(crate) fn find(gds: &Gds, request: &MethodRequest) -> Answer {
+    let [Variant::String(uri)] = request.arguments.as_slice() else {
+        return Err(StatusCode::BadInvalidArgument.into());
+    };
+    let records = gds.records.lock();
+    let found = records.of_uri(uri.as_ref());
+    let told: Vec<ExtensionObject> = found.map(told).collect();
+    Ok(vec![Variant::from(told)])
+}
+
+/// RegisterApplication: answers with the ApplicationId.
+pub(crate) fn register(gds: &Gds, request: &MethodRequest) -> Answer {
+    let (told, caller) = (record(request)?, &request.caller);
+    gds.may(caller, told.application_uri.as_ref())?;
+    let record = Record::of(told, 0);
+    let (uri, urls) = (record.uri.clone(), record.urls.clone());
+    let registered = gds.records.lock().register(record);
+    let number = registered.map_err(|fault| unregistered(&fault, caller))?;
+    info!(application = ?uri, ?urls, number, by = ?caller.user, "an application is registered");
+    Ok(vec![Variant::from(id(number))])
+}
+
+/// UpdateApplication: all but the ApplicationUri.
+pub(crate) fn update(gds: &Gds, request: &MethodRequest) -> Answer {
+    let (told, caller) = (record(request)?, &request.caller);
+    let known = gds.own(caller, &told.application_id)?;
+    let updated = gds.records.lock().update(Record::of(told, known.number));
+    updated.map_err(|fault| unregistered(&fault, caller))?;
+    info!(application = ?known.uri, by = ?caller.user, "an application is registered otherwise");
+    Ok(Vec::new())
+}
+
+/// UnregisterApplication: its certificates are revoked (OPC 10000-12, 6.6.8).
+pub(crate) fn unregister(gds: &Gds, request: &MethodRequest) -> Answer {
+    let [Variant::NodeId(id)] = request.arguments.as_slice() else {
+        return Err(StatusCode::BadInvalidArgument.into());
+    };
+    let caller = &request.caller;
+    let known = gds.own(caller, id)?;
+    let issued = gds.store.lock().of_application(&known.uri);
+    let issued = issued.map_err(|fault| refused(&fault))?;
+    let now = crate::service::now();
+    gds.revoke(&issued, now).map_err(|fault| refused(&fault))?;
+    let gone = gds.records.lock().remove(known.number);
+    gone.map_err(|fault| unregistered(&fault, caller))?;
+    info!(application = ?known.uri, by = ?caller.user, "an application is registered no longer");
+    Ok(Vec::new())
+}
+
+/// GetApplication: that of an ApplicationId.
+pub(crate) fn get(gds: &Gds, request: &MethodRequest) -> Answer {
+    let [Variant::NodeId(id)] = request.arguments.as_slice() else {
+        return Err(StatusCode::BadInvalidArgument.into());
+    };
+    let records = gds.records.lock();
+    let known = number(id).and_then(|number| records.get(number));
+    let known = known.ok_or(StatusCode::BadNotFound)?;
+    Ok(vec![Variant::from(told(known))])
+}
+
+/// QueryApplications: what each is, with the number to go on after.
+pub(crate) fn query(gds: &Gds, request: &MethodRequest) -> Answer {
+    let [
+        Variant::UInt32(after),
+        Variant::UInt32(most),
+        Variant::String(name),
+        Variant::String(uri),
+        Variant::UInt32(kinds),
+        Variant::String(product_uri),
+        capabilities,
+    ] = request.arguments.as_slice()
+    else {
+        return Err(StatusCode::BadInvalidArgument.into());
+    };
+    let capabilities = texts(capabilities);
+    let query = Query {
+        after: *after,
+        most: *most,
+        name: name.as_ref(),
+        uri: uri.as_ref(),
+        kinds: *kinds,
+        product_uri: product_uri.as_ref(),
+        capabilities: capabilities.iter().map(String::as_str).collect(),
+    };
+    let records = gds.records.lock();
+    let (found, next) = records.query(&query);
+    let found: Vec<ExtensionObject> = found
+        .into_iter()
+        .map(|one| ExtensionObject::from_message(one.described()))
+        .collect();
+    Ok(vec![
+        time(records.since()),
+        Variant::UInt32(next),
+        Variant::from(found),
+    ])
+}
+
+/// QueryServers: the same of servers alone, as FindServersOnNetwork has them (OPC 10000-12, 6.6.11).
+pub(crate) fn query_servers(gds: &Gds, request: &MethodRequest) -> Answer {
+    let [
+        Variant::UInt32(after),
+        Variant::UInt32(most),
+        Variant::String(name),
+        Variant::String(uri),
+        Variant::String(product_uri),
+        capabilities,
+    ] = request.arguments.as_slice()
+    else {
+        return Err(StatusCode::BadInvalidArgument.into());
+    };
+    let capabilities = texts(capabilities);
+    let query = Query {
+        after: *after,
+        most: *most,
+        name: name.as_ref(),
+        uri: uri.as_ref(),
+        kinds: SERVERS,
+        product_uri: product_uri.as_ref(),
+        capabilities: capabilities.iter().map(String::as_str).collect(),
+    };
+    let records = gds.records.lock();
+    let (found, _) = records.query(&query);
+    let found: Vec<ExtensionObject> = found
+        .into_iter()
+        .map(|one| ExtensionObject::from_message(one.on_network()))
+        .collect();
+    Ok(vec![time(records.since()), Variant::from(found)])
+}
+
+fn told(record: &Record) -> ExtensionObject {
+    ExtensionObject::new(record.told(id(record.number)))
+}
+
+/// The one argument, an application.
+fn record(request: &MethodRequest) -> Result<&ApplicationRecord, StatusCode> {
+    let [Variant::ExtensionObject(told)] = request.arguments.as_slice() else {
+        return Err(StatusCode::BadInvalidArgument);
+    };
+    told.inner_as::<ApplicationRecord>()
+        .ok_or(StatusCode::BadInvalidArgument)
+}
+
+/// Servers, among the kinds of a query.
+const SERVERS: u32 = 1;

@@ -1,0 +1,123 @@
+//! The Global Discovery Server of a plant (OPC 10000-12, 6 and 7): a register of its applications over all subnets, and a small
+//! authority that issues their certificates.
+//!
+//! Reading order: `record` (an application on the wire), `records` (all of them in a file), `store` (the authority in its folder),
+//! `service` (who may do what), `directory` and `manager` (the methods), `serve` (the server), `ca` (the same for people).
+
+mod ca;
+mod directory;
+mod manager;
+mod record;
+mod records;
+mod serve;
+mod service;
+mod store;
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::time::Duration;
+
+use bridge_node::{Failure, FailureKind, LogFormat, Service, run_service};
+use discovery::Interface;
+use plant_opcua::pki::default_root;
+use plant_opcua::server::EndpointUrl;
+
+use crate::ca::CaVerb;
+use crate::serve::{Settings, serve};
+
+/// The Global Discovery Server of a plant: registers its applications, and issues and revokes their certificates.
+///
+/// Whoever registers an application or asks for its certificate is a user with the role security_admin, or the application itself
+/// by a certificate that is trusted here, and comes over an encrypted channel. Everybody may ask who is registered. Users and
+/// trusted certificates are those of the certificate store (`ua-server user` and `ua-server trust` with its --pki).
+#[derive(Debug, clap::Parser)]
+#[command(name = "ua-gds", version, args_conflicts_with_subcommands = true)]
+struct UaGds {
+    #[command(subcommand)]
+    verb: Option<Verb>,
+    /// Where clients connect
+    #[arg(
+        long,
+        value_name = "URL",
+        env = "UA_GDS_ENDPOINT",
+        default_value = "opc.tcp://127.0.0.1:4841"
+    )]
+    endpoint: EndpointUrl,
+    #[command(flatten)]
+    folders: Folders,
+    /// How many days a certificate is valid that is issued to an application
+    #[arg(long, value_name = "DAYS", default_value = "365", value_parser = clap::value_parser!(u32).range(1..=36_500))]
+    days: u32,
+    /// The local discovery server it registers with
+    #[arg(long, value_name = "URL", env = "UA_LDS")]
+    lds: Option<String>,
+    /// The network interface where it is announced by mDNS, by name or address
+    #[arg(long, value_name = "NAME|ADDRESS", env = "UA_INTERFACE")]
+    interface: Option<String>,
+    /// How log lines look
+    #[arg(
+        long,
+        value_name = "FORMAT",
+        env = "UA_LOG_FORMAT",
+        default_value = "text"
+    )]
+    log: LogFormat,
+}
+
+#[derive(Debug, clap::Subcommand)]
+enum Verb {
+    /// The authority for people: make it, issue, revoke and list certificates
+    #[command(subcommand)]
+    Ca(CaVerb),
+}
+
+#[derive(Debug, clap::Args)]
+struct Folders {
+    /// The certificate store of the server, with its users
+    #[arg(long, value_name = "DIR", env = "UA_GDS_PKI")]
+    pki: Option<PathBuf>,
+    /// The folder of the authority, its key and the register [default: authority in the store]
+    #[arg(long, value_name = "DIR", env = "UA_GDS_AUTHORITY")]
+    authority: Option<PathBuf>,
+}
+
+impl Folders {
+    fn pki(&self) -> PathBuf {
+        let usual = || default_root(|name| std::env::var(name).ok()).with_file_name("gds-pki");
+        self.pki.clone().unwrap_or_else(usual)
+    }
+
+    fn authority(&self) -> PathBuf {
+        let usual = || self.pki().join("authority");
+        self.authority.clone().unwrap_or_else(usual)
+    }
+}
+
+fn main() -> ExitCode {
+    run_service::<UaGds>()
+}
+
+impl Service for UaGds {
+    const QUIET: &'static str = plant_opcua::QUIET;
+
+    fn log(&self) -> LogFormat {
+        self.log
+    }
+
+    async fn serve(self, stop: impl Future<Output = ()> + Send + 'static) -> Result<(), Failure> {
+        if let Some(Verb::Ca(verb)) = self.verb {
+            let done = tokio::task::spawn_blocking(|| ca::run(verb)).await;
+            return done
+                .unwrap_or_else(|error| Err(Failure::new(FailureKind::Io, error.to_string())));
+        }
+        let settings = Settings {
+            pki: self.folders.pki(),
+            authority: self.folders.authority(),
+            endpoint: self.endpoint,
+            life: Duration::from_secs(u64::from(self.days) * 86_400),
+            lds: self.lds,
+            interface: self.interface.as_deref().map(Interface::parse),
+        };
+        serve(settings, stop).await
+    }
+}

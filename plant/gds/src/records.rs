@@ -1,0 +1,508 @@
+//! The applications that are registered, in a file.
+
+use std::fs;
+use std::io::{self, Write as _};
+use std::path::{Path, PathBuf};
+
+use opcua::types::{
+    ApplicationDescription, ApplicationType, LocalizedText, NodeId, ServerOnNetwork, UAString,
+};
+use serde::{Deserialize, Serialize};
+
+use crate::record::ApplicationRecord;
+
+/// An application.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct Record {
+    /// Its number here, which no other has ever had.
+    pub(crate) number: u32,
+    pub(crate) uri: String,
+    /// ApplicationType of OPC 10000-4, 7.4.
+    pub(crate) kind: i32,
+    /// Locales and texts.
+    pub(crate) names: Vec<(String, String)>,
+    pub(crate) product_uri: String,
+    pub(crate) urls: Vec<String>,
+    pub(crate) capabilities: Vec<String>,
+}
+
+/// Why an application is not taken.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum RecordFault {
+    #[error("an application of that ApplicationUri is registered already")]
+    Present,
+    #[error("no such application is registered")]
+    Unknown,
+    #[error("{0}")]
+    Unfit(&'static str),
+    #[error("{MOST_RECORDS} applications are registered, and there is no room for more")]
+    Full,
+    #[error("{path}: {source}")]
+    Io {
+        path: PathBuf,
+        #[source]
+        source: io::Error,
+    },
+}
+
+/// What is looked for; what is empty says nothing.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Query<'q> {
+    /// Those after that number.
+    pub(crate) after: u32,
+    /// How many at most; 0 is as many as there may be.
+    pub(crate) most: u32,
+    /// A pattern of the name, with `%` and `_` (OPC 10000-4, 7.7.3).
+    pub(crate) name: &'q str,
+    pub(crate) uri: &'q str,
+    /// 1 is servers, 2 is clients.
+    pub(crate) kinds: u32,
+    pub(crate) product_uri: &'q str,
+    pub(crate) capabilities: Vec<&'q str>,
+}
+
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Kept {
+    /// When the numbers began, in seconds since 1970.
+    since: u64,
+    last: u32,
+    records: Vec<Record>,
+}
+
+/// All of them.
+#[derive(Debug)]
+pub(crate) struct Records {
+    path: PathBuf,
+    kept: Kept,
+}
+
+impl Records {
+    /// Reads those of a file; there are none where there is no file.
+    pub(crate) fn open(path: PathBuf, now: u64) -> Result<Self, RecordFault> {
+        let kept = match fs::read(&path) {
+            Ok(bytes) => serde_json::from_slice(&bytes).map_err(|error| RecordFault::Io {
+                path: path.clone(),
+                source: error.into(),
+            })?,
+            Err(error) if error.kind() == io::ErrorKind::NotFound => Kept {
+                since: now,
+                last: 0,
+                records: Vec::new(),
+            },
+            Err(source) => return Err(RecordFault::Io { path, source }),
+        };
+        Ok(Self { path, kept })
+    }
+
+    /// When the numbers began, in seconds since 1970.
+    pub(crate) fn since(&self) -> u64 {
+        self.kept.since
+    }
+
+    pub(crate) fn len(&self) -> usize {
+        self.kept.records.len()
+    }
+
+    pub(crate) fn get(&self, number: u32) -> Option<&Record> {
+        self.kept.records.iter().find(|one| one.number == number)
+    }
+
+    pub(crate) fn of_uri(&self, uri: &str) -> impl Iterator<Item = &Record> {
+        self.kept.records.iter().filter(move |one| one.uri == uri)
+    }
+
+    /// Takes up an application, and says its number.
+    pub(crate) fn register(&mut self, record: Record) -> Result<u32, RecordFault> {
+        check(&record)?;
+        if self.of_uri(&record.uri).next().is_some() {
+            return Err(RecordFault::Present);
+        }
+        if self.len() >= MOST_RECORDS {
+            return Err(RecordFault::Full);
+        }
+        let number = self.kept.last.checked_add(1).ok_or(RecordFault::Full)?;
+        self.kept.records.push(Record { number, ..record });
+        self.kept.last = number;
+        self.save().inspect_err(|_| {
+            self.kept.records.pop();
+        })?;
+        Ok(number)
+    }
+
+    /// Puts a record in the place of that of its number. The ApplicationUri stays.
+    pub(crate) fn update(&mut self, record: Record) -> Result<(), RecordFault> {
+        check(&record)?;
+        let all = &mut self.kept.records;
+        let known = all.iter_mut().find(|one| one.number == record.number);
+        let known = known.ok_or(RecordFault::Unknown)?;
+        if known.uri != record.uri {
+            return Err(RecordFault::Unfit("the ApplicationUri is another"));
+        }
+        let number = record.number;
+        let before = std::mem::replace(known, record);
+        self.save().inspect_err(|_| {
+            let known = self.kept.records.iter_mut();
+            for one in known.filter(|one| one.number == number) {
+                one.clone_from(&before);
+            }
+        })
+    }
+
+    /// Forgets an application.
+    pub(crate) fn remove(&mut self, number: u32) -> Result<Record, RecordFault> {
+        let mut places = self.kept.records.iter();
+        let place = places.position(|one| one.number == number);
+        let place = place.ok_or(RecordFault::Unknown)?;
+        let gone = self.kept.records.remove(place);
+        self.save()
+            .inspect_err(|_| self.kept.records.insert(place, gone.clone()))?;
+        Ok(gone)
+    }
+
+    /// Those that are looked for, and the number to go on after; 0 where there are no more.
+    pub(crate) fn query(&self, query: &Query<'_>) -> (Vec<&Record>, u32) {
+        let most = match usize::try_from(query.most).unwrap_or(MOST_AT_ONCE) {
+            0 => MOST_AT_ONCE,
+            most => most.min(MOST_AT_ONCE),
+        };
+        let mut fitting = self
+            .kept
+            .records
+            .iter()
+            .filter(|one| one.number > query.after && one.fits(query));
+        let found: Vec<&Record> = fitting.by_ref().take(most).collect();
+        let next = match (fitting.next(), found.last()) {
+            (Some(_), Some(last)) => last.number,
+            _ => 0,
+        };
+        (found, next)
+    }
+
+    fn save(&self) -> Result<(), RecordFault> {
+        let failed = |source| RecordFault::Io {
+            path: self.path.clone(),
+            source,
+        };
+        let content =
+            serde_json::to_vec_pretty(&self.kept).map_err(|error| failed(error.into()))?;
+        replace(&self.path, &content).map_err(failed)
+    }
+}
+
+impl Record {
+    /// As a client tells it.
+    pub(crate) fn of(told: &ApplicationRecord, number: u32) -> Self {
+        let texts = |all: &Option<Vec<UAString>>| -> Vec<String> {
+            let all = all.iter().flatten();
+            all.map(|one| one.as_ref().to_owned()).collect()
+        };
+        let names = told.application_names.iter().flatten();
+        let name =
+            |one: &LocalizedText| (one.locale.as_ref().to_owned(), one.text.as_ref().to_owned());
+        Self {
+            number,
+            uri: told.application_uri.as_ref().to_owned(),
+            kind: told.application_type as i32,
+            names: names.map(name).collect(),
+            product_uri: told.product_uri.as_ref().to_owned(),
+            urls: texts(&told.discovery_urls),
+            capabilities: texts(&told.server_capabilities),
+        }
+    }
+
+    /// As clients are told.
+    pub(crate) fn told(&self, id: NodeId) -> ApplicationRecord {
+        let texts = |all: &[String]| Some(all.iter().map(UAString::from).collect());
+        let names = self.names.iter();
+        ApplicationRecord {
+            application_id: id,
+            application_uri: UAString::from(&self.uri),
+            application_type: self.application_type(),
+            application_names: Some(
+                names
+                    .map(|(locale, text)| LocalizedText::new(locale, text))
+                    .collect(),
+            ),
+            product_uri: UAString::from(&self.product_uri),
+            discovery_urls: texts(&self.urls),
+            server_capabilities: texts(&self.capabilities),
+        }
+    }
+
+    pub(crate) fn described(&self) -> ApplicationDescription {
+        let (locale, text) = self.name();
+        ApplicationDescription {
+            application_uri: UAString::from(&self.uri),
+            product_uri: UAString::from(&self.product_uri),
+            application_name: LocalizedText::new(locale, text),
+            application_type: self.application_type(),
+            gateway_server_uri: UAString::null(),
+            discovery_profile_uri: UAString::null(),
+            discovery_urls: Some(self.urls.iter().map(UAString::from).collect()),
+        }
+    }
+
+    pub(crate) fn on_network(&self) -> ServerOnNetwork {
+        ServerOnNetwork {
+            record_id: self.number,
+            server_name: UAString::from(self.name().1),
+            discovery_url: UAString::from(self.urls.first().map_or("", String::as_str)),
+            server_capabilities: Some(self.capabilities.iter().map(UAString::from).collect()),
+        }
+    }
+
+    /// Whether it serves.
+    pub(crate) fn is_server(&self) -> bool {
+        self.application_type() != ApplicationType::Client
+    }
+
+    fn name(&self) -> (&str, &str) {
+        let first = self.names.first();
+        first.map_or(("", ""), |(locale, text)| (locale, text))
+    }
+
+    fn application_type(&self) -> ApplicationType {
+        ApplicationType::try_from(self.kind).unwrap_or(ApplicationType::Client)
+    }
+
+    fn fits(&self, query: &Query<'_>) -> bool {
+        let kind = match query.kinds {
+            0 | 3 => true,
+            1 => self.is_server(),
+            2 => matches!(
+                self.application_type(),
+                ApplicationType::Client | ApplicationType::ClientAndServer
+            ),
+            _ => false,
+        };
+        let has = |wanted: &&str| {
+            let mut own = self.capabilities.iter();
+            own.any(|one| one.eq_ignore_ascii_case(wanted))
+        };
+        let named = |pattern: &str| {
+            pattern.is_empty() || self.names.iter().any(|(_, text)| is_like(text, pattern))
+        };
+        kind && named(query.name)
+            && (query.uri.is_empty() || query.uri == self.uri)
+            && (query.product_uri.is_empty() || query.product_uri == self.product_uri)
+            && query.capabilities.iter().all(has)
+    }
+}
+
+/// Whether what a client tells of an application can be kept.
+fn check(record: &Record) -> Result<(), RecordFault> {
+    let fits = |ok: bool, why: &'static str| ok.then_some(()).ok_or(RecordFault::Unfit(why));
+    let short = |text: &String| text.len() <= LONGEST_TEXT;
+    fits(!record.uri.is_empty(), "it has no ApplicationUri")?;
+    fits(!record.names.is_empty(), "it has no name")?;
+    fits(
+        !record.is_server() || !record.urls.is_empty(),
+        "a server without a discovery URL",
+    )?;
+    fits(
+        !record.is_server() || !record.capabilities.is_empty(),
+        "a server without capabilities (`NA` says that it has none)",
+    )?;
+    let counts = [
+        record.names.len(),
+        record.urls.len(),
+        record.capabilities.len(),
+    ];
+    fits(
+        counts.iter().all(|count| *count <= MOST_TEXTS),
+        "too many names, URLs or capabilities",
+    )?;
+    let names = record
+        .names
+        .iter()
+        .flat_map(|(locale, text)| [locale, text]);
+    let mut texts = names
+        .chain(&record.urls)
+        .chain(&record.capabilities)
+        .chain([&record.uri, &record.product_uri]);
+    fits(texts.all(short), "a text that is too long")
+}
+
+/// Whether a text is of a pattern: `%` is any text, `_` is any character, and `\` stands before one that is meant itself.
+fn is_like(text: &str, pattern: &str) -> bool {
+    let text: Vec<char> = text.chars().collect();
+    // The places of the text that the pattern so far may end at.
+    let mut ends = vec![false; text.len() + 1];
+    if let Some(first) = ends.first_mut() {
+        *first = true;
+    }
+    let mut pattern = pattern.chars();
+    while let Some(step) = pattern.next() {
+        if step == '%' {
+            let mut reached = false;
+            for end in &mut ends {
+                reached |= *end;
+                *end = reached;
+            }
+            continue;
+        }
+        let wanted = match step {
+            '_' => None,
+            '\\' => pattern.next(),
+            other => Some(other),
+        };
+        let fits = text
+            .iter()
+            .map(|one| wanted.is_none_or(|wanted| wanted == *one));
+        let after = ends.iter().zip(fits).map(|(end, fits)| *end && fits);
+        ends = std::iter::once(false).chain(after).collect();
+    }
+    ends.last().copied().unwrap_or_default()
+}
+
+/// Writes a file beside, and puts it in the place of what is there.
+pub(crate) fn replace(path: &Path, content: &[u8]) -> io::Result<()> {
+    let beside = path.with_extension("new");
+    let mut file = fs::File::create(&beside)?;
+    file.write_all(content)?;
+    file.sync_all()?;
+    fs::rename(&beside, path)
+}
+
+const MOST_RECORDS: usize = 10_000;
+const MOST_AT_ONCE: usize = 500;
+const MOST_TEXTS: usize = 32;
+/// Bytes of a text; a URI may have 4096 (OPC 10000-3, 8.31).
+const LONGEST_TEXT: usize = 4096;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn records(name: &str) -> Records {
+        let path = std::env::temp_dir().join(format!("ua-gds-{}-{name}.json", std::process::id()));
+        drop(fs::remove_file(&path));
+        Records::open(path, 1_795_000_000).unwrap()
+    }
+
+    fn robot(number: u32) -> Record {
+        Record {
+            number: 0,
+            uri: format!("urn:cell:robot-{number}"),
+            kind: 0,
+            names: vec![("en".to_owned(), format!("Robot {number}"))],
+            product_uri: "urn:maker".to_owned(),
+            urls: vec![format!("opc.tcp://robot-{number}:4840")],
+            capabilities: vec!["DA".to_owned(), "HD".to_owned()],
+        }
+    }
+
+    #[test]
+    fn numbers_ascend_stay_over_a_restart_and_are_never_given_again() {
+        let mut all = records("numbers");
+        assert_eq!(all.register(robot(1)).unwrap(), 1);
+        assert_eq!(all.register(robot(2)).unwrap(), 2);
+        assert!(matches!(all.register(robot(2)), Err(RecordFault::Present)));
+        all.remove(2).unwrap();
+        let mut again = Records::open(all.path.clone(), 0).unwrap();
+        assert_eq!(again.since(), 1_795_000_000);
+        assert_eq!(again.register(robot(2)).unwrap(), 3);
+        assert_eq!(again.get(1).unwrap().uri, "urn:cell:robot-1");
+        assert!(again.get(2).is_none());
+        fs::remove_file(&all.path).unwrap();
+    }
+
+    #[test]
+    fn a_query_goes_on_where_it_ended_and_looks_at_each_filter() {
+        let mut all = records("query");
+        for number in 1..=5 {
+            all.register(robot(number)).unwrap();
+        }
+        let numbers = |query: &Query<'_>| {
+            let (found, next) = all.query(query);
+            (found.iter().map(|one| one.number).collect::<Vec<_>>(), next)
+        };
+        let two = |after| Query {
+            after,
+            most: 2,
+            ..Query::default()
+        };
+        assert_eq!(numbers(&two(0)), (vec![1, 2], 2));
+        assert_eq!(numbers(&two(2)), (vec![3, 4], 4));
+        assert_eq!(numbers(&two(4)), (vec![5], 0));
+        let filters = [
+            (
+                Query {
+                    name: "%bot 3",
+                    ..Query::default()
+                },
+                vec![3],
+            ),
+            (
+                Query {
+                    uri: "urn:cell:robot-4",
+                    ..Query::default()
+                },
+                vec![4],
+            ),
+            (
+                Query {
+                    kinds: 2,
+                    ..Query::default()
+                },
+                vec![],
+            ),
+            (
+                Query {
+                    capabilities: vec!["hd", "GDS"],
+                    ..Query::default()
+                },
+                vec![],
+            ),
+        ];
+        for (query, wanted) in filters {
+            assert_eq!(numbers(&query).0, wanted, "{query:?}");
+        }
+        fs::remove_file(&all.path).unwrap();
+    }
+
+    #[test]
+    fn what_cannot_be_kept_is_refused_with_the_reason() {
+        let mut all = records("unfit");
+        let unfit = [
+            Record {
+                uri: String::new(),
+                ..robot(1)
+            },
+            Record {
+                names: vec![],
+                ..robot(1)
+            },
+            Record {
+                urls: vec![],
+                ..robot(1)
+            },
+            Record {
+                urls: vec!["u".repeat(LONGEST_TEXT + 1)],
+                ..robot(1)
+            },
+        ];
+        for record in unfit {
+            let refused = all.register(record);
+            assert!(matches!(refused, Err(RecordFault::Unfit(_))), "{refused:?}");
+        }
+        assert_eq!(all.len(), 0);
+    }
+
+    #[test]
+    fn patterns_are_those_of_the_like_operator() {
+        for (text, pattern, fits) in [
+            ("Robot 1", "Robot _", true),
+            ("Robot 12", "Robot _", false),
+            ("Robot 12", "%bot%", true),
+            ("100 %", "100 \\%", true),
+            ("100 x", "100 \\%", false),
+            ("", "%", true),
+            ("a", "", false),
+        ] {
+            assert_eq!(is_like(text, pattern), fits, "{text:?} {pattern:?}");
+        }
+    }
+}

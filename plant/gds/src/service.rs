@@ -1,0 +1,215 @@
+//! What the methods share: who may do what, and what is registered and issued.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+
+use opcua::server::ANONYMOUS_USER_TOKEN_ID;
+use opcua::server::authenticator::UserToken;
+use opcua::sync::Mutex;
+use opcua::types::{
+    ByteString, DateTime, Identifier, NodeId, StatusCode, TrustListDataType, Variant,
+};
+use plant_opcua::server::{Caller, Refusal};
+use plant_opcua::trust_file::{TrustList, masks};
+use plant_opcua::users::{Access, Role};
+use tracing::{info, warn};
+use trust::Certificate;
+
+use crate::manager::Requests;
+use crate::records::{Record, RecordFault, Records};
+use crate::store::{Store, StoreFault};
+
+/// What a method answers.
+pub(crate) type Answer = Result<Vec<Variant>, Refusal>;
+
+/// The register and the authority.
+pub(crate) struct Gds {
+    pub(crate) store: Mutex<Store>,
+    pub(crate) records: Mutex<Records>,
+    pub(crate) requests: Mutex<Requests>,
+    /// The revocation list that the server itself has.
+    pub(crate) known: Mutex<Vec<u8>>,
+    pub(crate) access: Arc<Access>,
+    /// The certificate store of the server itself.
+    pub(crate) pki: PathBuf,
+    /// How long what is issued is valid.
+    pub(crate) life: Duration,
+    /// The index of the GDS namespace.
+    pub(crate) namespace: u16,
+}
+
+impl Gds {
+    /// Whether somebody may change an application, or ask for its certificates: a security administrator may, and the
+    /// application itself, which has proven that it is that by its certificate.
+    ///
+    /// # Errors
+    /// What the caller is told.
+    pub(crate) fn may(&self, caller: &Caller, uri: &str) -> Result<(), StatusCode> {
+        self.is_unread(caller)?;
+        let is_itself = caller.proven && caller.application_uri == uri;
+        match is_itself || self.is_administrator(caller) {
+            true => Ok(()),
+            false => Err(StatusCode::BadUserAccessDenied),
+        }
+    }
+
+    /// # Errors
+    /// Others could read or change what is said.
+    pub(crate) fn is_unread(&self, caller: &Caller) -> Result<(), StatusCode> {
+        match caller.encrypted {
+            true => Ok(()),
+            false => Err(StatusCode::BadSecurityModeInsufficient),
+        }
+    }
+
+    fn is_administrator(&self, caller: &Caller) -> bool {
+        // No user can be called so.
+        let name = match caller.user.as_str() {
+            "anonymous" => ANONYMOUS_USER_TOKEN_ID,
+            name => name,
+        };
+        let token = UserToken(name.to_owned());
+        self.access.roles(&token).contains(Role::SecurityAdmin)
+    }
+
+    /// The application of an ApplicationId, which the caller may change.
+    ///
+    /// # Errors
+    /// What the caller is told.
+    pub(crate) fn own(&self, caller: &Caller, id: &NodeId) -> Result<Record, StatusCode> {
+        self.is_unread(caller)?;
+        let known = number(id).and_then(|number| self.records.lock().get(number).cloned());
+        let Some(record) = known else {
+            return Err(StatusCode::BadNotFound);
+        };
+        self.may(caller, &record.uri)?;
+        Ok(record)
+    }
+
+    /// Revokes what an application has, and has the server itself know.
+    pub(crate) fn revoke(&self, gone: &[Certificate], now: Duration) -> Result<(), StoreFault> {
+        let store = self.store.lock();
+        for one in gone {
+            store.revoke(&one.serial(), now)?;
+            info!(name = ?one.name(), application = ?one.application_uri().unwrap_or_default(), serial = %one.serial(), "a certificate is revoked");
+        }
+        drop(store);
+        self.know(now)
+    }
+
+    /// Has the server itself let in whom the authority has issued a certificate, and nobody whose is revoked.
+    pub(crate) fn know(&self, now: Duration) -> Result<(), StoreFault> {
+        let list = self.store.lock().current_list(now)?;
+        let mut known = self.known.lock();
+        if *known == list.der() {
+            return Ok(());
+        }
+        list.der().clone_into(&mut known);
+        drop(known);
+        if let Err(error) = plant_opcua::known::put_crl(&self.pki, &list) {
+            warn!(%error, "the revocation list is not in the store of the server");
+        }
+        Ok(())
+    }
+}
+
+/// The authority and its list, as those that trust it are to have them.
+pub(crate) struct GroupList(pub(crate) Arc<Gds>);
+
+impl TrustList for GroupList {
+    fn list(&self, masks: u32) -> TrustListDataType {
+        let store = self.0.store.lock();
+        let lists = store.current_list(now());
+        let authority = ByteString::from(store.certificate().der().to_vec());
+        drop(store);
+        let revoked = match lists {
+            Ok(list) => vec![ByteString::from(list.der().to_vec())],
+            Err(error) => {
+                warn!(%error, "there is no revocation list to hand out");
+                Vec::new()
+            }
+        };
+        let wanted = |mask: u32, all: Vec<ByteString>| (masks & mask != 0).then_some(all);
+        TrustListDataType {
+            specified_lists: masks,
+            trusted_certificates: wanted(masks::TRUSTED_CERTIFICATES, vec![authority]),
+            trusted_crls: wanted(masks::TRUSTED_CRLS, revoked),
+            issuer_certificates: wanted(masks::ISSUER_CERTIFICATES, Vec::new()),
+            issuer_crls: wanted(masks::ISSUER_CRLS, Vec::new()),
+        }
+    }
+
+    fn replace(&self, _list: TrustListDataType) -> Result<bool, StatusCode> {
+        Err(StatusCode::BadNotWritable)
+    }
+}
+
+/// The ApplicationId of a number.
+pub(crate) fn id(number: u32) -> NodeId {
+    NodeId::new(OWN, number)
+}
+
+/// The number in an ApplicationId.
+pub(crate) fn number(id: &NodeId) -> Option<u32> {
+    match (id.namespace, &id.identifier) {
+        (OWN, Identifier::Numeric(number)) => Some(*number),
+        _ => None,
+    }
+}
+
+/// Tells what went wrong, and what the caller is told of it.
+pub(crate) fn refused(fault: &StoreFault) -> StatusCode {
+    warn!("{fault}");
+    match fault.is_io() {
+        true => StatusCode::BadResourceUnavailable,
+        false => StatusCode::BadInvalidArgument,
+    }
+}
+
+/// The same of the register.
+pub(crate) fn unregistered(fault: &RecordFault, caller: &Caller) -> StatusCode {
+    warn!(application = ?caller.application_uri, user = ?caller.user, "what a client tells of an application is refused: {fault}");
+    match fault {
+        RecordFault::Present => StatusCode::BadEntryExists,
+        RecordFault::Unknown => StatusCode::BadNotFound,
+        RecordFault::Unfit(_) => StatusCode::BadInvalidArgument,
+        RecordFault::Full => StatusCode::BadResourceUnavailable,
+        RecordFault::Io { .. } => StatusCode::BadResourceUnavailable,
+    }
+}
+
+/// The time since 1970.
+pub(crate) fn now() -> Duration {
+    plant_opcua::known::now()
+}
+
+/// A time in seconds since 1970, as clients get it.
+pub(crate) fn time(seconds: u64) -> Variant {
+    let ticks = i64::try_from(seconds).unwrap_or_default();
+    let ticks = ticks.saturating_mul(TICKS).saturating_add(TICKS_TO_1970);
+    Variant::from(DateTime::from(ticks))
+}
+
+/// The texts of an argument, as many as there may be.
+pub(crate) fn texts(argument: &Variant) -> Vec<String> {
+    let Variant::Array(array) = argument else {
+        return Vec::new();
+    };
+    let each = array.values.iter().take(MOST_TEXTS);
+    each.filter_map(|one| {
+        let Variant::String(text) = one else {
+            return None;
+        };
+        Some(text.as_ref().to_owned())
+    })
+    .collect()
+}
+
+/// The namespace of the server itself.
+pub(crate) const OWN: u16 = 1;
+/// 100 ns each, in a second.
+const TICKS: i64 = 10_000_000;
+/// From 1601 to 1970.
+const TICKS_TO_1970: i64 = 116_444_736_000_000_000;
+const MOST_TEXTS: usize = 32;

@@ -1,0 +1,417 @@
+//! The authority in its folder: its certificate and key, what it has issued and revoked.
+
+use std::fmt;
+use std::fs::{self, File};
+use std::io::{self, Write as _};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use opcua::crypto::{PrivateKey, random};
+use trust::{Authority, Certificate, Crl, Issue, Request, Revoked, Serial, Unfit};
+use x509_cert::der::pem::{self, LineEnding};
+
+use crate::records::replace;
+
+/// The authority of a folder.
+#[derive(Debug)]
+pub(crate) struct Store {
+    folder: PathBuf,
+    authority: Authority,
+}
+
+/// A certificate that was issued.
+#[derive(Debug, Clone)]
+pub(crate) struct Issued {
+    pub(crate) certificate: Certificate,
+    /// Since when it is revoked.
+    pub(crate) revoked: Option<Duration>,
+}
+
+/// Why the authority cannot do it.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum StoreFault {
+    #[error("{path}: {source}")]
+    Io {
+        path: PathBuf,
+        #[source]
+        source: io::Error,
+    },
+    #[error("there is no authority in {0}: `ua-gds ca init` makes one")]
+    Missing(PathBuf),
+    #[error("there is an authority in {0} already, and what it issued counts on it")]
+    Present(PathBuf),
+    #[error("{path} cannot be used: {why}")]
+    Unfit { path: PathBuf, why: Unfit },
+    #[error("{0} can be read by others than its owner: `chmod 600` it")]
+    Open(PathBuf),
+    #[error("no certificate that was issued here has the number {0} (`ua-gds ca list`)")]
+    Unknown(String),
+    #[error("no key can be made: {0}")]
+    Key(String),
+    #[error("what is asked for cannot be issued: {0}")]
+    Request(Unfit),
+}
+
+impl StoreFault {
+    /// Whether it is for want of something that the system has, and not of what was asked for.
+    pub(crate) const fn is_io(&self) -> bool {
+        matches!(self, Self::Io { .. })
+    }
+}
+
+impl Store {
+    /// Makes an authority that lives so long.
+    pub(crate) fn init(
+        folder: &Path,
+        names: (&str, &str),
+        now: Duration,
+        life: Duration,
+    ) -> Result<Self, StoreFault> {
+        make_folder(folder).map_err(io_at(folder))?;
+        let _alone = lock(folder)?;
+        if folder.join(CERTIFICATE).exists() || folder.join(KEY).exists() {
+            return Err(StoreFault::Present(folder.to_owned()));
+        }
+        let key = new_key(AUTHORITY_BITS)?;
+        let issue = Issue {
+            serial: random_serial(),
+            from: now.saturating_sub(CLOCKS_DIFFER),
+            until: now + life,
+        };
+        let authority = Authority::make(&key, names, &issue).map_err(StoreFault::Request)?;
+        let path = folder.join(KEY);
+        write_key(&path, &pem_of(&key)?).map_err(io_at(&path))?;
+        let path = folder.join(CERTIFICATE);
+        let content = authority.certificate().pem();
+        replace(&path, content.as_bytes()).map_err(io_at(&path))?;
+        let store = Self {
+            folder: folder.to_owned(),
+            authority,
+        };
+        store.sign_list(now)?;
+        Ok(store)
+    }
+
+    /// Opens the authority of a folder.
+    pub(crate) fn open(folder: &Path) -> Result<Self, StoreFault> {
+        let (path, key) = (folder.join(CERTIFICATE), folder.join(KEY));
+        if !path.exists() || !key.exists() {
+            return Err(StoreFault::Missing(folder.to_owned()));
+        }
+        if !is_owners(&key).map_err(io_at(&key))? {
+            return Err(StoreFault::Open(key));
+        }
+        let unfit = |path: &Path| {
+            let path = path.to_owned();
+            move |why| StoreFault::Unfit { path, why }
+        };
+        let bytes = fs::read(&path).map_err(io_at(&path))?;
+        let certificate = Certificate::read(&bytes).map_err(unfit(&path))?;
+        let bytes = fs::read(&key).map_err(io_at(&key))?;
+        let (_, der) = pem::decode_vec(&bytes).map_err(|_| unfit(&key)(Unfit::Unreadable))?;
+        let authority = Authority::open(certificate, &der).map_err(unfit(&key))?;
+        Ok(Self {
+            folder: folder.to_owned(),
+            authority,
+        })
+    }
+
+    pub(crate) const fn certificate(&self) -> &Certificate {
+        self.authority.certificate()
+    }
+
+    /// Issues what is asked for, from now on and for that long.
+    pub(crate) fn issue(
+        &self,
+        request: &Request,
+        now: Duration,
+        life: Duration,
+    ) -> Result<Certificate, StoreFault> {
+        let _alone = lock(&self.folder)?;
+        let issue = Issue {
+            serial: random_serial(),
+            from: now.saturating_sub(CLOCKS_DIFFER),
+            until: now + life,
+        };
+        let made = self.authority.issue(request, &issue);
+        let made = made.map_err(StoreFault::Request)?;
+        let folder = self.folder.join(ISSUED);
+        fs::create_dir_all(&folder).map_err(io_at(&folder))?;
+        let path = folder.join(format!("{}.der", made.serial()));
+        // What is not kept could not be revoked.
+        replace(&path, made.der()).map_err(io_at(&path))?;
+        Ok(made)
+    }
+
+    /// Revokes a certificate that was issued here; once more changes nothing.
+    pub(crate) fn revoke(&self, serial: &Serial, now: Duration) -> Result<(), StoreFault> {
+        let _alone = lock(&self.folder)?;
+        let name = format!("{serial}.der");
+        if !self.folder.join(ISSUED).join(name).exists() {
+            return Err(StoreFault::Unknown(serial.to_string()));
+        }
+        let mut all = self.revoked()?;
+        if !all.iter().any(|one| one.serial == *serial) {
+            let serial = serial.clone();
+            all.push(Revoked { serial, since: now });
+            let line = |one: &Revoked| format!("{} {}\n", one.serial, one.since.as_secs());
+            let text: String = all.iter().map(line).collect();
+            let path = self.folder.join(REVOKED);
+            replace(&path, text.as_bytes()).map_err(io_at(&path))?;
+        }
+        self.sign_list(now)
+    }
+
+    /// All that was issued, by name.
+    pub(crate) fn list(&self) -> Result<Vec<Issued>, StoreFault> {
+        let revoked = self.revoked()?;
+        let folder = self.folder.join(ISSUED);
+        let entries = match fs::read_dir(&folder) {
+            Ok(entries) => entries,
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
+            Err(source) => {
+                return Err(StoreFault::Io {
+                    path: folder,
+                    source,
+                });
+            }
+        };
+        let read = |entry: fs::DirEntry| Certificate::read(&fs::read(entry.path()).ok()?).ok();
+        let mut all: Vec<Issued> = entries
+            .flatten()
+            .filter_map(read)
+            .map(|certificate| {
+                let serial = certificate.serial();
+                let gone = revoked.iter().find(|one| one.serial == serial);
+                Issued {
+                    revoked: gone.map(|one| one.since),
+                    certificate,
+                }
+            })
+            .collect();
+        all.sort_by_cached_key(|one| {
+            (
+                one.certificate.name(),
+                one.certificate.validity(),
+                one.certificate.serial(),
+            )
+        });
+        Ok(all)
+    }
+
+    /// Those that an application has and that are not revoked, the latest first.
+    pub(crate) fn of_application(&self, uri: &str) -> Result<Vec<Certificate>, StoreFault> {
+        let all = self.list()?.into_iter();
+        let mut own: Vec<Certificate> = all
+            .filter(|one| one.revoked.is_none())
+            .map(|one| one.certificate)
+            .filter(|one| one.application_uri().as_deref() == Some(uri))
+            .collect();
+        own.sort_by_key(|one| std::cmp::Reverse(one.validity()));
+        Ok(own)
+    }
+
+    /// The revocation list, signed anew where half of its life is over.
+    pub(crate) fn current_list(&self, now: Duration) -> Result<Crl, StoreFault> {
+        let path = self.folder.join(LIST);
+        let read = || Crl::read(&fs::read(&path).ok()?).ok();
+        let current = read().filter(|list| {
+            let (made, next) = list.times();
+            list.is_of(self.certificate())
+                && made <= now
+                && next.is_some_and(|next| next.saturating_sub(now) > LIST_LIFE / 2)
+        });
+        if let Some(list) = current {
+            return Ok(list);
+        }
+        let _alone = lock(&self.folder)?;
+        self.sign_list(now)?;
+        read().ok_or_else(|| StoreFault::Unfit {
+            path: path.clone(),
+            why: Unfit::Unreadable,
+        })
+    }
+
+    /// Where the revocation list is.
+    pub(crate) fn list_path(&self) -> PathBuf {
+        self.folder.join(LIST)
+    }
+
+    /// Where the certificate of the authority is.
+    pub(crate) fn certificate_path(&self) -> PathBuf {
+        self.folder.join(CERTIFICATE)
+    }
+
+    fn sign_list(&self, now: Duration) -> Result<(), StoreFault> {
+        let revoked = self.revoked()?;
+        // Ascends, as the time does.
+        let number = u64::try_from(now.as_millis()).unwrap_or(u64::MAX);
+        let list = self.authority.crl(&revoked, number, (now, now + LIST_LIFE));
+        let list = list.map_err(StoreFault::Request)?;
+        let path = self.list_path();
+        replace(&path, list.der()).map_err(io_at(&path))
+    }
+
+    fn revoked(&self) -> Result<Vec<Revoked>, StoreFault> {
+        let path = self.folder.join(REVOKED);
+        let text = match fs::read_to_string(&path) {
+            Ok(text) => text,
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
+            Err(source) => return Err(StoreFault::Io { path, source }),
+        };
+        let line = |line: &str| {
+            let (serial, since) = line.split_once(' ')?;
+            Some(Revoked {
+                serial: Serial::parse(serial)?,
+                since: Duration::from_secs(since.parse().ok()?),
+            })
+        };
+        // One that is left out would be valid again.
+        let all: Option<Vec<Revoked>> = text.lines().map(line).collect();
+        all.ok_or(StoreFault::Unfit {
+            path,
+            why: Unfit::Unreadable,
+        })
+    }
+}
+
+/// A new private key in the DER of PKCS #8. Takes some time.
+pub(crate) fn new_key(bits: u32) -> Result<Vec<u8>, StoreFault> {
+    let failed = |error: &dyn fmt::Display| StoreFault::Key(error.to_string());
+    let key = PrivateKey::new(bits).map_err(|error| failed(&error))?;
+    let der = key.to_der().map_err(|error| failed(&error))?;
+    Ok(der.as_bytes().to_vec())
+}
+
+/// A private key in PEM.
+pub(crate) fn pem_of(key: &[u8]) -> Result<String, StoreFault> {
+    pem::encode_string("PRIVATE KEY", LineEnding::LF, key)
+        .map_err(|error| StoreFault::Key(error.to_string()))
+}
+
+/// Writes a key that only its owner reads, and in no other's place.
+pub(crate) fn write_key(path: &Path, pem: &str) -> io::Result<()> {
+    let mut options = fs::OpenOptions::new();
+    options.write(true).create_new(true);
+    #[cfg(unix)]
+    {
+        use std::os::unix::fs::OpenOptionsExt as _;
+        options.mode(0o600);
+    }
+    let mut file = options.open(path)?;
+    file.write_all(pem.as_bytes())?;
+    file.sync_all()
+}
+
+fn random_serial() -> Serial {
+    let bytes = random::byte_string(16).value.unwrap_or_default();
+    Serial::random(bytes.try_into().unwrap_or([0; 16]))
+}
+
+fn io_at(path: &Path) -> impl FnOnce(io::Error) -> StoreFault + use<> {
+    let path = path.to_owned();
+    move |source| StoreFault::Io { path, source }
+}
+
+/// Waits until nobody else issues or revokes here, and keeps others from it until the file is dropped.
+fn lock(folder: &Path) -> Result<File, StoreFault> {
+    let path = folder.join("lock");
+    let locked = File::create(&path).and_then(|file| match file.lock() {
+        // Some network file systems have no locks.
+        Err(error) if error.kind() != io::ErrorKind::Unsupported => Err(error),
+        Ok(()) | Err(_) => Ok(file),
+    });
+    locked.map_err(io_at(&path))
+}
+
+#[cfg(unix)]
+fn make_folder(folder: &Path) -> io::Result<()> {
+    use std::os::unix::fs::PermissionsExt as _;
+    fs::create_dir_all(folder)?;
+    fs::set_permissions(folder, fs::Permissions::from_mode(0o700))
+}
+
+#[cfg(not(unix))]
+fn make_folder(folder: &Path) -> io::Result<()> {
+    fs::create_dir_all(folder)
+}
+
+#[cfg(unix)]
+fn is_owners(path: &Path) -> io::Result<bool> {
+    use std::os::unix::fs::PermissionsExt as _;
+    Ok(fs::metadata(path)?.permissions().mode() & 0o077 == 0)
+}
+
+#[cfg(not(unix))]
+fn is_owners(_path: &Path) -> io::Result<bool> {
+    Ok(true)
+}
+
+const CERTIFICATE: &str = "authority.pem";
+const KEY: &str = "authority.key";
+const ISSUED: &str = "issued";
+const REVOKED: &str = "revoked";
+const LIST: &str = "authority.crl";
+const AUTHORITY_BITS: u32 = 3072;
+/// What is issued is valid that much earlier, for those whose clock is behind.
+const CLOCKS_DIFFER: Duration = Duration::from_secs(3600);
+/// Whoever does not fetch the list for that long trusts nobody here any more.
+const LIST_LIFE: Duration = Duration::from_secs(30 * 86_400);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const NOW: Duration = Duration::from_secs(1_795_000_000);
+    const YEAR: Duration = Duration::from_secs(365 * 86_400);
+
+    fn scratch(name: &str) -> PathBuf {
+        let path = std::env::temp_dir().join(format!("ua-gds-{}-{name}", std::process::id()));
+        drop(fs::remove_dir_all(&path));
+        path
+    }
+
+    #[test]
+    fn what_was_issued_and_revoked_is_known_after_a_restart() {
+        let folder = scratch("authority");
+        Store::init(&folder, ("Plant authority", "Plant"), NOW, YEAR).unwrap();
+        let again = Store::init(&folder, ("Plant authority", "Plant"), NOW, YEAR);
+        assert!(matches!(again, Err(StoreFault::Present(_))));
+        let store = Store::open(&folder).unwrap();
+        let key = new_key(2048).unwrap();
+        let hosts = ["robot".to_owned()];
+        let request = Request::make(&key, "urn:robot", ("Robot", "Plant"), &hosts).unwrap();
+        let [first, second] = [1, 2].map(|day| {
+            store
+                .issue(&request, NOW + Duration::from_secs(day), YEAR)
+                .unwrap()
+        });
+        store.revoke(&first.serial(), NOW).unwrap();
+        let store = Store::open(&folder).unwrap();
+        assert_eq!(store.of_application("urn:robot").unwrap(), [second]);
+        let list = store.current_list(NOW).unwrap();
+        assert!(list.is_of(store.certificate()) && list.revokes(&first));
+        let later = NOW + LIST_LIFE * 3 / 4;
+        assert!(
+            store
+                .current_list(later)
+                .unwrap()
+                .is_current(NOW + LIST_LIFE)
+        );
+        let unknown = store.revoke(&Serial::of(&[1, 2, 3]), NOW);
+        assert!(matches!(unknown, Err(StoreFault::Unknown(_))));
+        fs::remove_dir_all(folder).unwrap();
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn a_key_that_others_can_read_is_refused() {
+        use std::os::unix::fs::PermissionsExt as _;
+        let folder = scratch("open");
+        Store::init(&folder, ("Plant authority", "Plant"), NOW, YEAR).unwrap();
+        let open = fs::Permissions::from_mode(0o644);
+        fs::set_permissions(folder.join(KEY), open).unwrap();
+        assert!(matches!(Store::open(&folder), Err(StoreFault::Open(_))));
+        fs::remove_dir_all(folder).unwrap();
+    }
+}

@@ -1,0 +1,232 @@
+//! The Global Discovery Server: asyncua registers applications and has certificates issued, which another library looks at; people
+//! make, issue, revoke and list with `ua-gds ca`.
+
+use std::fs;
+use std::path::Path;
+use std::process::{Command, Output};
+
+use serde_json::{Value, json};
+use system_tests::{Cell, Child, Peer, Started, eventually, program};
+
+use super::SOON;
+
+const GDS: &str = "opc.tcp://127.0.0.1:4841";
+const PASSWORD: &str = "correct horse";
+const URI: &str = "urn:ua-bridge:system-tests:robot";
+
+struct Site {
+    cell: Cell,
+    _gds: Child,
+}
+
+/// A server with an authority, a user `sara` who says who may do what, and a client that it trusts.
+fn site() -> Option<Site> {
+    let cell = Cell::with(&[Peer::Python])?;
+    let pki = cell.folder().join("gds");
+    let pki = path(&pki);
+    let made = run(&cell, "ua-gds", &["ca", "init", "--name", "Cell authority"]);
+    assert!(text(&made.stdout).contains("Cell authority"), "{made:?}");
+    let again = run(&cell, "ua-gds", &["ca", "init"]);
+    assert!(!again.status.success() && text(&again.stderr).contains("already"));
+    let made = cell.asyncua_once("opcua_gds.py", &["make", GDS, path(&pairs(&cell))]);
+    assert_eq!(made.len(), 1);
+    let client = pairs(&cell).join("client_certificate.der");
+    run(&cell, "ua-server", &["trust", path(&client)]);
+    let password = cell.file("password", &format!("{PASSWORD}\n"));
+    for (name, role) in [("sara", "security_admin"), ("otto", "operator")] {
+        let made = Command::new(program("ua-server"))
+            .args(["user", "add", name, "--role", role, "--pki", pki])
+            .stdin(fs::File::open(&password).unwrap())
+            .output()
+            .unwrap();
+        assert!(made.status.success(), "{made:?}");
+    }
+    let gds = Started::new("ua-gds", &program("ua-gds"))
+        .args(["--endpoint", GDS, "--pki", pki])
+        .start();
+    eventually("the server answers clients", SOON, || {
+        cell.asyncua_try("opcua_read.py", &[GDS, "ns=0;i=2258"])
+    });
+    Some(Site { cell, _gds: gds })
+}
+
+fn pairs(cell: &Cell) -> std::path::PathBuf {
+    cell.folder().join("pairs")
+}
+
+fn path(path: &Path) -> &str {
+    path.to_str().unwrap()
+}
+
+fn text(bytes: &[u8]) -> String {
+    String::from_utf8_lossy(bytes).into_owned()
+}
+
+/// A verb of a program about the store of the server.
+fn run(cell: &Cell, name: &str, args: &[&str]) -> Output {
+    let pki = cell.folder().join("gds");
+    let mut command = Command::new(program(name));
+    command.args(args).args(["--pki", path(&pki)]);
+    command.output().unwrap()
+}
+
+fn told(cell: &Cell, args: &[&str]) -> String {
+    let output = run(cell, "ua-gds", args);
+    assert!(output.status.success(), "{args:?}: {output:?}");
+    text(&output.stdout)
+}
+
+impl Site {
+    fn asked(&self, verb: &str, more: &[&str]) -> Value {
+        let folder = pairs(&self.cell);
+        let args = [&[verb, GDS, path(&folder)], more].concat();
+        self.cell.asyncua_once("opcua_gds.py", &args).remove(0)
+    }
+
+    fn by_sara(&self, verb: &str) -> Value {
+        self.asked(verb, &["--user", "sara", "--password", PASSWORD])
+    }
+}
+
+#[test]
+fn applications_are_registered_found_changed_and_queried() {
+    let Some(site) = site() else { return };
+    let said = site.by_sara("directory");
+    assert_eq!(said["registered"], 3, "{said}");
+    assert_eq!(said["again"], "BadEntryExists");
+    assert_eq!(said["unfit"], "BadInvalidArgument");
+    assert_eq!(said["found"], json!([format!("{URI}-1")]));
+    assert_eq!(said["found_names"], json!(["Robot 1"]));
+    assert_eq!(
+        said["updated"],
+        json!(["Welder", ["DA", "HD"], ["opc.tcp://robot.cell:4840"]])
+    );
+    assert_eq!(
+        said["first_page"],
+        json!([format!("{URI}-0"), format!("{URI}-1")])
+    );
+    assert_eq!(said["second_page"], json!([[format!("{URI}-2")], 0]));
+    assert_eq!(
+        said["filtered"],
+        json!([[format!("{URI}-1"), ["opc.tcp://robot.cell:4840"]]])
+    );
+    assert_eq!(
+        said["servers"],
+        json!([["Robot 2", "opc.tcp://robot.cell:4840", ["DA"]]])
+    );
+    assert_eq!(said["gone"], "BadNotFound");
+    // Who may not: over a channel that others can read, an operator, and one without a name.
+    let strangers = [
+        (&["--way", "None"][..], "BadSecurityModeInsufficient"),
+        (
+            &[
+                "--way",
+                "Basic256Sha256/Sign",
+                "--user",
+                "sara",
+                "--password",
+                PASSWORD,
+            ],
+            "BadSecurityModeInsufficient",
+        ),
+        (
+            &["--user", "otto", "--password", PASSWORD],
+            "BadUserAccessDenied",
+        ),
+        (&[], "BadUserAccessDenied"),
+    ];
+    for (who, wanted) in strangers {
+        let said = site.asked("stranger", who);
+        assert_eq!(said["register"], wanted, "{who:?}: {said}");
+        assert_eq!(said["open"], wanted, "{who:?}: {said}");
+        assert_eq!(said["found"], json!([]), "{who:?}: {said}");
+    }
+}
+
+#[test]
+fn a_certificate_is_issued_used_renewed_by_its_owner_and_revoked() {
+    let Some(site) = site() else { return };
+    let said = site.by_sara("certificates");
+    assert_eq!(said["due_before"], true, "{said}");
+    assert_eq!(said["foreign_uri"], "BadInvalidArgument");
+    assert_eq!(said["forged"], "BadInvalidArgument");
+    assert_eq!(said["twice"], "BadNotFound");
+    assert_eq!(
+        said["issued"],
+        json!({
+            "signed": true, "uri": [URI], "hosts": ["robot.cell"], "own_key": true, "no_private_key": true, "is_authority": false
+        })
+    );
+    assert_eq!(said["due_after"], false);
+    assert_eq!(said["kept"], json!([true]));
+    assert_eq!(said["pair"], json!(["Paired", true]));
+    assert_eq!(said["trust_list"], json!([15, [true], [true]]));
+    assert_eq!(said["masked"], json!([1, 1, []]));
+    assert_eq!(said["status"], "Good");
+    assert_eq!(said["revoked"], json!([true, false]));
+    assert_eq!(said["status_revoked"], "BadCertificateRevoked");
+    assert_eq!(said["list_lives"], true);
+    // With what was issued the application is let in without being known, and does for itself what sara did.
+    let robot = ["--client", "robot", "--application-uri", URI];
+    let itself = site.asked("itself", &robot);
+    assert_eq!(itself["connected"], "Good", "{itself}");
+    assert_eq!(itself["other"], "BadUserAccessDenied");
+    assert_eq!(itself["trusted"], 1);
+    assert!(itself["renewed"].is_string());
+    // People see what was issued, and revoke.
+    let listed = told(&site.cell, &["ca", "list"]);
+    assert_eq!(listed.lines().count(), 3, "{listed}");
+    assert_eq!(listed.matches("REVOKED").count(), 1, "{listed}");
+    let certificate = pairs(&site.cell).join("robot_certificate.der");
+    told(&site.cell, &["ca", "revoke", path(&certificate)]);
+    eventually("the application is let in no longer", SOON, || {
+        let refused = site.asked("itself", &robot)["connected"] != "Good";
+        refused.then_some(())
+    });
+}
+
+#[test]
+fn people_issue_certificates_for_requests_and_with_keys() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let none = run(&cell, "ua-gds", &["ca", "list"]);
+    assert!(text(&none.stderr).contains("ua-gds ca init"), "{none:?}");
+    told(&cell, &["ca", "init"]);
+    let [key, out] = ["robot.key", "robot.pem"].map(|name| cell.folder().join(name));
+    let args = [
+        "ca",
+        "issue",
+        "--application-uri",
+        URI,
+        "--host",
+        "robot.cell",
+        "--key",
+        path(&key),
+        "--out",
+        path(&out),
+    ];
+    let issued = told(&cell, &args);
+    assert!(issued.contains(URI), "{issued}");
+    let pem = fs::read_to_string(&out).unwrap();
+    assert!(pem.starts_with("-----BEGIN CERTIFICATE-----"), "{pem}");
+    assert!(fs::read_to_string(&key).unwrap().contains("PRIVATE KEY"));
+    let line = told(&cell, &["ca", "list", "--json"]);
+    let one: Value = serde_json::from_str(line.trim()).unwrap();
+    assert_eq!(one["application_uri"], URI);
+    assert_eq!(one["hosts"], json!(["robot.cell"]));
+    assert_eq!(one["revoked"], Value::Null);
+    told(&cell, &["ca", "revoke", one["serial"].as_str().unwrap()]);
+    let line = told(&cell, &["ca", "list", "--json"]);
+    let one: Value = serde_json::from_str(line.trim()).unwrap();
+    assert!(one["revoked"].is_string(), "{line}");
+    let wrong = run(
+        &cell,
+        "ua-gds",
+        &["ca", "issue", path(&out), "--out", path(&out)],
+    );
+    assert!(
+        text(&wrong.stderr).contains("is no signing request"),
+        "{wrong:?}"
+    );
+}
