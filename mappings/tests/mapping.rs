@@ -685,9 +685,15 @@ fn a_flood_of_findings_ends_with_their_number() {
 fn too_many_variables_are_refused_and_the_most_allowed_are_not() {
     let document = |count: u32| {
         let entries: String = (0..count)
-            .map(|n| format!("  - {{node: ns=2;i={}, name: A{n}, origin: 1}}\n", n + 1))
+            .map(|n| {
+                // A namespace has topics for 65535 of them.
+                let (namespace, id) = (2 + n / 50_000, 1 + n % 50_000);
+                format!("  - {{node: ns={namespace};i={id}, name: A{n}, origin: 1}}\n")
+            })
             .collect();
-        Mapping::from_yaml(&format!("{HEAD}{entries}"), "cell.yaml")
+        let namespaces = "namespaces: {2: 'urn:two', 3: 'urn:three', 4: 'urn:four'}";
+        let text = format!("{namespaces}\nspaces: [{{id: 1}}]\nvariables:\n{entries}");
+        Mapping::from_yaml(&text, "cell.yaml")
     };
     assert_eq!(
         document(100_000).mapping.unwrap().variables().len(),
