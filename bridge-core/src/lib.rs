@@ -9,6 +9,7 @@
 //! The checks run in the order header, loop, route, payload, so that looped and unmapped traffic costs a header read
 //! and no allocation.
 
+mod application;
 mod base;
 mod block;
 mod call;
@@ -39,6 +40,7 @@ mod topic;
 mod transcoder;
 mod writer;
 
+pub use application::{Application, Endpoint};
 pub use call::{
     ActionFamily, Answered, AskError, AskErrorKind, AskId, CallCounters, CallDescription,
     CallField, CallMap, CallRole, CallStructure, Executed, Execution, Offered, OfferedType,
@@ -55,3 +57,4 @@ pub use room::Room;
 pub use router::Router;
 pub use settings::{Local, Now, Settings};
 pub use uadp::action::{ExecutionId, Refusal};
+pub use uadp::discovery::MessageSecurityMode;

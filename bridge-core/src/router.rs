@@ -1,6 +1,7 @@
 //! The Router: verdicts on samples, queues per topic, repetitions and silences.
 
 mod announce;
+mod applications;
 mod batch;
 mod by_name;
 mod calls;

@@ -30,9 +30,10 @@ mod status;
 pub use actions::{ActionGraph, Actions};
 pub use arguments::{Arguments, Flags, WithoutMapping};
 pub use bridge_core::{
-    ActionFamily, Answered, AskError, AskErrorKind, AskId, CallDescription, CallField, CallMap,
-    CallRole, CallStructure, Counters, Described, Executed, ExecutionId, Kept, Offered,
-    OfferedType, Owned, PublisherKey, Reason, Refusal, Room, Router, ValueDescription, ValueNote,
+    ActionFamily, Answered, Application, AskError, AskErrorKind, AskId, CallDescription, CallField,
+    CallMap, CallRole, CallStructure, Counters, Described, Endpoint, Executed, ExecutionId, Kept,
+    MessageSecurityMode, Offered, OfferedType, Owned, PublisherKey, Reason, Refusal, Room, Router,
+    ValueDescription, ValueNote,
 };
 pub use busy_poll::BusyPoll;
 pub use calls::{Asker, CallGraph, Calls};
@@ -45,7 +46,7 @@ pub use logging::{LogFormat, LogRecord, LogSink, hear_log};
 pub use metrics::{Requests, Told, serve_pages};
 pub use port::{Delivery, Execution, LinkState, Port, PortEvent};
 pub use present::Present;
-pub use program::{Context, Made, Program, run};
+pub use program::{Carried, Context, Made, Program, run};
 pub use service::{Service, run_service};
 pub use services::{CallFault, Outcome, Ran, ServiceCall, ServiceGraph, Services};
 pub use stamp::wants_stamp;

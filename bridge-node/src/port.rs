@@ -6,8 +6,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use bridge_core::{
-    Answered, AskId, CallDescription, CallMap, Described, Executed, ExecutionId, Kept, Offered,
-    OfferedType, PublisherKey, Reason, Router, ValueDescription, ValueNote,
+    Answered, Application, AskId, CallDescription, CallMap, Described, Executed, ExecutionId, Kept,
+    Offered, OfferedType, PublisherKey, Reason, Router, ValueDescription, ValueNote,
 };
 use bytes::Bytes;
 use mappings::{Mapping, TopicId};
@@ -106,6 +106,12 @@ pub trait Port: Send + 'static {
     /// The other servers that this side is connected to, or tries to be.
     fn links(&self) -> Vec<LinkState> {
         Vec::new()
+    }
+
+    /// What the program tells whoever asks the group which applications there are. `None` of one that is no server: what it
+    /// is says the shell.
+    fn application(&self) -> Option<Application> {
+        None
     }
 
     /// The addresses of this host that this side has taken for good when it started, all there were where the list is

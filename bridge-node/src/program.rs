@@ -8,7 +8,7 @@ use std::process::ExitCode;
 use std::sync::Arc;
 use std::time::Duration;
 
-use bridge_core::{Local, Owned, Router, Settings};
+use bridge_core::{Application, Local, Owned, Router, Settings};
 use clap::Parser;
 use mappings::{Mapping, PubSub, SecurityGroup, SpaceId};
 use tokio::signal::unix::SignalKind;
@@ -72,6 +72,13 @@ pub trait Program: Parser {
         None
     }
 
+    /// Tells of a space that it carries elsewhere than in the group, as by mDNS, for as long as what this gives is kept.
+    /// `None` where it does not.
+    fn tell(&self, carried: &Carried<'_>) -> Option<Box<dyn Send + Sync>> {
+        let _nobody = carried;
+        None
+    }
+
     /// The spaces it serves, none of them twice: each with a local side, a Router and a place in the group of its own.
     ///
     /// # Errors
@@ -96,6 +103,19 @@ pub enum Made {
     Run(Mapping),
     /// The configuration was only to be checked, and can run.
     Checked,
+}
+
+/// A space that a program carries, and where.
+#[derive(Debug, Clone, Copy)]
+pub struct Carried<'a> {
+    /// What the program is.
+    pub application: &'a Application,
+    /// The space.
+    pub own: SpaceId,
+    /// The PubSub group.
+    pub group: SocketAddr,
+    /// The network interface of the group, by name or address, where one is named.
+    pub interface: Option<&'a str>,
 }
 
 /// What a port is started with.
@@ -210,7 +230,9 @@ async fn prepare<P: Program>(
         "{} starts",
         P::NAME
     );
-    let udp = open(arguments, &mapping, several)?;
+    let options = options(arguments, &mapping, several)?;
+    let udp = Udp::open(&options)
+        .map_err(|error| Failure::new(FailureKind::Unavailable, error.to_string()))?;
     let settings = Settings {
         own,
         local: P::LOCAL,
@@ -230,6 +252,15 @@ async fn prepare<P: Program>(
         own,
     };
     let port = program.start(context).await?;
+    let application = port.application();
+    let application = application.unwrap_or_else(|| plain(P::NAME, own));
+    let told = program.tell(&Carried {
+        application: &application,
+        own,
+        group: options.address,
+        interface: options.interface.as_deref(),
+    });
+    router.introduce(application, now());
     Ok(Shell {
         program: P::NAME,
         own,
@@ -252,6 +283,7 @@ async fn prepare<P: Program>(
         taken: BTreeMap::new(),
         busy: BusyPoll::new(Duration::from_micros(arguments.flags.busy_poll.into())),
         dry_run: arguments.flags.dry_run,
+        _told: told,
     })
 }
 
@@ -259,6 +291,24 @@ async fn prepare<P: Program>(
 async fn told(mut stop: watch::Receiver<bool>) {
     let _told_or_alone = stop.wait_for(|stop| *stop).await;
 }
+
+/// What a program is that is no server. Its ApplicationUri is that of the certificate it fetches keys with.
+fn plain(program: &str, own: SpaceId) -> Application {
+    let host = std::fs::read_to_string(HOST_NAME).unwrap_or_default();
+    let host = match host.trim() {
+        "" => "localhost",
+        host => host,
+    };
+    Application {
+        uri: format!("urn:{host}:ua-bridge:{program}"),
+        product_uri: format!("urn:ua-bridge:{program}"),
+        name: format!("{program}, space {own}, on {host}"),
+        capabilities: vec!["NA".to_owned()],
+        ..Application::default()
+    }
+}
+
+const HOST_NAME: &str = "/proc/sys/kernel/hostname";
 
 /// Random bytes, which tell the requests of this run from those of others.
 fn instance() -> Result<[u8; 16], Failure> {
@@ -303,7 +353,8 @@ fn how(ended: Option<Result<Result<(), Failure>, JoinError>>) -> Result<(), Fail
     })
 }
 
-fn open(arguments: &Arguments, mapping: &Mapping, several: bool) -> Result<Udp, Failure> {
+/// The place in the group.
+fn options(arguments: &Arguments, mapping: &Mapping, several: bool) -> Result<Options, Failure> {
     let pubsub = mapping.pubsub();
     let address: SocketAddr = match &arguments.flags.address {
         Some(url) => PubSub::parse_address(url).ok_or_else(|| {
@@ -328,5 +379,5 @@ fn open(arguments: &Arguments, mapping: &Mapping, several: bool) -> Result<Udp, 
         );
         return Err(Failure::new(FailureKind::Usage, message));
     }
-    Udp::open(&options).map_err(|error| Failure::new(FailureKind::Unavailable, error.to_string()))
+    Ok(options)
 }

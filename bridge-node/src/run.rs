@@ -50,6 +50,8 @@ pub(crate) struct Shell<P> {
     pub(crate) taken: BTreeMap<u16, String>,
     pub(crate) busy: BusyPoll,
     pub(crate) dry_run: bool,
+    /// Elsewhere than in the group, for as long as it is here.
+    pub(crate) _told: Option<Box<dyn Send + Sync>>,
 }
 
 /// What of the mapping was decided when the program started.

@@ -27,6 +27,9 @@ pub(crate) struct Status {
     /// Other servers that the program is a client of.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     servers: Vec<LinkState>,
+    /// Other applications of the group, as they say of themselves.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    applications: Vec<ApplicationStatus>,
     /// Datagrams and messages that belong to no topic.
     others: TopicStatus,
     hops: BTreeMap<&'static str, HopStatus>,
@@ -47,6 +50,16 @@ pub(crate) struct Interfaces {
     /// `None` where the side is on none in particular.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) local: Option<u8>,
+}
+
+#[derive(Debug, Clone, Serialize)]
+struct ApplicationStatus {
+    space: u8,
+    from: String,
+    uri: String,
+    name: String,
+    urls: Vec<String>,
+    capabilities: Vec<String>,
 }
 
 #[derive(Debug, Clone, Serialize)]
@@ -149,6 +162,7 @@ impl Status {
             topics,
             calls,
             servers: Vec::new(),
+            applications: applications(router),
             others: router.others().into(),
             hops,
         }
@@ -169,6 +183,19 @@ impl Status {
             all().flat_map(|topic| topic.dropped.values()).sum(),
         ]
     }
+}
+
+fn applications(router: &Router) -> Vec<ApplicationStatus> {
+    let all = router.applications();
+    let shown = all.map(|(space, from, application)| ApplicationStatus {
+        space: space.get(),
+        from: from.to_string(),
+        uri: application.uri.clone(),
+        name: application.name.clone(),
+        urls: application.urls.clone(),
+        capabilities: application.capabilities.clone(),
+    });
+    shown.collect()
 }
 
 impl Told for Status {

@@ -5,9 +5,10 @@ use std::process::ExitCode;
 use std::sync::Arc;
 
 use bridge_core::Local;
-use bridge_node::{Arguments, Context, Failure, FailureKind, KeyService, Program};
+use bridge_node::{Arguments, Carried, Context, Failure, FailureKind, KeyService, Program};
 use bridge_ros1::{PortOptions, Ros1Port};
 use clap::{ArgMatches, Command, CommandFactory, FromArgMatches, Parser};
+use discovery::{Bridge, TellingArguments, tell_bridge};
 use mappings::{Mapping, SpaceId};
 use plant_keys::KeyArguments;
 use tcpros::{ArgumentError, NodeError, NodeOptions};
@@ -36,6 +37,8 @@ struct Flags {
     arguments: Arguments,
     #[command(flatten)]
     keys: KeyArguments,
+    #[command(flatten)]
+    told: TellingArguments,
 }
 
 impl Parser for BridgeRos1 {
@@ -105,6 +108,17 @@ impl Program for BridgeRos1 {
 
     fn key_service(&self, _mapping: &Mapping) -> Option<Arc<dyn KeyService>> {
         Some(self.flags.keys.service(Self::NAME))
+    }
+
+    fn tell(&self, carried: &Carried<'_>) -> Option<Box<dyn Send + Sync>> {
+        let bridge = Bridge {
+            program: Self::NAME.to_owned(),
+            uri: carried.application.uri.clone(),
+            space: carried.own.into(),
+            group: carried.group,
+        };
+        let told = tell_bridge(&bridge, &self.flags.told.telling, carried.interface)?;
+        Some(Box::new(told))
     }
 
     async fn start(&self, context: Context) -> Result<Ros1Port, Failure> {

@@ -8,13 +8,14 @@ use std::process::ExitCode;
 use std::sync::Arc;
 
 use bridge_core::Local;
-use bridge_node::{Arguments, Context, Failure, FailureKind, KeyService, Program};
+use bridge_node::{Arguments, Carried, Context, Failure, FailureKind, KeyService, Program};
 use bridge_ros2::discovery_info::GidLength;
 use bridge_ros2::domain::{DiscoveryRange, DomainError, DomainOptions};
 use bridge_ros2::node::NodeOptions;
 use bridge_ros2::security::Security;
 use bridge_ros2::{PortOptions, Ros2Port, RosArgs, limits};
 use clap::Parser;
+use discovery::{Bridge, TellingArguments, tell_bridge};
 use mappings::{Mapping, SpaceId};
 use plant_keys::KeyArguments;
 use tracing::{info, warn};
@@ -32,6 +33,8 @@ struct BridgeRos2 {
     arguments: Arguments,
     #[command(flatten)]
     keys: KeyArguments,
+    #[command(flatten)]
+    told: TellingArguments,
     /// The DDS domain to join, or several as 2,3; without it the domain of the space, or of the mapping's only ROS 2
     /// space
     #[arg(long, value_name = "N", env = "ROS_DOMAIN_ID", value_delimiter = ',', value_parser = domain_number)]
@@ -221,6 +224,17 @@ impl Program for BridgeRos2 {
 
     fn key_service(&self, _mapping: &Mapping) -> Option<Arc<dyn KeyService>> {
         Some(self.keys.service(Self::NAME))
+    }
+
+    fn tell(&self, carried: &Carried<'_>) -> Option<Box<dyn Send + Sync>> {
+        let bridge = Bridge {
+            program: Self::NAME.to_owned(),
+            uri: carried.application.uri.clone(),
+            space: carried.own.into(),
+            group: carried.group,
+        };
+        let told = tell_bridge(&bridge, &self.told.telling, carried.interface)?;
+        Some(Box::new(told))
     }
 
     async fn start(&self, context: Context) -> Result<Ros2Port, Failure> {

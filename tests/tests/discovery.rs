@@ -10,6 +10,8 @@ mod levels;
 mod presence;
 #[path = "discovery/rules.rs"]
 mod rules;
+#[path = "discovery/space.rs"]
+mod space;
 
 use std::io::{Read as _, Write as _};
 use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4, TcpListener, TcpStream};

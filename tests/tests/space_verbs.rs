@@ -44,7 +44,7 @@ fn what_a_ros_1_node_publishes_is_listed_echoed_and_measured_without_a_mapping()
         let (code, lines) = ua_space(&["list", "--seconds", "1", "--json"]);
         assert_eq!(code, 0, "{lines:?}");
         let all = objects(&lines).pop()?;
-        let all = all.as_array()?.iter();
+        let all = all["topics"].as_array()?.iter();
         let mut found = all.filter(|line| line["topic"] == "ua_1_2_10" && line["type"] == TWIST);
         found.next().cloned()
     });
@@ -247,13 +247,16 @@ fn skills_of_two_components_are_told_run_watched_and_completed_by_their_names() 
         )
     );
     let run = &result["run"];
-    let states = events(&watch, "state");
-    let states: Vec<&str> = states
-        .iter()
-        .filter(|state| state["run"] == *run)
-        .filter_map(|state| state["state"].as_str())
-        .collect();
-    assert_eq!(states, ["Running", "Ready"]);
+    // The last state may come after the result.
+    eventually("its states are watched", SOON, || {
+        let states = events(&watch, "state");
+        let states: Vec<&str> = states
+            .iter()
+            .filter(|state| state["run"] == *run)
+            .filter_map(|state| state["state"].as_str())
+            .collect();
+        (states == ["Running", "Ready"]).then_some(())
+    });
     watch.end();
 
     let (code, lines) = ua_space(&["skills", "info", names[1], "--json"]);

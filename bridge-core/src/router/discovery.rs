@@ -12,6 +12,7 @@ use uadp::discovery::{
 };
 use uadp::{NetworkMessage, NetworkMessageType, PublisherId, SecurityHeader, StatusCode};
 
+use super::applications::Applications;
 use super::receive::DISCOVERY;
 use super::{About, Router};
 use crate::call::split_name;
@@ -44,6 +45,7 @@ pub(super) struct Discovery {
     pub(super) learned: Learned<Described>,
     /// What the fields are, as announced, for messages that do not say it.
     layouts: Learned<Layout>,
+    pub(super) applications: Applications,
     /// When there is something to do: looked up at every turn, and computed when something changes.
     due: Option<Instant>,
 }
@@ -72,6 +74,7 @@ impl Discovery {
             probing: BTreeMap::new(),
             learned: Learned::default(),
             layouts: Learned::default(),
+            applications: Applications::default(),
             due: None,
         }
     }
@@ -91,6 +94,7 @@ impl Discovery {
         let rolls = self.rolls.values().filter_map(ProbeTimer::poll_timeout);
         let next = probes
             .chain(rolls)
+            .chain(self.applications.poll_timeout())
             .chain(self.announcer.poll_timeout())
             .min();
         self.due = next.map(|due| self.start + due);
@@ -142,6 +146,14 @@ impl Router {
         };
         let since = discovery.since_start(now);
         while let Some(due) = discovery.announcer.poll(since) {
+            if matches!(
+                due.subject,
+                Subject::ApplicationInformation | Subject::PublisherEndpoints
+            ) {
+                let endpoints = due.subject == Subject::PublisherEndpoints;
+                self.tell_application(&discovery, endpoints, due.sequence_number);
+                continue;
+            }
             let (Subject::DataSetMetaData(writer_id) | Subject::ActionMetaData(writer_id)) =
                 due.subject
             else {
@@ -179,6 +191,7 @@ impl Router {
             }
         }
         self.call_rolls(&mut discovery, (since, random));
+        self.ask_all(&mut discovery, (since, random));
         discovery.reckon();
         self.discovery = Some(discovery);
     }
@@ -263,7 +276,13 @@ impl Router {
                     self.handle_roll(space, now);
                 }
                 Ok(Probe::PubSubConnections { .. }) => {}
-                // Of endpoints and configurations there is nothing to tell.
+                Ok(probe @ (Probe::PublisherEndpoints | Probe::FindApplications)) => {
+                    let is_all = probe == Probe::FindApplications;
+                    if is_all || space == self.settings.own {
+                        self.is_asked(&probe, now);
+                    }
+                }
+                // Of configurations there is nothing to tell.
                 Ok(_) => self.drop_undecoded(None, from, &DISCOVERY),
                 Err(error) => self.drop_undecoded(None, from, &error),
             }
@@ -310,6 +329,14 @@ impl Router {
     ) {
         if let Announced::ActionMetaData(action) = &announcement.announced {
             self.learn_call(action, (space, from), now);
+            return;
+        }
+        if let Announced::ApplicationDescription {
+            description,
+            capabilities,
+        } = &announcement.announced
+        {
+            self.meet_application((description, *capabilities), (space, from), now);
             return;
         }
         let Announced::DataSetMetaData {

@@ -38,6 +38,9 @@ impl Router {
         now: Now,
     ) {
         let header = message.header();
+        if self.is_for_all(message, from, now) {
+            return;
+        }
         let Some(space) = self.space_of(&header, from) else {
             return;
         };

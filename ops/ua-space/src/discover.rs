@@ -10,8 +10,8 @@ use crate::exit::Failure;
 use crate::live::{Table, is_coloured};
 use crate::survey::look;
 
-pub(crate) use around::around;
-pub(crate) use entry::{Entry, Kind};
+pub(crate) use around::{around, around_and};
+pub(crate) use entry::{Entry, Kind, Shown};
 
 pub(crate) fn discover(arguments: &Discover) -> Result<(), Failure> {
     let found = look(around(&arguments.look))?;

@@ -1,5 +1,7 @@
 //! Looking into a running space: what is heard in its group, without a mapping.
 
+mod all;
+mod application;
 mod book;
 mod call;
 mod described;
@@ -15,9 +17,11 @@ mod structure;
 mod text;
 mod trace;
 
+pub(crate) use all::list;
+pub(crate) use application::Application;
 pub(crate) use call::call;
 pub(crate) use echo::{echo, hz};
-pub(crate) use list::{info, list};
+pub(crate) use list::info;
 pub(crate) use skills::{HeardNames, heard_names, skills};
 pub(crate) use text::{Table, harmless, is_coloured};
 pub(crate) use trace::trace;
@@ -87,22 +91,22 @@ pub(crate) fn in_group<T>(
     })
 }
 
-/// Who sends in the group for `seconds`: each ROS space and from where, and of how many topics.
-pub(crate) async fn senders(
-    group: &Group,
-    seconds: f64,
-) -> Result<BTreeMap<(u16, String), usize>, Failure> {
+/// Who is in a group.
+#[derive(Debug, Default)]
+pub(crate) struct InGroup {
+    /// Each ROS space and from where, and of how many topics.
+    pub(crate) senders: BTreeMap<(u16, String), usize>,
+    /// What programs say they are: for which space, and from where.
+    pub(crate) applications: BTreeMap<(u16, String), Application>,
+}
+
+/// Who says something in the group for `seconds`, or what it is when it is asked.
+pub(crate) async fn in_the_group(group: &Group, seconds: f64) -> Result<(InGroup, ()), Failure> {
     let mut live = Live::join(group)?;
+    live.want_all();
     let end = until(live.now(), Some(seconds));
     live.listen(end, &mut |_, _| Go::On).await?;
-    let mut senders = BTreeMap::new();
-    for (topic, heard) in live.book.topics() {
-        if topic.space != SpaceId::UA {
-            let key = (topic.space.get().into(), heard.from.to_string());
-            *senders.entry(key).or_default() += 1;
-        }
-    }
-    Ok(senders)
+    Ok((live.who(), ()))
 }
 
 impl Live {
@@ -140,6 +144,24 @@ impl Live {
         })
     }
 
+    /// Who was heard, and what they say they are.
+    pub(crate) fn who(&self) -> InGroup {
+        let mut senders = BTreeMap::new();
+        for (topic, heard) in self.book.topics() {
+            if topic.space != SpaceId::UA {
+                let key = (topic.space.get().into(), heard.from.to_string());
+                *senders.entry(key).or_default() += 1;
+            }
+        }
+        let applications = self.book.applications();
+        let applications =
+            applications.map(|((space, from), one)| ((*space, from.to_string()), one.clone()));
+        InGroup {
+            senders,
+            applications: applications.collect(),
+        }
+    }
+
     /// Time since it joined.
     pub(crate) fn now(&self) -> Duration {
         self.start.elapsed()
@@ -161,6 +183,11 @@ impl Live {
         for space in spaces {
             self.prober.want_calls(space, self.start.elapsed());
         }
+    }
+
+    /// Asks who there is.
+    pub(crate) fn want_all(&mut self) {
+        self.prober.want_all();
     }
 
     /// Asks what a topic or call consists of.

@@ -8,15 +8,15 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use bridge_node::actions::OwnActions;
 use bridge_node::{
-    Answered, AskId, CallDescription, Delivery, Described, Executed, Execution, ExecutionId,
-    Failure, FailureKind, Port, PortEvent, TypePaths,
+    Answered, Application, AskId, CallDescription, Delivery, Described, Endpoint, Executed,
+    Execution, ExecutionId, Failure, FailureKind, MessageSecurityMode, Port, PortEvent, TypePaths,
 };
 use bytes::Bytes;
 use discovery::{AnnounceSettings, Announced, Interface};
 use mappings::{Mapping, PubSub, TopicId};
 use program::{Method, State};
 use skills::server::{ComponentServer, ServeFault, ServeSettings};
-use skills::{Component, Lds, Owner, Skill};
+use skills::{Component, Lds, Owner, Security, Skill};
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 use tracing::{info, warn};
@@ -67,6 +67,8 @@ pub struct ComponentPort {
     _looks: JoinSet<()>,
     /// What skills ask of others.
     asking: Asking,
+    /// As the group is told.
+    application: Application,
 }
 
 impl ComponentPort {
@@ -113,7 +115,9 @@ impl ComponentPort {
             }
         }
         server.start();
-        let announced = announce(component, server.url(), options);
+        let told = told_of(component, server.url(), options);
+        let application = application(&told, &component.security);
+        let announced = announce(told, component, options);
         if server.skills().len() > MOST_IN_SPACE {
             warn!(
                 "only the first {MOST_IN_SPACE} skills have a place in the space; OPC UA has all"
@@ -137,6 +141,7 @@ impl ComponentPort {
             actions,
             _looks: looks,
             asking,
+            application,
         })
     }
 
@@ -174,6 +179,10 @@ impl Port for ComponentPort {
             event = self.actions.recv() => event,
             event = self.outbox.next() => event,
         }
+    }
+
+    fn application(&self) -> Option<Application> {
+        Some(self.application.clone())
     }
 
     /// A component has no use for what others say; that is no loss to tell of.
@@ -272,7 +281,7 @@ impl Port for ComponentPort {
 pub fn check(component: &Component, options: &Options) -> Result<(), Failure> {
     let component = Component {
         endpoint: "opc.tcp://127.0.0.1:0".to_owned(),
-        security: vec![skills::Security::None],
+        security: vec![Security::None],
         ..with_drivers(component, &mut Asking::new())
     };
     let runtime = tokio::runtime::Builder::new_current_thread()
@@ -334,15 +343,48 @@ pub fn print(text: &str) {
     let _printed = std::io::stderr().lock().write_all(text.as_bytes());
 }
 
-fn announce(component: &Component, url: &str, options: &Options) -> Option<Announced> {
-    let server = discovery::Server {
+/// The component as others are told of it.
+fn told_of(component: &Component, url: &str, options: &Options) -> discovery::Server {
+    discovery::Server {
         application_uri: component.application_uri.clone(),
         product_uri: "urn:ua-bridge:plant".to_owned(),
         name: component.name.clone(),
         url: url.to_owned(),
         capabilities: options.capabilities.clone(),
         number: NonZeroU16::new(component.namespace),
-    };
+    }
+}
+
+/// The same for the group.
+fn application(server: &discovery::Server, security: &[Security]) -> Application {
+    let ways = security.iter().flat_map(|security| match security {
+        Security::None => plant_opcua::server::Security::None.ways(),
+        Security::Basic256Sha256 => plant_opcua::server::Security::Basic256Sha256.ways(),
+    });
+    let endpoints = ways.map(|(policy_uri, encrypts)| Endpoint {
+        url: server.url.clone(),
+        policy_uri: policy_uri.to_owned(),
+        mode: match encrypts {
+            None => MessageSecurityMode::NONE,
+            Some(false) => MessageSecurityMode::SIGN,
+            Some(true) => MessageSecurityMode::SIGN_AND_ENCRYPT,
+        },
+    });
+    Application {
+        uri: server.application_uri.clone(),
+        product_uri: server.product_uri.clone(),
+        name: server.name.clone(),
+        urls: vec![server.url.clone()],
+        capabilities: server.capabilities.clone(),
+        endpoints: endpoints.collect(),
+    }
+}
+
+fn announce(
+    server: discovery::Server,
+    component: &Component,
+    options: &Options,
+) -> Option<Announced> {
     let lds = match &component.lds {
         Lds::Local => Some(discovery::DEFAULT_LDS.to_owned()),
         Lds::Nowhere => None,

@@ -1,13 +1,14 @@
 //! Who is there: the registry of [`registry`] with sockets around it.
 //!
 //! [`announce`] tells of a server: by mDNS to whoever is on the network, and by registration to the Local Discovery
-//! Server. [`watch`] tells who is there. [`lds`] is the Local Discovery Server itself, the program `ua-lds`.
+//! Server. [`watch`] tells who is there. [`tell_bridge`] tells of a program that carries a space. [`lds`] is the Local Discovery Server itself, the program `ua-lds`.
 //!
 //! Reading order: `url` and `interface` (where), `mdns` and `goodbye` (announcements and what is heard of others), `wire` (OPC UA
 //! over TCP), `client` (asking by it), `line` and `liveness` (who still answers), `keeper` (all of that around one registry),
-//! `watch`, `scan`, `chosen` and `announce` (for programs), `endpoint`, `connection`, `security` and `services` (answering by it), `lds`, `presence`.
+//! `watch`, `scan`, `chosen`, `announce` and `bridges` (for programs), `endpoint`, `connection`, `security` and `services` (answering by it), `lds`, `presence`.
 
 mod announce;
+mod bridges;
 mod chosen;
 pub mod client;
 mod clock;
@@ -31,6 +32,9 @@ mod watch;
 mod wire;
 
 pub use announce::{AnnounceSettings, AnnounceState, Announced, Server, announce};
+pub use bridges::{
+    Bridge, HeardBridge, Telling, TellingArguments, ToldBridge, heard_bridges, tell_bridge,
+};
 pub use chosen::{Marks, find_lds};
 pub use interface::Interface;
 pub use mdns::MdnsFault;

@@ -24,11 +24,20 @@ use crate::url::Url;
 
 /// No mDNS daemon can be started.
 #[derive(Debug, thiserror::Error)]
-#[error("servers cannot be announced or heard on {interface}: {source}")]
+#[error("nobody can be announced or heard on {interface}: {source}")]
 pub struct MdnsFault {
     interface: String,
     #[source]
     source: mdns_sd::Error,
+}
+
+impl MdnsFault {
+    pub(crate) fn new(interface: &Interface, source: mdns_sd::Error) -> Self {
+        Self {
+            interface: interface.to_string(),
+            source,
+        }
+    }
 }
 
 /// What is heard on the network.
@@ -110,10 +119,7 @@ impl Mdns {
     }
 
     fn open_at(interface: &Interface, port: u16) -> Result<Self, MdnsFault> {
-        let fault = |source| MdnsFault {
-            interface: interface.to_string(),
-            source,
-        };
+        let fault = |source| MdnsFault::new(interface, source);
         let daemon = ServiceDaemon::new_with_port(port).map_err(fault)?;
         daemon.disable_interface(IfKind::All).map_err(fault)?;
         daemon.enable_interface(interface.kind()).map_err(fault)?;

@@ -6,8 +6,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use bridge_node::{
-    Answered, AskId, CallDescription, Delivery, Described, Execution, ExecutionId, Failure,
-    FailureKind, Kept, LinkState, Port, PortEvent, Router, TypePaths,
+    Answered, Application, AskId, CallDescription, Delivery, Described, Execution, ExecutionId,
+    Failure, FailureKind, Kept, LinkState, MessageSecurityMode, Port, PortEvent, Router, TypePaths,
 };
 use bytes::Bytes;
 use discovery::{AnnounceSettings, Announced, MdnsFault, WatchSettings, announce, watch};
@@ -95,6 +95,8 @@ pub(crate) struct ServerPort {
     readers: Readers,
     /// When a publisher that is not heard counts as away.
     receive_timeout: Duration,
+    /// As the group is told.
+    application: Application,
 }
 
 impl ServerPort {
@@ -156,7 +158,7 @@ impl ServerPort {
         let others = Others::new(mapping, &described.application_uri, setup.pki.root());
         let nodes = (Arc::clone(&manager), Arc::clone(&subscriptions));
         let methods = Methods::new(nodes.clone(), mapping, (asked, &layout.structures));
-        let server = told_of(described, setup.url.advertised(port));
+        let (server, application) = told_of(described, setup.url.advertised(port), &security);
         let (told, components) = tell(server, setup.announce, nodes)?;
         Ok(Self {
             unbound: VecDeque::new(),
@@ -184,6 +186,7 @@ impl ServerPort {
             pubsub,
             readers: Readers::default(),
             receive_timeout: mapping.pubsub().receive_timeout,
+            application,
         })
     }
 }
@@ -373,6 +376,10 @@ impl Port for ServerPort {
 
     fn links(&self) -> Vec<LinkState> {
         self.others.links()
+    }
+
+    fn application(&self) -> Option<Application> {
+        Some(self.application.clone())
     }
 
     async fn shutdown(mut self) {
@@ -593,15 +600,43 @@ fn tell(
     Ok((Some(told), components))
 }
 
-/// The server as others are told of it.
-fn told_of(described: &Server, url: String) -> discovery::Server {
-    discovery::Server {
+/// The server as others are told of it, and the group.
+fn told_of(
+    described: &Server,
+    url: String,
+    security: &[Security],
+) -> (discovery::Server, Application) {
+    let server = discovery::Server {
         application_uri: described.application_uri.clone(),
         product_uri: endpoint::PRODUCT_URI.to_owned(),
         name: "ua-server".to_owned(),
         url,
         capabilities: ["DA", "HD"].map(str::to_owned).to_vec(),
         number: None,
+    };
+    let application = application(&server, security);
+    (server, application)
+}
+
+/// The same for the group.
+fn application(server: &discovery::Server, security: &[Security]) -> Application {
+    let ways = security.iter().flat_map(|security| security.ways());
+    let endpoints = ways.map(|(policy_uri, encrypts)| bridge_node::Endpoint {
+        url: server.url.clone(),
+        policy_uri: policy_uri.to_owned(),
+        mode: match encrypts {
+            None => MessageSecurityMode::NONE,
+            Some(false) => MessageSecurityMode::SIGN,
+            Some(true) => MessageSecurityMode::SIGN_AND_ENCRYPT,
+        },
+    });
+    Application {
+        uri: server.application_uri.clone(),
+        product_uri: server.product_uri.clone(),
+        name: server.name.clone(),
+        urls: vec![server.url.clone()],
+        capabilities: server.capabilities.clone(),
+        endpoints: endpoints.collect(),
     }
 }
 

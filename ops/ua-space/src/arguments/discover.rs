@@ -16,7 +16,7 @@ pub(crate) struct Discover {
 }
 
 /// How to look around.
-#[derive(Debug, Args)]
+#[derive(Debug, Default, Args)]
 pub(crate) struct Look {
     /// How long to listen
     #[arg(long, value_name = "SECONDS", default_value = "3", value_parser = seconds)]

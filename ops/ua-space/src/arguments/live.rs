@@ -8,7 +8,7 @@ use clap::{Args, Subcommand};
 use mappings::{SpaceId, TopicId};
 
 /// Where the space is.
-#[derive(Debug, Default, Args)]
+#[derive(Debug, Clone, Default, Args)]
 pub(crate) struct Group {
     /// The network interface of the PubSub group, by name or address
     #[arg(long, value_name = "NAME|ADDRESS", env = "UA_INTERFACE")]
@@ -33,7 +33,10 @@ pub(crate) struct List {
     /// How long to listen
     #[arg(long, value_name = "SECONDS", default_value = "3", value_parser = seconds)]
     pub(crate) seconds: f64,
-    /// One JSON array
+    /// Only topics and calls: look for no programs
+    #[arg(long)]
+    pub(crate) topics: bool,
+    /// One JSON object
     #[arg(long)]
     pub(crate) json: bool,
     #[command(flatten)]

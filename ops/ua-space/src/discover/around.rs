@@ -5,7 +5,9 @@ use std::time::Duration;
 
 use discovery::client::{Application, describe, find_servers, find_servers_on_network};
 use discovery::scan::{Outcome, Pace, scan};
-use discovery::{DEFAULT_LDS, Found, Interface, Known, WatchSettings, watch};
+use discovery::{
+    DEFAULT_LDS, Found, HeardBridge, Interface, Known, WatchSettings, heard_bridges, watch,
+};
 use tokio::signal::ctrl_c;
 use tokio::task::JoinSet;
 use tokio::time::timeout;
@@ -13,7 +15,7 @@ use tokio::time::timeout;
 use super::entry::{By, Entry, Kind, merged};
 use crate::arguments::Look;
 use crate::exit::Failure;
-use crate::live;
+use crate::live::{self, InGroup};
 use crate::report::warn;
 
 /// Who is there.
@@ -25,13 +27,29 @@ pub(crate) struct Around {
 
 /// Looks around; Ctrl-C ends it.
 pub(crate) async fn around(look: &Look) -> Result<Around, Failure> {
+    let hearing = live::in_the_group(&look.group, look.seconds);
+    let (found, heard) = around_and(look, hearing).await?;
+    if let Err(failure) = heard {
+        warn(&format!("the group is not heard: {failure}"));
+    }
+    Ok(found)
+}
+
+/// The same with somebody who listens in the group.
+pub(crate) async fn around_and<T>(
+    look: &Look,
+    hearing: impl Future<Output = Result<(InGroup, T), Failure>>,
+) -> Result<(Around, Result<T, Failure>), Failure> {
     tokio::select! {
-        found = Box::pin(gathered(look)) => Ok(found),
+        found = Box::pin(gathered(look, hearing)) => Ok(found),
         _ = ctrl_c() => Err(Failure::Interrupted),
     }
 }
 
-async fn gathered(look: &Look) -> Around {
+async fn gathered<T>(
+    look: &Look,
+    hearing: impl Future<Output = Result<(InGroup, T), Failure>>,
+) -> (Around, Result<T, Failure>) {
     let limit = Duration::from_secs_f64(look.seconds);
     let pace = Pace {
         per_second: look.rate,
@@ -43,8 +61,8 @@ async fn gathered(look: &Look) -> Around {
             ranges => Some(scan(ranges, &look.port, pace).await),
         }
     };
-    let senders = live::senders(&look.group, look.seconds);
-    let (heard, senders, scanned) = tokio::join!(heard(look, limit), senders, scanning);
+    let (heard, bridges, in_group, scanned) =
+        tokio::join!(heard(look, limit), told(look, limit), hearing, scanning);
     let mut found: Vec<Entry> = Vec::new();
     let mut asked: BTreeSet<String> = look.lds.iter().cloned().collect();
     asked.insert(DEFAULT_LDS.to_owned());
@@ -63,24 +81,42 @@ async fn gathered(look: &Look) -> Around {
     let mut places: Vec<Place> = heard.into_iter().map(Place::of_mdns).collect();
     places.extend(listed(look, asked).await);
     found.extend(reached(places).await);
-    match senders {
-        Ok(senders) => found.extend(senders.into_iter().map(bridge)),
-        Err(failure) => warn(&format!("the group is not heard: {failure}")),
-    }
-    Around {
+    found.extend(bridges.into_iter().map(of_bridge));
+    let heard = in_group.map(|(in_group, rest)| {
+        found.extend(in_group.applications.iter().map(application));
+        found.extend(in_group.senders.into_iter().map(bridge));
+        rest
+    });
+    let around = Around {
         entries: merged(found),
         tried,
-    }
+    };
+    (around, heard)
 }
 
-/// The servers that are announced on the network.
-async fn heard(look: &Look, limit: Duration) -> Vec<Known> {
+fn interfaces(look: &Look) -> impl Iterator<Item = Interface> + use<> {
     let interfaces = match &look.group.interface {
         Some(interface) => vec![Interface::parse(interface)],
         None => Interface::all(),
     };
+    interfaces.into_iter().take(MOST_INTERFACES)
+}
+
+/// The bridges that are announced on the network.
+async fn told(look: &Look, limit: Duration) -> Vec<HeardBridge> {
     let mut hearing = JoinSet::new();
-    for interface in interfaces.into_iter().take(MOST_INTERFACES) {
+    for interface in interfaces(look) {
+        hearing.spawn(async move { heard_bridges(&interface, limit).await });
+    }
+    // What cannot be heard there is told of servers.
+    let all = hearing.join_all().await;
+    all.into_iter().flatten().flatten().collect()
+}
+
+/// The servers that are announced on the network.
+async fn heard(look: &Look, limit: Duration) -> Vec<Known> {
+    let mut hearing = JoinSet::new();
+    for interface in interfaces(look) {
         let settings = WatchSettings {
             mdns: Some(interface.clone()),
             ..WatchSettings::default()
@@ -274,7 +310,35 @@ fn bridge(((space, from), topics): ((u16, String), usize)) -> Entry {
         1 => "space 1 (ROS 1)".to_owned(),
         space => format!("space {space} (ROS 2)"),
     };
-    entry.space = Some((space, topics));
+    entry.space = Some(space);
+    entry.topics = Some(topics);
+    entry
+}
+
+fn of_bridge(heard: HeardBridge) -> Entry {
+    let HeardBridge { name, bridge, .. } = heard;
+    let mut entry = Entry::new(Kind::Bridge, By::Mdns, heard.host.to_string());
+    entry.name = name;
+    entry.uri = bridge.uri;
+    entry.space = Some(bridge.space);
+    entry.group = Some(bridge.group.to_string());
+    entry
+}
+
+/// What an application says of itself in the group. One without a URL is no server.
+fn application(((space, from), told): (&(u16, String), &live::Application)) -> Entry {
+    let kind = match told.urls.is_empty() {
+        true => Kind::Bridge,
+        false => Kind::of_product(&told.product_uri),
+    };
+    let mut entry = Entry::new(kind, By::Group, from.clone());
+    if !told.urls.is_empty() {
+        entry.urls.clone_from(&told.urls);
+    }
+    entry.name.clone_from(&told.name);
+    entry.uri.clone_from(&told.uri);
+    entry.capabilities.extend(told.capabilities.iter().cloned());
+    entry.space = Some(*space);
     entry
 }
 

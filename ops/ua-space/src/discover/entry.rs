@@ -78,27 +78,33 @@ pub(crate) struct Entry {
     pub(crate) found_by: BTreeSet<By>,
     /// Why it was not reached, or not understood.
     pub(crate) fault: Option<String>,
-    /// Of a bridge: its space and how many topics were heard of it.
-    pub(crate) space: Option<(u16, usize)>,
+    /// Whose values it carries or sends, where it is known.
+    pub(crate) space: Option<u16>,
+    /// How many topics were heard of a bridge.
+    pub(crate) topics: Option<usize>,
+    /// The PubSub group that a bridge says it speaks in.
+    pub(crate) group: Option<String>,
 }
 
 /// An entry as JSON.
 #[derive(Serialize)]
 #[serde(rename_all = "camelCase")]
-pub(super) struct Shown<'e> {
-    pub(super) kind: &'static str,
+pub(crate) struct Shown<'e> {
+    pub(crate) kind: &'static str,
     name: &'e str,
     uri: &'e str,
     urls: &'e [String],
-    pub(super) capabilities: Vec<&'e str>,
+    pub(crate) capabilities: Vec<&'e str>,
     security: &'e [String],
-    pub(super) found_by: Vec<&'static str>,
+    pub(crate) found_by: Vec<&'static str>,
     #[serde(skip_serializing_if = "Option::is_none")]
     fault: Option<&'e str>,
     #[serde(skip_serializing_if = "Option::is_none")]
     space: Option<u16>,
     #[serde(skip_serializing_if = "Option::is_none")]
     topics: Option<usize>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    group: Option<&'e str>,
 }
 
 impl Entry {
@@ -113,10 +119,12 @@ impl Entry {
             found_by: BTreeSet::from([by]),
             fault: None,
             space: None,
+            topics: None,
+            group: None,
         }
     }
 
-    pub(super) fn shown(&self) -> Shown<'_> {
+    pub(crate) fn shown(&self) -> Shown<'_> {
         Shown {
             kind: self.kind.word(),
             name: &self.name,
@@ -126,13 +134,18 @@ impl Entry {
             security: &self.security,
             found_by: self.found_by.iter().map(|by| by.word()).collect(),
             fault: self.fault.as_deref(),
-            space: self.space.map(|(space, _)| space),
-            topics: self.space.map(|(_, topics)| topics),
+            space: self.space,
+            topics: self.topics,
+            group: self.group.as_deref(),
         }
     }
 
-    /// Whether both are the same: by the ApplicationUri, or the place where that is not told.
+    /// Whether both are the same: by the ApplicationUri, or the place where that is not told. A bridge is so for each space, and
+    /// one that is only known by what it sends is the one of that space.
     fn is(&self, other: &Self) -> bool {
+        if (self.kind, other.kind) == (Kind::Bridge, Kind::Bridge) && self.space != other.space {
+            return false;
+        }
         match self.uri.is_empty() || other.uri.is_empty() {
             true => self.urls.iter().any(|url| other.urls.contains(url)),
             false => self.uri == other.uri,
@@ -165,6 +178,9 @@ impl Entry {
         if first.security.is_empty() {
             first.security = second.security;
         }
+        first.space = first.space.or(second.space);
+        first.topics = first.topics.or(second.topics);
+        first.group = first.group.or(second.group);
         first.capabilities.extend(second.capabilities);
         first.found_by.extend(second.found_by);
         *self = first;

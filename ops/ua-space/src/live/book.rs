@@ -13,6 +13,7 @@ use uadp::{
     PublisherId, Reassembler, ReassemblyLimits,
 };
 
+use super::application::Application;
 use super::described::{Described, topic_of};
 
 /// All that was heard. Whoever can send to the group can make up topics, senders and announcements: there is room for
@@ -20,6 +21,7 @@ use super::described::{Described, topic_of};
 pub(crate) struct Book {
     topics: BTreeMap<TopicId, Heard>,
     announced: BTreeMap<Subject, Announcing>,
+    applications: BTreeMap<(u16, SocketAddr), Application>,
     /// Bytes of all descriptions, roughly.
     weight: usize,
     reassembler: Reassembler<SocketAddr>,
@@ -113,6 +115,7 @@ impl Book {
         Self {
             topics: BTreeMap::new(),
             announced: BTreeMap::new(),
+            applications: BTreeMap::new(),
             weight: 0,
             reassembler: Reassembler::new(ReassemblyLimits {
                 total: 64 << 20,
@@ -195,6 +198,11 @@ impl Book {
         let all = self.announced.keys();
         all.filter(|(of, kind, _)| (*of, *kind) == (topic, Kind::Call))
             .count()
+    }
+
+    /// What programs say they are, for which space, and from where.
+    pub(crate) fn applications(&self) -> impl Iterator<Item = (&(u16, SocketAddr), &Application)> {
+        self.applications.iter()
     }
 
     /// The spaces that something is heard or known of.
@@ -365,6 +373,13 @@ impl Book {
         now: Duration,
         each: &mut dyn FnMut(News<'_>),
     ) {
+        if let Announced::ApplicationDescription {
+            description,
+            capabilities,
+        } = &announcement.announced
+        {
+            return self.meet(Application::read(description, *capabilities), (space, from));
+        }
         #[expect(
             clippy::wildcard_enum_match_arm,
             reason = "all else is not about a topic"
@@ -402,6 +417,18 @@ impl Book {
             }
             (None, None) => {}
             (_, Some(Err(_))) | (None, Some(Ok(_))) => self.count(Drop::Useless),
+        }
+    }
+
+    /// Takes what a program says it is, if there is room for it.
+    fn meet(&mut self, application: Option<Application>, who: (u16, SocketAddr)) {
+        let is_known = self.applications.contains_key(&who);
+        match application {
+            None => self.count(Drop::Useless),
+            Some(_) if !is_known && self.applications.len() >= MOST_APPLICATIONS => {
+                self.count(Drop::Descriptions);
+            }
+            Some(application) => drop(self.applications.insert(who, application)),
         }
     }
 
@@ -471,6 +498,7 @@ fn only(message: &DataSetMessage<'_>) -> Option<(uadp::BuiltinType, bool)> {
 /// Of the two upper bits of a StatusCode.
 const BAD: u32 = 0x8000_0000;
 const MOST_TOPICS: usize = 16_384;
+const MOST_APPLICATIONS: usize = 1_024;
 /// Bytes of all descriptions.
 const MOST_WEIGHT: usize = 32 << 20;
 

@@ -1,4 +1,4 @@
-//! `ua-space list` and `ua-space info`: which topics and calls there are.
+//! The topics and calls of a group, as `ua-space list` and `ua-space info` show them.
 
 use std::collections::BTreeMap;
 use std::io::{self, Write as _};
@@ -9,44 +9,10 @@ use serde::Serialize;
 
 use super::book::{Book, Heard, Kind};
 use super::described::{Described, Field, ShownField, What};
-use super::text::{Table, age, harmless, is_coloured};
+use super::text::{Table, age, harmless};
 use super::{Go, Live, in_group, until};
-use crate::arguments::{Info, List};
+use crate::arguments::Info;
 use crate::exit::Failure;
-
-/// `ua-space list`.
-pub(crate) fn list(arguments: &List) -> Result<(), Failure> {
-    in_group(&arguments.group, async |mut live| {
-        let end = until(live.now(), Some(arguments.seconds));
-        live.want_calls(
-            FIRST_ASKED
-                .into_iter()
-                .chain(arguments.space.map(u16::from)),
-        );
-        live.listen(end, &mut |_, _| Go::On).await?;
-        let now = live.now();
-        let mut lines = lines(&live.book, now);
-        if let Some(space) = arguments.space {
-            lines.retain(|line| line.topic.space == space);
-        }
-        let mut out = io::stdout().lock();
-        if arguments.json {
-            let shown: Vec<Shown<'_>> = lines.iter().map(Line::shown).collect();
-            writeln!(out, "{}", json(&shown)?)?;
-        } else if lines.is_empty() {
-            writeln!(
-                out,
-                "nothing was heard in {} for {} s",
-                live.group(),
-                arguments.seconds
-            )?;
-        } else {
-            table(&lines).write(&mut out, is_coloured())?;
-        }
-        live.tell_dropped();
-        Ok(())
-    })
-}
 
 /// `ua-space info`.
 pub(crate) fn info(arguments: &Info) -> Result<(), Failure> {
@@ -85,11 +51,11 @@ pub(super) fn json(shown: &impl Serialize) -> Result<String, Failure> {
 }
 
 /// A topic or call as it is listed.
-struct Line<'b> {
-    topic: TopicId,
+pub(super) struct Line<'b> {
+    pub(super) topic: TopicId,
     described: Option<&'b Described>,
     heard: Option<&'b Heard>,
-    is_call: bool,
+    pub(super) is_call: bool,
     from: String,
     /// Since it was heard last.
     age: Option<Duration>,
@@ -98,7 +64,7 @@ struct Line<'b> {
 }
 
 #[derive(Serialize)]
-struct Shown<'l> {
+pub(super) struct Shown<'l> {
     topic: String,
     kind: &'static str,
     space: u8,
@@ -123,7 +89,7 @@ struct Shown<'l> {
     sender_changed: u64,
 }
 
-fn lines(book: &Book, now: Duration) -> Vec<Line<'_>> {
+pub(super) fn lines(book: &Book, now: Duration) -> Vec<Line<'_>> {
     let mut lines = BTreeMap::new();
     for (topic, heard) in book.topics() {
         let line = Line {
@@ -161,7 +127,7 @@ fn rate(heard: &Heard) -> Option<f64> {
 
 const HEAD: [&str; 7] = ["TOPIC", "KIND", "ORIGIN", "NAME", "RATE", "LAST", "TYPE"];
 
-fn table(lines: &[Line<'_>]) -> Table {
+pub(super) fn table(lines: &[&Line<'_>]) -> Table {
     let mut table = Table::new(HEAD.map(str::to_owned));
     for line in lines {
         let dash = || "-".to_owned();
@@ -179,9 +145,9 @@ fn table(lines: &[Line<'_>]) -> Table {
 }
 
 /// Spaces that are asked for their calls before anything is heard of them.
-const FIRST_ASKED: [u16; 3] = [0, 1, 2];
+pub(super) const FIRST_ASKED: [u16; 3] = [0, 1, 2];
 
-fn origin(space: SpaceId) -> &'static str {
+pub(super) fn origin(space: SpaceId) -> &'static str {
     match space {
         SpaceId::UA => "OPC UA",
         SpaceId::ROS1 => "ROS 1",
@@ -216,7 +182,7 @@ impl Line<'_> {
         Some(format!("{}{array}", builtin.name()))
     }
 
-    fn shown(&self) -> Shown<'_> {
+    pub(super) fn shown(&self) -> Shown<'_> {
         fn shown(fields: &[Field]) -> Vec<ShownField<'_>> {
             fields.iter().map(Field::shown).collect()
         }

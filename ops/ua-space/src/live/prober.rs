@@ -13,6 +13,8 @@ pub(crate) struct Prober {
     wanted: BTreeMap<(u16, Question), Wanted>,
     /// When a probe was sent last.
     sent: Option<Duration>,
+    /// How often was asked who there is, where that is to be asked.
+    asked_all: Option<u32>,
 }
 
 /// What a space is asked.
@@ -41,6 +43,11 @@ impl Prober {
         self.ask(space, Question::Calls, now);
     }
 
+    /// Asks who there is.
+    pub(crate) fn want_all(&mut self) {
+        self.asked_all.get_or_insert(0);
+    }
+
     fn ask(&mut self, space: u16, question: Question, now: Duration) {
         if self.wanted.len() < MOST {
             self.wanted.entry((space, question)).or_insert(Wanted {
@@ -61,6 +68,14 @@ impl Prober {
     pub(crate) fn poll(&mut self, now: Duration) -> Option<Vec<u8>> {
         if self.sent.is_some_and(|sent| now < sent + PACE) {
             return None;
+        }
+        if let Some(asked) = &mut self.asked_all
+            && *asked < ASK_ALL
+            && now >= WAIT * *asked
+        {
+            *asked += 1;
+            self.sent = Some(now);
+            return all();
         }
         let is_due = |wanted: &Wanted| wanted.attempts < ATTEMPTS && wanted.next <= now;
         let first = *self.wanted.iter().find(|(_, wanted)| is_due(wanted))?.0;
@@ -99,6 +114,15 @@ impl Prober {
     }
 }
 
+/// The question who there is, which is for everybody.
+fn all() -> Option<Vec<u8>> {
+    let mut datagram = Vec::new();
+    let encoded = Probe::FindApplications.encode(None, SecurityHeader::NONE, &mut datagram);
+    encoded.is_ok().then_some(datagram)
+}
+
+/// How often is asked who there is: a datagram may be lost.
+const ASK_ALL: u32 = 2;
 /// Questions that are remembered, asked or not.
 const MOST: usize = 8192;
 /// DataSetWriters of one probe: as many as publishers of the bridges announce within half a second.
@@ -148,6 +172,22 @@ mod tests {
         }
         assert!(probes <= 600, "{probes} in a minute");
         assert!(asked.len() <= MOST && asked.values().all(|times| *times <= ATTEMPTS));
+    }
+
+    #[test]
+    fn who_there_is_is_asked_twice_and_only_where_it_is_wanted() {
+        let asked = |prober: &mut Prober| {
+            let all = (0..10_000).filter_map(|millis| prober.poll(Duration::from_millis(millis)));
+            let is_it = |datagram: &Vec<u8>| {
+                let message = NetworkMessage::decode(datagram).unwrap();
+                Probe::decode(&message).unwrap() == Probe::FindApplications
+            };
+            all.filter(is_it).count()
+        };
+        let mut prober = Prober::default();
+        assert_eq!(asked(&mut prober), 0);
+        prober.want_all();
+        assert_eq!(asked(&mut prober), 2);
     }
 
     #[test]

@@ -51,6 +51,18 @@ impl Security {
         }
     }
 
+    /// The ways it makes: the URI of the policy, and whether messages are encrypted beside being signed; `None` where neither.
+    pub fn ways(self) -> impl Iterator<Item = (&'static str, Option<bool>)> + use<> {
+        let ways: &[Option<bool>] = match self {
+            Self::None => &[None],
+            Self::Basic256Sha256 | Self::Aes128Sha256RsaOaep | Self::Aes256Sha256RsaPss => {
+                &[Some(false), Some(true)]
+            }
+        };
+        let uri = self.policy().to_uri();
+        ways.iter().map(move |way| (uri, *way))
+    }
+
     /// The endpoints at that path: one without security, or one that is signed and one that is encrypted too.
     pub fn endpoints(self, path: &str) -> impl Iterator<Item = (String, ServerEndpoint)> + use<> {
         let modes: &[MessageSecurityMode] = match self {

@@ -36,12 +36,15 @@ fn topics_and_calls_are_listed_with_what_they_are_whatever_else_is_in_the_group(
             std::thread::park_timeout(Duration::from_millis(2));
         }
     });
-    let ended = of(&component, &["list", "--json", "--seconds", "2"]);
+    let ended = of(
+        &component,
+        &["list", "--json", "--topics", "--seconds", "2"],
+    );
     noise.join().unwrap();
     assert_eq!(ended.code, 0, "{ended:?}");
     let all = object(&ended.stdout);
     let line = |topic: &str| {
-        let mut all = all.as_array().unwrap().iter();
+        let mut all = all["topics"].as_array().unwrap().iter();
         all.find(|line| line["topic"] == topic).unwrap().clone()
     };
     let state = line("ua_0_7_101");
@@ -75,7 +78,7 @@ fn topics_and_calls_are_listed_with_what_they_are_whatever_else_is_in_the_group(
 #[test]
 fn a_pipe_gets_a_table_without_colour() {
     let component = Component::start();
-    let ended = of(&component, &["list", "--seconds", "1.5"]).quiet();
+    let ended = of(&component, &["list", "--topics", "--seconds", "1.5"]).quiet();
     let mut lines = ended.lines();
     let head = lines.next().unwrap();
     assert_eq!(

@@ -1,0 +1,143 @@
+//! The application behind a Publisher (OPC 10000-14, 7.2.4.6.5 and 7.2.4.6.6): what a program says of itself, and what it hears
+//! of others.
+
+use mappings::SpaceId;
+use uadp::discovery::{
+    Announced, Announcement, ApplicationDescription, ApplicationType, EndpointDescription, List,
+    MessageSecurityMode,
+};
+use uadp::{EncodeError, LocalizedText, PublisherId, SecurityHeader, StatusCode};
+
+/// An application, as it is announced in the group.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct Application {
+    /// Its ApplicationUri.
+    pub uri: String,
+    /// Its ProductUri; may be empty.
+    pub product_uri: String,
+    /// Its ApplicationName.
+    pub name: String,
+    /// Where its server listens; empty for a program that is none.
+    pub urls: Vec<String>,
+    /// Codes of OPC 10000-12, Annex D.
+    pub capabilities: Vec<String>,
+    /// The ways in which its server may be talked to.
+    pub endpoints: Vec<Endpoint>,
+}
+
+/// A way to talk to the server of an [`Application`].
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Endpoint {
+    /// Where.
+    pub url: String,
+    /// The URI of its SecurityPolicy.
+    pub policy_uri: String,
+    /// Its MessageSecurityMode.
+    pub mode: MessageSecurityMode,
+}
+
+impl Application {
+    /// What is heard of another. `None` for what is too long to be kept, has control characters, or does not say who it is.
+    pub(crate) fn read(
+        description: &ApplicationDescription<'_>,
+        capabilities: List<'_, Option<&str>>,
+    ) -> Option<Self> {
+        let texts = |list: List<'_, Option<&str>>| -> Option<Vec<String>> {
+            let some = list.iter().take(MOST_TEXTS).flatten();
+            some.map(|text| kept(Some(text))).collect()
+        };
+        let uri = kept(description.application_uri)?;
+        (!uri.is_empty()).then_some(())?;
+        Some(Self {
+            uri,
+            product_uri: kept(description.product_uri)?,
+            name: kept(description.application_name.text)?,
+            urls: texts(description.discovery_urls)?,
+            capabilities: texts(capabilities)?,
+            endpoints: Vec::new(),
+        })
+    }
+
+    /// Appends the whole announcement of what it is.
+    pub(crate) fn announce(
+        &self,
+        (space, sequence_number): (SpaceId, u16),
+        out: &mut Vec<u8>,
+    ) -> Result<(), EncodeError> {
+        let urls = some(&self.urls);
+        let capabilities = some(&self.capabilities);
+        let announcement = Announcement {
+            sequence_number,
+            announced: Announced::ApplicationDescription {
+                description: self.description(&urls),
+                capabilities: List::new(&capabilities),
+            },
+        };
+        let publisher = PublisherId::UInt16(space.into());
+        announcement.encode(publisher, SecurityHeader::NONE, out)
+    }
+
+    /// Appends the whole announcement of its Endpoints. A program that is no server says that it cannot tell any.
+    pub(crate) fn announce_endpoints(
+        &self,
+        (space, sequence_number): (SpaceId, u16),
+        out: &mut Vec<u8>,
+    ) -> Result<(), EncodeError> {
+        let urls = some(&self.urls);
+        let endpoints = self.endpoints.iter().map(|endpoint| EndpointDescription {
+            endpoint_url: Some(&endpoint.url),
+            server: self.description(&urls),
+            security_mode: endpoint.mode,
+            security_policy_uri: Some(&endpoint.policy_uri),
+            transport_profile_uri: Some(UA_TCP),
+            ..EndpointDescription::default()
+        });
+        let endpoints: Vec<EndpointDescription<'_>> = endpoints.collect();
+        let announcement = Announcement {
+            sequence_number,
+            announced: Announced::PublisherEndpoints {
+                endpoints: List::new(&endpoints),
+                status: match endpoints.is_empty() {
+                    true => BAD_NOT_SUPPORTED,
+                    false => StatusCode::GOOD,
+                },
+            },
+        };
+        let publisher = PublisherId::UInt16(space.into());
+        announcement.encode(publisher, SecurityHeader::NONE, out)
+    }
+
+    fn description<'a>(&'a self, urls: &'a [Option<&'a str>]) -> ApplicationDescription<'a> {
+        ApplicationDescription {
+            application_uri: Some(&self.uri),
+            product_uri: (!self.product_uri.is_empty()).then_some(&self.product_uri),
+            application_name: LocalizedText {
+                locale: None,
+                text: Some(&self.name),
+            },
+            application_type: match self.urls.is_empty() {
+                true => ApplicationType::CLIENT,
+                false => ApplicationType::SERVER,
+            },
+            discovery_urls: List::new(urls),
+            ..ApplicationDescription::default()
+        }
+    }
+}
+
+fn some(texts: &[String]) -> Vec<Option<&str>> {
+    texts.iter().map(|text| Some(text.as_str())).collect()
+}
+
+/// A text as it may be kept and shown.
+fn kept(text: Option<&str>) -> Option<String> {
+    let text = text.unwrap_or_default();
+    let fits = text.len() <= LONGEST_TEXT && !text.chars().any(char::is_control);
+    fits.then(|| text.to_owned())
+}
+
+const UA_TCP: &str = "http://opcfoundation.org/UA-Profile/Transport/uatcp-uasc-uabinary";
+/// Bad_NotSupported (OPC 10000-6, A.2).
+const BAD_NOT_SUPPORTED: StatusCode = StatusCode(0x803D_0000);
+const LONGEST_TEXT: usize = 512;
+const MOST_TEXTS: usize = 16;
