@@ -85,6 +85,8 @@ pub struct Router {
     news: VecDeque<TopicId>,
     /// Whether they have the next turn, before those that are ready.
     news_first: bool,
+    /// Whether a value went before a call the last time.
+    value_first: bool,
     timers: BinaryHeap<Reverse<(Instant, TopicId)>>,
     /// Bytes of the key frames kept for delta frames.
     base_bytes: usize,
@@ -120,6 +122,7 @@ impl Router {
             told: VecDeque::new(),
             news: VecDeque::new(),
             news_first: false,
+            value_first: false,
             timers: BinaryHeap::new(),
             base_bytes: 0,
             spare: Vec::new(),

@@ -247,3 +247,37 @@ fn a_goal_and_its_result_are_made_as_a_map_says() {
     told.extend(8_i32.to_le_bytes());
     assert_eq!(answer, told);
 }
+
+#[test]
+fn the_last_feedback_is_told_before_the_result() {
+    let count = actions(Dialect::Ros2, "demo_msgs/Count", COUNT);
+    let same = actions(Dialect::Ros1, "demo_msgs/Count", COUNT);
+    let mut cell = executed(&count);
+    let now = cell.now();
+    let by_name = note("", events(), FieldMap::default());
+    let router = &mut cell.programs[ASKING].router;
+    let bound = router.bind_as(of(GOAL + 3), (same.feedback(), by_name), now);
+    bound.unwrap();
+    let map = Arc::new(CallMap::default());
+    let bound = router.bind_call(of(GOAL + 2), (same.result(), &map), now);
+    bound.unwrap();
+    cell.ask(ASKING, AskId(1), (of(GOAL + 2), &[3; 16]), ms(3_000));
+    cell.run(ms(500));
+    let execution = cell.executions(EXECUTING).pop().unwrap();
+    cell.outputs(ASKING);
+    say(&mut cell, &feedback(1));
+    let mut response = vec![0, 1, 0, 0, 4, 0, 0, 0, 1, 0, 0, 0, 0];
+    response.extend([0; 15]);
+    cell.executed(EXECUTING, execution.id, Executed::Answered(response));
+    cell.run(ms(50));
+    let told: Vec<&str> = cell
+        .outputs(ASKING)
+        .iter()
+        .filter_map(|output| match output {
+            Output::Delivery(_) => Some("feedback"),
+            Output::Answer { .. } => Some("result"),
+            _ => None,
+        })
+        .collect();
+    assert_eq!(told, ["feedback", "result"]);
+}

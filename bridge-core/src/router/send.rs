@@ -29,11 +29,24 @@ impl Router {
         if let Some(told) = self.told.pop_front() {
             return Some(told);
         }
-        if self.calls.is_some()
-            && let Some(action) = self.next_action(now)
-        {
-            return Some(action);
+        if self.calls.is_none() {
+            return self.next_value(now);
         }
+        // In turn, and a value first: what an action reports before its end is not overtaken by that.
+        self.value_first = !self.value_first;
+        let next = if self.value_first {
+            self.next_value(now).or_else(|| self.next_action(now))
+        } else {
+            self.next_action(now).or_else(|| self.next_value(now))
+        };
+        if next.is_none() {
+            self.value_first = false;
+        }
+        next
+    }
+
+    /// What is told of values, and what is sent and delivered of them.
+    fn next_value(&mut self, now: Now) -> Option<Output> {
         // In turn, so that many topics nobody knows do not keep the values of the others waiting.
         self.news_first = !self.news_first;
         let next = if self.news_first {

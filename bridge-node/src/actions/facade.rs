@@ -8,7 +8,7 @@ use bridge_core::AskErrorKind;
 use bytes::Bytes;
 use mappings::TopicId;
 use messages::Wire;
-use tokio::sync::{mpsc, watch};
+use tokio::sync::{mpsc, oneshot, watch};
 use tokio::task::JoinSet;
 use tokio::time::{sleep, timeout};
 use tracing::debug;
@@ -50,6 +50,7 @@ impl<A: ActionServer> Facade<A> {
         let mut goals: HashMap<GoalId, mpsc::Sender<Bytes>> = HashMap::new();
         let mut tasks = JoinSet::new();
         let mut cancels = JoinSet::new();
+        let (ends, mut ended) = mpsc::channel::<oneshot::Sender<()>>(MOST_GOALS);
         loop {
             // All are cancel-safe.
             tokio::select! {
@@ -62,6 +63,10 @@ impl<A: ActionServer> Facade<A> {
                         }
                         let (feedback, told) = mpsc::channel(MOST_FEEDBACK);
                         goals.insert(new.id(), feedback);
+                        let told = Told {
+                            feedback: told,
+                            ends: ends.clone(),
+                        };
                         tasks.spawn(drive(self.asks.clone(), new, told));
                     }
                     ServerEvent::Cancel(request) if cancels.len() < MOST_CANCELS => {
@@ -73,6 +78,12 @@ impl<A: ActionServer> Facade<A> {
                     Some(value) => self.hand_on(&goals, &value),
                     None => return,
                 },
+                Some(all) = ended.recv() => {
+                    while let Ok(value) = self.values.try_recv() {
+                        self.hand_on(&goals, &value);
+                    }
+                    let _waits = all.send(());
+                }
             }
             while tasks.try_join_next().is_some() || cancels.try_join_next().is_some() {}
         }
@@ -105,8 +116,15 @@ fn refusal(goals: &HashMap<GoalId, mpsc::Sender<Bytes>>, id: GoalId) -> Option<&
     (goals.len() >= MOST_GOALS).then_some("as many goals as may be are open")
 }
 
+/// How a goal comes by what is reported of it.
+struct Told {
+    feedback: mpsc::Receiver<Bytes>,
+    /// Asks for all that has come so far.
+    ends: mpsc::Sender<oneshot::Sender<()>>,
+}
+
 /// Sees one goal through to its end.
-async fn drive<N: NewGoal>(asks: Asks, new: N, feedback: mpsc::Receiver<Bytes>) {
+async fn drive<N: NewGoal>(asks: Asks, new: N, told: Told) {
     let id = new.id();
     let Some(goal) = begin(&asks, id, new).await else {
         return;
@@ -116,7 +134,7 @@ async fn drive<N: NewGoal>(asks: Asks, new: N, feedback: mpsc::Receiver<Bytes>) 
         status,
         message,
         result,
-    } = follow(&asks, id, &goal, feedback).await;
+    } = follow(&asks, id, &goal, told).await;
     if let Err(why) = goal.end(status, &message, result.as_deref()) {
         debug!(why, "the end of a goal cannot be told");
     }
@@ -140,12 +158,8 @@ async fn begin<N: NewGoal>(asks: &Asks, id: GoalId, new: N) -> Option<N::Goal> {
 }
 
 /// Hands feedback on until the goal has ended. What was reported before the end comes before it.
-async fn follow(
-    asks: &Asks,
-    id: GoalId,
-    goal: &impl ServedGoal,
-    mut feedback: mpsc::Receiver<Bytes>,
-) -> End {
+async fn follow(asks: &Asks, id: GoalId, goal: &impl ServedGoal, told: Told) -> End {
+    let Told { mut feedback, ends } = told;
     let mut end = Box::pin(wait(asks, id));
     let end = loop {
         tokio::select! {
@@ -154,6 +168,11 @@ async fn follow(
             end = &mut end => break end,
         }
     };
+    // What came before the end may still wait where it is told apart by goals.
+    let (all, handed_on) = oneshot::channel();
+    if ends.send(all).await.is_ok() {
+        drop(handed_on.await);
+    }
     while let Ok(body) = feedback.try_recv() {
         hand_to(goal, &body);
     }

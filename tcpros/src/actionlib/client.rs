@@ -40,6 +40,8 @@ pub struct ActionClientOptions {
     pub reconnect_timeout: Duration,
     /// From the status that a goal has ended until its result must have come.
     pub result_timeout: Duration,
+    /// From a result until it is told: feedback that was sent before it comes on another connection, and may come after it.
+    pub feedback_grace: Duration,
     /// How many reports of progress may wait per goal; then the oldest are dropped.
     pub feedback_messages: usize,
     /// How many bytes of them may wait per goal; then the oldest are dropped. The newest is always kept.
@@ -47,7 +49,7 @@ pub struct ActionClientOptions {
 }
 
 impl Default for ActionClientOptions {
-    /// Five seconds, for the end of a connection one; 100 reports of progress and 16 MiB.
+    /// Five seconds, for the end of a connection one, for feedback that was overtaken 10 ms; 100 reports of progress and 16 MiB.
     fn default() -> Self {
         let five = Duration::from_secs(5);
         Self {
@@ -55,6 +57,7 @@ impl Default for ActionClientOptions {
             silence_timeout: five,
             reconnect_timeout: Duration::from_secs(1),
             result_timeout: five,
+            feedback_grace: Duration::from_millis(10),
             feedback_messages: 100,
             feedback_bytes: 16 * 1024 * 1024,
         }
@@ -525,6 +528,7 @@ const fn limits(options: &ActionClientOptions) -> Limits {
         silence: options.silence_timeout,
         reconnect: options.reconnect_timeout,
         result: options.result_timeout,
+        feedback_grace: options.feedback_grace,
         feedback_messages: options.feedback_messages,
         feedback_bytes: options.feedback_bytes,
     }

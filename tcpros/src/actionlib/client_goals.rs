@@ -165,6 +165,7 @@ pub(super) struct Limits {
     pub(super) silence: Duration,
     pub(super) reconnect: Duration,
     pub(super) result: Duration,
+    pub(super) feedback_grace: Duration,
     pub(super) feedback_messages: usize,
     pub(super) feedback_bytes: usize,
 }
@@ -289,7 +290,7 @@ impl ClientGoals {
         let Some(goal) = self.goals.get_mut(&entry.id) else {
             return;
         };
-        if goal.state.is_end() {
+        if goal.state.is_end() || goal.result.is_some() {
             self.counters.late_results += 1;
             return;
         }
@@ -298,12 +299,20 @@ impl ClientGoals {
             self.counters.invalid_transitions += 1;
         }
         let status = status.unwrap_or(Status::Lost);
-        goal.done(GoalResult {
+        let server = self.servers.get(&peer.caller_id);
+        let reports = server.is_some_and(|server| server.feedback > 0);
+        let result = GoalResult {
             status,
             text: entry.text.clone(),
             body,
             peer,
-        });
+        };
+        if reports && !self.limits.feedback_grace.is_zero() {
+            let due = clock::after(now, self.limits.feedback_grace);
+            goal.result = Some((due, result));
+        } else {
+            goal.done(result);
+        }
     }
 
     pub(super) fn feedback(&mut self, id: &str, feedback: Feedback) {
@@ -350,6 +359,9 @@ impl ClientGoals {
     /// Ends the goals whose time is up.
     pub(super) fn expire(&mut self, now: Instant) {
         for goal in self.goals.values_mut() {
+            if let Some((_, result)) = goal.result.take_if(|(at, _)| *at <= now) {
+                goal.done(result);
+            }
             let due = next_loss(goal, &self.servers, &self.limits).filter(|(at, _)| *at <= now);
             if let Some((_, reason)) = due {
                 goal.lose(reason);
@@ -360,11 +372,13 @@ impl ClientGoals {
 
     /// When [`Self::expire`] has something to do if nothing is received.
     pub(super) fn deadline(&self) -> Option<Instant> {
-        let losses = self.goals.values();
-        losses
+        let goals = self.goals.values();
+        let losses = goals
+            .clone()
             .filter_map(|goal| next_loss(goal, &self.servers, &self.limits))
-            .map(|(at, _)| at)
-            .min()
+            .map(|(at, _)| at);
+        let ends = goals.filter_map(|goal| goal.result.as_ref().map(|(at, _)| *at));
+        losses.chain(ends).min()
     }
 
     pub(super) fn lose(&mut self, id: &str, reason: LostReason) {
@@ -446,6 +460,8 @@ pub(super) struct Goal {
     server: Option<String>,
     /// Since when its result is awaited.
     ended: Option<Instant>,
+    /// Its result, and until when feedback is waited for that was sent before it and comes on another connection.
+    result: Option<(Instant, GoalResult)>,
     events: VecDeque<GoalEvent>,
     feedback_messages: usize,
     feedback_bytes: usize,
@@ -463,6 +479,7 @@ impl Goal {
             sent,
             server: None,
             ended: None,
+            result: None,
             events: VecDeque::new(),
             feedback_messages: 0,
             feedback_bytes: 0,
@@ -504,6 +521,9 @@ impl Goal {
     }
 
     fn lose(&mut self, reason: LostReason) {
+        if let Some((_, result)) = self.result.take() {
+            return self.done(result);
+        }
         if self.state.is_end() {
             return;
         }
@@ -622,6 +642,7 @@ mod tests {
         silence: Duration::from_secs(5),
         reconnect: SECOND,
         result: Duration::from_secs(5),
+        feedback_grace: Duration::ZERO,
         feedback_messages: 2,
         feedback_bytes: 1000,
     };
@@ -722,6 +743,38 @@ mod tests {
         assert_eq!(goals.goal("g").unwrap().status, Status::Aborted);
         let counted = (goals.counters.late_results, goals.counters.late_feedback);
         assert_eq!(counted, (1, 1));
+    }
+
+    #[test]
+    fn feedback_that_its_result_overtakes_is_told_before_it() {
+        let grace = Duration::from_millis(10);
+        for lost in [false, true] {
+            let (mut goals, now) = sent();
+            goals.limits.feedback_grace = grace;
+            status(&mut goals, Status::Active, now);
+            goals.result(&entry("g", Status::Succeeded), Bytes::new(), peer(), now);
+            let body = Bytes::from_static(b"f");
+            goals.feedback("g", Feedback { body, peer: peer() });
+            assert_eq!(goals.deadline(), Some(now + grace));
+            goals.expire(now + grace - Duration::from_millis(1));
+            assert!(goals.goal("g").unwrap().outcome.is_none());
+            if lost {
+                goals.lose("g", LostReason::NotAcknowledged(grace));
+            } else {
+                goals.expire(now + grace);
+            }
+            let events = std::iter::from_fn(|| goals.next_event("g"));
+            let told: Vec<bool> = events
+                .filter_map(|event| match event {
+                    GoalEvent::Feedback(_) => Some(false),
+                    GoalEvent::Done(_) => Some(true),
+                    GoalEvent::State(_) | GoalEvent::FeedbackDropped(_) | GoalEvent::Lost(_) => {
+                        None
+                    }
+                })
+                .collect();
+            assert_eq!(told, [false, true]);
+        }
     }
 
     #[test]
