@@ -9,7 +9,7 @@ use bytes::Bytes;
 use mappings::TopicId;
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
-use tokio::time::timeout_at;
+use tokio::time::{MissedTickBehavior, timeout_at};
 use uadp::StatusCode;
 
 use super::encoding::Encoding;
@@ -83,6 +83,7 @@ impl<C: ActionClient> Serving<C> {
     /// Works until nobody is left to tell it what to do. Who waits for anything then is told that it is lost; goals go on.
     pub(super) async fn run(mut self, mut commands: mpsc::Receiver<Command>) {
         let mut ticks = tokio::time::interval(TICK);
+        ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
             // All are cancel-safe.
             let is_over = tokio::select! {
@@ -97,7 +98,8 @@ impl<C: ActionClient> Serving<C> {
                     News::Goal(id, event) => self.goal_event(id, event).await,
                     News::Cancelled(execution, answer) => self.cancelled(execution, answer).await,
                 },
-                _ = ticks.tick() => self.tidy().await,
+                // A component may have a thousand actions, most of them without any goal.
+                _ = ticks.tick(), if !self.goals.is_empty() => self.tidy().await,
             };
             while self.tasks.try_join_next().is_some() {}
             if is_over.is_err() {

@@ -92,6 +92,11 @@ pub(super) enum Progress {
 }
 
 impl Goals {
+    /// Whether no goal is known, and so nobody waits and nothing is to be forgotten.
+    pub(super) fn is_empty(&self) -> bool {
+        self.known.is_empty()
+    }
+
     /// Somebody asks for a goal.
     pub(super) fn ask(&mut self, id: GoalId, execution: ExecutionId) -> Asked {
         if let Some(goal) = self.known.get_mut(&id) {

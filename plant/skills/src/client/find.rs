@@ -1,7 +1,8 @@
 //! Which skills a server has, by their types.
 
-use std::collections::HashSet;
+use std::collections::{HashMap, HashSet};
 
+use futures_util::{StreamExt, TryStreamExt, stream};
 use plant_opcua::client::{Browse, Client};
 use plant_opcua::types::{
     AttributeId, EUInformation, NodeClass, NodeClassMask, NodeId, ObjectId, ObjectTypeId,
@@ -128,14 +129,52 @@ async fn all(
     types: &HashSet<NodeId>,
     roots: &[NodeId],
 ) -> Result<Vec<FoundSkill>, SkillFault> {
-    let mut found = Vec::new();
     if types.is_empty() {
-        return Ok(found);
+        return Ok(Vec::new());
     }
-    for instance in instances(client, types).await? {
-        found.push(read(client, roots, instance).await?);
+    let instances = instances(client, types).await?;
+    let shared = Shared::of(client, roots, &instances).await?;
+    let reads = instances
+        .into_iter()
+        .map(|instance| read(client, &shared, instance));
+    stream::iter(reads).buffered(AT_ONCE).try_collect().await
+}
+
+/// What skills have in common, asked for once.
+struct Shared {
+    /// By the nodes of types: each with those above it.
+    chains: HashMap<NodeId, Vec<FoundType>>,
+    /// By the objects above the folders of skills: name, and number in the space.
+    components: HashMap<NodeId, (String, Option<u16>)>,
+}
+
+impl Shared {
+    async fn of(
+        client: &Client,
+        roots: &[NodeId],
+        instances: &[Instance],
+    ) -> Result<Self, SkillFault> {
+        let mut shared = Self {
+            chains: HashMap::new(),
+            components: HashMap::new(),
+        };
+        for instance in instances {
+            let of = &instance.reference.type_definition.node_id;
+            if !shared.chains.contains_key(of) {
+                let chain = chain(client, roots, of).await?;
+                shared.chains.insert(of.clone(), chain);
+            }
+            if let Some((node, name)) = component_of(&instance.above)
+                && !shared.components.contains_key(node)
+            {
+                let number = number_of(client, node).await?;
+                shared
+                    .components
+                    .insert(node.clone(), (name.clone(), number));
+            }
+        }
+        Ok(shared)
     }
-    Ok(found)
 }
 
 /// The type here that it is, where it has another name.
@@ -244,14 +283,16 @@ fn order(id: &NodeId) -> (u16, u32, String) {
 
 async fn read(
     client: &Client,
-    roots: &[NodeId],
+    shared: &Shared,
     instance: Instance,
 ) -> Result<FoundSkill, SkillFault> {
     let Instance { reference, above } = instance;
     let skill = reference.node_id.node_id.clone();
     let mut nodes = Nodes {
         skill: skill.clone(),
-        component: component_node(&above).cloned().unwrap_or_default(),
+        component: component_of(&above)
+            .map(|(node, _)| node.clone())
+            .unwrap_or_default(),
         children: Vec::new(),
     };
     let children = client
@@ -286,7 +327,9 @@ async fn read(
         Some(node) => texts(value(client, node).await?),
         None => Vec::new(),
     };
-    let (component, namespace) = component(client, &above).await?;
+    let component = component_of(&above).and_then(|(node, _)| shared.components.get(node));
+    let (component, namespace) = component.cloned().unwrap_or_default();
+    let types = shared.chains.get(&reference.type_definition.node_id);
     let own = skill
         .as_u32()
         .filter(|_| client.namespaces().get(usize::from(skill.namespace)) == Some(&uri(client)));
@@ -299,7 +342,7 @@ async fn read(
         number: number.filter(|number| *number > 0),
         name: name_of(&reference),
         node: text_of(client, &skill),
-        types: chain(client, roots, &reference.type_definition.node_id).await?,
+        types: types.cloned().unwrap_or_default(),
         parameters,
         results,
         capabilities,
@@ -308,34 +351,26 @@ async fn read(
     })
 }
 
-/// The object above the folder Skills.
-fn component_node(above: &[(NodeId, String)]) -> Option<&NodeId> {
-    let found = above.iter().rev().find(|(_, name)| name != "Skills");
-    found.map(|(node, _)| node)
+/// The object above the folder Skills, and its name.
+fn component_of(above: &[(NodeId, String)]) -> Option<&(NodeId, String)> {
+    above.iter().rev().find(|(_, name)| name != "Skills")
 }
 
-/// The object above the folder Skills, and what it says is its number in the space.
-async fn component(
-    client: &Client,
-    above: &[(NodeId, String)],
-) -> Result<(String, Option<u16>), SkillFault> {
-    let Some((node, name)) = above.iter().rev().find(|(_, name)| name != "Skills") else {
-        return Ok((String::new(), None));
-    };
+/// What a component says is its number in the space.
+async fn number_of(client: &Client, component: &NodeId) -> Result<Option<u16>, SkillFault> {
     let Some(index) = client.namespace(NAMESPACE) else {
-        return Ok((name.clone(), None));
+        return Ok(None);
     };
     let path = [QualifiedName::new(index, "NamespaceNumber")];
-    let number = match client.translate(node, &path).await {
+    let number = match client.translate(component, &path).await {
         Ok(node) => value(client, &node).await?,
         // Another maker's component has none.
         Err(_) => None,
     };
-    let number = match number {
+    Ok(match number {
         Some(Value::UInt16(number)) => Some(number),
         _ => None,
-    };
-    Ok((name.clone(), number))
+    })
 }
 
 async fn chain(
@@ -490,6 +525,8 @@ fn uri(client: &Client) -> String {
 
 /// Identifiers of a skill.
 const IDS_PER_SKILL: u32 = 100;
+/// Skills that are read side by side: servers commonly take more requests of a session than that.
+const AT_ONCE: usize = 8;
 /// So many levels below Objects skills are looked for.
 const DEEPEST: usize = 8;
 /// And among so many objects.
