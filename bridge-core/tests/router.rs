@@ -17,7 +17,7 @@ use bridge_core::{
 };
 use mappings::{Mapping, SpaceId, TopicId};
 use messages::{Dialect, Registry, Selection};
-use uadp::discovery::Probe;
+use uadp::discovery::{List, Probe};
 use uadp::{
     BuiltinType, DataSetHeader, Extras, Fields, GroupHeader, MessageKind, NetworkHeader,
     NetworkMessage, NetworkMessageEncoder, PublisherId, Scalar, SecurityHeader, Timestamp, Variant,
@@ -458,11 +458,21 @@ fn what_the_codec_reads_and_the_space_does_not_carry_is_counted_as_unsupported()
     // Flags, token and an empty nonce stand in front of the payload.
     let security_flags = NetworkMessage::decode(&signed).unwrap().payload_offset() - 6;
     signed[security_flags] |= 1;
-    let mut probe = Vec::new();
-    Probe::PublisherEndpoints
-        .encode(Some(frame.publisher), SecurityHeader::NONE, &mut probe)
-        .unwrap();
-    let all = [&signed, &probe];
+    let probes = [
+        Probe::DataSetWriterConfiguration(List::new(&[10])),
+        Probe::WriterGroupConfiguration {
+            writer_group_id: 1,
+            include_data_set_writers: true,
+        },
+    ];
+    let probes = probes.map(|probe| {
+        let mut bytes = Vec::new();
+        probe
+            .encode(Some(frame.publisher), SecurityHeader::NONE, &mut bytes)
+            .unwrap();
+        bytes
+    });
+    let all = std::iter::once(&signed).chain(&probes);
     for (count, datagram) in (1..).zip(all) {
         bench.hear(datagram);
         assert_eq!(bench.dropped(Reason::Unsupported), count, "{datagram:02x?}");
