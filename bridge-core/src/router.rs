@@ -175,7 +175,7 @@ impl Router {
                 held
             }
             Role::Ours(_) => {
-                entry.bound = Some((Arc::clone(message_type), selection.clone()));
+                entry.bound = Some(Box::new((Arc::clone(message_type), selection.clone())));
                 self.describe(topic, Some((message_type, selection)), now);
                 None
             }

@@ -26,7 +26,7 @@ pub(crate) struct Topic {
     /// that speaks in fields.
     pub(crate) plan: Option<Arc<Plan>>,
     /// What the plan of a topic of our own space was made of.
-    pub(crate) bound: Option<(Arc<MessageType>, Selection)>,
+    pub(crate) bound: Option<Box<(Arc<MessageType>, Selection)>>,
     /// For bytes of the other ROS, what makes them ours, or why nothing does.
     pub(crate) transcoder: Option<Box<Result<Transcoder, String>>>,
     /// What makes the message of the fields by their names, where no mapping names the value.

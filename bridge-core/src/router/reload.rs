@@ -117,8 +117,8 @@ impl Router {
             .topics
             .get(&topic)
             .and_then(|entry| entry.bound.clone());
-        if let Some((message_type, selection)) = bound {
-            self.describe(topic, Some((&message_type, &selection)), now);
+        if let Some((message_type, selection)) = bound.as_deref() {
+            self.describe(topic, Some((message_type, selection)), now);
         } else if self.settings.local == Local::Fields && self.is_home(topic) {
             self.describe(topic, None, now);
         }

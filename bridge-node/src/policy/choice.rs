@@ -9,10 +9,11 @@ use messages::{MessageType, Selection, TypeName};
 pub struct Choice {
     /// What the mapping ties it to; it decides alone.
     mapped: Option<(TypeName, Selection)>,
+    // In Boxes, as a mapped value of which nothing was heard has none of these.
     /// What the writer of the value says of it.
-    described: Option<Described>,
+    described: Option<Box<Described>>,
     /// The type it says, where it is known here and has those fields, and what of the message they are.
-    learned: Option<(TypeName, Selection)>,
+    learned: Option<Box<(TypeName, Selection)>>,
     /// The std_msgs type of the value, if it is one value and there is such a type.
     standard: Option<TypeName>,
 }
@@ -62,7 +63,7 @@ impl Choice {
         if let Some((message_type, _)) = &self.mapped {
             return vec![message_type.clone()];
         }
-        let learned = self.learned.as_ref().map(|(name, _)| name.clone());
+        let learned = self.learned.as_deref().map(|(name, _)| name.clone());
         let mut candidates: Vec<TypeName> = Vec::new();
         for name in asked_for
             .into_iter()
@@ -79,7 +80,8 @@ impl Choice {
     /// What of a message of that type the value is.
     #[must_use]
     pub fn selection(&self, name: &TypeName) -> Selection {
-        let learned = self.learned.as_ref().filter(|(learned, _)| learned == name);
+        let learned = self.learned.as_deref();
+        let learned = learned.filter(|(learned, _)| learned == name);
         self.mapped
             .as_ref()
             .or(learned)
@@ -98,7 +100,7 @@ impl Choice {
         let described = self.described.as_ref();
         if let Some(described) = described.filter(|described| described.message_type == *name) {
             let selection = described.selection(message_type);
-            self.learned = selection.map(|selection| (name.clone(), selection));
+            self.learned = selection.map(|selection| Box::new((name.clone(), selection)));
         }
     }
 
@@ -112,13 +114,14 @@ impl Choice {
             learned,
             standard,
         } = word;
-        self.described = described;
+        self.described = described.map(Box::new);
+        let learned = learned.map(Box::new);
         let Some((written, subscribed)) = open else {
             self.standard = standard;
             self.learned = learned;
             return Step::Open;
         };
-        let other_type = learned.as_ref().is_some_and(|(name, _)| name != written);
+        let other_type = learned.as_deref().is_some_and(|(name, _)| name != written);
         if self.mapped.is_some() || (subscribed && other_type) || learned.is_none() {
             return Step::Stay;
         }
