@@ -1,6 +1,6 @@
 //! The register of applications (OPC 10000-12, 6.6).
 
-use opcua::types::{ExtensionObject, StatusCode, Variant};
+use opcua::types::{ExtensionObject, StatusCode, UAString, Variant};
 use plant_opcua::server::MethodRequest;
 use tracing::info;
 
@@ -84,15 +84,8 @@ pub(crate) fn query(gds: &Gds, request: &MethodRequest) -> Answer {
         return Err(StatusCode::BadInvalidArgument.into());
     };
     let capabilities = texts(capabilities);
-    let query = Query {
-        after: *after,
-        most: *most,
-        name: name.as_ref(),
-        uri: uri.as_ref(),
-        kinds: *kinds,
-        product_uri: product_uri.as_ref(),
-        capabilities: capabilities.iter().map(String::as_str).collect(),
-    };
+    let numbers = (*after, *most, *kinds);
+    let query = looked_for(numbers, [name, uri, product_uri], &capabilities)?;
     let records = gds.records.lock();
     let (found, next) = records.query(&query);
     let found: Vec<ExtensionObject> = found
@@ -120,15 +113,8 @@ pub(crate) fn query_servers(gds: &Gds, request: &MethodRequest) -> Answer {
         return Err(StatusCode::BadInvalidArgument.into());
     };
     let capabilities = texts(capabilities);
-    let query = Query {
-        after: *after,
-        most: *most,
-        name: name.as_ref(),
-        uri: uri.as_ref(),
-        kinds: SERVERS,
-        product_uri: product_uri.as_ref(),
-        capabilities: capabilities.iter().map(String::as_str).collect(),
-    };
+    let numbers = (*after, *most, SERVERS);
+    let query = looked_for(numbers, [name, uri, product_uri], &capabilities)?;
     let records = gds.records.lock();
     let (found, _) = records.query(&query);
     let found: Vec<ExtensionObject> = found
@@ -136,6 +122,27 @@ pub(crate) fn query_servers(gds: &Gds, request: &MethodRequest) -> Answer {
         .map(|one| ExtensionObject::from_message(one.on_network()))
         .collect();
     Ok(vec![time(records.since()), Variant::from(found)])
+}
+
+/// What a query looks for: the number to go on after, how many at most and their kinds; name, ApplicationUri and ProductUri.
+fn looked_for<'q>(
+    (after, most, kinds): (u32, u32, u32),
+    [name, uri, product_uri]: [&'q UAString; 3],
+    capabilities: &'q [String],
+) -> Result<Query<'q>, StatusCode> {
+    // Everybody may ask, and each character of a pattern is held against each of a name.
+    if name.as_ref().len() > LONGEST_PATTERN {
+        return Err(StatusCode::BadInvalidArgument);
+    }
+    Ok(Query {
+        after,
+        most,
+        name: name.as_ref(),
+        uri: uri.as_ref(),
+        kinds,
+        product_uri: product_uri.as_ref(),
+        capabilities: capabilities.iter().map(String::as_str).collect(),
+    })
 }
 
 fn told(record: &Record) -> ExtensionObject {
@@ -151,5 +158,26 @@ fn record(request: &MethodRequest) -> Result<&ApplicationRecord, StatusCode> {
         .ok_or(StatusCode::BadInvalidArgument)
 }
 
+/// Bytes of the pattern of a name.
+const LONGEST_PATTERN: usize = 256;
 /// Servers, among the kinds of a query.
 const SERVERS: u32 = 1;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_pattern_that_would_be_held_against_names_for_minutes_is_refused() {
+        let refused = |length: usize| {
+            let name = UAString::from("%".repeat(length));
+            let none = UAString::null();
+            looked_for((0, 0, 0), [&name, &none, &none], &[]).err()
+        };
+        assert_eq!(refused(LONGEST_PATTERN), None);
+        assert_eq!(
+            refused(LONGEST_PATTERN + 1),
+            Some(StatusCode::BadInvalidArgument)
+        );
+    }
+}
