@@ -157,7 +157,7 @@ impl Seen {
             Part::State => self.state(said, value).await,
             Part::Progress => {
                 let progress = from_variant(said).and_then(|value| value.as_f64());
-                if let Some(progress) = progress {
+                if let Some(progress) = progress.filter(|progress| !progress.is_nan()) {
                     // Between 0 and 1, for which there is room.
                     #[expect(clippy::cast_possible_truncation, reason = "a share of 1")]
                     let progress = progress.clamp(0.0, 1.0) as f32;
