@@ -37,6 +37,28 @@ pub struct Endpoint {
 }
 
 impl Application {
+    /// The same as a server whose URLs may be talked to in these ways: the URI of a SecurityPolicy, and whether messages are
+    /// encrypted beside being signed; `None` where neither.
+    #[must_use]
+    pub fn talked_to<'a>(
+        mut self,
+        ways: impl IntoIterator<Item = (&'a str, Option<bool>)>,
+    ) -> Self {
+        for (policy_uri, encrypts) in ways {
+            let each = self.urls.iter().map(|url| Endpoint {
+                url: url.clone(),
+                policy_uri: policy_uri.to_owned(),
+                mode: match encrypts {
+                    None => MessageSecurityMode::NONE,
+                    Some(false) => MessageSecurityMode::SIGN,
+                    Some(true) => MessageSecurityMode::SIGN_AND_ENCRYPT,
+                },
+            });
+            self.endpoints.extend(each);
+        }
+        self
+    }
+
     /// What is heard of another. `None` for what is too long to be kept, has control characters, or does not say who it is.
     pub(crate) fn read(
         description: &ApplicationDescription<'_>,

@@ -31,9 +31,8 @@ pub use actions::{ActionGraph, Actions};
 pub use arguments::{Arguments, Flags, WithoutMapping};
 pub use bridge_core::{
     ActionFamily, Answered, Application, AskError, AskErrorKind, AskId, CallDescription, CallField,
-    CallMap, CallRole, CallStructure, Counters, Described, Endpoint, Executed, ExecutionId, Kept,
-    MessageSecurityMode, Offered, OfferedType, Owned, PublisherKey, Reason, Refusal, Room, Router,
-    ValueDescription, ValueNote,
+    CallMap, CallRole, CallStructure, Counters, Described, Executed, ExecutionId, Kept, Offered,
+    OfferedType, Owned, PublisherKey, Reason, Refusal, Room, Router, ValueDescription, ValueNote,
 };
 pub use busy_poll::BusyPoll;
 pub use calls::{Asker, CallGraph, Calls};

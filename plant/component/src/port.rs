@@ -8,8 +8,8 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use bridge_node::actions::OwnActions;
 use bridge_node::{
-    Answered, Application, AskId, CallDescription, Delivery, Described, Endpoint, Executed,
-    Execution, ExecutionId, Failure, FailureKind, MessageSecurityMode, Port, PortEvent, TypePaths,
+    Answered, Application, AskId, CallDescription, Delivery, Described, Executed, Execution,
+    ExecutionId, Failure, FailureKind, Port, PortEvent, TypePaths,
 };
 use bytes::Bytes;
 use discovery::{AnnounceSettings, Announced, Interface};
@@ -361,23 +361,15 @@ fn application(server: &discovery::Server, security: &[Security]) -> Application
         Security::None => plant_opcua::server::Security::None.ways(),
         Security::Basic256Sha256 => plant_opcua::server::Security::Basic256Sha256.ways(),
     });
-    let endpoints = ways.map(|(policy_uri, encrypts)| Endpoint {
-        url: server.url.clone(),
-        policy_uri: policy_uri.to_owned(),
-        mode: match encrypts {
-            None => MessageSecurityMode::NONE,
-            Some(false) => MessageSecurityMode::SIGN,
-            Some(true) => MessageSecurityMode::SIGN_AND_ENCRYPT,
-        },
-    });
     Application {
         uri: server.application_uri.clone(),
         product_uri: server.product_uri.clone(),
         name: server.name.clone(),
         urls: vec![server.url.clone()],
         capabilities: server.capabilities.clone(),
-        endpoints: endpoints.collect(),
+        ..Application::default()
     }
+    .talked_to(ways)
 }
 
 fn announce(

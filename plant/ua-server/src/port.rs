@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use bridge_node::{
     Answered, Application, AskId, CallDescription, Delivery, Described, Execution, ExecutionId,
-    Failure, FailureKind, Kept, LinkState, MessageSecurityMode, Port, PortEvent, Router, TypePaths,
+    Failure, FailureKind, Kept, LinkState, Port, PortEvent, Router, TypePaths,
 };
 use bytes::Bytes;
 use discovery::{AnnounceSettings, Announced, MdnsFault, WatchSettings, announce, watch};
@@ -621,23 +621,15 @@ fn told_of(
 /// The same for the group.
 fn application(server: &discovery::Server, security: &[Security]) -> Application {
     let ways = security.iter().flat_map(|security| security.ways());
-    let endpoints = ways.map(|(policy_uri, encrypts)| bridge_node::Endpoint {
-        url: server.url.clone(),
-        policy_uri: policy_uri.to_owned(),
-        mode: match encrypts {
-            None => MessageSecurityMode::NONE,
-            Some(false) => MessageSecurityMode::SIGN,
-            Some(true) => MessageSecurityMode::SIGN_AND_ENCRYPT,
-        },
-    });
     Application {
         uri: server.application_uri.clone(),
         product_uri: server.product_uri.clone(),
         name: server.name.clone(),
         urls: vec![server.url.clone()],
         capabilities: server.capabilities.clone(),
-        endpoints: endpoints.collect(),
+        ..Application::default()
     }
+    .talked_to(ways)
 }
 
 /// Bytes of fields that fit a DataSetMessage beside its header.
