@@ -2,8 +2,9 @@
 
 use bridge_node::{CallDescription, CallField};
 use mappings::TopicId;
+use messages::Rank;
 use opcua::server::address_space::AddressSpace;
-use opcua::types::NodeId;
+use opcua::types::{Argument, LocalizedText, NodeId};
 use tracing::warn;
 
 use crate::layout::Shape;
@@ -70,6 +71,21 @@ impl ArgumentTypes {
             Some(first) if all.iter().all(|one| self.knows(one)) => first.data_type(),
             Some(_) | None => Shape::of(field).data_type(),
         }
+    }
+
+    /// Fields as the arguments of a Method.
+    pub(crate) fn arguments(&self, topic: TopicId, fields: &[CallField]) -> Vec<Argument> {
+        let argument = |field: &CallField| Argument {
+            name: field.name.as_str().into(),
+            data_type: self.data_type(topic, field),
+            value_rank: Shape::of(field).value_rank(),
+            array_dimensions: match field.rank {
+                Rank::Scalar => None,
+                Rank::Array { fixed } => Some(vec![fixed.unwrap_or(0)]),
+            },
+            description: LocalizedText::null(),
+        };
+        fields.iter().map(argument).collect()
     }
 
     fn knows(&self, structure: &Structure) -> bool {

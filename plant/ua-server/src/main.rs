@@ -4,16 +4,19 @@
 //! and of components come by UADP and are read here; what clients write to the variables of origin 0 goes out by UADP. It knows
 //! no ROS.
 //!
-//! Reading order: `layout` (which nodes), `structures` (their DataTypes), `address` (as they stand in the address space), `values` (what they show), `wear` (how that grows old),
-//! `history` (what they showed), `nodes` (the node manager), `browse` (in which order), `budget` (what clients may take up), `space` (values in),
-//! `components` and `presence` (which servers are there), `methods` and `argument_types` (calls of the space as Methods), `executing` (Methods of other servers as calls), `sources` (their
-//! nodes as values), `clients` (the sessions for both), `others` (all of these), `port` (the shell's side),
-//! `endpoint` (how clients get in), `access` (what each may do), `auditing` (what is told of it), `sks` (keys of secured groups),
-//! `pubsub` (the PubSub configuration as nodes), `value` (between the two codecs), `verbs` (certificates and users by hand).
+//! Reading order: `layout` (which nodes), `structures` (their DataTypes), `address` (as they stand in the address space),
+//! `values` (what they show), `wear` (how that grows old), `history` (what they showed), `nodes` (the node manager), `browse`
+//! (in which order), `budget` (what clients may take up), `space` (values in), `components` and `presence` (which servers are
+//! there), `methods` and `argument_types` (calls of the space as Methods), `programs` (actions as Programs), `asking` (how
+//! clients ask for both), `executing` (Methods of other servers as calls), `sources` (their nodes as values), `clients` (the
+//! sessions for both), `others` (all of these), `port` (the shell's side), `endpoint` (how clients get in), `access` (what each
+//! may do), `auditing` (what is told of it), `sks` (keys of secured groups), `pubsub` (the PubSub configuration as nodes),
+//! `value` (between the two codecs), `verbs` (certificates and users by hand).
 
 mod access;
 mod address;
 mod argument_types;
+mod asking;
 mod auditing;
 mod browse;
 mod budget;

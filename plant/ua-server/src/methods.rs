@@ -7,77 +7,22 @@ use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
 
-use bridge_node::{Answered, AskError, AskId, CallDescription, CallField};
+use bridge_node::{Answered, AskId, CallDescription};
 use bytes::Bytes;
 use mappings::{Mapping, TopicId};
-use messages::Rank;
 use opcua::nodes::{MethodBuilder, ObjectBuilder};
 use opcua::server::SubscriptionCache;
 use opcua::server::address_space::AddressSpace;
-use opcua::sync::Mutex;
-use opcua::types::{
-    Argument, LocalizedText, NodeId, ObjectTypeId, QualifiedName, StatusCode, Variant,
-};
-use tokio::sync::{Notify, mpsc, oneshot};
+use opcua::types::{LocalizedText, NodeId, ObjectTypeId, QualifiedName};
+use tokio::sync::oneshot;
 use tracing::{info, warn};
-use uadp::Fields;
 
 use crate::address;
 use crate::argument_types::ArgumentTypes;
-use crate::layout::Shape;
+use crate::asking::{Callable, Heard, Question};
 use crate::nodes::SpaceManager;
 use crate::programs::Programs;
 use crate::structures::Structure;
-use crate::value;
-
-/// The Methods there are, by their nodes.
-pub(crate) type Table = Mutex<HashMap<NodeId, Callable>>;
-
-/// A call as a client finds it.
-#[derive(Debug, Clone)]
-pub(crate) struct Callable {
-    topic: TopicId,
-    description: Arc<CallDescription>,
-}
-
-/// The way of clients to [`Methods`].
-#[derive(Debug, Clone)]
-pub(crate) struct Questions {
-    sender: mpsc::Sender<Question>,
-    given_up: Arc<Notify>,
-}
-
-/// The other end of [`Questions`].
-#[derive(Debug)]
-pub(crate) struct Heard {
-    questions: mpsc::Receiver<Question>,
-    /// Of one or more that were handed on nobody waits for the answer any longer.
-    given_up: Arc<Notify>,
-}
-
-/// A request of a client.
-#[derive(Debug)]
-struct Question {
-    topic: TopicId,
-    block: Bytes,
-    answer: oneshot::Sender<Answered<Bytes>>,
-}
-
-/// What a client waits for; [`Methods`] is told when it does no longer.
-struct Waiting {
-    answered: oneshot::Receiver<Answered<Bytes>>,
-    given_up: Arc<Notify>,
-    over: bool,
-}
-
-impl Drop for Waiting {
-    fn drop(&mut self) {
-        if !self.over {
-            self.answered.close();
-            self.given_up.notify_one();
-        }
-    }
-}
 
 /// Shows the calls of other spaces, and hands on what clients ask them.
 pub(crate) struct Methods {
@@ -116,16 +61,6 @@ pub(crate) enum Wish {
 
 /// The calls that another mapping has under another node, without a Method in between.
 pub(crate) struct Moved(Vec<(TopicId, Arc<CallDescription>)>);
-
-/// What the arguments of a client come to.
-pub(crate) enum Refused {
-    /// Some are not of their types: a status for each.
-    Arguments(Vec<StatusCode>),
-    /// Nothing can be asked.
-    Status(StatusCode),
-    /// It was asked, and there is no response.
-    Asked(AskError),
-}
 
 impl Methods {
     pub(crate) fn new(
@@ -275,7 +210,7 @@ impl Methods {
             .filter(|(topic, node)| self.node(**topic) != **node);
         let callable = |(topic, node): (&TopicId, &NodeId)| {
             let methods = self.manager.inner().methods().lock();
-            Some((*topic, Arc::clone(&methods.get(node)?.description)))
+            Some((*topic, Arc::clone(methods.get(node)?.description())))
         };
         let mut moved: Vec<_> = moved.filter_map(callable).collect();
         for (topic, _) in &moved {
@@ -343,107 +278,6 @@ impl Methods {
     }
 }
 
-impl Questions {
-    /// Both ends.
-    pub(crate) fn channel() -> (Self, Heard) {
-        let (sender, questions) = mpsc::channel(MOST_QUESTIONS);
-        let given_up = Arc::<Notify>::default();
-        let heard = Heard {
-            questions,
-            given_up: Arc::clone(&given_up),
-        };
-        (Self { sender, given_up }, heard)
-    }
-}
-
-impl Waiting {
-    /// The answer. It is given up when the client is gone, for which is looked from time to time: the library goes on with the
-    /// requests of a connection that is lost.
-    async fn answer(mut self, gone: impl Fn() -> bool) -> Result<Answered<Bytes>, StatusCode> {
-        let answer = loop {
-            match tokio::time::timeout(LOOK_AT_CLIENT, &mut self.answered).await {
-                Ok(answer) => break answer.map_err(|_| StatusCode::BadShutdown),
-                Err(_) if gone() => return Err(StatusCode::BadSessionClosed),
-                Err(_) => {}
-            }
-        };
-        self.over = true;
-        answer
-    }
-}
-
-impl Callable {
-    pub(crate) fn new(topic: TopicId, description: &Arc<CallDescription>) -> Self {
-        Self {
-            topic,
-            description: Arc::clone(description),
-        }
-    }
-
-    pub(crate) const fn topic(&self) -> TopicId {
-        self.topic
-    }
-
-    pub(crate) fn description(&self) -> &CallDescription {
-        &self.description
-    }
-
-    /// Asks with those arguments, and gives what comes back. Given up when it is dropped, or when the client is gone.
-    pub(crate) async fn call(
-        &self,
-        arguments: &[Variant],
-        questions: &Questions,
-        gone: impl Fn() -> bool,
-    ) -> Result<Vec<Variant>, Refused> {
-        let block = self.block(arguments)?;
-        let (answer, answered) = oneshot::channel();
-        let question = Question {
-            topic: self.topic,
-            block,
-            answer,
-        };
-        let waiting = Waiting {
-            answered,
-            given_up: Arc::clone(&questions.given_up),
-            over: false,
-        };
-        questions
-            .sender
-            .try_send(question)
-            .map_err(|_| Refused::Status(StatusCode::BadTooManyOperations))?;
-        let answer = waiting.answer(gone).await.map_err(Refused::Status)?;
-        let response = answer.map_err(Refused::Asked)?;
-        let fields = Fields::parse(&response);
-        let fields = fields.map_err(|_| Refused::Status(StatusCode::BadDecodingError))?;
-        let outputs = fields.map(|field| field.map(|field| value::from_field(&field)));
-        outputs
-            .collect::<Result<_, _>>()
-            .map_err(|_| Refused::Status(StatusCode::BadDecodingError))
-    }
-
-    /// The request. Arguments that all have values of their own may be left out all together.
-    fn block(&self, arguments: &[Variant]) -> Result<Bytes, Refused> {
-        let request = &self.description.request;
-        let left_out = arguments.is_empty() && self.description.may_be_empty();
-        if arguments.len() < request.len() && !left_out {
-            return Err(Refused::Status(StatusCode::BadArgumentsMissing));
-        }
-        let block = value::fields_block(arguments).map_err(Refused::Status)?;
-        let fields = Fields::parse(&block);
-        let fields = fields.map_err(|_| Refused::Status(StatusCode::BadInvalidArgument))?;
-        let statuses = fields.zip(request).map(|(value, field)| match value {
-            Ok(value) if Shape::of(field).fits(&value) => StatusCode::Good,
-            Ok(_) => StatusCode::BadTypeMismatch,
-            Err(_) => StatusCode::BadInvalidArgument,
-        });
-        let statuses: Vec<StatusCode> = statuses.collect();
-        if statuses.iter().any(|status| status.is_bad()) {
-            return Err(Refused::Arguments(statuses));
-        }
-        Ok(Bytes::from(block))
-    }
-}
-
 /// Puts the Method in, and the objects around it that are not there. Gives the objects, the outermost first.
 fn add(
     address_space: &mut AddressSpace,
@@ -486,35 +320,17 @@ fn add(
         .executable(true)
         .user_executable(true);
     if !description.request.is_empty() {
-        let arguments = arguments(topic, &description.request, types);
+        let arguments = types.arguments(topic, &description.request);
         let id = arguments_node(node, "InputArguments");
         method = method.input_args(address_space, &id, &arguments);
     }
     if !description.response.is_empty() {
-        let arguments = arguments(topic, &description.response, types);
+        let arguments = types.arguments(topic, &description.response);
         let id = arguments_node(node, "OutputArguments");
         method = method.output_args(address_space, &id, &arguments);
     }
     method.insert(address_space);
     around
-}
-
-pub(crate) fn arguments(
-    topic: TopicId,
-    fields: &[CallField],
-    types: &ArgumentTypes,
-) -> Vec<Argument> {
-    let argument = |field: &CallField| Argument {
-        name: field.name.as_str().into(),
-        data_type: types.data_type(topic, field),
-        value_rank: Shape::of(field).value_rank(),
-        array_dimensions: match field.rank {
-            Rank::Scalar => None,
-            Rank::Array { fixed } => Some(vec![fixed.unwrap_or(0)]),
-        },
-        description: LocalizedText::null(),
-    };
-    fields.iter().map(argument).collect()
 }
 
 fn arguments_node(method: &NodeId, which: &str) -> NodeId {
@@ -528,9 +344,5 @@ fn arguments_node(method: &NodeId, which: &str) -> NodeId {
 const MOST_METHODS: usize = 4_096;
 /// Objects around one Method.
 const MOST_PARTS: usize = 8;
-/// Requests of clients that wait for the run loop; one more is refused.
-const MOST_QUESTIONS: usize = 256;
-/// How often it is looked whether a client that waits is still there.
-const LOOK_AT_CLIENT: Duration = Duration::from_secs(1);
 /// How long an answer is waited for where the mapping says nothing.
 const TIMEOUT: Duration = Duration::from_secs(30);

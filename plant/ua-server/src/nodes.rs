@@ -33,11 +33,10 @@ use uadp::Timestamp;
 
 use crate::access::{self, Genuine};
 use crate::address;
+use crate::asking::{Drive, Drives, Questions, Refused, Table};
 use crate::budget::{Answers, LARGEST, SMALL, Watched};
 use crate::history::{Past, Room, Series};
 use crate::layout::{FieldNode, Layout, TopicNode};
-use crate::methods::{Questions, Refused, Table};
-use crate::programs;
 use crate::properties;
 use crate::pubsub::PubSub;
 use crate::value;
@@ -60,7 +59,7 @@ pub(crate) struct SpaceNodes {
     exits: Exits,
     /// What clients can call.
     methods: Table,
-    programs: programs::Table,
+    programs: Drives,
     /// One client writes at a time.
     writing: Mutex<()>,
     /// Bytes of the largest value that may be written.
@@ -145,7 +144,7 @@ impl SpaceNodes {
             genuine: Genuine::default(),
             exits,
             methods: Table::default(),
-            programs: programs::Table::default(),
+            programs: Drives::default(),
             writing: Mutex::new(()),
             largest_write: AtomicUsize::new(usize::MAX),
             refused: AtomicU64::new(0),
@@ -158,7 +157,7 @@ impl SpaceNodes {
     }
 
     /// The Programs they can drive, by their methods.
-    pub(crate) const fn programs(&self) -> &programs::Table {
+    pub(crate) const fn programs(&self) -> &Drives {
         &self.programs
     }
 
@@ -520,7 +519,7 @@ impl SpaceNodes {
         self.exits.writes.try_send(write).map_err(|_| full)
     }
 
-    fn program(&self, method: &NodeId) -> Option<programs::Asked> {
+    fn program(&self, method: &NodeId) -> Option<Drive> {
         self.programs.lock().get(method).cloned()
     }
 
@@ -528,18 +527,17 @@ impl SpaceNodes {
     async fn drive(
         &self,
         context: &RequestContext,
-        asked: programs::Asked,
+        asked: Drive,
         arguments: &[Variant],
     ) -> Result<Vec<Variant>, Refused> {
         // Whoever may send goals may.
         let may = context
             .authenticator
-            .is_user_executable(&context.token, asked.goal());
+            .is_user_executable(&context.token, &asked.goal);
         if !may {
             return Err(Refused::Status(StatusCode::BadUserAccessDenied));
         }
-        let asked = asked.carry_out(arguments.to_vec());
-        let ended = tokio::spawn(asked).await;
+        let ended = tokio::spawn((asked.carry_out)(arguments.to_vec())).await;
         ended.unwrap_or(Err(Refused::Status(StatusCode::BadInternalError)))
     }
 

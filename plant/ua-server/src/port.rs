@@ -31,13 +31,14 @@ use tracing::{info, warn};
 use uadp::BuiltinType;
 
 use crate::access;
+use crate::asking::{Heard, Questions};
 use crate::auditing;
 use crate::browse::Ordered;
 use crate::components::Components;
 use crate::endpoint;
 use crate::history;
 use crate::layout::Layout;
-use crate::methods::{Heard, Methods, Questions, Wish};
+use crate::methods::{Methods, Wish};
 use crate::nodes::{ClientWrite, Exits, SpaceManager, SpaceNodes, look_again};
 use crate::others::Others;
 use crate::pubsub::{Places, PubSub, Readers, State};

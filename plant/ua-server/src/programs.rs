@@ -14,20 +14,15 @@ use std::sync::Arc;
 use bridge_node::{ActionFamily, CallDescription, CallRole};
 use mappings::TopicId;
 use opcua::server::SubscriptionCache;
-use opcua::sync::Mutex;
 use opcua::types::NodeId;
 use tracing::{info, warn};
 
 use self::nodes::Nodes;
-pub(crate) use self::run::Asked;
 use self::run::Run;
 use crate::address;
 use crate::argument_types::ArgumentTypes;
-use crate::methods::Callable;
+use crate::asking::Callable;
 use crate::nodes::SpaceManager;
-
-/// What clients can call, by the nodes of the methods.
-pub(crate) type Table = Mutex<HashMap<NodeId, Asked>>;
 
 /// Shows the actions of other spaces.
 pub(crate) struct Programs {
@@ -112,15 +107,16 @@ impl Programs {
             name => name.to_owned(),
         };
         let places = (Arc::clone(&self.manager), Arc::clone(&self.subscriptions));
-        let described = (&**description, result.description());
+        let described = (&**description, &**result.description());
         let (nodes, around) = Nodes::insert(places, (goal, &name), described, types);
         let node = nodes.program();
         let feedback = beside(goal, family.feedback);
         let methods = nodes.methods();
         let run = Run::new(name, nodes, [send, cancel, result]);
         let inner = self.manager.inner();
-        let asked = |method| Asked::new(&run, method, inner.questions(), goal_node(goal, inner));
-        let all = methods.map(|(node, method)| (node, asked(method)));
+        let sends = goal_node(goal, inner);
+        let drive = |method| run.drive(method, inner.questions(), sends.clone());
+        let all = methods.map(|(node, method)| (node, drive(method)));
         inner.programs().lock().extend(all);
         if let Some(feedback) = feedback {
             self.feedback.insert(feedback, goal);

@@ -18,7 +18,6 @@ use program::{Method, State, Transition};
 use super::run::{SUCCEEDED, whole};
 use crate::address;
 use crate::argument_types::ArgumentTypes;
-use crate::methods::arguments;
 use crate::nodes::SpaceManager;
 
 /// The nodes of one Program.
@@ -96,7 +95,7 @@ impl Nodes {
         };
         tree.program(last, parent.unwrap_or_else(address::programs_folder));
         let taken = goal.request.get(1..).unwrap_or_default();
-        let takes = without(GOAL, arguments(topic, taken, types));
+        let takes = without(GOAL, types.arguments(topic, taken));
         let gives = Argument {
             name: "GoalId".into(),
             data_type: DataTypeId::ByteString.into(),
@@ -341,7 +340,7 @@ impl Tree<'_> {
         for (name, type_) in OWN_RESULTS {
             self.variable(&result(name), (type_.into(), -1), VALUE, None);
         }
-        let arguments = without(RESULT, arguments(self.topic, fields, types));
+        let arguments = without(RESULT, types.arguments(self.topic, fields));
         let named = arguments.into_iter().map(|field| {
             let mut name = field.name.as_ref().to_owned();
             if OWN_RESULTS.iter().any(|(own, _)| *own == name) {

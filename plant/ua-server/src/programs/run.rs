@@ -13,7 +13,7 @@ use tracing::info;
 use uadp::Fields;
 
 use super::nodes::{Nodes, Outcome};
-use crate::methods::{Callable, Questions, Refused};
+use crate::asking::{Callable, Drive, Questions, Refused};
 use crate::value;
 
 /// One Program. Of all its methods one is carried out at a time.
@@ -37,47 +37,6 @@ struct Inner {
     halting: bool,
     /// The action is gone.
     left: bool,
-}
-
-/// A method of a Program that a client may call.
-#[derive(Clone)]
-pub(crate) struct Asked {
-    run: Arc<Run>,
-    method: Method,
-    questions: Questions,
-    goal: NodeId,
-}
-
-impl Asked {
-    pub(super) fn new(run: &Arc<Run>, method: Method, questions: &Questions, goal: NodeId) -> Self {
-        Self {
-            run: Arc::clone(run),
-            method,
-            questions: questions.clone(),
-            goal,
-        }
-    }
-
-    /// The node of the Method that sends goals of the action.
-    pub(crate) const fn goal(&self) -> &NodeId {
-        &self.goal
-    }
-
-    /// Calls it.
-    pub(crate) async fn carry_out(self, arguments: Vec<Variant>) -> Result<Vec<Variant>, Refused> {
-        let Self {
-            run,
-            method,
-            questions,
-            ..
-        } = self;
-        match method {
-            Method::Start => run.start(arguments, questions).await,
-            Method::Halt => run.halt(&questions).await,
-            Method::Reset => run.reset(),
-            Method::Suspend | Method::Resume => Err(NOT_NOW_AND_NEVER),
-        }
-    }
 }
 
 impl Run {
@@ -110,6 +69,37 @@ impl Run {
             }),
             state,
         })
+    }
+
+    /// A method of it, for clients that may call the Method at `goal`.
+    pub(super) fn drive(
+        self: &Arc<Self>,
+        method: Method,
+        questions: &Questions,
+        goal: NodeId,
+    ) -> Drive {
+        let (run, questions) = (Arc::clone(self), questions.clone());
+        Drive {
+            goal,
+            carry_out: Arc::new(move |arguments| {
+                let called = Arc::clone(&run).call(method, arguments, questions.clone());
+                Box::pin(called)
+            }),
+        }
+    }
+
+    async fn call(
+        self: Arc<Self>,
+        method: Method,
+        arguments: Vec<Variant>,
+        questions: Questions,
+    ) -> Result<Vec<Variant>, Refused> {
+        match method {
+            Method::Start => self.start(arguments, questions).await,
+            Method::Halt => self.halt(&questions).await,
+            Method::Reset => self.reset(),
+            Method::Suspend | Method::Resume => Err(NOT_NOW_AND_NEVER),
+        }
     }
 
     pub(super) const fn nodes(&self) -> &Nodes {

@@ -1,0 +1,198 @@
+//! How clients ask for calls of other spaces: what each call takes, and the way of a request to whoever sends it on.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+use std::time::Duration;
+
+use bridge_node::{Answered, AskError, CallDescription};
+use bytes::Bytes;
+use futures_util::future::BoxFuture;
+use mappings::TopicId;
+use opcua::sync::Mutex;
+use opcua::types::{NodeId, StatusCode, Variant};
+use tokio::sync::{Notify, mpsc, oneshot};
+use uadp::Fields;
+
+use crate::layout::Shape;
+use crate::value;
+
+/// The Methods there are, by their nodes.
+pub(crate) type Table = Mutex<HashMap<NodeId, Callable>>;
+
+/// A call as a client finds it.
+#[derive(Debug, Clone)]
+pub(crate) struct Callable {
+    topic: TopicId,
+    description: Arc<CallDescription>,
+}
+
+/// The way of clients to [`Methods`](crate::methods::Methods).
+#[derive(Debug, Clone)]
+pub(crate) struct Questions {
+    sender: mpsc::Sender<Question>,
+    given_up: Arc<Notify>,
+}
+
+/// The other end of [`Questions`].
+#[derive(Debug)]
+pub(crate) struct Heard {
+    pub(crate) questions: mpsc::Receiver<Question>,
+    /// Of one or more that were handed on nobody waits for the answer any longer.
+    pub(crate) given_up: Arc<Notify>,
+}
+
+/// A request of a client.
+#[derive(Debug)]
+pub(crate) struct Question {
+    pub(crate) topic: TopicId,
+    pub(crate) block: Bytes,
+    pub(crate) answer: oneshot::Sender<Answered<Bytes>>,
+}
+
+/// What a client waits for; [`Methods`](crate::methods::Methods) is told when it does no longer.
+struct Waiting {
+    answered: oneshot::Receiver<Answered<Bytes>>,
+    given_up: Arc<Notify>,
+    over: bool,
+}
+
+impl Drop for Waiting {
+    fn drop(&mut self) {
+        if !self.over {
+            self.answered.close();
+            self.given_up.notify_one();
+        }
+    }
+}
+
+/// The methods of Programs that clients can call, by their nodes.
+pub(crate) type Drives = Mutex<HashMap<NodeId, Drive>>;
+
+/// A method of a Program.
+#[derive(Clone)]
+pub(crate) struct Drive {
+    /// The node of the Method that sends goals of its action: whoever may call that may call this.
+    pub(crate) goal: NodeId,
+    /// Calls it with these arguments.
+    pub(crate) carry_out: CarryOut,
+}
+
+/// What a method of a Program does.
+pub(crate) type CarryOut =
+    Arc<dyn Fn(Vec<Variant>) -> BoxFuture<'static, Result<Vec<Variant>, Refused>> + Send + Sync>;
+
+/// What the arguments of a client come to.
+pub(crate) enum Refused {
+    /// Some are not of their types: a status for each.
+    Arguments(Vec<StatusCode>),
+    /// Nothing can be asked.
+    Status(StatusCode),
+    /// It was asked, and there is no response.
+    Asked(AskError),
+}
+
+impl Questions {
+    /// Both ends.
+    pub(crate) fn channel() -> (Self, Heard) {
+        let (sender, questions) = mpsc::channel(MOST_QUESTIONS);
+        let given_up = Arc::<Notify>::default();
+        let heard = Heard {
+            questions,
+            given_up: Arc::clone(&given_up),
+        };
+        (Self { sender, given_up }, heard)
+    }
+}
+
+impl Waiting {
+    /// The answer. It is given up when the client is gone, for which is looked from time to time: the library goes on with the
+    /// requests of a connection that is lost.
+    async fn answer(mut self, gone: impl Fn() -> bool) -> Result<Answered<Bytes>, StatusCode> {
+        let answer = loop {
+            match tokio::time::timeout(LOOK_AT_CLIENT, &mut self.answered).await {
+                Ok(answer) => break answer.map_err(|_| StatusCode::BadShutdown),
+                Err(_) if gone() => return Err(StatusCode::BadSessionClosed),
+                Err(_) => {}
+            }
+        };
+        self.over = true;
+        answer
+    }
+}
+
+impl Callable {
+    pub(crate) fn new(topic: TopicId, description: &Arc<CallDescription>) -> Self {
+        Self {
+            topic,
+            description: Arc::clone(description),
+        }
+    }
+
+    pub(crate) const fn topic(&self) -> TopicId {
+        self.topic
+    }
+
+    pub(crate) const fn description(&self) -> &Arc<CallDescription> {
+        &self.description
+    }
+
+    /// Asks with those arguments, and gives what comes back. Given up when it is dropped, or when the client is gone.
+    pub(crate) async fn call(
+        &self,
+        arguments: &[Variant],
+        questions: &Questions,
+        gone: impl Fn() -> bool,
+    ) -> Result<Vec<Variant>, Refused> {
+        let block = self.block(arguments)?;
+        let (answer, answered) = oneshot::channel();
+        let question = Question {
+            topic: self.topic,
+            block,
+            answer,
+        };
+        let waiting = Waiting {
+            answered,
+            given_up: Arc::clone(&questions.given_up),
+            over: false,
+        };
+        questions
+            .sender
+            .try_send(question)
+            .map_err(|_| Refused::Status(StatusCode::BadTooManyOperations))?;
+        let answer = waiting.answer(gone).await.map_err(Refused::Status)?;
+        let response = answer.map_err(Refused::Asked)?;
+        let fields = Fields::parse(&response);
+        let fields = fields.map_err(|_| Refused::Status(StatusCode::BadDecodingError))?;
+        let outputs = fields.map(|field| field.map(|field| value::from_field(&field)));
+        outputs
+            .collect::<Result<_, _>>()
+            .map_err(|_| Refused::Status(StatusCode::BadDecodingError))
+    }
+
+    /// The request. Arguments that all have values of their own may be left out all together.
+    fn block(&self, arguments: &[Variant]) -> Result<Bytes, Refused> {
+        let request = &self.description.request;
+        let left_out = arguments.is_empty() && self.description.may_be_empty();
+        if arguments.len() < request.len() && !left_out {
+            return Err(Refused::Status(StatusCode::BadArgumentsMissing));
+        }
+        let block = value::fields_block(arguments).map_err(Refused::Status)?;
+        let fields = Fields::parse(&block);
+        let fields = fields.map_err(|_| Refused::Status(StatusCode::BadInvalidArgument))?;
+        let statuses = fields.zip(request).map(|(value, field)| match value {
+            Ok(value) if Shape::of(field).fits(&value) => StatusCode::Good,
+            Ok(_) => StatusCode::BadTypeMismatch,
+            Err(_) => StatusCode::BadInvalidArgument,
+        });
+        let statuses: Vec<StatusCode> = statuses.collect();
+        if statuses.iter().any(|status| status.is_bad()) {
+            return Err(Refused::Arguments(statuses));
+        }
+        Ok(Bytes::from(block))
+    }
+}
+
+/// Requests of clients that wait for the run loop; one more is refused.
+const MOST_QUESTIONS: usize = 256;
+/// How often it is looked whether a client that waits is still there.
+const LOOK_AT_CLIENT: Duration = Duration::from_secs(1);
