@@ -535,6 +535,17 @@ fn asyncua_drives_an_action_of_ros_2_as_a_program() {
     let becomes = |path: &str, value: &str| {
         eventually(path, SOON, || shown(path).contains(value).then_some(()));
     };
+    let events = [
+        SERVER_ENDPOINT,
+        "--events",
+        "Transition",
+        "--events",
+        "Message",
+        "ns=1;s=ua_2_2_70.program",
+    ];
+    // There as soon as the action is.
+    becomes("CurrentState", "Ready");
+    let mut watch = cell.asyncua("opcua_subscribe.py", &events);
     // It reports the first three numbers, and goes on until it is cancelled.
     assert_eq!(ask("Start", &json!([100])), "Good");
     assert!(shown("CurrentState").contains("Running"));
@@ -563,4 +574,24 @@ fn asyncua_drives_an_action_of_ros_2_as_a_program() {
     assert_eq!(ask("Start", &json!([3])), "Good");
     becomes("CurrentState", "Ready");
     becomes("FinalResultData.Status", "4");
+    transitions(&mut watch);
+}
+
+/// Of two goals: one is cancelled, the other is reached.
+fn transitions(watch: &mut Child) {
+    let mut told = Vec::new();
+    let told = watch.wait_for_json("all transitions", SOON, |line| {
+        told.extend(line.get("event").cloned());
+        (told.len() == 5).then(|| told.clone())
+    });
+    let event =
+        |transition: &str, message: &str| json!({"Transition": transition, "Message": message});
+    let wanted = [
+        event("ReadyToRunning", "the goal is accepted"),
+        event("RunningToHalted", "the goal was cancelled"),
+        event("HaltedToReady", "HaltedToReady"),
+        event("ReadyToRunning", "the goal is accepted"),
+        event("RunningToReady", "the goal is reached"),
+    ];
+    assert_eq!(told, wanted);
 }
