@@ -232,6 +232,21 @@ fn a_station_knows_neither_skills_nor_rdf_nor_ros() {
 }
 
 #[test]
+fn who_issues_certificates_knows_neither_skills_nor_rdf_nor_ros() {
+    does_not_reach(
+        "ua-gds",
+        &[
+            "skills",
+            "devices",
+            "knowledge",
+            "oxigraph",
+            "tcpros",
+            "rustdds",
+        ],
+    );
+}
+
+#[test]
 fn discovery_knows_neither_skills_nor_rdf() {
     does_not_reach(
         "discovery",
@@ -257,7 +272,7 @@ fn knowledge_has_no_sessions_of_opc_ua() {
 
 #[test]
 fn no_program_of_the_plant_knows_a_ros_library() {
-    for program in ["ua-component", "ua-mes", "ua-station"] {
+    for program in ["ua-component", "ua-gds", "ua-mes", "ua-station"] {
         does_not_reach(program, &["tcpros", "rosrust*", "ros2-client", "rustdds"]);
     }
 }
