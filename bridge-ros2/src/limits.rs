@@ -9,7 +9,7 @@ use crate::graph::Endpoint;
 #[cfg(feature = "patched-dds")]
 macro_rules! rustdds {
     () => {
-        "RustDDS 0.15.1 with 55 patches, samples up to 10 MB"
+        "RustDDS 0.15.1 with 56 patches, samples up to 10 MB"
     };
 }
 
