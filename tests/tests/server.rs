@@ -6,6 +6,8 @@ mod access;
 mod authorities;
 #[path = "server/history.rs"]
 mod history;
+#[path = "server/malformed.rs"]
+mod malformed;
 #[path = "server/pubsub.rs"]
 mod pubsub;
 #[path = "server/quality.rs"]
@@ -39,7 +41,11 @@ server:
 ";
 
 fn server(cell: &Cell) -> Child {
-    let mapping = cell.file("server.yaml", MAPPING);
+    serving(cell, MAPPING)
+}
+
+fn serving(cell: &Cell, mapping: &str) -> Child {
+    let mapping = cell.file("server.yaml", mapping);
     let server = cell.ua_server(&[mapping.to_str().unwrap()]);
     eventually("the server answers clients", SOON, || {
         cell.asyncua_try("opcua_read.py", &[SERVER_ENDPOINT, "ns=0;i=2258"])
