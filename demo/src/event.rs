@@ -11,6 +11,7 @@ use crate::line::Name;
 use crate::plug::NodeEvent;
 use crate::robots::niryo::NiryoEvent;
 use crate::robots::turtlebot::TurtlebotEvent;
+use crate::skilled::MachineEvent;
 
 /// An event and when it was, in nanoseconds since 1970.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -28,6 +29,7 @@ pub(crate) enum Event {
     Turtlebot(TurtlebotEvent),
     Supervisor(SupervisorEvent),
     Node(NodeEvent),
+    Machine(MachineEvent),
 }
 
 /// From the ROS master.
@@ -119,6 +121,12 @@ impl From<SupervisorEvent> for Event {
     }
 }
 
+impl From<MachineEvent> for Event {
+    fn from(event: MachineEvent) -> Self {
+        Self::Machine(event)
+    }
+}
+
 impl From<NodeEvent> for Event {
     fn from(event: NodeEvent) -> Self {
         Self::Node(event)
@@ -132,7 +140,8 @@ mod tests {
 
     #[test]
     fn every_kind_of_event_comes_back_as_it_was_told() {
-        let events: [Event; 6] = [
+        let events: [Event; 7] = [
+            MachineEvent::Arrives { at: [2.0, 0.5] }.into(),
             MasterEvent::Listening {
                 uri: "http://127.0.0.1:1/".to_owned(),
             }

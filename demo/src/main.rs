@@ -1,12 +1,12 @@
-//! Stories with simulated robots and the programs people run: the fault-tolerant product assembly line, plug and produce, and
-//! the change of tools.
+//! Stories with simulated robots and the programs people run: the fault-tolerant product assembly line, the same line by skills,
+//! plug and produce, and the change of tools.
 //!
 //! One binary is all the demo's own processes: started plainly it starts the others, which are hidden subcommands of
 //! it, and the programs that stand beside it. The robots know one another, and components, through the topics of the space
 //! alone; what they print is for the timeline.
 //!
 //! Reading order: `robots::niryo` and `robots::turtlebot` (what the robots decide), `line` (the values they share),
-//! `supervisor`, `orchestra` (who starts and watches them all); `plug` and `tools` (the other stories); `stage` (what both stand on).
+//! `supervisor`, `orchestra` (who starts and watches them all); `skilled`, `plug` and `tools` (the other stories); `stage` (what both stand on).
 
 mod clock;
 mod event;
@@ -16,6 +16,7 @@ mod orchestra;
 mod pace;
 mod plug;
 mod robots;
+mod skilled;
 mod stage;
 mod stop;
 mod supervisor;
@@ -48,7 +49,7 @@ struct PlanArguments {
     /// Divides all times of the robots' and components' work
     #[arg(long, value_name = "FACTOR", default_value = "1")]
     speed: Speed,
-    /// Of the assembly line: how many covers lie in the storage
+    /// Of the assembly line, by skills or not: how many covers lie in the storage
     #[arg(long, value_name = "N", default_value_t = 4, value_parser = clap::value_parser!(u32).range(1..=1000))]
     covers: u32,
     /// Of the assembly line: the second of the story at which the supervisor switches the conveyor off
@@ -74,6 +75,8 @@ enum Scenario {
     PlugAndProduce,
     /// A robot that changes its tools, with devices behind their protocols; one is lost and plugged in again
     ToolChange,
+    /// The assembly line as a composite of skills that are done by robots of both ROS; its conveyor dies
+    LineBySkills,
 }
 
 /// The demo's own processes.
@@ -106,6 +109,18 @@ enum Role {
     Ros1Node,
     #[command(hide = true)]
     Ros2Node,
+    #[command(hide = true)]
+    LineArm {
+        #[arg(long)]
+        speed: Speed,
+    },
+    #[command(hide = true)]
+    LineBelt,
+    #[command(hide = true)]
+    LineBase {
+        #[arg(long)]
+        speed: Speed,
+    },
 }
 
 fn seconds(text: &str) -> Result<f64, &'static str> {
@@ -163,6 +178,14 @@ fn main() -> ExitCode {
                     };
                     runtime.block_on(Box::pin(plug::play(plan)))
                 }
+                Scenario::LineBySkills => {
+                    let plan = skilled::Plan {
+                        covers,
+                        speed,
+                        json,
+                    };
+                    runtime.block_on(Box::pin(skilled::play(plan)))
+                }
                 Scenario::ToolChange => {
                     let plan = tools::Plan {
                         speed,
@@ -199,6 +222,9 @@ async fn play_role(role: Role) -> anyhow::Result<()> {
         } => supervisor::run(speed.real(conveyor_off_at), pki).await,
         Role::Ros1Node => Box::pin(plug::ros1_node::run()).await,
         Role::Ros2Node => Box::pin(plug::ros2_node::run()).await,
+        Role::LineArm { speed } => skilled::arm_node::run(speed).await,
+        Role::LineBelt => skilled::belt_node::run().await,
+        Role::LineBase { speed } => Box::pin(skilled::base_node::run(speed)).await,
     }
 }
 

@@ -99,6 +99,7 @@ fn the_button_of_the_first_mapping_is_a_value() {
 fn every_shipped_mapping_has_a_test_that_runs_it() {
     let sources = [
         include_str!("shipped_mappings.rs"),
+        include_str!("assembly_line.rs"),
         include_str!("call_actionlib.rs"),
         include_str!("call_services.rs"),
         include_str!("niryo.rs"),

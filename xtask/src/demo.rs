@@ -12,7 +12,9 @@ pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<E
     step("building the programs (some minutes the first time)");
     let mut build = vec!["build", "--locked"];
     let has_components = arguments.iter().any(|argument| {
-        argument.ends_with("plug-and-produce") || argument.ends_with("tool-change")
+        ["plug-and-produce", "tool-change", "line-by-skills"]
+            .iter()
+            .any(|story| argument.ends_with(story))
     });
     let others: &[&str] = if has_components {
         &PLUG_AND_PRODUCE

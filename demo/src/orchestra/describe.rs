@@ -10,7 +10,8 @@ pub(crate) fn describe(event: &Event) -> Option<(Who, String)> {
     match event {
         Event::Master(_)
         | Event::Supervisor(SupervisorEvent::Awaits { .. } | SupervisorEvent::AwaitsSwitch)
-        | Event::Node(_) => None,
+        | Event::Node(_)
+        | Event::Machine(_) => None,
         Event::Niryo(event) => Some((NIRYO, niryo(*event))),
         Event::Turtlebot(event) => Some((TURTLEBOT, turtlebot(*event))),
         Event::Supervisor(SupervisorEvent::Connected) => Some((

@@ -56,7 +56,7 @@ impl Story {
     pub(crate) fn observe(&mut self, stamped: &Stamped) {
         let at = stamped.at_ns;
         match &stamped.event {
-            Event::Master(_) | Event::Node(_) => {}
+            Event::Master(_) | Event::Node(_) | Event::Machine(_) => {}
             Event::Niryo(event) => self.observe_niryo(*event, at),
             Event::Turtlebot(event) => self.observe_turtlebot(*event, at),
             Event::Supervisor(SupervisorEvent::Connected) => self.connected = true,

@@ -86,7 +86,7 @@ fn heard(name: Name, event: &InboxEvent) -> Option<Heard> {
     }
 }
 
-fn read_bool(message: &[u8]) -> Option<bool> {
+pub(crate) fn read_bool(message: &[u8]) -> Option<bool> {
     match message {
         [value] => Some(*value != 0),
         _ => None,
@@ -145,7 +145,7 @@ fn serve_switch(node: &Node, orders: mpsc::Sender<Order>) -> anyhow::Result<Serv
 }
 
 /// A response of std_srvs/SetBool that says yes: the Boolean, then the text with its length before it.
-fn set_bool_response(message: &str) -> Bytes {
+pub(crate) fn set_bool_response(message: &str) -> Bytes {
     let length = u32::try_from(message.len()).unwrap_or_default();
     let parts: [&[u8]; 3] = [&[1], &length.to_le_bytes(), message.as_bytes()];
     Bytes::from(parts.concat())
@@ -211,7 +211,7 @@ const UINT32: (&str, &str, &str) = (
 );
 
 /// Type name and checksum of the service that switches the conveyor.
-const SET_BOOL: (&str, &str) = ("std_srvs/SetBool", "09fb03525b03e7ea1fd3992bafd87e16");
+pub(crate) const SET_BOOL: (&str, &str) = ("std_srvs/SetBool", "09fb03525b03e7ea1fd3992bafd87e16");
 /// Calls of the switch that wait for the arm to come to them.
 const MOST_ORDERS: usize = 16;
 

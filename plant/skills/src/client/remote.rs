@@ -45,8 +45,16 @@ impl Driver for Remote {
     }
 
     async fn run(&self, work: Work) -> Result<Results, String> {
-        let robot = self.connect(&self.partners.robot, &work).await?;
-        let done = match self.connect(&self.partners.gripper, &work).await {
+        let robot_at = self.place(&self.partners.robot, &work).await?;
+        let gripper_at = self.place(&self.partners.gripper, &work).await?;
+        let robot = connect(&robot_at).await?;
+        if robot_at == gripper_at {
+            // A component has one lease, and so one session for both.
+            let done = self.with(&robot, &robot, &work).await;
+            robot.close().await;
+            return done;
+        }
+        let done = match connect(&gripper_at).await {
             Ok(gripper) => {
                 let done = self.with(&robot, &gripper, &work).await;
                 gripper.close().await;
@@ -60,9 +68,10 @@ impl Driver for Remote {
 }
 
 impl Remote {
-    async fn connect(&self, partner: &Partner, work: &Work) -> Result<SkillClient, String> {
-        let endpoint = match (partner, &self.detector) {
-            (Partner::At(endpoint), _) => endpoint.clone(),
+    /// The endpoint of a partner, once it is there.
+    async fn place(&self, partner: &Partner, work: &Work) -> Result<String, String> {
+        match (partner, &self.detector) {
+            (Partner::At(endpoint), _) => Ok(endpoint.clone()),
             (Partner::Called(uri), Some(detector)) => {
                 let any = TypeName::own(SKILL_TYPE);
                 let found = tokio::select! {
@@ -71,12 +80,10 @@ impl Remote {
                 };
                 let found = found.map_err(|_| format!("{uri} is not there"))?;
                 work.note(format!("{uri} is at {}", found.endpoint)).await;
-                found.endpoint
+                Ok(found.endpoint)
             }
-            (Partner::Called(uri), None) => return Err(format!("nobody looks for {uri}")),
-        };
-        let connected = SkillClient::connect(&endpoint, &ClientOptions::default()).await;
-        connected.map_err(|fault| format!("{endpoint}: {fault}"))
+            (Partner::Called(uri), None) => Err(format!("nobody looks for {uri}")),
+        }
     }
 
     async fn with(
@@ -90,7 +97,8 @@ impl Remote {
             one(gripper, "GraspSkillType").await?,
         );
         // Both or nothing: whoever waits for one of them at work does not take the other away.
-        for first in [&ptp, &grasp] {
+        let apart = robot.endpoint() != gripper.endpoint();
+        for first in [Some(&ptp), apart.then_some(&grasp)].into_iter().flatten() {
             let locked = first.lock("pick and place").await;
             locked.map_err(|fault| fault.to_string())?;
         }
@@ -108,6 +116,11 @@ impl Remote {
             .map_err(|broken| broken.to_string())?;
         Ok(Vec::new())
     }
+}
+
+async fn connect(endpoint: &str) -> Result<SkillClient, String> {
+    let connected = SkillClient::connect(endpoint, &ClientOptions::default()).await;
+    connected.map_err(|fault| format!("{endpoint}: {fault}"))
 }
 
 /// The first skill of a type.

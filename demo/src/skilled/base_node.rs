@@ -1,0 +1,150 @@
+//! The mobile robot as a ROS 2 node: to drive is an action.
+
+use std::net::{IpAddr, Ipv4Addr};
+use std::time::Duration;
+
+use anyhow::{Context as _, anyhow};
+use ros2_client::action::{
+    ActionServerQosPolicies, AsyncActionServer, ExecutingGoalHandle, GoalEndStatus,
+};
+use ros2_client::qos::{Durability, History, WhenFull};
+use ros2_client::{
+    ActionTypeName, Context, Message, Name as RosName, Node, NodeName, NodeOptions, QosProfile,
+    ServiceMapping,
+};
+use rustdds::DomainParticipantBuilder;
+use serde::{Deserialize, Serialize};
+use tokio::time::{sleep, timeout};
+
+use super::fact::MachineEvent;
+use crate::event::tell;
+use crate::line::DOMAIN;
+use crate::pace::{Pace, Speed};
+use crate::stop::Stop;
+
+/// The goal of `ua_msgs/NavigateTo`.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+struct Goal {
+    goal: [f64; 3],
+    frame: String,
+}
+
+/// Its result.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+struct Reached {
+    run: u32,
+    pose: [f64; 3],
+}
+
+/// Its feedback.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+struct OnTheWay {
+    state: String,
+    progress: f32,
+    step: String,
+    run: u32,
+}
+
+impl Message for Goal {}
+impl Message for Reached {}
+impl Message for OnTheWay {}
+
+type Server = AsyncActionServer<Goal, Reached, OnTheWay>;
+
+/// Runs the node until it is told to end.
+pub(crate) async fn run(speed: Speed) -> anyhow::Result<()> {
+    let mut stop = Stop::new()?;
+    let mut node = join()?;
+    let spinner = node
+        .spinner()
+        .map_err(|error| anyhow!("the node cannot watch its domain: {error}"))?;
+    let server = serve(&mut node)?;
+    let lasts = Pace::at(speed).drive;
+    tokio::select! {
+        ended = spinner.spin() => Err(anyhow!("the node does not watch its domain any more: {ended:?}")),
+        ended = drive(&server, lasts) => ended,
+        () = stop.wait() => Ok(()),
+    }
+}
+
+/// Takes goals, one after another.
+async fn drive(server: &Server, lasts: Duration) -> anyhow::Result<()> {
+    let broken = |error: &dyn std::fmt::Debug| anyhow!("the action does not work: {error:?}");
+    loop {
+        let new = server
+            .receive_new_goal()
+            .await
+            .map_err(|error| broken(&error))?;
+        let Some(goal) = server.get_new_goal(new.clone()) else {
+            continue;
+        };
+        let accepted = server
+            .accept_goal(new)
+            .await
+            .map_err(|error| broken(&error))?;
+        let executing = server.start_executing_goal(accepted).await;
+        let executing = executing.map_err(|error| broken(&error))?;
+        tell(MachineEvent::Leaves).context(NOBODY)?;
+        sleep(lasts).await;
+        let [x, y, _] = goal.goal;
+        tell(MachineEvent::Arrives { at: [x, y] }).context(NOBODY)?;
+        let reached = Reached {
+            run: 0,
+            pose: goal.goal,
+        };
+        answer(server, executing, reached).await;
+    }
+}
+
+/// Waits until somebody asks for the result.
+async fn answer(server: &Server, goal: ExecutingGoalHandle<Goal>, reached: Reached) {
+    let told = server.send_result_response(goal, GoalEndStatus::Succeeded, reached);
+    match timeout(RESULT_WITHIN, told).await {
+        Ok(Ok(())) => {}
+        Ok(Err(error)) => tracing::warn!(?error, "a result was not told"),
+        Err(_) => tracing::warn!("nobody asks for the result"),
+    }
+}
+
+fn serve(node: &mut Node) -> anyhow::Result<Server> {
+    let name = RosName::parse(ACTION).map_err(|error| anyhow!("{ACTION}: {error:?}"))?;
+    let services = QosProfile::publisher_default()
+        .reliability_reliable(WhenFull::Fail)
+        .history(History::KeepLast { depth: 10 });
+    let status = services.clone().durability(Durability::TransientLocal);
+    let qos = ActionServerQosPolicies {
+        goal_service: services.clone(),
+        result_service: services.clone(),
+        cancel_service: services.clone(),
+        feedback_publisher: services,
+        status_publisher: status,
+    };
+    let of_type = ActionTypeName::new("ua_msgs", "NavigateTo");
+    let server = node
+        .create_action_server(ServiceMapping::Enhanced, &name, &of_type, qos)
+        .map_err(|error| anyhow!("cannot make an action: {error}"))?;
+    Ok(AsyncActionServer::new(server))
+}
+
+/// Joins the domain on the loopback interface alone.
+fn join() -> anyhow::Result<Node> {
+    let participant = DomainParticipantBuilder::new(DOMAIN)
+        .with_only_networks([IpAddr::V4(Ipv4Addr::LOCALHOST)])
+        .same_host_loopback(true)
+        .build()
+        .with_context(|| format!("cannot join DDS domain {DOMAIN}"))?;
+    let context = Context::from_domain_participant(participant)
+        .map_err(|error| anyhow!("cannot make a ROS 2 context: {error}"))?;
+    let name = NodeName::new("/", "turtlebot3").map_err(|error| anyhow!("{error:?}"))?;
+    let options = NodeOptions::new()
+        .start_parameter_services(false)
+        .enable_rosout(false);
+    context
+        .new_node(name, options)
+        .map_err(|error| anyhow!("cannot make a ROS 2 node: {error}"))
+}
+
+const ACTION: &str = "/turtlebot3/navigate_to";
+/// How long it waits until somebody asks for a result.
+const RESULT_WITHIN: Duration = Duration::from_secs(5);
+const NOBODY: &str = "the demo does not listen any more";

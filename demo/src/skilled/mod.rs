@@ -1,0 +1,588 @@
+//! The assembly line, run by skills: an arm of ROS 1, a conveyor and a mobile robot of ROS 2 are components, and a composite that
+//! finds their skills by type brings covers to the worker. The conveyor dies on the way, with a cover on its way to it.
+//!
+//! All programs but the machines are those that people run.
+//! Reading order: this (who is started and what happens to them), `line` (the composite), `world` (who says whether it worked).
+
+pub(crate) mod arm_node;
+pub(crate) mod base_node;
+pub(crate) mod belt_node;
+mod cell;
+mod fact;
+mod line;
+mod report;
+mod world;
+
+use std::cell::RefCell;
+use std::path::PathBuf;
+use std::process::ExitStatus;
+use std::sync::Arc;
+use std::time::Duration;
+
+use serde::Deserialize;
+use skills::{ClientOptions, Detector, Runs, SkillClient, TypeName};
+use tokio::sync::{mpsc, watch};
+use tokio::time::{Instant, interval, sleep, timeout};
+
+use self::cell::{CONVEYOR, MAPPING, PARTS};
+pub(crate) use self::fact::MachineEvent;
+use self::line::{Line, Teller};
+use self::report::{Report, Run};
+use self::world::World;
+use crate::clock::wall_nanos;
+use crate::event::{Event, MasterEvent};
+use crate::line::DOMAIN;
+use crate::pace::Speed;
+use crate::stage::{
+    Failure, Interrupt, LOOPBACK, Program, Programs, Report as Told, Stage, Timeline, Who, fetch,
+    find, free_port, must_be_free,
+};
+
+/// What the story is to be.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Plan {
+    pub(crate) covers: u32,
+    pub(crate) speed: Speed,
+    pub(crate) json: bool,
+}
+
+/// Plays the story and prints it. Returns the exit code.
+pub(crate) async fn play(plan: Plan) -> u8 {
+    let show = Show {
+        timeline: RefCell::new(Timeline::open(plan.json)),
+        report: RefCell::new(Report {
+            speed: plan.speed.factor(),
+            covers: plan.covers,
+            ..Report::default()
+        }),
+        began_at: wall_nanos(),
+        begun: RefCell::new(Instant::now()),
+    };
+    let outcome = perform(plan, &show).await;
+    {
+        let mut report = show.report.borrow_mut();
+        report.finished = outcome.is_ok();
+        report.failure = outcome.as_ref().err().map(ToString::to_string);
+    }
+    match (outcome, show.conclude(plan.json)) {
+        (Err(failure), _) => failure.exit_code(),
+        // Nobody reads any more, as with `| head`.
+        (Ok(()), Err(_)) => 74,
+        (Ok(()), Ok(())) => 0,
+    }
+}
+
+/// What people see.
+struct Show {
+    timeline: RefCell<Timeline>,
+    report: RefCell<Report>,
+    began_at: i64,
+    /// When the run began that is under way.
+    begun: RefCell<Instant>,
+}
+
+impl Show {
+    fn note(&self, who: Who, what: String) {
+        self.note_at(wall_nanos(), who, what);
+    }
+
+    fn note_at(&self, at_ns: i64, who: Who, what: String) {
+        let mut timeline = self.timeline.borrow_mut();
+        timeline.note(at_ns, who, what);
+        let began_at = self.began_at;
+        let seconds = |at_ns: i64| Some(millis(at_ns - began_at) / 1e3);
+        if let Err(error) = timeline.print_all(&seconds) {
+            // The end says so with its exit code.
+            tracing::debug!(%error, "nobody reads");
+        }
+    }
+
+    fn conclude(&self, json: bool) -> std::io::Result<()> {
+        let (mut timeline, report) = (self.timeline.borrow_mut(), self.report.borrow());
+        timeline.print_text(&report.table())?;
+        if let Some(failure) = &report.failure {
+            timeline.print_text(&format!("error: {failure}\n"))?;
+        }
+        if json {
+            use std::io::Write as _;
+            let mut out = std::io::stdout().lock();
+            serde_json::to_writer(&mut out, &*report)?;
+            out.write_all(b"\n")?;
+            out.flush()?;
+        }
+        Ok(())
+    }
+}
+
+impl Teller for Show {
+    fn begins(&self, skill: &str, what: &str) {
+        *self.begun.borrow_mut() = Instant::now();
+        self.note(LINE, format!("{skill} begins: {what}"));
+    }
+
+    fn ended(&self, skill: &str, what: &str, message: &str) {
+        let run = Run {
+            skill: skill.to_owned(),
+            what: what.to_owned(),
+            message: message.to_owned(),
+            lasted_ms: elapsed(*self.begun.borrow()),
+        };
+        self.report.borrow_mut().runs.push(run);
+        if !message.is_empty() {
+            self.note(LINE, message.to_owned());
+        }
+    }
+
+    fn turns(&self, why: &str) {
+        self.note(LINE, why.to_owned());
+    }
+}
+
+async fn perform(plan: Plan, show: &Show) -> Result<(), Failure> {
+    let (demo, [lds, component, bridge_ros1, bridge_ros2]) =
+        find(["ua-lds", "ua-component", "bridge-ros1", "bridge-ros2"])?;
+    let mut interrupt = Interrupt::listen()?;
+    must_be_free(LDS_PORT, "discovery server")?;
+    let (programs, reports) =
+        Programs::prepare().map_err(Failure::io("cannot make a directory for the logs"))?;
+    let transport = plan.speed.real(TRANSPORT_SECONDS);
+    let (seen, world) = watch::channel(World::new(plan.covers, transport));
+    let mut story = Story {
+        plan,
+        binaries: Binaries {
+            demo,
+            lds,
+            component,
+            bridge_ros1,
+            bridge_ros2,
+        },
+        programs,
+        page: free_port()?,
+        transport,
+        world,
+        show,
+    };
+    let mut watcher = Watcher {
+        reports,
+        seen,
+        master: watch::Sender::new(None),
+        killed: watch::Sender::new(None),
+        show,
+    };
+    let (master, killed) = (watcher.master.subscribe(), watcher.killed.subscribe());
+    let played = tokio::select! {
+        played = story.play(master, killed) => played,
+        (name, status) = watcher.watch() => Err(Stop::Ended(name, status)),
+        () = interrupt.come() => Err(Stop::Interrupted),
+    };
+    watcher.reports.close();
+    let outcome = played.map_err(|stop| story.failure(stop));
+    {
+        let world = story.world.borrow();
+        let mut report = show.report.borrow_mut();
+        report.by_conveyor = world.by_conveyor();
+        report.by_turtlebot = world.by_turtlebot();
+        report.taken_back = world.taken_back();
+    }
+    story.programs.end().await;
+    // The logs are for those who wonder what went wrong.
+    if matches!(outcome, Ok(()) | Err(Failure::Interrupted { .. }))
+        && let Err(error) = story.programs.clean_up()
+    {
+        tracing::debug!(%error, "the logs were not removed");
+    }
+    outcome
+}
+
+/// Takes what the machines tell, and lets the world know.
+struct Watcher<'a> {
+    reports: mpsc::Receiver<Told>,
+    seen: watch::Sender<World>,
+    /// Where the ROS master listens.
+    master: watch::Sender<Option<String>>,
+    /// When the conveyor was killed, in nanoseconds since 1970.
+    killed: watch::Sender<Option<i64>>,
+    show: &'a Show,
+}
+
+impl Watcher<'_> {
+    /// Until a program ends without being told to.
+    async fn watch(&mut self) -> (&'static str, ExitStatus) {
+        let mut passes = interval(PASS);
+        loop {
+            tokio::select! {
+                report = self.reports.recv() => match report {
+                    Some(Told::Ended { name, status }) => return (name, status),
+                    Some(Told::Told(stamped)) => self.heard(&stamped.event, stamped.at_ns),
+                    Some(Told::Garbled { name, line }) => {
+                        self.show.note(Who::DEMO, format!("{name} says what is no event: {line}"));
+                    }
+                    Some(Told::Killed { name, at_ns }) if name == BELT_NODE => {
+                        self.see(MachineEvent::Belt { runs: false }, at_ns);
+                        self.killed.send_replace(Some(at_ns));
+                    }
+                    Some(Told::Killed { .. }) => {}
+                    // The programs hold a sender, so it does not end before them.
+                    None => return std::future::pending().await,
+                },
+                _ = passes.tick() => self.seen.send_modify(|world| world.pass(wall_nanos())),
+            }
+        }
+    }
+
+    fn heard(&self, event: &Event, at_ns: i64) {
+        match event {
+            Event::Master(MasterEvent::Listening { uri }) => {
+                self.master.send_replace(Some(uri.clone()));
+            }
+            Event::Machine(event) => self.see(*event, at_ns),
+            Event::Niryo(_) | Event::Turtlebot(_) | Event::Supervisor(_) | Event::Node(_) => {}
+        }
+    }
+
+    fn see(&self, event: MachineEvent, at_ns: i64) {
+        self.seen.send_modify(|world| world.see(event, at_ns));
+        let (who, what) = describe(event);
+        self.show.note_at(at_ns, who, what);
+    }
+}
+
+fn describe(event: MachineEvent) -> (Who, String) {
+    match event {
+        MachineEvent::Grasps { .. } => (ARM, "closes its gripper".to_owned()),
+        MachineEvent::Releases { .. } => (ARM, "opens its gripper".to_owned()),
+        MachineEvent::Belt { runs: true } => (BELT, "runs".to_owned()),
+        MachineEvent::Belt { runs: false } => (BELT, "stands still".to_owned()),
+        MachineEvent::Leaves => (BASE, "sets out".to_owned()),
+        MachineEvent::Arrives { at: [x, y] } => (BASE, format!("stands at {x}, {y}")),
+    }
+}
+
+/// Why the story stops.
+enum Stop {
+    Failed(Failure),
+    Broken(String),
+    Ended(&'static str, ExitStatus),
+    Interrupted,
+}
+
+impl From<Failure> for Stop {
+    fn from(failure: Failure) -> Self {
+        Self::Failed(failure)
+    }
+}
+
+/// The programs that are started.
+struct Binaries {
+    demo: PathBuf,
+    lds: PathBuf,
+    component: PathBuf,
+    bridge_ros1: PathBuf,
+    bridge_ros2: PathBuf,
+}
+
+struct Story<'a> {
+    plan: Plan,
+    binaries: Binaries,
+    programs: Programs,
+    /// Where the discovery server shows its page.
+    page: u16,
+    transport: Duration,
+    world: watch::Receiver<World>,
+    show: &'a Show,
+}
+
+/// What of the page of the discovery server is read.
+#[derive(Debug, Default, Deserialize)]
+struct Page {
+    servers: Vec<Registered>,
+}
+
+#[derive(Debug, Deserialize)]
+struct Registered {
+    uri: String,
+    urls: Vec<String>,
+}
+
+/// The skills of the line, and the sessions that they are run by.
+struct Found {
+    line: Line,
+    sessions: Vec<SkillClient>,
+}
+
+impl Story<'_> {
+    async fn play(
+        &mut self,
+        master: watch::Receiver<Option<String>>,
+        killed: watch::Receiver<Option<i64>>,
+    ) -> Result<(), Stop> {
+        self.introduce()?;
+        self.start_all(master).await?;
+        let began = Instant::now();
+        let Found { line, sessions } = self.find(began).await?;
+        self.show.report.borrow_mut().found_ms = Some(elapsed(began));
+        let text = format!("all skills are found after {:.0} ms", elapsed(began));
+        self.show.note(LINE, text);
+
+        let covers = self.plan.covers;
+        let conveyor = Arc::clone(&line.conveyor);
+        let (show, world) = (self.show, self.world.clone());
+        let beside = async {
+            tokio::join!(
+                strike(&self.programs, world, covers, show),
+                learn(&*conveyor, killed, show)
+            );
+            std::future::pending().await
+        };
+        let done = tokio::select! {
+            done = line.run(covers, show) => done,
+            done = beside => done,
+        };
+        for session in sessions {
+            session.close().await;
+        }
+        done.map_err(Stop::Broken)?;
+        let mut world = self.world.clone();
+        let arrived = world.wait_for(|world| world.delivered() == covers);
+        match timeout(SPARE, arrived).await {
+            Ok(Ok(_)) => {}
+            Ok(Err(_)) | Err(_) => {
+                let standing = self.world.borrow().standing();
+                return Err(Stop::Broken(format!("the line is done, and {standing}")));
+            }
+        }
+        show.note(Who::DEMO, "all covers have arrived".to_owned());
+        Ok(())
+    }
+
+    fn introduce(&self) -> Result<(), Failure> {
+        let text = format!(
+            "The assembly line by skills: {} covers, a conveyor that dies, speed {}.\nTimes are seconds since the beginning; the \
+             logs are in {}.\n\n",
+            self.plan.covers,
+            self.plan.speed.factor(),
+            self.programs.directory().display()
+        );
+        let printed = self.show.timeline.borrow_mut().print_text(&text);
+        printed.map_err(Failure::io("cannot print"))
+    }
+
+    async fn start_all(&mut self, mut master: watch::Receiver<Option<String>>) -> Result<(), Stop> {
+        let directory = self.programs.directory().to_owned();
+        cell::write(&directory).map_err(Failure::io("cannot write the files of the programs"))?;
+        self.start_own("ros-master", &["master"], &[], Stage::Master)?;
+        let listens = timeout(SPARE, master.wait_for(Option::is_some)).await;
+        let master = match listens {
+            Ok(Ok(uri)) => uri.clone().unwrap_or_default(),
+            Ok(Err(_)) | Err(_) => {
+                return Err(Stop::Broken("the ROS master does not listen".to_owned()));
+            }
+        };
+        let domain = DOMAIN.to_string();
+        let ros1 = [("ROS_MASTER_URI", &*master), ("ROS_HOSTNAME", LOOPBACK)];
+        let ros2 = [("ROS_LOCALHOST_ONLY", "1"), ("ROS_DOMAIN_ID", &*domain)];
+        let mapping = directory.join(MAPPING).display().to_string();
+        let arguments = [&mapping, "--interface", LOOPBACK];
+        for (name, path, environment) in [
+            ("bridge-ros1", self.binaries.bridge_ros1.clone(), &ros1),
+            ("bridge-ros2", self.binaries.bridge_ros2.clone(), &ros2),
+        ] {
+            self.start((name, path), &arguments, environment, Stage::Bridges)?;
+        }
+        let endpoint = format!("opc.tcp://{LOOPBACK}:{LDS_PORT}");
+        let metrics = format!("{LOOPBACK}:{}", self.page);
+        let arguments = ["--endpoint", &endpoint, "--metrics", &metrics];
+        let lds = self.binaries.lds.clone();
+        self.start(("ua-lds", lds), &arguments, &[], Stage::Bridges)?;
+
+        let speed = self.plan.speed.factor().to_string();
+        let speed = ["--speed", &speed];
+        let arguments = [&["line-arm"], &speed[..]].concat();
+        self.start_own("niryo-ned", &arguments, &ros1, Stage::Robots)?;
+        self.start_own(BELT_NODE, &["line-belt"], &ros1, Stage::Robots)?;
+        let arguments = [&["line-base"], &speed[..]].concat();
+        self.start_own("turtlebot3", &arguments, &ros2, Stage::Robots)?;
+        for part in &PARTS {
+            let yaml = directory.join(format!("{}.yaml", part.name));
+            let arguments = [&*yaml.display().to_string(), "--interface", LOOPBACK];
+            let component = self.binaries.component.clone();
+            self.start((part.name, component), &arguments, &[], Stage::Components)?;
+        }
+        Ok(())
+    }
+
+    fn start_own(
+        &mut self,
+        name: &'static str,
+        arguments: &[&str],
+        environment: &[(&'static str, &str)],
+        stage: Stage,
+    ) -> Result<(), Failure> {
+        let demo = self.binaries.demo.clone();
+        self.program((name, demo), arguments, environment, (stage, true))
+    }
+
+    fn start(
+        &mut self,
+        program: (&'static str, PathBuf),
+        arguments: &[&str],
+        environment: &[(&'static str, &str)],
+        stage: Stage,
+    ) -> Result<(), Failure> {
+        self.program(program, arguments, environment, (stage, false))
+    }
+
+    fn program(
+        &mut self,
+        (name, path): (&'static str, PathBuf),
+        arguments: &[&str],
+        environment: &[(&'static str, &str)],
+        (stage, tells): (Stage, bool),
+    ) -> Result<(), Failure> {
+        let environment = environment.iter();
+        self.programs.start(Program {
+            name,
+            path,
+            arguments: arguments.iter().copied().map(str::to_owned).collect(),
+            environment: environment
+                .map(|(key, value)| (*key, (*value).to_owned()))
+                .collect(),
+            tells,
+            hears: false,
+            stage,
+        })?;
+        Ok(())
+    }
+
+    /// Finds the skills of the line by their types, whosever they are.
+    async fn find(&self, began: Instant) -> Result<Found, Stop> {
+        let detector = Detector::new(ClientOptions {
+            application_name: "assembly line".to_owned(),
+            ..ClientOptions::default()
+        });
+        let mut line = None;
+        let told = self.tell_of_servers(&detector);
+        let found = async {
+            let mut sessions = Vec::new();
+            let mut skills: Vec<Arc<dyn Runs>> = Vec::new();
+            for of in [
+                "PickAndPlaceSkillType",
+                "RunConveyorSkillType",
+                "NavigateToSkillType",
+            ] {
+                let of = TypeName::own(of);
+                let one = detector.one(&of, FOUND, |_| true).await?;
+                let (session, handle) = detector.open(&one).await?;
+                sessions.push(session);
+                skills.push(Arc::new(handle));
+            }
+            Ok::<_, skills::SkillFault>((sessions, skills))
+        };
+        let (sessions, skills) = tokio::select! {
+            found = found => found.map_err(|fault| {
+                Stop::Broken(format!("the line is not complete after {:.0} ms: {fault}", elapsed(began)))
+            })?,
+            () = told => return Err(Stop::Broken("the demo looks no longer".to_owned())),
+        };
+        if let Ok([pick_and_place, conveyor, base]) = <[_; 3]>::try_from(skills) {
+            line = Some(Line {
+                pick_and_place,
+                conveyor,
+                base,
+                transport: self.transport,
+                within: WITHIN,
+            });
+        }
+        let line = line.ok_or_else(|| Stop::Broken("there are not three skills".to_owned()))?;
+        Ok(Found { line, sessions })
+    }
+
+    /// Tells a detector of the servers that are registered, for as long as it is wanted.
+    async fn tell_of_servers(&self, detector: &Detector) {
+        let mut known: Vec<String> = Vec::new();
+        loop {
+            let page: Page = fetch(self.page).await.unwrap_or_default();
+            for server in page.servers {
+                if let Some(url) = server.urls.first()
+                    && PARTS.iter().any(|part| part.uri == server.uri)
+                    && !known.contains(&server.uri)
+                {
+                    detector.seen(&server.uri, url);
+                    known.push(server.uri);
+                }
+            }
+            sleep(POLL).await;
+        }
+    }
+
+    fn failure(&self, stop: Stop) -> Failure {
+        let logs = self.programs.directory().to_owned();
+        match stop {
+            Stop::Failed(failure) => failure,
+            Stop::Broken(why) => Failure::Broken { why, logs },
+            Stop::Ended(name, status) => Failure::ChildEnded {
+                name,
+                status,
+                last_lines: self.programs.last_lines(name),
+                logs,
+            },
+            Stop::Interrupted => Failure::Interrupted {
+                standing: self.world.borrow().standing(),
+            },
+        }
+    }
+}
+
+/// Kills the conveyor, its machine and its component, while the arm carries the third cover to it, or the last of fewer.
+async fn strike(programs: &Programs, mut world: watch::Receiver<World>, covers: u32, show: &Show) {
+    let left = covers.saturating_sub(STRIKES_AT);
+    let carried = world.wait_for(|world| world.is_held() && world.in_storage() <= left);
+    if carried.await.is_ok() {
+        show.note(
+            BELT,
+            "dies: its machine and its component are killed".to_owned(),
+        );
+        programs.kill(BELT_NODE);
+        programs.kill(CONVEYOR);
+    }
+}
+
+/// Notes how long it takes until the line knows that its conveyor is dead.
+async fn learn(conveyor: &dyn Runs, mut killed: watch::Receiver<Option<i64>>, show: &Show) {
+    let why = conveyor.lost().await;
+    let now = wall_nanos();
+    show.note(LINE, format!("the conveyor is lost: {why}"));
+    if let Ok(at) = killed.wait_for(Option::is_some).await
+        && let Some(at) = *at
+    {
+        show.report.borrow_mut().told_lost_ms = Some(millis(now - at).max(0.0));
+    }
+}
+
+fn elapsed(since: Instant) -> f64 {
+    since.elapsed().as_secs_f64() * 1e3
+}
+
+fn millis(nanos: i64) -> f64 {
+    #[expect(clippy::cast_precision_loss, reason = "a time for people to see")]
+    let millis = nanos as f64 / 1e6;
+    millis
+}
+
+const LINE: Who = Who("line", "35");
+const ARM: Who = Who("Niryo Ned", "33");
+const BELT: Who = Who("conveyor", "31");
+const BASE: Who = Who("TurtleBot3", "36");
+/// The machine of the conveyor.
+const BELT_NODE: &str = "conveyor";
+const LDS_PORT: u16 = 4840;
+/// Which cover is carried when the conveyor dies.
+const STRIKES_AT: u32 = 3;
+/// How long the conveyor takes from one end to the other.
+const TRANSPORT_SECONDS: f64 = 3.0;
+const FOUND: Duration = Duration::from_secs(60);
+const WITHIN: Duration = Duration::from_secs(120);
+/// For what does not get faster with the story.
+const SPARE: Duration = Duration::from_secs(10);
+const POLL: Duration = Duration::from_millis(20);
+const PASS: Duration = Duration::from_millis(20);

@@ -1,0 +1,77 @@
+//! What a run of the story was like.
+
+use std::fmt::Write as _;
+
+use serde::Serialize;
+
+/// All of it.
+#[derive(Clone, Debug, Default, Serialize)]
+pub(super) struct Report {
+    pub(super) finished: bool,
+    pub(super) failure: Option<String>,
+    pub(super) speed: f64,
+    pub(super) covers: u32,
+    /// As the machines tell it, and not those that sent them.
+    pub(super) by_conveyor: u32,
+    pub(super) by_turtlebot: u32,
+    /// Covers that were taken from the dead conveyor.
+    pub(super) taken_back: u32,
+    /// From the start of the components until the skills of the line were found by their types.
+    pub(super) found_ms: Option<f64>,
+    /// From the signal that killed the conveyor until the line knew of it.
+    pub(super) told_lost_ms: Option<f64>,
+    pub(super) runs: Vec<Run>,
+}
+
+/// One run of a skill.
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct Run {
+    /// As `line-handling.PickAndPlace`.
+    pub(super) skill: String,
+    /// What it was run for.
+    pub(super) what: String,
+    /// Empty where all went well.
+    pub(super) message: String,
+    pub(super) lasted_ms: f64,
+}
+
+impl Report {
+    /// As people read it.
+    pub(super) fn table(&self) -> String {
+        let mut out = String::from("\n");
+        let ms = |ms: Option<f64>| ms.map_or_else(|| "-".to_owned(), |ms| format!("{ms:.0} ms"));
+        // A write to a String cannot fail.
+        _ = writeln!(
+            out,
+            "{:<28} {:<34} {:>9}  outcome",
+            "skill", "what for", "lasted"
+        );
+        for run in &self.runs {
+            let outcome = match run.message.is_empty() {
+                true => "done",
+                false => &run.message,
+            };
+            _ = writeln!(
+                out,
+                "{:<28} {:<34} {:>6.0} ms  {outcome}",
+                run.skill, run.what, run.lasted_ms
+            );
+        }
+        _ = writeln!(
+            out,
+            "\n{} of {} covers arrived: {} by conveyor, {} by TurtleBot3; {} taken back from the dead conveyor",
+            self.by_conveyor + self.by_turtlebot,
+            self.covers,
+            self.by_conveyor,
+            self.by_turtlebot,
+            self.taken_back
+        );
+        _ = writeln!(
+            out,
+            "all skills found after {}; the death of the conveyor known after {}",
+            ms(self.found_ms),
+            ms(self.told_lost_ms)
+        );
+        out
+    }
+}
