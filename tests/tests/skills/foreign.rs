@@ -3,7 +3,9 @@
 use std::time::Duration;
 
 use serde_json::{Value, json};
-use system_tests::{Cell, Child, METRICS_SERVER, Peer, Started, eventually, metrics, program};
+use system_tests::{
+    Cell, Child, Distribution, METRICS_SERVER, Peer, Started, eventually, metrics, program,
+};
 
 /// asyncua needs seconds to start on a busy machine.
 const SOON: Duration = Duration::from_secs(40);
@@ -204,4 +206,56 @@ fn goals_for_a_machine_run_it_are_cancelled_and_end_when_it_is_gone() {
     listed(4);
     let (code, _, result) = run(&["press.Stamp"]);
     assert_eq!((code, &result["succeeded"]), (0, &json!(true)), "{result}");
+}
+
+/// For the bridge alone: which action of ROS 2 the first Program of the machine is.
+const STAMP: &str = "
+spaces: [{id: 2, domain: 2}]
+namespaces: {12: 'urn:ua-bridge:system-tests:machine'}
+calls:
+  - node: ns=12;i=110
+    name: press.Stamp.Goal
+    origin: 0
+    ros:
+      - {space: 2, action: /stamp, type: test_msgs/Fibonacci, goal: {force: 12.5}, feedback: {sequence: [1]}, result: {sequence: [2]}}
+";
+
+#[test]
+fn a_client_of_rclpy_runs_and_cancels_the_program_of_a_machine_as_an_action() {
+    let Some(cell) = Cell::with(&[Peer::Ros2, Peer::Python]) else {
+        return;
+    };
+    let mapping = cell.file("press.yaml", MAPPING);
+    let _server = cell.ua_server(&[mapping.to_str().unwrap()]);
+    let mut machine = machine(&cell, &["--seconds", "6"]);
+    let actions = cell.file("stamp.yaml", STAMP);
+    let _bridge = cell.bridge_ros2(&[actions.to_str().unwrap()]);
+    listed(4);
+    let args = ["call", "/stamp", "--results", "--wait", "60"];
+    let client = cell.rclpy_started(Distribution::Jazzy, "ros2_rclpy_action.py", &args);
+    let mut client = client.told().start().ready(SOON);
+    let line = |client: &mut Child, key: &str, goal: u64, wanted: &str| {
+        client.wait_for_json(&format!("{key} {goal} with {wanted}"), SOON, |line| {
+            (line.get(key)? == goal).then(|| line.get(wanted).cloned())?
+        })
+    };
+
+    client.tell("send 7");
+    assert_eq!(line(&mut client, "goal", 0, "accepted"), true);
+    assert_eq!(line(&mut client, "feedback", 0, "sequence"), json!([1]));
+    let started = machine.wait_for_json("the machine is started", SOON, |line| {
+        line.get("started").map(|_| line.clone())
+    });
+    assert_eq!(started["force"], 12.5, "{started}");
+    assert_eq!(line(&mut client, "result", 0, "status"), "SUCCEEDED");
+    assert_eq!(line(&mut client, "result", 0, "sequence"), json!([2]));
+
+    client.tell("send 8");
+    assert_eq!(line(&mut client, "goal", 1, "accepted"), true);
+    assert_eq!(line(&mut client, "feedback", 1, "sequence"), json!([1]));
+    client.tell("cancel 1");
+    machine.wait_for_json("the machine is halted", SOON, |line| {
+        (line.get("halted")? == "Stamp").then_some(())
+    });
+    assert_eq!(line(&mut client, "result", 1, "status"), "CANCELED");
 }
