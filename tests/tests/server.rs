@@ -4,6 +4,8 @@
 mod access;
 #[path = "server/authorities.rs"]
 mod authorities;
+#[path = "server/configuration.rs"]
+mod configuration;
 #[path = "server/history.rs"]
 mod history;
 #[path = "server/malformed.rs"]

@@ -2,12 +2,13 @@
 //! types, and clients that come back by themselves. It knows no skills, no discovery, no space and no ROS.
 //!
 //! Reading order: `limits` (the bounds of both sides), `endpoint`, `pki`, `certificates`, `known` and `door` (how clients get in), `nodeset` (types from
-//! files), `users` and `audit`, `server` and `client`, `trust_file` (lists of
-//! certificates as files of a server).
+//! files), `users` and `audit`, `server` and `client`, `trust_file` and
+//! `configuration` (a server's certificates as clients manage them).
 
 pub mod audit;
 pub mod certificates;
 pub mod client;
+pub mod configuration;
 pub mod door;
 pub mod endpoint;
 pub mod known;

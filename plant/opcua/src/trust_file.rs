@@ -5,12 +5,14 @@
 
 use std::collections::BTreeMap;
 use std::io::Cursor;
+use std::time::Duration;
 
 use opcua::sync::Mutex;
 use opcua::types::{
     BinaryDecodable as _, BinaryEncodable as _, ByteString, ContextOwned, StatusCode,
     TrustListDataType, Variant,
 };
+use tokio::time::Instant;
 
 use crate::server::{MethodRequest, Refusal};
 
@@ -85,6 +87,8 @@ struct Handle {
     content: Vec<u8>,
     position: usize,
     is_writing: bool,
+    /// When it was used last.
+    used: Instant,
 }
 
 type Answer = Result<Vec<Variant>, Refusal>;
@@ -183,6 +187,7 @@ impl TrustFile {
 
     fn add(&self, session: u32, content: Vec<u8>, is_writing: bool) -> Answer {
         let mut open = self.open.lock();
+        open.forget();
         let is_read = open.all.values().all(|handle| !handle.is_writing);
         if !is_read || (is_writing && !open.all.is_empty()) {
             return Err(StatusCode::BadInvalidState.into());
@@ -197,6 +202,7 @@ impl TrustFile {
             content,
             position: 0,
             is_writing,
+            used: Instant::now(),
         };
         open.all.insert(number, handle);
         Ok(vec![Variant::UInt32(number)])
@@ -204,8 +210,12 @@ impl TrustFile {
 
     fn with(&self, session: u32, number: u32, what: impl FnOnce(&mut Handle) -> Answer) -> Answer {
         let mut open = self.open.lock();
+        open.forget();
         match open.all.get_mut(&number) {
-            Some(handle) if handle.session == session => what(handle),
+            Some(handle) if handle.session == session => {
+                handle.used = Instant::now();
+                what(handle)
+            }
             // Handles are of the session that opened (OPC 10000-20, 4.2.2).
             Some(_) | None => Err(StatusCode::BadInvalidArgument.into()),
         }
@@ -213,6 +223,7 @@ impl TrustFile {
 
     fn take(&self, session: u32, number: u32) -> Result<Handle, Refusal> {
         let mut open = self.open.lock();
+        open.forget();
         let is_own = open
             .all
             .get(&number)
@@ -231,6 +242,14 @@ impl TrustFile {
         let list = list.map_err(|_| StatusCode::BadInvalidArgument)?;
         let later = self.list.replace(list)?;
         Ok(vec![Variant::Boolean(later)])
+    }
+}
+
+impl Handles {
+    /// Closes those that nobody has used for long: a client that is gone would keep others from writing.
+    fn forget(&mut self) {
+        self.all
+            .retain(|_, handle| handle.used.elapsed() < LONGEST_UNUSED);
     }
 }
 
@@ -267,6 +286,8 @@ impl Handle {
 
 /// Bytes that a list that is written may have.
 pub const LARGEST: usize = 1 << 20;
+/// A file that is not used for that long is closed (ActivityTimeout, OPC 10000-12, 7.8.2.1).
+pub const LONGEST_UNUSED: Duration = Duration::from_secs(60);
 /// Bits of the modes that a file is opened in (OPC 10000-20, 4.2.2).
 const READ: u8 = 1;
 /// To write, with what is there erased.
@@ -392,6 +413,20 @@ mod tests {
         let updated = call(&file, 1, FileMethod::CloseAndUpdate, &[opened]);
         assert_eq!(updated, Ok(vec![Variant::Boolean(true)]));
         assert_eq!(file.list.list(masks::ALL), list);
+    }
+
+    #[test]
+    fn one_that_a_client_left_open_keeps_nobody_from_writing_for_long() {
+        let file = file(true);
+        let left = handle(call(&file, 1, FileMethod::Open, &[Variant::Byte(1)]));
+        let refused = call(&file, 2, FileMethod::Open, &[Variant::Byte(6)]);
+        assert_eq!(refused, Err(StatusCode::BadInvalidState.into()));
+        for handle in file.open.lock().all.values_mut() {
+            handle.used = handle.used.checked_sub(LONGEST_UNUSED).unwrap();
+        }
+        call(&file, 2, FileMethod::Open, &[Variant::Byte(6)]).unwrap();
+        let late = call(&file, 1, FileMethod::Close, &[left]);
+        assert_eq!(late, Err(StatusCode::BadInvalidArgument.into()));
     }
 
     #[test]

@@ -8,6 +8,7 @@ use opcua::server::node_manager::RequestContext;
 use opcua::sync::Mutex;
 use opcua::types::{MethodId, NodeId, StatusCode};
 use plant_opcua::certificates::application_uri;
+use plant_opcua::configuration::Configuration;
 use plant_opcua::users::{Anonymous, Permissions, Role, Roles, Rules};
 use tracing::warn;
 
@@ -95,6 +96,11 @@ pub(crate) fn rules(mapping: &Mapping, layout: &Layout) -> Rules {
     // Those of the core namespace are for everybody otherwise.
     let switches = SWITCHES.map(|method| (method.into(), Permissions::default()));
     nodes.extend(switches);
+    let certificates = Permissions {
+        call: roles(&[mappings::Role::SecurityAdmin]),
+        ..Permissions::default()
+    };
+    nodes.extend(Configuration::nodes().map(|method| (method, certificates)));
     Rules {
         anonymous: anonymous(mapping.server().anonymous),
         nodes,

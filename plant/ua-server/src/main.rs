@@ -11,7 +11,8 @@
 //! clients ask for both), `executing` (Methods of other servers as calls), `sources` (their nodes as values), `clients` (the
 //! sessions for both), `others` (all of these), `port` (the shell's side), `endpoint` (how clients get in), `access` (what each
 //! may do), `auditing` (what is told of it), `sks` (keys of secured groups), `pubsub` (the PubSub configuration as nodes),
-//! `value` (between the two codecs), `verbs` (certificates and users by hand).
+//! `value` (between the two codecs), `verbs` (certificates and users by hand), `restart` (in its own place, for another
+//! certificate).
 
 mod access;
 mod address;
@@ -34,6 +35,7 @@ mod presence;
 mod programs;
 mod properties;
 mod pubsub;
+mod restart;
 mod sks;
 mod sources;
 mod space;
@@ -88,7 +90,7 @@ struct UaServer {
 fn main() -> ExitCode {
     match verbs::asked() {
         Some(ended) => ended,
-        None => bridge_node::run::<UaServer>(),
+        None => restart::again(bridge_node::run::<UaServer>()),
     }
 }
 

@@ -15,10 +15,11 @@ use mappings::{Anonymous, Mapping, Role, Server, SpaceId, TopicId};
 use opcua::nodes::NodeType;
 use opcua::server::address_space::AddressSpace;
 use opcua::server::authenticator::AuthManager;
-use opcua::server::node_manager::ServerContext;
 use opcua::server::node_manager::memory::InMemoryNodeManagerImplBuilder;
+use opcua::server::node_manager::{NodeManagerBuilder, ServerContext};
 use opcua::server::{MonitoredItemHandle, ServerHandle, SubscriptionCache};
 use opcua::types::{NodeId, NumericRange, StatusCode, VariableId};
+use plant_opcua::configuration::Configuration;
 use plant_opcua::endpoint::EndpointUrl;
 use plant_opcua::pki::Pki;
 use plant_opcua::server::{Security, core_of, core_with};
@@ -42,6 +43,7 @@ use crate::methods::{Methods, Wish};
 use crate::nodes::{ClientWrite, Exits, SpaceManager, SpaceNodes, look_again};
 use crate::others::Others;
 use crate::pubsub::{Places, PubSub, Readers, State};
+use crate::restart;
 use crate::sks::Sks;
 use crate::sources::{self, Sourced};
 use crate::space::Space;
@@ -98,6 +100,8 @@ pub(crate) struct ServerPort {
     receive_timeout: Duration,
     /// As the group is told.
     application: Application,
+    /// Its certificates, as clients manage them.
+    certificates: Arc<Configuration>,
 }
 
 impl ServerPort {
@@ -130,13 +134,15 @@ impl ServerPort {
             exits,
         };
         let layout = Arc::clone(&nodes.layout);
-        let methods = [setup.sks.methods(), pubsub.methods()].concat();
+        let certificates = Configuration::new(setup.pki.root(), &described.application_uri);
+        let mdns = setup.announce.as_ref().is_some_and(|to| to.mdns.is_some());
+        let core = core(&setup.sks, &pubsub, (&certificates, mdns));
         let builder = endpoint::server(described, (&setup.url, port), &security);
         let (door, listener, builder) =
             endpoint::door(&setup.pki, setup.trust_any_client, (listener, builder))?;
         let (server, handle) = builder
             .with_authenticator(Arc::clone(&access) as Arc<dyn AuthManager>)
-            .with_node_manager(core_with(methods, history::capabilities(), prepared))
+            .with_node_manager(core)
             .with_node_manager(Ordered::around(nodes))
             .build()
             .map_err(configuration)?;
@@ -150,14 +156,10 @@ impl ServerPort {
         endpoint::stand(&runtime, door)?;
         let subscriptions = Arc::clone(handle.subscriptions());
         audit(&access, &handle);
-        drop(runtime.spawn(look_again(
-            Arc::clone(&manager),
-            Arc::clone(&subscriptions),
-            created_items,
-        )));
+        let nodes = (Arc::clone(&manager), Arc::clone(&subscriptions));
+        look_at_created(&runtime, nodes.clone(), created_items);
         tell_serving(&layout, &setup.pki, (&setup.url, port));
         let others = Others::new(mapping, &described.application_uri, setup.pki.root());
-        let nodes = (Arc::clone(&manager), Arc::clone(&subscriptions));
         let methods = Methods::new(nodes.clone(), mapping, (asked, &layout.structures));
         let (server, application) = told_of(described, setup.url.advertised(port), &security);
         let (told, components) = tell(server, setup.announce, nodes)?;
@@ -188,6 +190,7 @@ impl ServerPort {
             readers: Readers::default(),
             receive_timeout: mapping.pubsub().receive_timeout,
             application,
+            certificates,
         })
     }
 }
@@ -240,6 +243,7 @@ impl Port for ServerPort {
                 () = self.pubsub.called() => self.switch(),
                 event = next(&mut self.components) => return event,
                 () = at(self.space.due()) => self.space.grow_old(),
+                () = self.certificates.applied() => restart::ask(),
                 _ = self.look.tick() => {
                     self.pki.report_rejected();
                     self.access.look();
@@ -502,6 +506,17 @@ fn audit(access: &Access, handle: &ServerHandle) {
     access.on_login(move |login| auditing::came_in(login, &server).tell(&subscriptions));
 }
 
+/// The core namespace, with what is carried out and shown of it here.
+fn core(
+    sks: &Arc<Sks>,
+    pubsub: &Arc<PubSub>,
+    (configuration, is_announced): (&Arc<Configuration>, bool),
+) -> impl NodeManagerBuilder + use<> {
+    let methods = [sks.methods(), pubsub.methods(), configuration.methods()].concat();
+    let values = [history::capabilities(), Configuration::values(is_announced)].concat();
+    core_with(methods, values, prepared)
+}
+
 /// Has the server say that there is an audit, and how it works out what was.
 fn prepared(core: &mut AddressSpace) {
     history::list_aggregates(core);
@@ -519,6 +534,15 @@ fn places(handle: &ServerHandle, manager: &Arc<SpaceManager>) -> Places {
         space: Arc::clone(manager),
         subscriptions: Arc::clone(handle.subscriptions()),
     }
+}
+
+/// Has a second look at monitored items that are made.
+fn look_at_created(
+    runtime: &Runtime,
+    (manager, subscriptions): (Arc<SpaceManager>, Arc<SubscriptionCache>),
+    created: mpsc::Receiver<(NodeId, MonitoredItemHandle)>,
+) {
+    drop(runtime.spawn(look_again(manager, subscriptions, created)));
 }
 
 fn tell_serving(layout: &Layout, pki: &Pki, (url, port): (&EndpointUrl, u16)) {

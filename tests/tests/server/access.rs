@@ -11,7 +11,7 @@ use super::SOON;
 
 const SETPOINT: &str = "ns=2;i=30";
 const LIMIT: &str = "ns=2;i=31";
-const PASSWORD: &str = "correct horse battery";
+pub(super) const PASSWORD: &str = "correct horse battery";
 const SECURED: &str = "Basic256Sha256/Sign,Basic256Sha256/SignAndEncrypt,Aes128_Sha256_RsaOaep/Sign,\
     Aes128_Sha256_RsaOaep/SignAndEncrypt,Aes256_Sha256_RsaPss/Sign,Aes256_Sha256_RsaPss/SignAndEncrypt";
 
@@ -30,7 +30,7 @@ pub(super) struct Site {
 }
 
 impl Site {
-    fn with(mapping: &str, args: &[&str]) -> Option<Self> {
+    pub(super) fn with(mapping: &str, args: &[&str]) -> Option<Self> {
         Some(Self::of(Cell::with(&[Peer::Python])?, mapping, args))
     }
 
@@ -83,7 +83,7 @@ impl Site {
         self.tries(node, way, user, &[]).remove(0)
     }
 
-    fn pair(&self, name: &str) -> String {
+    pub(super) fn pair(&self, name: &str) -> String {
         let file = self
             .cell
             .folder()

@@ -1,0 +1,263 @@
+//! The trust list of a server in the files of its certificate store.
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+
+use opcua::crypto::{CertificateStore, X509};
+use opcua::types::{ByteString, StatusCode, TrustListDataType, Variant};
+use tracing::{info, warn};
+use trust::{Certificate, Crl, Fault, Known};
+
+use super::Answer;
+use crate::certificates::{self, Standing};
+use crate::known;
+use crate::server::MethodRequest;
+use crate::trust_file::{TrustList, masks};
+
+/// The list of the store at a root.
+#[derive(Debug, Clone)]
+pub(super) struct StoreList {
+    root: PathBuf,
+}
+
+impl StoreList {
+    pub(super) fn new(root: &Path) -> Self {
+        Self {
+            root: root.to_owned(),
+        }
+    }
+
+    /// AddCertificate: of an application or an authority that is trusted. Others are of a list that is written as a whole
+    /// (OPC 10000-12, 7.8.2.6).
+    pub(super) fn add(&self, request: &MethodRequest) -> Answer {
+        let [Variant::ByteString(bytes), Variant::Boolean(true)] = request.arguments.as_slice()
+        else {
+            return Err(StatusCode::BadInvalidArgument.into());
+        };
+        let certificate = read(bytes)?;
+        self.keep(&certificate, Standing::Trusted)
+            .map_err(|error| told(&error))?;
+        info!(name = ?certificate.name(), by = ?request.caller.user, "a certificate is trusted");
+        Ok(Vec::new())
+    }
+
+    /// RemoveCertificate: by its thumbprint.
+    pub(super) fn remove(&self, request: &MethodRequest) -> Answer {
+        let [Variant::String(thumbprint), Variant::Boolean(is_trusted)] =
+            request.arguments.as_slice()
+        else {
+            return Err(StatusCode::BadInvalidArgument.into());
+        };
+        let standing = match is_trusted {
+            true => Standing::Trusted,
+            false => Standing::Issuer,
+        };
+        let wanted = thumbprint.as_ref().to_lowercase();
+        let all = certificates::list(&self.root).map_err(|error| {
+            warn!(%error, "the certificate store cannot be read");
+            StatusCode::BadResourceUnavailable
+        })?;
+        let mut gone = all
+            .iter()
+            .filter(|one| one.standing == standing && one.thumbprint == wanted)
+            .peekable();
+        if gone.peek().is_none() {
+            return Err(StatusCode::BadInvalidArgument.into());
+        }
+        for one in gone {
+            fs::remove_file(&one.path).map_err(|error| told(&error))?;
+            info!(name = ?one.name, by = ?request.caller.user, "a certificate is trusted no longer");
+        }
+        Ok(Vec::new())
+    }
+
+    /// Looks at a new certificate of the server, with the certificates of authorities that come along: the signature of each is
+    /// to be of the one above it. Whom the server trusts says nothing of by whom it is to be known (OPC 10000-12, 7.10.5).
+    pub(super) fn judge(
+        &self,
+        certificate: &Certificate,
+        issuers: &Variant,
+    ) -> Result<(), StatusCode> {
+        let mut known = known::read(&self.root);
+        // Who may give the server a certificate decides that it is one to be shown.
+        known.trusted.append(&mut known.issuers);
+        known.trusted.extend(given(issuers)?);
+        if certificate.is_self_signed() {
+            known.trusted.push(certificate.clone());
+        }
+        match trust::check(certificate, &[], &known, known::now()) {
+            // Its authority says later what it has revoked.
+            Ok(()) | Err(Fault::RevocationUnknown | Fault::IssuerRevocationUnknown) => Ok(()),
+            Err(fault) => {
+                warn!(%fault, "a new certificate of the server is refused");
+                Err(StatusCode::BadSecurityChecksFailed)
+            }
+        }
+    }
+
+    /// Keeps the certificates of authorities above one, which clients may want to know.
+    pub(super) fn keep_issuers(&self, issuers: &Variant) -> Result<(), StatusCode> {
+        for certificate in given(issuers)? {
+            if certificate.is_authority() {
+                self.keep(&certificate, Standing::Issuer)
+                    .map_err(|error| told(&error))?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Puts a certificate where the library looks for it; says the name of its file.
+    fn keep(&self, certificate: &Certificate, standing: Standing) -> io::Result<String> {
+        let of_library = X509::from_der(certificate.der())
+            .map_err(|error| io::Error::other(error.to_string()))?;
+        let name = CertificateStore::cert_file_name(&of_library);
+        let folder = self.root.join(standing.name());
+        fs::create_dir_all(&folder)?;
+        fs::write(folder.join(&name), certificate.der())?;
+        if standing == Standing::Trusted {
+            // Both at once would count as refused.
+            match fs::remove_file(self.root.join(Standing::Rejected.name()).join(&name)) {
+                Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
+                Ok(()) | Err(_) => {}
+            }
+        }
+        Ok(name)
+    }
+
+    /// Has these certificates alone. The new ones come before the others go.
+    fn have(&self, all: &[Certificate], standing: Standing) -> io::Result<()> {
+        let mut names = BTreeSet::new();
+        for one in all {
+            names.insert(self.keep(one, standing)?);
+        }
+        for entry in fs::read_dir(self.root.join(standing.name()))?.flatten() {
+            let name = entry.file_name();
+            if !name.to_str().is_some_and(|name| names.contains(name)) {
+                fs::remove_file(entry.path())?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Has these lists alone of the authorities that are meant, by whether those are trusted.
+    fn have_lists(&self, all: &[Crl], are_trusted: bool) -> Result<(), StatusCode> {
+        let known = known::read(&self.root);
+        let folder = self.root.join(known::CRLS);
+        for entry in fs::read_dir(&folder).into_iter().flatten().flatten() {
+            let list = fs::read(entry.path())
+                .ok()
+                .and_then(|bytes| Crl::read(&bytes).ok());
+            let stays = list.is_some_and(|list| {
+                is_trusted(&list, &known) != are_trusted
+                    || all.iter().any(|one| one.der() == list.der())
+            });
+            if !stays {
+                fs::remove_file(entry.path()).map_err(|error| told(&error))?;
+            }
+        }
+        for one in all {
+            match known::put_crl(&self.root, one) {
+                Ok(Some(_)) => {}
+                Ok(None) => {
+                    warn!(issuer = ?one.issuer_name(), "a revocation list of an authority that is not known is left out");
+                    return Err(StatusCode::BadCertificateIssuerRevocationUnknown);
+                }
+                Err(error) => {
+                    warn!(%error, "a revocation list cannot be kept");
+                    return Err(StatusCode::BadResourceUnavailable);
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+impl TrustList for StoreList {
+    fn list(&self, masks: u32) -> TrustListDataType {
+        let known = known::read(&self.root);
+        let certificates = |mask: u32, all: &[Certificate]| {
+            let each = all.iter().map(|one| ByteString::from(one.der().to_vec()));
+            (masks & mask != 0).then(|| each.collect())
+        };
+        let lists = |mask: u32, are_trusted: bool| {
+            let each = known
+                .crls
+                .iter()
+                .filter(|list| is_trusted(list, &known) == are_trusted);
+            let each = each.map(|list| ByteString::from(list.der().to_vec()));
+            (masks & mask != 0).then(|| each.collect())
+        };
+        TrustListDataType {
+            specified_lists: masks,
+            trusted_certificates: certificates(masks::TRUSTED_CERTIFICATES, &known.trusted),
+            trusted_crls: lists(masks::TRUSTED_CRLS, true),
+            issuer_certificates: certificates(masks::ISSUER_CERTIFICATES, &known.issuers),
+            issuer_crls: lists(masks::ISSUER_CRLS, false),
+        }
+    }
+
+    fn replace(&self, list: TrustListDataType) -> Result<bool, StatusCode> {
+        // All is read before anything is written.
+        let certificates = |all: &Option<Vec<ByteString>>| -> Result<Vec<Certificate>, StatusCode> {
+            all.iter().flatten().map(read).collect()
+        };
+        let lists = |all: &Option<Vec<ByteString>>| -> Result<Vec<Crl>, StatusCode> {
+            let each = all.iter().flatten();
+            each.map(|one| {
+                let bytes = one.value.as_deref().unwrap_or_default();
+                Crl::read(bytes).map_err(|_| StatusCode::BadInvalidArgument)
+            })
+            .collect()
+        };
+        let trusted = certificates(&list.trusted_certificates)?;
+        let issuers = certificates(&list.issuer_certificates)?;
+        let (trusted_lists, issuer_lists) = (lists(&list.trusted_crls)?, lists(&list.issuer_crls)?);
+        let is_given = |mask: u32| list.specified_lists & mask != 0;
+        if is_given(masks::TRUSTED_CERTIFICATES) {
+            self.have(&trusted, Standing::Trusted)
+                .map_err(|error| told(&error))?;
+        }
+        if is_given(masks::ISSUER_CERTIFICATES) {
+            self.have(&issuers, Standing::Issuer)
+                .map_err(|error| told(&error))?;
+        }
+        if is_given(masks::TRUSTED_CRLS) {
+            self.have_lists(&trusted_lists, true)?;
+        }
+        if is_given(masks::ISSUER_CRLS) {
+            self.have_lists(&issuer_lists, false)?;
+        }
+        Ok(false)
+    }
+}
+
+fn is_trusted(list: &Crl, known: &Known) -> bool {
+    known.trusted.iter().any(|one| list.is_of(one))
+}
+
+/// The certificates in an argument of a method.
+fn given(issuers: &Variant) -> Result<Vec<Certificate>, StatusCode> {
+    let Variant::Array(array) = issuers else {
+        return Ok(Vec::new());
+    };
+    let each = array.values.iter().take(MOST_ISSUERS).map(|one| match one {
+        Variant::ByteString(bytes) => read(bytes),
+        _ => Err(StatusCode::BadInvalidArgument),
+    });
+    each.collect()
+}
+
+fn read(bytes: &ByteString) -> Result<Certificate, StatusCode> {
+    let bytes = bytes.value.as_deref().unwrap_or_default();
+    Certificate::read(bytes).map_err(|_| StatusCode::BadCertificateInvalid)
+}
+
+/// Tells what went wrong, and what the client is told.
+fn told(error: &io::Error) -> StatusCode {
+    warn!(%error, "the certificate store cannot be changed");
+    StatusCode::BadResourceUnavailable
+}
+
+const MOST_ISSUERS: usize = 10;
