@@ -65,6 +65,8 @@ struct Shared {
     /// Where the server listens.
     inner: SocketAddr,
     known: RwLock<Arc<Known>>,
+    /// The files of the store as they were before that was read first.
+    first: Stamp,
     /// How many connections each of those has that the library trusts now, by the file.
     admitted: Mutex<HashMap<PathBuf, usize>>,
     /// Counts the changes of what is known.
@@ -98,7 +100,10 @@ impl Door {
         let listener = std::net::TcpListener::bind((Ipv4Addr::LOCALHOST, 0))?;
         listener.set_nonblocking(true)?;
         socket2::SockRef::from(&listener).set_tcp_nodelay(true)?;
+        // Taken before: what is written while the store is read is to be seen later.
+        let first = known::stamp(&root);
         let shared = Shared {
+            first,
             known: RwLock::new(Arc::new(known::read(&root))),
             root,
             behind,
@@ -128,7 +133,7 @@ impl Door {
         let mut tasks = JoinSet::new();
         let mut look = tokio::time::interval(LOOK);
         look.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
-        let mut stamp = known::stamp(&shared.root);
+        let mut stamp = shared.first.clone();
         loop {
             tokio::select! {
                 accepted = listener.accept() => match accepted {

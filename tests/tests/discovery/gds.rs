@@ -186,6 +186,21 @@ fn a_certificate_is_issued_used_renewed_by_its_owner_and_revoked() {
 }
 
 #[test]
+fn whom_the_authority_issued_a_certificate_is_let_in_while_nothing_is_revoked() {
+    let Some(site) = site() else { return };
+    // The list of the authority came into the store of the server when this started, and not once since.
+    let [key, out] = ["robot_key.pem", "robot_certificate.der"];
+    let [key, out] = [key, out].map(|name| pairs(&site.cell).join(name));
+    let args = ["ca", "issue", "--application-uri", URI];
+    let args = [&args[..], &["--key", path(&key), "--out", path(&out)]].concat();
+    told(&site.cell, &args);
+    let robot = ["--client", "robot", "--application-uri", URI];
+    let said = site.asked("stranger", &robot);
+    assert_eq!(said["connected"], "Good", "{said}");
+    assert_eq!(said["register"], "BadUserAccessDenied");
+}
+
+#[test]
 fn people_issue_certificates_for_requests_and_with_keys() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;

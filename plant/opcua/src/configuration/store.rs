@@ -242,9 +242,11 @@ fn given(issuers: &Variant) -> Result<Vec<Certificate>, StatusCode> {
     let Variant::Array(array) = issuers else {
         return Ok(Vec::new());
     };
-    let each = array.values.iter().take(MOST_ISSUERS).map(|one| match one {
-        Variant::ByteString(bytes) => read(bytes),
-        _ => Err(StatusCode::BadInvalidArgument),
+    let each = array.values.iter().take(MOST_ISSUERS).map(|one| {
+        let Variant::ByteString(bytes) = one else {
+            return Err(StatusCode::BadInvalidArgument);
+        };
+        read(bytes)
     });
     each.collect()
 }
