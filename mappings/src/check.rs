@@ -4,6 +4,7 @@ mod bindings;
 mod calls;
 mod cell;
 mod environment;
+mod finding;
 mod meaning;
 mod names;
 mod network;
@@ -31,7 +32,7 @@ use crate::diagnostic::{Diagnostic, Severity};
 use crate::document::Document;
 use crate::findings::Findings;
 use crate::include::Loader;
-use crate::mapping::Mapping;
+use crate::mapping::{Mapping, Server};
 use crate::read::{At, Field};
 use crate::surroundings::{Alone, Surroundings};
 use crate::topic::SpaceId;
@@ -296,7 +297,10 @@ fn compile(
     let spaces = cell::spaces(document.spaces.as_ref(), findings);
     let namespaces = cell::namespaces(document.namespaces.as_ref(), findings);
     let pubsub = network::pubsub(document.pubsub.as_ref(), findings);
-    let server = network::server(document.server.as_ref(), findings);
+    let server = Server {
+        find_skills: finding::check(document.server.as_ref(), findings),
+        ..network::server(document.server.as_ref(), findings)
+    };
     let near = (&server.endpoint, &namespaces);
     let servers = servers::check(document.servers.as_ref(), near, findings);
     let variables = match &document.variables {
@@ -330,6 +334,8 @@ fn compile(
     };
     let entries = document.servers.as_ref();
     servers::alone(&servers, &variables, &calls, entries, findings);
+    let found = (document.server.as_ref(), server.find_skills.as_ref());
+    finding::alone(found, &servers, (&variables, &calls), findings);
     let groups = document.security.as_ref();
     let groups = groups
         .and_then(|at| at.value.as_deref())

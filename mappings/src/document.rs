@@ -11,7 +11,7 @@ use crate::call::Assigned;
 use crate::code::Code;
 use crate::mapping::UaField;
 use crate::read::{At, Read, Reader, choice, document, short};
-use crate::server_entries::{FromEntry, RemoteServerEntry, ToEntry};
+use crate::server_entries::{FindSkillsEntry, FromEntry, RemoteServerEntry, ToEntry};
 use crate::tree::{Kind, Node, Place};
 
 pub(crate) use security::{
@@ -123,6 +123,9 @@ document! {
         bad_after: String,
         /// How much clients may take up.
         limits: LimitsEntry,
+        /// Servers with skills that know nothing of the space, and that discovery finds: ua-server shows these skills in the space,
+        /// and has them run, as it does those of `servers` that have `skills`. Left out: none is looked for.
+        find_skills: FindSkillsEntry,
     }
 
     /// How much clients may take up of the server. What is more is refused.

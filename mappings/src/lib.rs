@@ -6,6 +6,7 @@ mod code;
 mod diagnostic;
 mod difference;
 mod document;
+mod endpoint;
 mod environment;
 mod findings;
 mod include;
@@ -36,17 +37,20 @@ pub use check::{Checked, PathFault, PathFaultKind, Source, TypeFiles, TypeOrigin
 pub use code::{Code, UnknownCode};
 pub use diagnostic::{Diagnostic, Severity, Span};
 pub use difference::Difference;
+pub use endpoint::Endpoint;
 pub use environment::{Environment, LiveNode, LiveRemote, LiveServer, LiveSpace, LiveTopic};
+
 pub use mapping::{
-    Binding, Endpoint, Mapping, Meaning, Overflow, PubSub, Publish, PublisherIdRule,
-    SecurityPolicy, Server, ServerLimits, ServiceBinding, ServiceRole, Space, Trigger, UaField,
-    Variable,
+    Binding, Mapping, Meaning, Overflow, PubSub, Publish, PublisherIdRule, SecurityPolicy, Server,
+    ServerLimits, ServiceBinding, ServiceRole, Space, Trigger, UaField, Variable,
 };
 pub use node_id::{ExpandedNodeIdText, Identifier, NamespaceText, NodeIdError, NodeIdText};
 pub use pattern::{Pattern, PatternFault, PatternReason, PatternVariable};
 pub use permission::{Anonymous, Permissions, Role};
 pub use quality::Ages;
-pub use remote::{Access, NodeSource, NodeTarget, Password, RemoteServer, SkillsPlace, User};
+pub use remote::{
+    Access, FindSkills, NodeSource, NodeTarget, Password, RemoteServer, SkillsPlace, User,
+};
 pub use schema::schema;
 pub use security::{GroupMode, GroupPolicy, KeySource, Replay, SecurityGroup, Served};
 pub use surroundings::{Readers, Surroundings};

@@ -10,11 +10,12 @@ use messages::{Leaf, Selection, TypeName};
 use uadp::BuiltinType;
 
 use crate::call::{Call, CallBinding};
+use crate::endpoint::Endpoint;
 use crate::node_id::NodeIdText;
 use crate::pattern::{Pattern, PatternFault, PatternReason, PatternVariable};
 use crate::permission::{Anonymous, Permissions};
 use crate::quality::Ages;
-use crate::remote::{NodeSource, NodeTarget, RemoteServer};
+use crate::remote::{FindSkills, NodeSource, NodeTarget, RemoteServer};
 use crate::security::SecurityGroup;
 use crate::topic::{SpaceId, TopicId};
 use crate::unit::Unit;
@@ -443,6 +444,8 @@ pub struct Server {
     pub bad_after: Option<Duration>,
     /// How much clients may take up.
     pub limits: ServerLimits,
+    /// Which servers with skills it speaks for when they are found, if any.
+    pub find_skills: Option<FindSkills>,
 }
 
 /// How much clients may take up of the server; `None` is left to the server.
@@ -481,49 +484,7 @@ impl Default for Server {
             anonymous: Anonymous::Usual,
             bad_after: None,
             limits: ServerLimits::default(),
-        }
-    }
-}
-
-/// `opc.tcp://host:port/path`.
-#[derive(Clone, Debug, PartialEq, Eq, Hash)]
-pub struct Endpoint {
-    /// Host name or address; an IPv6 address without its brackets.
-    pub host: String,
-    /// 1..=65535.
-    pub port: u16,
-    /// Empty, or begins with `/`.
-    pub path: String,
-}
-
-impl Endpoint {
-    /// Whether only programs of its own host reach it, as far as its host says.
-    #[must_use]
-    pub fn is_loopback(&self) -> bool {
-        match self.host.parse::<std::net::IpAddr>() {
-            Ok(address) => address.is_loopback(),
-            Err(_) => self.host.eq_ignore_ascii_case("localhost"),
-        }
-    }
-}
-
-impl Default for Endpoint {
-    fn default() -> Self {
-        Self {
-            host: "127.0.0.1".to_owned(),
-            port: 4840,
-            path: String::new(),
-        }
-    }
-}
-
-impl std::fmt::Display for Endpoint {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let Self { host, port, path } = self;
-        if host.contains(':') {
-            write!(f, "opc.tcp://[{host}]:{port}{path}")
-        } else {
-            write!(f, "opc.tcp://{host}:{port}{path}")
+            find_skills: None,
         }
     }
 }

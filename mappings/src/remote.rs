@@ -2,9 +2,11 @@
 
 use std::fmt;
 use std::num::NonZeroU16;
+use std::ops::RangeInclusive;
 use std::time::Duration;
 
-use crate::mapping::{Endpoint, SecurityPolicy};
+use crate::endpoint::Endpoint;
+use crate::mapping::SecurityPolicy;
 use crate::node_id::ExpandedNodeIdText;
 
 /// An OPC UA server that exists already, such as that of a PLC: an entry of `servers`.
@@ -25,6 +27,44 @@ pub struct SkillsPlace {
     pub namespace: u16,
     /// Whether they are run for other hosts too.
     pub open: bool,
+}
+
+/// Which servers with skills, of those that discovery finds, have a place in the space: `server.find_skills`.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct FindSkills {
+    /// Their ApplicationUris; with `*` at its end one stands for all that begin so.
+    pub uris: Vec<String>,
+    /// The namespace of the first one, 2..=65535.
+    pub first: u16,
+    /// How many have a place: their namespaces follow each other, up to 65535. 1..=[`LIMIT`](Self::LIMIT).
+    pub most: u16,
+    /// The security policy of the sessions; without one the best that each server offers and both sides know.
+    pub security: Option<SecurityPolicy>,
+    /// Whether their skills are run for other hosts too.
+    pub open: bool,
+}
+
+impl FindSkills {
+    /// How many have a place where nothing is said.
+    pub const MOST: u16 = 8;
+    /// How many may have a place.
+    pub const LIMIT: u16 = 64;
+
+    /// Whether a server with that ApplicationUri is one of them.
+    #[must_use]
+    pub fn wants(&self, application_uri: &str) -> bool {
+        let mut uris = self.uris.iter();
+        uris.any(|uri| match uri.strip_suffix('*') {
+            Some(begins) => application_uri.starts_with(begins),
+            None => application_uri == uri,
+        })
+    }
+
+    /// The namespaces that they have in the space.
+    #[must_use]
+    pub const fn namespaces(&self) -> RangeInclusive<u16> {
+        self.first..=self.first.saturating_add(self.most.saturating_sub(1))
+    }
 }
 
 /// How an OPC UA server is reached, and as whom.

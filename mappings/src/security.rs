@@ -3,7 +3,8 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use crate::mapping::{Endpoint, Mapping};
+use crate::endpoint::Endpoint;
+use crate::mapping::Mapping;
 
 /// A SecurityGroup (OPC 10000-14, 8.2): the programs that have its keys.
 #[derive(Clone, Debug, PartialEq, Eq)]

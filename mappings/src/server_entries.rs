@@ -1,7 +1,7 @@
 //! `servers` of the document, and what variables say of them.
 
 use crate::document::{DURATION, EXPANDED_NODE_ID, SecurityEntry};
-use crate::read::document;
+use crate::read::{At, document};
 
 document! {
     /// An OPC UA server that exists already, such as that of a PLC. The cell's own server is its client.
@@ -24,6 +24,25 @@ document! {
         /// them run, as a component does its own. Left out: they are not looked for.
         #[schemars(range(min = 1, max = 65_535))]
         skills: u16,
+        /// Whether these skills are run for other hosts too where the group is not secured; default false.
+        open: bool,
+    }
+
+    /// Servers with skills that discovery finds. Each has a namespace of its own in the space.
+    struct FindSkillsEntry {
+        /// Which, by their ApplicationUris; with `*` at its end one stands for all that begin so, as urn:vendor:*. 1 to 64.
+        #[schemars(required, length(min = 1, max = 64))]
+        uris: Vec<At<String>>,
+        /// The first namespace for them. Those from here on are theirs, and nothing else is in them. One that `namespaces` gives an
+        /// ApplicationUri is kept for that server; the others are given out as servers are found.
+        #[schemars(required, range(min = 2, max = 65_535))]
+        first: u16,
+        /// How many servers have a place, 1 to 64; default 8. Those that are found beyond them are told in the log.
+        #[schemars(range(min = 1, max = 64))]
+        most: u16,
+        /// Security policy of the sessions, which are those of an anonymous user. Left out: the best that each server offers, which may
+        /// be None.
+        security: SecurityEntry,
         /// Whether these skills are run for other hosts too where the group is not secured; default false.
         open: bool,
     }

@@ -124,7 +124,7 @@ class Program:
 async def run(args):
     server = Server()
     await server.init()
-    await server.set_application_uri(URI)
+    await server.set_application_uri(args.uri)
     server.name = "machine"
     server.set_endpoint(args.endpoint)
     server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
@@ -148,6 +148,7 @@ def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("endpoint")
     parser.add_argument("--seconds", type=float, default=2.5)
+    parser.add_argument("--uri", default=URI, help="its ApplicationUri")
     parser.add_argument("--limit", type=float, default=120.0)
     args = parser.parse_args()
     lifetime.bound(args.limit)

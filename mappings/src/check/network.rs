@@ -8,14 +8,12 @@ use super::cell::is_uri;
 use super::permissions;
 use crate::code::Code;
 use crate::document::{LimitsEntry, PubSubEntry, PublisherIdEntry, SecurityEntry, ServerEntry};
+use crate::endpoint::Endpoint;
 use crate::findings::Findings;
-use crate::mapping::{Endpoint, PubSub, PublisherIdRule, SecurityPolicy, Server, ServerLimits};
+use crate::mapping::{PubSub, PublisherIdRule, SecurityPolicy, Server, ServerLimits};
 use crate::read::{At, Field, given, short};
 use crate::secret::has_user;
 use crate::tree::Place;
-
-/// The port registered for OPC UA, TCP and UDP.
-const PORT: u16 = 4840;
 
 pub(super) fn pubsub(entry: Option<&At<PubSubEntry>>, findings: &mut Findings) -> PubSub {
     let default = PubSub::default();
@@ -67,7 +65,7 @@ pub(super) fn pubsub(entry: Option<&At<PubSubEntry>>, findings: &mut Findings) -
     pubsub
 }
 
-fn within(
+pub(super) fn within(
     field: &Field<u16>,
     range: RangeInclusive<u16>,
     unit: &str,
@@ -230,7 +228,7 @@ pub(super) fn server(entry: Option<&At<ServerEntry>>, findings: &mut Findings) -
         return default;
     };
     let endpoint = given(&entry.endpoint).and_then(|(text, place)| {
-        let endpoint = parse_endpoint(text);
+        let endpoint = Endpoint::parse(text);
         if endpoint.is_none() {
             let message = format!("`{}` is no endpoint", short(text));
             let mut note = findings.error(Code::Endpoint, place, message);
@@ -262,6 +260,7 @@ pub(super) fn server(entry: Option<&At<ServerEntry>>, findings: &mut Findings) -
         anonymous: permissions::anonymous(entry),
         bad_after: duration(&entry.bad_after, findings),
         limits: limits(&entry.limits, findings),
+        find_skills: None,
     };
     permissions::left_open(entry, &server, findings);
     server
@@ -285,7 +284,7 @@ pub(super) fn remote_endpoint(
     place: Place,
     findings: &mut Findings,
 ) -> Option<Endpoint> {
-    let endpoint = parse_endpoint(text);
+    let endpoint = Endpoint::parse(text);
     if endpoint.is_none() {
         let message = format!("`{}` is no endpoint", short(text));
         let mut note = findings.error(Code::Endpoint, place, message);
@@ -340,50 +339,6 @@ pub(super) const fn policy(entry: SecurityEntry) -> SecurityPolicy {
     }
 }
 
-/// `opc.tcp://host:port/path`, port 4840 when left out (OPC 10000-6, 7.2).
-pub(super) fn parse_endpoint(text: &str) -> Option<Endpoint> {
-    let rest = text.strip_prefix("opc.tcp://")?;
-    let slash = rest.find('/').unwrap_or(rest.len());
-    let (authority, path) = rest.split_at_checked(slash)?;
-    let (host, port) = match authority
-        .strip_prefix('[')
-        .and_then(|rest| rest.split_once(']'))
-    {
-        Some((host, port)) => {
-            host.parse::<std::net::Ipv6Addr>().ok()?;
-            (
-                host,
-                if port.is_empty() {
-                    None
-                } else {
-                    Some(port.strip_prefix(':')?)
-                },
-            )
-        }
-        None => match authority.split_once(':') {
-            Some((host, port)) => (host, Some(port)),
-            None => (authority, None),
-        },
-    };
-    let plain = |c: char| c.is_ascii_alphanumeric() || "-._".contains(c);
-    let named = !host.is_empty()
-        && host.len() <= 255
-        && (authority.starts_with('[') || host.chars().all(plain));
-    let port = match port {
-        Some(text) if text.bytes().all(|b| b.is_ascii_digit()) => {
-            text.parse().ok().filter(|port| *port != 0)?
-        }
-        Some(_) => return None,
-        None => PORT,
-    };
-    let whole = !path.contains(|c: char| c.is_whitespace() || c.is_control()) && path.len() <= 1024;
-    (named && whole).then(|| Endpoint {
-        host: host.to_owned(),
-        port,
-        path: path.to_owned(),
-    })
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -426,35 +381,6 @@ mod tests {
             "١s",
         ] {
             assert_eq!(parse_duration(text), None, "{text}");
-        }
-    }
-
-    #[test]
-    fn an_endpoint_prints_as_it_was_read() {
-        for text in [
-            "opc.tcp://127.0.0.1:4840",
-            "opc.tcp://plant-7.local:1/ua/x",
-            "opc.tcp://[::1]:4841",
-        ] {
-            assert_eq!(parse_endpoint(text).unwrap().to_string(), text);
-        }
-        assert_eq!(parse_endpoint("opc.tcp://gateway").unwrap().port, 4840);
-        for text in [
-            "",
-            "127.0.0.1:4840",
-            "http://a:1",
-            "opc.tcp://",
-            "opc.tcp://:4840",
-            "opc.tcp://a:0",
-            "opc.tcp://a:x",
-            "opc.tcp://a:65536",
-            "opc.tcp://[::1",
-            "opc.tcp://[x]:1",
-            "opc.tcp://a b:1",
-            "opc.tcp://a:1/ x",
-            "opc.tcp://a:+1",
-        ] {
-            assert_eq!(parse_endpoint(text), None, "{text}");
         }
     }
 }

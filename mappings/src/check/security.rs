@@ -4,16 +4,17 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::time::Duration;
 
-use super::network::{duration, parse_endpoint};
+use super::network::duration;
 use super::required;
 use crate::call::Call;
 use crate::code::Code;
 use crate::document::{
     Document, GroupEntry, GroupModeEntry, GroupPolicyEntry, KeysEntry, ReplayEntry, SksEntry,
 };
+use crate::endpoint::Endpoint;
 use crate::findings::Findings;
 use crate::key_text::is_key;
-use crate::mapping::{Endpoint, Mapping, SecurityPolicy};
+use crate::mapping::{Mapping, SecurityPolicy};
 use crate::read::{At, given, short};
 use crate::security::{GroupMode, GroupPolicy, KeySource, Replay, SecurityGroup, Served};
 use crate::tree::Place;
@@ -245,7 +246,7 @@ fn service(
     let Some((text, at)) = given(&entry.endpoint) else {
         return entry.endpoint.is_none().then(own);
     };
-    let Some(endpoint) = parse_endpoint(text) else {
+    let Some(endpoint) = Endpoint::parse(text) else {
         let message = format!("`{}` is no endpoint", short(text));
         findings
             .error(Code::Endpoint, at, message)

@@ -29,6 +29,8 @@ pub struct Foreign {
     pub namespace: u16,
     /// Whether its skills are run for other hosts too.
     pub open: bool,
+    /// Whether nobody named it: one that was found may speak for itself in the space, and is left alone then.
+    pub is_found: bool,
     /// Where it is, for people.
     pub endpoint: String,
     /// The session with it.
@@ -43,6 +45,7 @@ impl Foreign {
                 one.namespace,
                 one.open,
                 one.endpoint.clone(),
+                one.is_found,
             )
         };
         of(self) == of(other)
@@ -70,6 +73,8 @@ struct Server {
     mirrors: Option<Mirrors>,
     skills: BTreeMap<u16, Shown>,
     faults: ForeignFaults,
+    /// Whether it was found, and is in the space by itself.
+    speaks: bool,
 }
 
 /// A skill as it is in the space.
@@ -129,7 +134,11 @@ impl ForeignSkills {
             .map(|(_, server)| server)
             .collect();
         for mut server in gone {
-            withdraw(&mut server, &mut self.first, "the mapping has it no longer");
+            let why = match server.of.is_found {
+                true => "the server is there no longer",
+                false => "the mapping has it no longer",
+            };
+            withdraw(&mut server, &mut self.first, why);
         }
         for of in servers {
             if self.servers.contains_key(&of.name) {
@@ -144,6 +153,7 @@ impl ForeignSkills {
                     mirrors: None,
                     skills: BTreeMap::new(),
                     faults: BTreeMap::new(),
+                    speaks: false,
                 },
             );
         }
@@ -248,6 +258,12 @@ impl ForeignSkills {
         servers.map(|(name, server)| (name.as_str(), &server.faults))
     }
 
+    /// The names of those that were found and are in the space by themselves: nobody has to speak for them.
+    pub fn speaking(&self) -> impl Iterator<Item = &str> {
+        let servers = self.servers.iter().filter(|(_, server)| server.speaks);
+        servers.map(|(name, _)| name.as_str())
+    }
+
     fn take(&mut self, news: News) {
         let Some(server) = self.servers.get_mut(&news.name) else {
             return;
@@ -256,6 +272,18 @@ impl ForeignSkills {
             Change::Gone(why) => withdraw(server, &mut self.first, &why),
             Change::Found(found) => {
                 withdraw(server, &mut self.first, "it has other skills now");
+                // A component says its number of itself.
+                let has_number = found.found().any(|of| of.namespace.is_some());
+                server.speaks = server.of.is_found && has_number;
+                if server.speaks {
+                    let of = &server.of;
+                    info!(
+                        server = of.name,
+                        url = of.endpoint,
+                        "it is in the space by itself"
+                    );
+                    return;
+                }
                 show(
                     server,
                     &found,

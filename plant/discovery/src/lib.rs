@@ -39,6 +39,8 @@ pub use chosen::{Marks, find_lds};
 pub use interface::Interface;
 pub use mdns::MdnsFault;
 pub use presence::be_there;
+/// How it is known that a server is gone.
+pub use registry::Loss;
 pub use watch::{Found, Known, WatchSettings, Watcher, watch};
 
 /// Where the Local Discovery Server of a host is (OPC 10000-12, 4.2.2).

@@ -5,7 +5,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use mappings::{Access, ExecutedBy, Mapping, SecurityPolicy};
-use plant_opcua::client::{Client, ClientConfig, ClientUser, SecurityChoice};
+use plant_opcua::client::{Client, ClientConfig, ClientUser, Link, SecurityChoice};
 
 /// The clients of other servers.
 pub(crate) struct Clients {
@@ -51,8 +51,18 @@ impl Clients {
         client
     }
 
-    /// Lets go of the sessions that the mapping has no use for.
-    pub(crate) fn keep(&mut self, mapping: &Mapping) {
+    /// How the connection to a server is, where there is a client for it.
+    pub(crate) fn link(&self, access: &Access) -> Option<Link> {
+        let open = self.open.get(access);
+        open.map(|client| client.link().borrow().clone())
+    }
+
+    /// Lets go of the sessions that nobody has a use for: neither the mapping nor these.
+    pub(crate) fn keep<'s>(
+        &mut self,
+        mapping: &'s Mapping,
+        found: impl Iterator<Item = &'s Access>,
+    ) {
         let servers = mapping.servers().iter().map(|server| &server.access);
         let methods = mapping
             .calls()
@@ -61,7 +71,7 @@ impl Clients {
                 ExecutedBy::OpcUa(target) => Some(&target.access),
                 ExecutedBy::Ros(_) | ExecutedBy::Elsewhere => None,
             });
-        let wanted: HashSet<&Access> = servers.chain(methods).collect();
+        let wanted: HashSet<&Access> = servers.chain(methods).chain(found).collect();
         self.open.retain(|access, _| wanted.contains(access));
     }
 }

@@ -21,6 +21,14 @@ use crate::address;
 use crate::nodes::SpaceManager;
 use crate::presence::Presence;
 
+/// What comes next.
+pub(crate) enum Happened {
+    /// What is to be reported of a server.
+    Told(PortEvent),
+    /// What was heard of one, and is shown by now.
+    Heard(Found),
+}
+
 /// Shows each server that a watcher tells of, and those that have gone for some time after.
 pub(crate) struct Components {
     watcher: Watcher,
@@ -55,17 +63,17 @@ impl Components {
         }
     }
 
-    /// Waits for the next thing to happen, shows it, and gives what is to be reported of it. Whoever drops it before loses
-    /// nothing.
-    pub(crate) async fn next(&mut self) -> PortEvent {
-        loop {
-            if let Some(event) = self.presence.event() {
-                return event;
+    /// Waits for the next thing to happen, and shows it. Whoever drops it before loses nothing.
+    pub(crate) async fn next(&mut self) -> Happened {
+        if let Some(event) = self.presence.event() {
+            return Happened::Told(event);
+        }
+        match self.watcher.next().await {
+            Some(found) => {
+                self.show(&found);
+                Happened::Heard(found)
             }
-            match self.watcher.next().await {
-                Some(found) => self.show(&found),
-                None => std::future::pending().await,
-            }
+            None => std::future::pending().await,
         }
     }
 

@@ -9,7 +9,7 @@
 //! (in which order), `budget` (what clients may take up), `space` (values in), `components` and `presence` (which servers are
 //! there), `methods` and `argument_types` (calls of the space as Methods), `programs` (actions as Programs), `asking` (how
 //! clients ask for both), `executing` (Methods of other servers as calls), `sources` (their nodes as values), `clients` (the
-//! sessions for both), `others` (all of these), `port` (the shell's side), `endpoint` (how clients get in), `access` (what each
+//! sessions for both), `finding` (those with skills that discovery finds), `others` (all of these), `port` (the shell's side), `endpoint` (how clients get in), `access` (what each
 //! may do), `auditing` (what is told of it), `sks` (keys of secured groups), `pubsub` (the PubSub configuration as nodes),
 //! `value` (between the two codecs), `verbs` (certificates and users by hand), `restart` (in its own place, for another
 //! certificate).
@@ -25,6 +25,7 @@ mod clients;
 mod components;
 mod endpoint;
 mod executing;
+mod finding;
 mod history;
 mod layout;
 mod methods;
@@ -51,7 +52,7 @@ use std::sync::{Arc, OnceLock};
 
 use bridge_node::{Arguments, Context, Failure, FailureKind, KeyService, Owned, Program};
 use discovery::{AnnounceSettings, Interface};
-use mappings::{Mapping, SpaceId};
+use mappings::{FindSkills, Mapping, SpaceId};
 use plant_opcua::endpoint::EndpointUrl;
 use plant_opcua::pki::{self, Pki};
 
@@ -141,10 +142,13 @@ impl Program for UaServer {
         &self.arguments
     }
 
-    /// Those of the mapping and the server's own: in all others of space 0 components publish.
+    /// Those of the mapping, of servers that are found, and the server's own: in all others of space 0 components publish.
     fn owned(mapping: &Mapping) -> Owned {
         let own = std::iter::once(presence::NAMESPACE);
-        Owned::Only(mapping.namespaces().keys().copied().chain(own).collect())
+        let found = mapping.server().find_skills.as_ref();
+        let found = found.into_iter().flat_map(FindSkills::namespaces);
+        let mapped = mapping.namespaces().keys().copied();
+        Owned::Only(mapped.chain(own).chain(found).collect())
     }
 
     fn spaces(&self, _mapping: &Mapping) -> Result<Vec<SpaceId>, Failure> {

@@ -2,13 +2,18 @@
 //! components.
 
 use std::path::Path;
+use std::sync::Arc;
 
 use bridge_node::LinkState;
+use discovery::{AnnounceSettings, Found};
 use mappings::{Mapping, TopicId};
+use plant_opcua::client::Link;
+use tracing::warn;
 use ua_component::{Foreign, ForeignSkills};
 
 use crate::clients::Clients;
 use crate::executing::Executing;
+use crate::finding::{Finding, Placed};
 use crate::sources::Sources;
 
 /// The other servers.
@@ -16,51 +21,110 @@ pub(crate) struct Others {
     pub(crate) executing: Executing,
     pub(crate) sources: Sources,
     pub(crate) skills: ForeignSkills,
+    pub(crate) finding: Finding,
+    placed: Vec<Placed>,
     clients: Clients,
+    mapping: Arc<Mapping>,
 }
 
 impl Others {
-    /// Those of `mapping`, for a client with that ApplicationUri and the certificates in `pki`.
-    pub(crate) fn new(mapping: &Mapping, application_uri: &str, pki: &Path) -> Self {
-        let mut clients = Clients::new(application_uri, pki);
+    /// Those of `mapping`, with the certificates in `pki`; others are heard of where this one is told of.
+    pub(crate) fn new(mapping: &Arc<Mapping>, told: Option<&AnnounceSettings>, pki: &Path) -> Self {
+        let mut clients = Clients::new(&mapping.server().application_uri, pki);
+        let lds = told.and_then(|told| told.lds.as_deref());
         let mut others = Self {
             executing: Executing::new(mapping, &mut clients),
             sources: Sources::new(mapping, &mut clients),
             skills: ForeignSkills::default(),
+            finding: Finding::new(mapping, lds),
+            placed: Vec::new(),
             clients,
+            mapping: Arc::clone(mapping),
         };
-        others.follow(mapping);
+        if mapping.server().find_skills.is_some() && told.is_none() {
+            warn!(
+                "no server is found for server.find_skills: ua-server hears of none without --announce or --lds"
+            );
+        }
+        others.follow();
         others
     }
 
     /// Goes over to those of another mapping. Gives the topics whose source is new or another.
-    pub(crate) fn reload(&mut self, mapping: &Mapping) -> Vec<TopicId> {
+    pub(crate) fn reload(&mut self, mapping: &Arc<Mapping>) -> Vec<TopicId> {
+        self.mapping = Arc::clone(mapping);
         self.executing.reload(mapping, &mut self.clients);
         let new = self.sources.reload(mapping, &mut self.clients);
-        self.follow(mapping);
-        self.clients.keep(mapping);
+        self.finding.reload(mapping);
+        self.look();
+        self.follow();
         new
     }
 
-    /// Speaks for the skills of the servers that the mapping gives a place in the space.
-    fn follow(&mut self, mapping: &Mapping) {
-        let with_skills = mapping.servers().iter().filter_map(|server| {
+    /// Something has happened to a server on the network.
+    pub(crate) fn heard(&mut self, found: &Found) {
+        self.finding.heard(found);
+        self.found();
+    }
+
+    /// Speaks for servers that are found, and no longer for those that are gone.
+    pub(crate) fn found(&mut self) {
+        if self.look() {
+            self.follow();
+        }
+    }
+
+    /// Whether other servers have a place now.
+    fn look(&mut self) -> bool {
+        for name in self.skills.speaking() {
+            let mut placed = self.placed.iter();
+            if let Some(placed) = placed.find(|placed| placed.name == name) {
+                self.finding.leave_alone(&placed.access);
+            }
+        }
+        let clients = &self.clients;
+        let is_up = |access: &_| matches!(clients.link(access), Some(Link::Up { .. }));
+        let found = self.finding.look(is_up);
+        let is_new = found != self.placed;
+        if is_new {
+            self.placed = found.to_vec();
+        }
+        is_new
+    }
+
+    /// Speaks for the skills of the servers that the mapping gives a place in the space, and for those that are found.
+    fn follow(&mut self) {
+        let clients = &mut self.clients;
+        let named = self.mapping.servers().iter().filter_map(|server| {
             let place = server.skills?;
             Some(Foreign {
                 name: server.name.clone(),
                 namespace: place.namespace,
                 open: place.open,
+                is_found: false,
                 endpoint: server.access.endpoint.to_string(),
-                client: self.clients.of(&server.access),
+                client: clients.of(&server.access),
             })
         });
-        let with_skills = with_skills.collect();
-        self.skills.follow(with_skills);
+        let mut all: Vec<Foreign> = named.collect();
+        let found = self.placed.iter().map(|placed| Foreign {
+            name: placed.name.clone(),
+            namespace: placed.namespace,
+            open: placed.open,
+            is_found: true,
+            endpoint: placed.access.endpoint.to_string(),
+            client: clients.of(&placed.access),
+        });
+        all.extend(found);
+        self.skills.follow(all);
+        let found = self.placed.iter().map(|placed| &placed.access);
+        self.clients.keep(&self.mapping, found);
     }
 
     /// What there is to tell of each server.
     pub(crate) fn links(&self) -> Vec<LinkState> {
         let mut links = self.sources.links();
+        links.extend(self.placed.iter().map(|placed| self.link(placed)));
         for (name, faults) in self.skills.faults() {
             if let Some(link) = links.iter_mut().find(|link| link.name == name) {
                 let faults = faults.iter().map(|(of, why)| (of.clone(), why.clone()));
@@ -68,5 +132,28 @@ impl Others {
             }
         }
         links
+    }
+
+    fn link(&self, placed: &Placed) -> LinkState {
+        let told = LinkState {
+            name: placed.name.clone(),
+            url: placed.access.endpoint.to_string(),
+            ..LinkState::default()
+        };
+        match self.clients.link(&placed.access) {
+            Some(Link::Up {
+                connects, secured, ..
+            }) => LinkState {
+                up: true,
+                secured,
+                connects,
+                ..told
+            },
+            Some(Link::Down { reason }) => LinkState {
+                why: Some(reason),
+                ..told
+            },
+            Some(Link::Connecting | Link::Closed) | None => told,
+        }
     }
 }

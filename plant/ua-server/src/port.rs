@@ -35,7 +35,7 @@ use crate::access;
 use crate::asking::{Heard, Questions};
 use crate::auditing;
 use crate::browse::Ordered;
-use crate::components::Components;
+use crate::components::{Components, Happened};
 use crate::endpoint;
 use crate::history;
 use crate::layout::Layout;
@@ -159,7 +159,7 @@ impl ServerPort {
         let nodes = (Arc::clone(&manager), Arc::clone(&subscriptions));
         look_at_created(&runtime, nodes.clone(), created_items);
         tell_serving(&layout, &setup.pki, (&setup.url, port));
-        let others = Others::new(mapping, &described.application_uri, setup.pki.root());
+        let others = Others::new(mapping, setup.announce.as_ref(), setup.pki.root());
         let methods = Methods::new(nodes.clone(), mapping, (asked, &layout.structures));
         let (server, application) = told_of(described, setup.url.advertised(port), &security);
         let (told, components) = tell(server, setup.announce, nodes)?;
@@ -241,7 +241,11 @@ impl Port for ServerPort {
                 event = self.others.skills.next() => return event,
                 sourced = self.others.sources.next() => return self.sourced(sourced),
                 () = self.pubsub.called() => self.switch(),
-                event = next(&mut self.components) => return event,
+                happened = next(&mut self.components) => match happened {
+                    Happened::Told(event) => return event,
+                    Happened::Heard(found) => self.others.heard(&found),
+                },
+                () = self.others.finding.changed() => self.others.found(),
                 () = at(self.space.due()) => self.space.grow_old(),
                 () = self.certificates.applied() => restart::ask(),
                 _ = self.look.tick() => {
@@ -592,7 +596,7 @@ async fn at(time: Option<Instant>) {
 }
 
 /// What happens next to the servers that are there.
-async fn next(components: &mut Option<Components>) -> PortEvent {
+async fn next(components: &mut Option<Components>) -> Happened {
     match components {
         Some(components) => components.next().await,
         None => std::future::pending().await,

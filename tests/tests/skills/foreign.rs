@@ -39,8 +39,12 @@ fn objects(lines: &[String]) -> Vec<Value> {
 
 /// The skills that are listed, when there are so many whose state and calls are known.
 fn listed(count: usize) -> Vec<Value> {
+    listed_of("press", count)
+}
+
+fn listed_of(machine: &str, count: usize) -> Vec<Value> {
     eventually("the skills of the machine are listed", SOON, || {
-        let (_, lines) = ua_space(&["skills", "press", "--seconds", "1.5", "--json"]);
+        let (_, lines) = ua_space(&["skills", machine, "--seconds", "1.5", "--json"]);
         let all = objects(&lines).pop()?.as_array()?.clone();
         let whole = |skill: &&Value| {
             skill["state"].is_string() && skill["calls"].as_object().unwrap().len() == 5
@@ -258,4 +262,144 @@ fn a_client_of_rclpy_runs_and_cancels_the_program_of_a_machine_as_an_action() {
         (line.get("halted")? == "Stamp").then_some(())
     });
     assert_eq!(line(&mut client, "result", 1, "status"), "CANCELED");
+}
+
+const LDS: &str = "opc.tcp://127.0.0.1:4840";
+
+/// ua-lds, when it answers.
+fn discovery_server(cell: &Cell) -> Child {
+    let args = ["--interface", "lo", "--endpoint", LDS];
+    let child = Started::new("ua-lds", &program("ua-lds"))
+        .args(args)
+        .start();
+    eventually("ua-lds answers", SOON, || {
+        cell.asyncua_try("opcua_discovery.py", &["find-servers", LDS])
+    });
+    child
+}
+
+/// Registers a machine as asyncua does, which renews nothing.
+fn register(cell: &Cell, machine: &str, uri: &str, more: &[&str]) {
+    let args = [
+        "register", LDS, "--url", machine, "--uri", uri, "--name", "machine",
+    ];
+    let said = cell.asyncua_once("opcua_discovery.py", &[&args, more].concat());
+    assert_eq!(said[0]["status"], "Good", "{said:?}");
+}
+
+/// The servers that ua-server has sessions with: each with its name, and whether it is there.
+fn servers() -> Vec<(String, bool)> {
+    let status = metrics(METRICS_SERVER).unwrap();
+    let servers = status["servers"].as_array().cloned().unwrap_or_default();
+    let server = |server: &Value| Some((server["name"].as_str()?.to_owned(), server["up"] == true));
+    servers.iter().filter_map(server).collect()
+}
+
+#[test]
+fn a_machine_that_is_announced_is_in_the_space_without_being_named_until_it_is_gone() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let mapping = cell.file(
+        "found.yaml",
+        "
+namespaces: {42: 'urn:ua-bridge:system-tests:machine'}
+server:
+  endpoint: opc.tcp://127.0.0.1:4858
+  find_skills: {uris: ['urn:ua-bridge:system-tests:*'], first: 40, most: 4, security: None}
+",
+    );
+    let _lds = discovery_server(&cell);
+    let other = "opc.tcp://127.0.0.1:4859";
+    let other = cell.asyncua_started("opcua_programs.py", &[other, "--uri", "urn:elsewhere:saw"]);
+    let _other = other.start().ready(SOON);
+    register(
+        &cell,
+        "opc.tcp://127.0.0.1:4859",
+        "urn:elsewhere:saw",
+        &["--mdns", "saw"],
+    );
+    let first = machine(&cell, &[]);
+    let _server = cell.ua_server(&[mapping.to_str().unwrap(), "--announce"]);
+    let uri = "urn:ua-bridge:system-tests:machine";
+    register(&cell, MACHINE, uri, &["--mdns", "press on the left"]);
+
+    let topics = |skills: &[Value]| -> Vec<String> {
+        let topics = skills.iter().filter_map(|skill| skill["topic"].as_str());
+        topics.map(str::to_owned).collect()
+    };
+    let skills = listed_of("machine", 4);
+    let numbers = ["ua_0_42_101", "ua_0_42_201", "ua_0_42_301", "ua_0_42_401"];
+    assert_eq!(topics(&skills), numbers);
+    let (code, states, result) = run(&["machine.Stamp", "Force=33.5"]);
+    assert_eq!((code, &result["succeeded"]), (0, &json!(true)), "{result}");
+    assert_eq!(states, ["Running", "Ready"]);
+    assert_eq!(servers(), [("machine".to_owned(), true)]);
+
+    drop(first);
+    eventually("the machine is not known any more", SOON, || {
+        servers().is_empty().then_some(())
+    });
+    let (_, lines) = ua_space(&["skills", "machine", "--seconds", "1.5", "--json"]);
+    let left = objects(&lines).pop().unwrap_or_else(|| json!([]));
+    let callable = |skill: &Value| {
+        skill["calls"]
+            .as_object()
+            .is_some_and(|calls| !calls.is_empty())
+    };
+    assert!(!left.as_array().unwrap().iter().any(callable), "{left}");
+
+    // It is back where it was.
+    let _second = machine(&cell, &[]);
+    register(&cell, MACHINE, uri, &["--mdns", "press on the left"]);
+    assert_eq!(topics(&listed_of("machine", 4)), numbers);
+}
+
+#[test]
+fn of_machines_that_a_discovery_server_lists_so_many_are_in_the_space_as_have_a_place() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let mapping = cell.file(
+        "one.yaml",
+        "
+server:
+  endpoint: opc.tcp://127.0.0.1:4858
+  find_skills: {uris: ['urn:ua-bridge:system-tests:*'], first: 40, most: 1, security: None}
+",
+    );
+    let _lds = discovery_server(&cell);
+    // Nothing is announced here: the list of the discovery server has to be read.
+    let lds = ["--lds", LDS];
+    let server = cell.ua_server(&[&[mapping.to_str().unwrap()], &lds[..]].concat());
+    let says = |words: [&str; 2]| {
+        eventually(&format!("it says {words:?}"), SOON, || {
+            let lines = server.lines();
+            let mut lines = lines.iter();
+            let says = lines.any(|line| words.iter().all(|word| line.contains(word)));
+            says.then_some(())
+        });
+    };
+    // A component that has a number takes nobody's place.
+    let component = cell.file("bench.yaml", super::COMPONENT);
+    let _component = super::component(&component);
+    let uri = "urn:ua-bridge:system-tests:component";
+    register(&cell, super::ENDPOINT, uri, &["--old"]);
+    says(["in the space by itself", "component"]);
+    let uris = ["machine", "saw"].map(|name| format!("urn:ua-bridge:system-tests:{name}"));
+    let urls = [MACHINE, "opc.tcp://127.0.0.1:4859"];
+    let first = machine(&cell, &[]);
+    register(&cell, urls[0], &uris[0], &["--old"]);
+    listed_of("machine", 4);
+    let second = [urls[1], "--uri", &uris[1]];
+    let second = cell.asyncua_started("opcua_programs.py", &second);
+    let _second = second.start().ready(SOON);
+    register(&cell, urls[1], &uris[1], &["--old"]);
+    says(["no place", &uris[1]]);
+    assert_eq!(servers(), [("machine".to_owned(), true)]);
+
+    drop(first);
+    let skills = listed_of("saw", 4);
+    assert_eq!(skills[0]["topic"], "ua_0_40_101", "{skills:?}");
+    assert_eq!(servers(), [("saw".to_owned(), true)]);
 }

@@ -1,0 +1,129 @@
+//! `server.find_skills`: the servers with skills that discovery finds.
+
+use super::cell::is_uri;
+use super::network::{policy, within};
+use super::required;
+use super::servers::Servers;
+use crate::call::Call;
+use crate::code::Code;
+use crate::document::ServerEntry;
+use crate::findings::Findings;
+use crate::mapping::Variable;
+use crate::read::{At, given, short};
+use crate::remote::FindSkills;
+use crate::topic::SpaceId;
+use crate::tree::Place;
+
+/// Which servers with skills the cell's server speaks for when they are found. `None` when it is faulty, which is noted.
+pub(super) fn check(of: Option<&At<ServerEntry>>, findings: &mut Findings) -> Option<FindSkills> {
+    const OF: &str = "`find_skills`";
+    let server = of?.value.as_ref()?;
+    let (entry, owner) = given(&server.find_skills)?;
+    let uris = required(&entry.uris, "uris", OF, owner, findings)
+        .and_then(|(uris, place)| application_uris(uris, place, findings));
+    let first = required(&entry.first, "first", OF, owner, findings).map(|(first, _)| *first);
+    let most = match &entry.most {
+        None => Some(FindSkills::MOST),
+        Some(_) => within(&entry.most, 1..=FindSkills::LIMIT, "servers", findings),
+    };
+    let (uris, first, most) = (uris?, first?, most?);
+    if first < 2 || first.checked_add(most - 1).is_none() {
+        let message = format!("{most} servers from namespace {first} on");
+        findings
+            .error(Code::Servers, owner, message)
+            .help("each has a namespace of its own, from `first` on, and these are 2 to 65535");
+        return None;
+    }
+    Some(FindSkills {
+        uris,
+        first,
+        most,
+        security: given(&entry.security).map(|(entry, _)| policy(*entry)),
+        open: given(&entry.open).is_some_and(|(open, _)| *open),
+    })
+}
+
+/// ApplicationUris, or how they begin. `None` when one is faulty, which is noted.
+fn application_uris(
+    entries: &[At<String>],
+    place: Place,
+    findings: &mut Findings,
+) -> Option<Vec<String>> {
+    if entries.is_empty() || entries.len() > MOST_URIS {
+        let message = format!(
+            "{} ApplicationUris; 1 to {MOST_URIS} are read",
+            entries.len()
+        );
+        findings
+            .error(Code::Servers, place, message)
+            .help("uris: [\"urn:vendor:*\"]");
+        return None;
+    }
+    let mut uris = Vec::new();
+    for entry in entries {
+        let text = entry.value.as_ref()?;
+        let begins = text.strip_suffix('*').unwrap_or(text);
+        let is_pattern = begins.len() < text.len();
+        if begins.contains('*') || !(is_pattern || is_uri(begins)) || begins.contains(' ') {
+            let message = format!(
+                "`{}` is no ApplicationUri, and no beginning of one",
+                short(text)
+            );
+            findings
+                .error(Code::Servers, entry.place, message)
+                .help("urn:vendor:press, or urn:vendor:* for all that begin so");
+            return None;
+        }
+        uris.push(text.clone());
+    }
+    Some(uris)
+}
+
+/// Nothing else may be in the namespaces of servers that are found.
+pub(super) fn alone(
+    (entry, found): (Option<&At<ServerEntry>>, Option<&FindSkills>),
+    servers: &Servers,
+    (variables, calls): (&[Variable], &[Call]),
+    findings: &mut Findings,
+) {
+    let entry = entry.and_then(|at| at.value.as_ref());
+    let place = entry.and_then(|entry| given(&entry.find_skills));
+    let (Some(found), Some((_, place))) = (found, place) else {
+        return;
+    };
+    let namespaces = found.namespaces();
+    let named = servers.known.iter().filter_map(|server| {
+        let skills = server.skills?;
+        Some((
+            skills.namespace,
+            format!("is that of the skills of `{}`", short(&server.name)),
+        ))
+    });
+    let topics = variables
+        .iter()
+        .map(|variable| (variable.topic, &variable.name))
+        .chain(calls.iter().map(|call| (call.topic, &call.name)));
+    let topics = topics
+        .filter(|(topic, _)| topic.space == SpaceId::UA)
+        .map(|(topic, name)| {
+            (
+                topic.namespace.get(),
+                format!("has `{}` ({topic})", short(name)),
+            )
+        });
+    let other = named
+        .chain(topics)
+        .find(|(namespace, _)| namespaces.contains(namespace));
+    if let Some((namespace, what)) = other {
+        let (first, last) = (namespaces.start(), namespaces.end());
+        let message = format!(
+            "namespaces {first} to {last} are those of servers that are found, and {namespace} {what}"
+        );
+        findings
+            .error(Code::Servers, place, message)
+            .help("let `first` begin where nothing else is, or let `most` be less");
+    }
+}
+
+/// Most entries of `uris`.
+const MOST_URIS: usize = 64;

@@ -1,0 +1,530 @@
+//! Servers with skills that are found by discovery: who is heard of, by mDNS and in the lists of discovery servers, and which
+//! of them have a place in the space.
+//!
+//! What is heard is a claim of whoever is on the network: each server is asked itself who it is before it has a place.
+
+mod places;
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::time::Duration;
+
+use discovery::{Found, client};
+use mappings::{Access, Endpoint, FindSkills, Mapping};
+use tokio::task::JoinSet;
+use tokio::time::{Interval, MissedTickBehavior, interval};
+use tracing::{debug, info, warn};
+
+use self::places::{Places, Room};
+use crate::endpoint::PRODUCT_URI;
+
+/// A server that has a place.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Placed {
+    pub(crate) name: String,
+    pub(crate) namespace: u16,
+    pub(crate) open: bool,
+    pub(crate) access: Access,
+}
+
+/// Who is heard of.
+pub(crate) struct Finding {
+    wanted: Option<FindSkills>,
+    room: Room,
+    /// Those of `servers` in the mapping, which have no place twice.
+    named: Vec<Endpoint>,
+    own_uri: String,
+    heard: BTreeMap<String, Heard>,
+    /// Components with a number of their own in the space, by the names they are announced under.
+    speaking: BTreeMap<String, String>,
+    /// Discovery servers whose lists are read, by who told of them.
+    lists: BTreeMap<Source, String>,
+    asking: JoinSet<Answer>,
+    look: Interval,
+    /// Whether those that do not answer any more are to be asked again.
+    is_time: bool,
+    places: Places,
+    placed: Vec<Placed>,
+    /// Those that there was no room for, which is told once.
+    crowded: BTreeSet<String>,
+}
+
+/// A server that is heard of, by its URL.
+#[derive(Debug, Default)]
+struct Heard {
+    by: BTreeSet<Source>,
+    /// What others say its ApplicationUri is.
+    hint: Option<String>,
+    /// What it says itself.
+    says: Option<Says>,
+    /// Whether it is to be asked, again where something has happened to it.
+    due: bool,
+    is_asked: bool,
+    /// Whether there is no connection where there should be one.
+    is_missed: bool,
+    /// Whether it was seen to be in the space by itself.
+    is_left_alone: bool,
+}
+
+/// Who tells of a server.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+enum Source {
+    /// It is announced, under this name.
+    Network(String),
+    /// The discovery server at this URL lists it.
+    List(String),
+    /// The command line names it.
+    Named,
+}
+
+/// What a server says of itself.
+#[derive(Debug, Clone, PartialEq, Eq)]
+struct Says {
+    application_uri: String,
+    product_uri: String,
+}
+
+enum Answer {
+    /// Of a server, by its URL; `None` where there is none in time.
+    Is(String, Option<Says>),
+    /// The servers that a discovery server lists, each with its ApplicationUri.
+    Lists(String, Vec<(String, String)>),
+}
+
+impl Finding {
+    /// As the mapping says; with the discovery server that the command line names, if it does.
+    pub(crate) fn new(mapping: &Mapping, lds: Option<&str>) -> Self {
+        let mut look = interval(LOOK_AGAIN);
+        look.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        let lds = lds.filter(|lds| Endpoint::parse(lds).is_some());
+        let mut finding = Self {
+            wanted: None,
+            room: Room::default(),
+            named: Vec::new(),
+            own_uri: String::new(),
+            heard: BTreeMap::new(),
+            speaking: BTreeMap::new(),
+            lists: lds
+                .map(|lds| (Source::Named, lds.to_owned()))
+                .into_iter()
+                .collect(),
+            asking: JoinSet::new(),
+            look,
+            is_time: false,
+            places: Places::default(),
+            placed: Vec::new(),
+            crowded: BTreeSet::new(),
+        };
+        finding.reload(mapping);
+        finding
+    }
+
+    /// Goes over to another mapping.
+    pub(crate) fn reload(&mut self, mapping: &Mapping) {
+        let server = mapping.server();
+        self.wanted.clone_from(&server.find_skills);
+        self.own_uri.clone_from(&server.application_uri);
+        let servers = mapping.servers().iter();
+        self.named = servers
+            .clone()
+            .map(|server| server.access.endpoint.clone())
+            .collect();
+        let namespaces = self.wanted.as_ref().map(FindSkills::namespaces);
+        let kept = mapping.namespaces().iter();
+        let kept = kept.filter(|(namespace, _)| {
+            let mut of = namespaces.iter();
+            of.any(|namespaces| namespaces.contains(namespace))
+        });
+        self.room = Room {
+            kept: kept
+                .map(|(namespace, uri)| (*namespace, uri.clone()))
+                .collect(),
+            named: servers.map(|server| server.name.clone()).collect(),
+            namespaces,
+        };
+        self.crowded.clear();
+    }
+
+    /// Something has happened to a server on the network.
+    pub(crate) fn heard(&mut self, found: &Found) {
+        let known = found.known();
+        let source = Source::Network(known.name.clone());
+        let (is_there, is_new) = match found {
+            Found::Seen(_) => (true, false),
+            Found::Restarted(_) => (true, true),
+            Found::Gone { .. } => (false, false),
+        };
+        self.lists.remove(&source);
+        self.speaking.remove(&known.name);
+        if is_there && known.is_lds() {
+            self.lists.insert(source, known.url.clone());
+            return;
+        }
+        let url = url(&known.url).filter(|_| is_there && known.number.is_none());
+        if let (Some(_), Some(uri)) = (known.number, &known.application_uri)
+            && is_there
+        {
+            self.speaking.insert(known.name.clone(), uri.clone());
+        }
+        for (at, heard) in &mut self.heard {
+            if Some(at) != url.as_ref() {
+                heard.by.remove(&source);
+            }
+        }
+        if let Some(url) = url {
+            self.tell(url, source, known.application_uri.as_deref(), is_new);
+        }
+    }
+
+    fn tell(&mut self, url: String, by: Source, hint: Option<&str>, is_new: bool) {
+        let is_known = self.heard.contains_key(&url);
+        if !is_known && self.heard.len() >= MOST_HEARD {
+            debug!(url, "more servers are heard of than are looked at");
+            return;
+        }
+        let heard = self.heard.entry(url).or_default();
+        if is_new || heard.by.is_empty() {
+            heard.due = true;
+            heard.is_left_alone = false;
+        }
+        heard.by.insert(by);
+        if let Some(hint) = hint {
+            heard.hint = Some(hint.to_owned());
+        }
+    }
+
+    /// A server is in the space by itself: it has no place here until it is another run of its program.
+    pub(crate) fn leave_alone(&mut self, access: &Access) {
+        if let Some(heard) = self.heard.get_mut(&access.endpoint.to_string()) {
+            heard.is_left_alone = true;
+        }
+    }
+
+    /// Waits until who has a place may be another. Cancel-safe; pends where nobody is looked for.
+    pub(crate) async fn changed(&mut self) {
+        if self.wanted.is_none() {
+            return std::future::pending().await;
+        }
+        self.ask();
+        tokio::select! {
+            Some(answer) = self.asking.join_next(), if !self.asking.is_empty() => {
+                // One that was broken off has said nothing, and is asked again.
+                if let Ok(answer) = answer {
+                    self.take(answer);
+                }
+            }
+            _ = self.look.tick() => {
+                self.is_time = true;
+                for heard in self.heard.values_mut() {
+                    heard.due |= heard.says.is_none();
+                }
+                let lists: BTreeSet<String> = self.lists.values().cloned().collect();
+                for lds in lists.into_iter().take(MOST_LISTS) {
+                    self.asking.spawn(listed(lds));
+                }
+            }
+        }
+    }
+
+    /// Asks who is to be asked, some at a time.
+    fn ask(&mut self) {
+        let Some(wanted) = &self.wanted else {
+            return;
+        };
+        let asked = self.heard.values().filter(|heard| heard.is_asked).count();
+        let due = self.heard.iter_mut().filter(|(_, heard)| {
+            let may_be = heard.hint.as_ref().is_none_or(|uri| wanted.wants(uri));
+            heard.due && !heard.is_asked && may_be
+        });
+        for (url, heard) in due.take(MOST_ASKED.saturating_sub(asked)) {
+            (heard.due, heard.is_asked) = (false, true);
+            self.asking.spawn(described(url.clone()));
+        }
+    }
+
+    fn take(&mut self, answer: Answer) {
+        match answer {
+            Answer::Is(url, says) => {
+                if let Some(heard) = self.heard.get_mut(&url) {
+                    heard.is_asked = false;
+                    // A busy one that is connected has not gone.
+                    if says.is_some() || heard.is_missed {
+                        heard.says = says;
+                    }
+                }
+            }
+            Answer::Lists(lds, servers) => {
+                let source = Source::List(lds);
+                let servers = servers
+                    .into_iter()
+                    .filter_map(|(uri, at)| Some((url(&at)?, uri)));
+                let servers: BTreeMap<String, String> = servers.collect();
+                for (url, heard) in &mut self.heard {
+                    if !servers.contains_key(url) {
+                        heard.by.remove(&source);
+                    }
+                }
+                for (url, uri) in servers {
+                    self.tell(url, source.clone(), Some(&uri), false);
+                }
+            }
+        }
+    }
+
+    /// Those that have a place now. A server that nobody tells of any more keeps it as long as `is_up`.
+    pub(crate) fn look(&mut self, is_up: impl Fn(&Access) -> bool) -> &[Placed] {
+        let lists: BTreeSet<&String> = self.lists.values().collect();
+        for heard in self.heard.values_mut() {
+            heard.by.retain(|by| match by {
+                Source::List(lds) => lists.contains(lds),
+                Source::Network(_) | Source::Named => true,
+            });
+        }
+        let is_time = std::mem::take(&mut self.is_time);
+        self.heard.retain(|url, heard| {
+            let mut placed = self.placed.iter();
+            let placed = placed.find(|placed| placed.access.endpoint.to_string() == *url);
+            let is_up = placed.is_some_and(|placed| is_up(&placed.access));
+            if is_time {
+                heard.is_missed = placed.is_some() && !is_up;
+                heard.due |= heard.is_missed;
+            }
+            !heard.by.is_empty() || is_up
+        });
+        let wanted = self.wanted.clone();
+        let now = wanted.map_or_else(Vec::new, |wanted| self.place(&wanted));
+        for placed in now.iter().filter(|one| !self.placed.contains(one)) {
+            info!(
+                server = placed.name,
+                url = %placed.access.endpoint,
+                namespace = placed.namespace,
+                "a server is found, and is asked for its skills"
+            );
+        }
+        for placed in self.placed.iter().filter(|one| !now.contains(one)) {
+            info!(
+                server = placed.name,
+                url = %placed.access.endpoint,
+                "a server that was found is there no longer"
+            );
+        }
+        self.placed = now;
+        &self.placed
+    }
+
+    fn place(&mut self, wanted: &FindSkills) -> Vec<Placed> {
+        let mut at: BTreeMap<String, Access> = BTreeMap::new();
+        for (url, heard) in &self.heard {
+            let says = heard.says.as_ref().filter(|_| !heard.is_left_alone);
+            let Some(says) = says.filter(|says| self.may(says, wanted)) else {
+                continue;
+            };
+            let Some(access) = access(url, wanted) else {
+                continue;
+            };
+            let mut named = self.named.iter();
+            if named.any(|one| one.host == access.endpoint.host && one.port == access.endpoint.port)
+            {
+                continue;
+            }
+            // Of several ways to one the one that is used stays.
+            let mut placed = self.placed.iter();
+            let is_used = placed.any(|placed| placed.access == access);
+            if is_used || !at.contains_key(&says.application_uri) {
+                at.insert(says.application_uri.clone(), access);
+            }
+        }
+        let there: BTreeSet<String> = at.keys().cloned().collect();
+        self.crowded.retain(|uri| there.contains(uri));
+        let mut all = Vec::new();
+        for (uri, access) in at {
+            let Some(place) = self.places.give(&uri, &self.room, &there) else {
+                if self.crowded.insert(uri.clone()) {
+                    warn!(
+                        uri,
+                        url = %access.endpoint,
+                        most = wanted.most,
+                        "a server is found that has no place in the space any more: server.find_skills.most"
+                    );
+                }
+                continue;
+            };
+            all.push(Placed {
+                name: place.name,
+                namespace: place.namespace,
+                open: wanted.open,
+                access,
+            });
+        }
+        all
+    }
+
+    /// Not a server of a cell, whose Programs are what is in the space already; nor one that speaks for itself there.
+    fn may(&self, says: &Says, wanted: &FindSkills) -> bool {
+        let Says {
+            application_uri: uri,
+            product_uri,
+        } = says;
+        let mut speaking = self.speaking.values();
+        wanted.wants(uri)
+            && *uri != self.own_uri
+            && product_uri != PRODUCT_URI
+            && !speaking.any(|speaking| speaking == uri)
+    }
+}
+
+/// As it is told apart: without a path that says nothing.
+fn url(text: &str) -> Option<String> {
+    let mut endpoint = Endpoint::parse(text)?;
+    if endpoint.path == "/" {
+        endpoint.path.clear();
+    }
+    Some(endpoint.to_string())
+}
+
+fn access(url: &str, wanted: &FindSkills) -> Option<Access> {
+    Some(Access {
+        security: wanted.security,
+        ..Access::anonymous(Endpoint::parse(url)?)
+    })
+}
+
+async fn described(url: String) -> Answer {
+    let described = client::describe(&url, ANSWERS_WITHIN).await;
+    let says = described.ok().map(|described| Says {
+        application_uri: described.application.application_uri,
+        product_uri: described.product_uri,
+    });
+    Answer::Is(url, says)
+}
+
+/// Of a discovery server that does not answer the list is empty.
+async fn listed(lds: String) -> Answer {
+    let listed = client::find_servers(&lds, ANSWERS_WITHIN).await;
+    let listed = listed.unwrap_or_default().into_iter().take(MOST_HEARD);
+    let servers = listed
+        .filter(|server| !server.is_discovery_server)
+        .filter_map(|server| {
+            let mut urls = server.discovery_urls.into_iter();
+            let url = urls.find(|url| Endpoint::parse(url).is_some())?;
+            Some((server.application_uri, url))
+        });
+    let servers = servers.collect();
+    Answer::Lists(lds, servers)
+}
+
+/// How often lists are read, and those asked again that have not said who they are.
+const LOOK_AGAIN: Duration = Duration::from_secs(3);
+/// How long who is asked may take. A busy one takes seconds.
+const ANSWERS_WITHIN: Duration = Duration::from_secs(3);
+/// So many are looked at.
+const MOST_HEARD: usize = 256;
+/// So many are asked at once.
+const MOST_ASKED: usize = 8;
+/// The lists of so many discovery servers are read.
+const MOST_LISTS: usize = 8;
+
+#[cfg(test)]
+mod tests {
+    use std::time::SystemTime;
+
+    use discovery::{Known, Loss};
+
+    use super::*;
+
+    const MAPPING: &str = "
+namespaces: {41: 'urn:v:oven'}
+server: {find_skills: {uris: ['urn:v:*'], first: 40, most: 4, security: None}}
+servers: [{name: press, endpoint: 'opc.tcp://127.0.0.1:5000'}]
+";
+
+    fn finding() -> Finding {
+        let checked = Mapping::from_yaml(MAPPING, "m.yaml");
+        Finding::new(&checked.mapping.unwrap(), None)
+    }
+
+    fn seen(name: &str, port: u16, number: u16) -> Found {
+        Found::Seen(Known {
+            name: name.to_owned(),
+            url: format!("opc.tcp://127.0.0.1:{port}/"),
+            capabilities: Vec::new(),
+            application_uri: Some(format!("urn:v:{name}")),
+            since: SystemTime::UNIX_EPOCH,
+            started: None,
+            number: std::num::NonZeroU16::new(number),
+        })
+    }
+
+    fn says(finding: &mut Finding, port: u16, uri: &str, product: &str) {
+        let says = Says {
+            application_uri: uri.to_owned(),
+            product_uri: product.to_owned(),
+        };
+        let url = format!("opc.tcp://127.0.0.1:{port}");
+        finding.take(Answer::Is(url, Some(says)));
+    }
+
+    fn placed(finding: &mut Finding, is_up: bool) -> Vec<(String, u16)> {
+        let placed = finding.look(|_| is_up).iter();
+        placed
+            .map(|one| (one.access.endpoint.to_string(), one.namespace))
+            .collect()
+    }
+
+    #[tokio::test]
+    async fn who_has_said_to_be_one_of_those_wanted_has_a_place_until_it_is_gone() {
+        let mut finding = finding();
+        finding.heard(&seen("oven", 5001, 0));
+        assert!(
+            placed(&mut finding, false).is_empty(),
+            "it has said nothing"
+        );
+        says(&mut finding, 5001, "urn:v:oven", "");
+        let oven = vec![("opc.tcp://127.0.0.1:5001".to_owned(), 41)];
+        assert_eq!(placed(&mut finding, false), oven);
+        let gone = Found::Gone {
+            known: seen("oven", 5001, 0).known().clone(),
+            loss: Loss::Goodbye,
+        };
+        finding.heard(&gone);
+        assert_eq!(placed(&mut finding, true), oven, "it still answers");
+        assert!(placed(&mut finding, false).is_empty());
+    }
+
+    #[tokio::test]
+    async fn nobody_has_a_place_who_is_in_the_space_already() {
+        let mut finding = finding();
+        for (name, port, number, uri, product) in [
+            ("press", 5000, 0, "urn:v:press", ""),
+            ("gripper", 5002, 7, "urn:v:gripper", ""),
+            ("cell", 5003, 0, "urn:v:cell", PRODUCT_URI),
+            ("thief", 5004, 0, "urn:w:thief", ""),
+        ] {
+            finding.heard(&seen(name, port, number));
+            says(&mut finding, port, uri, product);
+        }
+        // A discovery server does not know that one of them has a number.
+        finding
+            .lists
+            .insert(Source::Named, "opc.tcp://lds:4840".to_owned());
+        finding.take(Answer::Lists(
+            "opc.tcp://lds:4840".to_owned(),
+            vec![
+                (
+                    "urn:v:gripper".to_owned(),
+                    "opc.tcp://127.0.0.1:5002".to_owned(),
+                ),
+                (
+                    "urn:v:saw".to_owned(),
+                    "opc.tcp://127.0.0.1:5005".to_owned(),
+                ),
+            ],
+        ));
+        says(&mut finding, 5002, "urn:v:gripper", "");
+        says(&mut finding, 5005, "urn:v:saw", "");
+        let all = placed(&mut finding, false);
+        assert_eq!(all.len(), 1, "{all:?}");
+        assert_eq!(all[0].0, "opc.tcp://127.0.0.1:5005");
+        finding.take(Answer::Lists("opc.tcp://lds:4840".to_owned(), Vec::new()));
+        assert!(placed(&mut finding, false).is_empty());
+    }
+}
