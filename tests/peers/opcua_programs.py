@@ -4,7 +4,8 @@ Its object `machine` has
 - Stamp, a Program with a parameter and a result that takes `--seconds` for a run, and fails where Force is above 90;
 - Blink, a Program without parameters whose run is over before its Start answers;
 - Grasp, of the type of an earlier system (https://fortiss.org/UA/Device/ GraspGripperSkillType), whose state has no Id;
-- a second one that is called Stamp, with a parameter of a structure;
+- a second one that is called Stamp, with parameters of structures: a frame, ranges, and one that is no numbers; what it was told
+  of the frame it says as a vector at its end;
 - Odd, a Program that says nobody in what state it is.
 The Start of all of them takes any state, as that of an earlier system does: who calls must look."""
 
@@ -57,7 +58,7 @@ class Program:
             self.state_id = await self.current.add_property(self.id(2), core("Id"), state_id)
         for at, name in enumerate(["Start", "Halt", "Suspend", "Resume", "Reset"]):
             await self.node.add_method(self.id(10 + at), core(name), self.called(name), [], [])
-        self.force = self.parts = None
+        self.force = self.parts = self.target = self.bounds = self.reached = None
         if not parts:
             return
         group = await self.node.add_object(self.id(20), own("ParameterSet"))
@@ -65,10 +66,19 @@ class Program:
         self.force = await group.add_variable(self.id(21), own("Force"), force)
         await self.force.set_writable()
         if structured:
-            frame = ua.NodeId(ua.ObjectIds.ThreeDFrame)
-            await group.add_variable(self.id(22), own("Where"), ua.Variant(None), datatype=frame)
+            of = lambda name: ua.NodeId(getattr(ua.ObjectIds, name))
+            await group.add_variable(self.id(22), own("Where"), ua.Variant(None), datatype=of("EUInformation"))
+            frame = ua.Variant(ua.ThreeDFrame(), ua.VariantType.ExtensionObject)
+            self.target = await group.add_variable(self.id(23), own("Target"), frame, datatype=of("ThreeDFrame"))
+            ranges = ua.Variant([ua.Range(-1.0, 1.0)], ua.VariantType.ExtensionObject)
+            self.bounds = await group.add_variable(self.id(24), own("Bounds"), ranges, datatype=of("Range"))
+            await self.target.set_writable()
+            await self.bounds.set_writable()
         results = await self.node.add_object(self.id(30), core("FinalResultData"))
         self.parts = await results.add_variable(self.id(31), own("Parts"), ua.Variant(0, ua.VariantType.Int32))
+        if structured:
+            vector = ua.Variant(ua.ThreeDVector(), ua.VariantType.ExtensionObject)
+            self.reached = await results.add_variable(self.id(32), own("Reached"), vector, datatype=of("ThreeDVector"))
 
     def called(self, name):
         async def call(_parent):
@@ -85,7 +95,15 @@ class Program:
 
     async def start(self):
         force = await self.force.read_value() if self.force else None
-        lifetime.say(started=self.name, first=self.first, state=self.state, force=force)
+        more = {}
+        if self.target:
+            frame = await self.target.read_value()
+            at, turned = frame.CartesianCoordinates, frame.Orientation
+            more["target"] = [at.X, at.Y, at.Z, turned.A, turned.B, turned.C]
+            more["bounds"] = [[one.Low, one.High] for one in await self.bounds.read_value()]
+            reached = ua.ThreeDVector(at.X, at.Y, at.Z)
+            await self.reached.write_value(ua.Variant(reached, ua.VariantType.ExtensionObject))
+        lifetime.say(started=self.name, first=self.first, state=self.state, force=force, **more)
         await self.go("Running")
         if self.seconds:
             self.run = asyncio.create_task(self.work(force))

@@ -1,12 +1,13 @@
 //! The skills of other components: found by their types, run to their end.
 //!
-//! Reading order: this, `find` (which skills a server has), `handle` (one of them), `mirror` (those of a server as if they were
+//! Reading order: this, `packed` (structures that are numbers), `find` (which skills a server has), `handle` (one of them), `mirror` (those of a server as if they were
 //! executed here), `detector` (those of all servers), `remote` (a composite of several).
 
 mod detector;
 mod find;
 mod handle;
 mod mirror;
+mod packed;
 mod remote;
 
 use std::path::PathBuf;

@@ -70,6 +70,22 @@ fn run(words: &[&str]) -> (i32, Vec<String>, Value) {
     (code, states, result)
 }
 
+/// Of the second Stamp: a frame is the six numbers of a position, ranges are two each.
+fn takes_structures_that_are_numbers(machine: &mut Child) {
+    let target = "Target=0.25,0,0.5,0,1.5,-0.25";
+    let (code, _, result) = run(&["press.Stamp_2", target, "Bounds=-2,2,-3,3"]);
+    assert_eq!((code, &result["succeeded"]), (0, &json!(true)), "{result}");
+    assert_eq!(result["results"]["Reached"], json!([0.25, 0.0, 0.5]));
+    let told = machine.wait_for_json("the machine says where to", SOON, |line| {
+        line.get("target").map(|_| line.clone())
+    });
+    assert_eq!(told["target"], json!([0.25, 0.0, 0.5, 0.0, 1.5, -0.25]));
+    assert_eq!(told["bounds"], json!([[-2.0, 2.0], [-3.0, 3.0]]));
+    let (code, lines) = ua_space(&["skills", "start", "press.Stamp_2", "Target=0.25,0,0.5"]);
+    let told = lines.join(" ");
+    assert!(code != 0 && told.contains("Target"), "{told}");
+}
+
 #[test]
 fn a_machine_that_knows_programs_only_is_in_the_space_as_a_component_is() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
@@ -139,6 +155,7 @@ fn a_machine_that_knows_programs_only_is_in_the_space_as_a_component_is() {
     });
     let (code, _, result) = run(&["press.Grasp", "Force=5"]);
     assert_eq!((code, &result["succeeded"]), (0, &json!(true)), "{result}");
+    takes_structures_that_are_numbers(&mut machine);
     // One that fails says so.
     let (code, states, result) = run(&["press.Stamp", "Force=99"]);
     assert_eq!((code, &result["succeeded"]), (1, &json!(false)), "{result}");

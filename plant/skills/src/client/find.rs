@@ -10,11 +10,12 @@ use plant_opcua::types::{
 };
 
 use super::lost;
+use super::packed::Packed;
 use crate::model::{NAMESPACE, SKILL_TYPE, SkillType, alias};
 use crate::parameters::TypeName;
 use crate::runs::SkillFault;
 use crate::server::OUTCOME;
-use crate::value::{Shape, Value};
+use crate::value::{Builtin, Shape, Value};
 use crate::variant::{builtin_of, from_variant};
 
 /// A skill of a server.
@@ -67,6 +68,18 @@ pub struct FoundParameter {
     /// Its node, as `nsu=<namespace uri>;i=1000017`.
     pub node: String,
     pub(super) id: NodeId,
+    /// How the server has its numbers, where they are a structure there.
+    pub(super) packed: Option<Packed>,
+}
+
+impl FoundParameter {
+    /// What its variable shows; `None` where that is no value of it.
+    pub(super) fn shown(&self, variant: &Variant) -> Option<Value> {
+        match self.packed {
+            Some(packed) => packed.unpack(variant),
+            None => from_variant(variant),
+        }
+    }
 }
 
 /// The nodes that a skill is run by.
@@ -446,24 +459,38 @@ async fn group(
             _ => None,
         };
         let array = matches!(next(), Some(Variant::Int32(rank)) if rank >= 0);
-        let default = next().as_ref().and_then(from_variant);
-        let Some(builtin) = data_type.as_deref().and_then(builtin_of) else {
+        let value = next();
+        let packed = data_type.as_deref().and_then(|of| Packed::of(of, array));
+        let shape = match packed {
+            Some(_) => Some(Shape {
+                builtin: Builtin::Double,
+                array: true,
+            }),
+            None => {
+                let builtin = data_type.as_deref().and_then(builtin_of);
+                builtin.map(|builtin| Shape { builtin, array })
+            }
+        };
+        let Some(shape) = shape else {
             let data_type =
                 data_type.map_or_else(|| "nothing".to_owned(), |of| text_of(client, &of));
             strange.push(format!(
-                "{} is of the DataType {data_type}, and a skill is told Booleans, numbers and texts",
+                "{} is of the DataType {data_type}, and a skill is told Booleans, numbers, texts and positions",
                 name_of(&child)
             ));
             continue;
         };
-        found.push(FoundParameter {
+        let mut parameter = FoundParameter {
             name: name_of(&child),
-            shape: Shape { builtin, array },
-            default,
+            shape,
+            default: None,
             unit: unit(client, &id).await?,
             node: text_of(client, &id),
             id,
-        });
+            packed,
+        };
+        parameter.default = value.as_ref().and_then(|value| parameter.shown(value));
+        found.push(parameter);
     }
     Ok(found)
 }

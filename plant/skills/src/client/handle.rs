@@ -7,7 +7,7 @@ use plant_opcua::client::{CallError, Client, ClientError, Link, Notice, Watch};
 use plant_opcua::types::{DataValue, NodeId, QualifiedName, StatusCode, UAString, Variant};
 use program::{Method, State};
 
-use super::find::FoundSkill;
+use super::find::{FoundParameter, FoundSkill};
 use super::{called, lost, refused};
 use crate::model::DEVICES;
 use crate::runs::{Runs, SkillFault};
@@ -96,9 +96,8 @@ impl SkillHandle {
         let ids: Vec<NodeId> = declared.iter().map(|of| of.id.clone()).collect();
         let values = self.client.read(&ids).await.unwrap_or_default();
         let shown = declared.iter().zip(values);
-        let shown = shown.filter_map(|(of, value)| {
-            Some((of.name.clone(), from_variant(value.value.as_ref()?)?))
-        });
+        let shown = shown
+            .filter_map(|(of, value)| Some((of.name.clone(), of.shown(value.value.as_ref()?)?)));
         shown.collect()
     }
 
@@ -259,7 +258,7 @@ impl SkillHandle {
     }
 
     /// A parameter by its name, and the value as it has it.
-    fn taken(&self, name: &str, value: Value) -> Result<(&NodeId, Value), SkillFault> {
+    fn taken(&self, name: &str, value: Value) -> Result<(&FoundParameter, Value), SkillFault> {
         let wrong = |status: &str, text: String| SkillFault::Refused {
             status: status.to_owned(),
             text,
@@ -274,15 +273,22 @@ impl SkillHandle {
             let text = format!("{name} is {}, and {given} was given", declared.shape);
             wrong("BadTypeMismatch", text)
         })?;
-        Ok((&declared.id, value))
+        Ok((declared, value))
     }
 
     async fn write(&self, parameters: Vec<(String, Value)>) -> Result<(), SkillFault> {
         let mut writes = Vec::new();
         let mut names = Vec::new();
         for (name, value) in parameters {
-            let (node, value) = self.taken(&name, value)?;
-            writes.push((node.clone(), to_variant(&value)));
+            let (declared, value) = self.taken(&name, value)?;
+            let said = match declared.packed {
+                None => to_variant(&value),
+                Some(packed) => packed.pack(&value).map_err(|why| SkillFault::Refused {
+                    status: "BadInvalidArgument".to_owned(),
+                    text: format!("{name}: {why}"),
+                })?,
+            };
+            writes.push((declared.id.clone(), said));
             names.push(name);
         }
         if writes.is_empty() {
@@ -363,7 +369,7 @@ impl SkillHandle {
         };
         let results = self.found.results.iter().zip(values);
         let results = results.filter_map(|(result, value)| {
-            Some((result.name.clone(), from_variant(value.value.as_ref()?)?))
+            Some((result.name.clone(), result.shown(value.value.as_ref()?)?))
         });
         Ok(Outcome {
             run,

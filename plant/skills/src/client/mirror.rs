@@ -19,6 +19,7 @@ use tokio::task::JoinSet;
 use self::seen::{Part, Seen};
 use super::find::{FoundParameter, FoundSkill};
 use super::handle::{STATE_PATHS, state_in};
+use super::packed::Packed;
 use super::{SkillClient, lost};
 use crate::parameters::Parameter;
 use crate::runs::SkillFault;
@@ -330,7 +331,7 @@ fn parameter(of: &FoundParameter) -> Parameter {
     Parameter {
         name: of.name.clone(),
         shape: of.shape,
-        length: None,
+        length: of.packed.and_then(Packed::length),
         default: of.default.clone(),
         unit: of.unit.clone(),
         range: None,

@@ -1,0 +1,225 @@
+//! Structures of OPC UA that are a few numbers, as these: the frame that a robot of the earlier system is told is the six
+//! numbers of a position here.
+
+use plant_opcua::types::{
+    Array, DataTypeId, ExtensionObject, NodeId, Range, ThreeDCartesianCoordinates, ThreeDFrame,
+    ThreeDOrientation, ThreeDVector, Variant, VariantScalarTypeId,
+};
+
+use crate::value::{Builtin, Value};
+
+/// How the numbers of a variable are packed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Packed {
+    what: What,
+    /// Whether it is an array of these structures.
+    many: bool,
+}
+
+/// A structure (OPC 10000-5, 12.23 to 12.30; OPC 10000-8, 5.6.2).
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum What {
+    /// x, y, z
+    Vector,
+    /// x, y, z
+    Coordinates,
+    /// a, b, c
+    Orientation,
+    /// x, y, z, a, b, c
+    Frame,
+    /// low, high
+    Range,
+}
+
+impl Packed {
+    /// Of a variable of that data type.
+    pub(super) fn of(data_type: &NodeId, many: bool) -> Option<Self> {
+        let known = [
+            (DataTypeId::ThreeDVector, What::Vector),
+            (DataTypeId::ThreeDCartesianCoordinates, What::Coordinates),
+            (DataTypeId::ThreeDOrientation, What::Orientation),
+            (DataTypeId::ThreeDFrame, What::Frame),
+            (DataTypeId::Range, What::Range),
+        ];
+        let id = (data_type.namespace == 0).then(|| data_type.as_u32())??;
+        let (_, what) = known.into_iter().find(|(of, _)| *of as u32 == id)?;
+        Some(Self { what, many })
+    }
+
+    /// How many numbers it always is; `None` of an array.
+    pub(super) const fn length(self) -> Option<u32> {
+        if self.many {
+            return None;
+        }
+        Some(match self.what {
+            What::Vector | What::Coordinates | What::Orientation => 3,
+            What::Frame => 6,
+            What::Range => 2,
+        })
+    }
+
+    /// The numbers of what a variable shows; `None` where it shows something else.
+    pub(super) fn unpack(self, shown: &Variant) -> Option<Value> {
+        let mut numbers = Vec::new();
+        let mut take = |one: &Variant| {
+            let Variant::ExtensionObject(object) = one else {
+                return None;
+            };
+            numbers.extend(self.what.numbers(object)?);
+            Some(())
+        };
+        match (self.many, shown) {
+            (true, Variant::Array(array)) => array.values.iter().try_for_each(&mut take)?,
+            _ => take(shown)?,
+        }
+        let numbers = numbers.into_iter().map(Value::Double);
+        Some(Value::Array(Builtin::Double, numbers.collect()))
+    }
+
+    /// What a variable is to be told.
+    ///
+    /// # Errors
+    /// How many numbers it wants, for people.
+    pub(super) fn pack(self, value: &Value) -> Result<Variant, String> {
+        let numbers = value.as_f64s().unwrap_or_default();
+        let each = self.what.names().len();
+        let fits = match self.many {
+            true => numbers.len().is_multiple_of(each),
+            false => numbers.len() == each,
+        };
+        if !fits {
+            let names = self.what.names().join(", ");
+            let times = if self.many {
+                "any number of times "
+            } else {
+                ""
+            };
+            let given = numbers.len();
+            return Err(format!(
+                "it is {times}{names}, and {given} numbers were given"
+            ));
+        }
+        let structures = numbers
+            .chunks(each)
+            .map(|numbers| self.what.object(numbers));
+        let mut structures = structures.map(Variant::ExtensionObject);
+        if self.many {
+            return Ok(Variant::Array(Box::new(Array {
+                value_type: VariantScalarTypeId::ExtensionObject,
+                values: structures.collect(),
+                dimensions: None,
+            })));
+        }
+        Ok(structures.next().unwrap_or(Variant::Empty))
+    }
+}
+
+impl What {
+    const fn names(self) -> &'static [&'static str] {
+        match self {
+            Self::Vector | Self::Coordinates => &["x", "y", "z"],
+            Self::Orientation => &["a", "b", "c"],
+            Self::Frame => &["x", "y", "z", "a", "b", "c"],
+            Self::Range => &["low", "high"],
+        }
+    }
+
+    fn numbers(self, object: &ExtensionObject) -> Option<Vec<f64>> {
+        Some(match self {
+            Self::Vector => {
+                let of: &ThreeDVector = object.inner_as()?;
+                vec![of.x, of.y, of.z]
+            }
+            Self::Coordinates => {
+                let of: &ThreeDCartesianCoordinates = object.inner_as()?;
+                vec![of.x, of.y, of.z]
+            }
+            Self::Orientation => {
+                let of: &ThreeDOrientation = object.inner_as()?;
+                vec![of.a, of.b, of.c]
+            }
+            Self::Frame => {
+                let of: &ThreeDFrame = object.inner_as()?;
+                let (at, turned) = (&of.cartesian_coordinates, &of.orientation);
+                vec![at.x, at.y, at.z, turned.a, turned.b, turned.c]
+            }
+            Self::Range => {
+                let of: &Range = object.inner_as()?;
+                vec![of.low, of.high]
+            }
+        })
+    }
+
+    /// Of as many numbers as it has names.
+    fn object(self, numbers: &[f64]) -> ExtensionObject {
+        let at = |place: usize| numbers.get(place).copied().unwrap_or_default();
+        let [x, y, z] = [at(0), at(1), at(2)];
+        let coordinates = || ThreeDCartesianCoordinates { x, y, z };
+        match self {
+            Self::Vector => ExtensionObject::from_message(ThreeDVector { x, y, z }),
+            Self::Coordinates => ExtensionObject::from_message(coordinates()),
+            Self::Orientation => {
+                ExtensionObject::from_message(ThreeDOrientation { a: x, b: y, c: z })
+            }
+            Self::Frame => ExtensionObject::from_message(ThreeDFrame {
+                cartesian_coordinates: coordinates(),
+                orientation: ThreeDOrientation {
+                    a: at(3),
+                    b: at(4),
+                    c: at(5),
+                },
+            }),
+            Self::Range => ExtensionObject::from_message(Range { low: x, high: y }),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn doubles(numbers: &[f64]) -> Value {
+        let numbers = numbers.iter().copied().map(Value::Double);
+        Value::Array(Builtin::Double, numbers.collect())
+    }
+
+    #[test]
+    fn what_is_packed_is_unpacked_as_it_was_and_has_its_length() {
+        for (id, many, numbers) in [
+            (DataTypeId::ThreeDVector, false, &[1.0, 2.0, 3.0][..]),
+            (
+                DataTypeId::ThreeDCartesianCoordinates,
+                false,
+                &[1.0, 2.0, 3.0],
+            ),
+            (DataTypeId::ThreeDOrientation, false, &[1.0, 2.0, 3.0]),
+            (
+                DataTypeId::ThreeDFrame,
+                false,
+                &[1.0, 2.0, 3.0, 4.0, 5.0, 6.0],
+            ),
+            (DataTypeId::Range, false, &[-1.0, 1.0]),
+            (DataTypeId::Range, true, &[-1.0, 1.0, -2.0, 2.0]),
+            (DataTypeId::Range, true, &[]),
+        ] {
+            let packed = Packed::of(&id.into(), many).unwrap();
+            let value = doubles(numbers);
+            assert_eq!(packed.unpack(&packed.pack(&value).unwrap()), Some(value));
+            let length = packed
+                .length()
+                .map(|length| usize::try_from(length).unwrap());
+            assert_eq!(length, (!many).then_some(numbers.len()), "{id:?}");
+        }
+        assert_eq!(Packed::of(&DataTypeId::EUInformation.into(), false), None);
+    }
+
+    #[test]
+    fn too_few_numbers_are_told_with_what_they_are() {
+        let frame = Packed::of(&DataTypeId::ThreeDFrame.into(), false).unwrap();
+        let fault = frame.pack(&doubles(&[1.0, 2.0, 3.0])).unwrap_err();
+        assert_eq!(fault, "it is x, y, z, a, b, c, and 3 numbers were given");
+        let bounds = Packed::of(&DataTypeId::Range.into(), true).unwrap();
+        assert!(bounds.pack(&doubles(&[1.0])).is_err());
+        assert_eq!(frame.unpack(&bounds.pack(&doubles(&[])).unwrap()), None);
+    }
+}
