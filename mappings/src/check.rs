@@ -3,6 +3,7 @@
 mod bindings;
 mod calls;
 mod cell;
+mod confirm;
 mod environment;
 mod finding;
 mod meaning;

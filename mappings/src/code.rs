@@ -140,6 +140,7 @@ codes! {
     Permissions = "M160", "`permissions` says which roles may `read`, `write` or `call` a node at the server: observer, operator, engineer, security_admin, one or a list, each once. Left out: everybody reads, and operators and engineers write and call. What is produced in another space than 0 no client writes.";
     OpenServer = "M161", "A server that other hosts reach is open to them: it offers None, with which nothing is signed or encrypted, or users without a name may write and call. Both have to be said in the mapping, and seldom should be.";
     Quality = "M162", "`quality` says when a value is no longer good because no newer one comes: `uncertain_after` so long, and `bad_after` it has been uncertain for so long. It goes with values that come from other programs. Values that are sent on change only, or less often than that, would be taken for old while they are not.";
+    Confirm = "M163", "`confirm` ties what clients write to what the robot answers: `by` is the node of the variable that answers, of another space or `from` a server, `within` how long that may take, and `when` or `equals` which answer counts. The answer is sent anew for each write, and has the type of what is written unless `equals` or `when: any` says otherwise.";
 }
 
 impl Code {
@@ -186,7 +187,7 @@ impl std::str::FromStr for Code {
 
 /// A text that is none of the codes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("no finding has that code; codes are M001 to M162")]
+#[error("no finding has that code; codes are M001 to M163")]
 pub struct UnknownCode;
 
 #[cfg(test)]

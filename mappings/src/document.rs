@@ -121,11 +121,22 @@ document! {
         /// says nothing else. Left out: it stays uncertain.
         #[schemars(regex(pattern = DURATION))]
         bad_after: String,
+        /// How much the server keeps of what was.
+        history: HistoryEntry,
         /// How much clients may take up.
         limits: LimitsEntry,
         /// Servers with skills that know nothing of the space, and that discovery finds: ua-server shows these skills in the space,
         /// and has them run, as it does those of `servers` that have `skills`. Left out: none is looked for.
         find_skills: FindSkillsEntry,
+    }
+
+    /// How much the server keeps of what was, in memory.
+    struct HistoryEntry {
+        /// Values of each variable that says nothing else, 0 to 65535; default 1000.
+        values: u16,
+        /// MiB of all of them together, 1 to 16384; default 64.
+        #[schemars(range(min = 1, max = 16384))]
+        megabytes: u16,
     }
 
     /// How much clients may take up of the server. What is more is refused.
@@ -158,6 +169,12 @@ document! {
         /// that is the value, by its place from 0 or by its name in the DataSetMetaData that the publisher announces. Left out:
         /// the only field, or the one that is announced under the `name` of this variable.
         ua_field: UaFieldEntry,
+        /// What the value is, for people: the Description of the node. Left out: the name of its topic.
+        #[schemars(length(min = 1, max = 1000))]
+        description: String,
+        /// How many digits behind the decimal point are worth showing (ValuePrecision), of a value that is a number.
+        #[schemars(range(max = 15))]
+        precision: u16,
         /// Unit of the value in OPC UA, by its symbol as m/s, its UNECE code as MTS, or its name.
         unit: String,
         /// Lowest and highest value to be expected in OPC UA, as [0, 1.5].
@@ -194,6 +211,10 @@ document! {
         at_most: String,
         /// When the server no longer shows the value as good, because no newer one comes.
         quality: QualityEntry,
+        /// With `origin: 0`: a client's write has succeeded when the robot answers, and not when the value has been sent.
+        confirm: ConfirmEntry,
+        /// How many past values the server keeps, 0 to 65535. Left out: as many as `server.history` says.
+        history: u16,
         /// Which roles may do what with the node.
         permissions: PermissionsEntry,
     }
@@ -208,6 +229,22 @@ document! {
         /// (BadNoCommunication) and is not shown. Left out: as `server.bad_after` says.
         #[schemars(regex(pattern = DURATION))]
         bad_after: String,
+    }
+
+    /// What says that a value a client wrote has arrived. Without it in time the write is BadTimeout, the variable shows what it
+    /// showed before, and the value is not repeated to who comes later.
+    struct ConfirmEntry {
+        /// Node of the variable that answers, as ns=2;i=31: one of another space, or one that comes `from` a server. The
+        /// answer is sent anew for each write.
+        #[schemars(required, regex(pattern = r"^(ns=[0-9]+;)?[isgb]="))]
+        by: String,
+        /// How long the answer may take; default 2s.
+        #[schemars(regex(pattern = DURATION))]
+        within: String,
+        /// Which answer counts: `same` (the default) one that equals what was written, `any` each that comes after it.
+        when: ConfirmWhenEntry,
+        /// In place of `when`: the answer that counts, as true, 3 or done.
+        equals: String,
     }
 
     /// Which roles may do what with a variable.
@@ -429,6 +466,13 @@ choice! {
         Exact = "exact",
         /// The number in any unsigned integer type.
         AnyWidth = "any_width",
+    }
+
+    enum ConfirmWhenEntry {
+        /// One that equals what was written.
+        Same = "same",
+        /// Each that comes.
+        Any = "any",
     }
 
     enum PublishEntry {

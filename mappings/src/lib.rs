@@ -47,7 +47,7 @@ pub use mapping::{
 pub use node_id::{ExpandedNodeIdText, Identifier, NamespaceText, NodeIdError, NodeIdText};
 pub use pattern::{Pattern, PatternFault, PatternReason, PatternVariable};
 pub use permission::{Anonymous, Permissions, Role};
-pub use quality::Ages;
+pub use quality::{Ages, Answer, Confirm, History};
 pub use remote::{
     Access, FindSkills, NodeSource, NodeTarget, Password, RemoteServer, SkillsPlace, User,
 };

@@ -14,7 +14,7 @@ use crate::endpoint::Endpoint;
 use crate::node_id::NodeIdText;
 use crate::pattern::{Pattern, PatternFault, PatternReason, PatternVariable};
 use crate::permission::{Anonymous, Permissions};
-use crate::quality::Ages;
+use crate::quality::{Ages, Confirm, History};
 use crate::remote::{FindSkills, NodeSource, NodeTarget, RemoteServer};
 use crate::security::SecurityGroup;
 use crate::topic::{SpaceId, TopicId};
@@ -442,6 +442,8 @@ pub struct Server {
     pub anonymous: Anonymous,
     /// When uncertain values of other programs are bad, where they do not say it themselves.
     pub bad_after: Option<Duration>,
+    /// How much is kept of what was.
+    pub history: History,
     /// How much clients may take up.
     pub limits: ServerLimits,
     /// Which servers with skills it speaks for when they are found, if any.
@@ -483,6 +485,7 @@ impl Default for Server {
             security: None,
             anonymous: Anonymous::Usual,
             bad_after: None,
+            history: History::default(),
             limits: ServerLimits::default(),
             find_skills: None,
         }
@@ -553,6 +556,10 @@ pub struct Variable {
     pub permissions: Permissions,
     /// How old it may become.
     pub ages: Ages,
+    /// How many past values are kept; `None` as many as of all.
+    pub history: Option<u16>,
+    /// What says that a written value has arrived.
+    pub confirm: Option<Box<Confirm>>,
     /// The node of another OPC UA server it comes from; its origin is the OPC UA side then.
     pub from: Option<Box<NodeSource>>,
     /// The node of another OPC UA server it is written to.
@@ -574,9 +581,13 @@ pub struct Meaning {
     /// Their unit of measure.
     pub unit: Option<&'static Unit>,
     /// The lowest and the highest to be expected, by their bits.
-    range: Option<(u64, u64)>,
+    pub(crate) range: Option<(u64, u64)>,
     /// Texts of single values.
     pub texts: BTreeMap<i64, String>,
+    /// What it is, for people.
+    pub description: Option<String>,
+    /// Digits behind the decimal point that are worth showing.
+    pub precision: Option<u8>,
 }
 
 impl Meaning {
@@ -589,6 +600,7 @@ impl Meaning {
             unit,
             range: range.map(|(low, high)| (low.to_bits(), high.to_bits())),
             texts,
+            ..Self::default()
         }
     }
 

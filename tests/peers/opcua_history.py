@@ -51,6 +51,9 @@ async def asked(client, question):
     if "attribute" in question:
         answer = await node.read_attribute(ua.AttributeIds[question["attribute"]], raise_on_bad_status=False)
         return {"status": answer.StatusCode.name, "value": opcua_session.plain(answer.Value.Value)}
+    if "property" in question:
+        value = await (await node.get_child(f"0:{question['property']}")).read_value()
+        return {"value": opcua_session.plain(value)}
     if question.get("children"):
         names = [(await child.read_browse_name()).Name for child in await node.get_children()]
         return {"children": sorted(names)}

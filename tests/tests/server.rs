@@ -6,8 +6,12 @@ mod access;
 mod authorities;
 #[path = "server/configuration.rs"]
 mod configuration;
+#[path = "server/confirm.rs"]
+mod confirm;
 #[path = "server/history.rs"]
 mod history;
+#[path = "server/identity.rs"]
+mod identity;
 #[path = "server/malformed.rs"]
 mod malformed;
 #[path = "server/pubsub.rs"]

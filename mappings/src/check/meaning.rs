@@ -83,7 +83,47 @@ pub(super) fn check(
             texts.insert(number, said.clone());
         }
     }
-    sound.map(|()| Meaning::new(unit, range, texts))
+    let precision = precision(entry, value, findings);
+    let description = description(entry, findings);
+    sound?;
+    Some(Meaning {
+        description: description?,
+        precision: precision?,
+        ..Meaning::new(unit, range, texts)
+    })
+}
+
+/// `None` when it is faulty, which is noted.
+fn precision(
+    entry: &VariableEntry,
+    value: (Option<ValueType>, bool),
+    findings: &mut Findings,
+) -> Option<Option<u8>> {
+    let Some((digits, place)) = given(&entry.precision) else {
+        return Some(None);
+    };
+    let precision = u8::try_from(*digits).ok().filter(|digits| *digits <= 15);
+    if precision.is_none() {
+        let message = format!("{digits} digits are out of range");
+        findings
+            .error(Code::WrongValue, place, message)
+            .label("0 to 15");
+    }
+    numbers(value, ("precision", Code::ValueRange, place), findings)?;
+    precision.map(Some)
+}
+
+/// `None` when it is faulty, which is noted.
+fn description(entry: &VariableEntry, findings: &mut Findings) -> Option<Option<String>> {
+    let Some((text, place)) = given(&entry.description) else {
+        return Some(None);
+    };
+    if text.trim().is_empty() || text.chars().count() > 1000 {
+        let message = "a description is a text of up to 1000 characters";
+        findings.error(Code::WrongValue, place, message);
+        return None;
+    }
+    Some(Some(text.clone()))
 }
 
 /// Notes that a value is none that such a key goes with.

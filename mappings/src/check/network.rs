@@ -7,10 +7,13 @@ use std::time::Duration;
 use super::cell::is_uri;
 use super::permissions;
 use crate::code::Code;
-use crate::document::{LimitsEntry, PubSubEntry, PublisherIdEntry, SecurityEntry, ServerEntry};
+use crate::document::{
+    HistoryEntry, LimitsEntry, PubSubEntry, PublisherIdEntry, SecurityEntry, ServerEntry,
+};
 use crate::endpoint::Endpoint;
 use crate::findings::Findings;
 use crate::mapping::{PubSub, PublisherIdRule, SecurityPolicy, Server, ServerLimits};
+use crate::quality::History;
 use crate::read::{At, Field, given, short};
 use crate::secret::has_user;
 use crate::tree::Place;
@@ -259,11 +262,24 @@ pub(super) fn server(entry: Option<&At<ServerEntry>>, findings: &mut Findings) -
         security,
         anonymous: permissions::anonymous(entry),
         bad_after: duration(&entry.bad_after, findings),
+        history: history(&entry.history, findings),
         limits: limits(&entry.limits, findings),
         find_skills: None,
     };
     permissions::left_open(entry, &server, findings);
     server
+}
+
+fn history(field: &Field<HistoryEntry>, findings: &mut Findings) -> History {
+    let usual = History::default();
+    let Some((entry, _)) = given(field) else {
+        return usual;
+    };
+    let megabytes = within(&entry.megabytes, 1..=16_384, "MiB", findings);
+    History {
+        values: given(&entry.values).map_or(usual.values, |(count, _)| *count),
+        bytes: megabytes.map_or(usual.bytes, |mebibytes| usize::from(mebibytes) << 20),
+    }
 }
 
 fn limits(field: &Field<LimitsEntry>, findings: &mut Findings) -> ServerLimits {

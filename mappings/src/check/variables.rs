@@ -11,7 +11,7 @@ use super::bindings::{self, Bindings};
 use super::servers::Servers;
 use super::services::Calls;
 use super::types::{self, Types, ValueType};
-use super::{Declared, meaning, permissions, quality, remote, required};
+use super::{Declared, confirm, meaning, permissions, quality, remote, required};
 use crate::code::Code;
 use crate::document::{PublishEntry, Queue, UaFieldEntry, VariableEntry};
 use crate::findings::Findings;
@@ -93,6 +93,10 @@ pub(super) fn check(
         .iter()
         .filter_map(|draft| variable(draft, servers, &mut bindings, findings));
     let mut variables: Vec<Variable> = variables.collect();
+    let entries = drafts
+        .iter()
+        .filter_map(|draft| Some((draft.topic()?, draft.entry)));
+    confirm::check(entries, &mut variables, findings);
     // Kept as long as the mapping.
     variables.shrink_to_fit();
     bindings.conflicts(findings);
@@ -382,6 +386,8 @@ fn variable(
         meaning: meaning?,
         permissions: permissions?,
         ages: ages?,
+        history: given(&entry.history).map(|(count, _)| *count),
+        confirm: None,
         from,
         to,
     })

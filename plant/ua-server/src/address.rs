@@ -12,7 +12,7 @@ use crate::properties;
 
 /// Adds a variable for each of a topic's nodes under `folder`, without a value.
 pub(crate) fn add_topic(address_space: &mut AddressSpace, topic: &TopicNode, folder: &NodeId) {
-    let writable = topic.writable();
+    let access = access(topic);
     let name = |node: &NodeId, text: &str| QualifiedName::new(node.namespace, text);
     let (type_, rank) = if topic.compound {
         (Shape(None).data_type(), 1)
@@ -21,17 +21,19 @@ pub(crate) fn add_topic(address_space: &mut AddressSpace, topic: &TopicNode, fol
         let only = topic.fields.first();
         only.map_or(open, |field| (field.data_type(), field.shape.value_rank()))
     };
+    let description = topic.meaning.description.clone();
+    let description = description.unwrap_or_else(|| topic.topic.to_string());
     VariableBuilder::new(
         &topic.node,
         name(&topic.node, &topic.name),
         LocalizedText::from(topic.name.as_str()),
     )
-    .description(LocalizedText::from(topic.topic.to_string()))
+    .description(LocalizedText::from(description))
     .data_type(type_)
     .value_rank(rank)
-    .access_level(access(writable))
-    .user_access_level(access(writable))
-    .historizing(true)
+    .access_level(access)
+    .user_access_level(access)
+    .historizing(topic.historizing)
     .has_type_definition(VariableTypeId::BaseDataVariableType)
     .organized_by(folder.clone())
     .insert(address_space);
@@ -47,9 +49,9 @@ pub(crate) fn add_topic(address_space: &mut AddressSpace, topic: &TopicNode, fol
         )
         .data_type(field.data_type())
         .value_rank(field.shape.value_rank())
-        .access_level(access(writable))
-        .user_access_level(access(writable))
-        .historizing(true)
+        .access_level(access)
+        .user_access_level(access)
+        .historizing(topic.historizing)
         .has_type_definition(VariableTypeId::BaseDataVariableType)
         .component_of(topic.node.clone())
         .insert(address_space);
@@ -64,13 +66,11 @@ pub(crate) fn retype(address_space: &mut AddressSpace, node: &NodeId, shape: Sha
     }
 }
 
-fn access(writable: bool) -> AccessLevel {
-    let read = AccessLevel::CURRENT_READ | AccessLevel::HISTORY_READ;
-    if writable {
-        read | AccessLevel::CURRENT_WRITE
-    } else {
-        read
-    }
+fn access(topic: &TopicNode) -> AccessLevel {
+    let mut level = AccessLevel::CURRENT_READ;
+    level.set(AccessLevel::HISTORY_READ, topic.historizing);
+    level.set(AccessLevel::CURRENT_WRITE, topic.writable());
+    level
 }
 
 pub(crate) fn add_folders(layout: &Layout, address_space: &mut AddressSpace) {

@@ -5,7 +5,6 @@ use std::net::{SocketAddr, TcpListener};
 use bridge_node::{Failure, FailureKind};
 use mappings::{SecurityPolicy, Server, ServerLimits};
 use opcua::server::{Limits, ServerBuilder};
-use opcua::types::{BuildInfo, UAString};
 use plant_opcua::door::Door;
 use plant_opcua::endpoint::EndpointUrl;
 use plant_opcua::limits;
@@ -13,6 +12,8 @@ use plant_opcua::pki::{OWN_CERTIFICATE, OWN_KEY, Pki};
 use plant_opcua::server::Security;
 use tokio::runtime::Runtime;
 use tracing::warn;
+
+use crate::identity;
 
 /// What the server offers of what the mapping says, listening at `address`.
 pub(crate) fn security(described: &Server, address: SocketAddr) -> Vec<Security> {
@@ -39,14 +40,8 @@ pub(crate) fn server(
         .application_name(APPLICATION_NAME)
         .application_uri(described.application_uri.as_str())
         .product_uri(PRODUCT_URI)
-        .build_info(BuildInfo {
-            product_uri: UAString::from(PRODUCT_URI),
-            manufacturer_name: UAString::null(),
-            product_name: UAString::from(APPLICATION_NAME),
-            software_version: UAString::from(env!("CARGO_PKG_VERSION")),
-            build_number: UAString::null(),
-            build_date: opcua::types::DateTime::null(),
-        })
+        .build_info(identity::build_info())
+        .diagnostics_enabled(true)
         .discovery_urls(vec![url.advertised(port)])
         .host(host)
         .port(port)
@@ -66,7 +61,7 @@ pub(crate) fn server(
 }
 
 /// How much clients may take up.
-fn within(told: ServerLimits) -> Limits {
+pub(crate) fn within(told: ServerLimits) -> Limits {
     let mut limits = limits::server();
     limits.max_history_continuation_points = MOST_HISTORY_GOES_ON;
     if let Some(sessions) = told.sessions {
@@ -144,7 +139,7 @@ fn io_fault(error: std::io::Error) -> Failure {
     Failure::new(FailureKind::Io, error.to_string())
 }
 
-const APPLICATION_NAME: &str = "UA bridge server";
+pub(crate) const APPLICATION_NAME: &str = "UA bridge server";
 pub(crate) const PRODUCT_URI: &str = "urn:ua-bridge:server";
 /// Answers of a session from the history that are not at their end.
 const MOST_HISTORY_GOES_ON: usize = 100;

@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, HashSet};
 
 use bridge_node::CallField;
-use mappings::{Mapping, Meaning, NodeIdText, SpaceId, TopicId, Variable};
+use mappings::{History, Mapping, Meaning, NodeIdText, SpaceId, TopicId, Variable};
 use messages::{Leaf, Rank};
 use opcua::types::{ByteString, DataTypeId, Identifier, NodeId, Variant, VariantTypeId};
 use uadp::BuiltinType;
@@ -35,6 +35,8 @@ pub(crate) struct TopicNode {
     pub(crate) meaning: Meaning,
     /// Its values come from another server, and from no client.
     pub(crate) sourced: bool,
+    /// Whether past values of it are kept.
+    pub(crate) historizing: bool,
 }
 
 /// The node of one field of a DataSet.
@@ -89,7 +91,9 @@ impl Layout {
     pub(crate) fn of(mapping: &Mapping, types: &mut Types) -> Result<Self, LayoutError> {
         let mut structures = Structures::default();
         let topics = mapping.variables().iter();
-        let topics = topics.map(|variable| TopicNode::of(variable, types, &mut structures));
+        let history = mapping.server().history;
+        let topics =
+            topics.map(|variable| TopicNode::of(variable, history, (&mut *types, &mut structures)));
         let layout = Self::new(
             &mapping.server().application_uri,
             mapping.namespaces(),
@@ -118,7 +122,9 @@ impl Layout {
         let others: Vec<u16> = others.map(|(index, _)| *index).collect();
         let mut structures = Structures::default();
         let topics = mapping.variables().iter();
-        let topics = topics.map(|variable| TopicNode::of(variable, types, &mut structures));
+        let history = mapping.server().history;
+        let topics =
+            topics.map(|variable| TopicNode::of(variable, history, (&mut *types, &mut structures)));
         let is_here = |topic: &TopicNode| !others.contains(&topic.node.namespace);
         let layout = Self {
             namespaces: running.to_vec(),
@@ -225,7 +231,11 @@ fn namespace_array(
 }
 
 impl TopicNode {
-    fn of(variable: &Variable, types: &mut Types, structures: &mut Structures) -> Self {
+    fn of(
+        variable: &Variable,
+        history: History,
+        (types, structures): (&mut Types, &mut Structures),
+    ) -> Self {
         let leaves = variable.fields.iter().map(|leaf| {
             let array = match leaf.rank {
                 Rank::Scalar => false,
@@ -246,6 +256,7 @@ impl TopicNode {
         let mut node = Self {
             meaning: variable.meaning.clone(),
             sourced: variable.from.is_some(),
+            historizing: variable.history.unwrap_or(history.values) > 0,
             ..node
         };
         let is_structure = |leaf: &Leaf| leaf.builtin == BuiltinType::ExtensionObject;
@@ -299,6 +310,7 @@ impl TopicNode {
             compound,
             meaning: Meaning::default(),
             sourced: false,
+            historizing: true,
         }
     }
 

@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 
 use async_trait::async_trait;
 use bytes::Bytes;
-use mappings::TopicId;
+use mappings::{Mapping, TopicId};
 use opcua::server::address_space::AddressSpace;
 use opcua::server::diagnostics::NamespaceMetadata;
 use opcua::server::node_manager::memory::{InMemoryNodeManager, InMemoryNodeManagerImpl};
@@ -35,7 +35,9 @@ use crate::access::{self, Genuine};
 use crate::address;
 use crate::asking::{Drive, Drives, Questions, Refused, Table};
 use crate::budget::{Answers, LARGEST, SMALL, Watched};
+use crate::confirm::Confirms;
 use crate::history::{Past, Room, Series};
+use crate::identity;
 use crate::layout::{FieldNode, Layout, TopicNode};
 use crate::properties;
 use crate::pubsub::PubSub;
@@ -86,6 +88,8 @@ pub(crate) struct Exits {
     pub(crate) access: Arc<Access>,
     /// The PubSub configuration, which clients can disable parts of.
     pub(crate) pubsub: Arc<PubSub>,
+    /// What says that a write has arrived.
+    pub(crate) confirms: Arc<Confirms>,
 }
 
 /// A value a client wrote to a topic of the OPC UA side.
@@ -120,6 +124,9 @@ impl SpaceNodes {
                 });
             }
         }
+        let served = namespaces.iter();
+        let served = served.map(|one| (one.namespace_index, one.namespace_uri.as_str()));
+        identity::add_namespaces(served, address_space);
         address::add_folders(layout, address_space);
         for structure in &layout.structures {
             structure.insert(address_space);
@@ -138,7 +145,7 @@ impl SpaceNodes {
             places: RwLock::new(places),
             order: RwLock::new(address::order(layout)),
             values: RwLock::new(Values::new(MOST_HELD)),
-            past: RwLock::new(Past::new(MOST_PAST, MOST_PAST_HELD)),
+            past: RwLock::new(Past::new(0, 0)),
             watched: Mutex::new(Watched::default()),
             answers: Mutex::new(Answers::default()),
             genuine: Genuine::default(),
@@ -236,6 +243,15 @@ impl SpaceNodes {
         self.order.read().contains_key(node)
     }
 
+    /// How much is kept of what was.
+    pub(crate) fn limit_past(&self, mapping: &Mapping) {
+        let usual = mapping.server().history;
+        let variables = mapping.variables().iter();
+        let own = variables.filter_map(|one| Some((one.topic, usize::from(one.history?))));
+        let most = (usize::from(usual.values), usual.bytes);
+        self.past.write().limit(most, own.collect());
+    }
+
     /// How large a value may be that clients write, in bytes.
     pub(crate) fn limit_writes(&self, largest: usize) {
         self.largest_write.store(largest, Ordering::Relaxed);
@@ -292,6 +308,7 @@ impl SpaceNodes {
         };
         if is_new {
             self.past.write().keep(topic.topic, shown);
+            self.exits.confirms.heard(topic.topic, shown);
         }
         let before = before.unwrap_or_else(Shown::waiting);
         let views = before.views(topic).zip(shown.views(topic));
@@ -440,16 +457,16 @@ impl SpaceNodes {
         Some(self.for_item(handle, &view, &mut None).0)
     }
 
-    fn write_one(
+    async fn write_one(
         &self,
-        address_space: &AddressSpace,
+        address_space: &RwLock<AddressSpace>,
         context: &RequestContext,
         write: &ParsedWriteValue,
     ) -> Result<(), StatusCode> {
         let is_value = write.attribute_id == AttributeId::Value;
         let place = self.place(&write.node_id).filter(|_| is_value);
         let Some((topic, field)) = place else {
-            let exists = address_space.node_exists(&write.node_id);
+            let exists = address_space.read().node_exists(&write.node_id);
             return Err(if exists {
                 StatusCode::BadNotWritable
             } else {
@@ -462,6 +479,40 @@ impl SpaceNodes {
         if !access::may_write(context, &write.node_id) {
             return Err(StatusCode::BadUserAccessDenied);
         }
+        let place = (&*topic, field);
+        if let Some(rule) = self.exits.confirms.of(topic.topic) {
+            let send = |register: &dyn Fn(&[Variant])| self.send_written(place, write, register);
+            let arrived = self.exits.confirms.write(topic.topic, &rule, send).await?;
+            // It has arrived, whether there is room to show it or not.
+            let _shown = self.show(&context.subscriptions, &topic, arrived);
+            return Ok(());
+        }
+        // Until it is shown nobody else may write: what is not written stays as it is.
+        let _alone = self.writing.lock();
+        let sent = self.send_alone(place, write, &|_| {})?;
+        let _shown = self.show(&context.subscriptions, &topic, sent);
+        Ok(())
+    }
+
+    /// As [`send_alone`](Self::send_alone), while nobody else writes.
+    fn send_written(
+        &self,
+        place: (&TopicNode, Option<usize>),
+        write: &ParsedWriteValue,
+        register: &dyn Fn(&[Variant]),
+    ) -> Result<Shown, StatusCode> {
+        let _alone = self.writing.lock();
+        self.send_alone(place, write, register)
+    }
+
+    /// Works out all fields of the topic after a write, and has them sent; they are registered before. Gives what is to be
+    /// shown then.
+    fn send_alone(
+        &self,
+        (topic, field): (&TopicNode, Option<usize>),
+        write: &ParsedWriteValue,
+        register: &dyn Fn(&[Variant]),
+    ) -> Result<Shown, StatusCode> {
         if self.exits.pubsub.is_off(topic.topic) {
             // Its writer is disabled, so it would not go out.
             return Err(StatusCode::BadInvalidState);
@@ -478,27 +529,24 @@ impl SpaceNodes {
             .value
             .as_ref()
             .ok_or(StatusCode::BadTypeMismatch)?;
-        // What is not written stays as it is: nobody else may write in between.
-        let _alone = self.writing.lock();
         let shown = self.shown(topic.topic);
         let field = field.and_then(|field| topic.fields.get(field));
-        let fields = new_fields(&shown, &topic, field, (value, &write.index_range))?;
-        if !properties::are_within(&topic, &fields) {
+        let fields = new_fields(&shown, topic, field, (value, &write.index_range))?;
+        if !properties::are_within(topic, &fields) {
             return Err(StatusCode::BadOutOfRange);
         }
         let block = Bytes::from(value::fields_block(&fields)?);
+        register(&fields);
         drop(fields);
         let source = source_of(&write.value);
-        self.send(&topic, block.clone(), source)?;
+        self.send(topic, block.clone(), source)?;
         let stamp = Stamp {
             status: StatusCode::Good,
             source: Some(source),
             server: DateTime::now(),
         };
         let block = Some(block);
-        // It has been sent, whether there is room to show it or not.
-        let _shown = self.show(&context.subscriptions, &topic, Shown { block, stamp });
-        Ok(())
+        Ok(Shown { block, stamp })
     }
 
     /// Hands a written value to the run loop.
@@ -555,7 +603,7 @@ impl SpaceNodes {
 
     /// The past values of a node.
     fn series(&self, node: &NodeId) -> Option<Series> {
-        let place = self.place(node)?;
+        let place = self.place(node).filter(|(topic, _)| topic.historizing)?;
         let kept = self.past.read().of(place.0.topic);
         Some(Series::new(place, kept))
     }
@@ -810,12 +858,12 @@ impl InMemoryNodeManagerImpl for SpaceNodes {
         address_space: &RwLock<AddressSpace>,
         nodes_to_write: &mut [&mut WriteNode],
     ) -> Result<(), StatusCode> {
-        let address_space = address_space.read();
         self.genuine.check(context)?;
-        for write in nodes_to_write {
-            let result = self.write_one(&address_space, context, write.value());
+        let writes = nodes_to_write.iter_mut().map(|write| async {
+            let result = self.write_one(address_space, context, write.value()).await;
             write.set_status(result.err().unwrap_or(StatusCode::Good));
-        }
+        });
+        futures_util::future::join_all(writes).await;
         Ok(())
     }
 
@@ -941,7 +989,3 @@ const AS_IT_COMES_MS: f64 = 0.000_1;
 const SECOND_LOOK: Duration = Duration::from_millis(100);
 /// Bytes of all values that are shown.
 const MOST_HELD: usize = 512 << 20;
-/// Past values of each topic.
-const MOST_PAST: usize = 1_000;
-/// Bytes of all past values.
-const MOST_PAST_HELD: usize = 64 << 20;

@@ -18,7 +18,7 @@ use opcua::server::authenticator::AuthManager;
 use opcua::server::node_manager::memory::InMemoryNodeManagerImplBuilder;
 use opcua::server::node_manager::{NodeManagerBuilder, ServerContext};
 use opcua::server::{MonitoredItemHandle, ServerHandle, SubscriptionCache};
-use opcua::types::{NodeId, NumericRange, StatusCode, VariableId};
+use opcua::types::{NodeId, NumericRange, StatusCode, VariableId, Variant};
 use plant_opcua::configuration::Configuration;
 use plant_opcua::endpoint::EndpointUrl;
 use plant_opcua::pki::Pki;
@@ -36,8 +36,10 @@ use crate::asking::{Heard, Questions};
 use crate::auditing;
 use crate::browse::Ordered;
 use crate::components::{Components, Happened};
+use crate::confirm::Confirms;
 use crate::endpoint;
 use crate::history;
+use crate::identity;
 use crate::layout::Layout;
 use crate::methods::{Methods, Wish};
 use crate::nodes::{ClientWrite, Exits, SpaceManager, SpaceNodes, look_again};
@@ -96,6 +98,8 @@ pub(crate) struct ServerPort {
     /// The PubSub configuration, and how the readers of it are.
     pubsub: Arc<PubSub>,
     readers: Readers,
+    /// Writes that wait for an answer.
+    confirms: Arc<Confirms>,
     /// When a publisher that is not heard counts as away.
     receive_timeout: Duration,
     /// As the group is told.
@@ -128,7 +132,8 @@ impl ServerPort {
         access.set_rules(access::rules(mapping, &layout));
 
         let pubsub = Arc::new(PubSub::new());
-        let (exits, (writes, created_items, asked)) = exits(&access, &pubsub);
+        let (exits, (writes, created_items, asked)) = exits(mapping, &access, &pubsub);
+        let confirms = Arc::clone(&exits.confirms);
         let nodes = NodesBuilder {
             layout: Arc::new(layout),
             exits,
@@ -136,7 +141,7 @@ impl ServerPort {
         let layout = Arc::clone(&nodes.layout);
         let certificates = Configuration::new(setup.pki.root(), &described.application_uri);
         let mdns = setup.announce.as_ref().is_some_and(|to| to.mdns.is_some());
-        let core = core(&setup.sks, &pubsub, (&certificates, mdns));
+        let core = core(&setup.sks, &pubsub, (&certificates, mdns), described);
         let builder = endpoint::server(described, (&setup.url, port), &security);
         let (door, listener, builder) =
             endpoint::door(&setup.pki, setup.trust_any_client, (listener, builder))?;
@@ -147,7 +152,7 @@ impl ServerPort {
             .build()
             .map_err(configuration)?;
         let manager = manager(&handle, &layout).map_err(configuration)?;
-        manager.inner().limit_writes(largest_write(mapping));
+        limit(manager.inner(), mapping);
         pubsub.stand(places(&handle, &manager));
         pubsub.show(mapping, &layout);
 
@@ -173,9 +178,7 @@ impl ServerPort {
             runtime: Some(runtime),
             serving: Some(serving),
             writes,
-            live: written(layout.topics.iter().map(|node| node.topic))
-                .map(|topic| (topic, true))
-                .collect(),
+            live: live(&layout),
             types,
             pki: setup.pki,
             sks: setup.sks,
@@ -188,6 +191,7 @@ impl ServerPort {
             events: VecDeque::new(),
             pubsub,
             readers: Readers::default(),
+            confirms,
             receive_timeout: mapping.pubsub().receive_timeout,
             application,
             certificates,
@@ -227,6 +231,7 @@ impl Port for ServerPort {
                 Some(write) = self.writes.recv() => {
                     let ClientWrite { topic, block, source, room } = write;
                     drop(room);
+                    self.confirms.supersede(topic);
                     self.others.sources.put(topic, &block);
                     return PortEvent::Sample { topic, payload: block, received: source, latched_by: None };
                 }
@@ -246,6 +251,10 @@ impl Port for ServerPort {
                     Happened::Heard(found) => self.others.heard(&found),
                 },
                 () = self.others.finding.changed() => self.others.found(),
+                () = self.confirms.called() => {
+                    let taken_back = self.confirms.take_back().into_iter();
+                    self.live.extend(taken_back.map(|topic| (topic, false)));
+                }
                 () = at(self.space.due()) => self.space.grow_old(),
                 () = self.certificates.applied() => restart::ask(),
                 _ = self.look.tick() => {
@@ -350,7 +359,9 @@ impl Port for ServerPort {
         .map(|(key, _)| key.to_owned())
         .collect();
         self.receive_timeout = mapping.pubsub().receive_timeout;
+        self.confirms.follow(mapping);
         self.space.limit_writes(largest_write(mapping));
+        self.space.limit_past(mapping);
         self.types.replace(types);
         let moved = self.methods.take_moved(mapping);
         match Layout::within(&self.namespaces, mapping, &mut self.types) {
@@ -515,9 +526,10 @@ fn core(
     sks: &Arc<Sks>,
     pubsub: &Arc<PubSub>,
     (configuration, is_announced): (&Arc<Configuration>, bool),
+    described: &Server,
 ) -> impl NodeManagerBuilder + use<> {
     let methods = [sks.methods(), pubsub.methods(), configuration.methods()].concat();
-    let values = [history::capabilities(), Configuration::values(is_announced)].concat();
+    let values = [capabilities(described), Configuration::values(is_announced)].concat();
     core_with(methods, values, prepared)
 }
 
@@ -564,8 +576,26 @@ fn looks() -> Interval {
     look
 }
 
+/// How large what clients write may be, and how much is kept of what was.
+fn limit(nodes: &SpaceNodes, mapping: &Mapping) {
+    nodes.limit_writes(largest_write(mapping));
+    nodes.limit_past(mapping);
+}
+
+/// What the server tells of its own of what it can do.
+fn capabilities(described: &Server) -> Vec<(VariableId, Variant)> {
+    let limits = endpoint::within(described.limits);
+    [history::capabilities(), identity::capabilities(&limits)].concat()
+}
+
+/// The topics that are written from here, as they begin.
+fn live(layout: &Layout) -> VecDeque<(TopicId, bool)> {
+    let topics = written(layout.topics.iter().map(|node| node.topic));
+    topics.map(|topic| (topic, true)).collect()
+}
+
 /// What leaves the node manager, and the other ends of that.
-fn exits(access: &Arc<Access>, pubsub: &Arc<PubSub>) -> (Exits, Entries) {
+fn exits(mapping: &Mapping, access: &Arc<Access>, pubsub: &Arc<PubSub>) -> (Exits, Entries) {
     let (writes, written) = mpsc::channel(MOST_WRITES);
     let (created, created_items) = mpsc::channel(MOST_CREATED);
     let (questions, heard) = Questions::channel();
@@ -576,7 +606,9 @@ fn exits(access: &Arc<Access>, pubsub: &Arc<PubSub>) -> (Exits, Entries) {
         questions,
         access: Arc::clone(access),
         pubsub: Arc::clone(pubsub),
+        confirms: Arc::default(),
     };
+    exits.confirms.follow(mapping);
     (exits, (written, created_items, heard))
 }
 

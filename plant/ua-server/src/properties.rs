@@ -52,6 +52,10 @@ pub(crate) fn add(address_space: &mut AddressSpace, topic: &TopicNode) {
         let value = ExtensionObject::from_message(Range { low, high });
         add(EU_RANGE, DataTypeId::Range, -1, value.into());
     }
+    if let Some(digits) = meaning.precision {
+        let digits = f64::from(digits);
+        add(VALUE_PRECISION, DataTypeId::Double, -1, digits.into());
+    }
     let texts = &meaning.texts;
     if texts.is_empty() {
         return;
@@ -100,7 +104,14 @@ const ENGINEERING_UNITS: &str = "EngineeringUnits";
 const EU_RANGE: &str = "EURange";
 const ENUM_STRINGS: &str = "EnumStrings";
 const ENUM_VALUES: &str = "EnumValues";
-const NAMES: [&str; 4] = [ENGINEERING_UNITS, EU_RANGE, ENUM_STRINGS, ENUM_VALUES];
+const VALUE_PRECISION: &str = "ValuePrecision";
+const NAMES: [&str; 5] = [
+    ENGINEERING_UNITS,
+    EU_RANGE,
+    ENUM_STRINGS,
+    ENUM_VALUES,
+    VALUE_PRECISION,
+];
 
 #[cfg(test)]
 mod tests {

@@ -152,6 +152,11 @@ impl Space {
         &self.structures
     }
 
+    /// How much is kept of what was.
+    pub(crate) fn limit_past(&self, mapping: &Mapping) {
+        self.manager.inner().limit_past(mapping);
+    }
+
     /// How large a value may be that clients write, in bytes.
     pub(crate) fn limit_writes(&self, largest: usize) {
         self.manager.inner().limit_writes(largest);

@@ -5,7 +5,9 @@ use std::process::{Command, Output, Stdio};
 use std::{fs, io::Write as _};
 
 use serde_json::{Value, json};
-use system_tests::{Cell, Child, HERE, Peer, SERVER_ENDPOINT, eventually, program};
+use system_tests::{
+    Cell, Child, Executes, Executor, HERE, Peer, SERVER_ENDPOINT, eventually, program,
+};
 
 use super::SOON;
 
@@ -443,4 +445,71 @@ fn what_other_hosts_reach_is_secured_unless_the_mapping_says_otherwise() {
         assert_eq!(offered.contains(&"None".to_owned()), policies == 2);
         server.end();
     }
+}
+
+#[test]
+fn who_may_not_call_is_told_so_nothing_is_executed_and_calls_are_audited() {
+    let mapping = "
+namespaces:
+  2: urn:ua-bridge:system-tests
+spaces:
+  - id: 1
+calls:
+  - node: ns=2;i=61
+    name: Grip
+    origin: 1
+    permissions: {call: engineer}
+    ros: {service: /grip, type: std_srvs/Trigger}
+";
+    let Some(site) = Site::with(mapping, &["--trust-any-client-certificate"]) else {
+        return;
+    };
+    let executor = Executor::start((1, 2, 61), "Grip", Executes::AtOnce, 1);
+    site.told(&["user", "add", "anna", "--role", "operator"], PASSWORD);
+    let certificates = site.cell.folder().join("caller");
+    let secured = [
+        "--security",
+        "Basic256Sha256",
+        "--certificates",
+        path(&certificates),
+    ];
+    let anna = [&secured[..], &["--user", "anna", "--password", PASSWORD]].concat();
+    let called = |who: &[&str]| {
+        let args = [SERVER_ENDPOINT, "UaSpace/Calls/Grip", "--value", "[]"];
+        let told = site
+            .cell
+            .asyncua_try("opcua_call.py", &[&args[..], who].concat())?;
+        Some(told.last()?["status"].clone())
+    };
+    let becomes = |who: &[&str], wanted: &str| {
+        eventually(&format!("a call of {who:?} is {wanted}"), SOON * 2, || {
+            (called(who)? == wanted).then_some(())
+        });
+    };
+    let mut audit = site
+        .cell
+        .asyncua("opcua_access.py", &["audit", SERVER_ENDPOINT]);
+    let mut told = |user: &str, done: bool| {
+        audit.wait_for_json(&format!("a call of {user}: {done}"), SOON, |line| {
+            let same = line.get("EventType")? == "AuditUpdateMethodEventType"
+                && line["ClientUserId"] == user
+                && line["Status"] == done;
+            same.then(|| line.clone())
+        })
+    };
+    let refused = "BadUserAccessDenied";
+    becomes(&anna, refused);
+    becomes(&secured, refused);
+    assert_eq!(executor.executed(), 0);
+    let audited = told("anna", false);
+    let method = audited["MethodId"].as_str().unwrap();
+    assert!(
+        method.contains("Identifier=61, NamespaceIndex=2"),
+        "{audited}"
+    );
+
+    site.told(&["user", "role", "anna", "engineer"], "");
+    becomes(&anna, "Good");
+    assert_eq!(executor.executed(), 1);
+    assert_eq!(told("anna", true)["SourceName"], "Attribute/Call");
 }

@@ -9,8 +9,10 @@ use crate::values::Shown;
 /// Past values, the oldest of each topic first.
 #[derive(Debug)]
 pub(crate) struct Past {
-    /// For each topic.
+    /// For each topic that has none of its own.
     most_values: usize,
+    /// For single ones.
+    own: HashMap<TopicId, usize>,
     /// Of all together.
     most_bytes: usize,
     bytes: usize,
@@ -30,6 +32,7 @@ impl Past {
     pub(crate) fn new(most_values: usize, most_bytes: usize) -> Self {
         Self {
             most_values,
+            own: HashMap::new(),
             most_bytes,
             bytes: 0,
             next: 0,
@@ -37,11 +40,29 @@ impl Past {
         }
     }
 
+    /// Keeps so many values of each topic from now on, and of single ones so many, in so many bytes for all.
+    pub(crate) fn limit(
+        &mut self,
+        (most_values, most_bytes): (usize, usize),
+        own: HashMap<TopicId, usize>,
+    ) {
+        (self.most_values, self.most_bytes, self.own) = (most_values, most_bytes, own);
+        for (topic, kept) in &mut self.topics {
+            let most = self.own.get(topic).copied().unwrap_or(most_values);
+            let over = kept.values.len().saturating_sub(most);
+            self.bytes -= kept.drop_oldest(over);
+        }
+        while self.bytes > self.most_bytes {
+            self.make_room();
+        }
+    }
+
     /// Takes in the value that a topic shows now. Where there is no room for all, topics that take up about their share of it or
     /// more give up the older half of their values.
     pub(crate) fn keep(&mut self, topic: TopicId, shown: &Shown) {
         let size = size(shown);
-        if self.most_values == 0 || size > self.most_bytes {
+        let most = self.own.get(&topic).copied().unwrap_or(self.most_values);
+        if most == 0 || size > self.most_bytes {
             return;
         }
         let kept = self.topics.entry(topic).or_default();
@@ -49,7 +70,7 @@ impl Past {
         self.next += 1;
         kept.bytes += size;
         self.bytes += size;
-        if kept.values.len() > self.most_values {
+        if kept.values.len() > most {
             self.bytes -= kept.drop_oldest(1);
         }
         while self.bytes > self.most_bytes {
@@ -137,6 +158,29 @@ mod tests {
         assert_eq!(marks(&past, other), [9]);
         past.remove(one);
         assert_eq!(past.bytes, 4 + BESIDE);
+    }
+
+    #[test]
+    fn a_topic_with_a_number_of_its_own_keeps_so_many_and_fewer_when_told() {
+        let (one, other, none) = (
+            TopicId::new(1, 2, 3).unwrap(),
+            TopicId::new(1, 2, 4).unwrap(),
+            TopicId::new(1, 2, 5).unwrap(),
+        );
+        let mut past = Past::new(3, 1 << 20);
+        past.limit((3, 1 << 20), HashMap::from([(one, 5), (none, 0)]));
+        for mark in 0..6 {
+            for topic in [one, other, none] {
+                past.keep(topic, &value(4, mark));
+            }
+        }
+        assert_eq!(marks(&past, one), [1, 2, 3, 4, 5]);
+        assert_eq!(marks(&past, other), [3, 4, 5]);
+        assert!(marks(&past, none).is_empty());
+        past.limit((2, 1 << 20), HashMap::from([(other, 1)]));
+        assert_eq!(marks(&past, one), [4, 5]);
+        assert_eq!(marks(&past, other), [5]);
+        assert_eq!(past.bytes, 3 * (4 + BESIDE));
     }
 
     #[test]

@@ -1,0 +1,192 @@
+//! What says that a written value has arrived.
+
+use std::collections::HashMap;
+use std::time::Duration;
+
+use uadp::BuiltinType;
+
+use super::{network, required, types};
+use crate::code::Code;
+use crate::document::{ConfirmEntry, ConfirmWhenEntry, VariableEntry};
+use crate::findings::Findings;
+use crate::mapping::Variable;
+use crate::node_id::NodeIdText;
+use crate::quality::{Answer, Confirm};
+use crate::read::{given, short};
+use crate::topic::{SpaceId, TopicId};
+use crate::tree::Place;
+
+/// Ties variables to those that answer for them. What is faulty is noted.
+pub(super) fn check<'d>(
+    entries: impl Iterator<Item = (TopicId, &'d VariableEntry)>,
+    variables: &mut [Variable],
+    findings: &mut Findings,
+) {
+    let mut confirms = Vec::new();
+    let entries = entries.filter_map(|(topic, entry)| Some((topic, entry.confirm.as_ref()?)));
+    let mut entries = entries.peekable();
+    if entries.peek().is_none() {
+        return;
+    }
+    let by_node: HashMap<&NodeIdText, &Variable> =
+        variables.iter().map(|one| (&one.node, one)).collect();
+    let by_topic: HashMap<TopicId, usize> = (0..)
+        .zip(variables.iter())
+        .map(|(at, one)| (one.topic, at))
+        .collect();
+    for (topic, at) in entries {
+        let Some(entry) = &at.value else { continue };
+        let Some(index) = by_topic.get(&topic) else {
+            continue;
+        };
+        let Some(written) = variables.get(*index) else {
+            continue;
+        };
+        let confirm = confirm((entry, at.place), written, &by_node, findings);
+        confirms.extend(confirm.map(|confirm| (*index, confirm)));
+    }
+    for (index, confirm) in confirms {
+        if let Some(variable) = variables.get_mut(index) {
+            variable.confirm = Some(Box::new(confirm));
+        }
+    }
+}
+
+/// `None` when something is faulty, which is noted.
+fn confirm(
+    (entry, place): (&ConfirmEntry, Place),
+    written: &Variable,
+    by_node: &HashMap<&NodeIdText, &Variable>,
+    findings: &mut Findings,
+) -> Option<Confirm> {
+    if !is_written(written) {
+        findings
+            .error(Code::Confirm, place, "no client writes this variable")
+            .help("`confirm` goes with `origin: 0`, and not with `from`");
+        return None;
+    }
+    let within = network::duration(&entry.within, findings);
+    if entry.within.is_some() && within.is_none() {
+        return None;
+    }
+    let (node, at) = required(&entry.by, "by", "`confirm`", place, findings)?;
+    let Ok(node) = node.parse::<NodeIdText>() else {
+        let message = format!("`{}` is no node id", short(node));
+        findings.error(Code::NodeId, at, message);
+        return None;
+    };
+    let Some(by) = by_node.get(&node) else {
+        let message = format!("no variable has the node `{}`", short(&node.to_string()));
+        findings
+            .error(Code::Confirm, at, message)
+            .help("the node of the variable that the robot answers with, as ns=2;i=31");
+        return None;
+    };
+    if is_written(by) {
+        findings
+            .error(
+                Code::Confirm,
+                at,
+                "the answer is a variable that clients write, not one of the robot",
+            )
+            .help("a variable of another space, or one that comes `from` a server");
+        return None;
+    }
+    let answer = answer(entry, (written, by), at, findings)?;
+    Some(Confirm {
+        by: by.topic,
+        within: within.unwrap_or(WITHIN),
+        answer,
+    })
+}
+
+fn answer(
+    entry: &ConfirmEntry,
+    (written, by): (&Variable, &Variable),
+    place: Place,
+    findings: &mut Findings,
+) -> Option<Answer> {
+    if let Some((text, at)) = given(&entry.equals) {
+        if entry.when.is_some() {
+            findings
+                .error(
+                    Code::Confirm,
+                    at,
+                    "`when` and `equals` say both which answer counts",
+                )
+                .help("leave one of them out");
+            return None;
+        }
+        if !is_value(text, by.value_type) {
+            let told = by.value_type.map(types::print);
+            let message = format!(
+                "`{}` is no value of the answer, which is {}",
+                short(text),
+                told.unwrap_or_else(|| "a message of several fields".to_owned())
+            );
+            findings
+                .error(Code::Confirm, at, message)
+                .help("one Boolean, number or text; bind the `field` that says it");
+            return None;
+        }
+        return Some(Answer::Equals(text.clone()));
+    }
+    match given(&entry.when) {
+        Some((ConfirmWhenEntry::Any, _)) => Some(Answer::Any),
+        Some((ConfirmWhenEntry::Same, _)) | None => {
+            if !are_comparable(written, by) {
+                findings
+                    .error(
+                        Code::Confirm,
+                        place,
+                        "the answer has another type than what is written, so it is never the same",
+                    )
+                    .help("`equals: true`, or what else the robot answers; or `when: any`");
+                return None;
+            }
+            if by.publish.on_change {
+                findings
+                    .warning(
+                        Code::Confirm,
+                        place,
+                        "the answer is sent on change only: a value that is written twice is not confirmed the second time",
+                    )
+                    .help("leave `publish: on_change` and `deadband` of the answer out");
+            }
+            Some(Answer::Same)
+        }
+    }
+}
+
+/// Whether clients write it.
+fn is_written(variable: &Variable) -> bool {
+    variable.topic.space == SpaceId::UA && variable.from.is_none()
+}
+
+/// Of what is not known beforehand nothing is said.
+fn are_comparable(written: &Variable, by: &Variable) -> bool {
+    if written.fields.is_empty() || by.fields.is_empty() {
+        return true;
+    }
+    let fields = written.fields.iter().zip(&by.fields);
+    written.fields.len() == by.fields.len()
+        && fields
+            .map(|(one, other)| (types::value_type(one), types::value_type(other)))
+            .all(|(one, other)| {
+                let numbers = messages::is_number(one.0) && messages::is_number(other.0);
+                one == other || (numbers && one.1 == other.1)
+            })
+}
+
+/// Whether the text is one value of the type.
+fn is_value(text: &str, value_type: Option<types::ValueType>) -> bool {
+    match value_type {
+        Some((BuiltinType::Boolean, false)) => matches!(text, "true" | "false"),
+        Some((BuiltinType::String, false)) => true,
+        Some((builtin, false)) if messages::is_number(builtin) => text.parse::<f64>().is_ok(),
+        Some(_) | None => false,
+    }
+}
+
+/// How long an answer may take where nothing is said.
+const WITHIN: Duration = Duration::from_secs(2);

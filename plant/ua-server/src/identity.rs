@@ -1,0 +1,142 @@
+//! What the server says of itself: its limits, its build, and whose namespaces it has (OPC 10000-5, 6.3).
+//!
+//! The library leaves these empty, or has no nodes for them.
+
+use opcua::nodes::{ObjectBuilder, VariableBuilder};
+use opcua::server::Limits;
+use opcua::server::address_space::AddressSpace;
+use opcua::types::{
+    BuildInfo, DataTypeId, DateTime, LocalizedText, NodeId, ObjectId, ObjectTypeId, QualifiedName,
+    UAString, VariableId, VariableTypeId, Variant,
+};
+
+use crate::endpoint::{APPLICATION_NAME, PRODUCT_URI};
+use crate::value;
+
+/// What the program is.
+pub(crate) fn build_info() -> BuildInfo {
+    BuildInfo {
+        product_uri: UAString::from(PRODUCT_URI),
+        manufacturer_name: UAString::from(MANUFACTURER),
+        product_name: UAString::from(APPLICATION_NAME),
+        software_version: UAString::from(env!("CARGO_PKG_VERSION")),
+        build_number: UAString::from(env!("CARGO_PKG_VERSION")),
+        build_date: built(),
+    }
+}
+
+/// When the program file was made; packages keep that. Null where the system does not say.
+fn built() -> DateTime {
+    let file = std::env::current_exe().and_then(std::fs::metadata);
+    let modified = file.and_then(|file| file.modified()).ok();
+    let since = modified.and_then(|time| time.duration_since(std::time::UNIX_EPOCH).ok());
+    let nanos = since.and_then(|since| i128::try_from(since.as_nanos()).ok());
+    let time = nanos.map(uadp::Timestamp::from_unix_nanos);
+    time.map_or_else(DateTime::null, |time| value::date_time(time.time))
+}
+
+/// The limits that clients can read beside those that the library tells.
+pub(crate) fn capabilities(limits: &Limits) -> Vec<(VariableId, Variant)> {
+    let count = |number: usize| Variant::from(u32::try_from(number).unwrap_or(u32::MAX));
+    let (sessions, each) = (limits.max_sessions, &limits.subscriptions);
+    let subscriptions = sessions.saturating_mul(each.max_subscriptions_per_session);
+    let items = subscriptions.saturating_mul(each.max_monitored_items_per_sub);
+    let locales = vec![UAString::from("en")];
+    vec![
+        (
+            VariableId::Server_ServerCapabilities_LocaleIdArray,
+            locales.into(),
+        ),
+        (
+            VariableId::Server_ServerCapabilities_MaxSessions,
+            count(sessions),
+        ),
+        (
+            VariableId::Server_ServerCapabilities_MaxSubscriptions,
+            count(subscriptions),
+        ),
+        (
+            VariableId::Server_ServerCapabilities_MaxSubscriptionsPerSession,
+            count(each.max_subscriptions_per_session),
+        ),
+        (
+            VariableId::Server_ServerCapabilities_MaxMonitoredItems,
+            count(items),
+        ),
+        (
+            VariableId::Server_ServerCapabilities_MaxMonitoredItemsPerSubscription,
+            count(each.max_monitored_items_per_sub),
+        ),
+        (
+            VariableId::Server_ServerCapabilities_MaxMonitoredItemsQueueSize,
+            count(each.max_monitored_item_queue_size),
+        ),
+        // RedundancySupport None: there is one server.
+        (
+            VariableId::Server_ServerRedundancy_RedundancySupport,
+            Variant::from(0_i32),
+        ),
+    ]
+}
+
+/// Adds an object below Namespaces for each namespace of ours. None of their nodes is the same in other servers, so none is static.
+pub(crate) fn add_namespaces<'a>(
+    namespaces: impl Iterator<Item = (u16, &'a str)>,
+    address_space: &mut AddressSpace,
+) {
+    for (index, uri) in namespaces {
+        let object = NodeId::new(APPLICATION, format!("Namespaces.{index}"));
+        ObjectBuilder::new(
+            &object,
+            QualifiedName::new(index, uri),
+            LocalizedText::from(uri),
+        )
+        .has_type_definition(ObjectTypeId::NamespaceMetadataType)
+        .component_of(ObjectId::Server_Namespaces)
+        .insert(address_space);
+        let mut add = |name: &str, data_type: DataTypeId, rank: i32, value: Variant| {
+            VariableBuilder::new(
+                &NodeId::new(APPLICATION, format!("Namespaces.{index}.{name}")),
+                QualifiedName::new(0, name),
+                LocalizedText::from(name),
+            )
+            .data_type(data_type)
+            .value_rank(rank)
+            .value(value)
+            .has_type_definition(VariableTypeId::PropertyType)
+            .property_of(object.clone())
+            .insert(address_space);
+        };
+        let text = |text: &str| Variant::from(UAString::from(text));
+        let none: Vec<i32> = Vec::new();
+        let no_ranges: Vec<UAString> = Vec::new();
+        add("NamespaceUri", DataTypeId::String, -1, text(uri));
+        add("NamespaceVersion", DataTypeId::String, -1, text(""));
+        let published = Variant::from(DateTime::null());
+        add(
+            "NamespacePublicationDate",
+            DataTypeId::DateTime,
+            -1,
+            published,
+        );
+        add("IsNamespaceSubset", DataTypeId::Boolean, -1, false.into());
+        add("StaticNodeIdTypes", DataTypeId::IdType, 1, none.into());
+        add(
+            "StaticNumericNodeIdRange",
+            DataTypeId::NumericRange,
+            1,
+            no_ranges.into(),
+        );
+        add(
+            "StaticStringNodeIdPattern",
+            DataTypeId::String,
+            -1,
+            text(""),
+        );
+    }
+}
+
+/// Whose program it is.
+const MANUFACTURER: &str = "UA bridge";
+/// The namespace index of the application's own URI.
+const APPLICATION: u16 = 1;

@@ -1,0 +1,175 @@
+"""Reads the attributes that every node of a server has to have: one JSON line for each that a client cannot use, and one with what was read.
+
+With --server one line says what the server tells of itself, and no tree is read. With --export the nodes of all namespaces but that of OPC UA are written by asyncua's exporter and loaded by its importer into a server of its
+own; a line says which of them are others there than here.
+"""
+
+import argparse
+import asyncio
+import os
+import tempfile
+
+from asyncua import Server, ua
+from asyncua.common.xmlexporter import XmlExporter
+
+import lifetime
+import opcua_session
+
+A = ua.AttributeIds
+EVERY = [A.NodeId, A.NodeClass, A.BrowseName, A.DisplayName]
+# What a node of a class has in any case: OPC 10000-3, tables 2 to 23.
+OF_CLASS = {
+    ua.NodeClass.Object: [A.EventNotifier],
+    ua.NodeClass.Variable: [A.Value, A.DataType, A.ValueRank, A.AccessLevel, A.UserAccessLevel, A.Historizing],
+    ua.NodeClass.Method: [A.Executable, A.UserExecutable],
+    ua.NodeClass.ObjectType: [A.IsAbstract],
+    ua.NodeClass.VariableType: [A.DataType, A.ValueRank, A.IsAbstract],
+    ua.NodeClass.ReferenceType: [A.IsAbstract, A.Symmetric],
+    ua.NodeClass.DataType: [A.IsAbstract],
+    ua.NodeClass.View: [A.ContainsNoLoops, A.EventNotifier],
+}
+AT_ONCE = 40
+
+
+async def browsed(client):
+    """Every node that hierarchical references lead to, with its class."""
+    root = client.nodes.root.nodeid
+    found, waiting = {root: ua.NodeClass.Object}, [root]
+    while waiting:
+        part, waiting = waiting[:AT_ONCE], waiting[AT_ONCE:]
+        for one in await references(client, part):
+            target = ua.NodeId(one.NodeId.Identifier, one.NodeId.NamespaceIndex, one.NodeId.NodeIdType)
+            if target not in found:
+                found[target] = one.NodeClass
+                waiting.append(target)
+    return found
+
+
+async def references(client, nodes):
+    parameters = ua.BrowseParameters()
+    parameters.View.Timestamp = ua.get_win_epoch()
+    for node in nodes:
+        wanted = ua.BrowseDescription()
+        wanted.NodeId = node
+        wanted.BrowseDirection = ua.BrowseDirection.Forward
+        wanted.ReferenceTypeId = ua.NodeId(ua.ObjectIds.HierarchicalReferences)
+        wanted.IncludeSubtypes = True
+        wanted.ResultMask = ua.BrowseResultMask.All
+        parameters.NodesToBrowse.append(wanted)
+    told = []
+    for result in await client.uaclient.browse(parameters):
+        while True:
+            result.StatusCode.check()
+            told.extend(result.References)
+            if not result.ContinuationPoint:
+                break
+            more = ua.BrowseNextParameters()
+            more.ContinuationPoints = [result.ContinuationPoint]
+            (result,) = await client.uaclient.browse_next(more)
+    return told
+
+
+async def attributes(client, found):
+    nodes = list(found)
+    read = bad = 0
+    for start in range(0, len(nodes), AT_ONCE):
+        part = nodes[start : start + AT_ONCE]
+        wanted = [
+            ua.ReadValueId(NodeId=node, AttributeId=attribute)
+            for node in part
+            for attribute in EVERY + OF_CLASS[ua.NodeClass(found[node])]
+        ]
+        parameters = ua.ReadParameters()
+        parameters.NodesToRead = wanted
+        answers = await client.uaclient.read(parameters)
+        for asked, answer in zip(wanted, answers, strict=True):
+            read += 1
+            if answer.StatusCode.is_good():
+                continue
+            status = answer.StatusCode.name
+            bad += 1
+            lifetime.say(node=asked.NodeId.to_string(), attribute=A(asked.AttributeId).name, status=status)
+    lifetime.say(nodes=len(nodes), read=read, bad=bad)
+
+
+async def described(node):
+    kind = await node.read_node_class()
+    told = {"class": kind.name, "name": (await node.read_browse_name()).Name}
+    told["display"] = (await node.read_display_name()).Text
+    if kind == ua.NodeClass.Variable:
+        told["type"] = (await node.read_data_type()).Identifier
+        told["rank"] = int(await node.read_value_rank())
+    return told
+
+
+async def round_trip(client, found):
+    ours = [client.get_node(node) for node in found if node.NamespaceIndex > 0]
+    file = tempfile.NamedTemporaryFile(suffix=".xml", delete=False)
+    file.close()
+    exporter = XmlExporter(client, export_values=False)
+    await exporter.build_etree(ours)
+    await exporter.write_xml(file.name)
+    other = Server()
+    await other.init()
+    for uri in (await client.get_namespace_array())[1:]:
+        await other.register_namespace(uri)
+    made = await other.import_xml(file.name)
+    os.unlink(file.name)
+    array = await client.get_namespace_array()
+    differ = []
+    for node in ours:
+        index = await other.get_namespace_index(array[node.nodeid.NamespaceIndex])
+        there = other.get_node(ua.NodeId(node.nodeid.Identifier, index, node.nodeid.NodeIdType))
+        one = await described(node)
+        try:
+            same = await described(there) == one
+        except ua.UaStatusCodeError as fault:
+            same, one = False, {"fault": str(fault), **one}
+        if not same:
+            differ.append(one)
+    lifetime.say(exported=len(ours), imported=len(made), differ=differ)
+
+
+def plain(structure):
+    return {name: opcua_session.plain(getattr(structure, name)) for name in structure.__dataclass_fields__}
+
+
+async def of_server(client):
+    ids = ua.ObjectIds
+    value = lambda identifier: client.get_node(ua.NodeId(identifier)).read_value()
+    status = await value(ids.Server_ServerStatus)
+    summary = await value(ids.Server_ServerDiagnostics_ServerDiagnosticsSummary)
+    namespaces = []
+    for one in await client.get_node(ua.NodeId(ids.Server_Namespaces)).get_children():
+        namespaces.append(await (await one.get_child("0:NamespaceUri")).read_value())
+    lifetime.say(
+        build=plain(status.BuildInfo),
+        state=int(status.State),
+        sessions=await value(ids.Server_ServerCapabilities_MaxSessions),
+        connected=summary.CurrentSessionCount,
+        namespaces=namespaces,
+    )
+
+
+async def run(args):
+    async with await opcua_session.client_of(args) as client:
+        if args.server:
+            await of_server(client)
+            return
+        found = await browsed(client)
+        await attributes(client, found)
+        if args.export:
+            await round_trip(client, found)
+
+
+def main():
+    parser = argparse.ArgumentParser()
+    opcua_session.add_arguments(parser)
+    parser.add_argument("--export", action="store_true")
+    parser.add_argument("--server", action="store_true")
+    args = parser.parse_args()
+    lifetime.bound(args.limit)
+    asyncio.run(run(args))
+
+
+main()

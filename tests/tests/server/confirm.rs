@@ -1,0 +1,107 @@
+//! Writes that have succeeded when the robot answers, and not when they have been sent.
+
+use system_tests::Distribution;
+
+use super::*;
+
+const MAPPING: &str = "
+namespaces:
+  2: urn:ua-bridge:system-tests
+spaces:
+  - id: 1
+  - id: 2
+variables:
+  - node: ns=2;i=10
+    name: reached
+    type: Double
+    origin: SPACE
+    ros: {topic: /arm/reached, type: std_msgs/Float64, field: data}
+  - node: ns=2;i=30
+    name: setpoint
+    type: Double
+    origin: 0
+    confirm: {by: ns=2;i=10, within: 3s}
+    ros: {space: SPACE, topic: /arm/setpoint, type: std_msgs/Float64, field: data}
+server:
+  security: [None]
+";
+
+const TOPICS: [&str; 2] = ["/arm/setpoint", "/arm/reached"];
+const SETPOINT: &str = "ns=2;i=30";
+
+fn served(cell: &Cell, space: &str) -> (Child, String) {
+    let mapping = cell.file("confirm.yaml", &MAPPING.replace("SPACE", space));
+    let mapping = mapping.to_str().unwrap().to_owned();
+    let server = cell.ua_server(&[&mapping]);
+    eventually("the server answers clients", SOON, || {
+        cell.asyncua_try("opcua_read.py", &[SERVER_ENDPOINT, "ns=0;i=2258"])
+    });
+    (server, mapping)
+}
+
+fn got(robot: &mut Child, setpoint: f64) {
+    robot.wait_for_json(&format!("the setpoint {setpoint}"), SOON, |line| {
+        (line.get("setpoint")?.as_f64()? == setpoint).then_some(())
+    });
+}
+
+/// Whether what goes out in `window` has a setpoint in it.
+fn is_sent(group: &UadpSocket, window: Duration) -> bool {
+    let sent = group.receive_for(window);
+    let mut written = sent.iter().filter_map(|datagram| written(datagram));
+    written.any(|(triple, _)| triple == (0, 2, 30))
+}
+
+/// A robot that is there behind its bridge, and then is not.
+fn confirms(cell: &Cell, mut robot: Child) {
+    let set = |value: &str| write(cell, SETPOINT, "Double", value);
+    // The first one may leave before everybody has found everybody.
+    eventually("the robot answers", SOON * 2, || {
+        (set("5.0") == "Good").then_some(())
+    });
+    got(&mut robot, 5.0);
+    assert_eq!(read(cell, SETPOINT)["value"], 5.0);
+    assert_eq!(set("5.0"), "Good", "each write has its own answer");
+
+    let group = UadpSocket::join();
+    assert_eq!(set("500.0"), "BadTimeout");
+    got(&mut robot, 500.0);
+    let shown = read(cell, SETPOINT);
+    assert_eq!(
+        (&shown["value"], &shown["status"]),
+        (&json!(5.0), &json!("Good"))
+    );
+    // What was on its way.
+    let _before = group.receive_for(Duration::from_millis(100));
+    let three_periods = Duration::from_secs(3);
+    assert!(!is_sent(&group, three_periods), "it is still repeated");
+
+    assert_eq!(set("6.0"), "Good");
+    assert!(is_sent(&group, three_periods), "it is not repeated");
+    drop(robot);
+    assert_eq!(set("7.0"), "BadTimeout");
+    assert_eq!(read(cell, SETPOINT)["value"], 6.0);
+}
+
+#[test]
+fn a_write_has_succeeded_when_a_robot_of_rospy_answers_and_has_not_happened_when_it_does_not() {
+    let Some(cell) = Cell::with(&[Peer::Python, Peer::Ros1]) else {
+        return;
+    };
+    let _master = cell.roscore();
+    let (_server, mapping) = served(&cell, "1");
+    let _bridge = cell.bridge_ros1(&[&mapping]);
+    let robot = cell.rospy("ros1_arm.py", &TOPICS);
+    confirms(&cell, robot);
+}
+
+#[test]
+fn a_write_has_succeeded_when_a_robot_of_rclpy_answers_and_has_not_happened_when_it_does_not() {
+    let Some(cell) = Cell::with(&[Peer::Python, Peer::Ros2]) else {
+        return;
+    };
+    let (_server, mapping) = served(&cell, "2");
+    let _bridge = cell.bridge_ros2(&[&mapping]);
+    let robot = cell.rclpy(Distribution::Jazzy, "ros2_arm.py", &TOPICS);
+    confirms(&cell, robot);
+}
