@@ -14,7 +14,7 @@ use std::{
 };
 
 use nix::sys::signal::Signal;
-use serde_json::Value;
+use serde_json::{Value, json};
 use system_tests::{
     BareNode, Cell, Child, MASTER, METRICS_ROS1, METRICS_ROS2, Peer, SERVER_ENDPOINT, UaSide,
     UadpSocket, eventually, http_get, metrics, string_frame, xml_rpc,
@@ -551,6 +551,16 @@ fn the_server_has_the_nodes_of_the_saved_mapping_and_its_clients_stay() {
     let nodes = ["ns=2;i=1", "ns=2;i=2", "ns=2;i=3"];
     let before = eventually("the server answers", SOON, || read(&nodes));
     assert_eq!(before, [waiting, waiting, unknown]);
+    let mut changes = cell.asyncua("opcua_changes.py", &[SERVER_ENDPOINT]);
+    changes.wait_for_json("the client listens", SOON, |line| {
+        line.get("ready").map(|_| ())
+    });
+    let mut told = |wanted: Value| {
+        changes.wait_for_json(&format!("{wanted} is told"), SOON, |line| {
+            (*line.get("changes")? == wanted).then_some(())
+        });
+    };
+    let (added, deleted, other_type) = (1, 2, 16);
 
     // The file that was started with does not change, only what it includes.
     save(
@@ -565,8 +575,15 @@ fn the_server_has_the_nodes_of_the_saved_mapping_and_its_clients_stay() {
     );
     server.wait_for_line("was read again", SOON);
     assert_eq!(read(&nodes), Some(vec![waiting.to_owned(); 3]));
+    told(json!([["ns=2;i=3", added]]));
+    save(
+        &part,
+        "variables:\n  - {node: ns=2;i=3, name: New, type: Int32, origin: 0}\n",
+    );
+    told(json!([["ns=2;i=3", other_type]]));
     save(&file, &whole.replace("node: ns=2;i=2,", "node: ns=2;i=7,"));
     server.wait_for_line("unbound topic=ua_1_2_2", SOON);
     let after = read(&nodes).unwrap();
     assert_eq!(after, [waiting, unknown, waiting]);
+    told(json!([["ns=2;i=2", deleted], ["ns=2;i=7", added]]));
 }

@@ -10,10 +10,10 @@
 //! there), `methods` and `argument_types` (calls of the space as Methods), `programs` (actions as Programs), `asking` (how
 //! clients ask for both), `executing` (Methods of other servers as calls), `sources` (their nodes as values), `clients` (the
 //! sessions for both), `finding` (those with skills that discovery finds), `others` (all of these), `port` (the shell's side),
-//! `endpoint` (how clients get in), `identity` (what the server says of itself), `confirm` (what says that a write has arrived),
-//! `access` (what each may do), `auditing` (what is told of it), `sks` (keys of secured groups), `pubsub` (the PubSub
-//! configuration as nodes), `value` (between the two codecs), `verbs` (certificates and users by hand), `restart` (in its own
-//! place, for another certificate).
+//! `endpoint` (how clients get in), `changes` (what is told of a reload), `identity` (what the server says of itself), `confirm`
+//! (what says that a write has arrived), `access` (what each may do), `auditing` (what is told of it), `sks` (keys of secured
+//! groups), `pubsub` (the PubSub configuration as nodes), `value` (between the two codecs), `verbs` (certificates and users by
+//! hand), `restart` (in its own place, for another certificate).
 
 mod access;
 mod address;
@@ -22,6 +22,7 @@ mod asking;
 mod auditing;
 mod browse;
 mod budget;
+mod changes;
 mod clients;
 mod components;
 mod confirm;

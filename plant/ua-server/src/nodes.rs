@@ -27,7 +27,7 @@ use opcua::types::{
 };
 use plant_opcua::server::Caller;
 use plant_opcua::users::Access;
-use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, oneshot};
 use tracing::{info, warn};
 use uadp::Timestamp;
 
@@ -101,6 +101,8 @@ pub(crate) struct ClientWrite {
     pub(crate) source: Timestamp,
     /// Given back when it has left.
     pub(crate) room: OwnedSemaphorePermit,
+    /// Told when it has left.
+    pub(crate) gone_out: oneshot::Sender<()>,
 }
 
 impl SpaceNodes {
@@ -487,14 +489,30 @@ impl SpaceNodes {
             let _shown = self.show(&context.subscriptions, &topic, arrived);
             return Ok(());
         }
-        // Until it is shown nobody else may write: what is not written stays as it is.
-        let _alone = self.writing.lock();
-        let sent = self.send_alone(place, write, &|_| {})?;
-        let _shown = self.show(&context.subscriptions, &topic, sent);
-        Ok(())
+        let gone_out = self.write_and_show(context, place, write)?;
+        // Its sender is dropped where the server ends.
+        match tokio::time::timeout(LONGEST_WAY_OUT, gone_out).await {
+            Ok(Ok(())) => Ok(()),
+            Ok(Err(_)) => Err(StatusCode::BadShutdown),
+            Err(_) => Err(StatusCode::BadTimeout),
+        }
     }
 
-    /// As [`send_alone`](Self::send_alone), while nobody else writes.
+    /// Has a value sent and shows it.
+    fn write_and_show(
+        &self,
+        context: &RequestContext,
+        place: (&TopicNode, Option<usize>),
+        write: &ParsedWriteValue,
+    ) -> Result<oneshot::Receiver<()>, StatusCode> {
+        // Until it is shown nobody else may write: what is not written stays as it is.
+        let _alone = self.writing.lock();
+        let (sent, gone_out) = self.send_alone(place, write, &|_| {})?;
+        let _shown = self.show(&context.subscriptions, place.0, sent);
+        Ok(gone_out)
+    }
+
+    /// As [`send_alone`](Self::send_alone), while nobody else writes; an answer says more than that it has left.
     fn send_written(
         &self,
         place: (&TopicNode, Option<usize>),
@@ -502,17 +520,18 @@ impl SpaceNodes {
         register: &dyn Fn(&[Variant]),
     ) -> Result<Shown, StatusCode> {
         let _alone = self.writing.lock();
-        self.send_alone(place, write, register)
+        let (sent, _gone_out) = self.send_alone(place, write, register)?;
+        Ok(sent)
     }
 
     /// Works out all fields of the topic after a write, and has them sent; they are registered before. Gives what is to be
-    /// shown then.
+    /// shown then, and what tells that it has left.
     fn send_alone(
         &self,
         (topic, field): (&TopicNode, Option<usize>),
         write: &ParsedWriteValue,
         register: &dyn Fn(&[Variant]),
-    ) -> Result<Shown, StatusCode> {
+    ) -> Result<(Shown, oneshot::Receiver<()>), StatusCode> {
         if self.exits.pubsub.is_off(topic.topic) {
             // Its writer is disabled, so it would not go out.
             return Err(StatusCode::BadInvalidState);
@@ -539,18 +558,23 @@ impl SpaceNodes {
         register(&fields);
         drop(fields);
         let source = source_of(&write.value);
-        self.send(topic, block.clone(), source)?;
+        let gone_out = self.send(topic, block.clone(), source)?;
         let stamp = Stamp {
             status: StatusCode::Good,
             source: Some(source),
             server: DateTime::now(),
         };
         let block = Some(block);
-        Ok(Shown { block, stamp })
+        Ok((Shown { block, stamp }, gone_out))
     }
 
     /// Hands a written value to the run loop.
-    fn send(&self, topic: &TopicNode, block: Bytes, source: Timestamp) -> Result<(), StatusCode> {
+    fn send(
+        &self,
+        topic: &TopicNode,
+        block: Bytes,
+        source: Timestamp,
+    ) -> Result<oneshot::Receiver<()>, StatusCode> {
         if block.len() > self.largest_write.load(Ordering::Relaxed) {
             return Err(StatusCode::BadRequestTooLarge);
         }
@@ -558,13 +582,16 @@ impl SpaceNodes {
         let size = u32::try_from(block.len() >> 10).map_err(|_| full)?;
         let room = Arc::clone(&self.exits.room);
         let room = room.try_acquire_many_owned(size).map_err(|_| full)?;
+        let (gone_out, told) = oneshot::channel();
         let write = ClientWrite {
             topic: topic.topic,
             block,
             source,
             room,
+            gone_out,
         };
-        self.exits.writes.try_send(write).map_err(|_| full)
+        self.exits.writes.try_send(write).map_err(|_| full)?;
+        Ok(told)
     }
 
     fn program(&self, method: &NodeId) -> Option<Drive> {
@@ -986,6 +1013,8 @@ fn now() -> Instant {
 const NAME: &str = "space";
 /// Counts as no interval at all, yet is above the 0 that the server takes for "not asked for".
 const AS_IT_COMES_MS: f64 = 0.000_1;
+/// How long a write may wait for the run loop.
+const LONGEST_WAY_OUT: Duration = Duration::from_secs(10);
 const SECOND_LOOK: Duration = Duration::from_millis(100);
 /// Bytes of all values that are shown.
 const MOST_HELD: usize = 512 << 20;

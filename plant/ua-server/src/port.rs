@@ -25,7 +25,7 @@ use plant_opcua::pki::Pki;
 use plant_opcua::server::{Security, core_of, core_with};
 use plant_opcua::users::{self, Access, UserFault};
 use tokio::runtime::Runtime;
-use tokio::sync::{Semaphore, mpsc};
+use tokio::sync::{Semaphore, mpsc, oneshot};
 use tokio::task::JoinHandle;
 use tokio::time::{Interval, MissedTickBehavior};
 use tracing::{info, warn};
@@ -100,6 +100,8 @@ pub(crate) struct ServerPort {
     readers: Readers,
     /// Writes that wait for an answer.
     confirms: Arc<Confirms>,
+    /// Who is told that the write that was reported last has left.
+    leaving: Option<oneshot::Sender<()>>,
     /// When a publisher that is not heard counts as away.
     receive_timeout: Duration,
     /// As the group is told.
@@ -192,6 +194,7 @@ impl ServerPort {
             pubsub,
             readers: Readers::default(),
             confirms,
+            leaving: None,
             receive_timeout: mapping.pubsub().receive_timeout,
             application,
             certificates,
@@ -216,6 +219,11 @@ impl ServerPort {
 
 impl Port for ServerPort {
     async fn recv(&mut self) -> PortEvent {
+        // What was reported before has been carried out.
+        if let Some(gone_out) = self.leaving.take() {
+            // Who wrote may have gone.
+            let _gone = gone_out.send(());
+        }
         self.space.settle();
         if let Some(topic) = self.unbound.pop_front() {
             return PortEvent::Unbound { topic };
@@ -229,8 +237,9 @@ impl Port for ServerPort {
             }
             tokio::select! {
                 Some(write) = self.writes.recv() => {
-                    let ClientWrite { topic, block, source, room } = write;
+                    let ClientWrite { topic, block, source, room, gone_out } = write;
                     drop(room);
+                    self.leaving = Some(gone_out);
                     self.confirms.supersede(topic);
                     self.others.sources.put(topic, &block);
                     return PortEvent::Sample { topic, payload: block, received: source, latched_by: None };

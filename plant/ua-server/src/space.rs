@@ -12,6 +12,7 @@ use opcua::types::{DateTime, StatusCode};
 use uadp::{Fields, Scalar, Timestamp};
 
 use crate::address;
+use crate::changes;
 use crate::layout::{Layout, Shape, TopicNode};
 use crate::nodes::SpaceManager;
 use crate::structures::Structure;
@@ -128,6 +129,7 @@ impl Space {
             &self.subscriptions,
             (&gone, &new),
         );
+        changes::tell(&self.subscriptions, &gone, &new);
         for node in &new {
             let known = Known::new(node.clone(), true);
             self.topics.insert(node.topic, known);

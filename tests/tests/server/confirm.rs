@@ -105,3 +105,56 @@ fn a_write_has_succeeded_when_a_robot_of_rclpy_answers_and_has_not_happened_when
     let robot = cell.rclpy(Distribution::Jazzy, "ros2_arm.py", &TOPICS);
     confirms(&cell, robot);
 }
+
+#[test]
+fn the_last_write_that_a_killed_server_confirmed_is_what_the_robot_got() {
+    let Some(cell) = Cell::with(&[Peer::Python, Peer::Ros1]) else {
+        return;
+    };
+    let _master = cell.roscore();
+    let sent = MAPPING.replace("    confirm: {by: ns=2;i=10, within: 3s}\n", "");
+    assert_ne!(sent, MAPPING);
+    let mapping = cell.file("sent.yaml", &sent.replace("SPACE", "1"));
+    let mapping = mapping.to_str().unwrap();
+    let server = cell.ua_server(&[mapping]);
+    let _bridge = cell.bridge_ros1(&[mapping]);
+    let mut robot = cell.rospy("ros1_arm.py", &TOPICS);
+    eventually("the robot is told", SOON * 2, || {
+        let args = [SERVER_ENDPOINT, SETPOINT, "Double", "0.5"];
+        let _status = cell.asyncua_try("opcua_write.py", &args)?;
+        let told = robot.json_lines();
+        told.iter()
+            .any(|line| line.get("setpoint").is_some())
+            .then_some(())
+    });
+    let args = [
+        SERVER_ENDPOINT,
+        SETPOINT,
+        "Double",
+        "--many",
+        "--patience",
+        "3",
+    ];
+    let mut client = cell.asyncua("opcua_write.py", &args);
+    robot.wait_for_json("a hundred setpoints", SOON, |line| {
+        (line.get("setpoint")?.as_f64()? >= 100.0).then_some(())
+    });
+    server.signal(nix::sys::signal::Signal::SIGKILL);
+    client.wait_for_json("the client is told", SOON, |line| {
+        line.get("gone").map(|_| ())
+    });
+    let confirmed = client.json_lines();
+    let confirmed = confirmed
+        .iter()
+        .filter_map(|line| line.get("confirmed")?.as_f64());
+    let last = confirmed.max_by(f64::total_cmp).unwrap();
+    // One more may have left whose confirmation did not.
+    eventually(&format!("{last} has come"), SOON, || {
+        let told = robot.json_lines();
+        let got = told
+            .iter()
+            .filter_map(|line| line.get("setpoint")?.as_f64());
+        let got = got.max_by(f64::total_cmp)?;
+        (got == last || got == last + 1.0).then_some(())
+    });
+}
