@@ -42,6 +42,7 @@ pub use executing::{Executing, ExecutorGraph};
 pub use exit::{Failure, FailureKind};
 pub use keys::{Fetched, Fetching, KeyRequest, KeyService};
 pub use logging::{LogFormat, LogRecord, LogSink, hear_log};
+pub use mapping_file::NodeSetReader;
 pub use metrics::{Requests, Told, serve_pages};
 pub use port::{Delivery, Execution, LinkState, Port, PortEvent};
 pub use present::Present;

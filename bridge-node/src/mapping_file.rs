@@ -2,7 +2,7 @@
 
 mod look;
 
-use std::cell::RefCell;
+use std::cell::{Cell, RefCell};
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
 use std::io::Write as _;
@@ -11,8 +11,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use mappings::{
-    Checked, Code, Diagnostic, Mapping, Readers, Severity, SpaceId, Surroundings, TypeOrigin,
-    TypeUse,
+    Checked, Code, Diagnostic, Mapping, NodeSets, Readers, Severity, SpaceId, Surroundings,
+    TypeOrigin, TypeUse,
 };
 use messages::{Dialect, TextKind, TypeName};
 use serde::Serialize;
@@ -26,6 +26,9 @@ use type_files::{Environment, TypeFiles, TypePaths};
 use self::look::{Before, Look, Seen, see};
 use crate::clock::now;
 use crate::exit::{Failure, FailureKind};
+
+/// Reads NodeSet2 files for the check of a mapping.
+pub type NodeSetReader = fn(&[PathBuf]) -> Box<dyn NodeSets>;
 
 /// The mapping that runs, and what is to be told of it.
 #[derive(Debug, Clone)]
@@ -94,9 +97,14 @@ type Known = BTreeSet<(Dialect, TextKind, TypeName)>;
 ///
 /// # Errors
 /// Why the file cannot be read.
-fn read(file: &Path, running: &TypePaths, known: &Known) -> Result<Reading, String> {
+fn read(
+    (file, nodesets): (&Path, Option<NodeSetReader>),
+    running: &TypePaths,
+    known: &Known,
+) -> Result<Reading, String> {
     let disk = Disk {
         running,
+        nodesets: (nodesets, Cell::default()),
         seen: RefCell::default(),
         types: RefCell::default(),
     };
@@ -127,6 +135,8 @@ fn read(file: &Path, running: &TypePaths, known: &Known) -> Result<Reading, Stri
         // Where one ends and the next begins.
         all.update([0]);
     }
+    // What the NodeSets are belongs to it as if it stood there.
+    all.update(disk.nodesets.1.get().to_le_bytes());
     let mut hash = String::new();
     for byte in all.finalize().iter().take(8) {
         // Writing to a string does not fail.
@@ -159,6 +169,8 @@ struct Disk<'r> {
     seen: RefCell<Seen>,
     /// What the `type_paths` have, once they were read.
     types: RefCell<Option<Arc<TypePaths>>>,
+    /// How NodeSets are read, and the fingerprint of those that were.
+    nodesets: (Option<NodeSetReader>, Cell<u64>),
 }
 
 impl Disk<'_> {
@@ -200,12 +212,25 @@ impl Surroundings for Disk<'_> {
         let own = Arc::clone(self.types.borrow_mut().get_or_insert_with(read));
         Box::new(TypeFiles::new(own, Environment::from_env()))
     }
+
+    fn nodesets(&self, files: &[PathBuf]) -> Option<Box<dyn NodeSets>> {
+        let (reader, fingerprint) = &self.nodesets;
+        let reader = (*reader)?;
+        for file in files {
+            see(&mut self.seen.borrow_mut().mapping, file);
+        }
+        let sets = reader(files);
+        fingerprint.set(sets.fingerprint());
+        Some(sets)
+    }
 }
 
 /// The file and the mapping last taken from it.
 #[derive(Debug)]
 pub(crate) struct MappingFile {
     file: Option<PathBuf>,
+    /// How the NodeSets that it names are read.
+    nodesets: Option<NodeSetReader>,
     /// The files as they were when they were last read.
     files: Arc<Seen>,
     /// Of the last reading, taken or refused.
@@ -233,6 +258,7 @@ impl MappingFile {
         };
         Self {
             file: None,
+            nodesets: None,
             files: Arc::default(),
             hash: String::new(),
             fingerprint: 0,
@@ -251,14 +277,14 @@ impl MappingFile {
     /// # Errors
     /// A file that cannot be read, or a mapping that cannot run.
     pub(crate) fn open(
-        file: Option<&Path>,
+        (file, nodesets): (Option<&Path>, Option<NodeSetReader>),
         only_check: bool,
         spaces: impl FnOnce(&Mapping) -> Result<Vec<SpaceId>, Failure>,
     ) -> Result<Option<Self>, Failure> {
         let Some(file) = file else {
             return Ok((!only_check).then(|| Self::none(Mapping::default())));
         };
-        let mut reading = read(file, &TypePaths::default(), &Known::new())
+        let mut reading = read((file, nodesets), &TypePaths::default(), &Known::new())
             .map_err(|error| Failure::new(FailureKind::Io, error))?;
         let spaces = reading.checked.outline().map(spaces).transpose();
         let mut own = Vec::new();
@@ -289,6 +315,7 @@ impl MappingFile {
                 };
                 Ok(Some(Self {
                     file: Some(file.to_owned()),
+                    nodesets,
                     files: Arc::new(reading.files),
                     hash: reading.hash,
                     fingerprint: reading.fingerprint,
@@ -341,6 +368,7 @@ impl MappingFile {
             };
             let look = Look {
                 file,
+                nodesets: self.nodesets,
                 files: Arc::clone(&self.files),
                 before: std::mem::take(&mut before),
                 turn,
@@ -563,11 +591,12 @@ mod tests {
         write("types/my_msgs/msg/Arm.msg", "bool x\n");
         write("cell.yaml", "spaces: [{id: 1}]\ntype_paths: [types]\n");
         let file = folder.join("cell.yaml");
-        let mut mapping = MappingFile::open(Some(&file), false, |_| Ok(vec![SpaceId::ROS1]))
-            .unwrap()
-            .unwrap();
+        let mut mapping =
+            MappingFile::open((Some(&file), None), false, |_| Ok(vec![SpaceId::ROS1]))
+                .unwrap()
+                .unwrap();
         let mut take = || {
-            let reading = read(&file, &mapping.running.types, &mapping.known);
+            let reading = read((&file, None), &mapping.running.types, &mapping.known);
             assert!(mapping.take(reading, false));
             let about = &mapping.running.about;
             let stale = about.stale.clone().unwrap_or_default();
@@ -599,20 +628,20 @@ mod tests {
         cell("/arm");
         let open = |number: u16| {
             let serves = |_: &Mapping| Ok(vec![SpaceId::new(number).unwrap_or(SpaceId::UA)]);
-            MappingFile::open(Some(&file), false, serves)
+            MappingFile::open((Some(&file), None), false, serves)
         };
         let stopped = open(2).unwrap_err();
         assert_eq!(stopped.kind(), FailureKind::Configuration);
         open(0).unwrap().unwrap();
         let mut mapping = open(1).unwrap().unwrap();
         cell("/other");
-        let reading = read(&file, &mapping.running.types, &mapping.known);
+        let reading = read((&file, None), &mapping.running.types, &mapping.known);
         assert!(mapping.take(reading, false));
         let about = &mapping.running.about;
         assert_eq!((about.reloads, about.refused), (1, 0));
         // Where nobody can say which space is served, the whole cell is checked.
         let nobody = |_: &Mapping| Err(Failure::new(FailureKind::Usage, "which?"));
-        let checked = MappingFile::open(Some(&file), true, nobody).unwrap_err();
+        let checked = MappingFile::open((Some(&file), None), true, nobody).unwrap_err();
         assert_eq!(checked.kind(), FailureKind::Configuration);
         std::fs::remove_dir_all(&folder).unwrap();
     }

@@ -25,7 +25,7 @@ use crate::descriptors;
 use crate::exit::{Failure, FailureKind};
 use crate::keys::{KeyRing, KeyService};
 use crate::logging;
-use crate::mapping_file::{MappingFile, Running};
+use crate::mapping_file::{MappingFile, NodeSetReader, Running};
 use crate::metrics::{self, Requests};
 use crate::port::Port;
 use crate::run::{Fixed, Shell};
@@ -44,6 +44,9 @@ pub trait Program: Parser {
     const LOCAL: Local;
     /// Log directives that hush what a library says without need, such as `rustdds=warn`.
     const QUIET: &'static str = "";
+
+    /// How it reads the NodeSet2 files that a mapping names, where it does.
+    const NODESETS: Option<NodeSetReader> = None;
 
     /// The arguments all programs have.
     fn arguments(&self) -> &Arguments;
@@ -144,7 +147,7 @@ pub fn run<P: Program>() -> ExitCode {
     let mapping = match program.made() {
         Ok(Some(Made::Run(made))) => Ok(Some(MappingFile::none(made))),
         Ok(Some(Made::Checked)) => Ok(None),
-        Ok(None) => MappingFile::open(mapping, arguments.check, spaces),
+        Ok(None) => MappingFile::open((mapping, P::NODESETS), arguments.check, spaces),
         Err(failure) => Err(failure),
     };
     let ended = match mapping {

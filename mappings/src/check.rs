@@ -9,6 +9,7 @@ mod finding;
 mod meaning;
 mod names;
 mod network;
+mod nodesets;
 mod patterns;
 mod permissions;
 mod quality;
@@ -298,8 +299,10 @@ fn compile(
     let spaces = cell::spaces(document.spaces.as_ref(), findings);
     let namespaces = cell::namespaces(document.namespaces.as_ref(), findings);
     let pubsub = network::pubsub(document.pubsub.as_ref(), findings);
+    let (files, named) = nodesets::files(document.server.as_ref(), findings);
     let server = Server {
         find_skills: finding::check(document.server.as_ref(), findings),
+        nodesets: files,
         ..network::server(document.server.as_ref(), findings)
     };
     let near = (&server.endpoint, &namespaces);
@@ -351,6 +354,7 @@ fn compile(
         .with_patterns(patterns)
         .with_type_paths(paths);
     security::left_open(&mapping, &document, findings);
+    nodesets::check(&document, &mapping, &named, around, findings);
     let minded_by_all = findings.errors().iter().any(Vec::is_empty);
     if let Some(environment) = around.environment()
         && !minded_by_all

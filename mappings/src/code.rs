@@ -141,6 +141,8 @@ codes! {
     OpenServer = "M161", "A server that other hosts reach is open to them: it offers None, with which nothing is signed or encrypted, or users without a name may write and call. Both have to be said in the mapping, and seldom should be.";
     Quality = "M162", "`quality` says when a value is no longer good because no newer one comes: `uncertain_after` so long, and `bad_after` it has been uncertain for so long. It goes with values that come from other programs. Values that are sent on change only, or less often than that, would be taken for old while they are not.";
     Confirm = "M163", "`confirm` ties what clients write to what the robot answers: `by` is the node of the variable that answers, of another space or `from` a server, `within` how long that may take, and `when` or `equals` which answer counts. The answer is sent anew for each write, and has the type of what is written unless `equals` or `when: any` says otherwise.";
+    NodeSet = "M170", "`server.nodesets` names NodeSet2 files (XML, OPC 10000-6, Annex F), each beside the file it stands in, of at most 64 MiB. Each namespace that one of them needs is that of another of them, or OPC UA's own, which every server has; no two have the same. Only programs that serve space 0 read them.";
+    NodeSetNode = "M171", "A `node` that a NodeSet has is a Variable, or with a call a Method, and its values are of the type that it has there. In a namespace of a NodeSet a node that it does not have is made anew.";
 }
 
 impl Code {
@@ -163,6 +165,8 @@ impl Code {
                 | Self::StructureOf
                 | Self::CallMap
                 | Self::UnknownActionType
+                | Self::NodeSet
+                | Self::NodeSetNode
         )
     }
 }
@@ -187,7 +191,7 @@ impl std::str::FromStr for Code {
 
 /// A text that is none of the codes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("no finding has that code; codes are M001 to M163")]
+#[error("no finding has that code; codes are M001 to M171")]
 pub struct UnknownCode;
 
 #[cfg(test)]

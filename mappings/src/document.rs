@@ -128,6 +128,9 @@ document! {
         /// Servers with skills that know nothing of the space, and that discovery finds: ua-server shows these skills in the space,
         /// and has them run, as it does those of `servers` that have `skills`. Left out: none is looked for.
         find_skills: FindSkillsEntry,
+        /// NodeSet2 files whose nodes the server has beside those of the mapping, in any order, relative to this file; at most 64.
+        /// A variable whose `node` is one of them makes it live; its namespace stands in `namespaces`.
+        nodesets: Vec<At<String>>,
     }
 
     /// How much the server keeps of what was, in memory.

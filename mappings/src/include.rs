@@ -107,6 +107,7 @@ impl<'a> Loader<'a> {
                 }
             }
         }
+        self.nodesets(&mut document, &path);
         for file in key_files(&mut document) {
             *file = beside(&path, file);
         }
@@ -119,6 +120,25 @@ impl<'a> Loader<'a> {
         }
         self.open.pop();
         Some(())
+    }
+
+    /// The NodeSets that a document names are beside its file.
+    fn nodesets(&mut self, document: &mut Document, path: &str) {
+        let server = document.server.as_mut().and_then(|at| at.value.as_mut());
+        let files = server.and_then(|server| server.nodesets.as_mut()?.value.as_mut());
+        for At { place, value } in files.into_iter().flatten() {
+            if value.as_ref().is_some_and(|named| named.contains("://")) {
+                let note = self.findings.error(Code::NodeSet, *place, URL);
+                note.help(
+                    "files are read from the disk: write a path, from the folder of this file",
+                );
+                *value = None;
+            }
+            // An empty one stays what it is, for a finding.
+            if let Some(named) = value.as_mut().filter(|named| !named.is_empty()) {
+                *named = beside(path, named);
+            }
+        }
     }
 
     /// Notes at the first of them that passwords stand in a file.

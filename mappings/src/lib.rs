@@ -14,6 +14,7 @@ mod key_text;
 mod mapping;
 mod nearest;
 mod node_id;
+mod nodesets;
 mod pattern;
 mod permission;
 mod quality;
@@ -45,6 +46,7 @@ pub use mapping::{
     ServerLimits, ServiceBinding, ServiceRole, Space, Trigger, UaField, Variable,
 };
 pub use node_id::{ExpandedNodeIdText, Identifier, NamespaceText, NodeIdError, NodeIdText};
+pub use nodesets::{NodeSetFault, NodeSetNode, NodeSetType, NodeSets};
 pub use pattern::{Pattern, PatternFault, PatternReason, PatternVariable};
 pub use permission::{Anonymous, Permissions, Role};
 pub use quality::{Ages, Answer, Confirm, History};

@@ -448,6 +448,8 @@ pub struct Server {
     pub limits: ServerLimits,
     /// Which servers with skills it speaks for when they are found, if any.
     pub find_skills: Option<FindSkills>,
+    /// NodeSet2 files whose nodes it has beside those of the mapping.
+    pub nodesets: Vec<PathBuf>,
 }
 
 /// How much clients may take up of the server; `None` is left to the server.
@@ -488,6 +490,7 @@ impl Default for Server {
             history: History::default(),
             limits: ServerLimits::default(),
             find_skills: None,
+            nodesets: Vec::new(),
         }
     }
 }

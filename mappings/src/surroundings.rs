@@ -6,6 +6,7 @@ use messages::NoTexts;
 
 use crate::check::TypeFiles;
 use crate::environment::Environment;
+use crate::nodesets::NodeSets;
 
 /// The files beside a document and the variables of its environment.
 pub trait Surroundings {
@@ -35,6 +36,12 @@ pub trait Surroundings {
     fn types(&self, paths: &[PathBuf]) -> Box<dyn TypeFiles> {
         let _ = paths;
         Box::new(NoTexts)
+    }
+
+    /// The NodeSet2 files that the document names, read; `None` where nobody reads them here.
+    fn nodesets(&self, files: &[PathBuf]) -> Option<Box<dyn NodeSets>> {
+        let _ = files;
+        None
     }
 
     /// What is there in the cell while the document is checked; `None` when nobody asked.

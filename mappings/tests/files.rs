@@ -400,8 +400,12 @@ fn the_passwords_of_a_file_are_one_finding_and_leave_room_for_errors() {
 #[test]
 fn a_url_is_no_path_and_its_password_is_not_shown() {
     let url = "https://robot:open-sesame@host/x.yaml";
-    for (key, code) in [("include", Code::Include), ("type_paths", Code::TypePath)] {
-        let text = format!("{HEAD}{key}: [\"{url}\"]\n");
+    for (keys, code) in [
+        ("include: [@]", Code::Include),
+        ("type_paths: [@]", Code::TypePath),
+        ("server: {nodesets: [@]}", Code::NodeSet),
+    ] {
+        let text = format!("{HEAD}{}\n", keys.replace('@', &format!("\"{url}\"")));
         let wild = text.replace("x.yaml", "*.yaml");
         let given = text.replace(url, "${URL}");
         for text in [text, wild, given] {

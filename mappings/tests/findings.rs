@@ -5,9 +5,9 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use mappings::{
-    Access, Checked, Code, Endpoint, Environment, LiveNode, LiveRemote, LiveServer, LiveSpace,
-    LiveTopic, Mapping, MethodTarget, PathFault, PathFaultKind, Severity, SpaceId, Surroundings,
-    TypeFiles, TypeOrigin,
+    Access, Checked, Code, Endpoint, Environment, Identifier, LiveNode, LiveRemote, LiveServer,
+    LiveSpace, LiveTopic, Mapping, MethodTarget, NodeSetFault, NodeSetNode, NodeSetType, NodeSets,
+    PathFault, PathFaultKind, Severity, SpaceId, Surroundings, TypeFiles, TypeOrigin,
 };
 use messages::{DefinitionText, DefinitionTexts, Dialect, Language, TextKind, TypeName};
 use uadp::BuiltinType;
@@ -56,8 +56,57 @@ impl Surroundings for Around {
         Box::new(Folder(paths.to_vec()))
     }
 
+    fn nodesets(&self, files: &[PathBuf]) -> Option<Box<dyn NodeSets>> {
+        Some(Box::new(Line(files.to_vec())))
+    }
+
     fn environment(&self) -> Option<&Environment> {
         self.environment.as_ref()
+    }
+}
+
+/// The NodeSet of a line, in the file line.xml; there is no other.
+struct Line(Vec<PathBuf>);
+
+impl NodeSets for Line {
+    fn faults(&mut self) -> Vec<NodeSetFault> {
+        let files = self.0.iter().enumerate();
+        files
+            .filter(|(_, path)| !path.ends_with("line.xml"))
+            .map(|(file, path)| NodeSetFault {
+                file,
+                is_fatal: true,
+                what: format!(
+                    "the NodeSet {} cannot be read: it is not there",
+                    path.display()
+                ),
+                help: "the path is taken from the folder of the file it stands in".to_owned(),
+            })
+            .collect()
+    }
+
+    fn fingerprint(&self) -> u64 {
+        0
+    }
+
+    fn has(&self, uri: &str) -> bool {
+        uri == "urn:line"
+    }
+
+    fn node(&self, _: &str, node: &Identifier) -> Option<NodeSetNode> {
+        let Identifier::Numeric(number) = node else {
+            return None;
+        };
+        Some(match number {
+            1 => NodeSetNode::Variable(NodeSetType::Builtin(BuiltinType::Double), -1),
+            2 => NodeSetNode::Variable(NodeSetType::Number, -1),
+            3 => NodeSetNode::Variable(NodeSetType::Builtin(BuiltinType::Int32), 1),
+            4 => NodeSetNode::Other,
+            5 => NodeSetNode::Method,
+            1001 => NodeSetNode::Variable(NodeSetType::Any, -2),
+            1002 => NodeSetNode::Variable(NodeSetType::Any, -1),
+            _ => return None,
+        })
     }
 }
 

@@ -14,6 +14,8 @@ mod history;
 mod identity;
 #[path = "server/malformed.rs"]
 mod malformed;
+#[path = "server/nodesets.rs"]
+mod nodesets;
 #[path = "server/pubsub.rs"]
 mod pubsub;
 #[path = "server/quality.rs"]

@@ -10,7 +10,7 @@ use tokio::time::timeout;
 use tracing::warn;
 use type_files::TypePaths;
 
-use super::{Known, Reading, read};
+use super::{Known, NodeSetReader, Reading, read};
 
 /// What was read, or would have been, and how each file and folder was before that.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -89,6 +89,7 @@ pub(super) struct Looked {
 #[derive(Debug)]
 pub(super) struct Look {
     pub(super) file: PathBuf,
+    pub(super) nodesets: Option<NodeSetReader>,
     /// As they were read last.
     pub(super) files: Arc<Seen>,
     pub(super) before: Before,
@@ -155,7 +156,8 @@ impl Look {
                 types,
             },
             gone: false,
-            reading: (wanted || self.asked).then(|| read(&self.file, &self.running, &self.known)),
+            reading: (wanted || self.asked)
+                .then(|| read((&self.file, self.nodesets), &self.running, &self.known)),
         }
     }
 
@@ -223,6 +225,7 @@ mod tests {
             self.turn += 1;
             let look = Look {
                 file: self.folder.join("cell.yaml"),
+                nodesets: None,
                 files: Arc::clone(&self.files),
                 before: std::mem::take(&mut self.before),
                 turn: self.turn,

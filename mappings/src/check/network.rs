@@ -265,6 +265,7 @@ pub(super) fn server(entry: Option<&At<ServerEntry>>, findings: &mut Findings) -
         history: history(&entry.history, findings),
         limits: limits(&entry.limits, findings),
         find_skills: None,
+        nodesets: Vec::new(),
     };
     permissions::left_open(entry, &server, findings);
     server

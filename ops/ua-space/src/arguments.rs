@@ -185,7 +185,7 @@ pub(crate) struct Check {
     /// One JSON object a file, with its findings
     #[arg(long)]
     pub(crate) json: bool,
-    /// For the host whose program serves this space, or these as 2,3; 0 is ua-server. What is wrong with types that only
+    /// For the host whose program serves this space, or these as 2,3; 0 is ua-server. What is wrong with types or NodeSets that only
     /// others need is a warning, as it is for that program. Without it all of a mapping counts
     #[arg(long = "for", value_name = "SPACE", value_delimiter = ',', value_parser = space)]
     pub(crate) spaces: Vec<SpaceId>,

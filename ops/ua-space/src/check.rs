@@ -5,7 +5,7 @@ use std::io::{self, BufWriter, Write as _};
 use std::path::PathBuf;
 
 use mappings::{
-    Checked, Diagnostic, Environment, Mapping, Readers, SpaceId, Surroundings, TypeFiles,
+    Checked, Diagnostic, Environment, Mapping, NodeSets, Readers, SpaceId, Surroundings, TypeFiles,
     TypeOrigin, TypeUse,
 };
 use messages::Dialect;
@@ -103,6 +103,10 @@ impl Surroundings for Around<'_> {
 
     fn types(&self, paths: &[PathBuf]) -> Box<dyn TypeFiles> {
         Disk.types(paths)
+    }
+
+    fn nodesets(&self, files: &[PathBuf]) -> Option<Box<dyn NodeSets>> {
+        Some(plant_nodesets::read(files))
     }
 
     fn environment(&self) -> Option<&Environment> {

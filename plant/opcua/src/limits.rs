@@ -26,6 +26,10 @@ pub const MOST_SESSIONS: usize = 50;
 pub const LONGEST_REQUEST: Duration = Duration::from_secs(10);
 /// Bytes of the largest NodeSet file.
 pub const LARGEST_NODESET: u64 = 64 << 20;
+/// Bytes of all NodeSet files of a server.
+pub const LARGEST_NODESETS: u64 = 128 << 20;
+/// NodeSet files of a server.
+pub const MOST_NODESETS: usize = 64;
 
 /// The limits of a server.
 #[must_use]

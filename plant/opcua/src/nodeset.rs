@@ -1,6 +1,9 @@
 //! NodeSet2 files (OPC 10000-6, Annex F): read, checked and put into an order in which each has what it needs.
 
-use std::collections::{BTreeSet, HashMap, HashSet};
+mod files;
+mod outline;
+
+use std::collections::{BTreeSet, HashMap};
 use std::fs::File;
 use std::io::{self, Read as _};
 use std::path::PathBuf;
@@ -10,13 +13,18 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use opcua::nodes::{ImportedItem, NodeBase as _, NodeSet2Import, NodeSetImport, NodeType};
 use opcua::server::address_space::AddressSpace;
 use opcua::types::{
-    DataTypeDefinition, NamespaceMap, NodeId, NodeSetNamespaceMapper, ReferenceTypeId,
+    DataTypeDefinition, Identifier, NamespaceMap, NodeId, NodeSetNamespaceMapper, ReferenceTypeId,
     StructureDefinition,
 };
 use opcua::xml::load_nodeset2_file;
 use opcua::xml::schema::ua_node_set::{UANode, UANodeSet};
 
-use crate::limits::LARGEST_NODESET;
+use crate::limits::{LARGEST_NODESET, MOST_NODESETS};
+
+pub use self::files::{FileFault, NodeSets, fingerprint};
+pub use self::outline::{NodeKind, ValueKind, builtin};
+
+use self::outline::Outline;
 
 /// The namespace of the OPC Foundation, index 0 of every server.
 pub const CORE: &str = "http://opcfoundation.org/UA/";
@@ -61,6 +69,27 @@ pub enum NodeSetError {
         /// How many nodes the file has.
         all: usize,
     },
+    /// Values of nodes cannot be read, such as structures of types that are not known; the nodes are there without them.
+    #[error("{file}: the values of {count} nodes cannot be read, of which the first is {first}")]
+    Unread {
+        /// The file.
+        file: String,
+        /// The NodeId of the first of them, as the file has it.
+        first: String,
+        /// How many there are.
+        count: usize,
+    },
+    /// The file has nodes of the namespace that every server has.
+    #[error("{file} has nodes of the core namespace, as {node}")]
+    Core {
+        /// The file.
+        file: String,
+        /// The NodeId of the first of them.
+        node: String,
+    },
+    /// There are too many files.
+    #[error("there are more than {MOST_NODESETS} NodeSets")]
+    Many,
     /// No file has the nodes of a namespace that is needed.
     #[error("{file} needs the namespace {uri}, and no NodeSet given has it")]
     Missing {
@@ -94,6 +123,12 @@ pub(crate) enum Source {
 /// A NodeSet that can be imported.
 pub(crate) struct NodeSet {
     file: String,
+    facts: Facts,
+    import: NodeSet2Import,
+}
+
+/// What is known of a document whose nodes are sound.
+struct Facts {
     /// The namespaces of its table, by their index less `offset`.
     uris: Vec<String>,
     offset: usize,
@@ -101,8 +136,7 @@ pub(crate) struct NodeSet {
     provides: BTreeSet<String>,
     /// The namespaces it refers to beside those and [`CORE`].
     needs: BTreeSet<String>,
-    nodes: usize,
-    import: NodeSet2Import,
+    nodes: Outline,
 }
 
 /// Reads the sources and orders them.
@@ -114,88 +148,56 @@ pub(crate) fn load(sources: Vec<Source>) -> Result<Vec<NodeSet>, NodeSetError> {
     ordered(read.collect::<Result<_, _>>()?)
 }
 
+/// The document of a source, with its name.
+fn parsed(source: Source) -> Result<(String, UANodeSet), NodeSetError> {
+    let (file, xml) = match source {
+        Source::Text { name, xml } => (name, xml),
+        Source::File(path) => {
+            let file = path.display().to_string();
+            let mut xml = String::new();
+            let read = File::open(&path)
+                .and_then(|opened| opened.take(LARGEST_NODESET + 1).read_to_string(&mut xml));
+            match read {
+                Ok(bytes) if bytes as u64 > LARGEST_NODESET => {
+                    let reason = format!("it has more than {} MiB", LARGEST_NODESET >> 20);
+                    return Err(NodeSetError::Xml { file, reason });
+                }
+                Ok(_) => (file, xml),
+                Err(source) => return Err(NodeSetError::Read { file, source }),
+            }
+        }
+    };
+    let wrong = |reason: String| NodeSetError::Xml {
+        file: file.clone(),
+        reason,
+    };
+    // A byte order mark is no part of the document.
+    let document = load_nodeset2_file(xml.trim_start_matches('\u{feff}'))
+        .map_err(|error| wrong(error.to_string()))?;
+    let set = document
+        .node_set
+        .ok_or_else(|| wrong("it has no UANodeSet element".to_owned()))?;
+    Ok((file, set))
+}
+
 impl NodeSet {
     fn read(source: Source) -> Result<Self, NodeSetError> {
-        let (file, xml) = match source {
-            Source::Text { name, xml } => (name, xml),
-            Source::File(path) => {
-                let file = path.display().to_string();
-                let mut xml = String::new();
-                let read = File::open(&path)
-                    .and_then(|opened| opened.take(LARGEST_NODESET + 1).read_to_string(&mut xml));
-                match read {
-                    Ok(bytes) if bytes as u64 > LARGEST_NODESET => {
-                        let reason = format!("it has more than {} MiB", LARGEST_NODESET >> 20);
-                        return Err(NodeSetError::Xml { file, reason });
-                    }
-                    Ok(_) => (file, xml),
-                    Err(source) => return Err(NodeSetError::Read { file, source }),
-                }
-            }
-        };
-        let wrong = |reason: String| NodeSetError::Xml {
-            file: file.clone(),
-            reason,
-        };
-        // A byte order mark is no part of the document.
-        let document = load_nodeset2_file(xml.trim_start_matches('\u{feff}'))
-            .map_err(|error| wrong(error.to_string()))?;
-        let set = document
-            .node_set
-            .ok_or_else(|| wrong("it has no UANodeSet element".to_owned()))?;
-        Self::checked(file, set)
+        let (file, set) = parsed(source)?;
+        let facts = Facts::of(&file, &set)?;
+        Ok(Self::new(file, facts, set))
     }
 
-    fn checked(file: String, set: UANodeSet) -> Result<Self, NodeSetError> {
-        let table = set.namespace_uris.as_ref();
-        let uris = table.map_or_else(Vec::new, |table| table.uris.clone());
-        // Some tools list the core namespace too, as index 0.
-        let offset = usize::from(uris.first().is_none_or(|first| first != CORE));
-        let aliases = set.aliases.iter().flat_map(|table| &table.aliases);
-        let check = Check {
-            file: &file,
-            uris: &uris,
-            offset,
-            aliases: aliases
-                .map(|alias| (alias.alias.as_str(), alias.id.0.as_str()))
-                .collect(),
-        };
-        let mut seen = HashSet::new();
-        let mut provides = BTreeSet::new();
-        let mut needs = BTreeSet::new();
-        for node in &set.nodes {
-            let (id, used) = check.node(node)?;
-            let uri = check.uri(id.namespace).unwrap_or(CORE);
-            if uri == CORE {
-                return Err(check.wrong(node, "a NodeSet has no nodes of the core namespace"));
-            }
-            provides.insert(uri.to_owned());
-            needs.extend(used);
-            if !seen.insert(id) {
-                return Err(check.wrong(node, "there are two nodes with this NodeId"));
-            }
-        }
-        for model in set.models.iter().flat_map(|table| &table.models) {
-            provides.insert(model.model_uri.clone());
-            let required = model.required_model.iter();
-            needs.extend(required.map(|model| model.model_uri.clone()));
-        }
-        needs.remove(CORE);
-        needs.retain(|uri| !provides.contains(uri));
-        Ok(Self {
+    fn new(file: String, facts: Facts, set: UANodeSet) -> Self {
+        Self {
             file,
-            uris,
-            offset,
-            provides,
-            needs,
-            nodes: set.nodes.len(),
+            facts,
             import: NodeSet2Import::new_nodeset("en", set, Vec::new()),
-        })
+        }
     }
 
     /// The namespaces it has nodes of.
     pub(crate) fn provides(&self) -> impl Iterator<Item = &str> {
-        self.provides.iter().map(String::as_str)
+        self.facts.provides.iter().map(String::as_str)
     }
 
     /// Puts the nodes into an address space, which owns the namespaces from now on.
@@ -213,14 +215,91 @@ impl NodeSet {
         };
         address_space.import_node_set(&counted, namespaces);
         let loaded = counted.loaded.into_inner();
-        if loaded < self.nodes {
+        if loaded < self.facts.nodes.len() {
             return Err(NodeSetError::Values {
                 file: self.file.clone(),
-                missing: self.nodes - loaded,
-                all: self.nodes,
+                missing: self.facts.nodes.len() - loaded,
+                all: self.facts.nodes.len(),
             });
         }
         Ok(())
+    }
+}
+
+impl Facts {
+    fn of(file: &str, set: &UANodeSet) -> Result<Self, NodeSetError> {
+        let table = set.namespace_uris.as_ref();
+        let uris = table.map_or_else(Vec::new, |table| table.uris.clone());
+        // Some tools list the core namespace too, as index 0.
+        let offset = usize::from(uris.first().is_none_or(|first| first != CORE));
+        let aliases = set.aliases.iter().flat_map(|table| &table.aliases);
+        let check = Check {
+            file,
+            uris: &uris,
+            offset,
+            aliases: aliases
+                .map(|alias| (alias.alias.as_str(), alias.id.0.as_str()))
+                .collect(),
+        };
+        let mut nodes = Outline::default();
+        let mut provides = BTreeSet::new();
+        let mut needs = BTreeSet::new();
+        for node in &set.nodes {
+            let (id, used) = check.node(node)?;
+            let uri = check.uri(id.namespace).unwrap_or(CORE);
+            if uri == CORE {
+                return Err(NodeSetError::Core {
+                    node: node.base().node_id.0.clone(),
+                    file: file.to_owned(),
+                });
+            }
+            provides.insert(uri.to_owned());
+            needs.extend(used);
+            let resolved = |text: &str| check.id(text).ok();
+            if !nodes.insert(id, node, &resolved) {
+                return Err(check.wrong(node, "there are two nodes with this NodeId"));
+            }
+        }
+        for model in set.models.iter().flat_map(|table| &table.models) {
+            provides.insert(model.model_uri.clone());
+            let required = model.required_model.iter();
+            needs.extend(required.map(|model| model.model_uri.clone()));
+        }
+        needs.remove(CORE);
+        needs.retain(|uri| !provides.contains(uri));
+        Ok(Self {
+            uris,
+            offset,
+            provides,
+            needs,
+            nodes,
+        })
+    }
+
+    /// The URI of a namespace of its table.
+    fn uri(&self, index: u16) -> Option<&str> {
+        if index == 0 {
+            return Some(CORE);
+        }
+        let at = usize::from(index).checked_sub(self.offset)?;
+        self.uris.get(at).map(String::as_str)
+    }
+
+    /// A node as the file numbers its namespace.
+    fn local(&self, uri: &str, identifier: &Identifier) -> Option<NodeId> {
+        let at = self.uris.iter().position(|one| one == uri)?;
+        Some(NodeId {
+            namespace: u16::try_from(at + self.offset).ok()?,
+            identifier: identifier.clone(),
+        })
+    }
+
+    fn register_namespaces(&self, namespaces: &mut NodeSetNamespaceMapper<'_>) {
+        for (index, uri) in (0_u16..).skip(self.offset).zip(&self.uris) {
+            if uri != CORE {
+                namespaces.add_namespace(uri, index);
+            }
+        }
     }
 }
 
@@ -232,15 +311,11 @@ struct Counted<'a> {
 
 impl NodeSetImport for Counted<'_> {
     fn register_namespaces(&self, namespaces: &mut NodeSetNamespaceMapper<'_>) {
-        for (index, uri) in (0_u16..).skip(self.set.offset).zip(&self.set.uris) {
-            if uri != CORE {
-                namespaces.add_namespace(uri, index);
-            }
-        }
+        self.set.facts.register_namespaces(namespaces);
     }
 
     fn get_own_namespaces(&self) -> Vec<String> {
-        let uris = self.set.uris.iter().filter(|uri| *uri != CORE);
+        let uris = self.set.facts.uris.iter().filter(|uri| *uri != CORE);
         uris.cloned().collect()
     }
 
@@ -379,7 +454,7 @@ impl Check<'_> {
 fn ordered(sets: Vec<NodeSet>) -> Result<Vec<NodeSet>, NodeSetError> {
     let mut owners: HashMap<&str, &NodeSet> = HashMap::new();
     for set in &sets {
-        for uri in &set.provides {
+        for uri in &set.facts.provides {
             if let Some(first) = owners.insert(uri, set) {
                 return Err(NodeSetError::Twice {
                     first: first.file.clone(),
@@ -391,6 +466,7 @@ fn ordered(sets: Vec<NodeSet>) -> Result<Vec<NodeSet>, NodeSetError> {
     }
     for set in &sets {
         if let Some(uri) = set
+            .facts
             .needs
             .iter()
             .find(|uri| !owners.contains_key(uri.as_str()))
@@ -405,13 +481,16 @@ fn ordered(sets: Vec<NodeSet>) -> Result<Vec<NodeSet>, NodeSetError> {
     let mut there: BTreeSet<String> = BTreeSet::new();
     let mut ordered = Vec::new();
     while !waiting.is_empty() {
-        let ready = |set: &NodeSet| set.needs.is_subset(&there);
+        let ready = |set: &NodeSet| set.facts.needs.is_subset(&there);
         let (next, rest): (Vec<_>, Vec<_>) = waiting.into_iter().partition(ready);
         if next.is_empty() {
             let files: Vec<&str> = rest.iter().map(|set| set.file.as_str()).collect();
             return Err(NodeSetError::Circle(files.join(", ")));
         }
-        there.extend(next.iter().flat_map(|set| set.provides.iter().cloned()));
+        there.extend(
+            next.iter()
+                .flat_map(|set| set.facts.provides.iter().cloned()),
+        );
         ordered.extend(next);
         waiting = rest;
     }

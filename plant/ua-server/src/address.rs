@@ -66,7 +66,7 @@ pub(crate) fn retype(address_space: &mut AddressSpace, node: &NodeId, shape: Sha
     }
 }
 
-fn access(topic: &TopicNode) -> AccessLevel {
+pub(crate) fn access(topic: &TopicNode) -> AccessLevel {
     let mut level = AccessLevel::CURRENT_READ;
     level.set(AccessLevel::HISTORY_READ, topic.historizing);
     level.set(AccessLevel::CURRENT_WRITE, topic.writable());

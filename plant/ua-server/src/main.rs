@@ -8,7 +8,7 @@
 //! `values` (what they show), `wear` (how that grows old), `history` (what they showed), `nodes` (the node manager), `browse`
 //! (in which order), `budget` (what clients may take up), `space` (values in), `components` and `presence` (which servers are
 //! there), `methods` and `argument_types` (calls of the space as Methods), `programs` (actions as Programs), `asking` (how
-//! clients ask for both), `executing` (Methods of other servers as calls), `sources` (their nodes as values), `clients` (the
+//! clients ask for both), `nodesets` (nodes from files), `executing` (Methods of other servers as calls), `sources` (their nodes as values), `clients` (the
 //! sessions for both), `finding` (those with skills that discovery finds), `others` (all of these), `port` (the shell's side),
 //! `endpoint` (how clients get in), `changes` (what is told of a reload), `identity` (what the server says of itself), `confirm`
 //! (what says that a write has arrived), `access` (what each may do), `auditing` (what is told of it), `sks` (keys of secured
@@ -34,6 +34,7 @@ mod identity;
 mod layout;
 mod methods;
 mod nodes;
+mod nodesets;
 mod others;
 mod port;
 mod presence;
@@ -54,7 +55,9 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::{Arc, OnceLock};
 
-use bridge_node::{Arguments, Context, Failure, FailureKind, KeyService, Owned, Program};
+use bridge_node::{
+    Arguments, Context, Failure, FailureKind, KeyService, NodeSetReader, Owned, Program,
+};
 use discovery::{AnnounceSettings, Interface};
 use mappings::{FindSkills, Mapping, SpaceId};
 use plant_opcua::endpoint::EndpointUrl;
@@ -141,6 +144,8 @@ impl Program for UaServer {
     // one looked whether the server is there. What becomes of other servers is told here.
     const QUIET: &'static str = "opcua_server=warn,opcua_server::session::controller=off,opcua_client=off,\
         opcua_crypto=warn,opcua_core=warn,opcua_nodes=warn,opcua_types=off";
+
+    const NODESETS: Option<NodeSetReader> = Some(plant_nodesets::read);
 
     fn arguments(&self) -> &Arguments {
         &self.arguments

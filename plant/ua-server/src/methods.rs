@@ -107,7 +107,7 @@ impl Methods {
         }
         let node = self.node(topic);
         let Some(around) = self.insert(&node, (topic, description)) else {
-            warn!(%topic, %node, "the call is shown as no Method: there is a node of that id already");
+            warn!(%topic, %node, "the call is shown as no Method: there is a node of that id already, which is none, or has other arguments");
             self.refused.insert(topic, Arc::clone(description));
             return;
         };
@@ -132,7 +132,10 @@ impl Methods {
         (topic, description): (TopicId, &Arc<CallDescription>),
     ) -> Option<Vec<NodeId>> {
         let mut address_space = self.manager.address_space().write();
-        if address_space.node_exists(node) {
+        let nodesets = self.manager.inner().nodesets();
+        let counts = (description.request.len(), description.response.len());
+        let of_nodeset = nodesets.suits(&address_space, node, counts);
+        if of_nodeset.is_none() && address_space.node_exists(node) || of_nodeset == Some(false) {
             return None;
         }
         let namespace = topic.namespace.get();
@@ -141,7 +144,11 @@ impl Methods {
         if served.any(|(index, _)| index == namespace) {
             self.types.add(&mut address_space, (topic, description));
         }
-        let around = add(&mut address_space, node, (topic, description), &self.types);
+        let around = if nodesets.let_call(&mut address_space, node, true) {
+            Vec::new()
+        } else {
+            add(&mut address_space, node, (topic, description), &self.types)
+        };
         drop(address_space);
         let callable = Callable::new(topic, description);
         let mut methods = self.manager.inner().methods().lock();
@@ -183,10 +190,13 @@ impl Methods {
         };
         self.manager.inner().methods().lock().remove(&node);
         let mut address_space = self.manager.address_space().write();
-        for arguments in ["InputArguments", "OutputArguments"] {
-            drop(address_space.delete(&arguments_node(&node, arguments), true));
+        let nodesets = self.manager.inner().nodesets();
+        if !nodesets.let_call(&mut address_space, &node, false) {
+            for arguments in ["InputArguments", "OutputArguments"] {
+                drop(address_space.delete(&arguments_node(&node, arguments), true));
+            }
+            drop(address_space.delete(&node, true));
         }
-        drop(address_space.delete(&node, true));
         self.types.remove(&mut address_space, topic);
         // An object without a Method in it would stay for ever.
         for object in self.around.remove(&topic).unwrap_or_default().iter().rev() {

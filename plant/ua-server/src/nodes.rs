@@ -25,6 +25,7 @@ use opcua::types::{
     AttributeId, DataValue, DateTime, NodeId, NumericRange, ReadAtTimeDetails,
     ReadProcessedDetails, ReadRawModifiedDetails, StatusCode, TimestampsToReturn, Variant,
 };
+use plant_opcua::nodeset::NodeSets;
 use plant_opcua::server::Caller;
 use plant_opcua::users::Access;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, oneshot};
@@ -39,6 +40,7 @@ use crate::confirm::Confirms;
 use crate::history::{Past, Room, Series};
 use crate::identity;
 use crate::layout::{FieldNode, Layout, TopicNode};
+use crate::nodesets::Loaded;
 use crate::properties;
 use crate::pubsub::PubSub;
 use crate::value;
@@ -59,6 +61,7 @@ pub(crate) struct SpaceNodes {
     answers: Mutex<Answers>,
     genuine: Genuine,
     exits: Exits,
+    nodesets: Loaded,
     /// What clients can call.
     methods: Table,
     programs: Drives,
@@ -108,7 +111,7 @@ pub(crate) struct ClientWrite {
 impl SpaceNodes {
     /// Registers the namespaces and puts the nodes of `layout` into `address_space`.
     pub(crate) fn build(
-        layout: &Layout,
+        (layout, sets): (&Layout, &NodeSets),
         exits: Exits,
         context: &ServerContext,
         address_space: &mut AddressSpace,
@@ -126,7 +129,12 @@ impl SpaceNodes {
                 });
             }
         }
+        let nodesets = {
+            let mut type_tree = context.type_tree.write();
+            Loaded::put_in(sets, address_space, type_tree.namespaces_mut())
+        };
         let served = namespaces.iter();
+        let served = served.filter(|one| !nodesets.tell_of(&one.namespace_uri));
         let served = served.map(|one| (one.namespace_index, one.namespace_uri.as_str()));
         identity::add_namespaces(served, address_space);
         address::add_folders(layout, address_space);
@@ -135,11 +143,10 @@ impl SpaceNodes {
         }
         let mut places = Places::new();
         for topic in &layout.topics {
-            address::add_topic(
-                address_space,
-                topic,
-                &address::origin_folder(topic.topic.space),
-            );
+            let folder = address::origin_folder(topic.topic.space);
+            if !nodesets.adopt(address_space, topic, &folder) {
+                address::add_topic(address_space, topic, &folder);
+            }
             put(&mut places, topic);
         }
         Self {
@@ -152,12 +159,18 @@ impl SpaceNodes {
             answers: Mutex::new(Answers::default()),
             genuine: Genuine::default(),
             exits,
+            nodesets,
             methods: Table::default(),
             programs: Drives::default(),
             writing: Mutex::new(()),
             largest_write: AtomicUsize::new(usize::MAX),
             refused: AtomicU64::new(0),
         }
+    }
+
+    /// The nodes that are there by NodeSets.
+    pub(crate) const fn nodesets(&self) -> &Loaded {
+        &self.nodesets
     }
 
     /// What clients can call.
@@ -191,13 +204,18 @@ impl SpaceNodes {
             past.remove(topic.topic);
         }
         drop(past);
+        let mut left = HashMap::new();
         for node in gone.iter().flat_map(TopicNode::nodes) {
-            drop(address_space.delete(node, true));
+            match self.nodesets.release(&mut address_space, node) {
+                Some(shown) => drop(left.insert(node, shown)),
+                None if self.nodesets.has(node) => {}
+                None => drop(address_space.delete(node, true)),
+            }
             places.remove(node);
         }
         // Nodes of their own: what stays behind would keep the new ones out. One that is the node of a variable is that.
         for node in gone.iter().flat_map(properties::nodes) {
-            if !places.contains_key(&node) {
+            if !places.contains_key(&node) && !self.nodesets.has(&node) {
                 drop(address_space.delete(&node, true));
             }
         }
@@ -211,16 +229,20 @@ impl SpaceNodes {
                     &mut address_space,
                 );
             }
-            address::add_topic(&mut address_space, topic, &folder);
+            if !self.nodesets.adopt(&mut address_space, topic, &folder) {
+                address::add_topic(&mut address_space, topic, &folder);
+            }
             put(&mut places, topic);
         }
         let mut notifier = subscriptions.data_notifier();
         for node in gone.iter().flat_map(TopicNode::nodes) {
-            let status = match places.get(node) {
-                Some(_) => StatusCode::BadWaitingForInitialData,
-                None => StatusCode::BadNodeIdUnknown,
+            let nothing =
+                |status| values::data_value(Some(Variant::Empty), Shown::nothing(status).stamp);
+            let value = match (places.get(node), left.remove(node)) {
+                (Some(_), _) => nothing(StatusCode::BadWaitingForInitialData),
+                (None, Some(shown)) => shown,
+                (None, None) => nothing(StatusCode::BadNodeIdUnknown),
             };
-            let value = values::data_value(Some(Variant::Empty), Shown::nothing(status).stamp);
             notifier.notify(node, AttributeId::Value, value);
         }
     }
@@ -625,7 +647,10 @@ impl SpaceNodes {
             return StatusCode::BadUserAccessDenied;
         }
         let called = self.exits.pubsub.call(method, &Caller::of(context).user);
-        called.unwrap_or(StatusCode::BadNodeIdUnknown)
+        called.unwrap_or_else(|| match self.nodesets.has(method) {
+            true => StatusCode::BadNotExecutable,
+            false => StatusCode::BadNodeIdUnknown,
+        })
     }
 
     /// The past values of a node.

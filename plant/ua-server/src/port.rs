@@ -21,6 +21,7 @@ use opcua::server::{MonitoredItemHandle, ServerHandle, SubscriptionCache};
 use opcua::types::{NodeId, NumericRange, StatusCode, VariableId, Variant};
 use plant_opcua::configuration::Configuration;
 use plant_opcua::endpoint::EndpointUrl;
+use plant_opcua::nodeset::NodeSets;
 use plant_opcua::pki::Pki;
 use plant_opcua::server::{Security, core_of, core_with};
 use plant_opcua::users::{self, Access, UserFault};
@@ -40,9 +41,10 @@ use crate::confirm::Confirms;
 use crate::endpoint;
 use crate::history;
 use crate::identity;
-use crate::layout::Layout;
+use crate::layout::{Layout, LayoutError};
 use crate::methods::{Methods, Wish};
 use crate::nodes::{ClientWrite, Exits, SpaceManager, SpaceNodes, look_again};
+use crate::nodesets;
 use crate::others::Others;
 use crate::pubsub::{Places, PubSub, Readers, State};
 use crate::restart;
@@ -79,6 +81,7 @@ pub(crate) struct ServerPort {
     unbound: VecDeque<TopicId>,
     /// As the server was started.
     namespaces: Vec<String>,
+    nodesets: nodesets::Running,
     described: Server,
     mapped_url: bool,
     types: Types,
@@ -120,8 +123,7 @@ impl ServerPort {
         let configuration = |error: String| Failure::new(FailureKind::Configuration, error);
 
         let mut types = setup.types;
-        let layout =
-            Layout::of(mapping, &mut types).map_err(|error| configuration(error.to_string()))?;
+        let (layout, (sets, nodesets)) = laid_out(mapping, &mut types)?;
         let described = mapping.server();
         setup.sks.follow(mapping)?;
         let (listener, address) = listen(&setup.pki, &setup.url, described)?;
@@ -138,6 +140,7 @@ impl ServerPort {
         let confirms = Arc::clone(&exits.confirms);
         let nodes = NodesBuilder {
             layout: Arc::new(layout),
+            sets,
             exits,
         };
         let layout = Arc::clone(&nodes.layout);
@@ -173,6 +176,7 @@ impl ServerPort {
         Ok(Self {
             unbound: VecDeque::new(),
             namespaces: layout.namespaces.clone(),
+            nodesets,
             described: described.clone(),
             mapped_url: setup.mapped_url,
             space: Space::new(&layout, manager, subscriptions).with_ages(mapping),
@@ -366,6 +370,7 @@ impl Port for ServerPort {
         .into_iter()
         .filter(|(_, differs)| *differs)
         .map(|(key, _)| key.to_owned())
+        .chain(self.nodesets.differs(mapping))
         .collect();
         self.receive_timeout = mapping.pubsub().receive_timeout;
         self.confirms.follow(mapping);
@@ -487,6 +492,20 @@ fn users(pki: &Pki, address: SocketAddr) -> Result<Arc<Access>, Failure> {
     let access = Access::new(Some(folder), address.ip().is_loopback());
     let faulty = |error: UserFault| Failure::new(FailureKind::Configuration, error.to_string());
     access.map(Arc::new).map_err(faulty)
+}
+
+/// NodeSets to be loaded, and what is remembered of them.
+type Loading = (NodeSets, nodesets::Running);
+
+/// The nodes of the mapping, and the NodeSets beside them.
+fn laid_out(mapping: &Mapping, types: &mut Types) -> Result<(Layout, Loading), Failure> {
+    let configuration =
+        |error: LayoutError| Failure::new(FailureKind::Configuration, error.to_string());
+    let mut layout = Layout::of(mapping, types).map_err(configuration)?;
+    let sets = nodesets::read(mapping)?;
+    nodesets::add_namespaces(&sets, &mut layout.namespaces);
+    let running = nodesets::Running::new(mapping, &sets);
+    Ok((layout, (sets, running)))
 }
 
 /// Makes the certificate where there is none, and listens.
@@ -729,6 +748,7 @@ async fn ended(serving: &mut Option<JoinHandle<Result<(), String>>>) -> String {
 
 struct NodesBuilder {
     layout: Arc<Layout>,
+    sets: NodeSets,
     exits: Exits,
 }
 
@@ -736,7 +756,8 @@ impl InMemoryNodeManagerImplBuilder for NodesBuilder {
     type Impl = SpaceNodes;
 
     fn build(self, context: ServerContext, address_space: &mut AddressSpace) -> SpaceNodes {
-        SpaceNodes::build(&self.layout, self.exits, &context, address_space)
+        let described = (&*self.layout, &self.sets);
+        SpaceNodes::build(described, self.exits, &context, address_space)
     }
 }
 
@@ -747,6 +768,9 @@ fn manager(handle: &ServerHandle, layout: &Layout) -> Result<Arc<SpaceManager>, 
         .get_of_type::<Ordered>()
         .and_then(|ordered| ordered.space())
         .ok_or_else(|| "the server has no node manager for the space".to_owned())?;
+    if let Some(fault) = manager.inner().nodesets().fault() {
+        return Err(fault.to_owned());
+    }
     let wanted = layout.namespaces.iter().skip(1);
     for ((index, uri), (expected, wanted)) in manager
         .inner()

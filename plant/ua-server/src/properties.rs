@@ -17,21 +17,48 @@ pub(crate) fn nodes(topic: &TopicNode) -> impl Iterator<Item = NodeId> {
     names.iter().map(move |name| component(&topic.node, name))
 }
 
+/// One of them.
+pub(crate) struct Property {
+    pub(crate) name: &'static str,
+    data_type: DataTypeId,
+    rank: i32,
+    pub(crate) value: Variant,
+}
+
+impl Property {
+    /// Adds it to a node.
+    pub(crate) fn insert(self, address_space: &mut AddressSpace, node: &NodeId) {
+        VariableBuilder::new(
+            &component(node, self.name),
+            QualifiedName::new(0, self.name),
+            LocalizedText::from(self.name),
+        )
+        .data_type(self.data_type)
+        .value_rank(self.rank)
+        .value(self.value)
+        .has_type_definition(VariableTypeId::PropertyType)
+        .property_of(node.clone())
+        .insert(address_space);
+    }
+}
+
 /// Adds those that the mapping has of the one value of a topic.
 pub(crate) fn add(address_space: &mut AddressSpace, topic: &TopicNode) {
+    each(topic, &mut |property| {
+        property.insert(address_space, &topic.node)
+    });
+}
+
+/// Those that the mapping has of the one value of a topic.
+pub(crate) fn each(topic: &TopicNode, with: &mut dyn FnMut(Property)) {
     let meaning = &topic.meaning;
-    let mut add = |name: &str, data_type: DataTypeId, rank: i32, value: Variant| {
-        VariableBuilder::new(
-            &component(&topic.node, name),
-            QualifiedName::new(0, name),
-            LocalizedText::from(name),
-        )
-        .data_type(data_type)
-        .value_rank(rank)
-        .value(value)
-        .has_type_definition(VariableTypeId::PropertyType)
-        .property_of(topic.node.clone())
-        .insert(address_space);
+    let mut add = |name, data_type, rank, value| {
+        with(Property {
+            name,
+            data_type,
+            rank,
+            value,
+        });
     };
     if let Some(unit) = meaning.unit {
         let information = EUInformation {

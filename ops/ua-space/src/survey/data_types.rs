@@ -5,19 +5,7 @@ use uadp::BuiltinType;
 /// The builtin type of values of the DataType `i=number`, `None` for abstract ones and for types this table does not
 /// have, whose supertypes may tell.
 pub(crate) fn builtin(number: u32) -> Option<BuiltinType> {
-    // Numbers of DataTypes that are builtin types are those of the builtin types; 24 to 29 are abstract.
-    let id = match number {
-        1..=23 | 25 => number,
-        29 => 6,
-        30 | 311 | 521 | 16307 | 2000..=2003 => 15,
-        290 => 11,
-        293 | 294 => 13,
-        291 | 292 | 295 | 12877..=12881 | 23751 | 24263 | 31918 => 12,
-        288 | 289 | 17588 | 20998 => 7,
-        11737 => 9,
-        _ => return None,
-    };
-    BuiltinType::from_id(u8::try_from(id).ok()?)
+    BuiltinType::from_id(plant_opcua::nodeset::builtin(number)?)
 }
 
 /// Structures are ExtensionObjects, whose fields a subscriber finds in the server.

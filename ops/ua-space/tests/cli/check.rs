@@ -262,3 +262,93 @@ fn a_password_in_a_file_others_can_read_is_told_and_not_shown() {
         ended.stdout
     );
 }
+
+/// A NodeSet with one Double of its own.
+const LINE: &str = r#"<UANodeSet xmlns="http://opcfoundation.org/UA/2011/03/UANodeSet.xsd">
+  <NamespaceUris><Uri>urn:line</Uri></NamespaceUris>
+  <UAVariable NodeId="ns=1;i=1" BrowseName="1:Speed" DataType="i=11">
+    <DisplayName>Speed</DisplayName>
+    <References><Reference ReferenceType="i=47" IsForward="false">i=85</Reference></References>
+  </UAVariable>
+</UANodeSet>"#;
+
+#[test]
+fn each_nodeset_that_cannot_be_loaded_is_told_where_it_is_named_and_with_what_to_do() {
+    let folder = std::env::temp_dir().join(format!("ua-space-nodesets-{}", std::process::id()));
+    fs::create_dir_all(folder.join("folder.xml")).unwrap();
+    let write = |name: &str, text: &str| fs::write(folder.join(name), text).unwrap();
+    write("line.xml", LINE);
+    write("again.xml", LINE);
+    let needs = LINE.replace("urn:line", "urn:cell</Uri><Uri>urn:nowhere");
+    let needs = needs.replace(">i=85<", ">ns=2;i=85<");
+    write("needs.xml", &needs);
+    write("core.xml", &LINE.replace("ns=1;i=1", "i=85000"));
+    write("text.xml", "spaces: []");
+    write("half.xml", &LINE[..LINE.len() - 20]);
+    write("other.xml", "<Project/>");
+    let large = fs::File::create(folder.join("large.xml")).unwrap();
+    large.set_len((64 << 20) + 1).unwrap();
+    let mapping = folder.join("cell.yaml");
+    let check = |files: &str, spaces: &[&str]| {
+        let text = format!(
+            "spaces: [{{id: 1}}]\nnamespaces: {{2: 'urn:line'}}\nserver: {{nodesets: [{files}]}}\nvariables:\n\
+            \x20 - {{node: ns=2;i=1, name: speed, type: Int32, origin: 1}}\n"
+        );
+        fs::write(&mapping, text).unwrap();
+        let arguments = [&["check", "--json", mapping.to_str().unwrap()], spaces].concat();
+        let ended = run(&arguments);
+        let told: Value = serde_json::from_str(&ended.stdout).unwrap();
+        (ended.code, told["findings"].as_array().unwrap().clone())
+    };
+    let mut wrong = Vec::new();
+    for (file, why, help) in [
+        ("away.xml", "No such file", "from the folder of the file"),
+        ("folder.xml", "it is no file", "from the folder of the file"),
+        ("large.xml", "more than 64 MiB", "UANodeSet"),
+        ("text.xml", "is not a NodeSet2 document", "UANodeSet"),
+        ("half.xml", "is not a NodeSet2 document", "UANodeSet"),
+        ("other.xml", "is not a NodeSet2 document", "UANodeSet"),
+        (
+            "core.xml",
+            "nodes of the core namespace",
+            "leave the file out",
+        ),
+        (
+            "needs.xml",
+            "needs the namespace urn:nowhere",
+            "name the NodeSet2 file of that",
+        ),
+        (
+            "line.xml, again.xml",
+            "both have nodes of the namespace urn:line",
+            "leave one",
+        ),
+    ] {
+        let (code, findings) = check(file, &[]);
+        let found = findings.first().unwrap_or(&Value::Null);
+        let text = |key: &str| found[key].as_str().unwrap_or_default().to_owned();
+        let column = 21 + file.find(", ").map_or(0, |at| at + 2);
+        let sound = (code, &found["code"], &found["severity"])
+            == (78, &json!("M170"), &json!("error"))
+            && (&found["line"], &found["column"]) == (&json!(3), &json!(column))
+            && text("message").contains(why)
+            && text("help").contains(help);
+        if !sound {
+            wrong.push(format!("{file}: {code} {findings:?}"));
+        }
+        // On the host of a bridge the files need not be.
+        let (code, findings) = check(file, &["--for", "1"]);
+        if code != 0
+            || findings
+                .first()
+                .is_none_or(|found| found["severity"] != "warning")
+        {
+            wrong.push(format!("{file} for space 1: {code} {findings:?}"));
+        }
+    }
+    let (code, findings) = check("line.xml", &[]);
+    fs::remove_dir_all(&folder).unwrap();
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+    assert_eq!((code, &findings[0]["code"]), (78, &json!("M171")));
+    assert_eq!(findings[0]["help"], "type: Double");
+}

@@ -357,7 +357,8 @@ impl Server {
 }
 
 /// What a variable shows, with its times.
-pub(crate) fn value_of(variable: &Variable) -> DataValue {
+#[must_use]
+pub fn value_of(variable: &Variable) -> DataValue {
     variable.value(
         TimestampsToReturn::Both,
         &NumericRange::None,

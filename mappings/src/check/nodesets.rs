@@ -1,0 +1,205 @@
+//! The NodeSet2 files that the server loads, and what of them is mapped.
+
+use std::path::PathBuf;
+
+use super::types::{print, value_type};
+use crate::code::Code;
+use crate::document::{Document, ServerEntry, VariableEntry};
+use crate::findings::Findings;
+use crate::mapping::{Mapping, Variable};
+use crate::nodesets::{NodeSetNode, NodeSets};
+use crate::read::{At, given, short};
+use crate::surroundings::Surroundings;
+use crate::topic::SpaceId;
+use crate::tree::Place;
+
+/// The files, and where each is named. Faulty entries are left out.
+pub(super) fn files(
+    entry: Option<&At<ServerEntry>>,
+    findings: &mut Findings,
+) -> (Vec<PathBuf>, Vec<Place>) {
+    let entries = entry.and_then(|at| given(&at.value.as_ref()?.nodesets));
+    let entries = entries.map_or(&[][..], |(entries, _)| entries);
+    if let Some(first) = entries.get(MOST) {
+        let message = format!("{} NodeSets; at most {MOST} are loaded", entries.len());
+        findings.error(Code::TooLarge, first.place, message);
+    }
+    let sound = entries
+        .iter()
+        .take(MOST)
+        .filter_map(|at| Some((at.value.as_ref()?, at.place)));
+    sound
+        .filter(|(path, place)| {
+            if path.is_empty() {
+                findings.error(Code::WrongValue, *place, "an empty path");
+            }
+            !path.is_empty()
+        })
+        .map(|(path, place)| (PathBuf::from(path), place))
+        .unzip()
+}
+
+/// Reads them where somebody does so here, and looks at what the mapping has of them. They are needed by the server alone.
+pub(super) fn check(
+    document: &Document,
+    mapping: &Mapping,
+    places: &[Place],
+    around: &dyn Surroundings,
+    findings: &mut Findings,
+) {
+    let files = &mapping.server().nodesets;
+    if files.is_empty() {
+        return;
+    }
+    let Some(mut sets) = around.nodesets(files) else {
+        return;
+    };
+    findings.of_part([SpaceId::UA]);
+    let mut is_whole = true;
+    for fault in sets.faults() {
+        let Some(place) = places.get(fault.file) else {
+            continue;
+        };
+        is_whole &= !fault.is_fatal;
+        let note = match fault.is_fatal {
+            true => findings.error(Code::NodeSet, *place, fault.what),
+            false => findings.warning(Code::NodeSet, *place, fault.what),
+        };
+        note.help(fault.help);
+    }
+    if is_whole {
+        own_namespace(mapping, places, sets.as_ref(), findings);
+        nodes(document, mapping, sets.as_ref(), findings);
+    }
+    findings.of_part(None);
+}
+
+/// The server's own namespace has its own nodes.
+fn own_namespace(
+    mapping: &Mapping,
+    places: &[Place],
+    sets: &dyn NodeSets,
+    findings: &mut Findings,
+) {
+    let own = &mapping.server().application_uri;
+    if let Some(place) = places.first()
+        && sets.has(own)
+    {
+        let message = format!(
+            "a NodeSet has nodes of `{}`, the namespace of the server itself",
+            short(own)
+        );
+        let note = findings.error(Code::NodeSet, *place, message);
+        note.help("give the server another `application_uri`");
+    }
+}
+
+/// What the mapping has of their nodes. Nothing is said where an entry was faulty.
+fn nodes(document: &Document, mapping: &Mapping, sets: &dyn NodeSets, findings: &mut Findings) {
+    if !document.has_all_of(mapping) {
+        return;
+    }
+    let entries = document.variables.as_ref().and_then(|at| at.value.as_ref());
+    for (at, one) in entries.into_iter().flatten().zip(mapping.variables()) {
+        let (Some(entry), Some(uri)) = (&at.value, mapping.namespaces().get(&one.node.namespace))
+        else {
+            continue;
+        };
+        if sets.has(uri) {
+            let place = given(&entry.node).map_or(at.place, |(_, place)| place);
+            match sets.node(uri, &one.node.identifier) {
+                Some(node) => variable(entry, one, (node, place), findings),
+                None => created(&one.node.to_string(), uri, place, findings),
+            }
+        }
+    }
+    let entries = document.calls.as_ref().and_then(|at| at.value.as_ref());
+    for (at, call) in entries.into_iter().flatten().zip(mapping.calls()) {
+        let uri = mapping.namespaces().get(&call.node.namespace);
+        let node = uri.and_then(|uri| sets.node(uri, &call.node.identifier));
+        if let (Some(entry), Some(node)) = (&at.value, node)
+            && node != NodeSetNode::Method
+        {
+            let message = format!(
+                "`{}` is no Method in its NodeSet",
+                short(&call.node.to_string())
+            );
+            let place = given(&entry.node).map_or(at.place, |(_, place)| place);
+            let note = findings.error(Code::NodeSetNode, place, message);
+            note.help("name a Method");
+        }
+    }
+}
+
+fn created(node: &str, uri: &str, place: Place, findings: &mut Findings) {
+    let message = format!(
+        "no NodeSet has a node `{}` of `{}`",
+        short(node),
+        short(uri)
+    );
+    let note = findings.warning(Code::NodeSetNode, place, message);
+    note.help("a new one is made for the value: give it a namespace of its own, or mend its id");
+}
+
+fn variable(
+    entry: &VariableEntry,
+    one: &Variable,
+    (node, place): (NodeSetNode, Place),
+    findings: &mut Findings,
+) {
+    let id = one.node.to_string();
+    let NodeSetNode::Variable(..) = node else {
+        let message = format!("`{}` is no Variable in its NodeSet", short(&id));
+        let note = findings.error(Code::NodeSetNode, place, message);
+        note.help("name a Variable; the objects and types around it are there by the NodeSet");
+        return;
+    };
+    let fields: Vec<_> = one.fields.iter().map(value_type).collect();
+    let value = match (one.value_type, &fields[..]) {
+        (Some(value), _) => value,
+        (None, [only]) => *only,
+        (None, [_, _, ..]) => {
+            let message = format!(
+                "the value has {} fields, and the Variable `{}` of a NodeSet takes one value",
+                fields.len(),
+                short(&id)
+            );
+            let note = findings.error(Code::NodeSetNode, place, message);
+            note.help("name one `field` of the message");
+            return;
+        }
+        (None, []) => {
+            if let Some(wanted) = node.value_type() {
+                let message = format!(
+                    "nothing says of which type the value is; `{}` is {}",
+                    short(&id),
+                    print(wanted)
+                );
+                let note = findings.error(Code::NodeSetNode, place, message);
+                note.help(format!("type: {}", print(wanted)));
+            }
+            return;
+        }
+    };
+    if node.takes(value) {
+        return;
+    }
+    let wanted = node.value_type();
+    let is = wanted.map_or_else(
+        || "takes no such value".to_owned(),
+        |wanted| format!("is {}", print(wanted)),
+    );
+    let message = format!(
+        "`{}` is {} here, and in its NodeSet it {is}",
+        short(&id),
+        print(value)
+    );
+    let place = given(&entry.r#type).map_or(place, |(_, place)| place);
+    let note = findings.error(Code::NodeSetNode, place, message);
+    if let Some(wanted) = wanted {
+        note.help(format!("type: {}", print(wanted)));
+    }
+}
+
+/// Most files.
+const MOST: usize = 64;

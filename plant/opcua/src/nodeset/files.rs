@@ -1,0 +1,356 @@
+//! NodeSets from files that somebody names: everything that is wrong with any of them is told at once, and one that holds
+//! values that cannot be read is used without them.
+
+use std::collections::hash_map::DefaultHasher;
+use std::collections::{BTreeSet, HashMap};
+use std::hash::{Hash as _, Hasher as _};
+use std::io;
+use std::os::unix::fs::MetadataExt as _;
+use std::path::{Path, PathBuf};
+
+use opcua::server::address_space::AddressSpace;
+use opcua::types::{
+    Context, DecodingOptions, Identifier, NamespaceMap, NodeId, NodeSetNamespaceMapper,
+    TypeLoaderCollection, Variant, XmlBody,
+};
+use opcua::xml::schema::ua_node_set::{UANode, UANodeSet};
+
+use super::outline::{self, Found, NodeKind, ValueKind};
+use super::{CORE, Facts, NodeSet, NodeSetError, Source, ordered, parsed};
+use crate::limits::{LARGEST_NODESETS, MOST_NODESETS};
+
+/// NodeSets that can be put into an address space.
+#[derive(Default)]
+pub struct NodeSets {
+    /// Each after those it needs.
+    sets: Vec<NodeSet>,
+    /// The namespaces they have nodes of, in the order of the files.
+    provides: Vec<String>,
+    fingerprint: u64,
+}
+
+/// What is wrong with one of the files.
+#[derive(Debug)]
+pub struct FileFault {
+    /// Which of them, from 0.
+    pub file: usize,
+    /// What.
+    pub error: NodeSetError,
+}
+
+impl NodeSetError {
+    /// Whether the NodeSet cannot be used at all.
+    #[must_use]
+    pub const fn is_fatal(&self) -> bool {
+        !matches!(self, Self::Unread { .. })
+    }
+
+    /// What to do, for people.
+    #[must_use]
+    pub const fn help(&self) -> &'static str {
+        match self {
+            Self::Read { .. } => "the path is taken from the folder of the file it stands in",
+            Self::Xml { .. } => {
+                "a NodeSet2 file is an XML document <UANodeSet xmlns=\"http://opcfoundation.org/UA/2011/03/UANodeSet.xsd\">"
+            }
+            Self::Node { .. } => "mend the file, or have whoever made it export it anew",
+            Self::Values { .. } | Self::Unread { .. } => {
+                "values of structures that the file defines itself are not read; its nodes are there, without them"
+            }
+            Self::Missing { .. } => {
+                "name the NodeSet2 file of that namespace too; the order of the files does not matter"
+            }
+            Self::Circle(_) => "one of them has to do without the others",
+            Self::Twice { .. } => "leave one of the two out",
+            Self::Core { .. } => "the server has that namespace already: leave the file out",
+            Self::Many => "leave out what the cell does not need",
+        }
+    }
+}
+
+impl std::fmt::Debug for NodeSets {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let mut list = f.debug_list();
+        list.entries(self.provides.iter()).finish()
+    }
+}
+
+impl NodeSets {
+    /// Reads the files and orders them. Those that are no regular files are not opened.
+    #[must_use]
+    pub fn read(files: &[PathBuf]) -> (Self, Vec<FileFault>) {
+        let mut faults = Vec::new();
+        let mut read = Vec::new();
+        let mut room = LARGEST_NODESETS;
+        for (file, path) in files.iter().enumerate() {
+            let mut fault = |error| faults.push(FileFault { file, error });
+            if file >= MOST_NODESETS {
+                fault(NodeSetError::Many);
+                break;
+            }
+            match length(path).and_then(|length| {
+                room = room.checked_sub(length).ok_or_else(|| too_large(path))?;
+                NodeSet::lenient(path)
+            }) {
+                Ok((set, unread)) => {
+                    if let Some(unread) = unread {
+                        fault(unread);
+                    }
+                    read.push((file, set));
+                }
+                Err(error) => fault(error),
+            }
+        }
+        let is_whole = !faults.iter().any(|fault| fault.error.is_fatal());
+        faults.extend(not_together(&read, is_whole));
+        faults.sort_by_key(|fault| fault.file);
+        if faults.iter().any(|fault| fault.error.is_fatal()) {
+            return (Self::default(), faults);
+        }
+        let provides = read.iter();
+        let provides = provides.flat_map(|(_, set)| set.provides().map(str::to_owned));
+        let provides = provides.collect();
+        let mut sets = Self {
+            sets: Vec::new(),
+            provides,
+            fingerprint: fingerprint(files),
+        };
+        match ordered(read.into_iter().map(|(_, set)| set).collect()) {
+            Ok(ordered) => sets.sets = ordered,
+            Err(error) => faults.push(FileFault { file: 0, error }),
+        }
+        (sets, faults)
+    }
+
+    /// Whether there are none.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.sets.is_empty()
+    }
+
+    /// The namespaces they have nodes of, in the order of the files.
+    pub fn provides(&self) -> impl Iterator<Item = &str> {
+        self.provides.iter().map(String::as_str)
+    }
+
+    /// Another one when a file is written or replaced.
+    #[must_use]
+    pub const fn fingerprint(&self) -> u64 {
+        self.fingerprint
+    }
+
+    /// What a node of a namespace is; `None` where no NodeSet has it.
+    #[must_use]
+    pub fn node(&self, uri: &str, identifier: &Identifier) -> Option<NodeKind> {
+        let set = self.of(uri)?;
+        let id = set.facts.local(uri, identifier)?;
+        Some(match set.facts.nodes.find(&id)? {
+            Found::Variable(data_type, rank) => {
+                NodeKind::Variable(self.value_kind(set, data_type), rank)
+            }
+            Found::Method => NodeKind::Method,
+            Found::Other => NodeKind::Other,
+        })
+    }
+
+    fn of(&self, uri: &str) -> Option<&NodeSet> {
+        self.sets
+            .iter()
+            .find(|set| set.facts.provides.contains(uri))
+    }
+
+    /// What values of a DataType are, by its supertypes.
+    fn value_kind(&self, set: &NodeSet, data_type: &NodeId) -> ValueKind {
+        let (mut set, mut id) = (set, data_type.clone());
+        for _ in 0..DEEPEST {
+            let Some(uri) = set.facts.uri(id.namespace) else {
+                break;
+            };
+            if uri == CORE {
+                return outline::core(&id);
+            }
+            let Some((owner, own)) = self
+                .of(uri)
+                .and_then(|owner| Some((owner, owner.facts.local(uri, &id.identifier)?)))
+            else {
+                break;
+            };
+            let Some(supertype) = owner.facts.nodes.supertype(&own) else {
+                break;
+            };
+            (set, id) = (owner, supertype.clone());
+        }
+        ValueKind::Any
+    }
+
+    /// Puts the nodes into an address space, which owns their namespaces from now on, and gives the ids that they have there.
+    ///
+    /// # Errors
+    /// Nodes that are left out.
+    pub fn import(
+        &self,
+        address_space: &mut AddressSpace,
+        namespaces: &mut NamespaceMap,
+    ) -> Result<Vec<NodeId>, NodeSetError> {
+        for uri in &self.provides {
+            address_space.add_namespace(uri, namespaces.add_namespace(uri));
+        }
+        let mut ids = Vec::new();
+        for set in &self.sets {
+            set.import(address_space, namespaces)?;
+            ids.extend(set.facts.nodes.ids().filter_map(|id| {
+                let namespace = namespaces.get_index(set.facts.uri(id.namespace)?)?;
+                let identifier = id.identifier.clone();
+                Some(NodeId {
+                    namespace,
+                    identifier,
+                })
+            }));
+        }
+        Ok(ids)
+    }
+}
+
+impl NodeSet {
+    /// Reads a file, without the values in it that cannot be read; and those.
+    fn lenient(path: &Path) -> Result<(Self, Option<NodeSetError>), NodeSetError> {
+        let (file, mut document) = parsed(Source::File(path.to_owned()))?;
+        let facts = Facts::of(&file, &document)?;
+        let unread = without_unread(&facts, &mut document);
+        let unread = unread.map(|(first, count)| NodeSetError::Unread {
+            file: file.clone(),
+            first,
+            count,
+        });
+        Ok((Self::new(file, facts, document), unread))
+    }
+}
+
+/// Takes the values out that cannot be read. The first node with one, and how many there are.
+fn without_unread(facts: &Facts, document: &mut UANodeSet) -> Option<(String, usize)> {
+    let mut map = NamespaceMap::new();
+    let mut mapper = NodeSetNamespaceMapper::new(&mut map);
+    facts.register_namespaces(&mut mapper);
+    let loaders = TypeLoaderCollection::new();
+    let tables = document.aliases.iter().flat_map(|table| &table.aliases);
+    let aliases = tables
+        .map(|alias| (alias.alias.clone(), alias.id.0.clone()))
+        .collect();
+    let mut context = Context::new(mapper.namespaces(), &loaders, DecodingOptions::default());
+    context.set_index_map(mapper.index_map());
+    context.set_aliases(&aliases);
+    let mut unread: Option<(String, usize)> = None;
+    for node in &mut document.nodes {
+        let value = match node {
+            UANode::Variable(variable) => &mut variable.value,
+            UANode::VariableType(variable) => &mut variable.value,
+            UANode::Object(_)
+            | UANode::Method(_)
+            | UANode::View(_)
+            | UANode::ObjectType(_)
+            | UANode::DataType(_)
+            | UANode::ReferenceType(_) => continue,
+        };
+        let readable = |one: &opcua::xml::schema::ua_node_set::Value| {
+            Variant::from_nodeset(&one.0, &context).is_ok_and(|value| is_binary(&value))
+        };
+        if value.as_ref().is_none_or(readable) {
+            continue;
+        }
+        *value = None;
+        let first = || (node.base().node_id.0.clone(), 0);
+        unread.get_or_insert_with(first).1 += 1;
+    }
+    unread
+}
+
+/// Whether clients can be sent a value: structures of types that nobody knows are left as the XML they are.
+fn is_binary(value: &Variant) -> bool {
+    if let Variant::Array(array) = value {
+        return array.values.iter().all(is_binary);
+    }
+    if let Variant::Variant(inner) = value {
+        return is_binary(inner);
+    }
+    let Variant::ExtensionObject(object) = value else {
+        return true;
+    };
+    !object.inner_is::<XmlBody>()
+}
+
+/// What keeps files from being used together. What is missing may be in one that could not be read.
+fn not_together(read: &[(usize, NodeSet)], is_whole: bool) -> Vec<FileFault> {
+    let mut faults = Vec::new();
+    let mut owners: HashMap<&str, &NodeSet> = HashMap::new();
+    for (file, set) in read {
+        for uri in &set.facts.provides {
+            if let Some(first) = owners.get(uri.as_str()) {
+                let error = NodeSetError::Twice {
+                    first: first.file.clone(),
+                    second: set.file.clone(),
+                    uri: uri.clone(),
+                };
+                faults.push(FileFault { file: *file, error });
+                break;
+            }
+        }
+        owners.extend(set.facts.provides.iter().map(|uri| (uri.as_str(), set)));
+    }
+    if !is_whole {
+        return faults;
+    }
+    for (file, set) in read {
+        let missing = set.facts.needs.iter();
+        let missing: BTreeSet<&String> = missing
+            .filter(|uri| !owners.contains_key(uri.as_str()))
+            .collect();
+        faults.extend(missing.into_iter().map(|uri| FileFault {
+            file: *file,
+            error: NodeSetError::Missing {
+                file: set.file.clone(),
+                uri: uri.clone(),
+            },
+        }));
+    }
+    faults
+}
+
+/// The bytes of a regular file.
+fn length(path: &Path) -> Result<u64, NodeSetError> {
+    let fault = |source| NodeSetError::Read {
+        file: path.display().to_string(),
+        source,
+    };
+    let found = std::fs::metadata(path).map_err(fault)?;
+    if !found.is_file() {
+        return Err(fault(io::Error::other("it is no file")));
+    }
+    Ok(found.len())
+}
+
+fn too_large(path: &Path) -> NodeSetError {
+    NodeSetError::Xml {
+        file: path.display().to_string(),
+        reason: format!(
+            "with it the NodeSets have more than {} MiB",
+            LARGEST_NODESETS >> 20
+        ),
+    }
+}
+
+/// What changes when one of the files is written or renamed over.
+#[must_use]
+pub fn fingerprint(files: &[PathBuf]) -> u64 {
+    let mut hasher = DefaultHasher::new();
+    for file in files {
+        file.hash(&mut hasher);
+        if let Ok(found) = std::fs::metadata(file) {
+            let at = (found.ino(), found.len(), found.mtime(), found.mtime_nsec());
+            at.hash(&mut hasher);
+        }
+    }
+    hasher.finish()
+}
+
+/// Supertypes of a DataType.
+const DEEPEST: usize = 64;

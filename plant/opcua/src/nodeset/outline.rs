@@ -1,0 +1,147 @@
+//! What the nodes of a NodeSet are, and what values its variables take.
+
+use std::collections::HashMap;
+
+use opcua::types::{Identifier, NodeId, ReferenceTypeId};
+use opcua::xml::schema::ua_node_set::UANode;
+
+/// What a node is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum NodeKind {
+    /// A Variable, what its values are, and its ValueRank.
+    Variable(ValueKind, i32),
+    /// A Method.
+    Method,
+    /// Anything else.
+    Other,
+}
+
+/// What the values of a DataType are.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ValueKind {
+    /// Anything, or not known.
+    Any,
+    /// Of the builtin type with this id (OPC 10000-6, 5.1.2).
+    Builtin(u8),
+    /// Of any numeric type.
+    Number,
+    /// Of any type of whole numbers with a sign.
+    Integer,
+    /// Of any type of whole numbers without a sign.
+    UnsignedInteger,
+}
+
+/// The nodes of one NodeSet, by their ids as the file has them.
+#[derive(Default)]
+pub(super) struct Outline(HashMap<NodeId, Entry>);
+
+enum Entry {
+    Variable {
+        data_type: NodeId,
+        rank: i32,
+    },
+    Method,
+    /// With its supertype.
+    DataType(Option<NodeId>),
+    Other,
+}
+
+/// What is known of a node here.
+pub(super) enum Found<'o> {
+    Variable(&'o NodeId, i32),
+    Method,
+    Other,
+}
+
+impl Outline {
+    /// Takes note of a node; `false` where there is one with that id already.
+    pub(super) fn insert(
+        &mut self,
+        id: NodeId,
+        node: &UANode,
+        resolved: &dyn Fn(&str) -> Option<NodeId>,
+    ) -> bool {
+        let entry = match node {
+            UANode::Variable(variable) => Entry::Variable {
+                data_type: resolved(&variable.data_type.0).unwrap_or_default(),
+                rank: variable.value_rank.0,
+            },
+            UANode::Method(_) => Entry::Method,
+            UANode::DataType(data_type) => {
+                let references = data_type.base.base.references.iter();
+                let mut references = references.flat_map(|list| &list.references);
+                let supertype = references.find(|one| {
+                    let of = resolved(&one.reference_type.0);
+                    !one.is_forward && of.is_some_and(|of| of == ReferenceTypeId::HasSubtype)
+                });
+                Entry::DataType(supertype.and_then(|one| resolved(&one.node_id.0)))
+            }
+            UANode::Object(_)
+            | UANode::View(_)
+            | UANode::ObjectType(_)
+            | UANode::VariableType(_)
+            | UANode::ReferenceType(_) => Entry::Other,
+        };
+        self.0.insert(id, entry).is_none()
+    }
+
+    pub(super) fn len(&self) -> usize {
+        self.0.len()
+    }
+
+    pub(super) fn ids(&self) -> impl Iterator<Item = &NodeId> {
+        self.0.keys()
+    }
+
+    pub(super) fn find(&self, id: &NodeId) -> Option<Found<'_>> {
+        Some(match self.0.get(id)? {
+            Entry::Variable { data_type, rank } => Found::Variable(data_type, *rank),
+            Entry::Method => Found::Method,
+            Entry::DataType(_) | Entry::Other => Found::Other,
+        })
+    }
+
+    /// The supertype of a DataType.
+    pub(super) fn supertype(&self, id: &NodeId) -> Option<&NodeId> {
+        match self.0.get(id)? {
+            Entry::DataType(supertype) => supertype.as_ref(),
+            Entry::Variable { .. } | Entry::Method | Entry::Other => None,
+        }
+    }
+}
+
+/// What values of a DataType of the core namespace are.
+pub(super) fn core(id: &NodeId) -> ValueKind {
+    match id.identifier {
+        Identifier::Numeric(NUMBER) => ValueKind::Number,
+        Identifier::Numeric(INTEGER) => ValueKind::Integer,
+        Identifier::Numeric(UNSIGNED_INTEGER) => ValueKind::UnsignedInteger,
+        Identifier::Numeric(number) => builtin(number).map_or(ValueKind::Any, ValueKind::Builtin),
+        Identifier::String(_) | Identifier::Guid(_) | Identifier::ByteString(_) => ValueKind::Any,
+    }
+}
+
+/// The id of the builtin type that values of the DataType `i=number` of the core namespace have (OPC 10000-3, 5.8.3; OPC
+/// 10000-6, 5.1.2); `None` for abstract ones and for types this table does not have, whose supertypes may tell.
+#[must_use]
+pub const fn builtin(number: u32) -> Option<u8> {
+    // Numbers of DataTypes that are builtin types are those of the builtin types; 24 to 29 are abstract.
+    Some(match number {
+        1..=23 | 25 => {
+            let [id, ..] = number.to_le_bytes();
+            id
+        }
+        29 => 6,
+        30 | 311 | 521 | 16307 | 2000..=2003 => 15,
+        290 => 11,
+        293 | 294 => 13,
+        291 | 292 | 295 | 12877..=12881 | 23751 | 24263 | 31918 => 12,
+        288 | 289 | 17588 | 20998 => 7,
+        11737 => 9,
+        _ => return None,
+    })
+}
+
+const NUMBER: u32 = 26;
+const INTEGER: u32 = 27;
+const UNSIGNED_INTEGER: u32 = 28;

@@ -1,0 +1,179 @@
+//! The nodes of NodeSet2 files beside those of the mapping.
+
+use std::path::Path;
+
+use super::*;
+
+/// Of the OPC Foundation: DI, Machinery, Robotics.
+const SHARED: &str = concat!(
+    env!("CARGO_MANIFEST_DIR"),
+    "/../../shared/data/nodesets/Opc.Ua."
+);
+const LINE: &str = include_str!("data/line.xml");
+
+/// A line of the cell among the devices of DI. The order of the files is none that they could be loaded in.
+fn mapping(variables: &str) -> String {
+    let of = |name: &str| format!("'{SHARED}{name}.NodeSet2.xml'");
+    format!(
+        "
+namespaces:
+  2: urn:ua-bridge:system-tests
+  3: urn:ua-bridge:system-tests:line
+spaces:
+  - id: 2
+pubsub: {{receive_timeout: 10min}}
+server:
+  security: [None]
+  nodesets: [line.xml, {}, {}, {}]
+variables:
+  - {{node: ns=2;i=10, name: temperature, type: Double, origin: 2}}
+{variables}",
+        of("Robotics"),
+        of("Machinery"),
+        of("Di")
+    )
+}
+
+const LIVE: &str =
+    "  - {node: ns=3;i=6000, name: speed, type: Double, origin: 2, range: [0, 1.5], unit: m/s}
+  - {node: ns=3;s=Line.Target, alias: 61, name: target, type: Double, origin: 0}
+  - {node: ns=3;i=6030, name: mode, type: Int32, origin: 2, enum: {0: idle, 1: moving}}
+";
+const SPEED: (u16, u16, u16) = (2, 3, 6000);
+
+/// Whether the NodeSets are there; where they are not, that is told as for a peer.
+fn has_nodesets() -> bool {
+    let there = Path::new(&format!("{SHARED}Di.NodeSet2.xml")).exists();
+    assert!(
+        there || std::env::var_os("CI").is_none(),
+        "there are no NodeSets at {SHARED}"
+    );
+    there
+}
+
+fn started(cell: &Cell, variables: &str) -> Child {
+    drop(cell.file("line.xml", LINE));
+    serving(cell, &mapping(variables))
+}
+
+#[test]
+fn nodes_of_nodesets_are_browsed_and_those_of_the_mapping_live() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    if !has_nodesets() {
+        return;
+    }
+    let mut server = started(&cell, LIVE);
+    server.wait_for_line("M170", SOON);
+    let group = UadpSocket::join();
+    let mut speed = watch(&cell, "ns=3;i=6000");
+    shows(&mut speed, "BadWaitingForInitialData", &Value::Null);
+    group.send(&key_frame(SPEED, 1, 1.25, DataSetHeader::default()));
+    shows(&mut speed, "Good", &json!(1.25));
+
+    // Written by a client it leaves for the space, which no Value of the file did.
+    assert_eq!(write(&cell, "ns=3;s=Line.Target", "Double", "2.5"), "Good");
+    eventually("the written value is sent", SOON, || {
+        let datagram = group.receive(Duration::from_millis(100))?;
+        let mut parts = datagram.windows(8);
+        parts
+            .any(|part| part == 2.5_f64.to_le_bytes())
+            .then_some(())
+    });
+    assert_eq!(read(&cell, "ns=3;s=Line.Target")["value"], json!(2.5));
+
+    // What nobody keeps up is as the file has it, and is neither written nor called.
+    let count = read(&cell, "ns=3;i=6020");
+    assert_eq!(count["value"], json!(7));
+    let time = |key: &str| {
+        count[key]
+            .as_str()
+            .is_some_and(|time| time.starts_with("20"))
+    };
+    assert!(
+        time("source_timestamp") && time("server_timestamp"),
+        "{count}"
+    );
+    assert_eq!(write(&cell, "ns=3;i=6020", "Int32", "8"), "BadNotWritable");
+    let range = read(&cell, "ns=3;i=6001")["value"].to_string();
+    assert!(range.contains("1.5"), "the mapping's range: {range}");
+
+    let about = cell.asyncua_once("opcua_tree.py", &[SERVER_ENDPOINT, "--server"]);
+    let uris = about[0]["namespaces"].as_array().unwrap();
+    let of_di = uris
+        .iter()
+        .filter(|uri| **uri == "http://opcfoundation.org/UA/DI/");
+    assert_eq!(of_di.count(), 1, "the NodeSet describes it: {about:?}");
+
+    let told = cell.asyncua_once("opcua_tree.py", &[SERVER_ENDPOINT]);
+    let bad = told.iter().filter(|line| line.get("status").is_some());
+    let mut bad: Vec<&str> = bad.map(|line| line["node"].as_str().unwrap()).collect();
+    bad.sort_unstable();
+    let waiting = ["ns=2;i=10", "ns=3;i=6030"];
+    assert_eq!(bad, waiting, "only those that no value came for");
+    let sum = told.last().unwrap();
+    assert!(sum["nodes"].as_u64() > Some(5_000), "{sum}");
+
+    let of = |name: &str| format!("{SHARED}{name}.NodeSet2.xml");
+    let (di, robotics) = (of("Di"), of("Robotics"));
+    let arguments = [
+        SERVER_ENDPOINT,
+        "urn:ua-bridge:system-tests:line",
+        "--nodeset",
+        &di,
+        "--nodeset",
+        &robotics,
+    ];
+    let told = cell.asyncua_once("opcua_round_trip.py", &arguments);
+    let export = &told[0];
+    assert_eq!(export["differ"], json!([]), "{export}");
+    assert_eq!(export["exported"], json!(12), "{export}");
+}
+
+#[test]
+fn a_node_that_the_mapping_leaves_is_that_of_its_file_again_and_other_files_need_a_restart() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    if !has_nodesets() {
+        return;
+    }
+    let mut server = started(&cell, "");
+    // Nobody keeps it up.
+    assert_eq!(read(&cell, "ns=3;i=6000")["value"], json!(0.5));
+    drop(cell.file("server.yaml", &mapping(LIVE)));
+    let group = UadpSocket::join();
+    let speed = watch(&cell, "ns=3;i=6000");
+    let mut sequence = 0;
+    shows_last(&speed, 1.25, || {
+        sequence += 1;
+        group.send(&key_frame(SPEED, sequence, 1.25, DataSetHeader::default()));
+    });
+    let range = read(&cell, "ns=3;i=6001")["value"].to_string();
+    assert!(range.contains("1.5"), "the mapping's range: {range}");
+
+    drop(cell.file("server.yaml", &mapping("")));
+    shows_last(&speed, 0.5, || {});
+    let range = read(&cell, "ns=3;i=6001")["value"].to_string();
+    assert!(range.contains("10"), "the file's range: {range}");
+
+    drop(cell.file("line.xml", &LINE.replace(">0.5<", ">0.75<")));
+    let told = server.wait_for_line("restart needed: server.nodesets", SOON);
+    assert!(told.contains("another one"), "{told}");
+    assert_eq!(read(&cell, "ns=3;i=6000")["value"], json!(0.5));
+
+    // A file that cannot be loaded leaves what runs as it is.
+    drop(cell.file("line.xml", "<UANodeSet>"));
+    server.wait_for_line("error[M170]", SOON);
+    assert_eq!(read(&cell, "ns=3;i=6000")["value"], json!(0.5));
+}
+
+/// Does something again and again until the client has been told of that value last.
+fn shows_last(watch: &Child, value: f64, mut done: impl FnMut()) {
+    eventually(&format!("the node shows {value}"), SOON, || {
+        done();
+        let last = watch.json_lines().pop()?;
+        (last.get("status")? == "Good" && last["value"] == json!(value)).then_some(())
+    });
+}
