@@ -48,7 +48,7 @@ impl Foreign {
                 one.is_found,
             )
         };
-        of(self) == of(other)
+        of(self) == of(other) && self.client.is_same(&other.client)
     }
 }
 

@@ -1,7 +1,9 @@
 //! Skills of a server of another maker, which knows Programs of OPC 10000-10 and nothing of the space: `ua-server` speaks for it.
 
+use std::fs;
 use std::time::Duration;
 
+use nix::sys::signal::Signal;
 use serde_json::{Value, json};
 use system_tests::{
     Cell, Child, Distribution, METRICS_SERVER, Peer, Started, eventually, metrics, program,
@@ -173,6 +175,25 @@ fn a_machine_that_knows_programs_only_is_in_the_space_as_a_component_is() {
 }
 
 #[test]
+fn a_machine_is_reached_as_the_saved_mapping_says() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    // The machine knows no such security.
+    let secured = MAPPING.replace("None", "Basic256Sha256");
+    let mapping = cell.file("press.yaml", &secured);
+    let server = cell.ua_server(&[mapping.to_str().unwrap()]);
+    let _machine = machine(&cell, &[]);
+    eventually("the machine is refused", SOON, || {
+        let server = metrics(METRICS_SERVER)?["servers"][0].clone();
+        (server["up"] == false && server["why"].is_string()).then_some(())
+    });
+    fs::write(&mapping, MAPPING).unwrap();
+    server.signal(Signal::SIGHUP);
+    listed(4);
+}
+
+#[test]
 fn goals_for_a_machine_run_it_are_cancelled_and_end_when_it_is_gone() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
@@ -337,7 +358,7 @@ server:
         &["--mdns", "saw"],
     );
     let first = machine(&cell, &[]);
-    let _server = cell.ua_server(&[mapping.to_str().unwrap(), "--announce"]);
+    let server = cell.ua_server(&[mapping.to_str().unwrap(), "--announce"]);
     let uri = "urn:ua-bridge:system-tests:machine";
     register(&cell, MACHINE, uri, &["--mdns", "press on the left"]);
 
@@ -370,6 +391,13 @@ server:
     let _second = machine(&cell, &[]);
     register(&cell, MACHINE, uri, &["--mdns", "press on the left"]);
     assert_eq!(topics(&listed_of("machine", 4)), numbers);
+
+    // And nobody speaks for it when nobody is to be found any more.
+    fs::write(&mapping, "server: {endpoint: 'opc.tcp://127.0.0.1:4858'}").unwrap();
+    server.signal(Signal::SIGHUP);
+    eventually("the machine is left alone", SOON, || {
+        servers().is_empty().then_some(())
+    });
 }
 
 #[test]

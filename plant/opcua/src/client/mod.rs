@@ -166,6 +166,12 @@ impl Client {
         }
     }
 
+    /// Whether both are handles to one client, and so of one session.
+    #[must_use]
+    pub fn is_same(&self, other: &Self) -> bool {
+        Arc::ptr_eq(&self.shared, &other.shared)
+    }
+
     /// What holds now, and each change. Between two looks there may have been several: `connects` tells.
     #[must_use]
     pub fn link(&self) -> watch::Receiver<Link> {
