@@ -163,7 +163,7 @@ document! {
         /// The OPC UA node, as ns=2;i=10.
         #[schemars(required, regex(pattern = r"^(ns=[0-9]+;)?[isgb]="))]
         node: String,
-        /// Name of the node.
+        /// Name of the node; dots part the folders it stands in, as Line.Conveyor.Speed.
         #[schemars(required, length(min = 1, max = 512))]
         name: String,
         /// OPC UA builtin type, as Boolean or Double[]. May be left out where a ROS type says it.

@@ -536,7 +536,7 @@ pub struct Variable {
     pub topic: TopicId,
     /// The OPC UA node.
     pub node: NodeIdText,
-    /// BrowseName and DisplayName of the node.
+    /// BrowseName and DisplayName of the node, behind the folders it stands in, which dots part.
     pub name: String,
     /// Builtin type and whether it is an array; `None` when the variable has several fields, or when neither the
     /// document nor a known ROS type says it.

@@ -15,7 +15,8 @@ async def run(args):
             node = client.get_node(text)
             if args.children:
                 found = await node.get_children()
-                lifetime.say(node=text, children=[child.nodeid.to_string() for child in found])
+                names = [(await child.read_browse_name()).Name for child in found]
+                lifetime.say(node=text, children=[child.nodeid.to_string() for child in found], names=names)
                 continue
             wanted = ua.ReadValueId(node.nodeid, ua.AttributeIds.Value, args.range)
             parameters = ua.ReadParameters()

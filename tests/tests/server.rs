@@ -8,6 +8,8 @@ mod authorities;
 mod configuration;
 #[path = "server/confirm.rs"]
 mod confirm;
+#[path = "server/folders.rs"]
+mod folders;
 #[path = "server/history.rs"]
 mod history;
 #[path = "server/identity.rs"]

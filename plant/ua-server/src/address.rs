@@ -13,6 +13,7 @@ use crate::properties;
 /// Adds a variable for each of a topic's nodes under `folder`, without a value.
 pub(crate) fn add_topic(address_space: &mut AddressSpace, topic: &TopicNode, folder: &NodeId) {
     let access = access(topic);
+    let (own_name, _) = topic.parts();
     let name = |node: &NodeId, text: &str| QualifiedName::new(node.namespace, text);
     let (type_, rank) = if topic.compound {
         (Shape(None).data_type(), 1)
@@ -25,8 +26,8 @@ pub(crate) fn add_topic(address_space: &mut AddressSpace, topic: &TopicNode, fol
     let description = description.unwrap_or_else(|| topic.topic.to_string());
     VariableBuilder::new(
         &topic.node,
-        name(&topic.node, &topic.name),
-        LocalizedText::from(topic.name.as_str()),
+        name(&topic.node, own_name),
+        LocalizedText::from(own_name),
     )
     .description(LocalizedText::from(description))
     .data_type(type_)

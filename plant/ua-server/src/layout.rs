@@ -314,6 +314,17 @@ impl TopicNode {
         }
     }
 
+    /// The name it has in its folder, and the names of the folders around it, the outermost first.
+    pub(crate) fn parts(&self) -> (&str, Vec<&str>) {
+        let mut parts: Vec<&str> = self
+            .name
+            .splitn(MOST_PARTS, '.')
+            .map(str::trim)
+            .filter(|part| !part.is_empty())
+            .collect();
+        (parts.pop().unwrap_or(&self.name), parts)
+    }
+
     /// Clients may write what this server produces. In space 0 that is what the mapping names: the rest is of components.
     pub(crate) fn writable(&self) -> bool {
         let ours = self.topic.space == SpaceId::UA && self.node != unmapped_node(self.topic);
@@ -427,6 +438,8 @@ impl Shape {
     }
 }
 
+/// Folders around one variable, and its own name.
+const MOST_PARTS: usize = 9;
 pub(crate) const OPC_UA_URI: &str = "http://opcfoundation.org/UA/";
 /// A mapping with a higher index is a slip of the keyboard, not a server.
 const MOST_NAMESPACES: u16 = 1_000;
@@ -434,6 +447,23 @@ const MOST_NAMESPACES: u16 = 1_000;
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn dots_part_folders_and_what_is_between_none_is_none() {
+        let named = |name: &str| {
+            let topic = TopicId::new(1, 2, 10).unwrap();
+            TopicNode::new(topic, NodeId::new(2, 10), name.to_owned(), Vec::new())
+        };
+        assert_eq!(named("speed").parts(), ("speed", Vec::new()));
+        assert_eq!(
+            named("Line.Conveyor.Speed").parts(),
+            ("Speed", vec!["Line", "Conveyor"])
+        );
+        assert_eq!(named("Line..Speed.").parts(), ("Speed", vec!["Line"]));
+        assert_eq!(named("...").parts(), ("...", Vec::new()));
+        let deep = named("a.b.c.d.e.f.g.h.i.j");
+        assert_eq!((deep.parts().0, deep.parts().1.len()), ("i.j", 8));
+    }
 
     fn topic(space: u16, namespace: u16, identifier: u16) -> TopicNode {
         TopicNode::new(

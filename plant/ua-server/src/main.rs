@@ -8,7 +8,7 @@
 //! `values` (what they show), `wear` (how that grows old), `history` (what they showed), `nodes` (the node manager), `browse`
 //! (in which order), `budget` (what clients may take up), `space` (values in), `components` and `presence` (which servers are
 //! there), `methods` and `argument_types` (calls of the space as Methods), `programs` (actions as Programs), `asking` (how
-//! clients ask for both), `nodesets` (nodes from files), `executing` (Methods of other servers as calls), `sources` (their nodes as values), `clients` (the
+//! clients ask for both), `nodesets` (nodes from files), `folders` (those of dotted names), `executing` (Methods of other servers as calls), `sources` (their nodes as values), `clients` (the
 //! sessions for both), `finding` (those with skills that discovery finds), `others` (all of these), `port` (the shell's side),
 //! `endpoint` (how clients get in), `changes` (what is told of a reload), `identity` (what the server says of itself), `confirm`
 //! (what says that a write has arrived), `access` (what each may do), `auditing` (what is told of it), `sks` (keys of secured
@@ -29,6 +29,7 @@ mod confirm;
 mod endpoint;
 mod executing;
 mod finding;
+mod folders;
 mod history;
 mod identity;
 mod layout;

@@ -37,6 +37,7 @@ use crate::address;
 use crate::asking::{Drive, Drives, Questions, Refused, Table};
 use crate::budget::{Answers, LARGEST, SMALL, Watched};
 use crate::confirm::Confirms;
+use crate::folders;
 use crate::history::{Past, Room, Series};
 use crate::identity;
 use crate::layout::{FieldNode, Layout, TopicNode};
@@ -143,7 +144,7 @@ impl SpaceNodes {
         }
         let mut places = Places::new();
         for topic in &layout.topics {
-            let folder = address::origin_folder(topic.topic.space);
+            let folder = folders::stand(address_space, topic);
             if !nodesets.adopt(address_space, topic, &folder) {
                 address::add_topic(address_space, topic, &folder);
             }
@@ -152,7 +153,7 @@ impl SpaceNodes {
         Self {
             namespaces,
             places: RwLock::new(places),
-            order: RwLock::new(address::order(layout)),
+            order: RwLock::new(folders::order(layout)),
             values: RwLock::new(Values::new(MOST_HELD)),
             past: RwLock::new(Past::new(0, 0)),
             watched: Mutex::new(Watched::default()),
@@ -220,20 +221,13 @@ impl SpaceNodes {
             }
         }
         for topic in new {
-            let folder = address::origin_folder(topic.topic.space);
-            if !address_space.node_exists(&folder) {
-                address::add_folder(
-                    &folder,
-                    &address::origin_name(topic.topic.space),
-                    address::root(),
-                    &mut address_space,
-                );
-            }
+            let folder = folders::stand(&mut address_space, topic);
             if !self.nodesets.adopt(&mut address_space, topic, &folder) {
                 address::add_topic(&mut address_space, topic, &folder);
             }
             put(&mut places, topic);
         }
+        folders::tidy(&mut address_space, gone);
         let mut notifier = subscriptions.data_notifier();
         for node in gone.iter().flat_map(TopicNode::nodes) {
             let nothing =
@@ -254,7 +248,7 @@ impl SpaceNodes {
 
     /// Has the nodes in the order of `layout` from now on.
     pub(crate) fn set_order(&self, layout: &Layout) {
-        *self.order.write() = address::order(layout);
+        *self.order.write() = folders::order(layout);
     }
 
     /// Where a node is among those with its parent; 0 for one that has no place.
