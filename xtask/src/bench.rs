@@ -50,7 +50,7 @@ pub(crate) fn skills(workspace: &Workspace, arguments: &[&str]) -> anyhow::Resul
     measured(
         workspace,
         "bench-skills",
-        &["ua-component", "system-tests"],
+        &["discovery", "ua-component", "ua-station", "system-tests"],
         arguments,
     )
 }

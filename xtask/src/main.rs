@@ -34,7 +34,7 @@ cargo xtask <verb>
   bench ros1 [ARGS]              measure relays of ROS 1 messages beside a raw echo; bridge-ros1 with 50 topics (--help)
   bench ros2 [ARGS]              measure relays of DDS samples beside a UDP echo; both bridges from ROS 1 to ROS 2 and back
   bench opcua [ARGS]             measure ua-server beside servers of asyncua and node-opcua, and what comes from the space to clients
-  bench skills [ARGS]            measure what clients wait for of skills, and a thousand of them in one server
+  bench skills [ARGS]            measure what clients wait for of skills and of servers that are plugged in (finding)
   bench uadp [--instructions]    measure the codec beside another one; only count instructions and hold them against the list
   bench messages [--instructions]  measure messages on their way to fields and back, beside memcpy, a tree of values and Python
 ";

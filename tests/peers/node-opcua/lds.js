@@ -1,12 +1,12 @@
 "use strict";
-// lds.js PORT: node-opcua's discovery server. Says `ready`, and then a JSON line whenever what it sees on the network
-// is another, and one whenever who is registered is.
+// lds.js PORT [PERIOD]: node-opcua's discovery server. Says `ready`, and then a JSON line whenever what it sees on the network
+// is another, and one whenever who is registered is. It is asked each PERIOD ms (100).
 const { OPCUADiscoveryServer } = require("node-opcua-server-discovery");
 const { findServers, findServersOnNetwork } = require("node-opcua-client");
 const path = require("path");
 const { OPCUACertificateManager } = require("node-opcua-certificate-manager");
 
-async function main([port]) {
+async function main([port, period = "100"]) {
   const serverCertificateManager = new OPCUACertificateManager({
     rootFolder: path.join(process.env.HOME, "pki"),
     automaticallyAcceptUnknownCertificate: true,
@@ -26,7 +26,7 @@ async function main([port]) {
     })));
     if (seen !== last) {
       last = seen;
-      console.log(`{"network":${seen}}`);
+      console.log(`{"network":${seen},"at_ms":${Date.now()}}`);
     }
     const { servers } = await findServers(`opc.tcp://127.0.0.1:${port}`);
     const registered = JSON.stringify(servers.map((server) => server.applicationUri));
@@ -34,7 +34,7 @@ async function main([port]) {
       lastRegistered = registered;
       console.log(`{"registered":${registered}}`);
     }
-    await new Promise((resolve) => setTimeout(resolve, 100));
+    await new Promise((resolve) => setTimeout(resolve, Number(period)));
   }
 }
 

@@ -1,6 +1,8 @@
 //! `cargo xtask bench skills`: what a client waits for, what a skill's methods take beside a plain one, and many skills in
 //! one server.
 
+mod finding;
+
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
@@ -18,13 +20,24 @@ fn main() -> ExitCode {
             Some(at) => args.get(at + 1)?.parse().ok(),
         }
     };
-    let (Some(runs), Some(skills)) = (number("--runs", 200), number("--skills", 1_000)) else {
+    let is_finding = args.first().is_some_and(|arg| arg == "finding");
+    let (Some(runs), Some(skills), Some(servers)) = (
+        number("--runs", if is_finding { 20 } else { 200 }),
+        number("--skills", 1_000),
+        number("--servers", 500),
+    ) else {
         print!("{HELP}");
         return ExitCode::from(64);
     };
     if args.iter().any(|arg| arg == "--help") {
         print!("{HELP}");
         return ExitCode::SUCCESS;
+    }
+    if is_finding {
+        return match finding::all(runs, servers) {
+            Some(()) => ExitCode::SUCCESS,
+            None => ExitCode::FAILURE,
+        };
     }
     let Some(cell) = Cell::with(&[]) else {
         return ExitCode::FAILURE;
@@ -45,9 +58,11 @@ fn main() -> ExitCode {
 
 const HELP: &str = "\
 cargo xtask bench skills [--runs N] [--skills N]
+cargo xtask bench skills finding [--runs N] [--servers N]
 
-  --runs N     runs and calls of each kind (200)
+  --runs N     runs and calls of each kind (200); servers that are plugged in (20)
   --skills N   skills in one server (1000)
+  --servers N  servers that register with one discovery server (500)
 ";
 
 /// A component with so many grippers, all done at once.

@@ -1,0 +1,452 @@
+//! `cargo xtask bench skills finding`: how soon a server that is plugged in is found, how soon its method is called from
+//! another workstation, and what many servers cost.
+
+use std::net::{Ipv4Addr, SocketAddrV4};
+use std::time::{Duration, Instant};
+
+use discovery::client::{find_servers, find_servers_on_network};
+use discovery::{
+    AnnounceSettings, Announced, Found, Interface, Server, WatchSettings, Watcher, announce,
+    be_there, watch,
+};
+use plant_opcua::client::{Browse, Client, ClientConfig};
+use plant_opcua::types::{NodeId, ObjectId};
+use system_tests::{
+    Cell, Child, HERE, Peer, Segment, Site, Started, Times, WIRE, Wire, cpu_share, eventually,
+    group_member, program, resident,
+};
+use tokio::net::TcpListener;
+use tokio::runtime::Runtime;
+
+/// Measures all of it; gives up with the reason where a peer is missing.
+pub(crate) fn all(runs: usize, servers: usize) -> Option<()> {
+    seen(runs)?;
+    called(runs)?;
+    many(servers)
+}
+
+fn runtime() -> Runtime {
+    // Its threads are of the network of this one.
+    tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(2)
+        .enable_all()
+        .build()
+        .unwrap()
+}
+
+/// A server that can do nothing but be there.
+async fn plugged(name: &str, at: Ipv4Addr, lds: Option<&str>) -> Announced {
+    let listener = TcpListener::bind((at, 0)).await.unwrap();
+    let port = listener.local_addr().unwrap().port();
+    let server = Server {
+        application_uri: format!("urn:bench:{name}"),
+        product_uri: String::new(),
+        name: name.to_owned(),
+        url: format!("opc.tcp://{at}:{port}/"),
+        capabilities: vec!["DA".to_owned()],
+        number: None,
+    };
+    let settings = AnnounceSettings {
+        lds: lds.map(str::to_owned),
+        mdns: lds.is_none().then(|| Interface::parse(&at.to_string())),
+        ..AnnounceSettings::default()
+    };
+    let announced = announce(server.clone(), settings).unwrap();
+    tokio::spawn(async move { be_there(listener, &server).await });
+    announced
+}
+
+/// From the call that announces a server to those who hear of it.
+fn seen(runs: usize) -> Option<()> {
+    let cell = Cell::with(&[Peer::NodeOpcua])?;
+    let host = cell.host(Wire::default());
+    let _lds = lds(&["--interface", WIRE]);
+    let mut other = cell
+        .node_opcua_started("lds.js", &["4841", "5"])
+        .on(&host)
+        .start();
+    other.wait_for_json("node-opcua answers itself", SOON, |line| {
+        line.get("network").map(drop)
+    });
+    let here: Ipv4Addr = HERE.parse().unwrap();
+    println!(
+        "\n{runs} servers, one after the other; milliseconds since each was told to announce itself:\n"
+    );
+    println!("| who hears of it | median | worst |\n|---|---|---|");
+    let runtime = runtime();
+    let [mut ours, mut listed, mut theirs] = [(); 3].map(|()| Times::default());
+    runtime.block_on(async {
+        let settings = WatchSettings {
+            mdns: Some(Interface::parse(HERE)),
+            ..WatchSettings::default()
+        };
+        let mut watcher = watch(settings).unwrap();
+        for run in 0..runs {
+            let name = format!("watched-{run}");
+            let began = Instant::now();
+            let announced = plugged(&name, here, None).await;
+            until_seen(&mut watcher, &name).await;
+            ours.add(began.elapsed());
+            announced.leave().await;
+            let name = format!("listed-{run}");
+            let began = Instant::now();
+            let announced = plugged(&name, here, None).await;
+            until_listed(LDS, &name).await;
+            listed.add(began.elapsed());
+            announced.leave().await;
+            let name = format!("theirs-{run}");
+            let began = since_1970();
+            let announced = plugged(&name, here, None).await;
+            let at = tokio::task::block_in_place(|| listed_by(&mut other, &name));
+            theirs.add(at.saturating_sub(began));
+            announced.leave().await;
+        }
+    });
+    for (who, times) in [
+        ("a watcher of ours", &mut ours),
+        ("who asks `ua-lds`: FindServersOnNetwork", &mut listed),
+        (
+            "who asks the discovery server of node-opcua, each 5 ms",
+            &mut theirs,
+        ),
+    ] {
+        row(who, times);
+    }
+    Some(())
+}
+
+fn row(what: &str, times: &mut Times) {
+    println!(
+        "| {what} | {:.0} | {:.0} |",
+        times.at(0.5) / 1e3,
+        times.at(1.0) / 1e3
+    );
+}
+
+async fn until_seen(watcher: &mut Watcher, name: &str) {
+    let seen = async {
+        while let Some(found) = watcher.next().await {
+            if matches!(&found, Found::Seen(known) if known.name.starts_with(name)) {
+                return;
+            }
+        }
+    };
+    tokio::time::timeout(SOON, seen).await.unwrap();
+}
+
+/// When node-opcua listed it, to the millisecond.
+fn listed_by(other: &mut Child, name: &str) -> Duration {
+    other.wait_for_json(&format!("{name} is listed"), SOON, |line| {
+        let mut network = line["network"].as_array()?.iter();
+        let is_it = |one: &serde_json::Value| {
+            one["name"]
+                .as_str()
+                .is_some_and(|its| its.starts_with(name))
+        };
+        network.any(is_it).then_some(())?;
+        line["at_ms"].as_u64().map(Duration::from_millis)
+    })
+}
+
+fn since_1970() -> Duration {
+    let now = std::time::SystemTime::now();
+    now.duration_since(std::time::UNIX_EPOCH).unwrap()
+}
+
+async fn until_listed(url: &str, name: &str) {
+    let end = Instant::now() + SOON;
+    loop {
+        let listed = find_servers_on_network(url, SOON).await;
+        if let Ok(listed) = &listed
+            && listed.iter().any(|one| one.name.starts_with(name))
+        {
+            return;
+        }
+        assert!(Instant::now() < end, "{name} is not listed: {listed:?}");
+        tokio::time::sleep(LOOK_EVERY).await;
+    }
+}
+
+/// From the start of a component to the answer of its method, which is called at another workstation.
+fn called(runs: usize) -> Option<()> {
+    let cell = Cell::with(&[])?;
+    let bus = cell.segment();
+    let top = cell.site();
+    bus.plug(&top, "bus0", "10.80.0.1");
+    let levels = [1, 2].map(|at| Level::new(&cell, &bus, at));
+    let _top = station(&top, "cell", "10.80.0.1", &["--interface", "bus0"]);
+    let _stations = [1, 2].map(|at| {
+        let (level, name) = (&levels[at - 1], format!("station-{at}"));
+        let args = ["--interface", "lower0", "--upper-interface", "upper0"];
+        let address = format!("10.80.{at}.1");
+        station(
+            &level.station,
+            &name,
+            &address,
+            &[&args[..], &["--upper-lds", "uri=urn:*"]].concat(),
+        )
+    });
+    let [first, second] = &levels;
+    let url = "opc.tcp://10.80.1.1:4840".to_owned();
+    let mut times = Times::default();
+    let mut known = None;
+    // The first finds out where the method is.
+    for _ in 0..=runs {
+        let began = Instant::now();
+        let component = second.component();
+        let path = first.device.within(|| answered(&url, known.as_deref()));
+        if known.replace(path).is_some() {
+            times.add(began.elapsed());
+        }
+        drop(component);
+        first.device.within(|| gone(&url));
+    }
+    println!(
+        "\n{runs} starts of a component; milliseconds to the answer to Reset of its skill, called at another workstation:\n"
+    );
+    println!("| way | median | worst |\n|---|---|---|");
+    row(
+        "component -> station -> cell -> station -> client",
+        &mut times,
+    );
+    Some(())
+}
+
+/// A workstation with two devices.
+struct Level {
+    _inside: Segment,
+    station: Site,
+    device: Site,
+    at: usize,
+}
+
+impl Level {
+    fn new(cell: &Cell, bus: &Segment, at: usize) -> Self {
+        let (inside, station, device) = (cell.segment(), cell.site(), cell.site());
+        bus.plug(&station, "upper0", &format!("10.80.0.{}", 10 + at));
+        inside.plug(&station, "lower0", &format!("10.80.{at}.1"));
+        inside.plug(&device, "dev0", &format!("10.80.{at}.21"));
+        Self {
+            _inside: inside,
+            station,
+            device,
+            at,
+        }
+    }
+
+    fn component(&self) -> Child {
+        let example = std::path::Path::new(env!("CARGO_MANIFEST_DIR"))
+            .join("../examples/plant/parallel-gripper.yaml");
+        let endpoint = format!("opc.tcp://10.80.{}.21:0", self.at);
+        Started::new("ua-component", &program("ua-component"))
+            .args([&example])
+            .args([
+                "--endpoint",
+                &endpoint,
+                "--lds",
+                "any",
+                "--interface",
+                "dev0",
+            ])
+            .at(&self.device)
+            .start()
+    }
+}
+
+fn station(at: &Site, name: &str, address: &str, more: &[&str]) -> Child {
+    let endpoint = format!("opc.tcp://{address}:4840");
+    Started::new(name, &program("ua-station"))
+        .args(["--name", name, "--endpoint", &endpoint, "--allow-unsecured"])
+        .args(more)
+        .at(at)
+        .start()
+}
+
+/// The client of the other workstation, in the network of this thread.
+fn asking<T>(url: &str, what: impl AsyncFnOnce(&Client) -> T) -> T {
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()
+        .unwrap();
+    runtime.block_on(async {
+        let config = ClientConfig {
+            timeout: SOON,
+            ..ClientConfig::new("urn:ua-bridge:bench:client", "bench")
+        };
+        let client = Client::open(config, &neighbour(url).await);
+        client.up(SOON).await.unwrap();
+        let told = what(&client).await;
+        client.close().await;
+        told
+    })
+}
+
+/// Where the other workstation is, as the discovery server of this one says.
+async fn neighbour(lds: &str) -> String {
+    let end = Instant::now() + SOON;
+    loop {
+        let listed = find_servers(lds, SOON).await;
+        let mut found = listed.iter().flatten();
+        if let Some(other) = found.find(|one| one.name == DEVICE[1])
+            && let Some(url) = other.discovery_urls.first()
+        {
+            return url.clone();
+        }
+        assert!(Instant::now() < end, "no neighbour: {listed:?}");
+        tokio::time::sleep(LOOK_EVERY).await;
+    }
+}
+
+/// Calls the method until it answers. Gives the names on the way to it.
+fn answered(url: &str, known: Option<&[String]>) -> Vec<String> {
+    asking(url, async |client| {
+        let end = Instant::now() + SOON;
+        loop {
+            let path = match known {
+                Some(path) => Some(path.to_vec()),
+                None => search(client).await,
+            };
+            if let Some(path) = path
+                && let Some(nodes) = nodes(client, &path).await
+                && let [.., object, method] = &*nodes
+            {
+                let called = client.call(object, method, Vec::new()).await;
+                if called.is_ok() {
+                    return path;
+                }
+            }
+            assert!(Instant::now() < end, "the method does not answer");
+            tokio::time::sleep(LOOK_EVERY).await;
+        }
+    })
+}
+
+fn gone(url: &str) {
+    asking(url, async |client| {
+        let end = Instant::now() + SOON;
+        let path = DEVICE.map(str::to_owned);
+        while nodes(client, &path).await.is_some() {
+            assert!(Instant::now() < end, "the component is not missed");
+            tokio::time::sleep(LOOK_EVERY).await;
+        }
+    });
+}
+
+/// The nodes of a path of names below Objects.
+async fn nodes(client: &Client, path: &[String]) -> Option<Vec<NodeId>> {
+    let mut nodes = vec![NodeId::from(ObjectId::ObjectsFolder)];
+    for name in path {
+        let below = client.browse(nodes.last()?, Browse::hierarchical()).await;
+        let below = below.ok()?;
+        let next = below
+            .iter()
+            .find(|one| one.browse_name.name.as_ref() == name);
+        nodes.push(next?.node_id.node_id.clone());
+    }
+    Some(nodes)
+}
+
+/// Where the method is, below the component.
+async fn search(client: &Client) -> Option<Vec<String>> {
+    let path = DEVICE.map(str::to_owned).to_vec();
+    let mut left = vec![(nodes(client, &path).await?.pop()?, path)];
+    while let Some((node, path)) = left.pop() {
+        let below = client.browse(&node, Browse::hierarchical()).await;
+        for one in below.unwrap_or_default() {
+            let name = one.browse_name.name.as_ref().to_owned();
+            let is_it = name == "Reset";
+            let path = [path.clone(), vec![name]].concat();
+            if is_it {
+                return Some(path);
+            }
+            if path.len() < DEVICE.len() + 6 {
+                left.push((one.node_id.node_id, path));
+            }
+        }
+    }
+    None
+}
+
+/// Many servers that register: until all are listed, and what they cost when nothing happens.
+fn many(servers: usize) -> Option<()> {
+    let _cell = Cell::with(&[])?;
+    let lds = lds(&[]);
+    let runtime = runtime();
+    let (began, crowd) = (Instant::now(), servers);
+    let told: Vec<Announced> = runtime.block_on(async {
+        let mut told = Vec::new();
+        for at in 0..crowd {
+            let name = format!("crowd-{at}");
+            told.push(plugged(&name, Ipv4Addr::LOCALHOST, Some(LDS)).await);
+        }
+        told
+    });
+    let all = async {
+        let registered = async {
+            while find_servers(LDS, SOON).await.unwrap_or_default().len() < servers {
+                tokio::time::sleep(LOOK_EVERY).await;
+            }
+            began.elapsed()
+        };
+        let announced = async {
+            loop {
+                let listed = find_servers_on_network(LDS, SOON).await;
+                if listed.unwrap_or_default().len() >= servers {
+                    return began.elapsed();
+                }
+                tokio::time::sleep(LOOK_EVERY).await;
+            }
+        };
+        let both = async { tokio::join!(registered, announced) };
+        tokio::time::timeout(SOON * 2, both).await.unwrap()
+    };
+    let (registered, announced) = runtime.block_on(all);
+    let ear = group_member(MDNS);
+    ear.set_nonblocking(true).unwrap();
+    let idle = cpu_share(lds.id(), WINDOW);
+    let mut packet = [0; 9000];
+    let (mut packets, mut bytes) = (0_u32, 0);
+    while let Ok(length) = ear.recv(&mut packet) {
+        packets += 1;
+        bytes += length;
+    }
+    println!(
+        "\n{servers} servers register with one discovery server, which announces them and tries each once a second:\n"
+    );
+    println!(
+        "| all registered | all announced | in RAM | of a processor, idle | mDNS packets per s | bytes per s |\n|---|---|---|---|---|---|"
+    );
+    println!(
+        "| {:.0} ms | {:.0} ms | {:.1} MB | {:.1} % | {:.1} | {:.0} |",
+        registered.as_secs_f64() * 1e3,
+        announced.as_secs_f64() * 1e3,
+        resident(lds.id()) as f64 / 1e6,
+        idle * 100.0,
+        f64::from(packets) / WINDOW.as_secs_f64(),
+        bytes as f64 / WINDOW.as_secs_f64()
+    );
+    runtime.block_on(async {
+        for announced in told {
+            drop(announced);
+        }
+    });
+    Some(())
+}
+
+fn lds(args: &[&str]) -> Child {
+    let child = Started::new("ua-lds", &program("ua-lds"))
+        .args(args)
+        .start();
+    eventually("ua-lds answers", SOON, || {
+        std::net::TcpStream::connect(LDS.trim_start_matches("opc.tcp://")).ok()
+    });
+    child
+}
+
+const LDS: &str = "opc.tcp://127.0.0.1:4840";
+/// Where the component is at the other workstation.
+const DEVICE: [&str; 4] = ["Neighbours", "station-2", "Devices", "parallel-gripper"];
+const MDNS: SocketAddrV4 = SocketAddrV4::new(Ipv4Addr::new(224, 0, 0, 251), 5353);
+const SOON: Duration = Duration::from_secs(20);
+const WINDOW: Duration = Duration::from_secs(20);
+const LOOK_EVERY: Duration = Duration::from_millis(2);
