@@ -360,7 +360,11 @@ impl Telling {
                 });
             }
             Err(error) => {
-                self.register_at = Instant::now() + self.wait;
+                // Of many who come at once not all are answered: they do not come at once again.
+                let wait = self
+                    .wait
+                    .mul_f64(registry::spread(&self.server.borrow().url));
+                self.register_at = Instant::now() + wait;
                 self.wait = (self.wait * 2)
                     .min(MOST_WAIT)
                     .min(self.settings.register_every);

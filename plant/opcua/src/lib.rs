@@ -1,12 +1,13 @@
 //! OPC UA for the programs of the plant: servers whose address space is made of NodeSets and of instances of their
 //! types, and clients that come back by themselves. It knows no skills, no discovery, no space and no ROS.
 //!
-//! Reading order: `limits` (the bounds of both sides), `endpoint`, `pki`, `certificates`, `known` and `door` (how clients get in), `nodeset` (types from
-//! files), `users` and `audit`, `server` and `client`, `trust_file` and
-//! `configuration` (a server's certificates as clients manage them).
+//! Reading order: `limits` (the bounds of both sides), `endpoint`, `pki`, `certificates`, `known` and `door` (how clients get
+//! in), `nodeset` (types from files), `users`, `audit` and `changes`, `server` and `client`, `trust_file` and `configuration` (a
+//! server's certificates as clients manage them).
 
 pub mod audit;
 pub mod certificates;
+pub mod changes;
 pub mod client;
 pub mod configuration;
 pub mod door;

@@ -21,4 +21,4 @@ pub use loss::Loss;
 pub use name::{instance_name, label, renamed};
 pub use network::{Announcement, NetworkRecord};
 pub use registry::{Event, Registered, Registry, Settings};
-pub use watch::{Outcome, Probe};
+pub use watch::{Outcome, Probe, spread};

@@ -193,8 +193,10 @@ impl Watched {
     }
 }
 
-/// A share of the time for each URL, of a tenth to all of it, the same each time (FNV-1a).
-fn spread(url: &str) -> f64 {
+/// A share of a time for each URL, of a tenth to all of it, the same each time (FNV-1a): what many do at the same time
+/// otherwise is done one after the other.
+#[must_use]
+pub fn spread(url: &str) -> f64 {
     let mix = |hash: u32, byte: u8| (hash ^ u32::from(byte)).wrapping_mul(16_777_619);
     let hash = url.bytes().fold(2_166_136_261, mix);
     0.1 + 0.9 * f64::from(hash >> 8) / f64::from(u32::MAX >> 8)

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use async_trait::async_trait;
+use plant_opcua::changes::{Became, ModelChange};
 use plant_opcua::client::{CallError, CallOptions, Client, ClientError};
 use plant_opcua::limits::LONGEST_REQUEST;
 use plant_opcua::server::{
@@ -78,12 +79,18 @@ impl Face {
         Ok(face)
     }
 
-    /// Shows the methods of a server in the place of what was shown of it.
+    /// Shows the methods of a server in the place of what was shown of it, and tells clients.
     ///
     /// # Errors
     /// The folder is not there any more.
     pub(crate) fn show(&self, shown: &Shown<'_>) -> Result<(), InstanceError> {
-        self.remove(shown.name);
+        self.server.remove(&self.root(shown.name));
+        let made = self.add(shown);
+        self.tell(shown.name, Became::Added);
+        made
+    }
+
+    fn add(&self, shown: &Shown<'_>) -> Result<(), InstanceError> {
         let root = format!("{}/{}", self.folder, shown.name);
         self.object(&root, &id(self.folder), shown.name)?;
         self.property(&root, "ApplicationUri", shown.application_uri)?;
@@ -104,9 +111,23 @@ impl Face {
         Ok(())
     }
 
-    /// Shows nothing more of a server.
+    /// Shows nothing more of a server, and tells clients.
     pub(crate) fn remove(&self, name: &str) {
-        self.server.remove(&id(&format!("{}/{name}", self.folder)));
+        self.server.remove(&self.root(name));
+        self.tell(name, Became::Deleted);
+    }
+
+    /// The object of a server.
+    fn root(&self, name: &str) -> NodeId {
+        id(&format!("{}/{name}", self.folder))
+    }
+
+    fn tell(&self, name: &str, became: Became) {
+        self.server.tell_changes(&[ModelChange {
+            node: self.root(name),
+            type_definition: ObjectTypeId::FolderType.into(),
+            became,
+        }]);
     }
 
     fn method(

@@ -4,7 +4,10 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use discovery::client::{Application, find_servers};
-use plant_opcua::client::{CallError, Client, ClientConfig, Link};
+use plant_opcua::client::{
+    CallError, Client, ClientConfig, Link, Notice, Select, Subscription, Watch,
+};
+use plant_opcua::types::{ObjectId, ObjectTypeId};
 use registry::hierarchy::Place;
 use tokio::sync::watch;
 use tokio::time::sleep;
@@ -120,6 +123,7 @@ impl Tending {
         link: &mut watch::Receiver<Link>,
     ) {
         let mut known = None;
+        let mut changes = of.client.subscribe(vec![model_changes()], TOLD_EVERY, 10);
         loop {
             match mirror::look(of.client).await {
                 Ok(looked) if known.as_ref() != Some(&looked) => {
@@ -129,6 +133,19 @@ impl Tending {
                 Ok(_) => {}
                 Err(error) => self.fault(of.url, "waiting", error.to_string()),
             }
+            // Being told its place may change a server: it is not told again for that.
+            let is_told = match (&*place, &known) {
+                (
+                    Some(place),
+                    Some(Mirror {
+                        configure: Some(_), ..
+                    }),
+                ) => {
+                    let station = place.borrow().clone();
+                    station.is_none() || *of.told.lock().await == station
+                }
+                _ => true,
+            };
             let told = async {
                 match (&mut *place, &known) {
                     (Some(place), Some(mirror)) => self.keep_told(of, mirror, place).await,
@@ -142,6 +159,8 @@ impl Tending {
                 }
                 () = told => {}
                 // What a server has may change: that of another station does whenever a device comes or goes.
+                () = changed(&mut changes), if is_told => {}
+                // Not every server says so.
                 () = sleep(LOOK_AGAIN) => {}
             }
         }
@@ -253,6 +272,26 @@ impl Tending {
     }
 }
 
+/// That nodes of a server are others than before.
+fn model_changes() -> Watch {
+    Watch::Events {
+        node: ObjectId::Server.into(),
+        select: vec![Select::new(ObjectTypeId::BaseEventType, "EventType")],
+        of_type: Some(ObjectTypeId::BaseModelChangeEventType.into()),
+    }
+}
+
+/// Ready when the server says that it has changed.
+async fn changed(changes: &mut Subscription) {
+    loop {
+        match changes.next().await {
+            Some(Notice::Event { .. }) => return,
+            Some(Notice::Subscribed | Notice::Value { .. } | Notice::Refused { .. }) => {}
+            None => std::future::pending().await,
+        }
+    }
+}
+
 /// A connection to the server that it is said to be.
 struct Connected<'a> {
     client: &'a Client,
@@ -266,6 +305,8 @@ struct Connected<'a> {
 }
 
 const ASK_LIMIT: Duration = Duration::from_secs(2);
+/// How soon a server is to tell of a change.
+const TOLD_EVERY: Duration = Duration::from_millis(50);
 const LOOK_AGAIN: Duration = Duration::from_secs(2);
 const FIRST_WAIT: Duration = Duration::from_millis(250);
 const MOST_WAIT: Duration = Duration::from_secs(30);

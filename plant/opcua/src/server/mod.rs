@@ -46,6 +46,7 @@ pub use crate::endpoint::EndpointUrl;
 
 use self::calls::Calls;
 use self::nodes::{Nodes, Spaces};
+use crate::changes::{self, ModelChange};
 use crate::door::Door;
 use crate::pki::Pki;
 use crate::users::Access;
@@ -339,6 +340,11 @@ impl Server {
     /// task of the server, which waits for it.
     pub fn on_session_closed(&self, told: impl Fn(u32) + Send + Sync + 'static) {
         self.inner.calls.sessions.tell(Arc::new(told));
+    }
+
+    /// Tells who watches the Server object which nodes are others than before.
+    pub fn tell_changes(&self, changes: &[ModelChange]) {
+        changes::tell(self.inner.handle.subscriptions(), changes);
     }
 
     /// Raises an event on its source and on the Server object.

@@ -321,14 +321,18 @@ fn answered(url: &str, known: Option<&[String]>) -> Vec<String> {
     })
 }
 
-fn gone(url: &str) {
-    asking(url, async |client| {
-        let end = Instant::now() + SOON;
-        let path = DEVICE.map(str::to_owned);
-        while nodes(client, &path).await.is_some() {
-            assert!(Instant::now() < end, "the component is not missed");
-            tokio::time::sleep(LOOK_EVERY).await;
-        }
+/// Waits until the component is missed: a workstation without methods is not listed.
+fn gone(lds: &str) {
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()
+        .unwrap();
+    let is_listed = || {
+        let listed = runtime.block_on(find_servers(lds, SOON)).unwrap();
+        listed.iter().any(|one| one.name == DEVICE[1])
+    };
+    eventually("the component is missed", SOON, || {
+        (!is_listed()).then_some(())
     });
 }
 
