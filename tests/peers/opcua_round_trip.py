@@ -4,6 +4,7 @@ line with how many there were, and which are others there than here."""
 import argparse
 import asyncio
 import os
+import re
 import tempfile
 
 from asyncua import Server, ua
@@ -41,7 +42,8 @@ async def described(node, namespaces):
         told["type"] = [namespaces[data_type.NamespaceIndex], str(data_type.Identifier)]
         told["rank"] = int(await node.read_value_rank())
         value = await node.read_data_value(raise_on_bad_status=False)
-        told["value"] = repr(value.Value.Value) if value.Value else None
+        # How many bytes a NodeId took on its way is no part of it.
+        told["value"] = re.sub(r", NodeIdType=<[^>]*>", "", repr(value.Value.Value)) if value.Value else None
     return told
 
 

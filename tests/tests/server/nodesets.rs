@@ -128,7 +128,7 @@ fn nodes_of_nodesets_are_browsed_and_those_of_the_mapping_live() {
     let told = cell.asyncua_once("opcua_round_trip.py", &arguments);
     let export = &told[0];
     assert_eq!(export["differ"], json!([]), "{export}");
-    assert_eq!(export["exported"], json!(12), "{export}");
+    assert_eq!(export["exported"], json!(13), "{export}");
 }
 
 #[test]
@@ -175,5 +175,37 @@ fn shows_last(watch: &Child, value: f64, mut done: impl FnMut()) {
         done();
         let last = watch.json_lines().pop()?;
         (last.get("status")? == "Good" && last["value"] == json!(value)).then_some(())
+    });
+}
+
+#[test]
+fn a_method_of_a_nodeset_is_called_while_the_call_of_its_node_is_there() {
+    let Some(cell) = Cell::with(&[Peer::Ros1, Peer::Python]) else {
+        return;
+    };
+    if !has_nodesets() {
+        return;
+    }
+    drop(cell.file("line.xml", LINE));
+    let calls = "calls:\n  - {node: ns=3;i=7000, name: Line.Halt, origin: 1, ros: {service: /halt, type: std_srvs/Trigger}}\n";
+    let text = mapping(calls).replace("  - id: 2\n", "  - id: 1\n  - id: 2\n");
+    let file = cell.file("server.yaml", &text);
+    let path = file.to_str().unwrap();
+    let _core = cell.roscore();
+    let mut server = cell.ua_server(&[path]);
+    server.wait_for_line("serving at", SOON);
+    let arguments = [SERVER_ENDPOINT, "DeviceSet/Line/Halt", "--value", "[]"];
+    let status = || {
+        let told = cell.asyncua_once("opcua_call.py", &arguments);
+        told.last().unwrap()["status"].clone()
+    };
+    assert_eq!(status(), "BadUserAccessDenied");
+    let _executor = cell.rospy_executor(&["empty=/halt"]);
+    let bridge = cell.bridge_ros1(&[path]);
+    server.wait_for_line("shown as a Method", SOON);
+    assert_eq!(status(), "Good");
+    drop(bridge);
+    eventually("it is not called any more", SOON, || {
+        (status() == "BadUserAccessDenied").then_some(())
     });
 }
