@@ -316,19 +316,18 @@ impl Configuration {
         Ok(Vec::new())
     }
 
-    /// GetRejectedList: the certificates that were refused, the latest first.
+    /// GetRejectedList: the certificates that were refused, the latest first, 100 at most.
     fn rejected(&self) -> Vec<Variant> {
         let entries = fs::read_dir(self.root.join("rejected"))
             .into_iter()
             .flatten();
         let mut all: Vec<_> = entries
             .flatten()
-            .take(MOST_REJECTED)
             .filter_map(|entry| Some((entry.metadata().ok()?.modified().ok()?, entry.path())))
             .collect();
         all.sort();
-        let each = all.iter().rev();
-        let read: Vec<ByteString> = each
+        let latest = all.iter().rev().take(MOST_REJECTED);
+        let read: Vec<ByteString> = latest
             .filter_map(|(_, path)| {
                 let certificate = CertificateStore::read_cert(path).ok()?;
                 certificate.to_der().ok().map(ByteString::from)
