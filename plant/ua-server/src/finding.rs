@@ -12,7 +12,7 @@ use discovery::{Found, client};
 use mappings::{Access, Endpoint, FindSkills, Mapping};
 use tokio::task::JoinSet;
 use tokio::time::{Interval, MissedTickBehavior, interval};
-use tracing::{debug, info, warn};
+use tracing::{info, warn};
 
 use self::places::{Places, Room};
 use crate::endpoint::PRODUCT_URI;
@@ -46,6 +46,8 @@ pub(crate) struct Finding {
     placed: Vec<Placed>,
     /// Those that there was no room for, which is told once.
     crowded: BTreeSet<String>,
+    /// Whether it was told that more are heard of than are looked at.
+    is_full: bool,
 }
 
 /// A server that is heard of, by its URL.
@@ -113,6 +115,7 @@ impl Finding {
             places: Places::default(),
             placed: Vec::new(),
             crowded: BTreeSet::new(),
+            is_full: false,
         };
         finding.reload(mapping);
         finding
@@ -142,6 +145,7 @@ impl Finding {
             namespaces,
         };
         self.crowded.clear();
+        self.is_full = false;
     }
 
     /// Something has happened to a server on the network.
@@ -178,7 +182,13 @@ impl Finding {
     fn tell(&mut self, url: String, by: Source, hint: Option<&str>, is_new: bool) {
         let is_known = self.heard.contains_key(&url);
         if !is_known && self.heard.len() >= MOST_HEARD {
-            debug!(url, "more servers are heard of than are looked at");
+            if !std::mem::replace(&mut self.is_full, true) {
+                warn!(
+                    url,
+                    most = MOST_HEARD,
+                    "more servers are heard of than are looked at for skills: this one and others are left out, which is told once"
+                );
+            }
             return;
         }
         let heard = self.heard.entry(url).or_default();
