@@ -360,14 +360,11 @@ impl Telling {
                 });
             }
             Err(error) => {
-                // Of many who come at once not all are answered: they do not come at once again.
-                let wait = self
-                    .wait
-                    .mul_f64(registry::spread(&self.server.borrow().url));
-                self.register_at = Instant::now() + wait;
+                self.register_at = Instant::now() + spread(self.wait, &self.server.borrow().url);
+                // With its share it is no longer than what may be waited at most.
                 self.wait = (self.wait * 2)
-                    .min(MOST_WAIT)
-                    .min(self.settings.register_every);
+                    .min(MOST_WAIT / 2)
+                    .min(self.settings.register_every / 2);
                 let fault = error.to_string();
                 self.state.send_modify(|state| {
                     state.registered = None;
@@ -386,6 +383,12 @@ impl Telling {
     }
 }
 
+/// That wait, and a share of it that is another for each URL: of many who come at once not all are answered, and they do not
+/// come at once again.
+fn spread(wait: Duration, url: &str) -> Duration {
+    wait + wait.mul_f64(registry::spread(url))
+}
+
 /// Its name on the network.
 fn name(server: &Server) -> String {
     let place = Url::parse(&server.url);
@@ -400,3 +403,25 @@ const FIRST_WAIT: Duration = Duration::from_secs(1);
 const MOST_UNHEARD: Duration = Duration::from_secs(10);
 const MOST_WAIT: Duration = Duration::from_secs(60);
 const LEAVE_LIMIT: Duration = Duration::from_secs(1);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn five_hundred_servers_that_failed_at_once_come_again_one_after_the_other_and_nobody_too_soon()
+    {
+        let urls = (0..500).map(|number| format!("opc.tcp://127.0.0.1:{}/", 40_000 + number));
+        let waits: Vec<Duration> = urls.map(|url| spread(FIRST_WAIT, &url)).collect();
+        let too_soon = waits.iter().filter(|wait| **wait < FIRST_WAIT);
+        assert_eq!(too_soon.count(), 0, "{waits:?}");
+        let too_late = waits.iter().filter(|wait| **wait > FIRST_WAIT * 2);
+        assert_eq!(too_late.count(), 0, "{waits:?}");
+        for tenth in 1..10 {
+            let from = FIRST_WAIT + FIRST_WAIT / 10 * tenth;
+            let within = from..from + FIRST_WAIT / 10;
+            let at_once = waits.iter().filter(|wait| within.contains(wait)).count();
+            assert!(at_once < 150, "{at_once} in {within:?}");
+        }
+    }
+}
