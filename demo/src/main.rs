@@ -1,5 +1,5 @@
-//! Stories with simulated robots and the programs people run: the fault-tolerant product assembly line, the same line by skills,
-//! plug and produce, and the change of tools.
+//! Stories with simulated robots and the programs people run: the fault-tolerant product assembly line by skills, the same line by
+//! topics, plug and produce, and the change of tools.
 //!
 //! One binary is all the demo's own processes: started plainly it starts the others, which are hidden subcommands of
 //! it, and the programs that stand beside it. The robots know one another, and components, through the topics of the space
@@ -49,10 +49,10 @@ struct PlanArguments {
     /// Divides all times of the robots' and components' work
     #[arg(long, value_name = "FACTOR", default_value = "1")]
     speed: Speed,
-    /// Of the assembly line, by skills or not: how many covers lie in the storage
+    /// Of both lines: how many covers lie in the storage
     #[arg(long, value_name = "N", default_value_t = 4, value_parser = clap::value_parser!(u32).range(1..=1000))]
     covers: u32,
-    /// Of the assembly line: the second of the story at which the supervisor switches the conveyor off
+    /// Of the line by topics: the second of the story at which the supervisor switches the conveyor off
     #[arg(long, value_name = "SECONDS", default_value = "25", value_parser = seconds)]
     conveyor_off_at: f64,
     /// Of plug and produce: the manifest (MTP) of the module that is imported, in place of that of the example plant
@@ -69,14 +69,14 @@ struct PlanArguments {
 /// A story.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 enum Scenario {
-    /// A ROS 1 arm and a ROS 2 robot that know one another through the space alone
+    /// A composite of skills that are done by robots of both ROS; its conveyor dies
     AssemblyLine,
+    /// The line without skills: a ROS 1 arm and a ROS 2 robot that know one another through topics of the space alone
+    LineByTopics,
     /// Components that are plugged in, found, started from ROS, run by the MES, lost and replaced
     PlugAndProduce,
     /// A robot that changes its tools, with devices behind their protocols; one is lost and plugged in again
     ToolChange,
-    /// The assembly line as a composite of skills that are done by robots of both ROS; its conveyor dies
-    LineBySkills,
 }
 
 /// The demo's own processes.
@@ -161,7 +161,7 @@ fn main() -> ExitCode {
                 json,
             } = arguments.plan;
             let code = match scenario {
-                Scenario::AssemblyLine => {
+                Scenario::LineByTopics => {
                     let plan = Plan {
                         covers,
                         speed,
@@ -178,7 +178,7 @@ fn main() -> ExitCode {
                     };
                     runtime.block_on(Box::pin(plug::play(plan)))
                 }
-                Scenario::LineBySkills => {
+                Scenario::AssemblyLine => {
                     let plan = skilled::Plan {
                         covers,
                         speed,

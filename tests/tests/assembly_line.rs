@@ -1,5 +1,5 @@
-//! The demo of the assembly line, with the programs that people run: its conveyor is switched by a call, and with
-//! mappings/line-by-skills.yaml all of it is done by skills.
+//! The demo of the assembly line, with the programs that people run: all of it is done by skills (mappings/line-by-skills.yaml), or
+//! by topics, with a conveyor that is switched by a call.
 
 use std::time::Duration;
 
@@ -9,7 +9,7 @@ use system_tests::{Cell, Started, program};
 fn the_conveyor_is_switched_by_a_call_and_the_line_goes_on_without_it() {
     let Some(_cell) = Cell::with(&[]) else { return };
     let mut demo = Started::new("demo", &program("demo"))
-        .args(["--speed", "10", "--json"])
+        .args(["--scenario", "line-by-topics", "--speed", "10", "--json"])
         .start();
     let ended = demo.wait_for_end(Duration::from_secs(180));
     let report = demo.json_lines().pop().unwrap_or_default();
@@ -29,7 +29,7 @@ fn the_conveyor_is_switched_by_a_call_and_the_line_goes_on_without_it() {
 fn a_line_of_skills_takes_back_what_a_dead_conveyor_was_to_carry_and_goes_on_without_it() {
     let Some(_cell) = Cell::with(&[]) else { return };
     let mut demo = Started::new("demo", &program("demo"))
-        .args(["--scenario", "line-by-skills", "--speed", "10", "--json"])
+        .args(["--speed", "10", "--json"])
         .start();
     let ended = demo.wait_for_end(Duration::from_secs(180));
     let report = demo.json_lines().pop().unwrap_or_default();

@@ -11,17 +11,11 @@ use crate::{
 pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
     step("building the programs (some minutes the first time)");
     let mut build = vec!["build", "--locked"];
-    let has_components = arguments.iter().any(|argument| {
-        ["plug-and-produce", "tool-change", "line-by-skills"]
-            .iter()
-            .any(|story| argument.ends_with(story))
-    });
-    let others: &[&str] = if has_components {
-        &PLUG_AND_PRODUCE
-    } else {
-        &[]
-    };
-    for package in LINE.iter().chain(others) {
+    let by_topics = arguments
+        .iter()
+        .any(|argument| argument.ends_with("line-by-topics"));
+    let others: &[&str] = if by_topics { &[] } else { &COMPONENTS };
+    for package in BRIDGES.iter().chain(others) {
         build.extend(["-p", package]);
     }
     let rustdds = Rustdds::prepare(workspace)?;
@@ -31,7 +25,7 @@ pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<E
     Ok(status(demo.current_dir(&workspace.root).args(arguments))?.into())
 }
 
-/// The packages of the assembly line, which every story needs.
-const LINE: [&str; 4] = ["bridge-ros1", "bridge-ros2", "ua-server", "demo"];
+/// The packages that every story needs.
+const BRIDGES: [&str; 4] = ["bridge-ros1", "bridge-ros2", "ua-server", "demo"];
 /// Those of the stories with components beside them.
-const PLUG_AND_PRODUCE: [&str; 4] = ["discovery", "ua-component", "ua-mes", "ua-space"];
+const COMPONENTS: [&str; 4] = ["discovery", "ua-component", "ua-mes", "ua-space"];

@@ -1,7 +1,7 @@
 //! The demo itself: starts the programs of the cell, watches the story they make together, and ends them.
 
 mod describe;
-pub(crate) mod report;
+mod report;
 mod story;
 
 use std::fs;
@@ -9,17 +9,16 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use tokio::sync::mpsc;
-use tokio::time::{Instant, interval, sleep_until, timeout_at};
+use tokio::time::{Instant, interval, sleep_until};
 
 use self::describe::describe;
-use self::report::{Hops, Status};
 use self::story::Story;
 use crate::clock::wall_nanos;
 use crate::event::{Event, MasterEvent};
 use crate::line::{DOMAIN, ENDPOINT};
 use crate::pace::{Speed, overdue_after};
 use crate::stage::{
-    Failure, Interrupt, LOOPBACK, Program, Programs, Report, Stage, Timeline, Who, fetch, find,
+    Failure, Hops, Interrupt, LOOPBACK, Program, Programs, Report, Stage, Timeline, Who, find,
     free_port, must_be_free,
 };
 
@@ -148,7 +147,9 @@ impl Director<'_> {
             Ok(()) | Err(Failure::Stuck { .. }) => {}
             Err(failure) => return Err(failure),
         }
-        *hops = self.ask_bridges(ros1_port, ros2_port).await;
+        let (measured, missing) = Hops::ask([ros1_port, ros2_port]).await;
+        *hops = measured;
+        missing.into_iter().for_each(|why| self.note(why));
         Ok(())
     }
 
@@ -316,28 +317,6 @@ impl Director<'_> {
                 }
             }
         }
-    }
-
-    /// The hops, of which each bridge has measured its own.
-    async fn ask_bridges(&mut self, ros1_port: u16, ros2_port: u16) -> Hops {
-        let by = Instant::now() + SPARE;
-        let both = async { tokio::join!(fetch::<Status>(ros1_port), fetch::<Status>(ros2_port)) };
-        let Ok((ros1, ros2)) = timeout_at(by, both).await else {
-            return Hops::default();
-        };
-        let mut hops = Hops::default();
-        match ros1 {
-            Ok(status) => hops.pb1 = status.hops.get("out").copied(),
-            Err(error) => self.note(format!("bridge-ros1 gives no figures: {error}")),
-        }
-        match ros2 {
-            Ok(status) => {
-                hops.tr0 = status.hops.get("network").copied();
-                hops.pb2 = status.hops.get("in").copied();
-            }
-            Err(error) => self.note(format!("bridge-ros2 gives no figures: {error}")),
-        }
-        hops
     }
 
     fn note(&mut self, what: String) {

@@ -13,7 +13,7 @@ mod line;
 mod report;
 mod world;
 
-use std::cell::RefCell;
+use std::cell::{Cell, RefCell};
 use std::path::PathBuf;
 use std::process::ExitStatus;
 use std::sync::Arc;
@@ -34,8 +34,8 @@ use crate::event::{Event, MasterEvent};
 use crate::line::DOMAIN;
 use crate::pace::Speed;
 use crate::stage::{
-    Failure, Interrupt, LOOPBACK, Program, Programs, Report as Told, Stage, Timeline, Who, fetch,
-    find, free_port, must_be_free,
+    Failure, Hops, Interrupt, LOOPBACK, Program, Programs, Report as Told, Stage, Timeline, Who,
+    fetch, find, free_port, must_be_free,
 };
 
 /// What the story is to be.
@@ -56,7 +56,7 @@ pub(crate) async fn play(plan: Plan) -> u8 {
             ..Report::default()
         }),
         began_at: wall_nanos(),
-        begun: RefCell::new(Instant::now()),
+        under_way: Cell::new(UnderWay::now()),
     };
     let outcome = perform(plan, &show).await;
     {
@@ -77,8 +77,29 @@ struct Show {
     timeline: RefCell<Timeline>,
     report: RefCell<Report>,
     began_at: i64,
-    /// When the run began that is under way.
-    begun: RefCell<Instant>,
+    /// The run that is under way, or was the last.
+    under_way: Cell<UnderWay>,
+}
+
+/// A run of a skill, as those see it who asked for it and who look at the machines.
+#[derive(Clone, Copy)]
+struct UnderWay {
+    /// When it was asked for.
+    since: Instant,
+    /// In nanoseconds since 1970.
+    since_ns: i64,
+    /// From there until a machine first did something, in milliseconds.
+    acted_ms: Option<f64>,
+}
+
+impl UnderWay {
+    fn now() -> Self {
+        Self {
+            since: Instant::now(),
+            since_ns: wall_nanos(),
+            acted_ms: None,
+        }
+    }
 }
 
 impl Show {
@@ -116,16 +137,20 @@ impl Show {
 
 impl Teller for Show {
     fn begins(&self, skill: &str, what: &str) {
-        *self.begun.borrow_mut() = Instant::now();
+        self.under_way.set(UnderWay::now());
         self.note(LINE, format!("{skill} begins: {what}"));
     }
 
     fn ended(&self, skill: &str, what: &str, message: &str) {
+        let UnderWay {
+            since, acted_ms, ..
+        } = self.under_way.get();
         let run = Run {
             skill: skill.to_owned(),
             what: what.to_owned(),
             message: message.to_owned(),
-            lasted_ms: elapsed(*self.begun.borrow()),
+            acted_ms,
+            lasted_ms: elapsed(since),
         };
         self.report.borrow_mut().runs.push(run);
         if !message.is_empty() {
@@ -158,6 +183,7 @@ async fn perform(plan: Plan, show: &Show) -> Result<(), Failure> {
         },
         programs,
         page: free_port()?,
+        bridges: [free_port()?, free_port()?],
         transport,
         world,
         show,
@@ -177,6 +203,13 @@ async fn perform(plan: Plan, show: &Show) -> Result<(), Failure> {
     };
     watcher.reports.close();
     let outcome = played.map_err(|stop| story.failure(stop));
+    if outcome.is_ok() {
+        let (hops, missing) = Hops::ask(story.bridges).await;
+        show.report.borrow_mut().hops = hops;
+        for why in missing {
+            show.note(Who::DEMO, why);
+        }
+    }
     {
         let world = story.world.borrow();
         let mut report = show.report.borrow_mut();
@@ -241,6 +274,12 @@ impl Watcher<'_> {
     }
 
     fn see(&self, event: MachineEvent, at_ns: i64) {
+        let mut run = self.show.under_way.get();
+        if at_ns >= run.since_ns {
+            run.acted_ms
+                .get_or_insert_with(|| millis(at_ns - run.since_ns));
+            self.show.under_way.set(run);
+        }
         self.seen.send_modify(|world| world.see(event, at_ns));
         let (who, what) = describe(event);
         self.show.note_at(at_ns, who, what);
@@ -287,6 +326,8 @@ struct Story<'a> {
     programs: Programs,
     /// Where the discovery server shows its page.
     page: u16,
+    /// Where the bridges of ROS 1 and of ROS 2 show theirs.
+    bridges: [u16; 2],
     transport: Duration,
     world: watch::Receiver<World>,
     show: &'a Show,
@@ -357,7 +398,7 @@ impl Story<'_> {
 
     fn introduce(&self) -> Result<(), Failure> {
         let text = format!(
-            "The assembly line by skills: {} covers, a conveyor that dies, speed {}.\nTimes are seconds since the beginning; the \
+            "The fault-tolerant product assembly line: {} covers, a conveyor that dies, speed {}.\nTimes are seconds since the beginning; the \
              logs are in {}.\n\n",
             self.plan.covers,
             self.plan.speed.factor(),
@@ -382,11 +423,23 @@ impl Story<'_> {
         let ros1 = [("ROS_MASTER_URI", &*master), ("ROS_HOSTNAME", LOOPBACK)];
         let ros2 = [("ROS_LOCALHOST_ONLY", "1"), ("ROS_DOMAIN_ID", &*domain)];
         let mapping = directory.join(MAPPING).display().to_string();
-        let arguments = [&mapping, "--interface", LOOPBACK];
-        for (name, path, environment) in [
-            ("bridge-ros1", self.binaries.bridge_ros1.clone(), &ros1),
-            ("bridge-ros2", self.binaries.bridge_ros2.clone(), &ros2),
+        let [of_ros1, of_ros2] = self.bridges;
+        for (name, path, environment, page) in [
+            (
+                "bridge-ros1",
+                self.binaries.bridge_ros1.clone(),
+                &ros1,
+                of_ros1,
+            ),
+            (
+                "bridge-ros2",
+                self.binaries.bridge_ros2.clone(),
+                &ros2,
+                of_ros2,
+            ),
         ] {
+            let metrics = format!("{LOOPBACK}:{page}");
+            let arguments = [&mapping, "--interface", LOOPBACK, "--metrics", &metrics];
             self.start((name, path), &arguments, environment, Stage::Bridges)?;
         }
         let endpoint = format!("opc.tcp://{LOOPBACK}:{LDS_PORT}");

@@ -4,6 +4,8 @@ use std::fmt::Write as _;
 
 use serde::Serialize;
 
+use crate::stage::{Hops, delays};
+
 /// All of it.
 #[derive(Clone, Debug, Default, Serialize)]
 pub(super) struct Report {
@@ -21,6 +23,8 @@ pub(super) struct Report {
     /// From the signal that killed the conveyor until the line knew of it.
     pub(super) told_lost_ms: Option<f64>,
     pub(super) runs: Vec<Run>,
+    /// Of the values beside the skills, such as what an action feeds back.
+    pub(super) hops: Hops,
 }
 
 /// One run of a skill.
@@ -32,6 +36,9 @@ pub(super) struct Run {
     pub(super) what: String,
     /// Empty where all went well.
     pub(super) message: String,
+    /// From the line's asking until a machine first did something for it: the arm grasps, the conveyor is switched, the robot sets out.
+    pub(super) acted_ms: Option<f64>,
+    /// From the line's asking until it knew the outcome.
     pub(super) lasted_ms: f64,
 }
 
@@ -43,8 +50,8 @@ impl Report {
         // A write to a String cannot fail.
         _ = writeln!(
             out,
-            "{:<28} {:<34} {:>9}  outcome",
-            "skill", "what for", "lasted"
+            "{:<28} {:<34} {:>12} {:>10}  outcome",
+            "skill", "what for", "machine acts", "lasted"
         );
         for run in &self.runs {
             let outcome = match run.message.is_empty() {
@@ -53,8 +60,12 @@ impl Report {
             };
             _ = writeln!(
                 out,
-                "{:<28} {:<34} {:>6.0} ms  {outcome}",
-                run.skill, run.what, run.lasted_ms
+                "{:<28} {:<34} {:>12} {:>7.1} ms  {outcome}",
+                run.skill,
+                run.what,
+                run.acted_ms
+                    .map_or_else(|| "-".to_owned(), |ms| format!("{ms:.1} ms")),
+                run.lasted_ms
             );
         }
         _ = writeln!(
@@ -72,6 +83,13 @@ impl Report {
             ms(self.found_ms),
             ms(self.told_lost_ms)
         );
+        let Hops { pb1, tr0, pb2 } = self.hops;
+        out.push('\n');
+        out.push_str(&delays(&[
+            ("tPB1, in the ROS 1 bridge", pb1, "2 s"),
+            ("tTR0, PubSub network", tr0, "-"),
+            ("tPB2, in the ROS 2 bridge", pb2, "-"),
+        ]));
         out
     }
 }

@@ -2,6 +2,7 @@
 
 mod beside;
 mod failure;
+mod hops;
 mod interrupt;
 mod pages;
 mod programs;
@@ -9,6 +10,7 @@ mod timeline;
 
 pub(crate) use beside::{find, free_port, must_be_free};
 pub(crate) use failure::Failure;
+pub(crate) use hops::{Hop, Hops, delays, micros};
 pub(crate) use interrupt::Interrupt;
 pub(crate) use pages::fetch;
 pub(crate) use programs::{Program, Programs, Report, Stage, command};

@@ -73,7 +73,7 @@ mod tests {
     use tokio::net::TcpListener;
 
     use super::*;
-    use crate::orchestra::report::{Hop, Status};
+    use crate::stage::hops::{Hop, Status};
 
     async fn answered(answer: &'static str) -> Result<Status, PageError> {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
