@@ -386,11 +386,43 @@ async fn endpoint(
     // A password is nothing for everybody to hear.
     let may_be_plain = is_none || is_best && config.user.is_none();
     let chosen = secured.or_else(|| may_be_plain.then(|| has(&is_plain)).flatten());
-    let mut chosen =
-        chosen.ok_or_else(|| format!("{} offers no security we can have", shared.url))?;
+    let mut chosen = chosen.ok_or_else(|| no_security(shared, &offered))?;
     // The name a server gives itself may not be known here.
     chosen.endpoint_url = shared.url.as_str().into();
     Ok(chosen)
+}
+
+/// That none of the endpoints will do, with what they are and what was wanted.
+fn no_security(shared: &Shared, offered: &[EndpointDescription]) -> String {
+    let each = offered.iter().map(|one| {
+        let policy = one.security_policy_uri.as_ref().rsplit('#').next();
+        match one.security_mode {
+            MessageSecurityMode::None => "None".to_owned(),
+            mode => format!("{}/{mode:?}", policy.unwrap_or_default()),
+        }
+    });
+    let mut each: Vec<String> = each.take(MOST_TOLD).collect();
+    each.sort();
+    each.dedup();
+    let offers = match each.is_empty() {
+        true => "nothing".to_owned(),
+        false => each.join(", "),
+    };
+    let config = &shared.config;
+    let mut wants = match config.security {
+        SecurityChoice::Best => "the best that is secured".to_owned(),
+        SecurityChoice::None => "None".to_owned(),
+        SecurityChoice::Basic256Sha256 => "Basic256Sha256/SignAndEncrypt".to_owned(),
+        SecurityChoice::Aes128Sha256RsaOaep => "Aes128_Sha256_RsaOaep/SignAndEncrypt".to_owned(),
+        SecurityChoice::Aes256Sha256RsaPss => "Aes256_Sha256_RsaPss/SignAndEncrypt".to_owned(),
+    };
+    if config.user.is_some() && config.security == SecurityChoice::Best {
+        wants.push_str(", as a password is not sent without");
+    }
+    format!(
+        "{} offers no security we can have: it offers {offers}, wanted is {wants} (`security`)",
+        shared.url
+    )
 }
 
 async fn what_it_is(session: &Session) -> Result<(Vec<String>, DateTime), String> {
@@ -491,6 +523,8 @@ const POLICIES: [&str; 3] = [
     "Aes256_Sha256_RsaPss",
     "Aes128_Sha256_RsaOaep",
 ];
+/// How many endpoints of a server are told of.
+const MOST_TOLD: usize = 12;
 /// How many keep-alives in a row may be missed.
 const MOST_MISSED: u32 = 2;
 /// How often it is looked whether subscriptions live.
