@@ -61,6 +61,27 @@ pub(crate) struct Actor {
     work: Option<Running>,
     /// What was said of the run that goes on.
     trace: Vec<String>,
+    refusals: Refusals,
+}
+
+/// Of calls that were refused, how they were told: a client that asks again and again must not fill the log.
+#[derive(Debug, Default)]
+struct Refusals {
+    told: Option<Instant>,
+    untold: u64,
+}
+
+impl Refusals {
+    /// How many were left untold before this one, where it is to be told now.
+    fn another(&mut self, now: Instant) -> Option<u64> {
+        let is_soon = |told: Instant| now.saturating_duration_since(told) < TOLD_EVERY;
+        if self.told.is_some_and(is_soon) {
+            self.untold += 1;
+            return None;
+        }
+        self.told = Some(now);
+        Some(std::mem::take(&mut self.untold))
+    }
 }
 
 /// The work of a run, until it has really ended.
@@ -122,6 +143,7 @@ impl Actor {
             now,
             work: None,
             trace: Vec::new(),
+            refusals: Refusals::default(),
         };
         (actor, watched)
     }
@@ -177,10 +199,12 @@ impl Actor {
             refused: answer.as_ref().err().cloned(),
         });
         self.tell(Told::Called);
-        if let Err(refusal) = &answer {
+        if let Err(refusal) = &answer
+            && let Some(untold) = self.refusals.another(Instant::now())
+        {
             info!(
                 skill = self.facts.name,
-                "{method} by {by} is refused: {refusal}"
+                untold, "{method} by {by} is refused: {refusal}"
             );
         }
         // Whoever called may be gone; what was done is done.
@@ -637,5 +661,23 @@ const TIME_TO_BREAK_OFF: Duration = Duration::from_millis(100);
 /// So many lines of a run are traced, of so many characters at most.
 const MOST_TRACED: usize = 256;
 const LONGEST_TRACED: usize = 240;
+/// Of refused calls of a skill one is told in this time, with the number of those before it that were not.
+const TOLD_EVERY: Duration = Duration::from_secs(1);
 /// The outcomes of so many runs can be asked for.
 const MOST_OUTCOMES: usize = 64;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn of_refusals_in_a_row_one_a_second_is_told_with_the_number_of_the_others() {
+        let (mut refusals, first) = (Refusals::default(), Instant::now());
+        let after = |ms| first + Duration::from_millis(ms);
+        assert_eq!(refusals.another(first), Some(0));
+        assert_eq!(refusals.another(after(1)), None);
+        assert_eq!(refusals.another(after(999)), None);
+        assert_eq!(refusals.another(after(1000)), Some(2));
+        assert_eq!(refusals.another(after(3000)), Some(0));
+    }
+}
