@@ -603,7 +603,7 @@ pub const fn can_announce_type_hashes() -> bool {
 }
 
 // When this does not compile: the feature `patched-dds` is on, but RustDDS is as published. `cargo xtask` builds with
-// both, and `cargo xtask dds` prints the flags to do so by hand.
+// both, and `cargo xtask patches` prints the flags to do so by hand.
 #[cfg(feature = "patched-dds")]
 fn with_peers(
     builder: DomainParticipantBuilder,

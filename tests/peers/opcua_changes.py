@@ -23,8 +23,7 @@ async def main():
     async with await opcua_session.client_of(args) as client:
         subscription = await client.create_subscription(50, Watch())
         kind = ua.ObjectIds.GeneralModelChangeEventType
-        # The server compares no event types of a list.
-        await subscription.subscribe_events(client.nodes.server, kind, where_clause_generation=False)
+        await subscription.subscribe_events(client.nodes.server, kind)
         lifetime.say(ready=True)
         await asyncio.Event().wait()
 

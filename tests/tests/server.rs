@@ -8,6 +8,8 @@ mod authorities;
 mod configuration;
 #[path = "server/confirm.rs"]
 mod confirm;
+#[path = "server/events.rs"]
+mod events;
 #[path = "server/folders.rs"]
 mod folders;
 #[path = "server/history.rs"]

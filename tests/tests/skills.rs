@@ -113,6 +113,40 @@ fn clients_walk_all_states_and_methods_and_see_nine_kinds_of_transition() {
     assert_is_whole(&cell.node_opcua_once("walk.js", &[ENDPOINT, uri]));
 }
 
+#[test]
+fn a_client_that_names_types_of_events_is_told_of_transitions_or_of_none() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let _component = component(&cell.file("component.yaml", COMPONENT));
+    let listening = |kind: &str| {
+        let mut client = cell.asyncua("opcua_events.py", &[ENDPOINT, kind]);
+        client.wait_for_json("the client listens", SOON, |line| {
+            line.get("ready").map(|_| ())
+        });
+        client
+    };
+    let base_model_change = listening("i=2132");
+    // Those of skills are a subtype of ProgramTransitionEventType.
+    let transitions = listening("i=2378");
+    let told = |client: &Child| -> Vec<Value> {
+        let lines = client.json_lines().into_iter();
+        lines.filter(|line| line.get("ready").is_none()).collect()
+    };
+    cell.asyncua_once("opcua_skill.py", &[ENDPOINT, "quick"]);
+    let seen = eventually("all transitions are told", SOON, || {
+        let seen = told(&transitions);
+        (seen.len() > 20).then_some(seen)
+    });
+    let kind = &seen[0]["type"];
+    assert!(
+        kind.as_str().is_some_and(|kind| kind.starts_with("ns=")),
+        "{kind}"
+    );
+    assert!(seen.iter().all(|event| event["type"] == *kind), "{seen:?}");
+    assert_eq!(told(&base_model_change), Vec::<Value>::new());
+}
+
 /// Each state with each method, each transition with its numbers, and a run to its end, as a client saw them.
 #[expect(clippy::too_many_lines, reason = "one walk through all states")]
 fn assert_is_whole(lines: &[Value]) {

@@ -9,9 +9,9 @@ use std::{
 use anyhow::{Context as _, ensure};
 
 use crate::{
-    dds::Rustdds,
     instructions,
     namespace::{Namespaces, REFUSED},
+    patches::Patched,
     peers,
     shell::{Ended, run as must, status, step},
     workspace::{SHIPPED, Workspace},
@@ -96,8 +96,8 @@ fn measured(
         "the measurement needs all peers"
     );
     step("building the programs with optimisation (some minutes the first time)");
-    let rustdds = Rustdds::prepare(workspace)?;
-    let mut build = rustdds.cargo(
+    let patched = Patched::prepare(workspace)?;
+    let mut build = patched.cargo(
         workspace,
         &[
             "build",

@@ -3,7 +3,7 @@
 use std::process::Command;
 
 use crate::{
-    dds::Rustdds,
+    patches::Patched,
     shell::{Ended, run as must, status, step},
     workspace::Workspace,
 };
@@ -18,8 +18,8 @@ pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<E
     for package in BRIDGES.iter().chain(others) {
         build.extend(["-p", package]);
     }
-    let rustdds = Rustdds::prepare(workspace)?;
-    must(&mut rustdds.cargo(workspace, &build))?;
+    let patched = Patched::prepare(workspace)?;
+    must(&mut patched.cargo(workspace, &build))?;
     step("running the demo");
     let mut demo = Command::new(workspace.target.join("debug/demo"));
     Ok(status(demo.current_dir(&workspace.root).args(arguments))?.into())

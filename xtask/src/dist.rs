@@ -5,7 +5,7 @@ use std::fs;
 use anyhow::Context as _;
 
 use crate::{
-    dds::Rustdds,
+    patches::Patched,
     shell::{Ended, run as must, step},
     workspace::{SHIPPED, Workspace},
 };
@@ -25,9 +25,9 @@ const PROGRAMS: [(&str, &str); 9] = [
 
 /// Builds the programs with optimisation and puts them into `target/dist`.
 pub(crate) fn run(workspace: &Workspace) -> anyhow::Result<Ended> {
-    let rustdds = Rustdds::prepare(workspace)?;
+    let patched = Patched::prepare(workspace)?;
     step("building the programs with optimisation (some minutes the first time)");
-    let mut build = rustdds.cargo(
+    let mut build = patched.cargo(
         workspace,
         &["build", "--profile", SHIPPED, "--locked", "--bins"],
     );

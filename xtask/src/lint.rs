@@ -9,7 +9,7 @@ use std::{
 use anyhow::Context as _;
 
 use crate::{
-    dds::Rustdds,
+    patches::Patched,
     shell::{Ended, line, run as must, status, step, succeeds},
     workspace::Workspace,
 };
@@ -20,7 +20,7 @@ const FETCH: Duration = Duration::from_secs(120);
 
 /// Runs all checks, so that one run shows everything there is to mend.
 pub(crate) fn run(workspace: &Workspace) -> anyhow::Result<Ended> {
-    let rustdds = Rustdds::prepare(workspace)?;
+    let patched = Patched::prepare(workspace)?;
     let mut failed = Vec::new();
     let mut check = |what: &str, command: &mut Command| -> anyhow::Result<()> {
         step(what);
@@ -35,7 +35,7 @@ pub(crate) fn run(workspace: &Workspace) -> anyhow::Result<Ended> {
     )?;
     check(
         "clippy",
-        &mut rustdds.cargo(
+        &mut patched.cargo(
             workspace,
             &[
                 "clippy",
@@ -49,12 +49,12 @@ pub(crate) fn run(workspace: &Workspace) -> anyhow::Result<Ended> {
         ),
     )?;
     check(
-        "the workspace with RustDDS as published",
+        "the workspace with all crates as published",
         &mut workspace.cargo(&["check", "--workspace", "--locked"]),
     )?;
     check(
         "documentation",
-        rustdds
+        patched
             .cargo(workspace, &["doc", "--workspace", "--no-deps", "--locked"])
             .env("RUSTDOCFLAGS", "-D warnings"),
     )?;

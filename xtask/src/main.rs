@@ -6,12 +6,12 @@
 )]
 
 mod bench;
-mod dds;
 mod demo;
 mod dist;
 mod instructions;
 mod lint;
 mod namespace;
+mod patches;
 mod peers;
 mod shell;
 mod test;
@@ -29,7 +29,7 @@ cargo xtask <verb>
   peers [--build]                only install the peers; of those only what the programs are built with
   lint                           formatting, clippy, licences and sources of dependencies, documentation
   dist                           build the programs that are handed out, with optimisation, into target/dist
-  dds                            only patch RustDDS, which all verbs build with, and print the flags to do so by hand
+  patches                        only patch the crates of patches/, which all verbs build with, and print the flags to do so by hand
   bench hop [ARGS]               measure one hop beside the floor and roscpp's relay
   bench ros1 [ARGS]              measure relays of ROS 1 messages beside a raw echo; bridge-ros1 with 50 topics (--help)
   bench ros2 [ARGS]              measure relays of DDS samples beside a UDP echo; both bridges from ROS 1 to ROS 2 and back
@@ -62,7 +62,7 @@ fn run(arguments: &[&str]) -> anyhow::Result<Ended> {
         ["peers"] => Ok(peers::run(&Workspace::find()?)),
         ["peers", "--build"] => peers::for_building(),
         ["dist"] => dist::run(&Workspace::find()?),
-        ["dds"] => dds::run(&Workspace::find()?),
+        ["patches"] => patches::run(&Workspace::find()?),
         ["lint"] => lint::run(&Workspace::find()?),
         ["bench", "uadp", rest @ ..] => {
             instructions::run(&Workspace::find()?, "uadp", rest, |_| Ok(()))

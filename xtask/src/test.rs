@@ -18,8 +18,8 @@ use std::{
 use anyhow::Context as _;
 
 use crate::{
-    dds::Rustdds,
     namespace::{Namespaces, REFUSED},
+    patches::{Patched, Source},
     peers,
     shell::{Ended, is_ci, step},
     workspace::Workspace,
@@ -52,12 +52,12 @@ pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<E
         peers::install(workspace);
     }
     step("building the programs and the tests (some minutes the first time)");
-    let rustdds = Rustdds::prepare(workspace)?;
+    let patched = Patched::prepare(workspace)?;
     let built = ["--bins", "--tests", "--examples"];
-    let build = rustdds.cargo(workspace, &[&["build"][..], TARGETS, &built].concat());
+    let build = patched.cargo(workspace, &[&["build"][..], TARGETS, &built].concat());
     let programs = programs::build(build)?;
     let of_patches = match filters.is_empty() {
-        true => programs::build(rustdds.build_of_own_tests(workspace))?,
+        true => of_patches(workspace, &patched)?,
         false => Vec::new(),
     };
 
@@ -67,8 +67,8 @@ pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<E
     let start = Instant::now();
     let report = Plan::of(
         workspace,
-        &rustdds,
-        (&programs, &of_patches),
+        &patched,
+        (&programs, of_patches),
         &filters,
         &skipped,
     )?
@@ -84,6 +84,22 @@ pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<E
     Ok(outcome.ended())
 }
 
+/// The test programs of the patched crates that have tests of ours.
+fn of_patches<'a>(
+    workspace: &Workspace,
+    patched: &'a Patched,
+) -> anyhow::Result<Vec<(&'a Source, Program)>> {
+    let mut all = Vec::new();
+    for source in patched.sources() {
+        // Without names of tests it would run all that the crate has.
+        if !source.tests().is_empty() {
+            let built = programs::build(source.build_of_own_tests(workspace))?;
+            all.extend(built.into_iter().map(|program| (source, program)));
+        }
+    }
+    Ok(all)
+}
+
 /// What runs, and what of it at the same time.
 struct Plan {
     /// One after the other: they take all cores themselves.
@@ -96,8 +112,8 @@ struct Plan {
 impl Plan {
     fn of(
         workspace: &Workspace,
-        rustdds: &Rustdds,
-        (programs, of_patches): (&[Program], &[Program]),
+        patched: &Patched,
+        (programs, of_patches): (&[Program], Vec<(&Source, Program)>),
         filters: &[&str],
         skipped: &Path,
     ) -> anyhow::Result<Self> {
@@ -142,13 +158,13 @@ impl Plan {
                 }
             }
         }
-        for program in of_patches {
+        for (source, program) in of_patches {
             let mut command = program.alone(namespaces);
-            command.args(rustdds.tests());
-            plan.programs
-                .push(Job::new("RustDDS, what patches/ adds".to_owned(), command));
+            command.args(source.tests());
+            let label = format!("{}, what patches/ adds", source.name());
+            plan.programs.push(Job::new(label, command));
         }
-        let mut documents = surround(rustdds.cargo(workspace, &[&["test"][..], TARGETS].concat()));
+        let mut documents = surround(patched.cargo(workspace, &[&["test"][..], TARGETS].concat()));
         documents.args(["--doc", "--"]).args(filters);
         plan.programs.push(Job::new(
             "examples in the documentation".to_owned(),

@@ -1,6 +1,7 @@
-//! RustDDS as this project changes it: the published source and the patches of `patches/`, put together under `target/`.
+//! Published crates as this project changes them: their sources and the patches of `patches/NAME-VERSION/`, put together
+//! under `target/`.
 //!
-//! Cargo then builds with that folder through its configuration key `paths`. A `[patch]` table, in the manifest or in the
+//! Cargo then builds with those folders through its configuration key `paths`. A `[patch]` table, in the manifest or in the
 //! configuration, would rewrite `Cargo.lock`, which `--locked` refuses; `paths` leaves it alone, since a path override
 //! may change the source of a package, not its dependencies.
 
@@ -21,20 +22,18 @@ use crate::{
     workspace::Workspace,
 };
 
-/// The patched source, ready to be built with.
-pub(crate) struct Rustdds {
-    folder: PathBuf,
+/// All patched sources, ready to be built with.
+pub(crate) struct Patched {
+    sources: Vec<Source>,
     features: [&'static str; 2],
-    /// Names of the tests that the patches add to those of RustDDS.
-    tests: Vec<String>,
 }
 
-impl Rustdds {
-    /// Brings the patched source up to date. It is written only when a patch or the version changed: cargo looks at the
+impl Patched {
+    /// Brings the patched sources up to date. One is written only when a patch or the version changed: cargo looks at the
     /// times of its files.
     ///
     /// # Errors
-    /// When the locked version has no patches, one of them does not apply, or a folder cannot be written.
+    /// When there are patches for what is not locked, one of them does not apply, or a folder cannot be written.
     pub(crate) fn prepare(workspace: &Workspace) -> anyhow::Result<Self> {
         let features = features();
         if !features.concat().contains("security") {
@@ -42,36 +41,96 @@ impl Rustdds {
                 "OpenSSL is not there (libssl-dev, pkg-config): bridge-ros2 is built without DDS Security",
             );
         }
-        let published = Published::find(workspace)?;
-        let patches = Patches::read(workspace, &published.version)?;
-        let name = format!("rustdds-{}", published.version);
+        let published = Published::all(workspace)?;
+        let sources = subfolders(&workspace.root.join("patches"))?
+            .iter()
+            .map(|folder| Source::prepare(workspace, folder, &published))
+            .collect::<anyhow::Result<_>>()?;
+        Ok(Self { sources, features })
+    }
+
+    pub(crate) fn sources(&self) -> &[Source] {
+        &self.sources
+    }
+
+    /// A command of cargo that compiles with the patched sources, in the root. The verb, such as `build`, comes first in
+    /// `arguments`, and `bridge-ros2` must be among the packages.
+    ///
+    /// Everything that is built or tested goes through here: with other flags cargo would build it all again.
+    pub(crate) fn cargo(&self, workspace: &Workspace, arguments: &[&str]) -> Command {
+        let mut command = workspace.cargo(&[]);
+        let (verb, rest) = arguments.split_at(1.min(arguments.len()));
+        // Behind the verb: cargo does not hand what is before it to an external verb such as clippy.
+        command
+            .args(verb)
+            .args(self.configuration())
+            .args(self.features)
+            .args(rest);
+        command
+    }
+
+    fn configuration(&self) -> [OsString; 2] {
+        let folders = self.sources.iter().map(|source| &source.folder);
+        let folders: Value = folders.map(|folder| folder.display().to_string()).collect();
+        // A JSON array of strings is a TOML array of strings.
+        ["--config".into(), format!("paths={folders}").into()]
+    }
+}
+
+/// One crate, patched.
+pub(crate) struct Source {
+    /// `NAME-VERSION`.
+    name: String,
+    folder: PathBuf,
+    /// Names of the tests that the patches add to its own.
+    tests: Vec<String>,
+}
+
+impl Source {
+    fn prepare(
+        workspace: &Workspace,
+        patches: &Path,
+        published: &[Published],
+    ) -> anyhow::Result<Self> {
+        let name = patches.file_name().unwrap_or_default().to_string_lossy();
+        let name = name.into_owned();
+        let published = published.iter().find(|published| published.name == name);
+        let published = published.with_context(|| {
+            format!(
+                "Cargo.lock does not have what {} is for. Bring the patches over to the version that it has, or take \
+                 that version: cargo update -p NAME --precise VERSION",
+                patches.display()
+            )
+        })?;
+        let patches = Patches::read(patches)?;
         let patched = workspace.target.join("patched");
-        let folder = patched.join(&name);
-        let stamp = patched.join(format!("{name}.made-of"));
+        let source = Self {
+            folder: patched.join(&name),
+            tests: patches.tests(),
+            name,
+        };
+        let stamp = patched.join(format!("{}.made-of", source.name));
         let made_of = patches.text(&published.folder);
-        let tests = patches.tests();
+        let folder = &source.folder;
         if folder.is_dir() && fs::read_to_string(&stamp).is_ok_and(|text| text == made_of) {
-            return Ok(Self {
-                folder,
-                features,
-                tests,
-            });
+            return Ok(source);
         }
         step(&format!(
-            "patching RustDDS {} into {}",
-            published.version,
+            "patching {} into {}",
+            source.name,
             folder.display()
         ));
         remove(&stamp)?;
-        remove(&folder)?;
-        copy(&published.folder, &folder)?;
-        patches.apply(&folder)?;
+        remove(folder)?;
+        copy(&published.folder, folder)?;
+        patches.apply(folder)?;
         fs::write(&stamp, made_of).with_context(|| stamp.display().to_string())?;
-        Ok(Self {
-            folder,
-            features,
-            tests,
-        })
+        Ok(source)
+    }
+
+    /// `NAME-VERSION`.
+    pub(crate) fn name(&self) -> &str {
+        &self.name
     }
 
     /// A command of cargo that builds the unit tests of the patched source by itself, outside of the workspace.
@@ -90,28 +149,6 @@ impl Rustdds {
     pub(crate) fn tests(&self) -> &[String] {
         &self.tests
     }
-
-    /// A command of cargo that compiles with the patched source, in the root. The verb, such as `build`, comes first in
-    /// `arguments`, and `bridge-ros2` must be among the packages.
-    ///
-    /// Everything that is built or tested goes through here: with other flags cargo would build it all again.
-    pub(crate) fn cargo(&self, workspace: &Workspace, arguments: &[&str]) -> Command {
-        let mut command = workspace.cargo(&[]);
-        let (verb, rest) = arguments.split_at(1.min(arguments.len()));
-        // Behind the verb: cargo does not hand what is before it to an external verb such as clippy.
-        command
-            .args(verb)
-            .args(self.configuration())
-            .args(self.features)
-            .args(rest);
-        command
-    }
-
-    fn configuration(&self) -> [OsString; 2] {
-        // A JSON string is a TOML string.
-        let folder = Value::from(self.folder.display().to_string());
-        ["--config".into(), format!("paths=[{folder}]").into()]
-    }
 }
 
 /// What `bridge-ros2` may use of the patched source only. For `security` it is linked with OpenSSL: where that is not
@@ -128,28 +165,29 @@ fn features() -> [&'static str; 2] {
     ["--features", features]
 }
 
-/// Prepares the source and prints how to build with it by hand.
+/// Prepares the sources and prints how to build with them by hand.
 pub(crate) fn run(workspace: &Workspace) -> anyhow::Result<Ended> {
-    let rustdds = Rustdds::prepare(workspace)?;
-    let [config, paths] = rustdds.configuration();
+    let patched = Patched::prepare(workspace)?;
+    let [config, paths] = patched.configuration();
     println!(
         "cargo build {} '{}' {}",
         config.display(),
         paths.display(),
-        rustdds.features.join(" ")
+        patched.features.join(" ")
     );
     Ok(Ended::WELL)
 }
 
-/// The crate as its authors published it.
+/// A crate as its authors published it.
 struct Published {
-    version: String,
+    /// `NAME-VERSION`.
+    name: String,
     folder: PathBuf,
 }
 
 impl Published {
-    /// Asks cargo, which fetches it when it is not there.
-    fn find(workspace: &Workspace) -> anyhow::Result<Self> {
+    /// All that are locked. Asks cargo, which fetches them when they are not there.
+    fn all(workspace: &Workspace) -> anyhow::Result<Vec<Self>> {
         let mut command = workspace.cargo(&[
             "metadata",
             "--format-version",
@@ -170,16 +208,14 @@ impl Published {
         let metadata: Value = serde_json::from_slice(&output.stdout)?;
         let packages = metadata.get("packages").and_then(Value::as_array);
         let text = |package: &Value, key: &str| Some(package.get(key)?.as_str()?.to_owned());
-        let found = packages.into_iter().flatten().find_map(|package| {
-            (text(package, "name")? == "rustdds").then_some(())?;
+        let published = packages.into_iter().flatten().filter_map(|package| {
+            let manifest = PathBuf::from(text(package, "manifest_path")?);
             Some(Self {
-                version: text(package, "version")?,
-                folder: PathBuf::from(text(package, "manifest_path")?)
-                    .parent()?
-                    .to_owned(),
+                name: format!("{}-{}", text(package, "name")?, text(package, "version")?),
+                folder: manifest.parent()?.to_owned(),
             })
         });
-        found.context("Cargo.lock has no package rustdds")
+        Ok(published.collect())
     }
 }
 
@@ -196,20 +232,13 @@ fn host() -> anyhow::Result<String> {
         .context("rustc -vV does not name the host")
 }
 
-/// The patches for one version, in their order.
+/// The patches of one crate, in their order.
 struct Patches(Vec<(PathBuf, String)>);
 
 impl Patches {
-    fn read(workspace: &Workspace, version: &str) -> anyhow::Result<Self> {
-        let folder = workspace.root.join(format!("patches/rustdds-{version}"));
-        ensure!(
-            folder.is_dir(),
-            "Cargo.lock has rustdds {version}, but there are no patches for it ({}). Bring those of another version \
-             over, or take that version: cargo update -p rustdds --precise VERSION",
-            folder.display()
-        );
+    fn read(folder: &Path) -> anyhow::Result<Self> {
         let mut patches = Vec::new();
-        for entry in fs::read_dir(&folder)? {
+        for entry in fs::read_dir(folder)? {
             let path = entry?.path();
             if path.extension().is_some_and(|ending| ending == "patch") {
                 let text = fs::read_to_string(&path).with_context(|| path.display().to_string())?;
@@ -270,6 +299,19 @@ impl Patches {
         }
         Ok(())
     }
+}
+
+/// In the order of their names.
+fn subfolders(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
+    let mut folders = Vec::new();
+    for entry in fs::read_dir(folder).with_context(|| folder.display().to_string())? {
+        let path = entry?.path();
+        if path.is_dir() {
+            folders.push(path);
+        }
+    }
+    folders.sort();
+    Ok(folders)
 }
 
 fn remove(path: &Path) -> anyhow::Result<()> {
