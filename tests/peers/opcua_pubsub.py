@@ -1,6 +1,7 @@
 """An asyncua client at the PubSub configuration of a server. It does what it is told, a line each: `walk` looks at every attribute
-of all that is below the object PublishSubscribe, `read PATH` reads the value of a node below it, `call PATH` calls a method. A JSON
-line for each answer, with the number of the order."""
+of all that is below the object PublishSubscribe, `read PATH` reads the value of a node below it, `call PATH` calls a method, `file PATH`
+reads and decodes a file, `open PATH MODE` opens it and leaves it so, `leave` closes the session. A JSON line for each answer, with the
+number of the order."""
 
 import argparse
 import asyncio
@@ -8,6 +9,9 @@ import dataclasses
 import sys
 
 from asyncua import ua
+from asyncua.client.ua_file import UaFile
+from asyncua.common.utils import Buffer
+from asyncua.ua.ua_binary import extensionobject_from_binary
 
 import lifetime
 import opcua_session
@@ -65,13 +69,33 @@ async def found(client, path):
     return above, node
 
 
+async def in_file(node):
+    """What a file is, as far as it says, and what it holds."""
+    async with UaFile(node, "r") as file:
+        content, size = await file.read(), await file.get_size()
+    decoded = extensionobject_from_binary(Buffer(content))
+    mime = await (await node.get_child("MimeType")).read_value()
+    said = {"type": type(decoded).__name__, "namespaces": decoded.Namespaces, "mime": mime, "complete": size == len(content)}
+    return said | {"body": type(decoded.Body.Value).__name__, "content": opened(decoded.Body.Value)}
+
+
 async def carried_out(client, order, path):
     if order == "walk":
         return await walk(client)
+    if order == "open":
+        path, _, mode = path.rpartition(" ")
     nodes = await found(client, path)
     if nodes is None:
         return {"missing": True}
     above, node = nodes
+    if order == "file":
+        return await in_file(node)
+    if order == "open":
+        try:
+            await node.call_method("Open", ua.Variant(int(mode), ua.VariantType.Byte))
+            return {"opened": "Good"}
+        except ua.UaStatusCodeError as error:
+            return {"opened": ua.StatusCode(error.code).name}
     if order == "read":
         answer = await node.read_attribute(ua.AttributeIds.Value, raise_on_bad_status=False)
         return {"value": opened(answer.Value.Value), "status": answer.StatusCode.name}
@@ -93,6 +117,8 @@ async def main():
         while line := await loop.run_in_executor(None, sys.stdin.readline):
             number += 1
             order, _, path = line.rstrip("\n").partition(" ")
+            if order == "leave":
+                break
             lifetime.say(order=number, path=path, **await carried_out(client, order, path))
 
 

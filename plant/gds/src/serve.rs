@@ -9,11 +9,12 @@ use discovery::{AnnounceSettings, Announced, Interface, announce};
 use opcua::sync::Mutex;
 use opcua::types::{NodeId, Variant};
 use plant_opcua::certificates;
+use plant_opcua::file::FileMethod;
 use plant_opcua::server::{
     EndpointUrl, MethodHandler, MethodRequest, Security, Server, ServerBuilder, ServerConfig,
     method,
 };
-use plant_opcua::trust_file::{FileMethod, TrustFile};
+use plant_opcua::trust_file::TrustFile;
 use plant_opcua::users::{self, Access, Permissions, Roles, Rules};
 use tokio::time::{MissedTickBehavior, interval};
 use tracing::{info, warn};

@@ -2,7 +2,7 @@
 //! types, and clients that come back by themselves. It knows no skills, no discovery, no space and no ROS.
 //!
 //! Reading order: `limits` (the bounds of both sides), `endpoint`, `pki`, `certificates`, `known` and `door` (how clients get
-//! in), `nodeset` (types from files), `users`, `audit` and `changes`, `server` and `client`, `trust_file` and `configuration` (a
+//! in), `nodeset` (types from files), `users`, `audit` and `changes`, `server` and `client`, `file`, `trust_file` and `configuration` (a
 //! server's certificates as clients manage them).
 
 pub mod audit;
@@ -12,6 +12,7 @@ pub mod client;
 pub mod configuration;
 pub mod door;
 pub mod endpoint;
+pub mod file;
 pub mod known;
 pub mod limits;
 pub mod nodeset;

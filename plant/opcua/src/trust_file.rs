@@ -3,18 +3,16 @@
 //! Its content is a TrustListDataType in the binary encoding, as it is when the file is opened; what is written counts when it is
 //! closed by CloseAndUpdate.
 
-use std::collections::BTreeMap;
 use std::io::Cursor;
-use std::time::Duration;
 
 use opcua::sync::Mutex;
 use opcua::types::{
-    BinaryDecodable as _, BinaryEncodable as _, ByteString, ContextOwned, StatusCode,
-    TrustListDataType, Variant,
+    BinaryDecodable as _, BinaryEncodable as _, ContextOwned, StatusCode, TrustListDataType,
+    Variant,
 };
-use tokio::time::Instant;
 
-use crate::server::{MethodRequest, Refusal};
+use crate::file::{Answer, FileMethod, Handles, READ, WRITE_ANEW};
+use crate::server::MethodRequest;
 
 /// Which lists are meant, as bits (TrustListMasks of OPC 10000-12, 7.8.2.8).
 pub mod masks {
@@ -42,27 +40,6 @@ pub trait TrustList: Send + Sync + 'static {
     fn replace(&self, list: TrustListDataType) -> Result<bool, StatusCode>;
 }
 
-/// A method of the file.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum FileMethod {
-    /// Opens it to be read, or to be written from its beginning.
-    Open,
-    /// Opens some of its lists to be read.
-    OpenWithMasks,
-    /// Reads on.
-    Read,
-    /// Writes on.
-    Write,
-    /// Closes it; what was written is forgotten.
-    Close,
-    /// Closes it, and what was written counts.
-    CloseAndUpdate,
-    /// Says where it is read on.
-    GetPosition,
-    /// Has it read on from elsewhere.
-    SetPosition,
-}
-
 /// The file, with those that have it open.
 pub struct TrustFile {
     list: Box<dyn TrustList>,
@@ -75,23 +52,6 @@ impl std::fmt::Debug for TrustFile {
         f.debug_struct("TrustFile").finish_non_exhaustive()
     }
 }
-
-#[derive(Default)]
-struct Handles {
-    last: u32,
-    all: BTreeMap<u32, Handle>,
-}
-
-struct Handle {
-    session: u32,
-    content: Vec<u8>,
-    position: usize,
-    is_writing: bool,
-    /// When it was used last.
-    used: Instant,
-}
-
-type Answer = Result<Vec<Variant>, Refusal>;
 
 impl TrustFile {
     /// The file of a list, which clients may write or not.
@@ -106,15 +66,12 @@ impl TrustFile {
     /// How many have it open.
     #[must_use]
     pub fn open_count(&self) -> usize {
-        self.open.lock().all.len()
+        self.open.lock().len()
     }
 
     /// A session is gone, and what it had open is closed.
     pub fn close_session(&self, session: u32) {
-        self.open
-            .lock()
-            .all
-            .retain(|_, handle| handle.session != session);
+        self.open.lock().close_session(session);
     }
 
     /// Carries out a method. Who may is looked at before.
@@ -122,36 +79,14 @@ impl TrustFile {
     /// # Errors
     /// Why it is refused.
     pub fn call(&self, method: FileMethod, request: &MethodRequest) -> Answer {
-        let session = request.caller.session;
         match (method, request.arguments.as_slice()) {
-            (FileMethod::Open, [Variant::Byte(mode)]) => self.open(session, *mode),
+            (FileMethod::Open, [Variant::Byte(mode)]) => self.open(request, *mode),
             (FileMethod::OpenWithMasks, [Variant::UInt32(masks)]) => {
-                self.open_with(session, *masks)
-            }
-            (FileMethod::Read, [Variant::UInt32(handle), Variant::Int32(length)]) => {
-                self.with(session, *handle, |one| one.read(*length))
-            }
-            (FileMethod::Write, [Variant::UInt32(handle), Variant::ByteString(data)]) => {
-                self.with(session, *handle, |one| one.write(data))
-            }
-            (FileMethod::Close, [Variant::UInt32(handle)]) => {
-                self.take(session, *handle).map(|_| Vec::new())
+                self.open_with(request, *masks)
             }
             (FileMethod::CloseAndUpdate, [Variant::UInt32(handle)]) => {
-                self.update(session, *handle)
+                self.update(request.caller.session, *handle)
             }
-            (FileMethod::GetPosition, [Variant::UInt32(handle)]) => {
-                self.with(session, *handle, |one| {
-                    let position = u64::try_from(one.position).unwrap_or(u64::MAX);
-                    Ok(vec![Variant::UInt64(position)])
-                })
-            }
-            (FileMethod::SetPosition, [Variant::UInt32(handle), Variant::UInt64(position)]) => self
-                .with(session, *handle, |one| {
-                    let wanted = usize::try_from(*position).unwrap_or(usize::MAX);
-                    one.position = wanted.min(one.content.len());
-                    Ok(Vec::new())
-                }),
             (
                 FileMethod::Open
                 | FileMethod::OpenWithMasks
@@ -162,82 +97,32 @@ impl TrustFile {
                 | FileMethod::GetPosition
                 | FileMethod::SetPosition,
                 _,
-            ) => Err(StatusCode::BadInvalidArgument.into()),
+            ) => self.open.lock().call(method, request),
         }
     }
 
-    fn open(&self, session: u32, mode: u8) -> Answer {
+    fn open(&self, request: &MethodRequest, mode: u8) -> Answer {
         match mode {
-            READ => self.open_with(session, masks::ALL),
-            WRITE_ANEW if self.is_writable => self.add(session, Vec::new(), true),
+            READ => self.open_with(request, masks::ALL),
+            WRITE_ANEW if self.is_writable => self.open.lock().add(request, Vec::new(), true),
             WRITE_ANEW => Err(StatusCode::BadNotWritable.into()),
             // A list is read, or put in the place of another: nothing between (OPC 10000-12, 7.8.2.2).
             _ => Err(StatusCode::BadInvalidArgument.into()),
         }
     }
 
-    fn open_with(&self, session: u32, masks: u32) -> Answer {
+    fn open_with(&self, request: &MethodRequest, masks: u32) -> Answer {
         if masks & !masks::ALL != 0 {
             return Err(StatusCode::BadInvalidArgument.into());
         }
         let list = self.list.list(masks);
         let content = list.encode_to_vec(&ContextOwned::default().context());
-        self.add(session, content, false)
-    }
-
-    fn add(&self, session: u32, content: Vec<u8>, is_writing: bool) -> Answer {
-        let mut open = self.open.lock();
-        open.forget();
-        let is_read = open.all.values().all(|handle| !handle.is_writing);
-        if !is_read || (is_writing && !open.all.is_empty()) {
-            return Err(StatusCode::BadInvalidState.into());
-        }
-        if open.all.len() >= MOST_OPEN {
-            return Err(StatusCode::BadTooManyOperations.into());
-        }
-        open.last = open.last.wrapping_add(1).max(1);
-        let number = open.last;
-        let handle = Handle {
-            session,
-            content,
-            position: 0,
-            is_writing,
-            used: Instant::now(),
-        };
-        open.all.insert(number, handle);
-        Ok(vec![Variant::UInt32(number)])
-    }
-
-    fn with(&self, session: u32, number: u32, what: impl FnOnce(&mut Handle) -> Answer) -> Answer {
-        let mut open = self.open.lock();
-        open.forget();
-        match open.all.get_mut(&number) {
-            Some(handle) if handle.session == session => {
-                handle.used = Instant::now();
-                what(handle)
-            }
-            // Handles are of the session that opened (OPC 10000-20, 4.2.2).
-            Some(_) | None => Err(StatusCode::BadInvalidArgument.into()),
-        }
-    }
-
-    fn take(&self, session: u32, number: u32) -> Result<Handle, Refusal> {
-        let mut open = self.open.lock();
-        open.forget();
-        let is_own = open
-            .all
-            .get(&number)
-            .is_some_and(|one| one.session == session);
-        let taken = is_own.then(|| open.all.remove(&number)).flatten();
-        taken.ok_or_else(|| StatusCode::BadInvalidArgument.into())
+        self.open.lock().add(request, content, false)
     }
 
     fn update(&self, session: u32, number: u32) -> Answer {
-        let handle = self.take(session, number)?;
-        if !handle.is_writing {
-            return Err(StatusCode::BadInvalidState.into());
-        }
-        let mut from = Cursor::new(&handle.content);
+        let written = self.open.lock().written(session, number)?;
+        let mut from = Cursor::new(&written);
         let list = TrustListDataType::decode(&mut from, &ContextOwned::default().context());
         let list = list.map_err(|_| StatusCode::BadInvalidArgument)?;
         let later = self.list.replace(list)?;
@@ -245,63 +130,13 @@ impl TrustFile {
     }
 }
 
-impl Handles {
-    /// Closes those that nobody has used for long: a client that is gone would keep others from writing.
-    fn forget(&mut self) {
-        self.all
-            .retain(|_, handle| handle.used.elapsed() < LONGEST_UNUSED);
-    }
-}
-
-impl Handle {
-    fn read(&mut self, length: i32) -> Answer {
-        if self.is_writing {
-            return Err(StatusCode::BadInvalidState.into());
-        }
-        let length = usize::try_from(length).map_err(|_| StatusCode::BadInvalidArgument)?;
-        let rest = self.content.get(self.position..).unwrap_or_default();
-        let read: Vec<u8> = rest.iter().take(length.min(MOST_READ)).copied().collect();
-        self.position += read.len();
-        Ok(vec![Variant::ByteString(ByteString::from(read))])
-    }
-
-    fn write(&mut self, data: &ByteString) -> Answer {
-        let data = data.value.as_deref().unwrap_or_default();
-        if !self.is_writing {
-            return Err(StatusCode::BadInvalidState.into());
-        }
-        // Whoever goes back writes over what is there.
-        let end = self.position.saturating_add(data.len());
-        if end > LARGEST {
-            return Err(StatusCode::BadRequestTooLarge.into());
-        }
-        self.content.resize(self.content.len().max(end), 0);
-        if let Some(there) = self.content.get_mut(self.position..end) {
-            there.copy_from_slice(data);
-        }
-        self.position = end;
-        Ok(Vec::new())
-    }
-}
-
-/// Bytes that a list that is written may have.
-pub const LARGEST: usize = 1 << 20;
-/// A file that is not used for that long is closed (ActivityTimeout, OPC 10000-12, 7.8.2.1).
-pub const LONGEST_UNUSED: Duration = Duration::from_secs(60);
-/// Bits of the modes that a file is opened in (OPC 10000-20, 4.2.2).
-const READ: u8 = 1;
-/// To write, with what is there erased.
-const WRITE_ANEW: u8 = 6;
-const MOST_OPEN: usize = 20;
-/// Bytes of an answer.
-const MOST_READ: usize = 32 << 10;
-
 #[cfg(test)]
 mod tests {
-    use opcua::types::NodeId;
+    use opcua::types::ByteString;
 
     use super::*;
-    use crate::server::Caller;
+    use crate::file::LARGEST;
+    use crate::file::tests::request;
 
     struct List(Mutex<TrustListDataType>);
 
@@ -328,21 +163,7 @@ mod tests {
     }
 
     fn call(file: &TrustFile, session: u32, method: FileMethod, arguments: &[Variant]) -> Answer {
-        let caller = Caller {
-            session,
-            user: "anonymous".to_owned(),
-            application_uri: String::new(),
-            proven: false,
-            encrypted: true,
-        };
-        let request = MethodRequest {
-            caller,
-            object: NodeId::null(),
-            method: NodeId::null(),
-            name: String::new(),
-            arguments: arguments.to_vec(),
-        };
-        file.call(method, &request)
+        file.call(method, &request(session, arguments))
     }
 
     fn handle(opened: Answer) -> Variant {
@@ -413,20 +234,6 @@ mod tests {
         let updated = call(&file, 1, FileMethod::CloseAndUpdate, &[opened]);
         assert_eq!(updated, Ok(vec![Variant::Boolean(true)]));
         assert_eq!(file.list.list(masks::ALL), list);
-    }
-
-    #[test]
-    fn one_that_a_client_left_open_keeps_nobody_from_writing_for_long() {
-        let file = file(true);
-        let left = handle(call(&file, 1, FileMethod::Open, &[Variant::Byte(1)]));
-        let refused = call(&file, 2, FileMethod::Open, &[Variant::Byte(6)]);
-        assert_eq!(refused, Err(StatusCode::BadInvalidState.into()));
-        for handle in file.open.lock().all.values_mut() {
-            handle.used = handle.used.checked_sub(LONGEST_UNUSED).unwrap();
-        }
-        call(&file, 2, FileMethod::Open, &[Variant::Byte(6)]).unwrap();
-        let late = call(&file, 1, FileMethod::Close, &[left]);
-        assert_eq!(late, Err(StatusCode::BadInvalidArgument.into()));
     }
 
     #[test]

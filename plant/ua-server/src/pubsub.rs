@@ -1,10 +1,11 @@
 //! The PubSub configuration in the address space (OPC 10000-14, 9.1): below the object PublishSubscribe stand the one
 //! connection of the program, a WriterGroup for each namespace it writes in, a ReaderGroup for each it hears, and a
-//! DataSetWriter or DataSetReader for each value of the mapping, with their states and counters.
+//! DataSetWriter or DataSetReader for each value of the mapping, with their states and counters; and a file that says it all.
 //!
 //! One lock guards the states; with it held the address spaces are written, one after the other.
 
 mod counts;
+mod file;
 mod insert;
 mod readers;
 mod states;
@@ -22,11 +23,13 @@ use opcua::sync::{Mutex, RwLock};
 use opcua::types::{
     AttributeId, DataValue, MethodId, NodeId, ObjectId, StatusCode, TimestampsToReturn, Variant,
 };
+use plant_opcua::file::Handles;
 use plant_opcua::server::{CoreMethod, MethodHandler, Refusal, method};
 use tokio::sync::Notify;
 use tracing::info;
 
 use self::counts::{Counts, Diagnostics};
+use self::file::Content;
 pub(crate) use self::readers::Readers;
 pub(crate) use self::states::State;
 use self::states::{Change, States};
@@ -42,6 +45,8 @@ pub(crate) struct PubSub {
     called: Notify,
     /// Once there are any.
     places: OnceLock<Places>,
+    /// Those that have the configuration open as a file. No other lock is held when this one is taken.
+    file: Mutex<Handles>,
 }
 
 /// Where the nodes are, and who is told of them.
@@ -63,6 +68,17 @@ struct Inner {
     made: Vec<NodeId>,
     /// What has become of topics since somebody asked: whether they are sent, or taken.
     switched: HashMap<TopicId, bool>,
+    /// What all of it is as a file.
+    content: Content,
+}
+
+impl Inner {
+    /// What somebody has disabled.
+    fn disabled(&self) -> HashSet<Kind> {
+        let parts = self.parts.iter().enumerate();
+        let disabled = parts.filter(|(at, _)| !self.states.is_enabled(*at));
+        disabled.map(|(_, part)| part.kind).collect()
+    }
 }
 
 /// A component of the configuration.
@@ -77,7 +93,7 @@ struct Part {
 }
 
 /// What a component is.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 enum Kind {
     Whole,
     Connection,
@@ -102,6 +118,7 @@ impl PubSub {
             off: RwLock::default(),
             called: Notify::new(),
             places: OnceLock::new(),
+            file: Mutex::default(),
         }
     }
 
@@ -129,11 +146,13 @@ impl PubSub {
             MethodId::PublishSubscribe_Diagnostics_Reset.into(),
             MethodId::PubSubDiagnosticsType_Reset.into(),
         ];
-        vec![
+        let mut methods = vec![
             CoreMethod::new(status.clone(), enable, "Enable", asked(Ask::Enable)),
             CoreMethod::new(status, disable, "Disable", asked(Ask::Disable)),
             CoreMethod::new(diagnostics, reset, "Reset", asked(Ask::Reset)),
-        ]
+        ];
+        methods.extend(self.file_methods());
+        methods
     }
 
     /// Has the nodes stand there from now on.
@@ -142,6 +161,9 @@ impl PubSub {
             let mut address_space = core.address_space().write();
             for (method, name) in WHOLE {
                 tree::core_method(&mut address_space, method, name);
+            }
+            for method in file::OF_WRITERS {
+                tree::nobody_executes(&mut address_space, method);
             }
         }
         drop(self.places.set(places));
@@ -153,13 +175,7 @@ impl PubSub {
             return;
         };
         let mut inner = self.inner.lock();
-        let disabled: Vec<Kind> = inner
-            .parts
-            .iter()
-            .enumerate()
-            .filter(|(at, _)| !inner.states.is_enabled(*at))
-            .map(|(_, part)| part.kind)
-            .collect();
+        let disabled = inner.disabled();
         {
             let mut address_space = places.space.address_space().write();
             for node in inner.made.drain(..) {
@@ -181,6 +197,8 @@ impl PubSub {
         }
         self.settle(&mut inner);
         self.show_states(&inner);
+        drop(inner);
+        self.show_file();
     }
 
     /// Whether a client means a method of a component, and if so what becomes of it.
@@ -233,6 +251,7 @@ impl PubSub {
 
     /// Takes in how the readers are, and what was counted of each topic.
     pub(crate) fn look(&self, readers: &Readers, router: &Router) {
+        self.tidy_file();
         let counted: HashMap<TopicId, &Counters> = router.topics().collect();
         let counts = |topic| {
             let counters = counted.get(&topic)?;

@@ -227,3 +227,121 @@ fn what_is_below_a_group_that_is_disabled_sends_nothing() {
     assert_eq!(client.call("Status/Enable"), "Good");
     assert_eq!(client.state(WRITER), OPERATIONAL);
 }
+
+const FILE: &str = "PubSubConfiguration";
+
+#[test]
+fn the_configuration_is_a_file_that_says_what_the_nodes_say() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let _server = server(&cell);
+    let mut client = Client::of(&cell);
+    let file = client.told(&format!("file {FILE}"));
+    assert_eq!(file["type"], "UABinaryFileDataType", "{file}");
+    assert_eq!(file["body"], "PubSubConfiguration2DataType", "{file}");
+    assert_eq!(file["mime"], "application/opcua+uabinary");
+    assert_eq!(file["complete"], true, "its Size is that of what was read");
+    // Index 1 of the NamespaceArray is the first.
+    assert_eq!(file["namespaces"][1], "urn:ua-bridge:system-tests");
+    let content = &file["content"];
+    assert_eq!(content["Enabled"], true);
+    let connection = &content["Connections"][0];
+    let of_node = |client: &mut Client, path: &str, said: &Value, names: &[&str]| {
+        for name in names {
+            assert_eq!(
+                client.read(&format!("{path}/{name}")),
+                said[name],
+                "{name} of {path}"
+            );
+        }
+    };
+    assert_eq!(connection["Name"], "space");
+    of_node(&mut client, "space", connection, &["TransportProfileUri"]);
+    of_node(
+        &mut client,
+        "space/Address",
+        &connection["Address"],
+        &["Url"],
+    );
+    let names = [
+        "WriterGroupId",
+        "SecurityMode",
+        "PublishingInterval",
+        "KeepAliveTime",
+    ];
+    let writers = &connection["WriterGroups"][0];
+    of_node(&mut client, "space/writers 2", writers, &names);
+    let mask = ["NetworkMessageContentMask"];
+    let settings = &writers["MessageSettings"];
+    of_node(
+        &mut client,
+        "space/writers 2/MessageSettings",
+        settings,
+        &mask,
+    );
+    let writer = &writers["DataSetWriters"][0];
+    assert_eq!(writer["DataSetName"], "ua_0_2_30");
+    of_node(
+        &mut client,
+        WRITER,
+        writer,
+        &["DataSetWriterId", "KeyFrameCount"],
+    );
+    let set = &content["PublishedDataSets"][0];
+    assert_eq!(set["Name"], writer["DataSetName"]);
+    let published = "PublishedDataSets/ua_0_2_30";
+    let source = &set["DataSetSource"];
+    of_node(&mut client, published, source, &["PublishedData"]);
+    of_node(&mut client, published, set, &["DataSetMetaData"]);
+    let readers = &connection["ReaderGroups"][0];
+    assert_eq!(readers["Name"], "readers 2 2");
+    let reader = &readers["DataSetReaders"][0];
+    let names = [
+        "WriterGroupId",
+        "DataSetWriterId",
+        "MessageReceiveTimeout",
+        "DataSetMetaData",
+    ];
+    of_node(&mut client, READER, reader, &names);
+    let targets = &reader["SubscribedDataSet"];
+    let target_node = format!("{READER}/SubscribedDataSet");
+    of_node(&mut client, &target_node, targets, &["TargetVariables"]);
+
+    // What somebody has disabled is so in the file, and nothing else.
+    assert_eq!(client.call(&format!("{WRITER}/Status/Disable")), "Good");
+    let file = client.told(&format!("file {FILE}"));
+    let connection = &file["content"]["Connections"][0];
+    let writers = &connection["WriterGroups"][0];
+    let readers = &connection["ReaderGroups"][0];
+    let enabled = [connection, writers, &writers["DataSetWriters"][0], readers];
+    let enabled = enabled.map(|part| part["Enabled"].as_bool().unwrap());
+    assert_eq!(enabled, [true, true, false, true]);
+}
+
+#[test]
+fn the_file_of_the_configuration_is_not_written_and_what_a_session_left_open_is_closed() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let _server = server(&cell);
+    let (mut first, mut second) = (Client::of(&cell), Client::of(&cell));
+    let mut opened = |mode: u8| first.told(&format!("open {FILE} {mode}"))["opened"].take();
+    // Anew; read and written; no mode of this file.
+    let modes = [6, 3, 2].map(&mut opened);
+    assert_eq!(
+        modes,
+        ["BadNotWritable", "BadNotWritable", "BadInvalidArgument"]
+    );
+    let read = [1; 6].map(&mut opened);
+    assert_eq!(read[..5], ["Good"; 5]);
+    assert_eq!(read[5], "BadTooManyOperations");
+    let count = format!("{FILE}/OpenCount");
+    second.becomes(&count, &json!(5));
+    assert_eq!(second.told(&format!("file {FILE}"))["complete"], true);
+    first.asyncua.tell("leave");
+    second.becomes(&count, &json!(0));
+    for name in ["Writable", "UserWritable"] {
+        assert_eq!(second.read(&format!("{FILE}/{name}")), false);
+    }
+}

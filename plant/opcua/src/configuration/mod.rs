@@ -26,10 +26,11 @@ use trust::{Certificate, Request};
 use x509_cert::der::pem::{self, LineEnding};
 
 use self::store::StoreList;
+use crate::file::{FileMethod, LARGEST, LONGEST_UNUSED};
 use crate::known;
 use crate::pki::{OWN_CERTIFICATE, OWN_KEY};
 use crate::server::{CoreMethod, MethodHandler, MethodRequest, Refusal, method};
-use crate::trust_file::{FileMethod, LARGEST, LONGEST_UNUSED, TrustFile};
+use crate::trust_file::TrustFile;
 
 /// The ServerConfiguration of a server with a certificate store.
 #[derive(Debug)]

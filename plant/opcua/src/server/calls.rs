@@ -15,7 +15,7 @@ use opcua::types::{
 use tokio::time::{Instant, timeout_at};
 
 use super::nodes::Spaces;
-use super::sessions::{Caller, Sessions};
+use super::sessions::{Caller, Presence, Sessions};
 use crate::limits::LONGEST_REQUEST;
 
 /// A call that has passed the checks of number and types of its arguments.
@@ -23,6 +23,8 @@ use crate::limits::LONGEST_REQUEST;
 pub struct MethodRequest {
     /// Who calls.
     pub caller: Caller,
+    /// Whether its session is still there.
+    pub presence: Presence,
     /// The object.
     pub object: NodeId,
     /// The method of the object, also where the client gave that of its type.
@@ -146,6 +148,7 @@ impl Calls {
                     let checked = self.check(context, &method, call.arguments());
                     let request = MethodRequest {
                         caller: self.sessions.caller(context),
+                        presence: Presence::of(context),
                         object: call.object_id().clone(),
                         method,
                         name,

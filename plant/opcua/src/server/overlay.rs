@@ -19,7 +19,7 @@ use tokio::time::Instant;
 
 use super::calls::{self, MethodHandler, MethodRequest, Refusal, check_arguments, within};
 use super::routed::{Front, Routed};
-use super::sessions::Caller;
+use super::sessions::{Caller, Presence};
 use crate::audit::{Action, Audit};
 use crate::limits::LONGEST_REQUEST;
 
@@ -159,6 +159,7 @@ impl Overlay {
         check_arguments(&declared, call.arguments(), &*types)?;
         Ok(MethodRequest {
             caller: Caller::of(context),
+            presence: Presence::of(context),
             object: method.object.clone(),
             method: own.clone(),
             name: method.name.clone(),

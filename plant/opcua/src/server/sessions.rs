@@ -8,8 +8,6 @@ use opcua::server::node_manager::RequestContext;
 use opcua::sync::{Mutex, RwLock};
 use opcua::types::MessageSecurityMode;
 
-/// The session of the library, whose type has no public name.
-type Watched = Box<dyn Fn() -> bool + Send + Sync>;
 type Told = Arc<dyn Fn(u32) + Send + Sync>;
 
 /// Who calls or writes.
@@ -50,10 +48,38 @@ impl Caller {
     }
 }
 
+/// Whether the session of a request is still there.
+#[derive(Clone)]
+pub struct Presence(Arc<dyn Fn() -> bool + Send + Sync>);
+
+impl std::fmt::Debug for Presence {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_tuple("Presence").field(&self.lasts()).finish()
+    }
+}
+
+impl Presence {
+    pub(crate) fn of(context: &RequestContext) -> Self {
+        // The type of the library's sessions has no public name.
+        let session = Arc::downgrade(&context.session);
+        Self::while_(move || Weak::upgrade(&session).is_some_and(|one| one.read().is_activated()))
+    }
+
+    pub(crate) fn while_(lasts: impl Fn() -> bool + Send + Sync + 'static) -> Self {
+        Self(Arc::new(lasts))
+    }
+
+    /// Whether it is there now.
+    #[must_use]
+    pub fn lasts(&self) -> bool {
+        (self.0)()
+    }
+}
+
 /// The sessions that are looked after.
 #[derive(Default)]
 pub(crate) struct Sessions {
-    watched: Mutex<HashMap<u32, Watched>>,
+    watched: Mutex<HashMap<u32, Presence>>,
     told: RwLock<Vec<Told>>,
 }
 
@@ -61,10 +87,9 @@ impl Sessions {
     /// Who is behind a request, and looks after that session from now on.
     pub(crate) fn caller(&self, context: &RequestContext) -> Caller {
         let mut watched = self.watched.lock();
-        watched.entry(context.session_id).or_insert_with(|| {
-            let session = Arc::downgrade(&context.session);
-            Box::new(move || Weak::upgrade(&session).is_some_and(|one| one.read().is_activated()))
-        });
+        watched
+            .entry(context.session_id)
+            .or_insert_with(|| Presence::of(context));
         drop(watched);
         Caller::of(context)
     }
@@ -76,8 +101,8 @@ impl Sessions {
     /// Tells of the sessions that are gone since the last look.
     pub(crate) fn look(&self) {
         let mut gone: Vec<u32> = Vec::new();
-        self.watched.lock().retain(|session, lives| {
-            let stays = lives();
+        self.watched.lock().retain(|session, presence| {
+            let stays = presence.lasts();
             if !stays {
                 gone.push(*session);
             }

@@ -1,18 +1,20 @@
 //! A mapping as PubSub components, and their nodes.
 
 use std::collections::BTreeMap;
+use std::time::Duration;
 
 use mappings::{GroupMode, KeySource, Mapping, SecurityGroup, SpaceId};
 use opcua::server::address_space::AddressSpace;
 use opcua::types::{
     AttributeId, ConfigurationVersionDataType, DataSetMetaDataType, DataTypeId,
     EndpointDescription, ExtensionObject, FieldMetaData, FieldTargetDataType, Guid, LocalizedText,
-    ObjectId, ObjectTypeId, PublishedVariableDataType, ReferenceTypeId, UAString, VariableId,
-    Variant,
+    MessageSecurityMode, NodeId, ObjectId, ObjectTypeId, PublishedVariableDataType,
+    ReferenceTypeId, UAString, VariableId, Variant,
 };
 use tracing::warn;
 
 use super::counts::{Counter, Counts, Diagnostics};
+use super::file::{self, Content};
 use super::states::State;
 use super::tree::{At, Tree};
 use super::{Ask, Inner, Kind, Part};
@@ -29,6 +31,7 @@ pub(super) fn all(mapping: &Mapping, layout: &Layout, address_space: &mut Addres
         },
     };
     let whole = insert.whole();
+    insert.file();
     let (connection, object) = insert.connection(whole);
     let mut groups: BTreeMap<(SpaceId, u16), (usize, At)> = BTreeMap::new();
     if layout.topics.len() > MOST_SHOWN {
@@ -53,6 +56,7 @@ pub(super) fn all(mapping: &Mapping, layout: &Layout, address_space: &mut Addres
     let Insert { inner, tree, .. } = insert;
     Inner {
         made: tree.made,
+        content: Content::of(mapping, layout),
         ..inner
     }
 }
@@ -76,6 +80,13 @@ impl Insert<'_> {
             counts: Counts::default(),
         });
         at
+    }
+
+    /// What the file of the configuration has besides: it is there.
+    fn file(&mut self) {
+        let file = At::core(file::OBJECT, "PubSub.Configuration");
+        let mime = (DataTypeId::String, -1);
+        self.tree.property("MimeType", mime, UA_BINARY, &file);
     }
 
     /// A component with its Status, and with counters where it has any.
@@ -121,7 +132,7 @@ impl Insert<'_> {
         let how = (&root, ReferenceTypeId::HasPubSubConnection);
         let object = self
             .tree
-            .object("space", ObjectTypeId::PubSubConnectionType, how);
+            .object(CONNECTION, ObjectTypeId::PubSubConnectionType, how);
         let tree = &mut self.tree;
         let publisher = Variant::UInt16(u16::from(SpaceId::UA.get()));
         tree.property(
@@ -135,7 +146,7 @@ impl Insert<'_> {
         let address = tree.part("Address", ObjectTypeId::NetworkAddressUrlType, &object);
         let interface = pubsub.interface.as_deref().unwrap_or_default();
         tree.selection("NetworkInterface", interface, &address);
-        let url = format!("opc.udp://{}", pubsub.address);
+        let url = url(self.mapping);
         tree.value("Url", (DataTypeId::String, -1), url, &address);
         let counters = (ObjectTypeId::PubSubDiagnosticsConnectionType, &[][..]);
         let at = self.part(
@@ -163,7 +174,7 @@ impl Insert<'_> {
                     ObjectTypeId::WriterGroupType,
                     ObjectTypeId::PubSubDiagnosticsWriterGroupType,
                 ),
-                format!("writers {namespace}"),
+                writers_name(namespace),
             )
         } else {
             (
@@ -174,7 +185,7 @@ impl Insert<'_> {
                     ObjectTypeId::ReaderGroupType,
                     ObjectTypeId::PubSubDiagnosticsReaderGroupType,
                 ),
-                format!("readers {space} {namespace}"),
+                readers_name(space, namespace),
             )
         };
         let object = self.tree.object(&name, type_.0, (connection, reference));
@@ -203,7 +214,6 @@ impl Insert<'_> {
 
     /// What a group of writers has besides.
     fn writer_group(&mut self, namespace: u16, object: &At) {
-        let milliseconds = |time: std::time::Duration| time.as_secs_f64() * 1e3;
         let pubsub = self.mapping.pubsub();
         let tree = &mut self.tree;
         tree.property("WriterGroupId", UINT16, namespace, object);
@@ -283,17 +293,10 @@ impl Insert<'_> {
         let version = ConfigurationVersionDataType::default();
         let kind = (DataTypeId::ConfigurationVersionDataType, -1);
         tree.property("ConfigurationVersion", kind, object_of(version), &set);
-        meta_data(tree, topic, &set);
-        let published = topic
-            .places()
-            .filter(|(_, field)| field.is_some() || !topic.compound);
-        let published = published.map(|(node, _)| PublishedVariableDataType {
-            published_variable: node.clone(),
-            attribute_id: AttributeId::Value as u32,
-            ..PublishedVariableDataType::default()
-        });
-        let published: Vec<ExtensionObject> =
-            published.map(ExtensionObject::from_message).collect();
+        show_meta_data(tree, topic, &set);
+        let published: Vec<ExtensionObject> = published(topic)
+            .map(ExtensionObject::from_message)
+            .collect();
         let kind = (DataTypeId::PublishedVariableDataType, 1);
         tree.property("PublishedData", kind, published, &set);
         tree.refer(&set.node, &object.node, ReferenceTypeId::DataSetToWriter);
@@ -328,29 +331,22 @@ impl Insert<'_> {
         );
         tree.property("WriterGroupId", UINT16, namespace, &object);
         tree.property("DataSetWriterId", UINT16, identifier, &object);
-        meta_data(tree, topic, &object);
+        show_meta_data(tree, topic, &object);
         tree.property("DataSetFieldContentMask", FIELDS, 0_u32, &object);
-        let timeout = pubsub.receive_timeout.as_secs_f64() * 1e3;
+        let timeout = milliseconds(pubsub.receive_timeout);
         tree.property("MessageReceiveTimeout", DURATION, timeout, &object);
         tree.property("KeyFrameCount", UINT32, 1_u32, &object);
         tree.property("HeaderLayoutUri", (DataTypeId::String, -1), "", &object);
         properties(tree, "DataSetReaderProperties", &object);
-        let targets = tree.part(
+        let written = tree.part(
             "SubscribedDataSet",
             ObjectTypeId::TargetVariablesType,
             &object,
         );
-        let written = topic
-            .places()
-            .filter(|(_, field)| field.is_some() || !topic.compound);
-        let written = written.map(|(node, _)| FieldTargetDataType {
-            target_node_id: node.clone(),
-            attribute_id: AttributeId::Value as u32,
-            ..FieldTargetDataType::default()
-        });
-        let written: Vec<ExtensionObject> = written.map(ExtensionObject::from_message).collect();
+        let targets: Vec<ExtensionObject> =
+            targets(topic).map(ExtensionObject::from_message).collect();
         let kind = (DataTypeId::FieldTargetDataType, 1);
-        tree.property("TargetVariables", kind, written, &targets);
+        tree.property("TargetVariables", kind, targets, &written);
         let counters = (
             ObjectTypeId::PubSubDiagnosticsDataSetReaderType,
             &[Counter::FailedMessages][..],
@@ -364,8 +360,34 @@ impl Insert<'_> {
     }
 }
 
+/// The variables whose values a writer sends.
+pub(super) fn published(topic: &TopicNode) -> impl Iterator<Item = PublishedVariableDataType> {
+    variables(topic).map(|node| PublishedVariableDataType {
+        published_variable: node.clone(),
+        attribute_id: AttributeId::Value as u32,
+        ..PublishedVariableDataType::default()
+    })
+}
+
+/// The variables that have the values a reader hears.
+pub(super) fn targets(topic: &TopicNode) -> impl Iterator<Item = FieldTargetDataType> {
+    variables(topic).map(|node| FieldTargetDataType {
+        target_node_id: node.clone(),
+        attribute_id: AttributeId::Value as u32,
+        ..FieldTargetDataType::default()
+    })
+}
+
+/// One for each field of a DataSet.
+fn variables(topic: &TopicNode) -> impl Iterator<Item = &NodeId> {
+    let fields = topic
+        .places()
+        .filter(|(_, field)| field.is_some() || !topic.compound);
+    fields.map(|(node, _)| node)
+}
+
 /// The fields of a DataSet, as they are known before anybody sends them.
-fn meta_data(tree: &mut Tree<'_>, topic: &TopicNode, above: &At) {
+pub(super) fn meta_data(topic: &TopicNode) -> DataSetMetaDataType {
     let fields = topic.fields.iter().map(|field| FieldMetaData {
         name: UAString::from(field.name.as_str()),
         built_in_type: field.shape.0.map_or(VARIANT, |(builtin, _)| builtin as u8),
@@ -374,48 +396,69 @@ fn meta_data(tree: &mut Tree<'_>, topic: &TopicNode, above: &At) {
         data_set_field_id: Guid::null(),
         ..FieldMetaData::default()
     });
-    let data = DataSetMetaDataType {
+    DataSetMetaDataType {
         name: UAString::from(topic.name.as_str()),
         description: LocalizedText::from(topic.topic.to_string().as_str()),
         fields: Some(fields.collect()),
         ..DataSetMetaDataType::default()
-    };
+    }
+}
+
+fn show_meta_data(tree: &mut Tree<'_>, topic: &TopicNode, above: &At) {
     let kind = (DataTypeId::DataSetMetaDataType, -1);
-    tree.property("DataSetMetaData", kind, object_of(data), above);
+    tree.property("DataSetMetaData", kind, object_of(meta_data(topic)), above);
 }
 
 /// How a group is secured, and who has its keys.
+pub(super) struct Secured {
+    pub(super) mode: MessageSecurityMode,
+    /// Null where it is not secured, as `services` is.
+    pub(super) group: UAString,
+    pub(super) services: Option<Vec<EndpointDescription>>,
+}
+
+impl Secured {
+    pub(super) fn of(group: Option<&SecurityGroup>) -> Self {
+        let mode = match group.map(|group| group.mode) {
+            None | Some(GroupMode::None) => MessageSecurityMode::None,
+            Some(GroupMode::Sign) => MessageSecurityMode::Sign,
+            Some(GroupMode::SignAndEncrypt) => MessageSecurityMode::SignAndEncrypt,
+        };
+        let Some(group) = group.filter(|group| group.mode != GroupMode::None) else {
+            return Self {
+                mode,
+                group: UAString::null(),
+                services: None,
+            };
+        };
+        let endpoint = match &group.keys {
+            Some(KeySource::Own(served)) => Some(served.endpoint.to_string()),
+            Some(KeySource::Sks(endpoint)) => Some(endpoint.to_string()),
+            Some(KeySource::File(_) | KeySource::Credential(_)) | None => None,
+        };
+        let services = endpoint.into_iter().map(|url| EndpointDescription {
+            endpoint_url: UAString::from(url.as_str()),
+            ..EndpointDescription::default()
+        });
+        Self {
+            mode,
+            group: group.id.as_str().into(),
+            services: Some(services.collect()),
+        }
+    }
+}
+
 fn security(tree: &mut Tree<'_>, group: Option<&SecurityGroup>, above: &At) {
-    let mode = match group.map(|group| group.mode) {
-        None | Some(GroupMode::None) => 1_i32,
-        Some(GroupMode::Sign) => 2,
-        Some(GroupMode::SignAndEncrypt) => 3,
-    };
-    tree.property(
-        "SecurityMode",
-        (DataTypeId::MessageSecurityMode, -1),
-        mode,
-        above,
-    );
-    let Some(group) = group.filter(|group| group.mode != GroupMode::None) else {
+    let secured = Secured::of(group);
+    let mode = (DataTypeId::MessageSecurityMode, -1);
+    tree.property("SecurityMode", mode, secured.mode as i32, above);
+    let Some(services) = secured.services else {
         return;
     };
-    tree.property(
-        "SecurityGroupId",
-        (DataTypeId::String, -1),
-        group.id.as_str(),
-        above,
-    );
-    let endpoint = match &group.keys {
-        Some(KeySource::Own(served)) => Some(served.endpoint.to_string()),
-        Some(KeySource::Sks(endpoint)) => Some(endpoint.to_string()),
-        Some(KeySource::File(_) | KeySource::Credential(_)) | None => None,
-    };
-    let services = endpoint.into_iter().map(|url| EndpointDescription {
-        endpoint_url: UAString::from(url.as_str()),
-        ..EndpointDescription::default()
-    });
-    let services: Vec<ExtensionObject> = services.map(ExtensionObject::from_message).collect();
+    let id = (DataTypeId::String, -1);
+    tree.property("SecurityGroupId", id, secured.group, above);
+    let services = services.into_iter().map(ExtensionObject::from_message);
+    let services: Vec<ExtensionObject> = services.collect();
     let kind = (DataTypeId::EndpointDescription, 1);
     tree.property("SecurityKeyServices", kind, services, above);
 }
@@ -442,17 +485,41 @@ fn text(at: &At) -> String {
     }
 }
 
-const UDP_UADP: &str = "http://opcfoundation.org/UA-Profile/Transport/pubsub-udp-uadp";
+/// Where the group is.
+pub(super) fn url(mapping: &Mapping) -> String {
+    format!("opc.udp://{}", mapping.pubsub().address)
+}
+
+/// The BrowseName of the writers of a namespace.
+pub(super) fn writers_name(namespace: u16) -> String {
+    format!("writers {namespace}")
+}
+
+/// The BrowseName of the readers of a namespace of a space.
+pub(super) fn readers_name(space: SpaceId, namespace: u16) -> String {
+    format!("readers {space} {namespace}")
+}
+
+/// A Duration.
+pub(super) fn milliseconds(time: Duration) -> f64 {
+    time.as_secs_f64() * 1e3
+}
+
+/// The BrowseName of the one connection.
+pub(super) const CONNECTION: &str = "space";
+pub(super) const UDP_UADP: &str = "http://opcfoundation.org/UA-Profile/Transport/pubsub-udp-uadp";
 const UINT16: (DataTypeId, i32) = (DataTypeId::UInt16, -1);
 const UINT32: (DataTypeId, i32) = (DataTypeId::UInt32, -1);
 const DURATION: (DataTypeId, i32) = (DataTypeId::Duration, -1);
 const FIELDS: (DataTypeId, i32) = (DataTypeId::DataSetFieldContentMask, -1);
 /// PublisherId, GroupHeader, WriterGroupId, PayloadHeader (OPC 10000-14, 6.3.1.1.4).
-const NETWORK_MESSAGE: u32 = 0b0100_0111;
+pub(super) const NETWORK_MESSAGE: u32 = 0b0100_0111;
 /// Timestamp, PicoSeconds, Status, MajorVersion, SequenceNumber (OPC 10000-14, 6.3.1.2.2).
-const DATA_SET_MESSAGE: u32 = 0b0010_1111;
+pub(super) const DATA_SET_MESSAGE: u32 = 0b0010_1111;
 /// The BuiltInType of a field that can be anything.
 const VARIANT: u8 = 24;
+/// Of a file in the binary encoding (OPC 10000-5, 12.36).
+const UA_BINARY: &str = "application/opcua+uabinary";
 /// Writers and readers that are shown, and those of them that have counters.
-const MOST_SHOWN: usize = 5_000;
+pub(super) const MOST_SHOWN: usize = 5_000;
 const MOST_DETAILED: usize = 500;

@@ -1,6 +1,6 @@
 //! Objects, variables and methods of the PubSub configuration, as they are put into the address space.
 
-use opcua::nodes::{MethodBuilder, ObjectBuilder, ReferenceDirection, VariableBuilder};
+use opcua::nodes::{MethodBuilder, NodeType, ObjectBuilder, ReferenceDirection, VariableBuilder};
 use opcua::server::address_space::AddressSpace;
 use opcua::types::{
     DataTypeId, LocalizedText, MethodId, NodeId, ObjectId, ObjectTypeId, QualifiedName,
@@ -153,6 +153,14 @@ pub(super) fn core_method(address_space: &mut AddressSpace, method: MethodId, na
         .executable(true)
         .user_executable(true)
         .insert(address_space);
+    }
+}
+
+/// Says of a method that is there that nobody executes it.
+pub(super) fn nobody_executes(address_space: &mut AddressSpace, method: MethodId) {
+    if let Some(NodeType::Method(method)) = address_space.find_mut(&method.into()) {
+        method.set_executable(false);
+        method.set_user_executable(false);
     }
 }
 
