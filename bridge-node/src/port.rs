@@ -140,6 +140,8 @@ pub struct LinkState {
     pub why: Option<String>,
     /// How often there has been a connection.
     pub connects: u64,
+    /// How often the certificate of the server was refused, each attempt to connect counted.
+    pub certificates_refused: u64,
     /// Values that came, of whatever quality.
     pub values: u64,
     /// Values that were written there.

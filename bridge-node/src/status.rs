@@ -302,6 +302,11 @@ impl LinkState {
         let labels = format!("{own},server=\"{}\"", self.name);
         line("server_up", &labels, &u8::from(self.up));
         line("server_connects_total", &labels, &self.connects);
+        line(
+            "server_certificates_refused_total",
+            &labels,
+            &self.certificates_refused,
+        );
         line("server_values_total", &labels, &self.values);
         line("server_written_total", &labels, &self.written);
         line("server_not_written_total", &labels, &self.not_written);

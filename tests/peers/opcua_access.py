@@ -2,7 +2,7 @@
 
 `pairs FOLDER` makes the keys and certificates that the tries use: of a client (`client`), of one whose time is over
 (`expired`), of a user (`user`), and of a server that the peers can be (`server`). `issued FOLDER` makes authorities and what they issue, with their
-revocation lists. `tries URL FOLDER NODE TYPE VALUE USER PASSWORD` tries each security policy and mode with
+revocation lists. `servers FOLDER` makes those of servers, of which one alone is as it should be. `tries URL FOLDER NODE TYPE VALUE USER PASSWORD` tries each security policy and mode with
 each kind of user, reading and writing the node. `endpoints URL` says which
 policies a server offers. `audit URL` tells of the events of the Server object. `crowd URL COUNT` opens that many sessions at once and
 says how many came in; with `--vanish` each has a subscription, and its connection breaks off as that of a client that is killed.
@@ -30,7 +30,7 @@ import opcua_session
 DAY = datetime.timedelta(days=1)
 
 
-def make(folder, name, uri, begin, end, above=None, purpose=ExtendedKeyUsageOID.CLIENT_AUTH):
+def make(folder, name, uri, begin, end, above=None, purpose=ExtendedKeyUsageOID.CLIENT_AUTH, host="127.0.0.1"):
     """A key and a certificate of an application, valid from the one day to the other from now: self-signed, or by an authority."""
     key = rsa.generate_private_key(public_exponent=65537, key_size=2048)
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
@@ -42,7 +42,7 @@ def make(folder, name, uri, begin, end, above=None, purpose=ExtendedKeyUsageOID.
     names = [
         x509.UniformResourceIdentifier(uri),
         x509.DNSName(socket.gethostname()),
-        x509.IPAddress(ipaddress.ip_address("127.0.0.1")),
+        x509.IPAddress(ipaddress.ip_address(host)),
     ]
     builder = (
         x509.CertificateBuilder()
@@ -128,6 +128,21 @@ def issued(folder):
     revocations(folder, "plant-now.crl", plant, [gone, client])
     revocations(folder, "between.crl", between, [])
     revocations(folder, "over.crl", over, [])
+    lifetime.say(made=str(folder))
+
+
+def servers(folder, host):
+    uri, purpose = opcua_session.SERVER_URI, ExtendedKeyUsageOID.SERVER_AUTH
+    plant = authority(folder, "plant")
+    sound = make(folder, "sound", uri, -1, 365, plant, purpose, host)
+    gone = make(folder, "gone", uri, -1, 365, plant, purpose, host)
+    make(folder, "late", uri, -30, -1, plant, purpose, host)
+    make(folder, "elsewhere", uri, -1, 365, plant, purpose, "192.0.2.7")
+    make(folder, "impostor", f"{uri}:another", -1, 365, plant, purpose, host)
+    make(folder, "stranger", f"{uri}:another", -1, 365, authority(folder, "strange"), purpose, host)
+    make(folder, "client", opcua_session.APPLICATION_URI, -1, 365, plant)
+    revocations(folder, "plant.crl", plant, [gone])
+    revocations(folder, "plant-now.crl", plant, [gone, sound])
     lifetime.say(made=str(folder))
 
 
@@ -323,6 +338,9 @@ def main():
     making.add_argument("folder", type=pathlib.Path)
     issuing = verbs.add_parser("issued")
     issuing.add_argument("folder", type=pathlib.Path)
+    serving = verbs.add_parser("servers")
+    serving.add_argument("folder", type=pathlib.Path)
+    serving.add_argument("--host", default="127.0.0.1", help="the address they are reached at")
     trying = verbs.add_parser("tries")
     trying.add_argument("endpoint")
     trying.add_argument("folder")
@@ -355,6 +373,8 @@ def main():
         pairs(args.folder)
     elif args.verb == "issued":
         issued(args.folder)
+    elif args.verb == "servers":
+        servers(args.folder, args.host)
     elif args.verb == "endpoints":
         asyncio.run(endpoints(args.endpoint))
     elif args.verb == "audit":

@@ -1,12 +1,15 @@
 """A device by asyncua: a server with a method Add and one to be configured by, registered with the discovery server of its
-level. It says each place that it is told."""
+level. It says each place that it is told. With `--pairs`, the folder of `opcua_access.py servers`, all of it is signed and encrypted: the
+server has the pair `--pair`, and registers with `--registers-with`."""
 
 import argparse
 import asyncio
+import pathlib
 
 from asyncua import Client, Server, ua, uamethod
 
 import lifetime
+import opcua_session
 
 
 @uamethod
@@ -34,9 +37,18 @@ async def register(args):
     server.ServerType = ua.ApplicationType.Server
     server.ServerNames = [ua.LocalizedText(args.name)]
     server.IsOnline = True
-    client = Client(args.lds, timeout=2)
     while True:
+        client = Client(args.lds, timeout=2)
+        client.application_uri = args.uri
         try:
+            if args.pairs:
+                pair = pathlib.Path(args.pairs) / args.registers_with
+                await client.set_security(
+                    opcua_session.POLICIES["Basic256Sha256"],
+                    certificate=f"{pair}_certificate.der",
+                    private_key=f"{pair}_key.pem",
+                    mode=ua.MessageSecurityMode.SignAndEncrypt,
+                )
             await client.connect_sessionless()
             await client.uaclient.register_server(server)
             break
@@ -51,7 +63,10 @@ async def run(args):
     await server.set_application_uri(args.uri)
     server.name = args.name
     server.set_endpoint(args.endpoint)
-    server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
+    if args.pairs:
+        await opcua_session.secure(server, args.pairs, "Basic256Sha256", args.pair, args.uri)
+    else:
+        server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
     space = await server.register_namespace(args.uri)
     device = await server.nodes.objects.add_object(space, "device")
     double, text = ua.ObjectIds.Double, ua.ObjectIds.String
@@ -71,6 +86,9 @@ def main():
     parser.add_argument("lds")
     parser.add_argument("name")
     parser.add_argument("uri")
+    parser.add_argument("--pairs")
+    parser.add_argument("--pair", default="sound")
+    parser.add_argument("--registers-with", default="sound")
     parser.add_argument("--limit", type=float, default=120.0)
     args = parser.parse_args()
     lifetime.bound(args.limit)

@@ -6,6 +6,7 @@ import asyncio
 from asyncua import ua
 
 import lifetime
+import opcua_access
 import opcua_session
 
 
@@ -82,11 +83,14 @@ async def session(client, args):
 
 
 async def run(args):
+    refusals = opcua_access.Refusals()
     try:
         client = await opcua_session.client_of(args)
         await client.connect_sessionless()
     except (ua.UaError, OSError, asyncio.TimeoutError) as error:
-        lifetime.say(**described(error))
+        # What ends the connection is told nobody else.
+        said = described(error)
+        lifetime.say(**said | {"status": refusals.last or said["status"]})
         return
     try:
         await {"find": find, "find-servers": find, "register": register, "session": session}[args.what](client, args)

@@ -52,7 +52,7 @@ async def run(args):
     await server.init()
     server.set_endpoint(args.endpoint)
     if args.only:
-        await opcua_session.secure(server, args.pairs, args.only)
+        await opcua_session.secure(server, args.pairs, args.only, args.pair, args.uri)
     else:
         server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
     if args.user:
@@ -87,6 +87,8 @@ def main():
     parser.add_argument("--user", nargs=2)
     parser.add_argument("--only", choices=list(opcua_session.POLICIES))
     parser.add_argument("--pairs")
+    parser.add_argument("--uri", default=URI, help="the ApplicationUri it says it has")
+    parser.add_argument("--pair", default="server", help="which of them it has")
     parser.add_argument("--limit", type=float, default=120.0)
     args = parser.parse_args()
     lifetime.bound(args.limit)

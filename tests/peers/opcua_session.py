@@ -75,13 +75,13 @@ async def client_of(args):
     return client
 
 
-async def secure(server, folder, only=None):
-    """Has a server offer no security and each policy we know, or one policy only, with the pair of `opcua_access.py pairs` in
+async def secure(server, folder, only=None, pair="server", uri=SERVER_URI):
+    """Has a server offer no security and each policy we know, or one policy only, with a pair that `opcua_access.py` made in
     the folder."""
     folder = pathlib.Path(folder)
-    await server.load_certificate(str(folder / "server_certificate.der"))
-    await server.load_private_key(str(folder / "server_key.pem"))
-    await server.set_application_uri(SERVER_URI)
+    await server.load_certificate(str(folder / f"{pair}_certificate.der"))
+    await server.load_private_key(str(folder / f"{pair}_key.pem"))
+    await server.set_application_uri(uri)
     offered = [only] if only else ["None", *POLICIES]
     types = ua.SecurityPolicyType
     named = {name: types[f"{name.replace('_', '')}_SignAndEncrypt"] for name in POLICIES}

@@ -251,8 +251,11 @@ fn a_secured_channel_is_for_whom_it_trusts_who_registers_only_itself() {
     let itself = "urn:ua-bridge:system-tests:client";
     let mut strict = lds(&["--pki", ours]);
     assert_ne!(register(itself), "Good");
-    let refused = strict.wait_for_line("its certificate is not trusted", SOON);
-    assert!(refused.contains("lds-pki/trusted"), "{refused}");
+    let refused = strict.wait_for_line("a client is not talked to", SOON);
+    let told = ["BadCertificateUntrusted", "`ua-server trust", "lds-pki"];
+    assert!(told.iter().all(|one| refused.contains(one)), "{refused}");
+    let counters = metrics(STATUS).unwrap()["counters"].clone();
+    assert_eq!(number(&counters, "certificates_refused_total"), 1);
     assert_eq!(
         number(&metrics(STATUS).unwrap()["counters"], "questions_total"),
         1,
@@ -267,6 +270,54 @@ fn a_secured_channel_is_for_whom_it_trusts_who_registers_only_itself() {
     assert_eq!(register(itself), "Good");
     assert!(registered(itself).is_some());
     assert_eq!(register("urn:asyncua:another"), "BadServerUriInvalid");
+}
+
+#[test]
+fn who_registers_is_known_by_its_authority_until_its_certificate_is_revoked() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let [ours, issued] = ["lds-pki", "issued"].map(|name| cell.folder().join(name));
+    let _made = cell.asyncua_once("opcua_access.py", &["issued", issued.to_str().unwrap()]);
+    let greeter = Greeter::start();
+    let register = |name: &str| {
+        // The script takes the pair that is called so.
+        let theirs = cell.folder().join(name);
+        std::fs::create_dir_all(&theirs).unwrap();
+        for file in ["certificate.der", "key.pem"] {
+            let (from, to) = (format!("{name}_{file}"), format!("client_{file}"));
+            std::fs::copy(issued.join(from), theirs.join(to)).unwrap();
+        }
+        let secured = ["--security", "Basic256Sha256", "--certificates"];
+        let own = ["--uri", "urn:ua-bridge:system-tests:client"];
+        let what = ["register", LDS, "--url", greeter.url()];
+        let all = [&what[..], &own, &secured, &[theirs.to_str().unwrap()]].concat();
+        cell.asyncua_once("opcua_discovery.py", &all).remove(0)["status"].clone()
+    };
+    let trust = |file: &str| {
+        let told = std::process::Command::new(program("ua-server"))
+            .arg("trust")
+            .args([&issued.join(file)])
+            .arg("--pki")
+            .arg(&ours)
+            .output()
+            .unwrap();
+        assert!(told.status.success(), "{told:?}");
+    };
+    let mut strict = lds(&["--pki", ours.to_str().unwrap()]);
+    trust("plant.der");
+    assert_eq!(register("client"), "BadCertificateRevocationUnknown");
+    strict.wait_for_line("ua-server trust FILE.crl", SOON);
+    trust("plant.crl");
+    assert_eq!(register("client"), "Good");
+    assert!(registered("urn:ua-bridge:system-tests:client").is_some());
+    assert_eq!(register("gone"), "BadCertificateRevoked");
+    // A stranger is not told which of the checks it was.
+    assert_eq!(register("stranger"), "BadSecurityChecksFailed");
+    trust("plant-now.crl");
+    assert_eq!(register("client"), "BadCertificateRevoked");
+    let counters = metrics(STATUS).unwrap()["counters"].clone();
+    assert_eq!(number(&counters, "certificates_refused_total"), 4);
 }
 
 #[test]

@@ -506,7 +506,7 @@ async fn look(of: Foreign, tell: mpsc::Sender<News>) {
                     }
                 }
             }
-            Link::Down { reason } => told.take().map(|_| Change::Gone(reason)),
+            Link::Down { reason, .. } => told.take().map(|_| Change::Gone(reason)),
             Link::Connecting | Link::Closed => None,
         };
         if let Some(what) = what {

@@ -314,22 +314,24 @@ async fn way(url: &str, pki: &Path) -> Result<Option<Way>, AskFault> {
         return Ok(None);
     };
     let server = best.server_certificate.clone();
-    if security.trusts(server.as_ref()) {
-        let mode = best.security_mode;
-        return Ok(Some(Way {
-            security,
-            server,
-            mode,
-        }));
-    }
+    let refused = match security.trusts(server.as_ref(), best.server.application_uri.as_ref()) {
+        Ok(()) => {
+            let mode = best.security_mode;
+            return Ok(Some(Way {
+                security,
+                server,
+                mode,
+            }));
+        }
+        Err(refused) => refused,
+    };
     let ip = Url::parse(url).and_then(|url| url.ip());
-    if ip.is_some_and(|ip| ip.to_canonical().is_loopback()) {
-        return Ok(None);
+    let is_here = ip.is_some_and(|ip| ip.to_canonical().is_loopback());
+    // What somebody has decided on stays decided here too.
+    match is_here && !refused.may_be_told {
+        true => Ok(None),
+        false => Err(AskFault::Certificate(refused.to_string())),
     }
-    Err(AskFault::Certificate(format!(
-        "its certificate is not trusted; to trust it, move it from rejected into {}",
-        security.trusted().display()
-    )))
 }
 
 /// Registers a server, or takes its registration back: RegisterServer2, and RegisterServer where that is not known. Over

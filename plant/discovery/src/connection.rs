@@ -51,6 +51,7 @@ pub(crate) struct Shared {
 pub(crate) struct Counters {
     pub(crate) connections: AtomicU64,
     pub(crate) refused_connections: AtomicU64,
+    pub(crate) refused_certificates: AtomicU64,
     pub(crate) questions: AtomicU64,
     pub(crate) unsupported: AtomicU64,
     pub(crate) malformed: AtomicU64,
@@ -247,9 +248,26 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
             return Ok(services::fault(&request, StatusCode::BadServiceUnsupported));
         };
         count(&self.shared.counters.questions);
+        if let Err(status) = self.stays(&question) {
+            count(&self.shared.counters.refused_certificates);
+            return Ok(services::fault(&request, status));
+        }
         let channel = self.channel(&question);
         let answer = self.shared.answer(question, channel).await;
         Ok(services::response(&request, answer, &self.own()))
+    }
+
+    /// Whether who registers is still one to be trusted: its certificate may have been revoked since the channel was opened.
+    fn stays(&self, question: &Question) -> Result<(), StatusCode> {
+        let channel = &self.conversation.channel;
+        let is_secured = channel.security_mode() != MessageSecurityMode::None;
+        let certificate = channel.remote_cert().filter(|_| is_secured);
+        match (certificate, question, &self.shared.security) {
+            (Some(certificate), Question::Register { .. }, Some(security)) => {
+                security.admit(certificate.as_byte_string().as_ref())
+            }
+            _ => Ok(()),
+        }
     }
 
     /// How the question came.
@@ -359,7 +377,10 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
 fn admit(header: &AsymmetricSecurityHeader, shared: &Shared) -> Result<(), StatusCode> {
     match (policy(header), &shared.security) {
         (Some(SecurityPolicy::None), _) => Ok(()),
-        (Some(_), Some(security)) => security.admit(header.sender_certificate.as_ref()),
+        (Some(_), Some(security)) => {
+            let admitted = security.admit(header.sender_certificate.as_ref());
+            admitted.inspect_err(|_| count(&shared.counters.refused_certificates))
+        }
         _ => Err(StatusCode::BadSecurityPolicyRejected),
     }
 }

@@ -495,6 +495,7 @@ impl Lds {
         let Counters {
             connections,
             refused_connections,
+            refused_certificates,
             questions,
             unsupported,
             malformed,
@@ -503,6 +504,7 @@ impl Lds {
         BTreeMap::from([
             ("connections_total", get(connections)),
             ("connections_gave_way_total", get(refused_connections)),
+            ("certificates_refused_total", get(refused_certificates)),
             ("questions_total", get(questions)),
             ("unsupported_total", get(unsupported)),
             ("malformed_total", get(malformed)),

@@ -4,9 +4,11 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use bridge_node::{Failure, FailureKind};
-use opcua::crypto::{CertificateStore, PrivateKey, SecurityPolicy, X509, X509Data};
+use opcua::crypto::{CertificateStore, PrivateKey, X509, X509Data};
 use opcua::types::StatusCode;
-use tracing::{debug, info, warn};
+use plant_opcua::judge::{Judge, Refused};
+use tracing::{info, warn};
+use trust::Names;
 use x509_cert::Certificate;
 use x509_cert::der::Decode as _;
 use x509_cert::ext::pkix::SubjectAltName;
@@ -17,8 +19,7 @@ use x509_cert::ext::pkix::name::GeneralName;
 pub(crate) struct Security {
     pub(crate) certificate: X509,
     pub(crate) key: PrivateKey,
-    trusted: PathBuf,
-    trust_any: bool,
+    judge: Judge,
 }
 
 impl Security {
@@ -58,8 +59,7 @@ impl Security {
             certificate: CertificateStore::read_cert(&certificate)
                 .map_err(|error| failed(&error))?,
             key: CertificateStore::read_pkey(&key).map_err(|error| failed(&error))?,
-            trusted: root.join("trusted"),
-            trust_any,
+            judge: Judge::of(root, trust_any),
         })
     }
 
@@ -70,78 +70,31 @@ impl Security {
         Ok(Self {
             certificate: CertificateStore::read_cert(&certificate).map_err(failed)?,
             key: CertificateStore::read_pkey(&key).map_err(failed)?,
-            trusted: root.join("trusted"),
-            trust_any: false,
+            judge: Judge::of(root, false),
         })
     }
 
-    /// Whether a server is whom this application trusts. The certificate of another is kept in `rejected`, for whoever
-    /// decides on it to move.
-    pub(crate) fn trusts(&self, der: &[u8]) -> bool {
-        if self.is_trusted(der) {
-            return true;
-        }
-        let thumbprint = X509::from_der(der).map(|certificate| certificate.thumbprint());
-        if let Ok(thumbprint) = thumbprint
-            && let Some(root) = self.trusted.parent()
-        {
-            let path = root
-                .join("rejected")
-                .join(format!("{}.der", thumbprint.as_hex_string()));
-            // There is nobody to tell but whoever looks there; what it is about is told by the caller.
-            if !path.exists()
-                && let Err(error) = fs::write(&path, der)
-            {
-                debug!(%error, path = %path.display(), "a certificate is not kept");
-            }
-        }
-        false
-    }
-
-    /// Where certificates of others are put to be trusted.
-    pub(crate) fn trusted(&self) -> &Path {
-        &self.trusted
-    }
-
-    /// Whether a channel may be opened with this certificate.
-    pub(crate) fn admit(&self, der: &[u8]) -> Result<(), StatusCode> {
-        let certificate = X509::from_der(der).map_err(|_| StatusCode::BadCertificateInvalid)?;
-        let now = opcua::types::DateTime::now().as_chrono();
-        let length = certificate
-            .key_length()
-            .map_err(|_| StatusCode::BadCertificateInvalid)?;
-        if !SecurityPolicy::Basic256Sha256.is_valid_keylength(length) {
-            return Err(StatusCode::BadCertificatePolicyCheckFailed);
-        }
-        certificate
-            .is_time_valid(&now)
-            .map_err(|error| error.status())?;
-        if self.trust_any || self.is_trusted(der) {
-            return Ok(());
-        }
-        warn!(
-            thumbprint = certificate.thumbprint().as_hex_string(),
-            "a client was refused because its certificate is not trusted; to trust it, put it into {}",
-            self.trusted.display()
-        );
-        // Not which of the checks it was (OPC 10000-4, 6.1.3).
-        Err(StatusCode::BadSecurityChecksFailed)
-    }
-
-    fn is_trusted(&self, der: &[u8]) -> bool {
-        let files = fs::read_dir(&self.trusted)
-            .into_iter()
-            .flatten()
-            .take(MOST_TRUSTED);
-        let mut files = files.filter_map(Result::ok);
-        let same = |file: fs::DirEntry| match fs::read(file.path()) {
-            Ok(bytes) => bytes == der,
-            Err(error) => {
-                debug!(%error, file = %file.path().display(), "not a certificate");
-                false
-            }
+    /// Judges the certificate of a server that says it is that application. One that nobody has decided on is kept in `rejected`,
+    /// for whoever does. Which host it is reached at is left open: what it is told there is no secret.
+    pub(crate) fn trusts(&self, der: &[u8], application_uri: &str) -> Result<(), Refused> {
+        let names = Names {
+            host: None,
+            application_uri: Some(application_uri),
         };
-        files.any(same)
+        self.judge.take(der, names).map(drop)
+    }
+
+    /// Whether a channel may be opened with this certificate, or may stay.
+    pub(crate) fn admit(&self, der: &[u8]) -> Result<(), StatusCode> {
+        let Err(refused) = self.judge.take(der, Names::default()) else {
+            return Ok(());
+        };
+        warn!("a client is not talked to: {refused}");
+        // Not which of the checks it was (OPC 10000-4, 6.1.3).
+        match refused.may_be_told {
+            true => Err(refused.status),
+            false => Err(StatusCode::BadSecurityChecksFailed),
+        }
     }
 }
 
@@ -193,6 +146,5 @@ fn owner_only(path: &Path) -> std::io::Result<()> {
     fs::set_permissions(path, fs::Permissions::from_mode(0o700))
 }
 
-const MOST_TRUSTED: usize = 1000;
 /// Five years, as other stacks make them.
 const CERTIFICATE_DAYS: u32 = 1826;

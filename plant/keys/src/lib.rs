@@ -1,10 +1,10 @@
 //! Keys of secured groups, fetched from a Security Key Service (OPC 10000-14, 8.3.2) for the programs of the space.
 //!
 //! Each fetch is a session of its own, signed and encrypted, in a thread of its own: what it costs to sign is more than a
-//! value should wait. The certificate of the service is trusted as that of any server is, by its file in `trusted`.
+//! value should wait. The certificate of the service is trusted as that of any server is: itself, or the authority that issued it.
 
 use std::fmt;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
@@ -140,8 +140,6 @@ fn serve(identity: &Identity, mut requests: mpsc::Receiver<Asked>) {
 
 /// The keys from a service, in a session that is made for it and closed again.
 async fn fetch(identity: &Identity, request: &KeyRequest) -> Result<Fetched, String> {
-    pki::know_trusted(&identity.pki);
-    let before = rejected(&identity.pki);
     let config = ClientConfig {
         pki: Some(identity.pki.clone()),
         security: SecurityChoice::Basic256Sha256,
@@ -171,19 +169,7 @@ async fn fetch(identity: &Identity, request: &KeyRequest) -> Result<Fetched, Str
     };
     let fetched = asked.await;
     client.close().await;
-    fetched.map_err(|why| {
-        // A certificate that came to `rejected` meanwhile is that of the service, and one that is there already may be.
-        let now = rejected(&identity.pki);
-        let new = now.iter().rfind(|path| !before.contains(path));
-        let refused = UNTRUSTED.iter().any(|status| why.contains(status));
-        match new.or_else(|| now.last().filter(|_| refused)) {
-            Some(path) => format!(
-                "{why}; its certificate is not trusted: to trust it, move {path:?} into {:?}",
-                identity.pki.join("trusted")
-            ),
-            None => format!("{why} (as {})", identity.application_uri),
-        }
-    })
+    fetched.map_err(|why| format!("{why} (as {})", identity.application_uri))
 }
 
 /// Why the service gives no keys, for people.
@@ -237,22 +223,6 @@ fn duration(milliseconds: f64) -> Option<Duration> {
     Duration::try_from_secs_f64(bounded / 1e3).ok()
 }
 
-/// The certificates of servers that were refused, the newest last.
-fn rejected(pki: &Path) -> Vec<PathBuf> {
-    let Ok(entries) = std::fs::read_dir(pki.join("rejected")) else {
-        return Vec::new();
-    };
-    let of = |entry: std::fs::DirEntry| {
-        let modified = entry.metadata().ok()?.modified().ok()?;
-        Some((modified, entry.path()))
-    };
-    let mut found: Vec<_> = entries.flatten().filter_map(of).collect();
-    found.sort();
-    found.into_iter().map(|(_, path)| path).collect()
-}
-
-/// What a client says of a server that it does not trust.
-const UNTRUSTED: [&str; 2] = ["BadSecurityChecksFailed", "BadCertificateUntrusted"];
 /// Requests that wait.
 const WAITING: usize = 64;
 /// How long the service may take for each answer.

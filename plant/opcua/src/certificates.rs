@@ -188,6 +188,36 @@ fn remove<'s>(gone: impl Iterator<Item = &'s Stored>) -> Result<(), StoreFault> 
     Ok(())
 }
 
+/// Keeps a certificate that was refused, for whoever decides on it. Of many the oldest give way: anybody can have one kept.
+///
+/// # Errors
+/// It cannot be read by the library, or the store cannot be written.
+pub fn keep_refused(root: &Path, certificate: &trust::Certificate) -> Result<Stored, StoreFault> {
+    let folder = root.join(Standing::Rejected.name());
+    let of_library =
+        X509::from_der(certificate.der()).map_err(|error| StoreFault::Certificate {
+            path: folder.clone(),
+            why: error.to_string(),
+        })?;
+    let path = folder.join(CertificateStore::cert_file_name(&of_library));
+    if let Some(there) = stored(&path, Standing::Rejected) {
+        return Ok(there);
+    }
+    let entries = fs::read_dir(&folder).into_iter().flatten().flatten();
+    let mut all: Vec<_> = entries
+        .filter_map(|entry| Some((entry.metadata().ok()?.modified().ok()?, entry.path())))
+        .collect();
+    all.sort();
+    let room = REJECTED_KEPT.saturating_sub(1);
+    for (_, oldest) in all.iter().take(all.len().saturating_sub(room)) {
+        fs::remove_file(oldest).map_err(|source| StoreFault::Io {
+            path: oldest.clone(),
+            source,
+        })?;
+    }
+    keep(root, &of_library, Standing::Rejected)
+}
+
 /// Puts a certificate where the library looks for it.
 fn keep(root: &Path, certificate: &X509, standing: Standing) -> Result<Stored, StoreFault> {
     let folder = root.join(standing.name());
@@ -289,6 +319,8 @@ pub fn application_uri(certificate: &X509) -> Option<String> {
 pub(crate) const OWN: &str = "own/cert.der";
 /// Digits of a thumbprint that tell a certificate.
 const FEWEST_DIGITS: usize = 4;
+/// How many certificates that were refused are kept.
+pub(crate) const REJECTED_KEPT: usize = 100;
 const LARGEST_CERTIFICATE: u64 = 64 << 10;
 /// Files of a folder that are looked at.
 const MOST_LISTED: usize = 10_000;

@@ -27,6 +27,8 @@ use tokio::time::timeout;
 use tracing::{debug, info, warn};
 use trust::{Certificate, Fault, Known};
 
+use crate::certificates;
+use crate::judge::{self, Shown};
 use crate::known::{self, Stamp};
 use crate::pki::{OWN_CERTIFICATE, OWN_KEY};
 
@@ -246,7 +248,9 @@ impl Shared {
             let unknown = matches!(fault, Fault::Untrusted | Fault::Incomplete);
             if unknown {
                 // Told from there, with what is to be typed.
-                self.keep_refused(&file, certificate);
+                if let Err(error) = certificates::keep_refused(&self.root, certificate) {
+                    warn!(%error, "a refused certificate is not kept");
+                }
             } else {
                 tell(certificate, fault, peer, "is refused");
             }
@@ -275,15 +279,6 @@ impl Shared {
         *count += 1;
         Ok(Admitted { shared: self, path })
     }
-
-    fn keep_refused(&self, file: &str, certificate: &Certificate) {
-        let path = self.root.join("rejected").join(file);
-        if !path.exists()
-            && let Err(error) = fs::write(&path, certificate.der())
-        {
-            warn!(path = %path.display(), %error, "a refused certificate is not kept");
-        }
-    }
 }
 
 /// Trusted by the library until it is dropped.
@@ -308,24 +303,8 @@ impl Drop for Admitted<'_> {
     }
 }
 
-/// A certificate, and those sent along with it.
-type Shown = (Certificate, Vec<Certificate>);
-
 fn tell(certificate: &Certificate, fault: Fault, peer: SocketAddr, what: &str) {
-    let help = match fault {
-        Fault::Revoked | Fault::IssuerRevoked => "it needs another certificate",
-        Fault::RevocationUnknown | Fault::IssuerRevocationUnknown => {
-            "take up the authority's list: `ua-server trust FILE.crl`"
-        }
-        Fault::Time => "it is to be issued anew, or one of the clocks is wrong",
-        Fault::IssuerTime => "the authority needs a new certificate",
-        Fault::Invalid
-        | Fault::Incomplete
-        | Fault::Policy
-        | Fault::Untrusted
-        | Fault::Use
-        | Fault::IssuerUse => "it needs another certificate, as OPC 10000-6, 6.2.2 has it",
-    };
+    let help = judge::help(fault);
     warn!(
         name = ?certificate.name(), issuer = ?certificate.issuer_name(), serial = %certificate.serial(), %peer,
         "a client {what}: {fault}; {help}"

@@ -51,6 +51,12 @@ impl EndpointUrl {
         &self.path
     }
 
+    /// The host as it is written: a name, or an address, without brackets.
+    #[must_use]
+    pub fn host(&self) -> &str {
+        self.host.trim_matches(['[', ']'])
+    }
+
     /// Host and port, as they are connected to.
     #[must_use]
     pub fn authority(&self) -> String {

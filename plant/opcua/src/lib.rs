@@ -1,7 +1,7 @@
 //! OPC UA for the programs of the plant: servers whose address space is made of NodeSets and of instances of their
 //! types, and clients that come back by themselves. It knows no skills, no discovery, no space and no ROS.
 //!
-//! Reading order: `limits` (the bounds of both sides), `endpoint`, `pki`, `certificates`, `known` and `door` (how clients get
+//! Reading order: `limits` (the bounds of both sides), `endpoint`, `pki`, `certificates`, `known`, `judge` and `door` (who gets
 //! in), `nodeset` (types from files), `users`, `audit` and `changes`, `server` and `client`, `file`, `trust_file` and `configuration` (a
 //! server's certificates as clients manage them).
 
@@ -13,6 +13,7 @@ pub mod configuration;
 pub mod door;
 pub mod endpoint;
 pub mod file;
+pub mod judge;
 pub mod known;
 pub mod limits;
 pub mod nodeset;

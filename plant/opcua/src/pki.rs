@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use opcua::crypto::{CertificateStore, X509Data};
 use tracing::{info, warn};
 
-use crate::certificates::{self, Standing};
+use crate::certificates::{self, REJECTED_KEPT, Standing};
 
 /// The directories of an OPC UA certificate store: `own`, `private`, `trusted` and `rejected` under one root.
 #[derive(Debug)]
@@ -291,8 +291,6 @@ pub const OWN_KEY: &str = "private/private.pem";
 const LOCK: &str = "private/lock";
 /// Five years, as other stacks make them: clients trust this very file, so a new one is work for people.
 const CERTIFICATE_DAYS: u32 = 1826;
-/// How many refused client certificates are kept.
-const REJECTED_KEPT: usize = 100;
 
 #[cfg(test)]
 mod tests {

@@ -144,7 +144,7 @@ async fn a_server_that_says_nothing_more_is_taken_for_down() {
     let client = Client::open(config, &url);
     until(&client, is_up).await;
     cut.send_replace(true);
-    let Link::Down { reason } = until(&client, is_down).await else {
+    let Link::Down { reason, .. } = until(&client, is_down).await else {
         panic!()
     };
     assert!(reason.contains("does not answer"), "{reason}");
@@ -200,7 +200,7 @@ async fn a_client_with_certificates_has_the_best_security_there_is() {
     config.pki = Some(client_pki.clone());
     config.backoff = (Duration::from_millis(20), Duration::from_millis(100));
     let strict = Client::open(config.clone(), cell.server.url());
-    let is_refused = |link: &Link| matches!(link, Link::Down { reason } if !reason.is_empty());
+    let is_refused = |link: &Link| matches!(link, Link::Down { reason, .. } if !reason.is_empty());
     until(&strict, is_refused).await;
     strict.close().await;
     config.accept_untrusted = true;

@@ -146,7 +146,7 @@ impl SkillClient {
             .wait_for(|link| matches!(link, Link::Down { .. } | Link::Closed))
             .await;
         match down.as_deref() {
-            Ok(Link::Down { reason }) => reason.clone(),
+            Ok(Link::Down { reason, .. }) => reason.clone(),
             Ok(_) | Err(_) => "the connection is closed".to_owned(),
         }
     }

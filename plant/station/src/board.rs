@@ -30,6 +30,8 @@ pub(crate) struct Peer {
     pub(crate) fault: Option<String>,
     /// Whether its certificate has been checked.
     pub(crate) secured: bool,
+    /// How often its certificate was refused, each attempt to connect counted.
+    pub(crate) certificates_refused: u64,
     pub(crate) methods: usize,
     pub(crate) methods_kept_back: usize,
     /// The place it was told.

@@ -72,7 +72,17 @@ impl Tending {
                     let fault = format!("it is {application_uri}, and said to be another");
                     self.fault(&url, "refused", fault);
                 }
-                Link::Down { reason } => self.fault(&url, "away", reason),
+                Link::Down {
+                    reason,
+                    certificate,
+                } => {
+                    let refused = client.certificates_refused();
+                    self.board.note(self.level, &url, |peer| {
+                        peer.certificates_refused = refused;
+                    });
+                    let state = certificate.map_or("away", |_| "refused");
+                    self.fault(&url, state, reason);
+                }
                 Link::Connecting => {}
                 Link::Closed => return,
             }

@@ -180,9 +180,12 @@ impl Certificate {
     #[must_use]
     pub fn is_for_host(&self, host: &str) -> bool {
         let host = host.trim_matches(['[', ']']).trim_end_matches('.');
+        // An address may be written in several ways.
+        let address = host.parse::<std::net::IpAddr>();
+        let host = address.map_or_else(|_| host.to_owned(), |address| address.to_string());
         self.hosts()
             .iter()
-            .any(|one| one.eq_ignore_ascii_case(host))
+            .any(|one| one.eq_ignore_ascii_case(&host))
     }
 
     /// The first moment and the last of its validity.

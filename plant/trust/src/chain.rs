@@ -52,6 +52,12 @@ pub enum Fault {
     /// An authority above it is not valid now.
     #[error("the certificate of the authority is not valid now")]
     IssuerTime,
+    /// It is not for the host that the server is reached at.
+    #[error("the certificate is for other hosts than the one that the server is reached at")]
+    Host,
+    /// It names another application than the one it is shown for.
+    #[error("the certificate is of another ApplicationUri")]
+    Uri,
     /// It is for something else than OPC UA applications.
     #[error("the certificate is for another use")]
     Use,
@@ -83,6 +89,8 @@ impl Fault {
             Self::Untrusted => 0x801A_0000,
             Self::Time => 0x8014_0000,
             Self::IssuerTime => 0x8015_0000,
+            Self::Host => 0x8016_0000,
+            Self::Uri => 0x8017_0000,
             Self::Use => 0x8018_0000,
             Self::IssuerUse => 0x8019_0000,
             Self::RevocationUnknown => 0x801B_0000,
@@ -99,6 +107,15 @@ impl Fault {
     }
 }
 
+/// What a certificate has to say of who shows it, where that is known.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Names<'n> {
+    /// The host of the URL that a server is reached at: a name, or an address.
+    pub host: Option<&'n str>,
+    /// The ApplicationUri that it says it has.
+    pub application_uri: Option<&'n str>,
+}
+
 /// Judges the certificate of an application at that time, with the certificates `sent` along.
 ///
 /// One that is trusted itself needs no authority that is known; where its authority is known, it counts whether that has revoked it.
@@ -110,6 +127,19 @@ pub fn check(
     sent: &[Certificate],
     known: &Known,
     now: Duration,
+) -> Result<(), Fault> {
+    check_named(certificate, sent, known, (Names::default(), now))
+}
+
+/// The same of a certificate that is to have these names, as that of a server that a client connects to.
+///
+/// # Errors
+/// The first thing that is wrong with it.
+pub fn check_named(
+    certificate: &Certificate,
+    sent: &[Certificate],
+    known: &Known,
+    (names, now): (Names<'_>, Duration),
 ) -> Result<(), Fault> {
     let chain = chain(certificate, sent, known)?;
     let is_strong = |one: &&Certificate| {
@@ -127,6 +157,16 @@ pub fn check(
     }
     if !issuers.iter().all(|one| one.is_valid_at(now)) {
         return Err(Fault::IssuerTime);
+    }
+    if names
+        .host
+        .is_some_and(|host| !certificate.is_for_host(host))
+    {
+        return Err(Fault::Host);
+    }
+    let uri = names.application_uri;
+    if uri.is_some() && certificate.application_uri().as_deref() != uri {
+        return Err(Fault::Uri);
     }
     used(certificate, issuers)?;
     revoked(&chain, known, now)

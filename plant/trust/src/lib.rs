@@ -16,7 +16,7 @@ mod request;
 
 pub use authority::{Authority, Issue};
 pub use certificate::{Certificate, Serial};
-pub use chain::{Fault, Known, check};
+pub use chain::{Fault, Known, Names, check, check_named};
 pub use crl::{Crl, Revoked};
 pub use renewal::{Renewal, Step};
 pub use request::Request;

@@ -8,8 +8,8 @@
 use std::time::Duration;
 
 use trust::{
-    Authority, Certificate, Crl, Fault, Issue, Known, Renewal, Request, Revoked, Serial, Step,
-    Unfit, check,
+    Authority, Certificate, Crl, Fault, Issue, Known, Names, Renewal, Request, Revoked, Serial, Step,
+    Unfit, check, check_named,
 };
 use x509_cert::der::pem;
 
@@ -163,6 +163,30 @@ fn each_fault_has_its_status() {
             && !Fault::Untrusted.may_be_told()
             && !Fault::Invalid.may_be_told()
     );
+}
+
+#[test]
+fn the_certificate_of_a_server_is_for_its_host_and_of_its_application() {
+    let Cell { device, known, .. } = cell();
+    let named = |host, application_uri, now| {
+        let names = Names {
+            host,
+            application_uri,
+        };
+        check_named(&device, &[], &known, (names, now))
+    };
+    let (host, uri) = (Some("cell-1"), Some("urn:cell:robot"));
+    assert_eq!(named(host, uri, NOW), Ok(()));
+    assert_eq!(named(Some("[0:0::1]"), None, NOW), Ok(()));
+    assert_eq!(named(Some("cell-2"), uri, NOW), Err(Fault::Host));
+    assert_eq!(named(host, Some("urn:cell:other"), NOW), Err(Fault::Uri));
+    // The earlier step tells.
+    assert_eq!(
+        named(Some("cell-2"), uri, NOW + DAY * 2),
+        Err(Fault::Time)
+    );
+    assert_eq!(Fault::Host.status(), 0x8016_0000);
+    assert_eq!(Fault::Uri.status(), 0x8017_0000);
 }
 
 #[test]

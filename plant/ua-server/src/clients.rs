@@ -57,6 +57,12 @@ impl Clients {
         open.map(|client| client.link().borrow().clone())
     }
 
+    /// How often the certificate of a server was refused.
+    pub(crate) fn refused(&self, access: &Access) -> u64 {
+        let open = self.open.get(access);
+        open.map_or(0, Client::certificates_refused)
+    }
+
     /// Lets go of the sessions that nobody has a use for: neither the mapping nor these.
     pub(crate) fn keep<'s>(
         &mut self,

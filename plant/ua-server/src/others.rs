@@ -138,6 +138,7 @@ impl Others {
         let told = LinkState {
             name: placed.name.clone(),
             url: placed.access.endpoint.to_string(),
+            certificates_refused: self.clients.refused(&placed.access),
             ..LinkState::default()
         };
         match self.clients.link(&placed.access) {
@@ -149,7 +150,7 @@ impl Others {
                 connects,
                 ..told
             },
-            Some(Link::Down { reason }) => LinkState {
+            Some(Link::Down { reason, .. }) => LinkState {
                 why: Some(reason),
                 ..told
             },

@@ -298,3 +298,168 @@ fn a_device_calls_a_device_of_another_workstation_and_no_level_sees_another() {
         (answer["status"] == "BadNodeIdUnknown" || answer.get("missing").is_some()).then_some(())
     });
 }
+
+/// Trusts a certificate, or takes up a revocation list, in a store.
+fn trust(cell: &Cell, store: &str, what: &str) {
+    let told = std::process::Command::new(program("ua-server"))
+        .args(["trust", what, "--pki"])
+        .arg(cell.folder().join(store))
+        .output()
+        .unwrap();
+    assert!(told.status.success(), "{told:?}");
+}
+
+/// A gripper of ours over secured channels alone, with a store of its own.
+fn secured_gripper(cell: &Cell, site: &Site) -> Child {
+    let example = std::path::Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("../examples/plant/parallel-gripper.yaml");
+    let text = std::fs::read_to_string(example).unwrap();
+    assert!(text.contains("security: [None]"), "{text}");
+    let text = text.replace("security: [None]", "security: [Basic256Sha256]");
+    let file = cell.file("parallel-gripper.yaml", &text);
+    let endpoint = format!("opc.tcp://{}.21:0", INSIDE[0]);
+    Started::new("ua-component", &program("ua-component"))
+        .args([&file])
+        .args(["--endpoint", &endpoint, "--lds", "any"])
+        .args(["--interface", "dev0", "--pki"])
+        .args([&cell.folder().join("gripper-pki")])
+        .at(site)
+        .start()
+}
+
+/// A workstation that talks over secured channels alone, and hosts above and below it.
+struct Guarded {
+    _networks: [Segment; 2],
+    station: Site,
+    above: Site,
+    devices: [Site; 2],
+    supervisor: Child,
+    /// The pairs of devices; it trusts the authority of most of them.
+    pairs: String,
+    /// Where methods are called from above.
+    top: String,
+}
+
+fn guarded(cell: &Cell) -> Guarded {
+    let (bus, inside) = (cell.segment(), cell.segment());
+    let [station, above, first, second] = [(); 4].map(|()| cell.site());
+    bus.plug(&above, "bus0", &format!("{BUS}.1"));
+    bus.plug(&station, "upper0", &format!("{BUS}.11"));
+    inside.plug(&station, "lower0", &format!("{}.1", INSIDE[0]));
+    inside.plug(&first, "dev0", &format!("{}.21", INSIDE[0]));
+    inside.plug(&second, "dev0", &format!("{}.22", INSIDE[0]));
+    let pairs = cell.folder().join("pairs").to_str().unwrap().to_owned();
+    let host = format!("{}.22", INSIDE[0]);
+    let _made = cell.asyncua_once("opcua_access.py", &["servers", &pairs, "--host", &host]);
+    for file in ["plant.der", "plant.crl"] {
+        trust(cell, "station-pki", &format!("{pairs}/{file}"));
+    }
+    let lds = format!("opc.tcp://{}.1:4840", INSIDE[0]);
+    let top = format!("opc.tcp://{BUS}.11:4870");
+    let supervisor = Started::new("station-a", &program("ua-station"))
+        .args(["--name", "station-a", "--place", "plant/cell-1"])
+        .args(["--endpoint", &lds, "--interface", "lower0"])
+        .args(["--upper-interface", "upper0", "--upper-endpoint", &top])
+        .args(["--metrics", STATUS, "--pki"])
+        .args([&cell.folder().join("station-pki")])
+        .at(&station)
+        .start();
+    eventually("the station answers", SOON, || status(&station));
+    Guarded {
+        _networks: [bus, inside],
+        station,
+        above,
+        devices: [first, second],
+        supervisor,
+        pairs,
+        top,
+    }
+}
+
+impl Guarded {
+    /// A device of asyncua with a pair, which registers with another or the same.
+    fn device(&self, cell: &Cell, name: &str, uri: &str, (pair, registers): (&str, &str)) -> Child {
+        let port = 4850 + name.len();
+        let endpoint = format!("opc.tcp://{}.22:{port}/", INSIDE[0]);
+        let lds = format!("opc.tcp://{}.1:4840", INSIDE[0]);
+        let named = [&*endpoint, &lds, name, uri];
+        let with = ["--pairs", &self.pairs, "--pair", pair];
+        let device = cell.asyncua_started("opcua_device.py", &[named, with].concat());
+        let device = device.args(["--registers-with", registers]);
+        device.at(&self.devices[1]).start()
+    }
+}
+
+#[test]
+fn over_secured_channels_a_device_is_configured_and_called_and_one_that_is_not_trusted_is_told_of() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let mut plant = guarded(&cell);
+    let uri = "urn:ua-bridge:system-tests:plc";
+    // A device of asyncua, whose certificate is of the authority.
+    let mut adder = plant.device(&cell, "adder", uri, ("sound", "sound"));
+    let told = adder.wait_for_json("its place", SOON * 3, |line| {
+        line["place"].is_string().then(|| line.clone())
+    });
+    assert_eq!(told["place"], "plant/cell-1/adder");
+    let shown = below(&plant.station, "adder").unwrap();
+    assert_eq!(shown["secured"], true, "{shown}");
+    // Its method is called from above over a secured channel.
+    let path = "Devices/adder/device/Add";
+    let args = [&*plant.top, path, "--value", "[2.5, 4.0]"];
+    let secured = ["--security", "Basic256Sha256", "--certificates", &plant.pairs];
+    let called = cell.asyncua_started("opcua_call.py", &[args, secured].concat());
+    let mut called = called.at(&plant.above).start();
+    assert!(called.wait_for_end(SOON * 3).success());
+    let sum = called.json_lines().pop().unwrap();
+    assert_eq!(
+        sum,
+        json!({"status": "Good", "arguments": [], "value": [6.5]})
+    );
+    // One that registers with a certificate that is trusted, and shows another.
+    let another = format!("{uri}:another");
+    let mut stranger = plant.device(&cell, "stranger", &another, ("stranger", "impostor"));
+    let refused = eventually("the stranger is refused", SOON * 3, || {
+        let shown = below(&plant.station, "stranger")?;
+        (shown["state"] == "refused").then_some(shown)
+    });
+    let why = refused["fault"].as_str().unwrap();
+    assert!(why.contains("BadCertificateChainIncomplete"), "{why}");
+    assert!(refused["certificates_refused"].as_u64() > Some(0));
+    assert!(refused.get("place").is_none(), "{refused}");
+    let line = "BadCertificateChainIncomplete";
+    plant.supervisor.wait_for_line(line, SOON);
+    let lines = stranger.json_lines();
+    assert!(lines.iter().all(|line| line.get("place").is_none()));
+    // What the station says is to be typed mends it.
+    let (_, command) = why.rsplit_once("`ua-server trust ").unwrap();
+    let (digits, _) = command.split_once(' ').unwrap();
+    trust(&cell, "station-pki", digits);
+    stranger.wait_for_json("its place", SOON * 3, |line| {
+        (line["place"] == "plant/cell-1/stranger").then_some(())
+    });
+}
+
+#[test]
+fn a_component_of_ours_is_configured_over_secured_channels_once_each_trusts_the_other() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let plant = guarded(&cell);
+    let [station, own] = ["station-pki", "gripper-pki"].map(|store| {
+        let file = cell.folder().join(store).join("own/cert.der");
+        file.to_str().unwrap().to_owned()
+    });
+    trust(&cell, "gripper-pki", &station);
+    let _gripper = secured_gripper(&cell, &plant.devices[0]);
+    eventually("the gripper has a certificate", SOON, || {
+        std::path::Path::new(&own).exists().then_some(())
+    });
+    trust(&cell, "station-pki", &own);
+    eventually("the gripper is configured", SOON * 4, || {
+        let shown = below(&plant.station, "parallel-gripper")?;
+        let place = "plant/cell-1/parallel-gripper";
+        (shown["secured"] == true && shown["place"] == place).then_some(())
+    });
+}

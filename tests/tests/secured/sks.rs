@@ -274,8 +274,12 @@ fn a_bridge_waits_for_a_service_that_starts_after_it_and_says_what_is_missing() 
 
     let _server = server(&cell, &mapping);
     // It trusts nobody it was not told to, and says how to tell it.
-    let untrusted = bridge.wait_for_line("its certificate is not trusted", SOON);
-    assert!(untrusted.contains("pki-ros1/rejected"), "{untrusted}");
+    let untrusted = bridge.wait_for_line("BadCertificateUntrusted", SOON);
+    let told = ["`ua-server trust", "pki-ros1"];
+    assert!(
+        told.iter().all(|one| untrusted.contains(one)),
+        "{untrusted}"
+    );
     self::store(&cell, "ros1");
     eventually("the bridge has keys", SOON, || token(METRICS_ROS1));
     bridge.wait_for_line("the Security Key Service answers again", SOON);

@@ -1,15 +1,18 @@
 //! A client that connects, watches over its connection, and comes back with all its subscriptions.
 //!
-//! Reading order: `supervisor` (the life of a connection), `subscription`, `types` (type closures), `connector`.
+//! Reading order: `supervisor` (the life of a connection), `shown` (whom the server proves to be), `subscription`, `types` (type
+//! closures), `connector`.
 
 mod connector;
 mod services;
+mod shown;
 mod subscription;
 mod supervisor;
 mod types;
 
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use opcua::types::StatusCode;
@@ -30,7 +33,7 @@ pub struct ClientConfig {
     pub application_name: String,
     /// The directory of certificates; without one nothing is secured.
     pub pki: Option<PathBuf>,
-    /// Trusts the certificate of any server, and keeps it as trusted. For tests and demonstrations only.
+    /// Trusts the certificate of any server that is sound otherwise. For tests and demonstrations only.
     pub accept_untrusted: bool,
     /// What it wants of what servers offer.
     pub security: SecurityChoice,
@@ -116,6 +119,8 @@ pub enum Link {
     Down {
         /// Why.
         reason: String,
+        /// The status, where the certificate of the server is refused.
+        certificate: Option<StatusCode>,
     },
     /// The client is closed.
     Closed,
@@ -206,6 +211,12 @@ impl Client {
     pub fn namespaces(&self) -> Vec<String> {
         let connected = self.shared.connected();
         connected.map_or_else(|_| Vec::new(), |one| one.namespaces.clone())
+    }
+
+    /// How often the certificate of the server was refused, each attempt to connect counted.
+    #[must_use]
+    pub fn certificates_refused(&self) -> u64 {
+        self.shared.refused.load(Ordering::Relaxed)
     }
 
     /// The index of a namespace at the server.

@@ -6,6 +6,7 @@ use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
 use std::pin::pin;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use futures_util::TryStreamExt as _;
@@ -20,9 +21,10 @@ use opcua::types::{
 use tokio::sync::{Notify, mpsc, oneshot, watch};
 use tokio::task::JoinHandle;
 use tokio::time::{Instant, sleep, timeout};
-use tracing::{debug, info};
+use tracing::{debug, info, warn};
 
 use super::connector::Direct;
+use super::shown::{Servers, Taken, Why};
 use super::subscription::Wanted;
 use super::{ClientConfig, ClientError, ClientUser, Link, SecurityChoice};
 use crate::limits;
@@ -39,6 +41,10 @@ pub(crate) struct Shared {
     /// Something else is wanted, or nothing more.
     pub(crate) changed: Notify,
     closing: watch::Sender<bool>,
+    /// How often the certificate of the server was refused.
+    pub(crate) refused: AtomicU64,
+    /// `None` without certificates.
+    servers: Option<Servers>,
 }
 
 /// A connection.
@@ -62,6 +68,8 @@ impl Drop for Connected {
 impl Shared {
     pub(crate) fn new(config: ClientConfig, url: &str) -> Self {
         Self {
+            servers: Servers::of(&config),
+            refused: AtomicU64::new(0),
             config,
             url: url.to_owned(),
             link: watch::Sender::new(Link::Connecting),
@@ -81,18 +89,26 @@ impl Shared {
         connected.ok_or_else(|| self.not_connected())
     }
 
-    fn down(&self, reason: String) {
-        let down = Link::Down { reason };
-        if self.link.send_replace(down.clone()) != down
-            && let Link::Down { reason } = down
-        {
-            info!(url = self.url, reason, "not connected");
+    fn down(&self, why: Why) {
+        let is_refused = why.certificate.is_some();
+        if is_refused {
+            self.refused.fetch_add(1, Ordering::Relaxed);
+        }
+        let down = Link::Down {
+            reason: why.reason.clone(),
+            certificate: why.certificate,
+        };
+        let is_new = self.link.send_replace(down.clone()) != down;
+        match (is_new, is_refused) {
+            (true, true) => warn!(url = self.url, reason = why.reason, "not connected"),
+            (true, false) => info!(url = self.url, reason = why.reason, "not connected"),
+            (false, _) => {}
         }
     }
 
     pub(crate) fn not_connected(&self) -> ClientError {
         let reason = match &*self.link.borrow() {
-            Link::Down { reason } => reason.clone(),
+            Link::Down { reason, .. } => reason.clone(),
             Link::Closed => "the client is closed".to_owned(),
             Link::Connecting | Link::Up { .. } => format!("{} has not answered yet", self.url),
         };
@@ -125,7 +141,7 @@ async fn live(shared: &Shared) {
     let client = match library_client(&shared.config) {
         Ok(client) => client,
         Err(reason) => {
-            shared.down(reason);
+            shared.down(reason.into());
             return std::future::pending().await;
         }
     };
@@ -133,14 +149,14 @@ async fn live(shared: &Shared) {
     let (first, longest) = shared.config.backoff;
     let mut wait = first;
     loop {
-        let reason = match connect(shared, &client, life.connects + 1).await {
+        let why = match connect(shared, &client, life.connects + 1).await {
             Ok(connection) => {
                 wait = first;
                 hold(shared, &mut life, connection).await
             }
-            Err(reason) => reason,
+            Err(why) => why,
         };
-        shared.down(reason);
+        shared.down(why);
         sleep(wait).await;
         wait = (wait * 2).min(longest);
     }
@@ -154,7 +170,7 @@ struct Life {
 }
 
 /// Has a connection until it is lost, and tells why.
-async fn hold(shared: &Shared, life: &mut Life, mut connection: Connection) -> String {
+async fn hold(shared: &Shared, life: &mut Life, mut connection: Connection) -> Why {
     life.connects += 1;
     let before = life.started.replace(connection.started);
     let restarted = before.is_some_and(|before| before != connection.started);
@@ -172,11 +188,11 @@ async fn hold(shared: &Shared, life: &mut Life, mut connection: Connection) -> S
         secured: endpoint.security_mode == MessageSecurityMode::SignAndEncrypt,
         application_uri: endpoint.server.application_uri.as_ref().to_owned(),
     });
-    let reason = watch_over(shared, &mut connection).await;
+    let why = watch_over(shared, &mut connection).await;
     *shared.connected.lock() = None;
     // Who waits for an answer is told at once.
     connection.connected.driving.abort();
-    reason
+    why
 }
 
 fn library_client(config: &ClientConfig) -> Result<opcua::client::Client, String> {
@@ -198,8 +214,6 @@ fn library_client(config: &ClientConfig) -> Result<opcua::client::Client, String
             .session_name(&config.application_name)
             .certificate_path(Path::new(OWN_CERTIFICATE))
             .private_key_path(Path::new(OWN_KEY))
-            .trust_server_certs(config.accept_untrusted)
-            .verify_server_certs(true)
             .pki_dir(&root)
             .session_retry_limit(0)
             .session_timeout(30_000)
@@ -228,6 +242,8 @@ fn library_client(config: &ClientConfig) -> Result<opcua::client::Client, String
 struct Connection {
     connected: Arc<Connected>,
     endpoint: EndpointDescription,
+    /// `None` where nothing is secured.
+    taken: Option<Taken>,
     started: DateTime,
     /// What happens in the loop of the library.
     activity: mpsc::Receiver<Activity>,
@@ -254,18 +270,26 @@ async fn connect(
     shared: &Shared,
     client: &opcua::client::Client,
     connects: u64,
-) -> Result<Connection, String> {
+) -> Result<Connection, Why> {
     let within = shared.config.timeout;
     let endpoint = timeout(within * 2, endpoint(shared, client))
         .await
         .map_err(|_| format!("{} does not tell its endpoints", shared.url))??;
+    let taken = match &shared.servers {
+        Some(servers) => servers.take(&endpoint)?,
+        None => None,
+    };
+    let store = match (&shared.servers, &taken) {
+        (Some(servers), Some(taken)) => servers.store(taken)?,
+        _ => Arc::clone(client.certificate_store()),
+    };
     let source = Direct::new(&shared.url, within);
     let (session, event_loop) = client
         .session_builder()
         .user_identity_token(identity(&shared.config))
         .with_connector(source)
         .connect_to_endpoint_directly(endpoint.clone())
-        .and_then(|builder| builder.build(Arc::clone(client.certificate_store())))
+        .and_then(|builder| builder.build(store))
         .map_err(|error| error.to_string())?;
     session.disable_reconnects();
     let (tell, mut activity) = mpsc::channel(64);
@@ -317,6 +341,7 @@ async fn connect(
             driving: driving.keep(),
         }),
         endpoint,
+        taken,
         started,
         activity,
         ended,
@@ -465,24 +490,27 @@ fn strings(value: DataValue) -> Option<Vec<String>> {
 }
 
 /// Makes the subscriptions, and returns with the reason when the connection is no good any more.
-async fn watch_over(shared: &Shared, connection: &mut Connection) -> String {
+async fn watch_over(shared: &Shared, connection: &mut Connection) -> Why {
     let mut missed = 0;
     let mut published = Instant::now();
     let mut look = tokio::time::interval(LOOK);
     look.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+    let mut judged = tokio::time::interval(JUDGED_EVERY);
+    judged.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
     loop {
         if let Err(reason) = super::subscription::renew(shared, &connection.connected).await {
-            return reason;
+            return reason.into();
         }
         tokio::select! {
             reason = &mut connection.ended => {
-                return reason.unwrap_or_else(|_| "the connection ended".to_owned());
+                let reason = reason.unwrap_or_else(|_| "the connection ended".to_owned());
+                return reason.into();
             }
             activity = connection.activity.recv() => match activity {
                 Some(Activity::Missed) => {
                     missed += 1;
                     if missed >= MOST_MISSED {
-                        return "the server does not answer".to_owned();
+                        return "the server does not answer".to_owned().into();
                     }
                 }
                 Some(Activity::KeptAlive | Activity::Connected) => missed = 0,
@@ -495,7 +523,14 @@ async fn watch_over(shared: &Shared, connection: &mut Connection) -> String {
                 if !subscribed {
                     published = Instant::now();
                 } else if published.elapsed() > LONGEST_SILENCE {
-                    return "the server is silent about its subscriptions".to_owned();
+                    return "the server is silent about its subscriptions".to_owned().into();
+                }
+            }
+            _ = judged.tick() => {
+                if let (Some(servers), Some(taken)) = (&shared.servers, &connection.taken)
+                    && let Err(refused) = servers.again(taken)
+                {
+                    return refused.into();
                 }
             }
         }
@@ -527,6 +562,8 @@ const POLICIES: [&str; 3] = [
 const MOST_TOLD: usize = 12;
 /// How many keep-alives in a row may be missed.
 const MOST_MISSED: u32 = 2;
+/// How often the certificate of a server is judged while it is connected: it may be revoked, or be over.
+const JUDGED_EVERY: Duration = Duration::from_secs(2);
 /// How often it is looked whether subscriptions live.
 const LOOK: Duration = Duration::from_millis(500);
 /// How long nothing may come of any subscription; each says every second that it lives.

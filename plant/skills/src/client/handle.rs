@@ -469,7 +469,7 @@ impl Runs for SkillHandle {
 
 fn why(link: Option<&Link>) -> String {
     match link {
-        Some(Link::Down { reason }) => reason.clone(),
+        Some(Link::Down { reason, .. }) => reason.clone(),
         _ => "the connection is closed".to_owned(),
     }
 }

@@ -50,7 +50,7 @@ pub(super) async fn run(
         let all = wanted.borrow_and_update().clone();
         let told = match now {
             Link::Up { connects, .. } => watcher.look(&all, connects).await,
-            Link::Down { reason } => watcher.lose(&all, &reason).await,
+            Link::Down { reason, .. } => watcher.lose(&all, &reason).await,
             Link::Connecting | Link::Closed => Ok(()),
         };
         if told.is_err() {

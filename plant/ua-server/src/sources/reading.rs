@@ -102,7 +102,7 @@ async fn heard(batches: &mut [Batch]) -> (usize, Option<Notice>) {
 impl Reader {
     /// Goes with the connection.
     async fn follow(&mut self, link: &Link) -> Told {
-        self.state.link(link);
+        self.state.link(link, self.client.certificates_refused());
         match link {
             Link::Up { connects, .. } => {
                 self.away = false;

@@ -47,8 +47,9 @@ impl State {
     }
 
     /// Takes note of the link. What changes is told for people, once.
-    pub(super) fn link(&self, link: &Link) {
+    pub(super) fn link(&self, link: &Link, certificates_refused: u64) {
         let mut told = self.told.lock();
+        told.certificates_refused = certificates_refused;
         match link {
             Link::Up {
                 connects, secured, ..
@@ -66,7 +67,7 @@ impl State {
                 told.connects = *connects;
                 told.why = None;
             }
-            Link::Down { reason } => {
+            Link::Down { reason, .. } => {
                 if told.up || told.why.is_none() {
                     warn!(
                         server = told.name,

@@ -1,0 +1,197 @@
+//! The certificate that a peer shows, judged by what a store knows: chain, trust, dates, names, use and revocation (OPC 10000-4, 6.1.3).
+//!
+//! What is refused says why, with the command that mends it. Files of the store count as soon as they are there.
+
+use std::fmt;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use opcua::sync::Mutex;
+use opcua::types::StatusCode;
+use tracing::debug;
+use trust::{Certificate, Fault, Known, Names};
+
+use crate::certificates;
+use crate::known::{self, Stamp};
+
+/// A certificate, and those sent along with it.
+pub type Shown = (Certificate, Vec<Certificate>);
+
+/// Judges by the store at one root.
+#[derive(Debug)]
+pub struct Judge {
+    root: PathBuf,
+    trusts_all: bool,
+    /// What was read last, and how the files were then.
+    read: Mutex<Option<(Stamp, Arc<Known>)>>,
+}
+
+/// Why a peer is not talked to.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Refused {
+    /// The status of it.
+    pub status: StatusCode,
+    /// Whether the peer may be told the status (OPC 10000-4, 6.1.3).
+    pub may_be_told: bool,
+    /// The common name in the certificate, which whoever made it chose.
+    pub name: String,
+    /// What is wrong, and what mends it.
+    pub why: String,
+}
+
+impl fmt::Display for Refused {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self {
+            status, name, why, ..
+        } = self;
+        write!(f, "its certificate {name:?} is refused ({status}): {why}")
+    }
+}
+
+impl Judge {
+    /// One for a store; for tests and demonstrations, whom nobody trusts can be trusted too.
+    #[must_use]
+    pub fn of(root: &Path, trusts_all: bool) -> Self {
+        Self {
+            root: root.to_owned(),
+            trusts_all,
+            read: Mutex::default(),
+        }
+    }
+
+    /// The root of the store.
+    #[must_use]
+    pub fn root(&self) -> &Path {
+        &self.root
+    }
+
+    /// What the store knows now.
+    #[must_use]
+    pub fn known(&self) -> Arc<Known> {
+        // Taken before: what is written while the store is read is to be seen later.
+        let stamp = known::stamp(&self.root);
+        let mut read = self.read.lock();
+        if let Some((before, known)) = &*read
+            && *before == stamp
+        {
+            return Arc::clone(known);
+        }
+        let known = Arc::new(known::read(&self.root));
+        *read = Some((stamp, Arc::clone(&known)));
+        known
+    }
+
+    /// Reads what a peer shows and judges it. One that nobody has decided on is kept in `rejected` of the store.
+    ///
+    /// # Errors
+    /// It is refused.
+    pub fn take(&self, der: &[u8], names: Names<'_>) -> Result<Shown, Refused> {
+        let shown = Certificate::read_chain(der).map_err(|unfit| Refused {
+            status: StatusCode::BadCertificateInvalid,
+            may_be_told: false,
+            name: String::new(),
+            why: unfit.to_string(),
+        })?;
+        self.judge(&shown, names)?;
+        if !shown.1.is_empty() {
+            // The library reads one certificate where a peer sends several.
+            return Err(Refused {
+                status: StatusCode::BadCertificateInvalid,
+                may_be_told: true,
+                name: shown.0.name(),
+                why: "it sends certificates of authorities along with its own; have it send its own alone".to_owned(),
+            });
+        }
+        Ok(shown)
+    }
+
+    /// Judges what was taken before, as it stands now.
+    ///
+    /// # Errors
+    /// It is refused.
+    pub fn judge(&self, shown: &Shown, names: Names<'_>) -> Result<(), Refused> {
+        let (certificate, sent) = shown;
+        let mut known = self.known();
+        if self.trusts_all {
+            Arc::make_mut(&mut known).trusted.push(certificate.clone());
+        }
+        let checked = trust::check_named(certificate, sent, &known, (names, known::now()));
+        checked.map_err(|fault| Refused {
+            status: StatusCode::from(fault.status()),
+            may_be_told: fault.may_be_told(),
+            name: certificate.name(),
+            why: format!("{fault}; {}", self.help(certificate, fault, names)),
+        })
+    }
+
+    fn help(&self, certificate: &Certificate, fault: Fault, names: Names<'_>) -> String {
+        let pki = &self.root;
+        let issuer = certificate.issuer_name();
+        let this_one = || {
+            let kept = certificates::keep_refused(&self.root, certificate);
+            let digits = kept.map_or_else(
+                |error| {
+                    debug!(%error, "a refused certificate is not kept");
+                    "FILE.der".to_owned()
+                },
+                |kept| kept.thumbprint.chars().take(SHOWN_DIGITS).collect(),
+            );
+            format!("`ua-server trust {digits} --pki {pki:?}`")
+        };
+        match fault {
+            Fault::Untrusted => format!("to trust it: {}", this_one()),
+            Fault::Incomplete => format!(
+                "to trust the authority {issuer:?} that issued it: `ua-server trust AUTHORITY.der --pki {pki:?}`, or this \
+                 certificate alone: {}",
+                this_one()
+            ),
+            Fault::RevocationUnknown => format!(
+                "take up the list of the authority {issuer:?}: `ua-server trust FILE.crl --pki {pki:?}`"
+            ),
+            Fault::IssuerRevocationUnknown => format!(
+                "take up the list of the authority above {issuer:?}: `ua-server trust FILE.crl --pki {pki:?}`"
+            ),
+            Fault::Host => format!(
+                "it is reached at {:?}, and its certificate is for {:?}: reach it by one of these, or have it issued for that host",
+                names.host.unwrap_or_default(),
+                certificate.hosts()
+            ),
+            Fault::Uri => format!(
+                "it says it is {:?}, and its certificate is of {:?}",
+                names.application_uri.unwrap_or_default(),
+                certificate.application_uri().unwrap_or_default()
+            ),
+            Fault::Invalid
+            | Fault::Policy
+            | Fault::Time
+            | Fault::IssuerTime
+            | Fault::Use
+            | Fault::IssuerUse
+            | Fault::Revoked
+            | Fault::IssuerRevoked => help(fault).to_owned(),
+        }
+    }
+}
+
+/// What mends it where nothing in the store does.
+pub(crate) const fn help(fault: Fault) -> &'static str {
+    match fault {
+        Fault::Revoked | Fault::IssuerRevoked => "it needs another certificate",
+        Fault::RevocationUnknown | Fault::IssuerRevocationUnknown => {
+            "take up the authority's list: `ua-server trust FILE.crl`"
+        }
+        Fault::Time => "it is to be issued anew, or one of the clocks is wrong",
+        Fault::IssuerTime => "the authority needs a new certificate",
+        Fault::Invalid
+        | Fault::Incomplete
+        | Fault::Policy
+        | Fault::Untrusted
+        | Fault::Host
+        | Fault::Uri
+        | Fault::Use
+        | Fault::IssuerUse => "it needs another certificate, as OPC 10000-6, 6.2.2 has it",
+    }
+}
+
+/// Digits of a thumbprint that people are told.
+const SHOWN_DIGITS: usize = 16;
