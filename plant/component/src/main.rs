@@ -39,8 +39,9 @@ struct UaComponent {
     #[arg(long, value_name = "URL", env = "UA_ENDPOINT")]
     endpoint: Option<String>,
     /// The discovery server it registers with, in place of what the YAML says: its URL; one that is heard of on --interface,
-    /// as `any` (the only one there), uri=<ApplicationUri> or name=<mDNS name> (both may end with *); or `none`
-    #[arg(long, value_name = "URL|CHOICE", env = "UA_LDS")]
+    /// as `any` (the only one there), uri=<ApplicationUri> or name=<mDNS name> (both may end with *); `embed` for that of this
+    /// host at port 4840, or embed=<URL>, which the component is itself while there is none; or `none`
+    #[arg(long, value_name = "URL|CHOICE|embed", env = "UA_LDS")]
     lds: Option<String>,
     /// The certificate store: own, private, trusted and rejected under one directory
     #[arg(long, value_name = "DIR", env = "UA_PKI")]
@@ -99,10 +100,8 @@ impl UaComponent {
         if let Some(endpoint) = &self.endpoint {
             component.endpoint.clone_from(endpoint);
         }
-        match self.lds.as_deref() {
-            Some("none") => component.lds = Lds::Nowhere,
-            Some(url) => component.lds = Lds::At(url.to_owned()),
-            None => {}
+        if let Some(lds) = &self.lds {
+            component.lds = Lds::written(lds);
         }
         Ok(self.read.get_or_init(|| Read { component, text }))
     }

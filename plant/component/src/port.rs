@@ -16,7 +16,7 @@ use discovery::{AnnounceSettings, Announced, Interface};
 use mappings::{Mapping, PubSub, TopicId};
 use program::{Method, State};
 use skills::server::{ComponentServer, ServeFault, ServeSettings};
-use skills::{Component, Lds, Owner, Security, Skill};
+use skills::{Component, Owner, Security, Skill};
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 use tracing::{info, warn};
@@ -377,19 +377,14 @@ fn announce(
     component: &Component,
     options: &Options,
 ) -> Option<Announced> {
-    let lds = match &component.lds {
-        Lds::Local => Some(discovery::DEFAULT_LDS.to_owned()),
-        Lds::Nowhere => None,
-        Lds::At(url) => Some(url.clone()),
-    };
+    let lds = component.lds.option(discovery::DEFAULT_LDS);
     if lds.is_none() && options.mdns.is_none() {
         return None;
     }
     let settings = AnnounceSettings {
-        lds,
         mdns: options.mdns.clone(),
         pki: options.pki.clone(),
-        ..AnnounceSettings::default()
+        ..AnnounceSettings::registering(lds.as_deref())
     };
     match discovery::announce(server, settings) {
         Ok(announced) => Some(announced),

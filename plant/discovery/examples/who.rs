@@ -93,10 +93,10 @@ impl Presence {
             number: None,
         };
         let settings = AnnounceSettings {
-            lds: self.lds,
             register_every: Duration::from_secs(self.register_period),
             pki: self.pki,
             mdns: (!self.no_mdns).then(|| Interface::parse(&self.address.to_string())),
+            ..AnnounceSettings::registering(self.lds.as_deref())
         };
         let told = announce(server.clone(), settings).map_err(unavailable)?;
         tokio::spawn(async move { be_there(listener, &server).await });

@@ -15,6 +15,7 @@ use tracing::{debug, info, warn};
 use crate::chosen::find_lds;
 use crate::client::{self, AskFault};
 use crate::clock;
+use crate::embedded::{Embedded, Embedding, lost};
 use crate::host_name;
 use crate::interface::Interface;
 use crate::mdns::{Aside, Heard, Mdns, MdnsFault, Ours, same_place};
@@ -43,6 +44,8 @@ pub struct AnnounceSettings {
     /// The Local Discovery Server to register with; `None` for none. Its URL, or which of those it is that are heard of by
     /// mDNS, as a [`Choice`] is written: `any`, `uri=urn:cell:*`, `name=cell-lds`.
     pub lds: Option<String>,
+    /// Whether the program is that discovery server itself while nobody else is. To be true with a URL of this host alone.
+    pub embed: bool,
     /// Where it is announced by mDNS; `None` for nowhere: then the Local Discovery Server is asked to do it.
     pub mdns: Option<Interface>,
     /// How often the registration is repeated; every ten seconds at least where nothing is heard by mDNS.
@@ -57,9 +60,28 @@ impl Default for AnnounceSettings {
     fn default() -> Self {
         Self {
             lds: Some(crate::DEFAULT_LDS.to_owned()),
+            embed: false,
             mdns: Some(Interface::LOOPBACK),
             register_every: Duration::from_secs(60),
             pki: None,
+        }
+    }
+}
+
+impl AnnounceSettings {
+    /// With the discovery server as programs take it by `--lds`: `embed` is that of this host, which the program is itself while
+    /// there is none; `embed=URL` the same at another port or address of this host; all else is as [`lds`](Self::lds) is.
+    #[must_use]
+    pub fn registering(written: Option<&str>) -> Self {
+        let embedded = match written.and_then(|written| written.strip_prefix("embed")) {
+            Some("") => Some(crate::DEFAULT_LDS),
+            Some(more) => more.strip_prefix('='),
+            None => None,
+        };
+        Self {
+            lds: embedded.or(written).map(str::to_owned),
+            embed: embedded.is_some(),
+            ..Self::default()
         }
     }
 }
@@ -143,6 +165,10 @@ pub fn announce(server: Server, settings: AnnounceSettings) -> Result<Announced,
         lds_run: None,
         register_at: Instant::now(),
         wait: FIRST_WAIT,
+        here: None,
+        there: None,
+        look_from: Instant::now(),
+        look_wait: FIRST_WAIT,
     };
     let task = tokio::spawn(telling.run(stopped));
     Ok(Announced {
@@ -187,9 +213,24 @@ struct Telling {
     lds_run: Option<Option<i64>>,
     register_at: Instant,
     wait: Duration,
+    /// The discovery server, where it is embedded.
+    here: Option<Embedded>,
+    /// Ready when the discovery server of another program is gone, in whose place one may be embedded.
+    there: Option<Pin<Box<dyn Future<Output = ()> + Send>>>,
+    /// When a connection to that one may be held next.
+    look_from: Instant,
+    /// How much later than it broke off.
+    look_wait: Duration,
 }
 
-type Registering = Pin<Box<dyn Future<Output = Result<(), AskFault>> + Send>>;
+type Registering = Pin<Box<dyn Future<Output = Result<Done, AskFault>> + Send>>;
+
+/// What came of a registration.
+enum Done {
+    Registered,
+    /// Nobody was there: a discovery server is embedded now.
+    Embedded(Embedded),
+}
 
 impl Telling {
     async fn run(mut self, mut stopped: mpsc::Receiver<()>) {
@@ -209,6 +250,7 @@ impl Telling {
                     None => std::future::pending().await,
                 }
             };
+            let gone = gone(&mut self.here, &mut self.there);
             let found = async {
                 match &mut self.found {
                     Some(found) => found.changed().await,
@@ -231,6 +273,7 @@ impl Telling {
                     registering = None;
                     self.registered(result);
                 }
+                () = gone => self.gone(),
                 () = sleep_until(self.register_at), if due => registering = self.register(true),
             }
         }
@@ -250,6 +293,9 @@ impl Telling {
                 && let Err(error) = unregister.await
             {
                 debug!(%error, "the registration was not taken back");
+            }
+            if let Some(here) = self.here.take() {
+                here.leave().await;
             }
         };
         tokio::join!(goodbye, unregister);
@@ -325,6 +371,21 @@ impl Telling {
         self.soon();
     }
 
+    /// The discovery server is not there any more, be it here or there.
+    fn gone(&mut self) {
+        debug!(lds = self.settings.lds, "the discovery server broke off");
+        let was_here = self.here.take().is_some();
+        self.there = None;
+        // One with too many clients breaks off again and again.
+        self.look_from = Instant::now() + spread(self.look_wait, &self.server.borrow().url);
+        self.look_wait = (self.look_wait * 2).min(MOST_WAIT / 2);
+        self.soon();
+        if was_here {
+            // What ends by itself may do so again.
+            self.register_at += FIRST_WAIT;
+        }
+    }
+
     fn soon(&mut self) {
         self.register_at = Instant::now();
         self.wait = FIRST_WAIT;
@@ -338,17 +399,48 @@ impl Telling {
         let server = self.server.borrow().clone();
         // Whoever announces itself is not announced by another.
         let mdns_name = self.mdns.is_none().then(|| name(&server));
+        if let Some(here) = &self.here {
+            let registering = here.register(&server, mdns_name, is_online);
+            return Some(Box::pin(async move {
+                registering.await.map(|()| Done::Registered)
+            }));
+        }
         let pki = self.settings.pki.clone();
+        let interface = self.settings.mdns.clone();
+        let embed = self.settings.embed;
         Some(Box::pin(async move {
+            if embed && same_port(&lds, &server.url) {
+                let message = format!("the server itself is at {lds}; give it another endpoint");
+                return Err(AskFault::Embed(message));
+            }
             let how = (mdns_name.as_deref(), pki.as_deref());
-            client::register(&lds, &server, how, is_online).await
+            match client::register(&lds, &server, how, is_online).await {
+                Ok(()) => Ok(Done::Registered),
+                Err(AskFault::Connect(absent)) if embed && is_online => {
+                    let embedding = Embedding {
+                        lds,
+                        interface: interface.unwrap_or(Interface::LOOPBACK),
+                        pki,
+                        name: server.name,
+                    };
+                    embedding.start(absent).await.map(Done::Embedded)
+                }
+                Err(fault) => Err(fault),
+            }
         }))
     }
 
-    fn registered(&mut self, result: Result<(), AskFault>) {
+    fn registered(&mut self, result: Result<Done, AskFault>) {
         let lds = self.settings.lds.as_deref().unwrap_or_default();
         match result {
-            Ok(()) => {
+            Ok(Done::Embedded(here)) => {
+                self.here = Some(here);
+                self.there = None;
+                self.look_wait = FIRST_WAIT;
+                self.state.send_modify(|state| state.registered = None);
+                self.soon();
+            }
+            Ok(Done::Registered) => {
                 self.register_at = Instant::now() + self.settings.register_every;
                 self.wait = FIRST_WAIT;
                 self.state.send_modify(|state| {
@@ -358,8 +450,12 @@ impl Telling {
                     }
                     state.fault = None;
                 });
+                if self.settings.embed && self.here.is_none() && self.there.is_none() {
+                    self.there = Some(Box::pin(lost(lds.to_owned(), self.look_from)));
+                }
             }
             Err(error) => {
+                self.look_wait = FIRST_WAIT;
                 self.register_at = Instant::now() + spread(self.wait, &self.server.borrow().url);
                 // With its share it is no longer than what may be waited at most.
                 self.wait = (self.wait * 2)
@@ -370,7 +466,10 @@ impl Telling {
                     state.registered = None;
                     // Once for each reason: it is tried again and again.
                     if state.fault.as_ref() != Some(&fault) {
-                        if matches!(error, AskFault::Refused(_) | AskFault::Certificate(_)) {
+                        if matches!(
+                            error,
+                            AskFault::Refused(_) | AskFault::Certificate(_) | AskFault::Embed(_)
+                        ) {
                             warn!(lds, "not registered: {fault}");
                         } else {
                             info!(lds, "not registered yet: {fault}");
@@ -381,6 +480,24 @@ impl Telling {
             }
         }
     }
+}
+
+/// Ready when the discovery server is gone, in this program or in another.
+async fn gone(
+    here: &mut Option<Embedded>,
+    there: &mut Option<Pin<Box<dyn Future<Output = ()> + Send>>>,
+) {
+    match (here, there) {
+        (Some(here), _) => here.ended().await,
+        (None, Some(there)) => there.await,
+        (None, None) => std::future::pending().await,
+    }
+}
+
+/// Whether only one of two programs can listen.
+fn same_port(one: &str, other: &str) -> bool {
+    let place = |url| Url::parse(url).map(|url| (url.host, url.port));
+    place(one).is_some_and(|one| place(other) == Some(one))
 }
 
 /// That wait, and a share of it that is another for each URL: of many who come at once not all are answered, and they do not
@@ -407,6 +524,26 @@ const LEAVE_LIMIT: Duration = Duration::from_secs(1);
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_discovery_server_is_embedded_where_the_option_says_so() {
+        let written = |text: &str| {
+            let settings = AnnounceSettings::registering(Some(text));
+            (settings.lds.unwrap_or_default(), settings.embed)
+        };
+        let elsewhere = "opc.tcp://10.0.0.2:4841";
+        assert_eq!(written("embed"), (crate::DEFAULT_LDS.to_owned(), true));
+        assert_eq!(
+            written(&format!("embed={elsewhere}")),
+            (elsewhere.to_owned(), true)
+        );
+        for text in [elsewhere, "any", "name=embed", "embedded"] {
+            assert_eq!(written(text), (text.to_owned(), false));
+        }
+        assert_eq!(AnnounceSettings::registering(None).lds, None);
+        assert!(same_port(elsewhere, "opc.tcp://10.0.0.2:4841/server"));
+        assert!(!same_port(elsewhere, "opc.tcp://10.0.0.2:4840/server"));
+    }
 
     #[test]
     fn five_hundred_servers_that_failed_at_once_come_again_one_after_the_other_and_nobody_too_soon()

@@ -52,6 +52,9 @@ pub enum AskFault {
     /// It does not speak OPC UA as it should.
     #[error("{0}")]
     Protocol(String),
+    /// Nobody is there, and this program cannot be there itself.
+    #[error("no discovery server is there, and none can be embedded: {0}")]
+    Embed(String),
 }
 
 impl From<WireFault> for AskFault {

@@ -65,6 +65,15 @@ impl Crowd {
     }
 }
 
+impl Drop for Crowd {
+    /// Nobody talks on to a discovery server that has ended.
+    fn drop(&mut self) {
+        for (_, task) in &self.0 {
+            task.abort();
+        }
+    }
+}
+
 const MOST: usize = 128;
 const MOST_OF_ONE: usize = 64;
 const ACCEPT_AGAIN: Duration = Duration::from_millis(100);

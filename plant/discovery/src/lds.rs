@@ -1,6 +1,7 @@
 //! The Local Discovery Server: the registry behind an endpoint of OPC UA, and mDNS on one interface.
 
 use std::collections::{BTreeMap, VecDeque};
+use std::io::ErrorKind;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -12,9 +13,11 @@ use registry::{Announcement, Asked, Event, Loss, Settings, instance_name};
 use serde::Serialize;
 use tokio::net::TcpListener;
 use tokio::sync::{mpsc, watch};
+use tokio::task::{JoinSet, spawn_blocking};
 use tokio::time::{MissedTickBehavior, interval, timeout};
 use tracing::{info, warn};
 
+use crate::client;
 use crate::clock;
 use crate::connection::{Asking, Counters, Shared};
 use crate::endpoint;
@@ -45,6 +48,64 @@ pub struct LdsSettings {
     pub pki: Option<PathBuf>,
     /// Whether any client certificate will do. For tests only.
     pub trust_any: bool,
+    /// The program it runs in, where that is another than `ua-lds`.
+    pub embedded: Option<EmbeddedIn>,
+}
+
+/// The program that a discovery server runs in.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct EmbeddedIn {
+    /// What it is called.
+    pub name: String,
+    /// The certificate store that says whom it trusts; its own otherwise.
+    pub trusts: Option<PathBuf>,
+}
+
+impl LdsSettings {
+    /// As `ua-lds` runs when nothing is told to it but where: within this host, and without secured channels.
+    #[must_use]
+    pub fn at(endpoint: impl Into<String>) -> Self {
+        Self {
+            application_uri: None,
+            endpoint: endpoint.into(),
+            interface: Interface::LOOPBACK,
+            allow_unsecured: false,
+            secured_only: false,
+            register_every: REGISTER_EVERY,
+            pki: None,
+            trust_any: false,
+            embedded: None,
+        }
+    }
+
+    /// What it is called, for people.
+    fn name(&self) -> String {
+        match &self.embedded {
+            None => NAME.to_owned(),
+            Some(program) => format!("{NAME} in {}", program.name),
+        }
+    }
+
+    /// Its certificate store, with its own pair made.
+    async fn open_security(
+        &self,
+        application_uri: &str,
+        host: &str,
+    ) -> Result<Option<Security>, Failure> {
+        let Some(root) = self.pki.clone() else {
+            return Ok(None);
+        };
+        let (uri, host, trust_any) = (application_uri.to_owned(), host.to_owned(), self.trust_any);
+        // Making a key takes a while, in which a program around it has other work.
+        let open = move || Security::open(&root, &uri, &host, trust_any);
+        let opened = spawn_blocking(open).await;
+        let opened = opened.map_err(|error| Failure::new(FailureKind::Io, error.to_string()))??;
+        let trusts = self
+            .embedded
+            .as_ref()
+            .and_then(|program| program.trusts.clone());
+        Ok(Some(opened.judging_by(trusts, self.trust_any)))
+    }
 }
 
 /// A server of another level that is reached through this one (OPC 10000-4, 7.2: GatewayServerUri).
@@ -200,39 +261,18 @@ pub async fn run_around(
     mut pages: Requests<LdsStatus>,
     stop: impl Future<Output = ()>,
 ) -> Result<(), Failure> {
-    let (mut lds, mut questions) = Lds::start(&settings).await?;
+    let listening = match listen(&settings.endpoint).await {
+        Ok(listening) => listening,
+        Err(fault) => return Err(fault.told(&settings.endpoint).await),
+    };
+    let (mut lds, questions) = Lds::start(&settings, listening).await?;
     lds.around = around;
-    let mut semaphores = interval(SEMAPHORES_EVERY.min(settings.register_every));
-    semaphores.set_missed_tick_behavior(MissedTickBehavior::Delay);
-    tokio::pin!(stop);
-    loop {
-        tokio::select! {
-            () = &mut stop => break,
-            () = lds.keeper.step() => {}
-            Some((question, channel, reply)) = questions.recv() => {
-                let answer = lds.answer(question, &channel);
-                // A client that has gone does not wait for it.
-                drop(reply.send(answer));
-            }
-            Some(reply) = pages.recv() => drop(reply.send(lds.status())),
-            _ = semaphores.tick() => lds.look_at_semaphores(),
-        }
-        while let Some(event) = lds.keeper.event() {
-            lds.take(event);
-        }
-        for (url, started) in lds.keeper.take_started() {
-            info!(
-                url,
-                started_ms = clock::millis(clock::of_ticks(started)),
-                "it says when it started"
-            );
-        }
-    }
-    lds.leave().await;
+    lds.run(questions, &mut pages, stop).await;
     Ok(())
 }
 
-struct Lds {
+/// A discovery server that takes clients in, and answers them while it [runs](Self::run).
+pub(crate) struct Lds {
     keeper: Keeper,
     shared: Arc<Shared>,
     interface: Interface,
@@ -244,11 +284,17 @@ struct Lds {
     lost: u64,
     around: Option<Around>,
     missed: u64,
+    register_every: Duration,
+    /// Lets clients in while it is kept.
+    accepting: JoinSet<()>,
 }
 
 impl Lds {
-    async fn start(settings: &LdsSettings) -> Result<(Self, mpsc::Receiver<Asking>), Failure> {
-        let (listener, place) = listen(&settings.endpoint).await?;
+    /// With what [`listen`] has given.
+    pub(crate) async fn start(
+        settings: &LdsSettings,
+        (listener, place): (TcpListener, Url),
+    ) -> Result<(Self, mpsc::Receiver<Asking>), Failure> {
         let at = listener.local_addr().map_err(|error| {
             Failure::new(
                 FailureKind::Io,
@@ -256,7 +302,7 @@ impl Lds {
             )
         })?;
         let mdns = Mdns::open(&settings.interface);
-        let mut mdns =
+        let mdns =
             mdns.map_err(|error| Failure::new(FailureKind::Unavailable, error.to_string()))?;
         let addresses = settings.interface.addresses();
         if addresses.is_empty() {
@@ -278,53 +324,100 @@ impl Lds {
         .to_string();
         let given = settings.application_uri.clone();
         let application_uri = given.unwrap_or_else(|| format!("urn:{}:ua-lds", host_name()));
-        let security = settings.pki.as_deref().map(|root| {
-            let host = Url::parse(&url).map_or_else(host_name, |url| url.host);
-            Security::open(root, &application_uri, &host, settings.trust_any)
-        });
-        let security = security.transpose()?;
+        let host = Url::parse(&url).map_or_else(host_name, |url| url.host);
+        let security = settings.open_security(&application_uri, &host).await?;
         let certificate = security
             .as_ref()
             .map(|own| own.certificate.as_byte_string());
         let own = Own {
             application_uri,
-            name: "UA bridge discovery server".to_owned(),
+            name: settings.name(),
             url: url.clone(),
             application_type: ApplicationType::DiscoveryServer,
             certificate: certificate.unwrap_or_default(),
         };
         let started = clock::wall();
-        let instance = instance_name("ua-lds", &host_name(), at.port());
-        mdns.put(Ours {
-            announcement: Announcement {
-                instance: instance.clone(),
-                url: url.clone(),
-                capabilities: vec!["LDS".to_owned()],
-            },
-            aside: Aside::of_start(clock::ticks(started)),
-        });
         let (ask, questions) = mpsc::channel(64);
         let shared = Arc::new(Shared::new(own, security, ask).secured_only(settings.secured_only));
-        tokio::spawn(endpoint::accept(listener, Arc::clone(&shared)));
+        let mut accepting = JoinSet::new();
+        accepting.spawn(endpoint::accept(listener, Arc::clone(&shared)));
         info!(url, interface = %settings.interface, "ua-lds listens");
         let registry = Settings {
             allow_unsecured: settings.allow_unsecured,
             forget_after: settings.register_every * 2,
             ..Settings::default()
         };
-        let lds = Self {
+        let mut lds = Self {
             keeper: Keeper::new(registry, Some(mdns), Some(url)),
             shared,
             interface: settings.interface.clone(),
-            instance,
+            instance: instance_name("ua-lds", &host_name(), at.port()),
             started,
             since: BTreeMap::new(),
             losses: VecDeque::new(),
             lost: 0,
             around: None,
             missed: 0,
+            register_every: settings.register_every,
+            accepting,
         };
+        lds.announce();
         Ok((lds, questions))
+    }
+
+    /// Announces itself.
+    fn announce(&mut self) {
+        if let Some(mdns) = &mut self.keeper.mdns {
+            mdns.put(Ours {
+                announcement: Announcement {
+                    instance: self.instance.clone(),
+                    url: self.shared.own.url.clone(),
+                    capabilities: vec!["LDS".to_owned()],
+                },
+                aside: Aside::of_start(clock::ticks(self.started)),
+            });
+        }
+    }
+
+    /// Where the program around it asks without a connection.
+    pub(crate) fn asking(&self) -> mpsc::Sender<Asking> {
+        self.shared.ask.clone()
+    }
+
+    /// Answers until it is told to stop, and says goodbye.
+    pub(crate) async fn run(
+        &mut self,
+        mut questions: mpsc::Receiver<Asking>,
+        pages: &mut Requests<LdsStatus>,
+        stop: impl Future<Output = ()>,
+    ) {
+        let mut semaphores = interval(SEMAPHORES_EVERY.min(self.register_every));
+        semaphores.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        tokio::pin!(stop);
+        loop {
+            tokio::select! {
+                () = &mut stop => break,
+                () = self.keeper.step() => {}
+                Some((question, channel, reply)) = questions.recv() => {
+                    let answer = self.answer(question, &channel);
+                    // A client that has gone does not wait for it.
+                    drop(reply.send(answer));
+                }
+                Some(reply) = pages.recv() => drop(reply.send(self.status())),
+                _ = semaphores.tick() => self.look_at_semaphores(),
+            }
+            while let Some(event) = self.keeper.event() {
+                self.take(event);
+            }
+            for (url, started) in self.keeper.take_started() {
+                info!(
+                    url,
+                    started_ms = clock::millis(clock::of_ticks(started)),
+                    "it says when it started"
+                );
+            }
+        }
+        self.leave().await;
     }
 
     fn answer(&mut self, question: Question, channel: &registry::Channel) -> Answer {
@@ -490,7 +583,8 @@ impl Lds {
         }
     }
 
-    fn counters(&self) -> BTreeMap<&'static str, u64> {
+    /// What was counted, each by its name in `/status`.
+    pub(crate) fn counters(&self) -> BTreeMap<&'static str, u64> {
         let get = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
         let Counters {
             connections,
@@ -519,8 +613,9 @@ impl Lds {
         ])
     }
 
-    /// Says goodbye.
+    /// Lets nobody in any more, and says goodbye.
     async fn leave(&mut self) {
+        self.accepting.shutdown().await;
         let goodbye = self
             .keeper
             .mdns
@@ -534,22 +629,65 @@ impl Lds {
     }
 }
 
-async fn listen(endpoint: &str) -> Result<(TcpListener, Url), Failure> {
-    let place = Url::parse(endpoint).ok_or_else(|| {
-        let message = format!(
-            "--endpoint {}: for example opc.tcp://127.0.0.1:4840",
-            endpoint
-        );
-        Failure::new(FailureKind::Usage, message)
-    })?;
-    let listener = TcpListener::bind((place.host.as_str(), place.port)).await.map_err(|error| {
-            let message = format!(
-                "cannot listen at {}: {error}; if another discovery server runs on this host, give another --endpoint",
-                endpoint
-            );
-            Failure::new(FailureKind::Unavailable, message)
-        })?;
-    Ok((listener, place))
+/// Why nothing can listen.
+#[derive(Debug)]
+pub(crate) enum ListenFault {
+    /// The URL is none of OPC UA over TCP.
+    Url,
+    /// The system does not let it.
+    Io(std::io::Error),
+}
+
+impl ListenFault {
+    /// Whether somebody else listens there.
+    pub(crate) fn is_taken(&self) -> bool {
+        matches!(self, Self::Io(error) if error.kind() == ErrorKind::AddrInUse)
+    }
+
+    /// As a failure of a program that is a discovery server. Asks whoever has the place who that is.
+    async fn told(self, endpoint: &str) -> Failure {
+        let error = match &self {
+            Self::Url => {
+                let message =
+                    format!("--endpoint {endpoint}: for example opc.tcp://127.0.0.1:4840");
+                return Failure::new(FailureKind::Usage, message);
+            }
+            Self::Io(error) => error,
+        };
+        let who = match self.is_taken() {
+            true => client::find_servers(endpoint, WHO_LIMIT).await.ok(),
+            false => None,
+        };
+        let who = who.and_then(|all| all.into_iter().find(|one| one.is_discovery_server));
+        let what = match who {
+            Some(one) => format!(
+                "the discovery server \"{}\" ({}) serves there: end it, or the program it is in, or give another --endpoint",
+                cut(&one.name),
+                cut(&one.application_uri)
+            ),
+            None => {
+                "if another discovery server runs on this host, give another --endpoint".to_owned()
+            }
+        };
+        let message = format!("cannot listen at {endpoint}: {error}; {what}");
+        Failure::new(FailureKind::Unavailable, message)
+    }
+}
+
+impl std::fmt::Display for ListenFault {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Url => f.write_str("that is no URL as opc.tcp://host:port"),
+            Self::Io(error) => error.fmt(f),
+        }
+    }
+}
+
+/// Listens at a URL.
+pub(crate) async fn listen(endpoint: &str) -> Result<(TcpListener, Url), ListenFault> {
+    let place = Url::parse(endpoint).ok_or(ListenFault::Url)?;
+    let listener = TcpListener::bind((place.host.as_str(), place.port)).await;
+    Ok((listener.map_err(ListenFault::Io)?, place))
 }
 
 /// The servers of other levels with these URIs, or all of them, as if they had registered.
@@ -575,6 +713,10 @@ fn cut(text: &str) -> String {
     text.chars().take(256).collect()
 }
 
+const NAME: &str = "UA bridge discovery server";
+/// As most discovery servers have it.
+const REGISTER_EVERY: Duration = Duration::from_secs(600);
+const WHO_LIMIT: Duration = Duration::from_secs(1);
 const MOST_LOSSES: usize = 64;
 const SEMAPHORES_EVERY: Duration = Duration::from_secs(5);
 const LEAVE_LIMIT: Duration = Duration::from_secs(1);

@@ -5,7 +5,7 @@
 //!
 //! Reading order: `url` and `interface` (where), `mdns` and `goodbye` (announcements and what is heard of others), `wire` (OPC UA
 //! over TCP), `client` (asking by it), `line` and `liveness` (who still answers), `keeper` (all of that around one registry),
-//! `watch`, `scan`, `chosen`, `announce` and `bridges` (for programs), `endpoint`, `connection`, `security` and `services` (answering by it), `lds`, `presence`.
+//! `watch`, `scan`, `chosen`, `announce` and `bridges` (for programs), `endpoint`, `connection`, `security` and `services` (answering by it), `lds`, `embedded` (the same within another program), `presence`.
 
 mod announce;
 mod bridges;
@@ -13,6 +13,7 @@ mod chosen;
 pub mod client;
 mod clock;
 mod connection;
+mod embedded;
 mod endpoint;
 #[doc(hidden)]
 pub mod fuzz;

@@ -74,6 +74,14 @@ impl Security {
         })
     }
 
+    /// The same, but whom it trusts says the store at that root.
+    pub(crate) fn judging_by(self, root: Option<PathBuf>, trust_any: bool) -> Self {
+        Self {
+            judge: root.map_or(self.judge, |root| Judge::of(&root, trust_any)),
+            ..self
+        }
+    }
+
     /// Judges the certificate of a server that says it is that application. One that nobody has decided on is kept in `rejected`,
     /// for whoever does. Which host it is reached at is left open: what it is told there is no secret.
     pub(crate) fn trusts(&self, der: &[u8], application_uri: &str) -> Result<(), Refused> {

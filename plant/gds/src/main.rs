@@ -48,8 +48,9 @@ struct UaGds {
     /// How many days a certificate is valid that is issued to an application
     #[arg(long, value_name = "DAYS", default_value = "365", value_parser = clap::value_parser!(u32).range(1..=36_500))]
     days: u32,
-    /// The local discovery server it registers with
-    #[arg(long, value_name = "URL", env = "UA_LDS")]
+    /// The local discovery server it registers with; `embed` for that of this host at port 4840, or embed=<URL>, which the
+    /// program is itself while there is none
+    #[arg(long, value_name = "URL|embed", env = "UA_LDS")]
     lds: Option<String>,
     /// The network interface where it is announced by mDNS, by name or address
     #[arg(long, value_name = "NAME|ADDRESS", env = "UA_INTERFACE")]

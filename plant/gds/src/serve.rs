@@ -202,10 +202,9 @@ impl Serving {
             number: None,
         };
         let told = AnnounceSettings {
-            lds: settings.lds.clone(),
             mdns: settings.interface.clone(),
             pki: Some(settings.pki.clone()),
-            ..AnnounceSettings::default()
+            ..AnnounceSettings::registering(settings.lds.as_deref())
         };
         let told = announce(server, told);
         told.map(Some)

@@ -58,8 +58,9 @@ struct UaMes {
     /// Where clients connect, as opc.tcp://127.0.0.1:0, in place of what the YAML says
     #[arg(long, value_name = "URL", env = "UA_ENDPOINT")]
     endpoint: Option<String>,
-    /// The local discovery server it registers with, or `none`, in place of what the YAML says
-    #[arg(long, value_name = "URL", env = "UA_LDS")]
+    /// The local discovery server it registers with, or `none`, in place of what the YAML says; `embed` for that of this host
+    /// at port 4840, or embed=<URL>, which the program is itself while there is none
+    #[arg(long, value_name = "URL|embed", env = "UA_LDS")]
     lds: Option<String>,
     /// The certificate store: own, private, trusted and rejected under one directory
     #[arg(long, value_name = "DIR", env = "UA_PKI")]
@@ -162,10 +163,8 @@ impl UaMes {
         if let Some(sparql) = self.sparql {
             settings.sparql = sparql;
         }
-        match self.lds.as_deref() {
-            Some("none") => settings.lds = Lds::Nowhere,
-            Some(url) => settings.lds = Lds::At(url.to_owned()),
-            None => {}
+        if let Some(lds) = &self.lds {
+            settings.lds = Lds::written(lds);
         }
         Ok(settings)
     }

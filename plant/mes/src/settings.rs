@@ -158,9 +158,12 @@ impl Reading<'_> {
     }
 
     fn lds(&mut self, node: &Node) -> Option<Lds> {
-        match self.reader.text(node, "an endpoint or `none`")? {
-            "none" => Some(Lds::Nowhere),
-            _ => self.endpoint(node).map(Lds::At),
+        match Lds::written(self.reader.text(node, "an endpoint, `embed` or `none`")?) {
+            lds @ (Lds::Nowhere | Lds::Local | Lds::Embed(None)) => Some(lds),
+            Lds::Embed(Some(url)) => self
+                .checked_endpoint(&url, node)
+                .map(|url| Lds::Embed(Some(url))),
+            Lds::At(url) => self.checked_endpoint(&url, node).map(Lds::At),
         }
     }
 
@@ -504,6 +507,10 @@ impl Reading<'_> {
 
     fn endpoint(&mut self, node: &Node) -> Option<String> {
         let text = self.reader.text(node, "an endpoint")?;
+        self.checked_endpoint(text, node)
+    }
+
+    fn checked_endpoint(&mut self, text: &str, node: &Node) -> Option<String> {
         match text.parse::<plant_opcua::server::EndpointUrl>() {
             Ok(_) => Some(text.to_owned()),
             Err(error) => self.reader.refuse(

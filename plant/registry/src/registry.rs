@@ -309,6 +309,12 @@ impl Registry {
         self.watch.next(self.settings.probe_every, now)
     }
 
+    /// When the run of the program that is known started, as it is told another way than before: a program says when it was
+    /// announced, and its server when that began. Nobody is told of a restart.
+    pub fn started(&mut self, url: &str, start_time: i64) {
+        self.watch.started(url, start_time);
+    }
+
     /// What came of a try.
     pub fn probed(&mut self, url: &str, outcome: Outcome, now: Instant) {
         match outcome {

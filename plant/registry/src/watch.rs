@@ -139,6 +139,13 @@ impl Watch {
         Some(free.map_or(due, |free| free.max(due)))
     }
 
+    /// The run that is known started then, as it is told another way: that is no other run.
+    pub(crate) fn started(&mut self, url: &str, start_time: i64) {
+        if let Some(watched) = self.endpoints.get_mut(url) {
+            watched.start_time = Some(start_time);
+        }
+    }
+
     /// Takes note of what came of a try.
     pub(crate) fn probed(
         &mut self,

@@ -438,6 +438,18 @@ fn another_start_time_is_a_restart() {
     registry.probed(&url, alive(Some(5)), now);
     assert_eq!(registry.poll_event(), None);
     registry.probed(&url, alive(Some(6)), now);
+    assert_eq!(
+        registry.poll_event(),
+        Some(Event::Restarted { url: url.clone() })
+    );
+    registry.started(&url, 4);
+    registry.probed(&url, alive(Some(4)), now);
+    assert_eq!(
+        registry.poll_event(),
+        None,
+        "the same run, told another way"
+    );
+    registry.probed(&url, alive(Some(7)), now);
     assert_eq!(registry.poll_event(), Some(Event::Restarted { url }));
 }
 

@@ -61,8 +61,35 @@ pub enum Lds {
     Local,
     /// None.
     Nowhere,
-    /// At this URL.
+    /// At this URL, or as programs choose one that is heard of.
     At(String),
+    /// Of this host, at this URL or else at the port kept for it; the component is it itself while there is none.
+    Embed(Option<String>),
+}
+
+impl Lds {
+    /// As the option `--lds` of programs is written.
+    #[must_use]
+    pub fn written(text: &str) -> Self {
+        match (text, text.strip_prefix("embed=")) {
+            ("none", _) => Self::Nowhere,
+            ("embed", _) => Self::Embed(None),
+            (_, Some(url)) => Self::Embed(Some(url.to_owned())),
+            _ => Self::At(text.to_owned()),
+        }
+    }
+
+    /// The same backwards; `None` for none, and `local` for the one at the port kept for it.
+    #[must_use]
+    pub fn option(&self, local: &str) -> Option<String> {
+        match self {
+            Self::Nowhere => None,
+            Self::Local => Some(local.to_owned()),
+            Self::At(url) => Some(url.clone()),
+            Self::Embed(None) => Some("embed".to_owned()),
+            Self::Embed(Some(url)) => Some(format!("embed={url}")),
+        }
+    }
 }
 
 /// One skill of a component.

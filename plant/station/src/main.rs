@@ -93,14 +93,12 @@ impl Service for UaStation {
         let pages = serve_pages(self.metrics).await?;
         let interface = self.interface.as_deref().map(Interface::parse);
         let lds = LdsSettings {
-            application_uri: None,
-            endpoint: self.endpoint,
             interface: interface.unwrap_or(Interface::LOOPBACK),
             allow_unsecured: self.allow_unsecured,
-            secured_only: false,
             register_every: Duration::from_secs(self.register_period.into()),
             pki: self.pki,
             trust_any: self.trust_any_certificate,
+            ..LdsSettings::at(self.endpoint)
         };
         let upper = self.upper_interface.as_deref().map(|interface| Upper {
             interface: Interface::parse(interface),

@@ -84,8 +84,9 @@ struct UaServer {
     #[arg(long)]
     trust_any_client_certificate: bool,
     /// Register with this Local Discovery Server, now or when it comes, as opc.tcp://127.0.0.1:4840; with --announce also one
-    /// that is heard of, as `any` (the only one there), `uri=<ApplicationUri>` or `name=<mDNS name>` (both may end with *)
-    #[arg(long, value_name = "URL|CHOICE", env = "UA_LDS")]
+    /// that is heard of, as `any` (the only one there), `uri=<ApplicationUri>` or `name=<mDNS name>` (both may end with *).
+    /// `embed` is that of this host at port 4840, and embed=<URL> at another, which the program is itself while there is none
+    #[arg(long, value_name = "URL|CHOICE|embed", env = "UA_LDS")]
     lds: Option<String>,
     /// Announce the server by mDNS on the network interface of --interface, and show the servers that are there; without
     /// an interface, to this host and of this host
@@ -124,13 +125,12 @@ impl UaServer {
             .as_deref()
             .map(Interface::parse);
         let settings = AnnounceSettings {
-            lds: self.lds.clone(),
             mdns: self
                 .announce
                 .then(|| interface.unwrap_or(Interface::LOOPBACK)),
             // That of --pki is made by then.
             pki: Some(self.pki_root()),
-            ..AnnounceSettings::default()
+            ..AnnounceSettings::registering(self.lds.as_deref())
         };
         (self.announce || self.lds.is_some()).then_some(settings)
     }

@@ -70,14 +70,13 @@ impl Service for UaLds {
         let pages = serve_pages(self.metrics).await?;
         let interface = self.interface.as_deref().map(Interface::parse);
         let settings = LdsSettings {
-            application_uri: None,
-            endpoint: self.endpoint,
             interface: interface.unwrap_or(Interface::LOOPBACK),
             allow_unsecured: self.allow_unsecured,
             secured_only: self.secured_only,
             register_every: Duration::from_secs(self.register_period.into()),
             pki: self.pki,
             trust_any: self.trust_any_client_certificate,
+            ..LdsSettings::at(self.endpoint)
         };
         lds::run(settings, pages, stop).await
     }

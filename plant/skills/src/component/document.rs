@@ -129,9 +129,12 @@ fn component(
 }
 
 fn read_lds(node: &Node, reader: &mut Reader<'_>) -> Option<Lds> {
-    match reader.text(node, "an endpoint or `none`")? {
-        "none" => Some(Lds::Nowhere),
-        _ => read_endpoint(node, reader).map(Lds::At),
+    match Lds::written(reader.text(node, "an endpoint, `embed` or `none`")?) {
+        lds @ (Lds::Nowhere | Lds::Local | Lds::Embed(None)) => Some(lds),
+        Lds::Embed(Some(url)) => {
+            checked_endpoint(&url, node, reader).map(|url| Lds::Embed(Some(url)))
+        }
+        Lds::At(url) => checked_endpoint(&url, node, reader).map(Lds::At),
     }
 }
 
@@ -192,6 +195,10 @@ fn read_namespace(node: &Node, reader: &mut Reader<'_>) -> Option<u16> {
 
 fn read_endpoint(node: &Node, reader: &mut Reader<'_>) -> Option<String> {
     let text = reader.text(node, "an endpoint")?;
+    checked_endpoint(text, node, reader)
+}
+
+fn checked_endpoint(text: &str, node: &Node, reader: &mut Reader<'_>) -> Option<String> {
     match text.parse::<plant_opcua::server::EndpointUrl>() {
         Ok(_) => Some(text.to_owned()),
         Err(error) => {
@@ -393,6 +400,30 @@ mod tests {
         assert!(
             matches!(&component.skills[0].driver, DriverSetup::Simulated(how) if how.duration == Some(Duration::from_millis(400)))
         );
+    }
+
+    #[test]
+    fn the_discovery_server_is_read_as_the_option_of_programs_is_written() {
+        let read = |lds: &str| {
+            let text = format!("{GRIPPER}lds: {lds}\n");
+            let component = Component::from_yaml(&text, Path::new("examples/plant"));
+            component.map(|component| component.lds.option("local"))
+        };
+        for (lds, option) in [
+            ("none", None),
+            ("embed", Some("embed")),
+            (
+                "embed=opc.tcp://10.0.0.2:4841",
+                Some("embed=opc.tcp://10.0.0.2:4841"),
+            ),
+            ("opc.tcp://10.0.0.2", Some("opc.tcp://10.0.0.2")),
+        ] {
+            assert_eq!(read(lds), Ok(option.map(str::to_owned)));
+        }
+        for lds in ["embed=there", "embedded"] {
+            let findings = read(lds).unwrap_err().sorted();
+            assert_eq!(findings[0].code.as_str(), "P014", "{lds}: {findings:?}");
+        }
     }
 
     #[test]
