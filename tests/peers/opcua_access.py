@@ -155,6 +155,11 @@ def pairs(folder):
     lifetime.say(made=str(folder))
 
 
+def aged(folder, uri):
+    make(folder, "aged", uri, -9, 1, purpose=ExtendedKeyUsageOID.SERVER_AUTH)
+    lifetime.say(made=str(folder))
+
+
 def status_of(error):
     """The name of the status in an error, however it is wrapped."""
     while error is not None:
@@ -239,7 +244,14 @@ async def tries(args):
 async def endpoints(url):
     found = await Client(url, timeout=10).connect_and_get_server_endpoints()
     policies = [one.SecurityPolicyUri.rpartition("#")[2] for one in found]
-    lifetime.say(policies=policies, urls=[one.EndpointUrl for one in found])
+    issuers = [issuer(one.ServerCertificate) for one in found if one.ServerCertificate]
+    lifetime.say(policies=policies, urls=[one.EndpointUrl for one in found], issuers=issuers)
+
+
+def issuer(der):
+    """The common name of who issued a certificate."""
+    names = x509.load_der_x509_certificate(der).issuer.get_attributes_for_oid(NameOID.COMMON_NAME)
+    return names[0].value if names else None
 
 
 FIELDS = ["EventType", "SourceName", "Status", "StatusCodeId", "ClientUserId", "ServerId", "NewValue", "OldValue", "MethodId"]
@@ -336,6 +348,9 @@ def main():
     verbs = parser.add_subparsers(dest="verb", required=True)
     making = verbs.add_parser("pairs")
     making.add_argument("folder", type=pathlib.Path)
+    aging = verbs.add_parser("aged")
+    aging.add_argument("folder", type=pathlib.Path)
+    aging.add_argument("uri")
     issuing = verbs.add_parser("issued")
     issuing.add_argument("folder", type=pathlib.Path)
     serving = verbs.add_parser("servers")
@@ -371,6 +386,8 @@ def main():
     lifetime.bound(120.0)
     if args.verb == "pairs":
         pairs(args.folder)
+    elif args.verb == "aged":
+        aged(args.folder, args.uri)
     elif args.verb == "issued":
         issued(args.folder)
     elif args.verb == "servers":

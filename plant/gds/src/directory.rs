@@ -4,9 +4,9 @@ use opcua::types::{ExtensionObject, StatusCode, UAString, Variant};
 use plant_opcua::server::MethodRequest;
 use tracing::info;
 
-use crate::record::ApplicationRecord;
 use crate::records::{Query, Record};
 use crate::service::{Answer, Gds, id, number, refused, texts, time, unregistered};
+use plant_opcua::directory::ApplicationRecord;
 
 /// FindApplications: those of an ApplicationUri.
 pub(crate) fn find(gds: &Gds, request: &MethodRequest) -> Answer {

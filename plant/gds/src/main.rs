@@ -7,7 +7,6 @@
 mod ca;
 mod directory;
 mod manager;
-mod record;
 mod records;
 mod serve;
 mod service;

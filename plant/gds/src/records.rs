@@ -9,7 +9,7 @@ use opcua::types::{
 };
 use serde::{Deserialize, Serialize};
 
-use crate::record::ApplicationRecord;
+use plant_opcua::directory::ApplicationRecord;
 
 /// An application.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]

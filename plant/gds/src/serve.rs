@@ -20,11 +20,11 @@ use tokio::time::{MissedTickBehavior, interval};
 use tracing::{info, warn};
 
 use crate::manager::{self, StartNewKeyPair, TRUST_LIST};
-use crate::record::{NAMESPACE, Types};
 use crate::records::Records;
 use crate::service::{Answer, Gds, GroupList, now};
 use crate::store::{Store, StoreFault};
 use crate::{directory, service};
+use plant_opcua::directory::{NAMESPACE, Types};
 
 /// How it runs.
 #[derive(Debug)]

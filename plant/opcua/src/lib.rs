@@ -10,6 +10,7 @@ pub mod certificates;
 pub mod changes;
 pub mod client;
 pub mod configuration;
+pub mod directory;
 pub mod door;
 pub mod endpoint;
 pub mod file;

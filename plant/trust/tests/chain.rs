@@ -8,8 +8,8 @@
 use std::time::Duration;
 
 use trust::{
-    Authority, Certificate, Crl, Fault, Issue, Known, Names, Renewal, Request, Revoked, Serial, Step,
-    Unfit, check, check_named,
+    Authority, Certificate, Crl, Fault, Issue, Known, Names, Renewal, Request, Revoked, Serial,
+    Step, Unfit, check, check_named,
 };
 use x509_cert::der::pem;
 
@@ -181,10 +181,7 @@ fn the_certificate_of_a_server_is_for_its_host_and_of_its_application() {
     assert_eq!(named(Some("cell-2"), uri, NOW), Err(Fault::Host));
     assert_eq!(named(host, Some("urn:cell:other"), NOW), Err(Fault::Uri));
     // The earlier step tells.
-    assert_eq!(
-        named(Some("cell-2"), uri, NOW + DAY * 2),
-        Err(Fault::Time)
-    );
+    assert_eq!(named(Some("cell-2"), uri, NOW + DAY * 2), Err(Fault::Time));
     assert_eq!(Fault::Host.status(), 0x8016_0000);
     assert_eq!(Fault::Uri.status(), 0x8017_0000);
 }

@@ -1,10 +1,14 @@
 //! What clients may choose of the server: its endpoints and their security.
 
 use std::net::{SocketAddr, TcpListener};
+use std::sync::Arc;
 
 use bridge_node::{Failure, FailureKind};
 use mappings::{SecurityPolicy, Server, ServerLimits};
 use opcua::server::{Limits, ServerBuilder};
+use opcua::types::ApplicationType;
+use plant_opcua::configuration::{Configuration, Plant};
+use plant_opcua::directory::ApplicationRecord;
 use plant_opcua::door::Door;
 use plant_opcua::endpoint::EndpointUrl;
 use plant_opcua::limits;
@@ -133,6 +137,29 @@ pub(crate) fn stand(runtime: &Runtime, door: Standing) -> Result<(), Failure> {
         drop(runtime.spawn(door.stand(listener)));
     }
     Ok(())
+}
+
+/// Has the Global Discovery Server at `gds` keep the certificate of the server young, for as long as the server runs.
+pub(crate) fn keep_young(
+    runtime: &Runtime,
+    gds: Option<String>,
+    certificates: &Arc<Configuration>,
+    told: &discovery::Server,
+) {
+    let Some(url) = gds else { return };
+    let texts = |all: &[String]| Some(all.iter().map(|one| one.as_str().into()).collect());
+    let record = ApplicationRecord {
+        application_uri: told.application_uri.as_str().into(),
+        application_type: ApplicationType::Server,
+        application_names: Some(vec![told.name.as_str().into()]),
+        product_uri: told.product_uri.as_str().into(),
+        discovery_urls: texts(std::slice::from_ref(&told.url)),
+        server_capabilities: texts(&told.capabilities),
+        ..ApplicationRecord::default()
+    };
+    let certificates = Arc::clone(certificates);
+    let plant = Plant { url, record };
+    drop(runtime.spawn(async move { certificates.keep_young(plant).await }));
 }
 
 fn io_fault(error: std::io::Error) -> Failure {

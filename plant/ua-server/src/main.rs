@@ -92,6 +92,10 @@ struct UaServer {
     /// an interface, to this host and of this host
     #[arg(long)]
     announce: bool,
+    /// Register with this Global Discovery Server, as opc.tcp://10.80.0.1:4841, have it renew the server's certificate before
+    /// that is over, and fetch its revocation lists
+    #[arg(long, value_name = "URL", env = "UA_GDS")]
+    gds: Option<EndpointUrl>,
     /// Made when it is first wanted.
     #[arg(skip)]
     sks: OnceLock<Arc<Sks>>,
@@ -198,6 +202,7 @@ impl Program for UaServer {
             trust_any_client: self.trust_any_client_certificate,
             types: Types::new(&context.types),
             mapped_url: self.endpoint.is_none(),
+            gds: self.gds.as_ref().map(ToString::to_string),
             announce: self.announcement(),
         };
         ServerPort::start(&context.mapping, setup)

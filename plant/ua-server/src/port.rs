@@ -65,6 +65,8 @@ pub(crate) struct Setup {
     pub(crate) mapped_url: bool,
     /// To whom the server is told of.
     pub(crate) announce: Option<AnnounceSettings>,
+    /// The Global Discovery Server that keeps its certificate young.
+    pub(crate) gds: Option<String>,
 }
 
 /// The OPC UA side of the space.
@@ -172,6 +174,7 @@ impl ServerPort {
         let others = Others::new(mapping, setup.announce.as_ref(), setup.pki.root());
         let methods = Methods::new(nodes.clone(), mapping, (asked, &layout.structures));
         let (server, application) = told_of(described, setup.url.advertised(port), &security);
+        endpoint::keep_young(&runtime, setup.gds, &certificates, &server);
         let (told, components) = tell(server, setup.announce, nodes)?;
         Ok(Self {
             unbound: VecDeque::new(),

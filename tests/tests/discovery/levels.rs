@@ -391,7 +391,8 @@ impl Guarded {
 }
 
 #[test]
-fn over_secured_channels_a_device_is_configured_and_called_and_one_that_is_not_trusted_is_told_of() {
+fn over_secured_channels_a_device_is_configured_and_called_and_one_that_is_not_trusted_is_told_of()
+{
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
     };
@@ -408,7 +409,12 @@ fn over_secured_channels_a_device_is_configured_and_called_and_one_that_is_not_t
     // Its method is called from above over a secured channel.
     let path = "Devices/adder/device/Add";
     let args = [&*plant.top, path, "--value", "[2.5, 4.0]"];
-    let secured = ["--security", "Basic256Sha256", "--certificates", &plant.pairs];
+    let secured = [
+        "--security",
+        "Basic256Sha256",
+        "--certificates",
+        &plant.pairs,
+    ];
     let called = cell.asyncua_started("opcua_call.py", &[args, secured].concat());
     let mut called = called.at(&plant.above).start();
     assert!(called.wait_for_end(SOON * 3).success());

@@ -15,7 +15,7 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
-use opcua::types::StatusCode;
+use opcua::types::{NamespaceMap, StatusCode, TypeLoader};
 use tokio::sync::watch;
 
 pub use self::services::{Browse, CallError, CallOptions, MOST_REFERENCES};
@@ -217,6 +217,21 @@ impl Client {
     #[must_use]
     pub fn certificates_refused(&self) -> u64 {
         self.shared.refused.load(Ordering::Relaxed)
+    }
+
+    /// Reads structures of these types from now on, over the connection that there is.
+    ///
+    /// # Errors
+    /// There is no connection.
+    pub fn knows(&self, types: Arc<dyn TypeLoader>) -> Result<(), ClientError> {
+        let connected = self.shared.connected()?;
+        let mut namespaces = NamespaceMap::new();
+        for uri in &connected.namespaces {
+            namespaces.add_namespace(uri);
+        }
+        connected.session.set_namespaces(namespaces);
+        connected.session.add_type_loader(types);
+        Ok(())
     }
 
     /// The index of a namespace at the server.

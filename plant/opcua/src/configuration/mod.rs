@@ -4,8 +4,9 @@
 //! issued (UpdateCertificate), and says whom it is to trust (the trust list, a file). What counts after ApplyChanges only, because
 //! the library reads its pair once, is told to the program around it, which starts the server anew.
 //!
-//! Reading order: `store` (the trust list in the files of the store), then here.
+//! Reading order: `store` (the trust list in the files of the store), then here, `renewing` (without an administrator).
 
+mod renewing;
 mod store;
 
 use std::fs;
@@ -24,6 +25,8 @@ use tokio::sync::Notify;
 use tracing::{info, warn};
 use trust::{Certificate, Request};
 use x509_cert::der::pem::{self, LineEnding};
+
+pub use self::renewing::Plant;
 
 use self::store::StoreList;
 use crate::file::{FileMethod, LARGEST, LONGEST_UNUSED};

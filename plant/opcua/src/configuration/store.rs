@@ -80,10 +80,19 @@ impl StoreList {
         certificate: &Certificate,
         issuers: &Variant,
     ) -> Result<(), StatusCode> {
+        self.judge_among(certificate, &given(issuers)?)
+    }
+
+    /// The same with the certificates of authorities read.
+    pub(super) fn judge_among(
+        &self,
+        certificate: &Certificate,
+        issuers: &[Certificate],
+    ) -> Result<(), StatusCode> {
         let mut known = known::read(&self.root);
         // Who may give the server a certificate decides that it is one to be shown.
         known.trusted.append(&mut known.issuers);
-        known.trusted.extend(given(issuers)?);
+        known.trusted.extend_from_slice(issuers);
         if certificate.is_self_signed() {
             known.trusted.push(certificate.clone());
         }
@@ -99,11 +108,14 @@ impl StoreList {
 
     /// Keeps the certificates of authorities above one, which clients may want to know.
     pub(super) fn keep_issuers(&self, issuers: &Variant) -> Result<(), StatusCode> {
-        for certificate in given(issuers)? {
-            if certificate.is_authority() {
-                self.keep(&certificate, Standing::Issuer)
-                    .map_err(|error| told(&error))?;
-            }
+        self.keep_all(&given(issuers)?)
+    }
+
+    /// The same with the certificates read.
+    pub(super) fn keep_all(&self, issuers: &[Certificate]) -> Result<(), StatusCode> {
+        for certificate in issuers.iter().filter(|one| one.is_authority()) {
+            self.keep(certificate, Standing::Issuer)
+                .map_err(|error| told(&error))?;
         }
         Ok(())
     }

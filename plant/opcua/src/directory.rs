@@ -1,0 +1,274 @@
+//! The Directory of a Global Discovery Server (OPC 10000-12, 6 and 7.9): the structure of an application, and a client that keeps one
+//! application registered, asks for its certificates and reads the trust list.
+
+use std::sync::{Arc, LazyLock};
+
+use opcua::types::{
+    ApplicationType, BinaryDecodable, BinaryEncodable, ByteString, ContextOwned,
+    ExpandedMessageInfo, ExpandedNodeId, ExtensionObject, LocalizedText, MethodId, NodeId,
+    StaticTypeLoader, TrustListDataType, TypeLoaderInstance, UAString, UaNullable, Variant,
+    XmlDecodable, XmlEncodable, XmlType, binary_decode_to_enc,
+};
+use trust::{Certificate, Crl, Request};
+
+use crate::client::{CallError, Client, ClientError};
+use crate::file::LARGEST;
+
+/// The namespace of the Directory.
+pub const NAMESPACE: &str = "http://opcfoundation.org/UA/GDS/";
+
+/// ApplicationRecordDataType.
+#[derive(
+    Debug,
+    Clone,
+    PartialEq,
+    Default,
+    BinaryEncodable,
+    BinaryDecodable,
+    XmlEncodable,
+    XmlDecodable,
+    XmlType,
+    UaNullable,
+)]
+pub struct ApplicationRecord {
+    /// The ApplicationId; null of one that is to be registered.
+    pub application_id: NodeId,
+    /// The ApplicationUri.
+    pub application_uri: UAString,
+    /// Server, client, or both.
+    pub application_type: ApplicationType,
+    /// Names for people.
+    pub application_names: Option<Vec<LocalizedText>>,
+    /// The ProductUri.
+    pub product_uri: UAString,
+    /// Where it is asked who it is.
+    pub discovery_urls: Option<Vec<UAString>>,
+    /// Capabilities as `DA`; at least one of a server.
+    pub server_capabilities: Option<Vec<UAString>>,
+}
+
+impl ExpandedMessageInfo for ApplicationRecord {
+    fn full_type_id(&self) -> ExpandedNodeId {
+        ExpandedNodeId::new_with_namespace(NAMESPACE, BINARY)
+    }
+
+    fn full_json_type_id(&self) -> ExpandedNodeId {
+        ExpandedNodeId::new_with_namespace(NAMESPACE, JSON)
+    }
+
+    fn full_xml_type_id(&self) -> ExpandedNodeId {
+        ExpandedNodeId::new_with_namespace(NAMESPACE, XML)
+    }
+
+    fn full_data_type_id(&self) -> ExpandedNodeId {
+        ExpandedNodeId::new_with_namespace(NAMESPACE, DATA_TYPE)
+    }
+}
+
+/// Reads it in what clients send.
+pub struct Types;
+
+impl StaticTypeLoader for Types {
+    fn instance() -> &'static TypeLoaderInstance {
+        static TYPES: LazyLock<TypeLoaderInstance> = LazyLock::new(|| {
+            let mut types = TypeLoaderInstance::new();
+            types.add_binary_type(DATA_TYPE, BINARY, binary_decode_to_enc::<ApplicationRecord>);
+            types
+        });
+        &TYPES
+    }
+
+    fn namespace() -> &'static str {
+        NAMESPACE
+    }
+}
+
+/// Why a Directory does not do what it is asked for.
+#[derive(Debug, thiserror::Error)]
+pub enum DirectoryError {
+    /// There is no connection.
+    #[error(transparent)]
+    Client(#[from] ClientError),
+    /// It refuses, or does not answer.
+    #[error("{method}: {error}")]
+    Call {
+        /// What it was asked for.
+        method: &'static str,
+        /// Why not.
+        error: CallError,
+    },
+    /// It has no Directory.
+    #[error("the server has no namespace {NAMESPACE}: it is no Global Discovery Server")]
+    None,
+    /// It answers with something else than the standard says.
+    #[error("{0} answers with what OPC 10000-12 does not say")]
+    Answer(&'static str),
+}
+
+/// The Directory of the server that a client is connected to.
+#[derive(Clone)]
+pub struct Directory {
+    client: Client,
+    namespace: u16,
+}
+
+impl Directory {
+    /// That of a client that is connected.
+    ///
+    /// # Errors
+    /// There is no connection, or the server has none.
+    pub fn of(client: &Client) -> Result<Self, DirectoryError> {
+        client.knows(Arc::new(Types))?;
+        let namespace = client.namespace(NAMESPACE);
+        Ok(Self {
+            client: client.clone(),
+            namespace: namespace.ok_or(DirectoryError::None)?,
+        })
+    }
+
+    async fn call(
+        &self,
+        (number, method): (u32, &'static str),
+        arguments: Vec<Variant>,
+    ) -> Result<Vec<Variant>, DirectoryError> {
+        let [object, node] = [DIRECTORY, number].map(|number| NodeId::new(self.namespace, number));
+        let called = self.client.call(&object, &node, arguments).await;
+        called.map_err(|error| DirectoryError::Call { method, error })
+    }
+
+    /// The ApplicationId of an application: it is registered where it is not yet.
+    ///
+    /// # Errors
+    /// The server does not say.
+    pub async fn registered(&self, record: ApplicationRecord) -> Result<NodeId, DirectoryError> {
+        let uri = Variant::String(record.application_uri.clone());
+        let found = self.call(FIND_APPLICATIONS, vec![uri]).await?;
+        let Some(Variant::Array(found)) = found.into_iter().next() else {
+            return Err(DirectoryError::Answer("FindApplications"));
+        };
+        let known = found.values.into_iter().find_map(|one| match one {
+            Variant::ExtensionObject(object) => object.into_inner_as::<ApplicationRecord>(),
+            _ => None,
+        });
+        if let Some(known) = known {
+            return Ok(known.application_id);
+        }
+        let record = Variant::from(ExtensionObject::from_message(record));
+        let registered = self.call(REGISTER_APPLICATION, vec![record]).await?;
+        match registered.into_iter().next() {
+            Some(Variant::NodeId(id)) => Ok(*id),
+            _ => Err(DirectoryError::Answer("RegisterApplication")),
+        }
+    }
+
+    /// The certificate that an authority issues for a signing request, and the certificates of those above it.
+    ///
+    /// # Errors
+    /// None is issued.
+    pub async fn issued(
+        &self,
+        application: &NodeId,
+        request: &Request,
+    ) -> Result<(Certificate, Vec<Certificate>), DirectoryError> {
+        let (application, any) = (Variant::from(application.clone()), NodeId::null());
+        let request = Variant::ByteString(ByteString::from(request.der().to_vec()));
+        let arguments = vec![
+            application.clone(),
+            Variant::from(any.clone()),
+            Variant::from(any),
+            request,
+        ];
+        let number = self.call(START_SIGNING_REQUEST, arguments).await?;
+        let number = number.into_iter().next();
+        let number = number.ok_or(DirectoryError::Answer("StartSigningRequest"))?;
+        let finished = self.call(FINISH_REQUEST, vec![application, number]).await?;
+        let read = |bytes: &Variant| match bytes {
+            Variant::ByteString(bytes) => Certificate::read(bytes.value.as_deref()?).ok(),
+            _ => None,
+        };
+        let odd = || DirectoryError::Answer("FinishRequest");
+        let certificate = finished.first().and_then(read).ok_or_else(odd)?;
+        let above = match finished.get(2) {
+            Some(Variant::Array(all)) => all.values.iter().filter_map(read).collect(),
+            _ => Vec::new(),
+        };
+        Ok((certificate, above))
+    }
+
+    /// The revocation lists in the trust list of an application.
+    ///
+    /// # Errors
+    /// The list cannot be read.
+    pub async fn revocation_lists(&self, application: &NodeId) -> Result<Vec<Crl>, DirectoryError> {
+        let arguments = vec![
+            Variant::from(application.clone()),
+            Variant::from(NodeId::null()),
+        ];
+        let list = self.call(GET_TRUST_LIST, arguments).await?;
+        let Some(Variant::NodeId(list)) = list.into_iter().next() else {
+            return Err(DirectoryError::Answer("GetTrustList"));
+        };
+        let bytes = self.file(&list).await?;
+        let context = ContextOwned::default();
+        let read = TrustListDataType::decode(&mut bytes.as_slice(), &context.context());
+        let read = read.map_err(|_| DirectoryError::Answer("the trust list"))?;
+        let lists = read.trusted_crls.into_iter().chain(read.issuer_crls);
+        let each = lists.flatten().filter_map(|bytes| bytes.value);
+        Ok(each.filter_map(|bytes| Crl::read(&bytes).ok()).collect())
+    }
+
+    /// The content of a file object, which is closed afterwards (OPC 10000-20, 4.2).
+    async fn file(&self, file: &NodeId) -> Result<Vec<u8>, DirectoryError> {
+        let call = async |method: MethodId, name: &'static str, arguments: Vec<Variant>| {
+            let called = self.client.call(file, &method.into(), arguments).await;
+            called.map_err(|error| DirectoryError::Call {
+                method: name,
+                error,
+            })
+        };
+        let opened = call(MethodId::FileType_Open, "Open", vec![Variant::Byte(READ)]).await?;
+        let Some(Variant::UInt32(handle)) = opened.into_iter().next() else {
+            return Err(DirectoryError::Answer("Open"));
+        };
+        let mut content = Vec::new();
+        let read = loop {
+            let arguments = vec![Variant::UInt32(handle), Variant::Int32(AT_ONCE)];
+            let read = call(MethodId::FileType_Read, "Read", arguments).await;
+            let bytes = match read.map(|answer| answer.into_iter().next()) {
+                Ok(Some(Variant::ByteString(bytes))) => bytes.value.unwrap_or_default(),
+                Ok(_) => break Err(DirectoryError::Answer("Read")),
+                Err(error) => break Err(error),
+            };
+            if bytes.is_empty() {
+                break Ok(());
+            }
+            content.extend(bytes);
+            if content.len() > LARGEST {
+                break Err(DirectoryError::Answer("a file that is too large"));
+            }
+        };
+        let closed = call(
+            MethodId::FileType_Close,
+            "Close",
+            vec![Variant::UInt32(handle)],
+        );
+        read.and(closed.await.map(drop))?;
+        Ok(content)
+    }
+}
+
+/// Nodes of the Directory object of every Global Discovery Server.
+const DIRECTORY: u32 = 141;
+const FIND_APPLICATIONS: (u32, &str) = (143, "FindApplications");
+const REGISTER_APPLICATION: (u32, &str) = (146, "RegisterApplication");
+const START_SIGNING_REQUEST: (u32, &str) = (157, "StartSigningRequest");
+const FINISH_REQUEST: (u32, &str) = (163, "FinishRequest");
+const GET_TRUST_LIST: (u32, &str) = (204, "GetTrustList");
+/// The mode of a file that is read.
+const READ: u8 = 1;
+/// So many bytes of a file are read at once.
+const AT_ONCE: i32 = 16 * 1024;
+const DATA_TYPE: u32 = 1;
+const BINARY: u32 = 134;
+const XML: u32 = 127;
+const JSON: u32 = 8001;
