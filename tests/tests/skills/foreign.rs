@@ -1,6 +1,7 @@
 //! Skills of a server of another maker, which knows Programs of OPC 10000-10 and nothing of the space: `ua-server` speaks for it.
 
 use std::fs;
+use std::process::Command;
 use std::time::Duration;
 
 use nix::sys::signal::Signal;
@@ -306,9 +307,14 @@ const LDS: &str = "opc.tcp://127.0.0.1:4840";
 
 /// ua-lds, when it answers.
 fn discovery_server(cell: &Cell) -> Child {
+    discovery_server_with(cell, &[])
+}
+
+fn discovery_server_with(cell: &Cell, more: &[&str]) -> Child {
     let args = ["--interface", "lo", "--endpoint", LDS];
     let child = Started::new("ua-lds", &program("ua-lds"))
         .args(args)
+        .args(more)
         .start();
     eventually("ua-lds answers", SOON, || {
         cell.asyncua_try("opcua_discovery.py", &["find-servers", LDS])
@@ -447,4 +453,66 @@ server:
     let skills = listed_of("saw", 4);
     assert_eq!(skills[0]["topic"], "ua_0_40_101", "{skills:?}");
     assert_eq!(servers(), [("saw".to_owned(), true)]);
+}
+
+#[test]
+fn a_secured_machine_of_node_opcua_that_registers_by_itself_is_run_once_it_is_trusted() {
+    let Some(cell) = Cell::with(&[Peer::Python, Peer::NodeOpcua]) else {
+        return;
+    };
+    let mapping = |security: &str| {
+        format!(
+            "
+server:
+  endpoint: opc.tcp://127.0.0.1:4858
+  find_skills: {{uris: ['urn:*'], first: 40, most: 4, security: {security}}}
+"
+        )
+    };
+    let file = cell.file("secured.yaml", &mapping("None"));
+    let pki = cell.folder().join("lds-pki");
+    let _lds = discovery_server_with(&cell, &["--pki", pki.to_str().unwrap()]);
+    let certificate = pki.join("trusted/node.der");
+    let args = ["4857", LDS, certificate.to_str().unwrap()];
+    let mut machine = cell.node_opcua_started("programs.js", &args).start();
+    let uri = machine.wait_for_json("who it is", SOON, |line| {
+        line["uri"].as_str().map(str::to_owned)
+    });
+    machine.wait_for_line("serverRegistered", SOON);
+    let server = cell.ua_server(&[file.to_str().unwrap(), "--lds", LDS]);
+    let refused = |what: &str, is_meant: &dyn Fn(&str) -> bool| {
+        eventually(what, SOON, || {
+            let told = metrics(METRICS_SERVER)?["servers"][0].clone();
+            (told["up"] == false && is_meant(told["why"].as_str()?)).then_some(())
+        });
+    };
+    // It has no channel without security, and with it nobody is trusted for having a certificate.
+    refused("there is no channel without security", &|why| {
+        why.contains("it offers Basic256Sha256/SignAndEncrypt, wanted is None")
+    });
+    fs::write(&file, mapping("Basic256Sha256")).unwrap();
+    server.signal(Signal::SIGHUP);
+    refused("it is not trusted", &|why| !why.contains("it offers"));
+    let trusted = Command::new(program("ua-server"))
+        .arg("trust")
+        .arg(&certificate)
+        .arg("--pki")
+        .arg(cell.folder().join("pki"))
+        .output()
+        .unwrap();
+    assert!(trusted.status.success(), "{trusted:?}");
+
+    let name = uri.rsplit(':').next().unwrap();
+    let skills = listed_of(name, 1);
+    assert_eq!(skills[0]["skill"], "Weld", "{skills:?}");
+    let told = metrics(METRICS_SERVER).unwrap()["servers"][0].clone();
+    assert_eq!(told["secured"], true, "{told}");
+    let (code, states, result) = run(&[&format!("{name}.Weld"), "Force=33.5"]);
+    assert_eq!((code, &result["succeeded"]), (0, &json!(true)), "{result}");
+    assert_eq!(states, ["Running", "Ready"]);
+    assert_eq!(result["results"], json!({"ForceUsed": 33.5}));
+    let started = machine.wait_for_json("the machine says what it was given", SOON, |line| {
+        line.get("started").cloned()
+    });
+    assert_eq!(started, 33.5);
 }
