@@ -33,6 +33,8 @@ pub enum Peer {
     Ros2,
     /// node-opcua, which `cargo xtask test` installs from npm.
     NodeOpcua,
+    /// A library that shifts the wall clock of a program, which `cargo xtask test` compiles.
+    Clock,
     /// Wireshark's tshark, from Debian or Ubuntu.
     Tshark,
 }
@@ -87,6 +89,7 @@ pub(crate) const TSHARK: &str = "/usr/bin/tshark";
 pub(crate) const FASTDDS: &str = "fastdds-peer";
 pub(crate) const CYCLONE: &str = "cyclone-peer";
 pub(crate) const ROSCPP: &str = "roscpp-peer";
+pub(crate) const CLOCK: &str = "clock-shift.so";
 pub(crate) const NODE_OPCUA: &str = "node-opcua";
 
 impl Cell {
@@ -225,7 +228,7 @@ pub(crate) fn compiled(name: &str) -> PathBuf {
 }
 
 fn find(peer: Peer, python: &Path) -> Result<(), String> {
-    let [fastdds, cyclone, roscpp] = [FASTDDS, CYCLONE, ROSCPP].map(compiled);
+    let [fastdds, cyclone, roscpp, clock] = [FASTDDS, CYCLONE, ROSCPP, CLOCK].map(compiled);
     let [jazzy, kilted] = Distribution::ALL.map(Distribution::python);
     let node_opcua = compiled(NODE_OPCUA).join("node_modules/node-opcua-client");
     let needed: &[&Path] = match peer {
@@ -243,6 +246,7 @@ fn find(peer: Peer, python: &Path) -> Result<(), String> {
         Peer::FastDds => &[&fastdds],
         Peer::CycloneC => &[&cyclone],
         Peer::Roscpp => &[&roscpp],
+        Peer::Clock => &[&clock],
         Peer::Ros2 => &[&jazzy, &kilted],
         Peer::NodeOpcua => &[&node_opcua],
         Peer::Tshark => &[Path::new(TSHARK)],

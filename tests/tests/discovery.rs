@@ -1,5 +1,7 @@
 //! Who is there: `ua-lds`, servers that tell of themselves, and clients and packets of other makers as judges.
 
+#[path = "discovery/clock.rs"]
+mod clock;
 #[path = "discovery/embedded.rs"]
 mod embedded;
 #[path = "discovery/faults.rs"]

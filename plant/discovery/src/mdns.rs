@@ -99,6 +99,9 @@ pub(crate) struct Mdns {
     /// What a goodbye was heard of that the daemon has not taken yet, and when it must have. A goodbye may be that of another
     /// host to a name that two had, or the server is back at once: what stays in the daemon's cache is told by nobody.
     doubted: BTreeMap<String, (Announcement, Aside, Instant)>,
+    /// What the daemon holds for outdated though no goodbye was heard, and when that is told. It takes a clock that is set
+    /// forward for a sleep of the machine, forgets whom it knew, and hears of them anew in a moment.
+    outdated: BTreeMap<String, (Announcement, Aside, Instant)>,
     ignored: u64,
 }
 
@@ -137,6 +140,7 @@ impl Mdns {
             left: Vec::new(),
             there: BTreeMap::new(),
             doubted: BTreeMap::new(),
+            outdated: BTreeMap::new(),
             ignored: 0,
         })
     }
@@ -192,6 +196,9 @@ impl Mdns {
     pub(crate) async fn next(&mut self) -> Heard {
         loop {
             while let Some(instance) = self.left.pop() {
+                if self.outdated.remove(&instance).is_some() {
+                    return Heard::Withdrawn { instance };
+                }
                 if !self.ours.contains_key(&instance)
                     && let Some((announcement, aside)) = self.there.remove(&instance)
                 {
@@ -204,12 +211,13 @@ impl Mdns {
                     return Heard::Withdrawn { instance };
                 }
             }
-            if let Some(heard) = self.still_there() {
+            if let Some(heard) = self.still_there().or_else(|| self.not_heard_again()) {
                 return heard;
             }
             let announce_at = self.announce_at;
-            let doubted = self.doubted.values().map(|(_, _, until)| *until).min();
-            let wake_at = doubted.map_or(announce_at, |until| until.min(announce_at));
+            let waiting = self.doubted.values().chain(self.outdated.values());
+            let due = waiting.map(|(_, _, until)| *until).min();
+            let wake_at = due.map_or(announce_at, |until| until.min(announce_at));
             let Self {
                 goodbyes,
                 packet,
@@ -260,6 +268,18 @@ impl Mdns {
             announcement,
             aside,
         })
+    }
+
+    /// A server that is outdated, and was not heard since.
+    fn not_heard_again(&mut self) -> Option<Heard> {
+        let now = Instant::now();
+        let mut due = self
+            .outdated
+            .iter()
+            .filter(|(_, (_, _, until))| *until <= now);
+        let instance = due.next()?.0.clone();
+        self.outdated.remove(&instance);
+        Some(Heard::Withdrawn { instance })
     }
 
     fn take_goodbyes(&mut self, heard: std::io::Result<usize>) {
@@ -348,6 +368,7 @@ impl Mdns {
                     };
                 }
                 self.doubted.remove(&announcement.instance);
+                let outdated = self.outdated.remove(&announcement.instance);
                 let is_known = self.there.contains_key(&announcement.instance);
                 if is_known || self.there.len() < MOST {
                     let heard = (announcement.clone(), aside);
@@ -357,15 +378,26 @@ impl Mdns {
                     // At once, but not for each of many that appear together: a record is sent once a second at most.
                     self.announce_at = self.announce_at.min(Instant::now() + SETTLE);
                 }
-                Some(Heard::Announced {
+                let is_as_before = outdated.is_some_and(|(before, beside, _)| {
+                    (before, beside) == (announcement.clone(), aside)
+                });
+                (!is_as_before).then_some(Heard::Announced {
                     announcement,
                     aside,
                 })
             }
             ServiceEvent::ServiceRemoved(_, fullname) => {
                 let instance = instance(&fullname)?;
-                self.there.remove(&instance);
+                let known = self.there.remove(&instance);
                 self.doubted.remove(&instance);
+                if let Some((announcement, aside)) = known
+                    && self.goodbyes.is_some()
+                    && self.outdated.len() < MOST
+                {
+                    let until = Instant::now() + DOUBT;
+                    self.outdated.insert(instance, (announcement, aside, until));
+                    return None;
+                }
                 // Ours is announced still: the goodbye is of another of that name.
                 (!self.ours.contains_key(&instance)).then_some(Heard::Withdrawn { instance })
             }

@@ -1,5 +1,5 @@
 //! The peers that are compiled here: Fast DDS, Cyclone DDS and roscpp by their own libraries, from `tests/peers/dds` and
-//! `tests/peers/calls`.
+//! `tests/peers/calls`, and the library that shifts clocks, from `tests/peers/clock`.
 
 use std::{fs, path::Path, process::Command};
 
@@ -50,6 +50,13 @@ const PROGRAMS: &[Program] = &[
             "-lboost_system",
             "-pthread",
         ],
+    },
+    // Loaded into programs under test.
+    Program {
+        name: "clock-shift.so",
+        sources: &["../clock/shift.cpp"],
+        types: None,
+        libraries: &["-shared", "-fPIC", "-ldl"],
     },
 ];
 
