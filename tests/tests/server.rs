@@ -211,6 +211,39 @@ fn a_silent_writer_leaves_an_uncertain_value_that_is_good_again_when_it_speaks()
 }
 
 #[test]
+fn a_subscriber_is_told_what_comes_after_the_clock_of_a_publisher_was_set_back() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let _server = server(&cell);
+    let mut watch = watch(&cell, TEMPERATURE_NODE);
+    let group = UadpSocket::join();
+    let hour = 36_000_000_000;
+    let at = |shift: i64| DataSetHeader {
+        timestamp: Some(uadp::DateTime(now().time.0 + shift)),
+        ..DataSetHeader::default()
+    };
+    // As it was, an hour ahead, as it was again, with the value of before too, and an hour behind.
+    for (sequence, shift, value) in [
+        (1, 0, 20.0),
+        (2, hour, 21.0),
+        (3, 0, 21.0),
+        (4, 0, 22.0),
+        (5, -hour, 23.0),
+        (6, -hour, 24.0),
+    ] {
+        let header = at(shift);
+        let of_day = header.timestamp.map(|sent| (sent.0 / hour) % 24);
+        group.send(&key_frame(TEMPERATURE, sequence, value, header));
+        watch.wait_for_json(&format!("{value} of hour {of_day:?}"), SOON, |line| {
+            let told = line["source_timestamp"].as_str()?.get(11..13)?;
+            let is_it = line["status"] == "Good" && line["value"] == value;
+            (is_it && told.parse().ok() == of_day).then_some(())
+        });
+    }
+}
+
+#[test]
 fn the_status_of_a_data_set_message_is_that_of_the_value() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
