@@ -323,7 +323,7 @@ pub(crate) mod tests {
         let number = handles.add(&request(1, &[]), vec![1, 2, 3, 4], false);
         let number = number.unwrap().remove(0);
         let mut call = |method, more: &[Variant]| {
-            let arguments = [&[number.clone()], more].concat();
+            let arguments = [std::slice::from_ref(&number), more].concat();
             handles.call(method, &request(1, &arguments)).unwrap()
         };
         let bytes = |bytes: &[u8]| vec![Variant::ByteString(ByteString::from(bytes.to_vec()))];
