@@ -2,6 +2,7 @@
 
 mod files;
 mod outline;
+mod structures;
 
 use std::collections::{BTreeSet, HashMap};
 use std::fs::File;
@@ -17,11 +18,11 @@ use opcua::types::{
     StructureDefinition,
 };
 use opcua::xml::load_nodeset2_file;
-use opcua::xml::schema::ua_node_set::{UANode, UANodeSet};
+use opcua::xml::schema::ua_node_set::{AliasTable, NodeIdAlias, UANode, UANodeSet};
 
 use crate::limits::{LARGEST_NODESET, MOST_NODESETS};
 
-pub use self::files::{FileFault, NodeSets, fingerprint};
+pub use self::files::{FileFault, Imported, NodeSets, fingerprint};
 pub use self::outline::{NodeKind, ValueKind, builtin};
 
 use self::outline::Outline;
@@ -124,7 +125,12 @@ pub(crate) enum Source {
 pub(crate) struct NodeSet {
     file: String,
     facts: Facts,
-    import: NodeSet2Import,
+    /// Its DataTypes and their encodings.
+    types: NodeSet2Import,
+    /// All its other nodes.
+    others: NodeSet2Import,
+    /// Those of them whose values are left out, for they cannot be read.
+    unread: Vec<NodeId>,
 }
 
 /// What is known of a document whose nodes are sound.
@@ -137,6 +143,38 @@ struct Facts {
     /// The namespaces it refers to beside those and [`CORE`].
     needs: BTreeSet<String>,
     nodes: Outline,
+}
+
+/// A document as two: its DataTypes with their encodings, and all other nodes.
+fn parted(mut set: UANodeSet) -> (UANodeSet, UANodeSet) {
+    let is_type = |node: &UANode| match node {
+        UANode::DataType(_) => true,
+        UANode::Object(object) => object.base.base.browse_name.0.starts_with(ENCODING),
+        UANode::Variable(_)
+        | UANode::Method(_)
+        | UANode::View(_)
+        | UANode::ObjectType(_)
+        | UANode::VariableType(_)
+        | UANode::ReferenceType(_) => false,
+    };
+    let (types, others) = set.nodes.drain(..).partition(is_type);
+    let tables = set.aliases.iter().flat_map(|table| &table.aliases);
+    let aliases = tables.map(|one| NodeIdAlias {
+        id: one.id.clone(),
+        alias: one.alias.clone(),
+    });
+    let aliases = aliases.collect();
+    let of_types = UANodeSet {
+        aliases: Some(AliasTable { aliases }),
+        nodes: types,
+        ..UANodeSet::default()
+    };
+    set.nodes = others;
+    (of_types, set)
+}
+
+fn imported(set: UANodeSet) -> NodeSet2Import {
+    NodeSet2Import::new_nodeset("en", set, Vec::new())
 }
 
 /// Reads the sources and orders them.
@@ -184,15 +222,21 @@ impl NodeSet {
     fn read(source: Source) -> Result<Self, NodeSetError> {
         let (file, set) = parsed(source)?;
         let facts = Facts::of(&file, &set)?;
-        Ok(Self::new(file, facts, set))
-    }
-
-    fn new(file: String, facts: Facts, set: UANodeSet) -> Self {
-        Self {
+        let (types, others) = parted(set);
+        Ok(Self {
             file,
             facts,
-            import: NodeSet2Import::new_nodeset("en", set, Vec::new()),
-        }
+            types: imported(types),
+            others: imported(others),
+            unread: Vec::new(),
+        })
+    }
+
+    /// Its DataTypes and their encodings.
+    fn types(&self, namespaces: &NodeSetNamespaceMapper<'_>) -> Vec<ImportedItem> {
+        let mut items: Vec<ImportedItem> = self.types.load(namespaces).collect();
+        encoded(&mut items);
+        items
     }
 
     /// The namespaces it has nodes of.
@@ -323,14 +367,12 @@ impl NodeSetImport for Counted<'_> {
         &'a self,
         namespaces: &'a NodeSetNamespaceMapper<'_>,
     ) -> Box<dyn Iterator<Item = ImportedItem> + 'a> {
-        let items = self.set.import.load(namespaces);
-        let mut items: Vec<ImportedItem> = items
-            .inspect(|_| {
-                self.loaded.fetch_add(1, Ordering::Relaxed);
-            })
-            .collect();
-        encoded(&mut items);
-        Box::new(items.into_iter())
+        let types = self.set.types(namespaces);
+        let others = self.set.others.load(namespaces);
+        let items = types.into_iter().chain(others);
+        Box::new(items.inspect(|_| {
+            self.loaded.fetch_add(1, Ordering::Relaxed);
+        }))
     }
 }
 
@@ -371,6 +413,10 @@ fn encoded(items: &mut [ImportedItem]) {
 
 /// The BrowseName of what stands for the binary encoding of a structure (OPC 10000-3, 5.8.4).
 const BINARY: &str = "Default Binary";
+/// What the BrowseNames of encodings begin with.
+const ENCODING: &str = "Default ";
+/// Supertypes of a DataType.
+const DEEPEST: usize = 64;
 
 /// What the library would panic at, or leave out without saying so.
 struct Check<'a> {

@@ -11,7 +11,7 @@ use opcua::server::address_space::{AccessLevel, AddressSpace};
 use opcua::sync::Mutex;
 use opcua::types::{
     BrowseDirection, DataValue, NamespaceMap, NodeId, ObjectId, QualifiedName, ReferenceTypeId,
-    Variant,
+    StatusCode, Variant,
 };
 use plant_opcua::nodeset::NodeSets;
 use tracing::{info, warn};
@@ -101,8 +101,12 @@ impl Loaded {
         if sets.is_empty() {
             return loaded;
         }
+        let mut unread = Vec::new();
         match sets.import(address_space, namespaces) {
-            Ok(nodes) => loaded.nodes.extend(nodes),
+            Ok(imported) => {
+                loaded.nodes.extend(imported.nodes);
+                unread = imported.unread;
+            }
             Err(error) => loaded.fault = Some(error.to_string()),
         }
         let namespaces: NodeId = ObjectId::Server_Namespaces.into();
@@ -131,6 +135,14 @@ impl Loaded {
                     method.set_user_executable(false);
                 }
                 Some(_) | None => {}
+            }
+        }
+        for node in &unread {
+            if let Some(NodeType::Variable(variable)) = address_space.find_mut(node) {
+                variable.set_data_value(DataValue::new_now_status(
+                    Variant::Empty,
+                    StatusCode::BadDecodingError,
+                ));
             }
         }
         info!(nodes = loaded.nodes.len(), "loaded {sets:?} from NodeSets");

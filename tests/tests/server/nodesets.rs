@@ -110,8 +110,12 @@ fn nodes_of_nodesets_are_browsed_and_those_of_the_mapping_live() {
     let bad = told.iter().filter(|line| line.get("status").is_some());
     let mut bad: Vec<&str> = bad.map(|line| line["node"].as_str().unwrap()).collect();
     bad.sort_unstable();
-    let waiting = ["ns=2;i=10", "ns=3;i=6030"];
-    assert_eq!(bad, waiting, "only those that no value came for");
+    let waiting = ["ns=2;i=10", "ns=3;i=6030", "ns=3;i=6040"];
+    assert_eq!(
+        bad, waiting,
+        "only those that no value came for, and a structure without an id for its encoding"
+    );
+    assert_eq!(read(&cell, "ns=3;i=6040")["status"], "BadDecodingError");
     let sum = told.last().unwrap();
     assert!(sum["nodes"].as_u64() > Some(5_000), "{sum}");
 
@@ -129,6 +133,54 @@ fn nodes_of_nodesets_are_browsed_and_those_of_the_mapping_live() {
     let export = &told[0];
     assert_eq!(export["differ"], json!([]), "{export}");
     assert_eq!(export["exported"], json!(13), "{export}");
+}
+
+#[test]
+fn values_of_structures_that_a_nodeset_defines_are_read_by_their_definitions() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    drop(cell.file("cells.xml", include_str!("data/cells.xml")));
+    let mapping = "
+namespaces:
+  2: urn:ua-bridge:system-tests
+spaces:
+  - id: 2
+server:
+  security: [None]
+  nodesets: [cells.xml]
+variables:
+  - {node: ns=2;i=10, name: temperature, type: Double, origin: 2}
+";
+    let mut server = serving(&cell, mapping);
+    // Of one that is none by its definition it is told, and it has no value.
+    let told = server.wait_for_line("M170", SOON);
+    assert!(
+        told.contains("the values of 1 nodes") && told.contains("ns=1;i=6002"),
+        "{told}"
+    );
+    assert_eq!(read(&cell, "ns=3;i=6002")["status"], "BadDecodingError");
+
+    let nodes = [SERVER_ENDPOINT, "ns=3;i=6000", "ns=3;i=6001"];
+    let told = cell.asyncua_once("opcua_structures.py", &nodes);
+    assert_eq!(told[0]["type"], "Corner", "{told:?}");
+    assert_eq!(told[0]["value"], json!({"X": 1.5, "Y": -2.0}));
+    assert_eq!(told[1]["type"], "Area", "{told:?}");
+    let corner = |x: f64, y: f64| json!({"X": x, "Y": y});
+    let areas = told[1]["value"].as_array().unwrap();
+    assert_eq!(areas.len(), 2);
+    let (left, right) = (&areas[0], &areas[1]);
+    assert_eq!(
+        (&left["Name"], &left["Number"]),
+        (&json!("left"), &json!(7))
+    );
+    assert_eq!(left["Limits"], json!({"Low": 0.0, "High": 10.0}));
+    assert_eq!(left["Corners"], json!([corner(0.0, 0.0), corner(3.0, 4.5)]));
+    assert_eq!(
+        (&right["Name"], &right["Number"]),
+        (&json!("right"), &Value::Null)
+    );
+    assert_eq!(right["Corners"], json!([]));
 }
 
 #[test]

@@ -7,16 +7,21 @@ use std::hash::{Hash as _, Hasher as _};
 use std::io;
 use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
+use opcua::nodes::{NodeSet2Import, NodeSetImport as _};
 use opcua::server::address_space::AddressSpace;
 use opcua::types::{
-    Context, DecodingOptions, Identifier, NamespaceMap, NodeId, NodeSetNamespaceMapper,
-    TypeLoaderCollection, Variant, XmlBody,
+    Context, DecodingOptions, Identifier, NamespaceMap, NodeId, NodeSetNamespaceMapper, TypeLoader,
+    TypeLoaderCollection, Variant,
 };
 use opcua::xml::schema::ua_node_set::{UANode, UANodeSet};
 
 use super::outline::{self, Found, NodeKind, ValueKind};
-use super::{CORE, Facts, NodeSet, NodeSetError, Source, ordered, parsed};
+use super::structures::{Structures, can_be_sent};
+use super::{
+    CORE, DEEPEST, Facts, NodeSet, NodeSetError, Source, imported, ordered, parsed, parted,
+};
 use crate::limits::{LARGEST_NODESETS, MOST_NODESETS};
 
 /// NodeSets that can be put into an address space.
@@ -27,6 +32,17 @@ pub struct NodeSets {
     /// The namespaces they have nodes of, in the order of the files.
     provides: Vec<String>,
     fingerprint: u64,
+    /// What values of structures that the files define are read by.
+    structures: Arc<Structures>,
+}
+
+/// The nodes of NodeSets, by the ids that they have in an address space.
+#[derive(Debug, Default)]
+pub struct Imported {
+    /// All of them.
+    pub nodes: Vec<NodeId>,
+    /// Those whose values in the files cannot be read.
+    pub unread: Vec<NodeId>,
 }
 
 /// What is wrong with one of the files.
@@ -55,7 +71,7 @@ impl NodeSetError {
             }
             Self::Node { .. } => "mend the file, or have whoever made it export it anew",
             Self::Values { .. } | Self::Unread { .. } => {
-                "values of structures that the file defines itself are not read; its nodes are there, without them"
+                "a structure is read by the definition that its DataType has in one of the files; its nodes are there, without the values"
             }
             Self::Missing { .. } => {
                 "name the NodeSet2 file of that namespace too; the order of the files does not matter"
@@ -80,7 +96,7 @@ impl NodeSets {
     #[must_use]
     pub fn read(files: &[PathBuf]) -> (Self, Vec<FileFault>) {
         let mut faults = Vec::new();
-        let mut read = Vec::new();
+        let mut documents = Vec::new();
         let mut room = LARGEST_NODESETS;
         for (file, path) in files.iter().enumerate() {
             let mut fault = |error| faults.push(FileFault { file, error });
@@ -90,16 +106,21 @@ impl NodeSets {
             }
             match length(path).and_then(|length| {
                 room = room.checked_sub(length).ok_or_else(|| too_large(path))?;
-                NodeSet::lenient(path)
+                Document::read(path)
             }) {
-                Ok((set, unread)) => {
-                    if let Some(unread) = unread {
-                        fault(unread);
-                    }
-                    read.push((file, set));
-                }
+                Ok(document) => documents.push((file, document)),
                 Err(error) => fault(error),
             }
+        }
+        let structures = Arc::new(Structures::default());
+        let mut map = NamespaceMap::new();
+        let all = documents.iter().map(|(_, document)| document);
+        define(all, &structures, &mut map);
+        let mut read = Vec::new();
+        for (file, document) in documents {
+            let (set, unread) = document.into_set(&structures, &mut map);
+            faults.extend(unread.map(|error| FileFault { file, error }));
+            read.push((file, set));
         }
         let is_whole = !faults.iter().any(|fault| fault.error.is_fatal());
         faults.extend(not_together(&read, is_whole));
@@ -114,6 +135,7 @@ impl NodeSets {
             sets: Vec::new(),
             provides,
             fingerprint: fingerprint(files),
+            structures,
         };
         match ordered(read.into_iter().map(|(_, set)| set).collect()) {
             Ok(ordered) => sets.sets = ordered,
@@ -191,47 +213,112 @@ impl NodeSets {
         &self,
         address_space: &mut AddressSpace,
         namespaces: &mut NamespaceMap,
-    ) -> Result<Vec<NodeId>, NodeSetError> {
+    ) -> Result<Imported, NodeSetError> {
         for uri in &self.provides {
             address_space.add_namespace(uri, namespaces.add_namespace(uri));
         }
-        let mut ids = Vec::new();
+        let mut types = Vec::new();
+        for set in &self.sets {
+            let mut mapper = NodeSetNamespaceMapper::new(namespaces);
+            set.facts.register_namespaces(&mut mapper);
+            types.extend(set.types(&mapper));
+        }
+        self.structures.define(&types);
+        let mut imported = Imported::default();
         for set in &self.sets {
             set.import(address_space, namespaces)?;
-            ids.extend(set.facts.nodes.ids().filter_map(|id| {
+            let there = |id: &NodeId| {
                 let namespace = namespaces.get_index(set.facts.uri(id.namespace)?)?;
                 let identifier = id.identifier.clone();
                 Some(NodeId {
                     namespace,
                     identifier,
                 })
-            }));
+            };
+            imported
+                .nodes
+                .extend(set.facts.nodes.ids().filter_map(there));
+            imported.unread.extend(set.unread.iter().filter_map(there));
         }
-        Ok(ids)
+        Ok(imported)
     }
 }
 
-impl NodeSet {
-    /// Reads a file, without the values in it that cannot be read; and those.
-    fn lenient(path: &Path) -> Result<(Self, Option<NodeSetError>), NodeSetError> {
-        let (file, mut document) = parsed(Source::File(path.to_owned()))?;
+/// A file that is read and sound.
+struct Document {
+    file: String,
+    facts: Facts,
+    types: NodeSet2Import,
+    /// Its nodes beside the types.
+    others: UANodeSet,
+}
+
+impl Document {
+    fn read(path: &Path) -> Result<Self, NodeSetError> {
+        let (file, document) = parsed(Source::File(path.to_owned()))?;
         let facts = Facts::of(&file, &document)?;
-        let unread = without_unread(&facts, &mut document);
-        let unread = unread.map(|(first, count)| NodeSetError::Unread {
-            file: file.clone(),
-            first,
-            count,
+        let (types, others) = parted(document);
+        Ok(Self {
+            file,
+            facts,
+            types: imported(types),
+            others,
+        })
+    }
+
+    /// The NodeSet without the values in it that cannot be read; and those.
+    fn into_set(
+        mut self,
+        structures: &Arc<Structures>,
+        map: &mut NamespaceMap,
+    ) -> (NodeSet, Option<NodeSetError>) {
+        let loader: Arc<dyn TypeLoader> = Arc::<Structures>::clone(structures);
+        let nodes = without_unread(&self.facts, &mut self.others, &loader, map);
+        let fault = nodes.first().map(|first| NodeSetError::Unread {
+            file: self.file.clone(),
+            first: first.clone(),
+            count: nodes.len(),
         });
-        Ok((Self::new(file, facts, document), unread))
+        let unread = nodes.iter().filter_map(|node| node.parse().ok());
+        let mut others = imported(self.others);
+        others.add_type_loader(loader);
+        let set = NodeSet {
+            unread: unread.collect(),
+            file: self.file,
+            facts: self.facts,
+            types: self.types,
+            others,
+        };
+        (set, fault)
     }
 }
 
-/// Takes the values out that cannot be read. The first node with one, and how many there are.
-fn without_unread(facts: &Facts, document: &mut UANodeSet) -> Option<(String, usize)> {
-    let mut map = NamespaceMap::new();
-    let mut mapper = NodeSetNamespaceMapper::new(&mut map);
+/// Has the structures known that the files define. Their namespaces are numbered as in the map.
+fn define<'d>(
+    documents: impl Iterator<Item = &'d Document>,
+    structures: &Structures,
+    map: &mut NamespaceMap,
+) {
+    let mut items = Vec::new();
+    for document in documents {
+        let mut mapper = NodeSetNamespaceMapper::new(map);
+        document.facts.register_namespaces(&mut mapper);
+        items.extend(document.types.load(&mapper));
+    }
+    structures.define(&items);
+}
+
+/// Takes the values out that cannot be read, and says of which nodes they are.
+fn without_unread(
+    facts: &Facts,
+    document: &mut UANodeSet,
+    structures: &Arc<dyn TypeLoader>,
+    map: &mut NamespaceMap,
+) -> Vec<String> {
+    let mut mapper = NodeSetNamespaceMapper::new(map);
     facts.register_namespaces(&mut mapper);
-    let loaders = TypeLoaderCollection::new();
+    let mut loaders = TypeLoaderCollection::new();
+    loaders.add(Arc::clone(structures));
     let tables = document.aliases.iter().flat_map(|table| &table.aliases);
     let aliases = tables
         .map(|alias| (alias.alias.clone(), alias.id.0.clone()))
@@ -239,7 +326,7 @@ fn without_unread(facts: &Facts, document: &mut UANodeSet) -> Option<(String, us
     let mut context = Context::new(mapper.namespaces(), &loaders, DecodingOptions::default());
     context.set_index_map(mapper.index_map());
     context.set_aliases(&aliases);
-    let mut unread: Option<(String, usize)> = None;
+    let mut unread = Vec::new();
     for node in &mut document.nodes {
         let value = match node {
             UANode::Variable(variable) => &mut variable.value,
@@ -252,30 +339,15 @@ fn without_unread(facts: &Facts, document: &mut UANodeSet) -> Option<(String, us
             | UANode::ReferenceType(_) => continue,
         };
         let readable = |one: &opcua::xml::schema::ua_node_set::Value| {
-            Variant::from_nodeset(&one.0, &context).is_ok_and(|value| is_binary(&value))
+            Variant::from_nodeset(&one.0, &context).is_ok_and(|value| can_be_sent(&value, &context))
         };
         if value.as_ref().is_none_or(readable) {
             continue;
         }
         *value = None;
-        let first = || (node.base().node_id.0.clone(), 0);
-        unread.get_or_insert_with(first).1 += 1;
+        unread.push(node.base().node_id.0.clone());
     }
     unread
-}
-
-/// Whether clients can be sent a value: structures of types that nobody knows are left as the XML they are.
-fn is_binary(value: &Variant) -> bool {
-    if let Variant::Array(array) = value {
-        return array.values.iter().all(is_binary);
-    }
-    if let Variant::Variant(inner) = value {
-        return is_binary(inner);
-    }
-    let Variant::ExtensionObject(object) = value else {
-        return true;
-    };
-    !object.inner_is::<XmlBody>()
 }
 
 /// What keeps files from being used together. What is missing may be in one that could not be read.
@@ -351,6 +423,3 @@ pub fn fingerprint(files: &[PathBuf]) -> u64 {
     }
     hasher.finish()
 }
-
-/// Supertypes of a DataType.
-const DEEPEST: usize = 64;
