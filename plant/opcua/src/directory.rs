@@ -146,9 +146,11 @@ impl Directory {
         let Some(Variant::Array(found)) = found.into_iter().next() else {
             return Err(DirectoryError::Answer("FindApplications"));
         };
-        let known = found.values.into_iter().find_map(|one| match one {
-            Variant::ExtensionObject(object) => object.into_inner_as::<ApplicationRecord>(),
-            _ => None,
+        let known = found.values.into_iter().find_map(|one| {
+            let Variant::ExtensionObject(object) = one else {
+                return None;
+            };
+            object.into_inner_as::<ApplicationRecord>()
         });
         if let Some(known) = known {
             return Ok(known.application_id);
@@ -182,9 +184,11 @@ impl Directory {
         let number = number.into_iter().next();
         let number = number.ok_or(DirectoryError::Answer("StartSigningRequest"))?;
         let finished = self.call(FINISH_REQUEST, vec![application, number]).await?;
-        let read = |bytes: &Variant| match bytes {
-            Variant::ByteString(bytes) => Certificate::read(bytes.value.as_deref()?).ok(),
-            _ => None,
+        let read = |bytes: &Variant| {
+            let Variant::ByteString(bytes) = bytes else {
+                return None;
+            };
+            Certificate::read(bytes.value.as_deref()?).ok()
         };
         let odd = || DirectoryError::Answer("FinishRequest");
         let certificate = finished.first().and_then(read).ok_or_else(odd)?;

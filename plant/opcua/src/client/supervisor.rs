@@ -421,10 +421,11 @@ async fn endpoint(
 fn no_security(shared: &Shared, offered: &[EndpointDescription]) -> String {
     let each = offered.iter().map(|one| {
         let policy = one.security_policy_uri.as_ref().rsplit('#').next();
-        match one.security_mode {
-            MessageSecurityMode::None => "None".to_owned(),
-            mode => format!("{}/{mode:?}", policy.unwrap_or_default()),
+        let mode = one.security_mode;
+        if mode == MessageSecurityMode::None {
+            return "None".to_owned();
         }
+        format!("{}/{mode:?}", policy.unwrap_or_default())
     });
     let mut each: Vec<String> = each.take(MOST_TOLD).collect();
     each.sort();
