@@ -139,13 +139,12 @@ impl ServerPort {
 
         let pubsub = Arc::new(PubSub::new());
         let (exits, (writes, created_items, asked)) = exits(mapping, &access, &pubsub);
-        let confirms = Arc::clone(&exits.confirms);
+        let (confirms, layout) = (Arc::clone(&exits.confirms), Arc::new(layout));
         let nodes = NodesBuilder {
-            layout: Arc::new(layout),
+            layout: Arc::clone(&layout),
             sets,
             exits,
         };
-        let layout = Arc::clone(&nodes.layout);
         let certificates = Configuration::new(setup.pki.root(), &described.application_uri);
         let mdns = setup.announce.as_ref().is_some_and(|to| to.mdns.is_some());
         let core = core(&setup.sks, &pubsub, (&certificates, mdns), described);
