@@ -63,6 +63,17 @@ fn announced_again(names: &[&str]) {
     }
 }
 
+/// The server is in the hour that is so many seconds ahead.
+fn tells_a_time(cell: &Cell, server: &str, ahead: i64) {
+    let of_day = i64::try_from(now().as_secs()).unwrap() + ahead;
+    let told = hour(&read(cell, server, CURRENT_TIME));
+    let is = |at: i64| at / 3600 % 24 == told;
+    assert!(
+        is(of_day) || is(of_day + 30),
+        "{server} {told}, {ahead} s ahead"
+    );
+}
+
 fn setpoint_is_told(cell: &Cell, subscriber: &mut Child, value: f64) {
     let text = value.to_string();
     let write = [SERVER, SETPOINT, "Double", &text];
@@ -132,14 +143,8 @@ fn a_clock_that_jumps_loses_nobody_restarts_nobody_and_ends_no_subscription() {
     let mut watching = cell.asyncua("opcua_subscribe.py", &["--limit", "240", ENDPOINT, GRASP]);
     for (value, ahead) in [(1.0, 0), (2.0, 3600), (3.0, 0), (4.0, -3600)] {
         clock.set(ahead);
-        let of_day = i64::try_from(now().as_secs()).unwrap() + ahead;
         for server in servers {
-            let told = hour(&read(&cell, server, CURRENT_TIME));
-            let is = |at: i64| at / 3600 % 24 == told;
-            assert!(
-                is(of_day) || is(of_day + 30),
-                "{server} {told}, {ahead} s ahead"
-            );
+            tells_a_time(&cell, server, ahead);
         }
         setpoint_is_told(&cell, &mut subscriber, value);
         run_is_told(&cell, &mut watching);
