@@ -133,7 +133,7 @@ fn a_client_that_names_types_of_events_is_told_of_transitions_or_of_none() {
         let lines = client.json_lines().into_iter();
         lines.filter(|line| line.get("ready").is_none()).collect()
     };
-    cell.asyncua_once("opcua_skill.py", &[ENDPOINT, "quick"]);
+    let _ran = cell.asyncua_once("opcua_skill.py", &[ENDPOINT, "quick"]);
     let seen = eventually("all transitions are told", SOON, || {
         let seen = told(&transitions);
         (seen.len() > 20).then_some(seen)
