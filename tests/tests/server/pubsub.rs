@@ -231,6 +231,7 @@ fn what_is_below_a_group_that_is_disabled_sends_nothing() {
 const FILE: &str = "PubSubConfiguration";
 
 #[test]
+#[expect(clippy::too_many_lines, reason = "one walk through the configuration")]
 fn the_configuration_is_a_file_that_says_what_the_nodes_say() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
