@@ -40,7 +40,7 @@ struct UaComponent {
     endpoint: Option<String>,
     /// The discovery server it registers with, in place of what the YAML says: its URL; one that is heard of on --interface,
     /// as `any` (the only one there), uri=<ApplicationUri> or name=<mDNS name> (both may end with *); `embed` for that of this
-    /// host at port 4840, or embed=<URL>, which the component is itself while there is none; or `none`
+    /// host at port 4840, or `embed=URL`, which the component is itself while there is none; or `none`
     #[arg(long, value_name = "URL|CHOICE|embed", env = "UA_LDS")]
     lds: Option<String>,
     /// The certificate store: own, private, trusted and rejected under one directory

@@ -47,7 +47,7 @@ struct UaGds {
     /// How many days a certificate is valid that is issued to an application
     #[arg(long, value_name = "DAYS", default_value = "365", value_parser = clap::value_parser!(u32).range(1..=36_500))]
     days: u32,
-    /// The local discovery server it registers with; `embed` for that of this host at port 4840, or embed=<URL>, which the
+    /// The local discovery server it registers with; `embed` for that of this host at port 4840, or `embed=URL`, which the
     /// program is itself while there is none
     #[arg(long, value_name = "URL|embed", env = "UA_LDS")]
     lds: Option<String>,

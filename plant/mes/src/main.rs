@@ -59,7 +59,7 @@ struct UaMes {
     #[arg(long, value_name = "URL", env = "UA_ENDPOINT")]
     endpoint: Option<String>,
     /// The local discovery server it registers with, or `none`, in place of what the YAML says; `embed` for that of this host
-    /// at port 4840, or embed=<URL>, which the program is itself while there is none
+    /// at port 4840, or `embed=URL`, which the program is itself while there is none
     #[arg(long, value_name = "URL|embed", env = "UA_LDS")]
     lds: Option<String>,
     /// The certificate store: own, private, trusted and rejected under one directory

@@ -85,7 +85,7 @@ struct UaServer {
     trust_any_client_certificate: bool,
     /// Register with this Local Discovery Server, now or when it comes, as opc.tcp://127.0.0.1:4840; with --announce also one
     /// that is heard of, as `any` (the only one there), `uri=<ApplicationUri>` or `name=<mDNS name>` (both may end with *).
-    /// `embed` is that of this host at port 4840, and embed=<URL> at another, which the program is itself while there is none
+    /// `embed` is that of this host at port 4840, and `embed=URL` at another, which the program is itself while there is none
     #[arg(long, value_name = "URL|CHOICE|embed", env = "UA_LDS")]
     lds: Option<String>,
     /// Announce the server by mDNS on the network interface of --interface, and show the servers that are there; without

@@ -169,7 +169,7 @@ async fn until_listed(url: &str, name: &str) {
 
 /// From the start of a component to the answer of its method, which is called at another workstation.
 fn called(runs: usize) -> Option<()> {
-    let cell = Cell::with(&[])?;
+    let cell = Cell::with(&[Peer::NodeOpcua])?;
     let bus = cell.segment();
     let top = cell.site();
     bus.plug(&top, "bus0", "10.80.0.1");
@@ -201,6 +201,8 @@ fn called(runs: usize) -> Option<()> {
         drop(component);
         first.device.within(|| gone(&url));
     }
+    let path = serde_json::to_string(&known.unwrap_or_default()).unwrap();
+    let mut by_other = other_client(&cell, first, (&url, &path), || second.component(), runs);
     println!(
         "\n{runs} starts of a component; milliseconds to the answer to Reset of its skill, called at another workstation:\n"
     );
@@ -209,7 +211,37 @@ fn called(runs: usize) -> Option<()> {
         "component -> station -> cell -> station -> client",
         &mut times,
     );
+    row("the same to a client of node-opcua", &mut by_other);
     Some(())
+}
+
+/// The same by a client of node-opcua, which runs all the time.
+fn other_client(
+    cell: &Cell,
+    at: &Level,
+    (lds, path): (&str, &str),
+    start: impl Fn() -> Child,
+    runs: usize,
+) -> Times {
+    let other = cell.node_opcua_started("across.js", &[lds, DEVICE[1]]);
+    let mut other = other.told().at(&at.device).start().ready(SOON);
+    let mut times = Times::default();
+    for run in 1..=runs {
+        let began = since_1970();
+        let component = start();
+        other.tell(path);
+        let answered = eventually("node-opcua is answered", SOON, || {
+            let answers = other.json_lines();
+            let mut answers = answers
+                .iter()
+                .filter_map(|line| line["answered_ms"].as_u64());
+            answers.nth(run - 1).map(Duration::from_millis)
+        });
+        times.add(answered.saturating_sub(began));
+        drop(component);
+        at.device.within(|| gone(lds));
+    }
+    times
 }
 
 /// A workstation with two devices.
