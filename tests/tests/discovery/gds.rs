@@ -278,6 +278,7 @@ fn a_server_has_its_certificate_renewed_before_it_is_over_and_hears_what_is_revo
     for file in ["authority.pem", "authority.crl"] {
         trust(&authority.join(file), &pki);
     }
+    trust(&cell.folder().join("gds/own/cert.der"), &pki);
     let mapping = cell.file("cell.yaml", &format!("server: {{endpoint: '{server}'}}\n"));
     let mut child = cell.ua_server(&[path(&mapping), "--gds", GDS]);
     // Whom nobody knows is not given anything.
@@ -318,7 +319,7 @@ fn a_server_has_its_certificate_renewed_before_it_is_over_and_hears_what_is_revo
         key,
         "the key stays"
     );
-    let lists = fs::read_dir(pki.join("crls")).unwrap();
+    let lists = fs::read_dir(pki.join("crl")).unwrap();
     let lists: Vec<_> = lists
         .map(|file| fs::read(file.unwrap().path()).unwrap())
         .collect();
