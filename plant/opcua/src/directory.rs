@@ -11,7 +11,7 @@ use opcua::types::{
 };
 use trust::{Certificate, Crl, Request};
 
-use crate::client::{CallError, Client, ClientError};
+use crate::client::{Browse, CallError, Client, ClientError};
 use crate::file::LARGEST;
 
 /// The namespace of the Directory.
@@ -223,8 +223,14 @@ impl Directory {
 
     /// The content of a file object, which is closed afterwards (OPC 10000-20, 4.2).
     async fn file(&self, file: &NodeId) -> Result<Vec<u8>, DirectoryError> {
-        let call = async |method: MethodId, name: &'static str, arguments: Vec<Variant>| {
-            let called = self.client.call(file, &method.into(), arguments).await;
+        // Each file has methods of its own.
+        let below = self.client.browse(file, Browse::hierarchical()).await?;
+        let call = async |of_type: MethodId, name: &'static str, arguments: Vec<Variant>| {
+            let own = below
+                .iter()
+                .find(|one| one.browse_name.name.as_ref() == name);
+            let method = own.map_or_else(|| of_type.into(), |one| one.node_id.node_id.clone());
+            let called = self.client.call(file, &method, arguments).await;
             called.map_err(|error| DirectoryError::Call {
                 method: name,
                 error,
