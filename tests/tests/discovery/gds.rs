@@ -251,3 +251,78 @@ fn people_issue_certificates_for_requests_and_with_keys() {
         "{wrong:?}"
     );
 }
+
+/// Nine days old, and over in one: as a server that was set up and left alone has it one day.
+#[test]
+fn a_server_has_its_certificate_renewed_before_it_is_over_and_hears_what_is_revoked() {
+    let Some(site) = site() else { return };
+    let cell = &site.cell;
+    let (uri, server) = ("urn:ua-bridge:server", "opc.tcp://127.0.0.1:4858");
+    let (made, pki) = (cell.folder().join("made"), cell.folder().join("pki"));
+    let said = cell.asyncua_once("opcua_access.py", &["aged", path(&made), uri]);
+    assert_eq!(said.len(), 1);
+    for folder in ["own", "private"] {
+        fs::create_dir_all(pki.join(folder)).unwrap();
+    }
+    let certificate = made.join("aged_certificate.der");
+    fs::copy(&certificate, pki.join("own/cert.der")).unwrap();
+    fs::copy(made.join("aged_key.pem"), pki.join("private/private.pem")).unwrap();
+    let trust = |file: &Path, store: &Path| {
+        let trusted = Command::new(program("ua-server"))
+            .args(["trust", path(file), "--pki", path(store)])
+            .output()
+            .unwrap();
+        assert!(trusted.status.success(), "{trusted:?}");
+    };
+    let authority = cell.folder().join("gds/authority");
+    for file in ["authority.pem", "authority.crl"] {
+        trust(&authority.join(file), &pki);
+    }
+    trust(&cell.folder().join("gds/own/cert.der"), &pki);
+    let mapping = cell.file("cell.yaml", &format!("server: {{endpoint: '{server}'}}\n"));
+    let mut child = cell.ua_server(&[path(&mapping), "--gds", GDS]);
+    // Whom nobody knows is not given anything.
+    child.wait_for_line("certificates are not kept young", LATER);
+    let issuers = || {
+        let said = cell.asyncua_try("opcua_access.py", &["endpoints", server])?;
+        Some(said[0]["issuers"].clone())
+    };
+    assert_eq!(issuers().unwrap()[0], "aged");
+    let key = fs::read(pki.join("private/private.pem")).unwrap();
+
+    let list = fs::read(authority.join("authority.crl")).unwrap();
+    told(
+        cell,
+        &[
+            "ca",
+            "issue",
+            "--application-uri",
+            URI,
+            "--key",
+            path(&made.join("gone.pem")),
+            "--out",
+            path(&made.join("gone.der")),
+        ],
+    );
+    let issued = told(cell, &["ca", "list", "--json"]);
+    let mut issued = issued
+        .lines()
+        .map(|line| serde_json::from_str::<Value>(line).unwrap());
+    let gone = issued.find(|one| one["application_uri"] == URI).unwrap();
+    told(cell, &["ca", "revoke", gone["serial"].as_str().unwrap()]);
+    trust(&certificate, &cell.folder().join("gds"));
+    eventually("another certificate is shown", LATER * 2, || {
+        (issuers()?[0] == "Cell authority").then_some(())
+    });
+    assert_eq!(
+        fs::read(pki.join("private/private.pem")).unwrap(),
+        key,
+        "the key stays"
+    );
+    let lists = fs::read_dir(pki.join("crl")).unwrap();
+    let lists: Vec<_> = lists
+        .map(|file| fs::read(file.unwrap().path()).unwrap())
+        .collect();
+    assert_eq!(lists.len(), 1);
+    assert_ne!(lists[0], list, "what was revoked since is known");
+}
