@@ -2,8 +2,8 @@
 //! types, and clients that come back by themselves. It knows no skills, no discovery, no space and no ROS.
 //!
 //! Reading order: `limits` (the bounds of both sides), `endpoint`, `pki`, `certificates`, `known`, `judge` and `door` (who gets
-//! in), `nodeset` (types from files), `users`, `audit` and `changes`, `server` and `client`, `file`, `trust_file` and `configuration` (a
-//! server's certificates as clients manage them).
+//! in), `nodeset` (types from files), `users`, `audit` and `changes`, `server` and `client`, `file`, `trust_file`, `directory` and
+//! `configuration` (a server's certificates as clients manage them, and as it renews them itself).
 
 pub mod audit;
 pub mod certificates;

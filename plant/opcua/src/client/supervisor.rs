@@ -436,8 +436,8 @@ fn no_security(shared: &Shared, offered: &[EndpointDescription]) -> String {
     };
     let config = &shared.config;
     let mut wants = match config.security {
-        SecurityChoice::Best => "the best that is secured".to_owned(),
-        SecurityChoice::None => "None".to_owned(),
+        SecurityChoice::Best if config.pki.is_some() => "the best that is secured".to_owned(),
+        SecurityChoice::Best | SecurityChoice::None => "None".to_owned(),
         SecurityChoice::Basic256Sha256 => "Basic256Sha256/SignAndEncrypt".to_owned(),
         SecurityChoice::Aes128Sha256RsaOaep => "Aes128_Sha256_RsaOaep/SignAndEncrypt".to_owned(),
         SecurityChoice::Aes256Sha256RsaPss => "Aes256_Sha256_RsaPss/SignAndEncrypt".to_owned(),

@@ -5,13 +5,13 @@ use std::fs;
 use std::time::Duration;
 
 use opcua::types::NodeId;
-use tokio::time::{Instant, sleep};
+use tokio::time::{Instant, sleep, timeout};
 use tracing::{debug, info, warn};
 use trust::{Certificate, Renewal, Request, Step};
 
 use super::{Configuration, write_pair};
-use crate::client::{Client, ClientConfig, SecurityChoice};
-use crate::directory::{ApplicationRecord, Directory};
+use crate::client::{Client, ClientConfig, Link, SecurityChoice};
+use crate::directory::{ApplicationRecord, Directory, DirectoryError};
 use crate::known;
 use crate::pki::OWN_CERTIFICATE;
 
@@ -92,9 +92,9 @@ impl Configuration {
             },
             &plant.url,
         );
-        let visited = self.ask(&client, plant, old).await;
+        let visited = timeout(LONGEST_VISIT, self.ask(&client, plant, old)).await;
         client.close().await;
-        visited
+        visited.unwrap_or_else(|_| Err(format!("it is not done within {LONGEST_VISIT:?}")))
     }
 
     async fn ask(
@@ -103,18 +103,26 @@ impl Configuration {
         plant: &Plant,
         old: Option<&Certificate>,
     ) -> Result<bool, Why> {
-        let text = |error: crate::directory::DirectoryError| error.to_string();
+        let text = |error: DirectoryError| error.to_string();
         client
             .up(ANSWERS_WITHIN)
             .await
             .map_err(|error| error.to_string())?;
+        // Who is not proven could give the server any certificate.
+        if !matches!(&*client.link().borrow(), Link::Up { secured: true, .. }) {
+            return Err("it is reached without security only, and is not asked so".to_owned());
+        }
         let directory = Directory::of(client).map_err(text)?;
         let application = directory.registered(plant.record.clone()).await;
         let application = application.map_err(text)?;
-        self.fetch_lists(&directory, &application).await?;
+        let lists = self.fetch_lists(&directory, &application).await;
         let Some(old) = old else {
-            return Ok(false);
+            return lists.map(|()| false);
         };
+        // A certificate is worth having without them.
+        if let Err(why) = lists {
+            warn!(gds = plant.url, "revocation lists are not fetched: {why}");
+        }
         let key = self.own_key().map_err(|status| status.to_string())?;
         let request = Request::make(&key, &self.application_uri, (&old.name(), ""), &old.hosts());
         let request = request.map_err(|why| why.to_string())?;
@@ -137,6 +145,13 @@ impl Configuration {
         }
         if !certificate.is_valid_at(known::now()) {
             return Err("what was issued is not valid now: one of the clocks is wrong".to_owned());
+        }
+        if !matches!(
+            Renewal::of(certificate).step(known::now()),
+            Step::Wait { .. }
+        ) {
+            // The server would be started anew without end.
+            return Err("what was issued is to be renewed at once".to_owned());
         }
         let key = self.own_key().map_err(|status| status.to_string())?;
         if !certificate.is_of_private_key(&key) {
@@ -178,5 +193,7 @@ const LOOK: Duration = Duration::from_secs(2);
 const LISTS_EVERY: Duration = Duration::from_secs(3600);
 /// The same after it was in vain.
 const LISTS_AGAIN: Duration = Duration::from_secs(30);
+/// How long a visit may take, with all its answers.
+const LONGEST_VISIT: Duration = Duration::from_secs(60);
 /// How long the Global Discovery Server may take for an answer.
 const ANSWERS_WITHIN: Duration = Duration::from_secs(10);
