@@ -1,6 +1,6 @@
 "use strict";
 // programs.js PORT LDS FILE: a server of node-opcua as a machine that knows Programs of OPC 10000-10 and nothing of the space. Its object
-// `machine` has Weld, a Program with a parameter, a result and a run of half a second. It registers with the discovery server by
+// `machine` has Weld, a Program with a parameter, a result and a run of some seconds. It registers with the discovery server by
 // itself, writes its certificate to the file, takes secured channels only, and says what is called there.
 const { OPCUAServer, RegisterServerMethod } = require("node-opcua-server");
 const { OPCUACertificateManager } = require("node-opcua-certificate-manager");
@@ -11,7 +11,8 @@ const { MessageSecurityMode, SecurityPolicy } = require("node-opcua-client");
 const fs = require("fs");
 const path = require("path");
 
-const RUN_MS = 500;
+// node-opcua samples a state once a second.
+const RUN_MS = 2500;
 
 function say(line) {
   console.log(JSON.stringify(line));
@@ -90,7 +91,6 @@ async function main([port, lds, file]) {
   weld(addressSpace, machine, space);
   say({ ready: true, uri: server.serverInfo.applicationUri });
   await server.start();
-  say({ started: true });
   process.on("SIGTERM", async () => {
     await server.shutdown(0);
     process.exit(0);
