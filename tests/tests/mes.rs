@@ -138,11 +138,14 @@ fn is_replaced(run: &Value) {
     let by_type = rows("skills?type=urn:ua-bridge:skills%23i=1200");
     let types: Vec<&Value> = by_type.iter().map(|row| &row["type"]).collect();
     assert_eq!(types, ["VacuumGraspSkillType"], "by the type above its own");
-    let mut ran = rows("run-steps");
-    ran.retain(|row| row["outcome"] == "lost");
-    let lost: Vec<&Value> = ran.iter().map(|row| &row["component"]).collect();
+    // The graph is told of a run after `/status` is.
+    let ran = eventually("the graph has the run as done", SOON, || {
+        let done = rows("runs").first()?["outcome"] == "done";
+        done.then(|| rows("run-steps"))
+    });
+    let lost = ran.iter().filter(|row| row["outcome"] == "lost");
+    let lost: Vec<&Value> = lost.map(|row| &row["component"]).collect();
     assert_eq!(lost, ["urn:example:gripper"]);
-    assert_eq!(rows("runs")[0]["outcome"], "done");
 }
 
 #[test]

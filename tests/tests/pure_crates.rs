@@ -248,10 +248,7 @@ fn who_issues_certificates_knows_neither_skills_nor_rdf_nor_ros() {
 
 #[test]
 fn discovery_knows_neither_skills_nor_rdf() {
-    does_not_reach(
-        "discovery",
-        &["skills", "plant-opcua", "knowledge", "oxigraph", "tcpros"],
-    );
+    does_not_reach("discovery", &["skills", "knowledge", "oxigraph", "tcpros"]);
 }
 
 #[test]
