@@ -338,8 +338,7 @@ impl SpaceNodes {
 
     /// The server compares values alone for an item without filter, though a status that changed is to be reported
     /// too (OPC 10000-4, 7.22.2: the default trigger is StatusValue). No value in between makes it report both;
-    /// clients with a queue of one see only the second. So it is with a value of a clock that was set back, which the
-    /// server would put off until the clock is where it was.
+    /// clients with a queue of one see only the second.
     fn notify(
         &self,
         subscriptions: &SubscriptionCache,
@@ -352,18 +351,13 @@ impl SpaceNodes {
             return;
         };
         let flipped = before.stamp().status != view.stamp().status && before.has_value_of(view);
-        let set_back = view.is_set_back(before);
-        let between = match (set_back, flipped) {
-            (true, _) => Some(view.timeless()),
-            (false, true) => Some(view.between()),
-            (false, false) => None,
-        };
+        let between = flipped.then(|| view.between());
         let weight = view.weight();
         if weight <= SMALL {
             if let Some(between) = between {
                 let watched = self.watched.lock();
                 for (handle, _) in items.entries() {
-                    if set_back || watched.is_unfiltered(*handle) {
+                    if watched.is_unfiltered(*handle) {
                         items.data_value_to_item(between.clone(), handle);
                     }
                 }
@@ -375,7 +369,7 @@ impl SpaceNodes {
         for (handle, _) in items.entries() {
             let (value, unfiltered) = self.for_item(*handle, view, &mut decoded);
             if let Some(between) = &between
-                && (set_back || unfiltered)
+                && unfiltered
             {
                 items.data_value_to_item(between.clone(), handle);
             }

@@ -233,24 +233,6 @@ impl<'a> View<'a> {
         data_value(None, self.stamp())
     }
 
-    /// The same without a time: it is told whatever the time of the value before it was.
-    pub(crate) fn timeless(&self) -> DataValue {
-        DataValue {
-            source_timestamp: None,
-            ..self.between()
-        }
-    }
-
-    /// Whether the clock of whoever makes the value was set back since the one before. Clocks of several publishers that are
-    /// a little apart were not.
-    pub(crate) fn is_set_back(&self, before: &Self) -> bool {
-        let tick = |stamp: Stamp| stamp.source.map(|source| source.time.0);
-        match (tick(before.stamp()), tick(self.stamp())) {
-            (Some(before), Some(now)) => before.saturating_sub(now) > SET_BACK,
-            (None, _) | (_, None) => false,
-        }
-    }
-
     /// In place of the value, why it is not given.
     pub(crate) fn refused(&self, status: StatusCode) -> DataValue {
         let stamp = self.stamp();
@@ -385,8 +367,6 @@ const VARIANT: usize = size_of::<Variant>();
 const BOXED: usize = 2 * size_of::<DataValue>();
 /// Room behind a value that is not worth a copy.
 const SLACK: usize = 64;
-/// A second, in ticks of 100 ns.
-const SET_BACK: i64 = 10_000_000;
 
 #[cfg(test)]
 mod tests {

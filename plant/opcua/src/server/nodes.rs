@@ -4,7 +4,7 @@ use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
 
 use async_trait::async_trait;
-use opcua::nodes::{DefaultTypeTree, NodeType, Variable};
+use opcua::nodes::{DefaultTypeTree, NodeType};
 use opcua::server::address_space::{AccessLevel, AddressSpace, user_access_level};
 use opcua::server::diagnostics::NamespaceMetadata;
 use opcua::server::node_manager::memory::{CoreNodeManager, InMemoryNodeManagerImpl};
@@ -12,8 +12,8 @@ use opcua::server::node_manager::{ParsedWriteValue, RequestContext, ServerContex
 use opcua::server::{CreateMonitoredItem, SubscriptionCache};
 use opcua::sync::RwLock;
 use opcua::types::{
-    Argument, AttributeId, DataEncoding, DataValue, DateTime, NodeId, NumericRange, ObjectTypeId,
-    ReferenceTypeId, StatusCode, TimestampsToReturn,
+    Argument, AttributeId, DataValue, DateTime, NodeId, ObjectTypeId, ReferenceTypeId, StatusCode,
+    TimestampsToReturn,
 };
 use tokio::time::{Instant, timeout_at};
 
@@ -249,35 +249,16 @@ pub(crate) fn show(
     }
     let now = DateTime::now();
     let mut shown = Vec::with_capacity(values.len());
-    let mut set_back = Vec::new();
     for (node, value) in values {
         let mut value = plain(value);
         value.status.get_or_insert(StatusCode::Good);
-        let time = *value.source_timestamp.get_or_insert(now);
+        value.source_timestamp.get_or_insert(now);
         value.server_timestamp.get_or_insert(now);
         if let Some(NodeType::Variable(variable)) = address_space.find_mut(&node) {
-            if told_of(variable).is_some_and(|before| is_set_back(before, time)) {
-                set_back.push(node.clone());
-            }
             variable.set_data_value(value);
             shown.push(node);
         }
     }
-    // The library puts off what is older than what was told last, until the clock is where it was. What has no time it tells,
-    // and then what comes next.
-    subscriptions.maybe_notify(
-        set_back.iter().map(|node| (node, AttributeId::Value)),
-        |_, _, _, _| {
-            Some(DataValue {
-                value: None,
-                status: Some(StatusCode::Good),
-                source_timestamp: None,
-                source_picoseconds: None,
-                server_timestamp: Some(now),
-                server_picoseconds: None,
-            })
-        },
-    );
     // Until all are told, so that nobody is told in another order.
     subscriptions.maybe_notify(
         shown.iter().map(|node| (node, AttributeId::Value)),
@@ -287,18 +268,6 @@ pub(crate) fn show(
         },
     );
     Ok(())
-}
-
-/// The time of the value that a variable shows.
-fn told_of(variable: &Variable) -> Option<DateTime> {
-    let range = &NumericRange::None;
-    let shown = variable.value(TimestampsToReturn::Both, range, &DataEncoding::Binary, 0.0);
-    shown.source_timestamp
-}
-
-/// Whether a clock was set back, by more than clocks of two hosts are apart.
-fn is_set_back(before: DateTime, now: DateTime) -> bool {
-    before.ticks().saturating_sub(now.ticks()) > SET_BACK
 }
 
 #[async_trait]
@@ -390,5 +359,3 @@ impl InMemoryNodeManagerImpl for Nodes {
 
 /// Counts as no interval at all, yet is above the 0 that the library takes for "not asked for".
 const AS_IT_COMES_MS: f64 = 0.000_1;
-/// A second, in ticks of 100 ns.
-const SET_BACK: i64 = 10_000_000;
