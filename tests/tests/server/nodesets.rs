@@ -1,5 +1,6 @@
 //! The nodes of NodeSet2 files beside those of the mapping.
 
+use std::collections::BTreeSet;
 use std::path::Path;
 
 use super::*;
@@ -58,7 +59,7 @@ fn started(cell: &Cell, variables: &str) -> Child {
 
 #[test]
 fn nodes_of_nodesets_are_browsed_and_those_of_the_mapping_live() {
-    let Some(cell) = Cell::with(&[Peer::Python]) else {
+    let Some(cell) = Cell::with(&[Peer::Python, Peer::NodeOpcua]) else {
         return;
     };
     if !has_nodesets() {
@@ -106,18 +107,7 @@ fn nodes_of_nodesets_are_browsed_and_those_of_the_mapping_live() {
         .filter(|uri| **uri == "http://opcfoundation.org/UA/DI/");
     assert_eq!(of_di.count(), 1, "the NodeSet describes it: {about:?}");
 
-    let told = cell.asyncua_once("opcua_tree.py", &[SERVER_ENDPOINT]);
-    let bad = told.iter().filter(|line| line.get("status").is_some());
-    let mut bad: Vec<&str> = bad.map(|line| line["node"].as_str().unwrap()).collect();
-    bad.sort_unstable();
-    let waiting = ["ns=2;i=10", "ns=3;i=6030", "ns=3;i=6040"];
-    assert_eq!(
-        bad, waiting,
-        "only those that no value came for, and a structure without an id for its encoding"
-    );
-    assert_eq!(read(&cell, "ns=3;i=6040")["status"], "BadDecodingError");
-    let sum = told.last().unwrap();
-    assert!(sum["nodes"].as_u64() > Some(5_000), "{sum}");
+    are_walked_by_asyncua_and_node_opcua(&cell);
 
     let of = |name: &str| format!("{SHARED}{name}.NodeSet2.xml");
     let (di, robotics) = (of("Di"), of("Robotics"));
@@ -135,12 +125,45 @@ fn nodes_of_nodesets_are_browsed_and_those_of_the_mapping_live() {
     assert_eq!(export["exported"], json!(13), "{export}");
 }
 
+/// Both read every node and attribute, find the same bad, and asyncua's importer takes what its exporter wrote of them.
+fn are_walked_by_asyncua_and_node_opcua(cell: &Cell) {
+    let tree = cell.asyncua_started("opcua_tree.py", &[SERVER_ENDPOINT, "--export"]);
+    let mut tree = tree.start();
+    assert!(tree.wait_for_end(SOON * 3).success());
+    let mut told = tree.json_lines();
+    let trip = told.pop().unwrap();
+    assert_eq!(trip["differ"], json!([]), "{trip}");
+    assert_eq!(trip["exported"], trip["imported"], "{trip}");
+    assert!(trip["exported"].as_u64() > Some(800), "{trip}");
+    let bad = told.iter().filter(|line| line.get("status").is_some());
+    let mut bad: Vec<&str> = bad.map(|line| line["node"].as_str().unwrap()).collect();
+    bad.sort_unstable();
+    let waiting = ["ns=2;i=10", "ns=3;i=6030", "ns=3;i=6040"];
+    assert_eq!(
+        bad, waiting,
+        "only those that no value came for, and a structure without an id for its encoding"
+    );
+    assert_eq!(read(cell, "ns=3;i=6040")["status"], "BadDecodingError");
+    let sum = told.last().unwrap();
+    assert!(sum["nodes"].as_u64() > Some(5_000), "{sum}");
+
+    // node-opcua reads the same tree, and finds nothing else.
+    let walked = cell.node_opcua_once("tree.js", &[SERVER_ENDPOINT]);
+    let theirs = walked.last().unwrap();
+    assert_eq!(theirs["nodes"], sum["nodes"], "{theirs} {sum}");
+    assert!(theirs["read"].as_u64() > Some(40_000), "{theirs}");
+    let bad = walked.iter().filter(|line| line.get("status").is_some());
+    let bad: BTreeSet<&str> = bad.map(|line| line["node"].as_str().unwrap()).collect();
+    assert_eq!(bad, BTreeSet::from([waiting[0], waiting[1], waiting[2]]));
+}
+
 #[test]
 fn values_of_structures_that_a_nodeset_defines_are_read_by_their_definitions() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
     };
     drop(cell.file("cells.xml", include_str!("data/cells.xml")));
+    drop(cell.file("walls.xml", include_str!("data/walls.xml")));
     let mapping = "
 namespaces:
   2: urn:ua-bridge:system-tests
@@ -148,7 +171,7 @@ spaces:
   - id: 2
 server:
   security: [None]
-  nodesets: [cells.xml]
+  nodesets: [cells.xml, walls.xml]
 variables:
   - {node: ns=2;i=10, name: temperature, type: Double, origin: 2}
 ";
@@ -161,7 +184,7 @@ variables:
     );
     assert_eq!(read(&cell, "ns=3;i=6002")["status"], "BadDecodingError");
 
-    let nodes = [SERVER_ENDPOINT, "ns=3;i=6000", "ns=3;i=6001"];
+    let nodes = [SERVER_ENDPOINT, "ns=3;i=6000", "ns=3;i=6001", "ns=4;i=6000"];
     let told = cell.asyncua_once("opcua_structures.py", &nodes);
     assert_eq!(told[0]["type"], "Corner", "{told:?}");
     assert_eq!(told[0]["value"], json!({"X": 1.5, "Y": -2.0}));
@@ -181,6 +204,10 @@ variables:
         (&json!("right"), &Value::Null)
     );
     assert_eq!(right["Corners"], json!([]));
+    // It has what it inherits from a structure of the other file, before its own.
+    assert_eq!(told[2]["type"], "Post", "{told:?}");
+    let post = json!({"X": 1.0, "Y": 2.0, "Height": 2.5});
+    assert_eq!(told[2]["value"], post, "{told:?}");
 }
 
 #[test]

@@ -9,7 +9,7 @@ use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use opcua::nodes::{NodeSet2Import, NodeSetImport as _};
+use opcua::nodes::{NodeSet2Import, NodeSetImport as _, NodeType};
 use opcua::server::address_space::AddressSpace;
 use opcua::types::{
     Context, DecodingOptions, Identifier, NamespaceMap, NodeId, NodeSetNamespaceMapper, TypeLoader,
@@ -18,7 +18,7 @@ use opcua::types::{
 use opcua::xml::schema::ua_node_set::{UANode, UANodeSet};
 
 use super::outline::{self, Found, NodeKind, ValueKind};
-use super::structures::{Structures, can_be_sent};
+use super::structures::{self, Structures, can_be_sent};
 use super::{
     CORE, DEEPEST, Facts, NodeSet, NodeSetError, Source, imported, ordered, parsed, parted,
 };
@@ -223,6 +223,7 @@ impl NodeSets {
             set.facts.register_namespaces(&mut mapper);
             types.extend(set.types(&mapper));
         }
+        let completed = structures::inherit(&mut types);
         self.structures.define(&types);
         let mut imported = Imported::default();
         for set in &self.sets {
@@ -239,6 +240,11 @@ impl NodeSets {
                 .nodes
                 .extend(set.facts.nodes.ids().filter_map(there));
             imported.unread.extend(set.unread.iter().filter_map(there));
+        }
+        for (id, definition) in completed {
+            if let Some(NodeType::DataType(data_type)) = address_space.find_mut(&id) {
+                data_type.set_data_type_definition(Some(definition));
+            }
         }
         Ok(imported)
     }
@@ -305,6 +311,7 @@ fn define<'d>(
         document.facts.register_namespaces(&mut mapper);
         items.extend(document.types.load(&mapper));
     }
+    structures::inherit(&mut items);
     structures.define(&items);
 }
 

@@ -13,9 +13,10 @@ use opcua::types::custom::{
 };
 use opcua::types::xml::{XmlEncodable, XmlStreamReader, XmlStreamWriter, XmlType};
 use opcua::types::{
-    BinaryEncodable, Context, DynEncodable, EncodingResult, Error, ExpandedMessageInfo,
-    ExpandedNodeId, NamespaceMap, NodeId, NodeSetNamespaceMapper, ReferenceTypeId, StructureType,
-    TypeLoader, TypeLoaderPriority, UaNullable, Variant, XmlBody,
+    BinaryEncodable, Context, DataTypeDefinition, DynEncodable, EncodingResult, Error,
+    ExpandedMessageInfo, ExpandedNodeId, NamespaceMap, NodeId, NodeSetNamespaceMapper,
+    ReferenceTypeId, StructureDefinition, StructureField, StructureType, TypeLoader,
+    TypeLoaderPriority, UaNullable, Variant, XmlBody,
 };
 
 use super::{BINARY, DEEPEST};
@@ -205,6 +206,73 @@ fn as_type(item: &ImportedItem) -> Option<&opcua::nodes::DataType> {
         | NodeType::View(_)
         | NodeType::Method(_) => None,
     }
+}
+
+/// Gives each structure the fields that it has from structures of other files (OPC 10000-3, 8.48): the library knows those of
+/// its own file alone. Gives the definitions that are others now.
+///
+/// Structures of the core namespace have no definition here, so their fields are not among them.
+pub(super) fn inherit(items: &mut [ImportedItem]) -> HashMap<NodeId, DataTypeDefinition> {
+    let mut known: HashMap<NodeId, StructureDefinition> = HashMap::new();
+    for item in items.iter() {
+        let Some(data_type) = as_type(item) else {
+            continue;
+        };
+        if let Some(DataTypeDefinition::Structure(own)) = data_type.data_type_definition() {
+            known.insert(data_type.node_id().clone(), own.clone());
+        }
+    }
+    let mut others = HashMap::new();
+    for item in items {
+        let NodeType::DataType(data_type) = &mut item.node else {
+            continue;
+        };
+        let Some(whole) = with_inherited(data_type.node_id(), &known) else {
+            continue;
+        };
+        let whole = DataTypeDefinition::Structure(whole);
+        data_type.set_data_type_definition(Some(whole.clone()));
+        others.insert(data_type.node_id().clone(), whole);
+    }
+    others
+}
+
+/// A definition with the fields that it inherits, those of the uppermost first; `None` where it has them already.
+fn with_inherited(
+    id: &NodeId,
+    known: &HashMap<NodeId, StructureDefinition>,
+) -> Option<StructureDefinition> {
+    let own = known.get(id)?;
+    let mut line = vec![own];
+    while line.len() < DEEPEST {
+        let Some(above) = line.last().and_then(|at| known.get(&at.base_data_type)) else {
+            break;
+        };
+        line.push(above);
+    }
+    let mut fields: Vec<StructureField> = Vec::new();
+    for field in line
+        .iter()
+        .rev()
+        .flat_map(|one| one.fields.iter().flatten())
+    {
+        if fields.iter().all(|there| there.name != field.name) {
+            fields.push(field.clone());
+        }
+    }
+    if own.fields.as_ref().map_or(0, Vec::len) == fields.len() {
+        return None;
+    }
+    let has_optional = fields.iter().any(|field| field.is_optional);
+    let structure_type = match own.structure_type == StructureType::Structure && has_optional {
+        true => StructureType::StructureWithOptionalFields,
+        false => own.structure_type,
+    };
+    Some(StructureDefinition {
+        structure_type,
+        fields: Some(fields),
+        ..own.clone()
+    })
 }
 
 /// What the library needs to read values by.
