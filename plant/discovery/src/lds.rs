@@ -9,6 +9,7 @@ use std::time::{Duration, SystemTime};
 
 use bridge_node::{Failure, FailureKind, Requests};
 use opcua::types::ApplicationType;
+use plant_opcua::seldom::Seldom;
 use registry::{Announcement, Asked, Event, Loss, Settings, instance_name};
 use serde::Serialize;
 use tokio::net::TcpListener;
@@ -25,7 +26,7 @@ use crate::host_name;
 use crate::interface::Interface;
 use crate::keeper::Keeper;
 use crate::mdns::{Aside, Mdns, Ours};
-use crate::security::Security;
+use crate::security::{Security, TOLD_EVERY};
 use crate::services::{Answer, Own, Question, semaphore};
 use crate::url::Url;
 
@@ -285,6 +286,8 @@ pub(crate) struct Lds {
     around: Option<Around>,
     missed: u64,
     register_every: Duration,
+    /// Which registrations were refused, by the URI and why.
+    refused: Seldom,
     /// Lets clients in while it is kept.
     accepting: JoinSet<()>,
 }
@@ -359,6 +362,7 @@ impl Lds {
             around: None,
             missed: 0,
             register_every: settings.register_every,
+            refused: Seldom::every(TOLD_EVERY),
             accepting,
         };
         lds.announce();
@@ -450,7 +454,11 @@ impl Lds {
                 match registry.register(*asked, channel, semaphore_is_there, clock::now()) {
                     Ok(_) => Answer::Registered,
                     Err(fault) => {
-                        warn!(uri = ?cut(&uri), "a registration is refused: {}", cut(&fault.to_string()));
+                        let (uri, why) = (cut(&uri), cut(&fault.to_string()));
+                        let what = format!("{uri} {why}");
+                        if let Some(untold) = self.refused.another(&what, clock::now()) {
+                            warn!(?uri, untold, "a registration is refused: {why}");
+                        }
                         Answer::Refused(fault.status())
                     }
                 }

@@ -2,11 +2,14 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use bridge_node::{Failure, FailureKind};
 use opcua::crypto::{CertificateStore, PrivateKey, X509, X509Data};
+use opcua::sync::Mutex;
 use opcua::types::StatusCode;
 use plant_opcua::judge::{Judge, Refused};
+use plant_opcua::seldom::Seldom;
 use tracing::{info, warn};
 use trust::Names;
 use x509_cert::Certificate;
@@ -14,12 +17,16 @@ use x509_cert::der::Decode as _;
 use x509_cert::ext::pkix::SubjectAltName;
 use x509_cert::ext::pkix::name::GeneralName;
 
+use crate::clock;
+
 /// The certificate store of a discovery server: `own`, `private` and `trusted` under one directory.
 #[derive(Debug)]
 pub(crate) struct Security {
     pub(crate) certificate: X509,
     pub(crate) key: PrivateKey,
     judge: Judge,
+    /// Who was turned away, by the certificate and why.
+    refused: Mutex<Seldom>,
 }
 
 impl Security {
@@ -60,6 +67,7 @@ impl Security {
                 .map_err(|error| failed(&error))?,
             key: CertificateStore::read_pkey(&key).map_err(|error| failed(&error))?,
             judge: Judge::of(root, trust_any),
+            refused: Mutex::new(Seldom::every(TOLD_EVERY)),
         })
     }
 
@@ -71,6 +79,7 @@ impl Security {
             certificate: CertificateStore::read_cert(&certificate).map_err(failed)?,
             key: CertificateStore::read_pkey(&key).map_err(failed)?,
             judge: Judge::of(root, false),
+            refused: Mutex::new(Seldom::every(TOLD_EVERY)),
         })
     }
 
@@ -97,7 +106,10 @@ impl Security {
         let Err(refused) = self.judge.take(der, Names::default()) else {
             return Ok(());
         };
-        warn!("a client is not talked to: {refused}");
+        let told = refused.to_string();
+        if let Some(untold) = self.refused.lock().another(&told, clock::now()) {
+            warn!(untold, "a client is not talked to: {told}");
+        }
         // Not which of the checks it was (OPC 10000-4, 6.1.3).
         match refused.may_be_told {
             true => Err(refused.status),
@@ -156,3 +168,6 @@ fn owner_only(path: &Path) -> std::io::Result<()> {
 
 /// Five years, as other stacks make them.
 const CERTIFICATE_DAYS: u32 = 1826;
+
+/// The same client is told of in the log once in this time.
+pub(crate) const TOLD_EVERY: Duration = Duration::from_secs(10);

@@ -23,7 +23,7 @@ use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::{Semaphore, watch};
 use tokio::task::JoinSet;
-use tokio::time::timeout;
+use tokio::time::{Instant, timeout};
 use tracing::{debug, info, warn};
 use trust::{Certificate, Fault, Known};
 
@@ -31,6 +31,7 @@ use crate::certificates;
 use crate::judge::{self, Shown};
 use crate::known::{self, Stamp};
 use crate::pki::{OWN_CERTIFICATE, OWN_KEY};
+use crate::seldom::Seldom;
 
 /// In front of a server that lets in whom a trusted authority has issued a certificate.
 #[derive(Debug)]
@@ -73,6 +74,8 @@ struct Shared {
     admitted: Mutex<HashMap<PathBuf, usize>>,
     /// Counts the changes of what is known.
     changes: watch::Sender<u64>,
+    /// Who was turned away, by the certificate and why.
+    refused: Mutex<Seldom>,
 }
 
 impl Door {
@@ -112,6 +115,7 @@ impl Door {
             inner: listener.local_addr()?,
             admitted: Mutex::default(),
             changes: watch::Sender::new(0),
+            refused: Mutex::new(Seldom::every(TOLD_EVERY)),
         };
         info!("those whom a trusted authority issued certificates are let in");
         Ok(Some((
@@ -221,7 +225,7 @@ impl Shared {
                     if let Some(shown) = &shown
                         && let Err(fault) = self.judge(shown)
                     {
-                        tell(&shown.0, fault, peer, "is cut off");
+                        self.tell(&shown.0, fault, peer, "is cut off");
                         // The library drops its session when the connection is gone.
                         break;
                     }
@@ -252,7 +256,7 @@ impl Shared {
                     warn!(%error, "a refused certificate is not kept");
                 }
             } else {
-                tell(certificate, fault, peer, "is refused");
+                self.tell(certificate, fault, peer, "is refused");
             }
             // A stranger is not told which of the checks it was (OPC 10000-4, 6.1.3).
             let status = match fault.may_be_told() {
@@ -263,7 +267,7 @@ impl Shared {
         }
         if !shown.1.is_empty() {
             // The library reads one certificate where a client sends several.
-            tell_chain(certificate, peer);
+            self.tell_chain(certificate, peer);
             return Err(StatusCode::BadCertificateInvalid);
         }
         let path = self.behind.pki.join(known::TRUSTED).join(file);
@@ -278,6 +282,37 @@ impl Shared {
         }
         *count += 1;
         Ok(Admitted { shared: self, path })
+    }
+    fn tell(&self, certificate: &Certificate, fault: Fault, peer: SocketAddr, what: &str) {
+        let help = judge::help(fault);
+        let why = format!("{what}: {fault}; {help}");
+        if let Some(untold) = self.another(certificate, &why) {
+            warn!(
+                name = ?certificate.name(), issuer = ?certificate.issuer_name(), serial = %certificate.serial(), %peer, untold,
+                "a client {why}"
+            );
+        }
+    }
+
+    fn tell_chain(&self, certificate: &Certificate, peer: SocketAddr) {
+        if let Some(untold) = self.another(certificate, "chain") {
+            warn!(
+                name = ?certificate.name(), %peer, untold,
+                "a client is refused: it sends certificates of authorities along with its own; have it send its own alone"
+            );
+        }
+    }
+
+    /// How often that was not told of a certificate, where it is to be told now.
+    fn another(&self, certificate: &Certificate, why: &str) -> Option<u64> {
+        let what = format!(
+            "{} {} {why}",
+            certificate.issuer_name(),
+            certificate.serial()
+        );
+        self.refused
+            .lock()
+            .another(&what, Instant::now().into_std())
     }
 }
 
@@ -301,21 +336,6 @@ impl Drop for Admitted<'_> {
             }
         }
     }
-}
-
-fn tell(certificate: &Certificate, fault: Fault, peer: SocketAddr, what: &str) {
-    let help = judge::help(fault);
-    warn!(
-        name = ?certificate.name(), issuer = ?certificate.issuer_name(), serial = %certificate.serial(), %peer,
-        "a client {what}: {fault}; {help}"
-    );
-}
-
-fn tell_chain(certificate: &Certificate, peer: SocketAddr) {
-    warn!(
-        name = ?certificate.name(), %peer,
-        "a client is refused: it sends certificates of authorities along with its own; have it send its own alone"
-    );
 }
 
 /// The certificate that opens a channel; `None` for one without security.
@@ -375,6 +395,8 @@ async fn refuse(client: &mut TcpStream, status: StatusCode) -> io::Result<()> {
 const BEHIND: &str = "admitted";
 const MOST_CONNECTIONS: usize = 1000;
 /// From the connection to the certificate.
+/// The same client is told of in the log once in this time.
+const TOLD_EVERY: Duration = Duration::from_secs(10);
 const GREETING: Duration = Duration::from_secs(5);
 const LOOK: Duration = Duration::from_secs(1);
 const PAUSE: Duration = Duration::from_millis(100);

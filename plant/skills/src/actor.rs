@@ -6,6 +6,7 @@ use std::future::pending;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, SystemTime};
 
+use plant_opcua::seldom::Seldom;
 use program::{Ending, Method, Nature, Program, Refused, RunId, State, Transition};
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::task::{JoinError, JoinHandle};
@@ -61,27 +62,8 @@ pub(crate) struct Actor {
     work: Option<Running>,
     /// What was said of the run that goes on.
     trace: Vec<String>,
-    refusals: Refusals,
-}
-
-/// Of calls that were refused, how they were told: a client that asks again and again must not fill the log.
-#[derive(Debug, Default)]
-struct Refusals {
-    told: Option<Instant>,
-    untold: u64,
-}
-
-impl Refusals {
-    /// How many were left untold before this one, where it is to be told now.
-    fn another(&mut self, now: Instant) -> Option<u64> {
-        let is_soon = |told: Instant| now.saturating_duration_since(told) < TOLD_EVERY;
-        if self.told.is_some_and(is_soon) {
-            self.untold += 1;
-            return None;
-        }
-        self.told = Some(now);
-        Some(std::mem::take(&mut self.untold))
-    }
+    /// Of its refusals one is told at a time: a client that asks again and again must not fill the log.
+    refusals: Seldom,
 }
 
 /// The work of a run, until it has really ended.
@@ -143,7 +125,7 @@ impl Actor {
             now,
             work: None,
             trace: Vec::new(),
-            refusals: Refusals::default(),
+            refusals: Seldom::every(TOLD_EVERY),
         };
         (actor, watched)
     }
@@ -200,7 +182,7 @@ impl Actor {
         });
         self.tell(Told::Called);
         if let Err(refusal) = &answer
-            && let Some(untold) = self.refusals.another(Instant::now())
+            && let Some(untold) = self.refusals.another("", Instant::now().into_std())
         {
             info!(
                 skill = self.facts.name,
@@ -665,19 +647,3 @@ const LONGEST_TRACED: usize = 240;
 const TOLD_EVERY: Duration = Duration::from_secs(1);
 /// The outcomes of so many runs can be asked for.
 const MOST_OUTCOMES: usize = 64;
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn of_refusals_in_a_row_one_a_second_is_told_with_the_number_of_the_others() {
-        let (mut refusals, first) = (Refusals::default(), Instant::now());
-        let after = |ms| first + Duration::from_millis(ms);
-        assert_eq!(refusals.another(first), Some(0));
-        assert_eq!(refusals.another(after(1)), None);
-        assert_eq!(refusals.another(after(999)), None);
-        assert_eq!(refusals.another(after(1000)), Some(2));
-        assert_eq!(refusals.another(after(3000)), Some(0));
-    }
-}
