@@ -9,13 +9,19 @@ use std::time::Duration;
 
 use serde_json::{Value, json};
 use system_tests::{
-    Cell, METRICS_ROS1, METRICS_ROS2, Peer, UaSide, UadpSocket, eventually, metrics, program,
+    Cell, METRICS_ROS1, METRICS_ROS2, Peer, Started, UaSide, UadpSocket, eventually, metrics,
+    program,
 };
 use uadp::{NetworkMessage, Scalar};
 
 const SOON: Duration = Duration::from_secs(30);
 const TOPIC: [&str; 2] = ["/ua_1_5_10", "std_msgs/String"];
 const SECRET: &str = "a recipe nobody may know";
+const GRIPPER: &str = concat!(
+    env!("CARGO_MANIFEST_DIR"),
+    "/../examples/plant/parallel-gripper.yaml"
+);
+const METRICS_COMPONENT: &str = "127.0.0.1:9107";
 
 /// Runs `ua-space` and gives what it printed.
 fn space(args: &[&str]) -> String {
@@ -123,6 +129,75 @@ fn bridges_with_the_keys_hear_each_other_and_a_third_program_neither_hears_nor_i
         (heard.values().len() > count + 10).then_some(())
     });
     assert_eq!(dropped(METRICS_ROS2, "unknown_key"), before);
+}
+
+/// A call by `ua-space` of what a component executes: its exit code and what it printed.
+fn called(words: &[&str]) -> (Option<i32>, String) {
+    let told = Command::new(program("ua-space"))
+        .args(["call", "--interface", "lo", "--json"])
+        .args(words)
+        .output()
+        .unwrap();
+    let printed = String::from_utf8_lossy(&told.stdout).into_owned();
+    let errors = String::from_utf8_lossy(&told.stderr);
+    (told.status.code(), printed + &errors)
+}
+
+#[test]
+fn skills_of_a_secured_group_are_run_by_who_has_its_keys_and_by_nobody_else() {
+    let Some(cell) = Cell::with(&[Peer::Ros1]) else {
+        return;
+    };
+    let keys = cell.folder().join("cell.keys");
+    space(&["keys", path(&keys)]);
+    let mapping = cell.file(
+        "cell.yaml",
+        "security: [{group: cell, keys: {file: cell.keys}}]\n",
+    );
+    let secured = ["--security", path(&mapping)];
+    let _master = cell.roscore();
+    let _bridge = cell.bridge_ros1(&secured);
+    let of_component = [GRIPPER, "--lds", "none", "--interface", "lo"];
+    let _component = Started::new("ua-component", &program("ua-component"))
+        .args(of_component)
+        .args(["--metrics", METRICS_COMPONENT])
+        .args(secured)
+        .start();
+    eventually("the component has its keys", SOON, || {
+        token(METRICS_COMPONENT)
+    });
+
+    // Who is in ROS runs one of its skills by the bridge, which has them.
+    for method in ["/ua_0_7_209", "/ua_0_7_205"] {
+        let asked = [method, "std_srvs/Trigger", "--value", "{}"];
+        let mut robot = cell.rospy("ros1_call.py", &asked);
+        let told = robot.wait_for_json("an answer", SOON, |line| {
+            line.get("value").or_else(|| line.get("error")).cloned()
+        });
+        assert_eq!(told["success"], true, "{method}: {told}");
+    }
+    // And whoever looks into the space with them is told how another went.
+    let with_keys = ["--keys", path(&keys), "--wait", "20"];
+    let reset = called(&[&["parallel-gripper.Grasp.Reset"], &with_keys[..]].concat());
+    assert_eq!(reset.0, Some(0), "{}", reset.1);
+    let grasp = ["parallel-gripper.Grasp", "Force=12.5"];
+    let grasped = called(&[&grasp[..], &with_keys].concat());
+    assert_eq!(grasped.0, Some(0), "{}", grasped.1);
+    let datagrams = UadpSocket::join().receive_for(Duration::from_secs(1));
+    assert!(!datagrams.is_empty());
+    for datagram in &datagrams {
+        assert!(NetworkMessage::decode(datagram).unwrap().is_sealed());
+    }
+
+    // Who has none learns of no skill, and what it asks for in clear is not heard.
+    let before = dropped(METRICS_COMPONENT, "unsecured");
+    let refused = called(&["ua_0_7_109", "--wait", "2"]);
+    assert!(refused.0.is_some_and(|code| code != 0), "{}", refused.1);
+    eventually("what is in clear is counted", SOON, || {
+        (dropped(METRICS_COMPONENT, "unsecured") > before).then_some(())
+    });
+    let again = called(&[&grasp[..], &with_keys].concat());
+    assert_eq!(again.0, Some(0), "{}", again.1);
 }
 
 #[test]
