@@ -29,7 +29,8 @@ cargo xtask <verb>
   peers [--build]                only install the peers; of those only what the programs are built with
   lint                           formatting, clippy, licences and sources of dependencies, documentation
   dist                           build the programs that are handed out, with optimisation, into target/dist
-  patches                        only patch the crates of patches/, which all verbs build with, and print the flags to do so by hand
+  patches [--test]               only patch the crates of patches/, which all verbs build with, and print the flags to do so by hand;
+                                 or run all tests that the patches add, of which `test` leaves out those that take minutes to build
   bench hop [ARGS]               measure one hop beside the floor and roscpp's relay
   bench ros1 [ARGS]              measure relays of ROS 1 messages beside a raw echo; bridge-ros1 with 50 topics (--help)
   bench ros2 [ARGS]              measure relays of DDS samples beside a UDP echo; both bridges from ROS 1 to ROS 2 and back
@@ -63,6 +64,7 @@ fn run(arguments: &[&str]) -> anyhow::Result<Ended> {
         ["peers", "--build"] => peers::for_building(),
         ["dist"] => dist::run(&Workspace::find()?),
         ["patches"] => patches::run(&Workspace::find()?),
+        ["patches", "--test"] => test::of_all_patches(&Workspace::find()?),
         ["lint"] => lint::run(&Workspace::find()?),
         ["bench", "uadp", rest @ ..] => {
             instructions::run(&Workspace::find()?, "uadp", rest, |_| Ok(()))

@@ -261,16 +261,21 @@ impl Patches {
         let mut tests = Vec::new();
         for (_, text) in &self.0 {
             let mut is_test = false;
-            for line in text.lines().filter_map(|line| line.strip_prefix('+')) {
-                let line = line.trim();
-                let name = line
+            for line in text.lines() {
+                let added = line.strip_prefix('+');
+                // The attribute may be that of the test behind it in the published source, which a patch shows as its own.
+                let Some(source) = added.or_else(|| line.strip_prefix(' ')) else {
+                    continue;
+                };
+                let source = source.trim();
+                let name = source
                     .strip_prefix("fn ")
                     .and_then(|rest| rest.split('(').next());
                 match name {
-                    Some(name) if is_test => tests.push(name.to_owned()),
+                    Some(name) if is_test && added.is_some() => tests.push(name.to_owned()),
                     _ => {}
                 }
-                is_test = line == "#[test]" || is_test && name.is_none();
+                is_test = source == "#[test]" || is_test && name.is_none();
             }
         }
         tests
@@ -363,8 +368,17 @@ mod tests {
 +  fn a_second_one() -> io::Result<()> {
 -  #[test]
 -  fn gone() {
+   #[test]
++  fn a_third_one() {
++  }
++
++  #[test]
+   fn as_published() {
 ";
         let patches = Patches(vec![("0001.patch".into(), text.to_owned())]);
-        assert_eq!(patches.tests(), ["a_first_one", "a_second_one"]);
+        assert_eq!(
+            patches.tests(),
+            ["a_first_one", "a_second_one", "a_third_one"]
+        );
     }
 }

@@ -57,7 +57,7 @@ pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<E
     let build = patched.cargo(workspace, &[&["build"][..], TARGETS, &built].concat());
     let programs = programs::build(build)?;
     let of_patches = match filters.is_empty() {
-        true => of_patches(workspace, &patched)?,
+        true => of_patches(workspace, &patched, |source| !takes_minutes(source))?,
         false => Vec::new(),
     };
 
@@ -84,13 +84,34 @@ pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<E
     Ok(outcome.ended())
 }
 
-/// The test programs of the patched crates that have tests of ours.
+/// Runs the tests that the patches add to their crates, and nothing else.
+pub(crate) fn of_all_patches(workspace: &Workspace) -> anyhow::Result<Ended> {
+    let patched = Patched::prepare(workspace)?;
+    let programs = of_patches(workspace, &patched, |_| true)?;
+    let namespaces = Namespaces::try_out();
+    let jobs = programs.iter();
+    let jobs = jobs.map(|(source, program)| job_of_patches(source, program, namespaces));
+    let mut report = Report::default();
+    report.take(Lanes(1).run(jobs.collect())?);
+    let outcome = Outcome::new(&report, Vec::new(), 0);
+    print!("{outcome}");
+    Ok(outcome.ended())
+}
+
+/// A crate whose own tests are built with the OPC UA types once more. What its patches change is asserted by system tests too,
+/// with clients of other makers.
+fn takes_minutes(source: &Source) -> bool {
+    source.name().starts_with("async-opcua")
+}
+
+/// The test programs of those patched crates that have tests of ours.
 fn of_patches<'a>(
     workspace: &Workspace,
     patched: &'a Patched,
+    wanted: impl Fn(&Source) -> bool,
 ) -> anyhow::Result<Vec<(&'a Source, Program)>> {
     let mut all = Vec::new();
-    for source in patched.sources() {
+    for source in patched.sources().iter().filter(|source| wanted(source)) {
         // Without names of tests it would run all that the crate has.
         if !source.tests().is_empty() {
             let built = programs::build(source.build_of_own_tests(workspace))?;
@@ -159,10 +180,8 @@ impl Plan {
             }
         }
         for (source, program) in of_patches {
-            let mut command = program.alone(namespaces);
-            command.args(source.tests());
-            let label = format!("{}, what patches/ adds", source.name());
-            plan.programs.push(Job::new(label, command));
+            plan.programs
+                .push(job_of_patches(source, &program, namespaces));
         }
         let mut documents = surround(patched.cargo(workspace, &[&["test"][..], TARGETS].concat()));
         documents.args(["--doc", "--"]).args(filters);
@@ -190,6 +209,12 @@ impl Plan {
         }
         Ok(report)
     }
+}
+
+fn job_of_patches(source: &Source, program: &Program, namespaces: Namespaces) -> Job {
+    let mut command = program.alone(namespaces);
+    command.args(source.tests());
+    Job::new(format!("{}, what patches/ adds", source.name()), command)
 }
 
 /// More failures than this are no accident of a peer, and trying them all again would take CI's time.
