@@ -453,6 +453,29 @@ fn a_call_without_values_is_gone_when_it_is_not_announced_any_more_or_said_to_be
 }
 
 #[test]
+fn a_program_whose_last_value_has_no_producer_any_more_keeps_its_calls_until_it_dies() {
+    let mut cell = plugged_in(Local::Fields);
+    cell.describe(GRIPPER, topic(0, 7, 101), state());
+    cell.say(GRIPPER, topic(0, 7, 101), "Ready");
+    cell.run(ms(5_000));
+    let now = cell.now();
+    let component = &mut cell.programs[GRIPPER].router;
+    component.set_live(topic(0, 7, 101), false, now);
+    cell.run(ms(100_000));
+    assert_eq!((cell.gone(BRIDGE), cell.known(BRIDGE)), (vec![], vec![]));
+    cell.ask(BRIDGE, AskId(1), (start(), &[0, 0]), ms(3_000));
+    cell.run(ms(50));
+    assert_eq!(cell.executions(GRIPPER).len(), 1);
+
+    // Once it has values again, it is missed as soon as before.
+    cell.say(GRIPPER, topic(0, 7, 101), "Ready");
+    cell.run(ms(5_000));
+    cell.kill(GRIPPER);
+    cell.run(ms(3_700));
+    assert_eq!(cell.gone(BRIDGE), [start()]);
+}
+
+#[test]
 fn who_comes_late_learns_the_calls_that_are_there_by_asking() {
     let mut cell = Cell::new(vec![component(7)]);
     cell.describe(0, topic(0, 7, 101), state());
@@ -623,6 +646,9 @@ fn a_request_and_a_response_of_a_megabyte_cross_in_chunks() {
     // They are repeated, and executed once.
     cell.run(ms(500));
     assert!(cell.executions(GRIPPER).is_empty());
+    // Chunks of an answer are not values, which would be missed.
+    cell.run(ms(50_000));
+    assert_eq!(cell.gone(BRIDGE), []);
 }
 
 #[test]

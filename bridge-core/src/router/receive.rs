@@ -68,7 +68,11 @@ impl Router {
             self.count(About::sender(from), Reason::NotInSpace, 1, String::new);
             return;
         };
-        if let Some(calls) = &mut self.calls {
+        // A message that was cut up whole is no value: it may be an answer of a program that sends no values.
+        let whole = message.is_chunk() && message.writer_ids().is_none();
+        if let Some(calls) = &mut self.calls
+            && !whole
+        {
             calls.heard(space, namespace, from, now);
         }
         if message.is_chunk() && !message.is_sealed() {

@@ -38,16 +38,34 @@ pub(super) struct Group {
     from: SocketAddr,
     /// When it last said something of a call.
     said: Instant,
-    /// When values of it were last heard, if there were any.
+    /// When values of it were last heard. None where it has none, or none of which it knows the producer any more.
     heard: Option<Instant>,
     /// It is silent.
     gone: bool,
     /// Since when it was asked what its calls are, and nothing is heard of it: somebody else says that it has them, or it
     /// executes nothing.
     doubted: Option<Instant>,
+    /// It was asked since its values are missing.
+    asked: bool,
 }
 
 impl Group {
+    /// Whether its values are missing, and it is to be asked whether it lives without: those of a producer that has left
+    /// end, and with the last of them all that comes unasked.
+    fn is_to_be_asked(&self, now: Instant, silence: Duration) -> bool {
+        !self.gone
+            && !self.asked
+            && (self.heard).is_some_and(|heard| now.saturating_duration_since(heard) >= silence / 2)
+    }
+
+    /// It said what its calls are: unless values come again, it is one without.
+    fn lives(&mut self, now: Instant, silence: Duration) {
+        let missing = |heard: &mut Instant| now.saturating_duration_since(*heard) >= silence / 2;
+        self.heard.take_if(missing);
+        (self.said, self.gone) = (now, false);
+        (self.doubted, self.asked) = (None, false);
+    }
+
     /// Whether nothing is heard of it any more.
     fn is_silent(&self, now: Instant, (silence, forgotten): (Duration, Duration)) -> bool {
         let since = |at: Instant| now.saturating_duration_since(at);
@@ -78,7 +96,7 @@ impl Calls {
             return;
         }
         group.heard = Some(now.monotonic);
-        group.doubted = None;
+        (group.doubted, group.asked) = (None, false);
         if std::mem::take(&mut group.gone) {
             self.revive((space, namespace), now.monotonic);
         }
@@ -195,6 +213,7 @@ impl Router {
         now: Now,
     ) {
         let (_, namespace, _) = topic.triple();
+        let (silence, _) = self.silences();
         let calls = self.calls_mut(now);
         let weight = description.weight();
         let before = calls.table.get(&topic).and_then(|call| call.known.as_ref());
@@ -222,12 +241,13 @@ impl Router {
             heard: None,
             gone: false,
             doubted: None,
+            asked: false,
         });
         if group.from != from {
             // A program that was started anew.
             (group.from, group.heard) = (from, None);
         }
-        (group.said, group.gone, group.doubted) = (now.monotonic, false, None);
+        group.lives(now.monotonic, silence);
         calls.look_at.get_or_insert(now.monotonic + LOOK);
         let call = calls.table.entry(topic).or_default();
         match &mut call.known {
@@ -306,8 +326,8 @@ impl Router {
         }
     }
 
-    /// Who sends values is gone when they are missing; who sends none, when its announcements are; and either when it is asked
-    /// in vain.
+    /// Who sends values is gone when they are missing and it does not say, asked, that it has none any more; who sends none,
+    /// when its announcements are; and either when it is asked in vain.
     fn silences(&self) -> (Duration, Duration) {
         let pubsub = self.mapping.pubsub();
         let forgotten = pubsub.metadata_period.saturating_mul(MISSED);
@@ -316,7 +336,7 @@ impl Router {
 
     /// Tells of the calls that nobody executes any longer.
     pub(super) fn look_for_silence(&mut self, now: Now) {
-        let silences @ (_, forgotten) = self.silences();
+        let silences @ (silence, forgotten) = self.silences();
         let Some(calls) = &mut self.calls else {
             return;
         };
@@ -342,13 +362,22 @@ impl Router {
                     asked.push(*topic);
                 }
             }
+            // By one of its calls for all.
+            let group = calls.groups.get_mut(&(topic.space, namespace));
+            if !known.gone
+                && let Some(group) = group
+                && group.is_to_be_asked(now.monotonic, silence)
+            {
+                group.asked = true;
+                asked.push(*topic);
+            }
         }
         calls
             .groups
             .retain(|_, group| now.monotonic.saturating_duration_since(group.said) < forgotten);
         let some = !calls.groups.is_empty() || !calls.executions.is_empty();
         calls.look_at = some.then(|| now.monotonic + LOOK);
-        // Somebody else may have them, or they are back.
+        // Somebody else may have them, or they are back, or they are there without values.
         for topic in asked {
             self.plan_probe(topic, now);
         }
