@@ -46,6 +46,11 @@ class Server(Ends):
         self.reader = DataReader(participant, self.request, qos=self.qos)
 
     def answer(self, request, reply):
+        # As rmw_cyclonedds does: a request may come before the reader of its client is matched, and a reply before that is
+        # lost. A client has one of each.
+        end = time.monotonic() + 1.0
+        while ros2_types.matched(self.writer) < ros2_types.matched(self.reader) and time.monotonic() < end:
+            time.sleep(0.001)
         reply.client, reply.count = request.client, request.count
         self.writer.write(reply)
 

@@ -29,11 +29,9 @@ void serve(const Arguments& arguments) {
     const auto reader = participant.informed(
         service.request, service.request_type, quality, [&](const Body& request, const fast::SampleInfo& info) {
             const rtps::SampleIdentity identity = client_of(info);
-            rtps::WriteParams params;
-            params.related_sample_identity(identity);
             const Body& reply = replies.empty() ? request : replies[served % replies.size()];
             ++served;
-            const bool taken = replier.write(reply, params);
+            const bool taken = replier.reply(identity, reply);
             Line line;
             line.field("request", hex(request)).field("seq", info.sample_identity.sequence_number().to64long());
             line.field("client", text(identity.writer_guid())).field("replied", taken);

@@ -4,6 +4,7 @@
 #include <chrono>
 #include <condition_variable>
 #include <mutex>
+#include <set>
 #include <thread>
 
 #include <fastdds/dds/domain/DomainParticipant.hpp>
@@ -114,15 +115,39 @@ public:
         return writer_->wait_for_acknowledgments({whole, 0}) == ReturnCode_t::RETCODE_OK;
     }
 
+    // Answers a client, as rmw_fastrtps does it: its request may come before the reader is known that awaits the reply, and
+    // a reply that goes out before that reader is matched is lost. Who names no reader is answered at once.
+    bool reply(const rtps::SampleIdentity& to, const Body& body) {
+        const auto& reader = to.writer_guid();
+        if (reader.entityId.is_reader()) {
+            std::unique_lock<std::mutex> guard(lock_);
+            matched_.wait_for(guard, std::chrono::seconds(2), [&] { return guids_.count(reader) > 0; });
+        }
+        rtps::WriteParams params;
+        params.related_sample_identity(to);
+        return write(body, params);
+    }
+
 private:
     void on_publication_matched(fast::DataWriter*, const fast::PublicationMatchedStatus& status) override {
         readers_ = status.current_count;
+        const std::lock_guard<std::mutex> guard(lock_);
+        const auto reader = rtps::iHandle2GUID(status.last_subscription_handle);
+        if (status.current_count_change > 0) {
+            guids_.insert(reader);
+        } else {
+            guids_.erase(reader);
+        }
+        matched_.notify_all();
     }
     void on_offered_incompatible_qos(fast::DataWriter*, const fast::OfferedIncompatibleQosStatus& status) override {
         Line().field("incompatible", status.last_policy_id);
     }
 
     std::atomic<int> readers_ = 0;
+    std::mutex lock_;
+    std::condition_variable matched_;
+    std::set<rtps::GUID_t> guids_;
     fast::DataWriter* writer_;
 };
 

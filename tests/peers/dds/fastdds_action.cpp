@@ -125,9 +125,7 @@ public:
     }
 
     void reply(const rtps::SampleIdentity& to, const Body& body) {
-        rtps::WriteParams params;
-        params.related_sample_identity(to);
-        fast_writer().write(body, params);
+        fast_writer().reply(to, body);
     }
 
     bool matched() { return writer_->readers() > 0 && reader_->writers() > 0; }
