@@ -80,6 +80,8 @@ fn state(name: &str) -> (u32, &'static str) {
 mod faults;
 #[path = "skills/foreign.rs"]
 mod foreign;
+#[path = "skills/robot.rs"]
+mod robot;
 
 #[test]
 fn a_client_with_a_queue_sees_each_state_of_runs_that_are_over_at_once() {

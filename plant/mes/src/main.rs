@@ -300,6 +300,7 @@ fn component(settings: &Settings, driver: ExecuteProcess) -> Component {
         open: settings.open,
         lease: skills::LEASE,
         device: None,
+        robot: None,
         skills: vec![SkillSetup {
             name: "ExecuteProcess".to_owned(),
             skill_type: TypeName::own("ExecuteProcessSkillType"),

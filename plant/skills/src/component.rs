@@ -41,8 +41,27 @@ pub struct Component {
     pub lease: Duration,
     /// What does the work of the skills whose driver is [`DriverSetup::Device`].
     pub device: Option<Arc<dyn Device>>,
+    /// The robot that it is to clients of OPC 40010-1.
+    pub robot: Option<Robot>,
     /// Its skills, by their numbers from 1.
     pub skills: Vec<SkillSetup>,
+}
+
+/// What OPC 40010-1 wants to know of a robot, beside what its skills say.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Robot {
+    /// Who makes it.
+    pub manufacturer: String,
+    /// Which one of those.
+    pub model: String,
+    /// The ProductCode; empty where it is not told.
+    pub product_code: String,
+    /// The SerialNumber; empty where it is not told.
+    pub serial_number: String,
+    /// A value of MotionDeviceCategoryEnumeration (OPC 40010-1, 10.1).
+    pub category: i32,
+    /// Where the document says so.
+    pub place: Place,
 }
 
 /// A security policy.

@@ -29,8 +29,8 @@ pub use client::{
 };
 pub use component::{
     Asked, Component, Device, DeviceKinds, DriverFault, DriverSetup, Drivers, Form, LEASE, Lds,
-    MOST_SKILLS, NoDevices, Part, Partner, Partners, Security, Simulation, SkillSetup, Source,
-    SpaceWork,
+    MOST_SKILLS, NoDevices, Part, Partner, Partners, Robot, Security, Simulation, SkillSetup,
+    Source, SpaceWork,
 };
 pub use composite::{Broken, Job, PickAndPlace, Teller};
 pub use driver::{Driver, Results, Stopped, Work};

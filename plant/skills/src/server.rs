@@ -1,12 +1,13 @@
 //! A component as an OPC UA server: its skills as instances of their types, with methods, events and parameters.
 //!
 //! Reading order: this, `place` (where it is in the plant), `types` (what a skill is, from the instance of its type), `show`
-//! (what clients see), `methods` (what they have it do), `lock` (the lease, as OPC 10000-100 has it), `uses` (what composites
-//! are made of).
+//! (what clients see), `methods` (what they have it do), `lock` (the lease, as OPC 10000-100 has it), `robot` (what it is to
+//! clients of OPC 40010-1), `uses` (what composites are made of).
 
 mod lock;
 mod methods;
 mod place;
+mod robot;
 mod show;
 mod types;
 mod uses;
@@ -103,6 +104,15 @@ impl ComponentServer {
                 Err(finding) => findings.push(finding),
             }
         }
+        if let Some(robot) = &component.robot
+            && !robot::has_types(&server)
+        {
+            let message = "a robot is shown by the types of OPC 40010-1, and they are not there";
+            let finding = Finding::error(Code::NodeSet, robot.place, message);
+            findings.push(finding.with_help(
+                "Opc.Ua.Robotics.NodeSet2.xml and Opc.Ua.Di.NodeSet2.xml stand under `nodesets`",
+            ));
+        }
         if !findings.is_empty() {
             return Err(ServeFault::Findings(findings));
         }
@@ -129,7 +139,7 @@ impl ComponentServer {
             methods::serve(&server, &nodes, &skill);
             served.push((skill, nodes));
         }
-        let skills = served.iter().map(|(skill, _)| skill.clone()).collect();
+        let skills: Vec<Skill> = served.iter().map(|(skill, _)| skill.clone()).collect();
         let mut tasks = JoinSet::new();
         let leases = Leases {
             server: server.clone(),
@@ -141,6 +151,10 @@ impl ComponentServer {
             .map_err(|error| ServeFault::Space(error.to_string()))?;
         let locking = Lock::serve(&server, &authority, &root.node_id, &mut ids);
         tasks.spawn(locking.map_err(|error| ServeFault::Space(error.to_string()))?);
+        if let Some(robot) = &component.robot {
+            let kept = robot::serve(&server, (&component.name, robot), &skills, &mut ids);
+            tasks.spawn(kept.map_err(|error| ServeFault::Space(error.to_string()))?);
+        }
         if let Some(node) = root.node("LeaseHolder") {
             tasks.spawn(show_holder(
                 server.clone(),

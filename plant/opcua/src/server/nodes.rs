@@ -13,7 +13,7 @@ use opcua::server::{CreateMonitoredItem, SubscriptionCache};
 use opcua::sync::RwLock;
 use opcua::types::{
     Argument, AttributeId, DataValue, DateTime, NodeId, ObjectTypeId, ReferenceTypeId, StatusCode,
-    TimestampsToReturn,
+    TimestampsToReturn, Variant,
 };
 use tokio::time::{Instant, timeout_at};
 
@@ -251,6 +251,8 @@ pub(crate) fn show(
     let mut shown = Vec::with_capacity(values.len());
     for (node, value) in values {
         let mut value = plain(value);
+        // A variable without any value is read without its status.
+        value.value.get_or_insert(Variant::Empty);
         value.status.get_or_insert(StatusCode::Good);
         value.source_timestamp.get_or_insert(now);
         value.server_timestamp.get_or_insert(now);

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use super::{
     Asked, Component, DeviceKinds, DriverSetup, LEASE, Lds, MOST_SKILLS, NoDevices, Partner,
-    Partners, Security, Simulation, SkillSetup,
+    Partners, Robot, Security, Simulation, SkillSetup,
 };
 use crate::parameters::{TypeName, shortened};
 use crate::yaml::{Code, Findings, Kind, Node, Place, Reader, parse};
@@ -60,6 +60,7 @@ fn component(
         "open",
         "lease",
         "device",
+        "robot",
         "skills",
     ];
     let [
@@ -73,6 +74,7 @@ fn component(
         open,
         lease,
         device,
+        robot,
         skills,
     ] = reader.map(root, keys)?;
     // Each is read, so that all is told, whether or not another is wrong.
@@ -107,6 +109,7 @@ fn component(
     let open = open.map_or(Some(false), |node| reader.boolean(node));
     let lease = lease.map_or(Some(LEASE), |node| reader.duration(node));
     let device = device.map(|node| kinds.read(node, reader));
+    let robot = robot.map(|node| read_robot(node, reader));
     let skills = reader
         .needed(skills, "skills", root.place)
         .map(|node| read_skills(node, reader));
@@ -124,7 +127,64 @@ fn component(
             Some(read) => Some(read?),
             None => None,
         },
+        robot: match robot {
+            Some(read) => Some(read?),
+            None => None,
+        },
         skills: skills?,
+    })
+}
+
+fn read_robot(node: &Node, reader: &mut Reader<'_>) -> Option<Robot> {
+    let keys = [
+        "manufacturer",
+        "model",
+        "product_code",
+        "serial_number",
+        "category",
+    ];
+    let [manufacturer, model, code, number, category] = reader.map(node, keys)?;
+    let manufacturer = reader.needed(manufacturer, "manufacturer", node.place);
+    let model = reader.needed(model, "model", node.place);
+    let mut line = |node: Option<&Node>| {
+        let node = node?;
+        let text = reader.text(node, "a line of text")?;
+        if text.len() <= LONGEST_NAME && !text.chars().any(char::is_control) {
+            return Some(text.to_owned());
+        }
+        let message = format!(
+            "expected a line of at most {LONGEST_NAME} bytes, found `{}`",
+            shortened(text)
+        );
+        reader.refuse(node, Code::WrongValue, message)
+    };
+    let (manufacturer, model) = (line(manufacturer), line(model));
+    let mut line_or_none = |node: Option<&Node>| match node {
+        Some(_) => line(node),
+        None => Some(String::new()),
+    };
+    let (product_code, serial_number) = (line_or_none(code), line_or_none(number));
+    let category = category.map_or(Some(0), |node| read_category(node, reader));
+    Some(Robot {
+        manufacturer: manufacturer?,
+        model: model?,
+        product_code: product_code?,
+        serial_number: serial_number?,
+        category: category?,
+        place: node.place,
+    })
+}
+
+fn read_category(node: &Node, reader: &mut Reader<'_>) -> Option<i32> {
+    let text = reader.text(node, "the kind of a robot")?;
+    let known = (0..).zip(CATEGORIES).find(|(_, name)| *name == text);
+    known.map(|(value, _)| value).or_else(|| {
+        let message = format!(
+            "expected one of {}, found `{}`",
+            CATEGORIES.join(", "),
+            shortened(text)
+        );
+        reader.refuse(node, Code::WrongValue, message)
     })
 }
 
@@ -374,6 +434,16 @@ fn read_partner(node: &Node, reader: &mut Reader<'_>) -> Option<Partner> {
 const DEFAULT_ENDPOINT: &str = "opc.tcp://127.0.0.1:0";
 const USUALLY_WITHIN: Duration = Duration::from_secs(60);
 const LONGEST_NAME: usize = 64;
+/// MotionDeviceCategoryEnumeration (OPC 40010-1, 10.1), by its values.
+const CATEGORIES: [&str; 7] = [
+    "other",
+    "articulated_robot",
+    "scara_robot",
+    "cartesian_robot",
+    "spherical_robot",
+    "parallel_robot",
+    "cylindrical_robot",
+];
 const LONGEST_URI: usize = 256;
 
 #[cfg(test)]

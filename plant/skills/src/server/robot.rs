@@ -1,0 +1,167 @@
+//! A robot as OPC 40010-1 shows it, beside its skills: the skill that runs is the program of its one task control.
+//!
+//! What the drivers do not know of it (axes, power trains, safety states) is not there, or is Bad.
+
+use std::future::Future;
+
+use futures_util::future::select_all;
+use plant_opcua::server::{IdRange, Instance, InstanceError, InstanceSpec, Server};
+use plant_opcua::types::{DataValue, LocalizedText, NodeId, QualifiedName, StatusCode, Variant};
+use program::State;
+
+use super::OWN;
+use crate::component::Robot;
+use crate::model::DEVICES;
+use crate::skill::Skill;
+
+/// Whether the server has the types of OPC 40010-1.
+pub(super) fn has_types(server: &Server) -> bool {
+    server.find_type(ROBOTICS, SYSTEM).is_some()
+}
+
+/// Makes the motion device system in the DeviceSet of OPC 10000-100. What comes back keeps its task control up to date.
+pub(super) fn serve(
+    server: &Server,
+    (name, robot): (&str, &Robot),
+    skills: &[Skill],
+    ids: &mut IdRange,
+) -> Result<impl Future<Output = ()> + use<>, InstanceError> {
+    let mut maker = Maker { server, ids };
+    let devices = server.namespace(DEVICES).unwrap_or_default();
+    let system = maker.make(SYSTEM, name, NodeId::new(devices, DEVICE_SET), &[])?;
+    let arm = maker.make(
+        "MotionDeviceType",
+        name,
+        within(&system, "MotionDevices")?,
+        &[],
+    )?;
+    let controller = format!("{name}-controller");
+    let parent = within(&system, "Controllers")?;
+    let controller = maker.make("ControllerType", &controller, parent, &[])?;
+    let task = maker.make(
+        "TaskControlType",
+        "TaskControl",
+        within(&controller, "TaskControls")?,
+        &["ParameterSet/ExecutionMode"],
+    )?;
+    let robotics = server.namespace(ROBOTICS).unwrap_or_default();
+    let controls = NodeId::new(robotics, CONTROLS);
+    server.add_reference(&task.node_id, &controls, &arm.node_id);
+    for device in [&arm, &controller] {
+        show_plate(server, device, robot);
+    }
+    show(server, &arm, "MotionDeviceCategory", robot.category);
+    // No driver tells how fast a robot may be at most, and its controller has no users.
+    for (of, path) in [
+        (&arm, "ParameterSet/SpeedOverride"),
+        (&controller, "CurrentUser/Level"),
+    ] {
+        let unknown = DataValue {
+            status: Some(StatusCode::BadNotSupported),
+            ..DataValue::null()
+        };
+        if let Some(node) = of.node(path) {
+            let _shown = server.show_value(node, unknown);
+        }
+    }
+    show(server, &task, "ComponentName", LocalizedText::from(name));
+    show(server, &task, "ParameterSet/ExecutionMode", CYCLE);
+    Ok(keep(server.clone(), task, skills.to_vec()))
+}
+
+/// What stands on the plate of a device.
+fn show_plate(server: &Server, device: &Instance, robot: &Robot) {
+    for (name, text) in [
+        ("Manufacturer", &robot.manufacturer),
+        ("Model", &robot.model),
+    ] {
+        show(server, device, name, LocalizedText::from(text.as_str()));
+    }
+    for (name, text) in [
+        ("ProductCode", &robot.product_code),
+        ("SerialNumber", &robot.serial_number),
+    ] {
+        show(server, device, name, text.as_str());
+    }
+}
+
+/// Shows which skill runs, whenever that is another.
+async fn keep(server: Server, task: Instance, skills: Vec<Skill>) {
+    let mut watches: Vec<_> = skills.iter().map(Skill::watch).collect();
+    let mut before = None;
+    loop {
+        let shown = watches
+            .iter_mut()
+            .map(|watch| watch.borrow_and_update().state);
+        let runs = |state: State| matches!(state, State::Running | State::Suspended);
+        let running = skills.iter().zip(shown).filter(|(_, state)| runs(*state));
+        let names: Vec<&str> = running
+            .map(|(skill, _)| skill.facts().name.as_str())
+            .collect();
+        let names = names.join(", ");
+        if before.as_ref() != Some(&names) {
+            show(
+                &server,
+                &task,
+                "ParameterSet/TaskProgramLoaded",
+                !names.is_empty(),
+            );
+            show(
+                &server,
+                &task,
+                "ParameterSet/TaskProgramName",
+                names.as_str(),
+            );
+            before = Some(names);
+        }
+        let changes = watches.iter_mut().map(|watch| Box::pin(watch.changed()));
+        if select_all(changes).await.0.is_err() {
+            return;
+        }
+    }
+}
+
+fn show(server: &Server, of: &Instance, path: &str, value: impl Into<Variant>) {
+    if let Some(node) = of.node(path) {
+        // The node is ours for as long as the server is there.
+        let _shown = server.show(node, value);
+    }
+}
+
+fn within(of: &Instance, name: &str) -> Result<NodeId, InstanceError> {
+    let node = of.node(name).cloned();
+    node.ok_or_else(|| InstanceError::NoOptional(name.to_owned()))
+}
+
+struct Maker<'a> {
+    server: &'a Server,
+    ids: &'a mut IdRange,
+}
+
+impl Maker<'_> {
+    fn make(
+        &mut self,
+        of_type: &str,
+        name: &str,
+        parent: NodeId,
+        optional: &[&str],
+    ) -> Result<Instance, InstanceError> {
+        let none = || InstanceError::NoType(NodeId::null());
+        let of_type = self.server.find_type(ROBOTICS, of_type).ok_or_else(none)?;
+        let name = QualifiedName::new(OWN, name);
+        let spec = InstanceSpec {
+            optional: optional.iter().map(|path| (*path).to_owned()).collect(),
+            ..InstanceSpec::new(of_type, self.ids.next(), name, parent)
+        };
+        self.server.instantiate(&spec, &mut |_| self.ids.next())
+    }
+}
+
+const ROBOTICS: &str = "http://opcfoundation.org/UA/Robotics/";
+const SYSTEM: &str = "MotionDeviceSystemType";
+/// DeviceSet (OPC 10000-100, 5.9).
+const DEVICE_SET: u32 = 5001;
+/// The ReferenceType Controls (OPC 40010-1, 8.2).
+const CONTROLS: u32 = 4002;
+/// Of ExecutionModeEnumeration (OPC 40010-1): a skill runs once and ends.
+const CYCLE: i32 = 0;

@@ -1,0 +1,97 @@
+"""Looks at robots as a client of OPC 40010-1 does, which knows no skills, and says what it sees as JSON lines.
+
+First each motion device system of the DeviceSet, then each value of its first task control while skill 1 of the server's own
+namespace runs once.
+"""
+
+import argparse
+import asyncio
+
+from asyncua import ua
+
+import lifetime
+import opcua_session
+
+DEVICES = "http://opcfoundation.org/UA/DI/"
+ROBOTICS = "http://opcfoundation.org/UA/Robotics/"
+TASK = ["TaskProgramName", "TaskProgramLoaded"]
+# Methods of skill 1.
+RESET, START = 109, 105
+
+
+class Told:
+    def __init__(self, names):
+        self.names = names
+
+    async def datachange_notification(self, node, value, _):
+        lifetime.say(changed=self.names[node.nodeid], value=value)
+
+
+async def names(node):
+    return {(await child.read_browse_name()).Name: child for child in await node.get_children()}
+
+
+async def value(node):
+    shown = await node.read_data_value(raise_on_bad_status=False)
+    content = shown.Value.Value if shown.Value else None
+    text = content.Text if isinstance(content, ua.LocalizedText) else opcua_session.plain(content)
+    return text if shown.StatusCode.is_good() else shown.StatusCode.name
+
+
+async def values(node, *wanted):
+    children = await names(node)
+    return {name: await value(children[name]) for name in wanted}
+
+
+async def only(node, folder):
+    """The one device in a folder, whose type says so."""
+    found = await names((await names(node))[folder])
+    (name,) = found
+    kind = await found[name].read_type_definition()
+    return name, found[name], kind.Identifier
+
+
+async def run(args):
+    async with await opcua_session.client_of(args) as client:
+        lifetime.say(ready=args.endpoint)
+        devices, robotics = [await client.get_namespace_index(uri) for uri in (DEVICES, ROBOTICS)]
+        device_set = client.get_node(ua.NodeId(5001, devices))
+        for system in await device_set.get_children():
+            if await system.read_type_definition() != ua.NodeId(1002, robotics):
+                continue
+            plate = ["Manufacturer", "Model", "ProductCode", "SerialNumber"]
+            arm_name, arm, arm_type = await only(system, "MotionDevices")
+            _, controller, controller_type = await only(system, "Controllers")
+            _, task, task_type = await only(controller, "TaskControls")
+            controls = await task.get_referenced_nodes(ua.NodeId(4002, robotics))
+            parameters = (await names(task))["ParameterSet"]
+            lifetime.say(
+                system=(await system.read_browse_name()).Name,
+                types=[arm_type, controller_type, task_type],
+                arm=await values(arm, *plate, "MotionDeviceCategory"),
+                speed=await values((await names(arm))["ParameterSet"], "SpeedOverride"),
+                controller=await values(controller, *plate),
+                user=await values((await names(controller))["CurrentUser"], "Level"),
+                task=await values(task, "ComponentName"),
+                mode=await values(parameters, "ExecutionMode"),
+                controls=[(await node.read_browse_name()).Name for node in controls] == [arm_name],
+            )
+            children = await names(parameters)
+            watched = {children[name].nodeid: name for name in TASK}
+            subscription = await client.create_subscription(20, Told(watched))
+            await subscription.subscribe_data_change([children[name] for name in TASK], queuesize=10, sampling_interval=0)
+            skill = client.get_node(ua.NodeId(100, 1))
+            for method in (RESET, START):
+                await skill.call_method(ua.NodeId(method, 1))
+            await asyncio.to_thread(lifetime.told().wait)
+
+
+def main():
+    parser = argparse.ArgumentParser()
+    opcua_session.add_arguments(parser)
+    args = parser.parse_args()
+    lifetime.bound(args.limit)
+    asyncio.run(run(args))
+
+
+main()

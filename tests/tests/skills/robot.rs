@@ -1,0 +1,90 @@
+//! A robot to clients of OPC 40010-1, which know no skills.
+
+use std::path::Path;
+
+use serde_json::{Value, json};
+use system_tests::{Cell, Peer, eventually};
+
+use super::{ENDPOINT, SOON, component};
+
+/// Of the OPC Foundation: DI and Robotics.
+const SHARED: &str = concat!(
+    env!("CARGO_MANIFEST_DIR"),
+    "/../../shared/data/nodesets/Opc.Ua."
+);
+const ROBOT: &str = "component: arm
+application_uri: urn:ua-bridge:system-tests:component
+namespace: 6
+security: [None]
+robot: {manufacturer: Universal Robots, model: UR5, serial_number: '20195501', category: articulated_robot}
+skills:
+  - {name: Grasp, type: GraspSkillType, driver: {simulated: {duration: 400 ms}}}
+  - {name: PtpMove, type: PtpMoveSkillType, driver: simulated}
+";
+
+#[test]
+fn a_client_that_knows_robots_and_no_skills_sees_what_it_is_and_which_program_runs() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let there = Path::new(&format!("{SHARED}Robotics.NodeSet2.xml")).exists();
+    assert!(
+        there || std::env::var_os("CI").is_none(),
+        "there are no NodeSets at {SHARED}"
+    );
+    if !there {
+        return;
+    }
+    let of = |name: &str| format!("'{SHARED}{name}.NodeSet2.xml'");
+    let nodesets = format!("nodesets: [{}, {}]\n", of("Robotics"), of("Di"));
+    let yaml = cell.file("arm.yaml", &format!("{nodesets}{ROBOT}"));
+    let _arm = component(&yaml);
+    let mut client = cell.asyncua("opcua_robot.py", &[ENDPOINT]);
+    let plate = json!({
+        "Manufacturer": "Universal Robots", "Model": "UR5", "ProductCode": "", "SerialNumber": "20195501",
+    });
+    let mut arm = plate.clone();
+    arm["MotionDeviceCategory"] = json!(1);
+    let seen = client.wait_for_json("the robot", SOON, |line| {
+        line.get("system").map(|_| line.clone())
+    });
+    let expected = json!({
+        "system": "arm",
+        "types": [1004, 1003, 1011],
+        "arm": arm,
+        // No driver knows these two.
+        "speed": {"SpeedOverride": "BadNotSupported"},
+        "controller": plate,
+        "user": {"Level": "BadNotSupported"},
+        "task": {"ComponentName": "arm"},
+        "mode": {"ExecutionMode": 0},
+        "controls": true,
+    });
+    assert_eq!(seen, expected);
+    for (name, expected) in [
+        ("TaskProgramName", json!(["", "Grasp", ""])),
+        ("TaskProgramLoaded", json!([false, true, false])),
+    ] {
+        eventually(&format!("{name} is told: {expected}"), SOON, || {
+            let lines = client.json_lines();
+            let told = lines.iter().filter(|line| line["changed"] == name);
+            let told: Vec<&Value> = told.map(|line| &line["value"]).collect();
+            (json!(told) == expected).then_some(())
+        });
+    }
+}
+
+#[test]
+fn a_robot_without_the_types_for_it_is_told_where_they_belong() {
+    let Some(cell) = Cell::with(&[]) else {
+        return;
+    };
+    let yaml = cell.file("arm.yaml", ROBOT);
+    let mut arm = super::component_started(&yaml, &["--interface", "lo", "--lds", "none"]).start();
+    arm.wait_for_line(
+        "error[P016]: a robot is shown by the types of OPC 40010-1",
+        SOON,
+    );
+    arm.wait_for_line("arm.yaml:5:", SOON);
+    arm.wait_for_line("stand under `nodesets`", SOON);
+}
