@@ -473,6 +473,34 @@ mod tests {
     }
 
     #[test]
+    fn a_robot_is_read_and_all_that_is_wrong_with_it_told() {
+        let read = |robot: &str| {
+            let text = format!("{GRIPPER}robot: {robot}\n");
+            Component::from_yaml(&text, Path::new("examples/plant"))
+                .map(|component| component.robot.unwrap())
+                .map_err(|findings| findings.render("x.yaml", &text))
+        };
+        let robot = read("{manufacturer: A, model: B 5, category: scara_robot}").unwrap();
+        assert_eq!(
+            (robot.manufacturer.as_str(), robot.model.as_str()),
+            ("A", "B 5")
+        );
+        assert_eq!((robot.serial_number.as_str(), robot.category), ("", 2));
+        let told = read("{manufacturer: [A], category: humanoid}").unwrap_err();
+        for expected in [
+            "error[P006]",
+            "`model`",
+            "error[P005]",
+            "a line of text",
+            "other, articulated_robot",
+        ] {
+            assert!(told.contains(expected), "{expected} is not in\n{told}");
+        }
+        let long = format!("{{manufacturer: A, model: {}}}", "x".repeat(65));
+        assert!(read(&long).unwrap_err().contains("at most 64 bytes"));
+    }
+
+    #[test]
     fn the_discovery_server_is_read_as_the_option_of_programs_is_written() {
         let read = |lds: &str| {
             let text = format!("{GRIPPER}lds: {lds}\n");
