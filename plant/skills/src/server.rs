@@ -104,14 +104,8 @@ impl ComponentServer {
                 Err(finding) => findings.push(finding),
             }
         }
-        if let Some(robot) = &component.robot
-            && !robot::has_types(&server)
-        {
-            let message = "a robot is shown by the types of OPC 40010-1, and they are not there";
-            let finding = Finding::error(Code::NodeSet, robot.place, message);
-            findings.push(finding.with_help(
-                "Opc.Ua.Robotics.NodeSet2.xml and Opc.Ua.Di.NodeSet2.xml stand under `nodesets`",
-            ));
+        if let Some(finding) = robot::lacks_types(&server, component.robot.as_ref()) {
+            findings.push(finding);
         }
         if !findings.is_empty() {
             return Err(ServeFault::Findings(findings));

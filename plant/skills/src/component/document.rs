@@ -123,16 +123,18 @@ fn component(
         lds: lds?,
         open: open?,
         lease: lease?,
-        device: match device {
-            Some(read) => Some(read?),
-            None => None,
-        },
-        robot: match robot {
-            Some(read) => Some(read?),
-            None => None,
-        },
+        device: whole(device)?,
+        robot: whole(robot)?,
         skills: skills?,
     })
+}
+
+/// Nothing where something is there and wrong.
+fn whole<T>(read: Option<Option<T>>) -> Option<Option<T>> {
+    match read {
+        Some(read) => read.map(Some),
+        None => Some(None),
+    }
 }
 
 fn read_robot(node: &Node, reader: &mut Reader<'_>) -> Option<Robot> {

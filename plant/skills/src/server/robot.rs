@@ -13,10 +13,17 @@ use super::OWN;
 use crate::component::Robot;
 use crate::model::DEVICES;
 use crate::skill::Skill;
+use crate::yaml::{Code, Finding};
 
-/// Whether the server has the types of OPC 40010-1.
-pub(super) fn has_types(server: &Server) -> bool {
-    server.find_type(ROBOTICS, SYSTEM).is_some()
+/// What is wrong where there is a robot, and the types of OPC 40010-1 are not.
+pub(super) fn lacks_types(server: &Server, robot: Option<&Robot>) -> Option<Finding> {
+    let robot = robot?;
+    if server.find_type(ROBOTICS, SYSTEM).is_some() {
+        return None;
+    }
+    let message = "a robot is shown by the types of OPC 40010-1, and they are not there";
+    let help = "Opc.Ua.Robotics.NodeSet2.xml and Opc.Ua.Di.NodeSet2.xml stand under `nodesets`";
+    Some(Finding::error(Code::NodeSet, robot.place, message).with_help(help))
 }
 
 /// Makes the motion device system in the DeviceSet of OPC 10000-100. What comes back keeps its task control up to date.
