@@ -15,7 +15,7 @@ async def run(args):
             node = client.get_node(text)
             if args.children:
                 found = await node.get_children()
-                names = [(await child.read_browse_name()).Name for child in found]
+                names = [] if args.nameless else [(await child.read_browse_name()).Name for child in found]
                 lifetime.say(node=text, children=[child.nodeid.to_string() for child in found], names=names)
                 continue
             wanted = ua.ReadValueId(node.nodeid, ua.AttributeIds.Value, args.range)
@@ -30,6 +30,7 @@ def main():
     parser = argparse.ArgumentParser()
     opcua_session.add_arguments(parser)
     parser.add_argument("--children", action="store_true", help="the nodes below, instead of the values")
+    parser.add_argument("--nameless", action="store_true", help="of the nodes below only what they are, for there are many")
     parser.add_argument("--range", help="IndexRange: 0:9")
     parser.add_argument("node", nargs="+", help="as OPC UA writes it: ns=2;i=10")
     args = parser.parse_args()

@@ -140,10 +140,11 @@ fn a_server_that_ends_takes_its_service_along_and_of_a_killed_one_who_asks_is_to
         server.end();
         has_service(&mut judge, "/ua_bridge_ros2", OF_ROS1, false);
     }
-    let server = cell.rospy("ros1_serve.py", &[OF_ROS1]);
+    let mut server = cell.rospy("ros1_serve.py", &[OF_ROS1]);
     assert_eq!(set_bool(&mut judge, OF_ROS1, true), done());
-    // The master goes on to name it.
+    // The master goes on to name it. While its sockets are still there, nobody could know whether it executes.
     server.signal(Signal::SIGKILL);
+    server.wait_for_end(SOON);
     let refused = set_bool(&mut judge, OF_ROS1, true);
     assert_eq!(refused["success"], false, "{refused}");
     let why = refused["message"].as_str().unwrap();

@@ -198,7 +198,8 @@ fn thirty_thousand_variables_are_served_and_the_last_of_them_gets_its_value() {
         status("Good")
     });
     assert_eq!(value, json!(30.5));
-    let below = read(&cell, &["--children", "ns=1;s=UaSpace.2"])["children"].clone();
+    let below = ["--children", "--nameless", "ns=1;s=UaSpace.2"];
+    let below = read(&cell, &below)["children"].clone();
     let below = below.as_array().unwrap();
     assert_eq!(below.len(), usize::try_from(MANY).unwrap());
     assert_eq!(below[0], "ns=2;i=1");

@@ -287,7 +287,8 @@ async fn two_hundred_topics_leave_no_file_descriptor_behind() {
         publishers.iter().all(|p| p.subscribers() == 1)
     })
     .await;
-    assert!(open() >= files + 400);
+    // Connections of the watchdogs may have been counted before.
+    assert!(open() >= files + 390, "{} and {files}", open());
     drop((publishers, subscriptions));
     // Up to the few connections of the watchdogs, which come and go.
     eventually("the end of all links", || {

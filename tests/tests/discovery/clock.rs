@@ -101,12 +101,10 @@ fn run_is_told(cell: &Cell, watching: &mut Child) {
 
 #[test]
 fn a_clock_that_jumps_loses_nobody_restarts_nobody_and_ends_no_subscription() {
-    let Some(cell) = Cell::with(&[Peer::Python, Peer::Ros1, Peer::Clock]) else {
+    let Some(cell) = Cell::with(&[Peer::Python, Peer::Clock]) else {
         return;
     };
     let clock = cell.wall_clock();
-    let _core = cell.roscore();
-    let bridge = cell.bridge_ros1_started(&[]).by(&clock).start();
     let lds = Started::new("ua-lds", &program("ua-lds"))
         .args(["--metrics", STATUS])
         .by(&clock)
@@ -150,7 +148,7 @@ fn a_clock_that_jumps_loses_nobody_restarts_nobody_and_ends_no_subscription() {
         }
         setpoint_is_told(&cell, &mut subscriber, value);
         run_is_told(&cell, &mut watching);
-        announced_again(&["parallel-gripper", "ua-server", "bridge-ros1 space 1"]);
+        announced_again(&["parallel-gripper", "ua-server"]);
         let lines = cell.asyncua_once("opcua_discovery.py", &["find", LDS]);
         let uris: Vec<&Value> = list(&lines, "registered")
             .iter()
@@ -173,7 +171,7 @@ fn a_clock_that_jumps_loses_nobody_restarts_nobody_and_ends_no_subscription() {
     let lost = |line: &&Value| line["found"] == "gone" || line["found"] == "restarted";
     let lines = watch.json_lines();
     assert_eq!(lines.iter().find(lost), None);
-    for child in [&lds, &gripper, &server, &bridge] {
+    for child in [&lds, &gripper, &server] {
         let lines = child.lines();
         let restarted = lines.iter().find(|line| line.contains("restarted"));
         assert_eq!(restarted, None, "{child}");
