@@ -23,8 +23,8 @@ use uadp::action::{
     ActionAddress, ActionDialect, ActionFields, ActionHeader, ActionKind, ActionState, ActionToSend,
 };
 use uadp::{
-    BuiltinType, Extras, NetworkHeader, NetworkMessage, OwnedPublisherId, PublisherId, Scalar,
-    Variant,
+    BuiltinType, Extras, NetworkHeader, NetworkMessage, NetworkMessageType, OwnedPublisherId,
+    PublisherId, Scalar, Variant,
 };
 
 const BRIDGE: usize = 0;
@@ -271,5 +271,33 @@ fn what_was_asked_of_a_program_before_it_was_started_anew_is_not_executed_again(
     assert_eq!(cell.executions(GRIPPER).len(), 1);
     let from = SocketAddr::from(([192, 0, 2, 9], 5_000));
     cell.hear(GRIPPER, &request(None, 1), from);
+    assert_eq!(cell.executions(GRIPPER).len(), 1);
+}
+
+#[test]
+fn who_missed_that_a_program_was_started_anew_asks_what_it_is_when_that_shows() {
+    let mut cell = plugged_in();
+    let deaf = Rc::new(Shared::new(true));
+    let deafened = Rc::clone(&deaf);
+    cell.copies = Box::new(move |bytes| {
+        let message = NetworkMessage::decode(bytes).unwrap();
+        let is_value_or_call = message.message_type() == NetworkMessageType::DataSet;
+        usize::from(is_value_or_call || !deafened.get())
+    });
+    let mut again = component(7);
+    again.router.set_instance([9; 16]);
+    cell.start(GRIPPER, again);
+    cell.offer(GRIPPER, start(), offered(true));
+    cell.run(ms(1_000));
+    deaf.set(false);
+    cell.ask(BRIDGE, AskId(1), (start(), &[0, 0]), ms(3_000));
+    cell.run(ms(50));
+    let (_, told) = cell.answers(BRIDGE).pop().unwrap();
+    assert_eq!(told.unwrap_err().kind, AskErrorKind::Unknown);
+    assert_eq!(cell.executions(GRIPPER).len(), 0);
+    // Not with the next announcement, which comes after 30 s.
+    cell.run(ms(2_000));
+    cell.ask(BRIDGE, AskId(2), (start(), &[0, 0]), ms(3_000));
+    cell.run(ms(50));
     assert_eq!(cell.executions(GRIPPER).len(), 1);
 }

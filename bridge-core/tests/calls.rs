@@ -16,7 +16,7 @@ use bridge_core::{
     OfferedType, Output, Owned, Reason, ValueDescription,
 };
 use cell::{Cell, Program, component, ms, topic};
-use mappings::{Assigned, Assignment, FieldMap, Overflow, TopicId};
+use mappings::{Assigned, Assignment, FieldMap, Mapping, Overflow, TopicId};
 use messages::{Dialect, Leaf, Literal, Rank, Registry, ServiceType};
 use uadp::{BuiltinType, Fields, Scalar, StatusCode, Variant};
 
@@ -473,6 +473,28 @@ fn a_program_whose_last_value_has_no_producer_any_more_keeps_its_calls_until_it_
     cell.kill(GRIPPER);
     cell.run(ms(3_700));
     assert_eq!(cell.gone(BRIDGE), [start()]);
+}
+
+#[test]
+fn a_program_that_speaks_seldom_is_missed_whenever_it_dies() {
+    let text = "spaces: [{id: 2}]\npubsub: {key_frame_period: 10s, keep_alive_period: 10s, receive_timeout: 15s}\n";
+    let checked = Mapping::from_yaml(text, "test.yaml");
+    assert!(checked.findings.is_empty(), "{}", checked.render(text));
+    let mapping = Arc::new(checked.mapping.unwrap());
+    for second in 0..10 {
+        let mut cell = plugged_in(Local::Fields);
+        let now = cell.now();
+        for program in &mut cell.programs {
+            program.router.replace_mapping(Arc::clone(&mapping), now);
+        }
+        cell.describe(GRIPPER, topic(0, 7, 101), state());
+        cell.say(GRIPPER, topic(0, 7, 101), "Ready");
+        cell.run(ms(50_500 + 1_000 * second));
+        assert_eq!(cell.gone(BRIDGE), [], "{second}: it lives");
+        cell.kill(GRIPPER);
+        cell.run(ms(15_700));
+        assert_eq!(cell.gone(BRIDGE), [start()], "{second}");
+    }
 }
 
 #[test]

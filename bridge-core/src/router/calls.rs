@@ -463,7 +463,13 @@ impl Router {
             calls.spoke(topic);
         }
         match heard {
-            Ok(uadp::action::Heard::Done(id, outcome)) => self.conclude(id, outcome),
+            Ok(uadp::action::Heard::Done(id, outcome)) => {
+                // It may be another life of the program, whose announcement was missed.
+                if let Outcome::Unknown(Unknown::Lost) = outcome {
+                    self.plan_probe(topic, now);
+                }
+                self.conclude(id, outcome);
+            }
             Ok(uadp::action::Heard::Executing(_) | uadp::action::Heard::Closed(_)) => {}
             Err(ResponseDrop::Elsewhere) => {
                 self.count_call(topic, Some(from), Reason::Forged, || {

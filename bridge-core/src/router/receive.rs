@@ -68,10 +68,10 @@ impl Router {
             self.count(About::sender(from), Reason::NotInSpace, 1, String::new);
             return;
         };
-        // A message that was cut up whole is no value: it may be an answer of a program that sends no values.
-        let whole = message.is_chunk() && message.writer_ids().is_none();
+        // A chunk without a payload header may be of an answer, and who answers need not send values.
+        let may_be_value = !message.is_chunk() || message.writer_ids().is_some();
         if let Some(calls) = &mut self.calls
-            && !whole
+            && may_be_value
         {
             calls.heard(space, namespace, from, now);
         }

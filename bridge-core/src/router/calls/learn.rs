@@ -38,30 +38,34 @@ pub(super) struct Group {
     from: SocketAddr,
     /// When it last said something of a call.
     said: Instant,
-    /// When values of it were last heard. None where it has none, or none of which it knows the producer any more.
+    /// When values of it were last heard. `None` where it has none, or said so after the last of them had ended.
     heard: Option<Instant>,
     /// It is silent.
     gone: bool,
     /// Since when it was asked what its calls are, and nothing is heard of it: somebody else says that it has them, or it
     /// executes nothing.
     doubted: Option<Instant>,
-    /// It was asked since its values are missing.
+    /// It was asked what its calls are, since its values are missing.
     asked: bool,
 }
 
 impl Group {
-    /// Whether its values are missing, and it is to be asked whether it lives without: those of a producer that has left
-    /// end, and with the last of them all that comes unasked.
-    fn is_to_be_asked(&self, now: Instant, silence: Duration) -> bool {
-        !self.gone
-            && !self.asked
-            && (self.heard).is_some_and(|heard| now.saturating_duration_since(heard) >= silence / 2)
+    /// Whether its values are missing for so long that it is to be asked whether it lives. The values of a producer that has
+    /// left end, and the program that executes the calls may be there all the same.
+    fn is_to_be_asked(&self, now: Instant, missing: Duration) -> bool {
+        !self.gone && !self.asked && self.lacks_values(now, missing)
     }
 
-    /// It said what its calls are: unless values come again, it is one without.
-    fn lives(&mut self, now: Instant, silence: Duration) {
-        let missing = |heard: &mut Instant| now.saturating_duration_since(*heard) >= silence / 2;
-        self.heard.take_if(missing);
+    fn lacks_values(&self, now: Instant, missing: Duration) -> bool {
+        self.heard
+            .is_some_and(|heard| now.saturating_duration_since(heard) >= missing)
+    }
+
+    /// It said what its calls are. One whose values are missing sends none until the next of them comes.
+    fn lives(&mut self, now: Instant, missing: Duration) {
+        if self.lacks_values(now, missing) {
+            self.heard = None;
+        }
         (self.said, self.gone) = (now, false);
         (self.doubted, self.asked) = (None, false);
     }
@@ -213,7 +217,7 @@ impl Router {
         now: Now,
     ) {
         let (_, namespace, _) = topic.triple();
-        let (silence, _) = self.silences();
+        let missing = self.missing();
         let calls = self.calls_mut(now);
         let weight = description.weight();
         let before = calls.table.get(&topic).and_then(|call| call.known.as_ref());
@@ -247,7 +251,7 @@ impl Router {
             // A program that was started anew.
             (group.from, group.heard) = (from, None);
         }
-        group.lives(now.monotonic, silence);
+        group.lives(now.monotonic, missing);
         calls.look_at.get_or_insert(now.monotonic + LOOK);
         let call = calls.table.entry(topic).or_default();
         match &mut call.known {
@@ -334,9 +338,19 @@ impl Router {
         (pubsub.receive_timeout, forgotten)
     }
 
+    /// How long no value comes before a program is asked whether it lives: early enough for an answer, and never before the
+    /// next keep-alive is overdue.
+    fn missing(&self) -> Duration {
+        let pubsub = self.mapping.pubsub();
+        let period = pubsub.keep_alive_period;
+        let overdue = period.saturating_add(period / 4);
+        overdue.max(pubsub.receive_timeout / 2)
+    }
+
     /// Tells of the calls that nobody executes any longer.
     pub(super) fn look_for_silence(&mut self, now: Now) {
-        let silences @ (silence, forgotten) = self.silences();
+        let silences @ (_, forgotten) = self.silences();
+        let missing = self.missing();
         let Some(calls) = &mut self.calls else {
             return;
         };
@@ -362,11 +376,11 @@ impl Router {
                     asked.push(*topic);
                 }
             }
-            // By one of its calls for all.
+            // One of its calls is asked for in the name of all.
             let group = calls.groups.get_mut(&(topic.space, namespace));
             if !known.gone
                 && let Some(group) = group
-                && group.is_to_be_asked(now.monotonic, silence)
+                && group.is_to_be_asked(now.monotonic, missing)
             {
                 group.asked = true;
                 asked.push(*topic);
