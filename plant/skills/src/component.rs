@@ -58,7 +58,7 @@ pub struct Robot {
     pub product_code: String,
     /// The SerialNumber; empty where it is not told.
     pub serial_number: String,
-    /// A value of MotionDeviceCategoryEnumeration (OPC 40010-1, 10.1).
+    /// A value of MotionDeviceCategoryEnumeration (OPC 40010-1, 7.2.3).
     pub category: i32,
     /// Where the document says so.
     pub place: Place,

@@ -45,10 +45,9 @@ const SPEED: (u16, u16, u16) = (2, 3, 6000);
 /// Whether the NodeSets are there; where they are not, that is told as for a peer.
 fn has_nodesets() -> bool {
     let there = Path::new(&format!("{SHARED}Di.NodeSet2.xml")).exists();
-    assert!(
-        there || std::env::var_os("CI").is_none(),
-        "there are no NodeSets at {SHARED}"
-    );
+    if !there {
+        Cell::skip(&format!("there are no NodeSets at {SHARED}"));
+    }
     there
 }
 

@@ -251,7 +251,7 @@ pub(crate) fn show(
     let mut shown = Vec::with_capacity(values.len());
     for (node, value) in values {
         let mut value = plain(value);
-        // A variable without any value is read without its status.
+        // The OPC UA library reads a variable that holds no value at all without its status.
         value.value.get_or_insert(Variant::Empty);
         value.status.get_or_insert(StatusCode::Good);
         value.source_timestamp.get_or_insert(now);

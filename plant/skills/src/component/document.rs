@@ -129,7 +129,7 @@ fn component(
     })
 }
 
-/// Nothing where something is there and wrong.
+/// The value of a key that may be left out; `None` where it is there and wrong.
 fn whole<T>(read: Option<Option<T>>) -> Option<Option<T>> {
     match read {
         Some(read) => read.map(Some),
@@ -436,7 +436,7 @@ fn read_partner(node: &Node, reader: &mut Reader<'_>) -> Option<Partner> {
 const DEFAULT_ENDPOINT: &str = "opc.tcp://127.0.0.1:0";
 const USUALLY_WITHIN: Duration = Duration::from_secs(60);
 const LONGEST_NAME: usize = 64;
-/// MotionDeviceCategoryEnumeration (OPC 40010-1, 10.1), by its values.
+/// MotionDeviceCategoryEnumeration (OPC 40010-1, 7.2.3), by its values.
 const CATEGORIES: [&str; 7] = [
     "other",
     "articulated_robot",

@@ -1,6 +1,6 @@
 //! A robot as OPC 40010-1 shows it, beside its skills: the skill that runs is the program of its one task control.
 //!
-//! What the drivers do not know of it (axes, power trains, safety states) is not there, or is Bad.
+//! Drivers know nothing of axes, power trains and safety states, which are not there, nor of `SpeedOverride`, which is Bad.
 
 use std::future::Future;
 
@@ -9,7 +9,6 @@ use plant_opcua::server::{IdRange, Instance, InstanceError, InstanceSpec, Server
 use plant_opcua::types::{DataValue, LocalizedText, NodeId, QualifiedName, StatusCode, Variant};
 use program::State;
 
-use super::OWN;
 use crate::component::Robot;
 use crate::model::DEVICES;
 use crate::skill::Skill;
@@ -121,6 +120,9 @@ async fn keep(server: Server, task: Instance, skills: Vec<Skill>) {
             );
             before = Some(names);
         }
+        if watches.is_empty() {
+            return;
+        }
         let changes = watches.iter_mut().map(|watch| Box::pin(watch.changed()));
         if select_all(changes).await.0.is_err() {
             return;
@@ -155,10 +157,11 @@ impl Maker<'_> {
     ) -> Result<Instance, InstanceError> {
         let none = || InstanceError::NoType(NodeId::null());
         let of_type = self.server.find_type(ROBOTICS, of_type).ok_or_else(none)?;
-        let name = QualifiedName::new(OWN, name);
+        let id = self.ids.next();
+        let name = QualifiedName::new(id.namespace, name);
         let spec = InstanceSpec {
             optional: optional.iter().map(|path| (*path).to_owned()).collect(),
-            ..InstanceSpec::new(of_type, self.ids.next(), name, parent)
+            ..InstanceSpec::new(of_type, id, name, parent)
         };
         self.server.instantiate(&spec, &mut |_| self.ids.next())
     }
@@ -166,9 +169,9 @@ impl Maker<'_> {
 
 const ROBOTICS: &str = "http://opcfoundation.org/UA/Robotics/";
 const SYSTEM: &str = "MotionDeviceSystemType";
-/// DeviceSet (OPC 10000-100, 5.9).
+/// DeviceSet (OPC 10000-100, 4.9).
 const DEVICE_SET: u32 = 5001;
 /// The ReferenceType Controls (OPC 40010-1, 8.2).
 const CONTROLS: u32 = 4002;
-/// Of ExecutionModeEnumeration (OPC 40010-1): a skill runs once and ends.
+/// Of ExecutionModeEnumeration (OPC 40010-1, 7.11.3): a skill runs once and ends.
 const CYCLE: i32 = 0;
