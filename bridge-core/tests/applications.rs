@@ -8,7 +8,7 @@
     reason = "test code"
 )]
 
-mod cell;
+use crate::cell;
 
 use std::net::SocketAddr;
 use std::time::Duration;

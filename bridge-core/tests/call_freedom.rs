@@ -10,7 +10,7 @@
     reason = "test code"
 )]
 
-mod cell;
+use crate::cell;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;

@@ -7,7 +7,7 @@
     reason = "test code"
 )]
 
-mod cell;
+use crate::cell;
 
 use std::sync::Arc;
 

@@ -1,12 +1,8 @@
 //! Every type of the bundle crosses UADP as the fields its leaves say, and returns.
 #![expect(clippy::unwrap_used, reason = "test code")]
 
-#[path = "../../messages/tests/support/inventor.rs"]
-#[expect(dead_code, reason = "the tests of `messages` use all of it")]
-mod inventor;
-#[path = "../../messages/tests/support/mod.rs"]
-#[expect(dead_code, reason = "the tests of `messages` use all of it")]
-mod support;
+use crate::inventor;
+use crate::support;
 
 use bridge_core::{decode_fields, encode_fields};
 use messages::{Dialect, Plan, Rank, Registry, Selection, Wire};

@@ -8,9 +8,8 @@
     reason = "test code"
 )]
 
-#[path = "support/inventor.rs"]
-mod inventor;
-mod support;
+use crate::inventor;
+use crate::support;
 
 use std::collections::BTreeMap;
 use std::io::{Read as _, Write as _};

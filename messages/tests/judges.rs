@@ -1,7 +1,7 @@
 //! What other implementations say: md5 sums, field lists, and messages they wrote. See `data/make.py`.
 #![expect(clippy::unwrap_used, clippy::panic, reason = "test code")]
 
-mod support;
+use crate::support;
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};

@@ -6,9 +6,8 @@
     reason = "test code"
 )]
 
-#[path = "support/inventor.rs"]
-mod inventor;
-mod support;
+use crate::inventor;
+use crate::support;
 
 use inventor::{invent, unnamed};
 use messages::{Dialect, Fault, Leaf, Plan, ReadError, Registry, Selection, Wire};

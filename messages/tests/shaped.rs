@@ -1,7 +1,7 @@
 //! Parts of arrays and converted values, on both wires.
 #![expect(clippy::unwrap_used, reason = "test code")]
 
-mod support;
+use crate::support;
 
 use messages::{
     Conversion, Dialect, Literal, MessageType, Part, Plan, PlanError, ReadError, Registry,

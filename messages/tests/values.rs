@@ -1,7 +1,7 @@
 //! Bytes that are read as documented, and values and bytes that do not fit.
 #![expect(clippy::unwrap_used, reason = "test code")]
 
-mod support;
+use crate::support;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;

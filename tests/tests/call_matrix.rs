@@ -2,7 +2,6 @@
 //!
 //! The tables of the guide are those that these tests see.
 
-#[path = "call_matrix/actions.rs"]
 mod actions;
 
 use serde_json::{Value, json};

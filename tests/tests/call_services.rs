@@ -1,6 +1,5 @@
 //! Services of one ROS, asked for from the other: under their names of the space, and as a mapping says.
 
-#[path = "call_services/examples.rs"]
 mod examples;
 
 use std::fs;

@@ -1,20 +1,12 @@
 //! Who is there: `ua-lds`, servers that tell of themselves, and clients and packets of other makers as judges.
 
-#[path = "discovery/clock.rs"]
 mod clock;
-#[path = "discovery/embedded.rs"]
 mod embedded;
-#[path = "discovery/faults.rs"]
 mod faults;
-#[path = "discovery/gds.rs"]
 mod gds;
-#[path = "discovery/levels.rs"]
 mod levels;
-#[path = "discovery/presence.rs"]
 mod presence;
-#[path = "discovery/rules.rs"]
 mod rules;
-#[path = "discovery/space.rs"]
 mod space;
 
 use std::io::{Read as _, Write as _};

@@ -1,18 +1,11 @@
 //! Actions of ROS 2 between us and the middleware of each vendor, in both roles.
 
-#[path = "ros2_actions/fastdds.rs"]
 mod fastdds;
-#[path = "ros2_actions/fibonacci.rs"]
 mod fibonacci;
-#[path = "ros2_actions/graph.rs"]
 mod graph;
-#[path = "ros2_actions/parts.rs"]
 mod parts;
-#[path = "ros2_actions/rclpy.rs"]
 mod rclpy;
-#[path = "ros2_actions/secured.rs"]
 mod secured;
-#[path = "ros2_actions/served.rs"]
 mod served;
 
 use std::time::Duration;

@@ -3,9 +3,7 @@
 //! What needs a bridge that has it is skipped where it was built without (`bridge-ros2 --version`); `cargo xtask` builds
 //! it with.
 
-#[path = "ros2_security/kinds.rs"]
 mod kinds;
-#[path = "ros2_security/node.rs"]
 mod node;
 
 use std::{

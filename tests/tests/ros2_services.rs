@@ -1,10 +1,7 @@
 //! Services of ROS 2 between us and the middleware of each vendor, in both roles.
 
-#[path = "ros2_services/bindings.rs"]
 mod bindings;
-#[path = "ros2_services/peer.rs"]
 mod peer;
-#[path = "ros2_services/secured.rs"]
 mod secured;
 
 use std::time::Duration;

@@ -1,6 +1,5 @@
 //! A secured group, live: both bridges have its keys, and a third program has none.
 
-#[path = "secured/sks.rs"]
 mod sks;
 
 use std::path::Path;

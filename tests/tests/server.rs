@@ -1,28 +1,16 @@
 //! The OPC UA server by itself: datagrams of the tests' own on one side, asyncua on the other.
 
-#[path = "server/access.rs"]
 mod access;
-#[path = "server/authorities.rs"]
 mod authorities;
-#[path = "server/configuration.rs"]
 mod configuration;
-#[path = "server/confirm.rs"]
 mod confirm;
-#[path = "server/events.rs"]
 mod events;
-#[path = "server/folders.rs"]
 mod folders;
-#[path = "server/history.rs"]
 mod history;
-#[path = "server/identity.rs"]
 mod identity;
-#[path = "server/malformed.rs"]
 mod malformed;
-#[path = "server/nodesets.rs"]
 mod nodesets;
-#[path = "server/pubsub.rs"]
 mod pubsub;
-#[path = "server/quality.rs"]
 mod quality;
 
 use std::{

@@ -1,9 +1,7 @@
 //! What the OPC UA server shows of values that are large, structured, or none: datagrams of the tests' own on one side,
 //! asyncua on the other.
 
-#[path = "server_values/certificates.rs"]
 mod certificates;
-#[path = "server_values/sources.rs"]
 mod sources;
 
 use std::time::{Duration, Instant, SystemTime};

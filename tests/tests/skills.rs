@@ -76,11 +76,8 @@ fn state(name: &str) -> (u32, &'static str) {
     }
 }
 
-#[path = "skills/faults.rs"]
 mod faults;
-#[path = "skills/foreign.rs"]
 mod foreign;
-#[path = "skills/robot.rs"]
 mod robot;
 
 #[test]

@@ -2,8 +2,7 @@
 
 #![expect(clippy::unwrap_used, reason = "test code")]
 
-#[path = "common/everything.rs"]
-mod everything;
+use crate::everything;
 
 use allocation_counter::measure;
 use everything::read_everything;

@@ -7,8 +7,7 @@
     reason = "test code"
 )]
 
-#[path = "common/everything.rs"]
-mod everything;
+use crate::everything;
 
 use allocation_counter::measure;
 use everything::read_everything;

@@ -9,12 +9,9 @@
     reason = "test code"
 )]
 
-#[path = "common/everything.rs"]
-mod everything;
-#[path = "common/model.rs"]
-mod model;
-#[path = "common/rewrite.rs"]
-mod rewrite;
+use crate::everything;
+use crate::model;
+use crate::rewrite;
 
 use everything::read_everything;
 use model::{Sample, Value, sample, value};

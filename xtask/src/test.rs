@@ -31,7 +31,7 @@ use programs::Program;
 /// Every target of a test run. All commands build these for the same packages, so that nothing is built twice.
 const TARGETS: &[&str] = &["--workspace", "--locked"];
 const SYSTEM_TESTS: &str = "system-tests";
-/// Test programs that measure what the machine can carry, so that what runs beside them would be measured, too.
+/// Modules of the system tests that measure what the machine can carry: a test beside them would be measured too.
 const ALONE: &[&str] = &["large", "rate", "ros2_fuzz", "ros2_large", "sharing"];
 /// System tests at a time, on two cores. Most of what they do is wait; more at a time were not tried.
 const BESIDE: usize = 3;
@@ -172,8 +172,10 @@ impl Plan {
             for test in program.tests(filters)? {
                 let mut command = command();
                 command.args(["--exact", &test]);
-                let job = Job::new(format!("{}::{test}", program.name), command).with_peers();
-                match ALONE.contains(&program.name.as_str()) {
+                let module = test.split("::").next().unwrap_or_default();
+                let alone = ALONE.contains(&module);
+                let job = Job::new(test, command).with_peers();
+                match alone {
                     true => plan.alone.push(job),
                     false => plan.beside.push(job),
                 }

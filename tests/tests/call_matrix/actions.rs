@@ -5,7 +5,7 @@ use std::time::Duration;
 use serde_json::{Value, json};
 use system_tests::{Cell, Child, Distribution, Peer};
 
-use crate::{in_the_guide, mapping};
+use crate::call_matrix::{in_the_guide, mapping};
 
 /// rospy and rclpy need seconds to start on a busy machine.
 const SOON: Duration = Duration::from_secs(60);

@@ -6,7 +6,7 @@ use system_tests::{Capture, Cell, Peer};
 use uadp::action::ActionDialect;
 use uadp::{NetworkMessage, PublisherId, SecurityHeader, discovery};
 
-use crate::messages::assert_shown;
+use crate::dissector::messages::assert_shown;
 
 /// The bytes of `uadp/tests/action/vectors.txt` by name.
 fn vectors() -> Vec<(String, Vec<u8>)> {
@@ -219,7 +219,7 @@ fn an_announced_action_is_shown_with_its_targets_and_metadata() {
     announcement
         .encode(PublisherId::UInt16(2), SecurityHeader::NONE, &mut datagram)
         .unwrap();
-    let shown = crate::dissected(&cell, &datagram);
+    let shown = crate::dissector::dissected(&cell, &datagram);
     assert!(!shown.has("uadp.malformed"), "{:?}", shown.expert_infos());
     assert_shown(
         &shown,

@@ -8,7 +8,7 @@ use uadp::{
     QualifiedName, Scalar, StatusCode, Variant,
 };
 
-use crate::{
+use crate::dissector::{
     dissected,
     time::ticks,
     vectors::{Vector, unhex},

@@ -6,7 +6,7 @@ use uadp::{
     Scalar, Sealer, SecurityMode, SecurityPolicy, Whole,
 };
 
-use crate::messages::{assert_shown, header, key_frame, numbered};
+use crate::dissector::messages::{assert_shown, header, key_frame, numbered};
 
 fn sealer(mode: SecurityMode) -> Sealer {
     let policy = SecurityPolicy::PubSubAes256Ctr;

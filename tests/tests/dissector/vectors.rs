@@ -6,7 +6,7 @@ use serde_json::Value;
 use system_tests::{Dissected, hex, is_true};
 use uadp::{BuiltinType, NetworkMessage};
 
-use crate::time::ticks;
+use crate::dissector::time::ticks;
 
 /// A datagram with its description, both from `uadp/tests/vectors`.
 pub(crate) struct Vector {

@@ -3,7 +3,7 @@
 use system_tests::{Capture, Cell, Dissected, Peer};
 use uadp::{DecodeError, MessageKind, NetworkMessage, NetworkMessageType, Scalar};
 
-use crate::{
+use crate::dissector::{
     dissected,
     messages::key_frame,
     vectors::{Vector, unhex},

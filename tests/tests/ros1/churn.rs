@@ -4,7 +4,7 @@ use serde_json::Value;
 use std::path::Path;
 use system_tests::{Cell, Child, MASTER, Peer, Started, program};
 
-use crate::support::SOON;
+use crate::ros1::support::SOON;
 
 /// More files than a shell usually allows: each topic between two nodes of one process takes two.
 const FILES: &str = "--nofile=8192";

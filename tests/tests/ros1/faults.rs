@@ -18,7 +18,7 @@ use system_tests::{
 };
 use tcpros::ConnectionHeader;
 
-use crate::support::{Ours, SOON, string, string_type};
+use crate::ros1::support::{Ours, SOON, string, string_type};
 
 const ROS1: &[Peer] = &[Peer::Ros1];
 /// What the master or a peer may take on a busy machine besides what a rule allows.

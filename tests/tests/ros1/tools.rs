@@ -10,7 +10,7 @@ use system_tests::{Cell, Child, Peer, eventually};
 use tcpros::Publisher;
 use tokio::task::JoinHandle;
 
-use crate::support::{Ours, SOON, string, string_type, twist, twist_type};
+use crate::ros1::support::{Ours, SOON, string, string_type, twist, twist_type};
 
 const PERIOD: Duration = Duration::from_millis(20);
 /// Messages per topic in a bag.

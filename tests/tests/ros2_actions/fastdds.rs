@@ -4,9 +4,9 @@ use bridge_ros2::action::{CancelCode, Outcome, Status};
 use serde_json::{Value, json};
 use system_tests::{Cell, Peer};
 
-use crate::fibonacci::{ACTION, Ours, goal, until};
-use crate::served::{options, serve};
-use crate::{client, done, feedback, outcome, story};
+use crate::ros2_actions::fibonacci::{ACTION, Ours, goal, until};
+use crate::ros2_actions::served::{options, serve};
+use crate::ros2_actions::{client, done, feedback, outcome, story};
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn a_server_of_fast_dds_ends_our_goals_in_every_way() {

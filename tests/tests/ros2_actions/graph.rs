@@ -7,8 +7,8 @@ use messages::{ActionTypeHashes, Dialect, Registry, TypeHash};
 use serde_json::Value;
 use system_tests::{Cell, Child, Peer};
 
-use crate::fibonacci::{self, DEFINITION, Ours, until};
-use crate::served::{options, serve};
+use crate::ros2_actions::fibonacci::{self, DEFINITION, Ours, until};
+use crate::ros2_actions::served::{options, serve};
 
 /// The graph as a peer last printed it.
 fn graph(peer: &Child) -> Value {

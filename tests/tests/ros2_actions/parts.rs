@@ -10,7 +10,7 @@ use system_tests::Cell;
 use tokio::time::timeout;
 
 use super::{client, done};
-use crate::fibonacci::{ACTION, Ours, SOON, goal, until};
+use crate::ros2_actions::fibonacci::{ACTION, Ours, SOON, goal, until};
 
 /// Part of a server of the action, which answers the same to all; to nobody without `answer`.
 fn part(ours: &Ours, name: &str, types: [&str; 2], answer: Option<&'static [u8]>) -> ServiceServer {

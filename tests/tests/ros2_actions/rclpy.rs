@@ -16,9 +16,9 @@ use serde_json::{Value, json};
 use system_tests::{Cell, Child, Distribution, Peer, Started};
 use tokio::time::timeout;
 
-use crate::fibonacci::{ACTION, DEFINITION, Ours, SOON, goal, until};
-use crate::served::{of, options, said, serve_as};
-use crate::{client_of, done, feedback, outcome, story};
+use crate::ros2_actions::fibonacci::{ACTION, DEFINITION, Ours, SOON, goal, until};
+use crate::ros2_actions::served::{of, options, said, serve_as};
+use crate::ros2_actions::{client_of, done, feedback, outcome, story};
 
 const SCRIPT: &str = "ros2_rclpy_action.py";
 /// An action of rclpy whose messages have messages inside.

@@ -7,9 +7,9 @@ use bridge_ros2::service::ServicePeers;
 use serde_json::json;
 use system_tests::{Cell, Keystore, Peer};
 
-use crate::fibonacci::{ACTION, Ours, goal, until};
-use crate::served::{options, serve};
-use crate::{client, done, feedback, outcome, story};
+use crate::ros2_actions::fibonacci::{ACTION, Ours, goal, until};
+use crate::ros2_actions::served::{options, serve};
+use crate::ros2_actions::{client, done, feedback, outcome, story};
 
 fn join(keystore: &Keystore) -> Ours {
     let domain = Domain::join(&DomainOptions {

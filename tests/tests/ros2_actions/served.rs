@@ -15,7 +15,7 @@ use system_tests::{Cell, Child, Peer};
 use tokio::sync::{Semaphore, watch};
 use tokio::task::JoinHandle;
 
-use crate::fibonacci::{self, ACTION, Ours, SOON, feedback, result, until};
+use crate::ros2_actions::fibonacci::{self, ACTION, Ours, SOON, feedback, result, until};
 
 /// A server at work, until dropped.
 pub(crate) struct Serving {

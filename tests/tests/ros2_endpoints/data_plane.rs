@@ -14,7 +14,7 @@ use nix::sys::signal::Signal;
 use serde_json::Value;
 use system_tests::{Cell, Peer, eventually};
 
-use crate::peer::{SOON, heard, is_string, options, reads, string, writes};
+use crate::ros2_endpoints::peer::{SOON, heard, is_string, options, reads, string, writes};
 
 const STRING: &str = "std_msgs::msg::dds_::String_";
 const TEXT: &str = "std_msgs/String";

@@ -12,7 +12,7 @@ use serde_json::json;
 use system_tests::{Cell, Child, Peer};
 use uadp::BuiltinType;
 
-use crate::peer::{DOMAIN, SOON, heard, is_string, options, reads, string, writes};
+use crate::ros2_endpoints::peer::{DOMAIN, SOON, heard, is_string, options, reads, string, writes};
 
 const LATCHED: [&str; 4] = ["--durability", "transient_local", "--depth", "1"];
 

@@ -12,8 +12,8 @@ use serde_json::json;
 use system_tests::{Cell, Peer, eventually};
 use uadp::BuiltinType;
 
-use crate::peer::{SOON, options, writes};
-use crate::port::{bound, event, port, port_of, run_until, topic, types};
+use crate::ros2_endpoints::peer::{SOON, options, writes};
+use crate::ros2_endpoints::port::{bound, event, port, port_of, run_until, topic, types};
 
 const UNKNOWN: &str = "type_description_interfaces/FieldType";
 

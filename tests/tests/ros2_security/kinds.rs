@@ -5,7 +5,7 @@ use std::time::Duration;
 use system_tests::{Cell, Child, Governance, Keystore, Peer, Triple, UaSide, Wiretap, eventually};
 use uadp::Scalar;
 
-use crate::{BACK, SOON, STRING, Secured, THERE, answering, is_in, reaches, sends};
+use crate::ros2_security::{BACK, SOON, STRING, Secured, THERE, answering, is_in, reaches, sends};
 
 /// A maker, and the value its peer writes.
 const MAKERS: [(Secured, Triple, &str); 2] = [

@@ -3,7 +3,7 @@
 use serde_json::json;
 use system_tests::{Cell, Distribution, Keystore, METRICS_ROS2, Peer, UaSide, eventually, metrics};
 
-use crate::{BACK, SOON, STRING, THERE, answering, reaches};
+use crate::ros2_security::{BACK, SOON, STRING, THERE, answering, reaches};
 
 const NODE: &str = "/ua_bridge_ros2";
 

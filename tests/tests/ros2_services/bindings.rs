@@ -4,7 +4,7 @@ use serde_json::json;
 use system_tests::{Cell, Peer, UaSide, eventually};
 use uadp::Scalar;
 
-use crate::peer::{SOON, Vendor, cyclone_serves};
+use crate::ros2_services::peer::{SOON, Vendor, cyclone_serves};
 
 const CELL: &str = "
 spaces:

@@ -5,8 +5,8 @@ use bridge_ros2::security::Enclave;
 use bridge_ros2::service::{ServiceOptions, ServicePeers};
 use system_tests::{Cell, Keystore, Peer};
 
-use crate::peer::{Ours, SET_BOOL, until};
-use crate::{GRIP, server};
+use crate::ros2_services::peer::{Ours, SET_BOOL, until};
+use crate::ros2_services::{GRIP, server};
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn calls_of_secured_clients_of_both_makers_are_answered_by_our_server() {

@@ -16,7 +16,7 @@ use uadp::{
     Variant,
 };
 
-use crate::{body, unhex};
+use crate::discovery::{body, unhex};
 
 /// The encoding of a structure.
 pub(crate) fn structure(name: &str) -> Vec<u8> {

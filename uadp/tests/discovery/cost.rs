@@ -4,7 +4,7 @@ use allocation_counter::measure;
 use uadp::DecodeError;
 use uadp::discovery::{Announced, Announcement, DataSetMetaDataType, Probe};
 
-use crate::asyncua::bodies;
+use crate::discovery::asyncua::bodies;
 
 #[test]
 fn reading_allocates_nothing() {

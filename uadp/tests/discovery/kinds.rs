@@ -10,7 +10,7 @@ use uadp::{
     SecurityHeader, StatusCode,
 };
 
-use crate::{body, probe_body};
+use crate::discovery::{body, probe_body};
 
 #[test]
 fn probes_are_laid_out_as_in_the_tables() {

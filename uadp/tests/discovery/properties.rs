@@ -18,8 +18,8 @@ use uadp::{
     QualifiedName, Scalar, StatusCode, Variant,
 };
 
-use crate::asyncua::bodies;
-use crate::{body, datagram, probe_body};
+use crate::discovery::asyncua::bodies;
+use crate::discovery::{body, datagram, probe_body};
 
 /// The structures borrow; what they borrow is as short-lived as the test program.
 fn leak<T>(values: Vec<T>) -> &'static [T] {

@@ -15,7 +15,7 @@ use uadp::{
     SecurityHeader, StatusCode, Variant,
 };
 
-use crate::{datagram, unhex};
+use crate::discovery::{datagram, unhex};
 
 #[test]
 fn probes_are_read_as_described_and_written_back() {

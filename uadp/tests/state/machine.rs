@@ -5,7 +5,7 @@ use uadp::{
     DataSetWriterState, PubSubState, StateEvent, StateMachine, StateRefused, WriterSettings,
 };
 
-use crate::ms;
+use crate::state::ms;
 
 /// OPC 10000-14, 6.2.1, Table 2, row by row.
 const TABLE: &[(PubSubState, StateEvent, PubSubState)] = &[

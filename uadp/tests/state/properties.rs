@@ -12,9 +12,9 @@ use uadp::{
     ReaderSettings,
 };
 
-use crate::machine::STATES;
-use crate::writer::start_writer;
-use crate::{TIMEOUT, ms, start_reader, versioned};
+use crate::state::machine::STATES;
+use crate::state::writer::start_writer;
+use crate::state::{TIMEOUT, ms, start_reader, versioned};
 
 /// What happens between a publisher and a reader.
 #[derive(Debug, Clone)]

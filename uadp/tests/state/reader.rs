@@ -9,7 +9,7 @@ use uadp::{
     Timestamp,
 };
 
-use crate::{datagram, description, message, ms, settings, start_reader, versioned};
+use crate::state::{datagram, description, message, ms, settings, start_reader, versioned};
 
 #[test]
 fn a_reader_is_operational_from_its_first_key_frame_or_event_on() {

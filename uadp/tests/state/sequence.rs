@@ -4,7 +4,7 @@ use uadp::MessageKind::{DeltaFrame, Event, KeepAlive, KeyFrame};
 use uadp::PubSubState::Operational;
 use uadp::{Accepted, Arrival, DateTime, ReaderDrop, ReaderSettings, Timestamp};
 
-use crate::{in_group, message, ms, settings, stamped, start_reader};
+use crate::state::{in_group, message, ms, settings, stamped, start_reader};
 
 #[test]
 fn the_next_message_is_accepted_and_a_gap_is_counted() {

@@ -3,7 +3,7 @@
 use uadp::PubSubState::Paused;
 use uadp::{DataSetMessage, GroupHeader, NetworkHeader, PublisherId, ReaderDrop, ReaderTable};
 
-use crate::{ms, settings};
+use crate::state::{ms, settings};
 
 fn publisher(id: PublisherId<'_>) -> NetworkHeader<'_> {
     NetworkHeader {

@@ -7,7 +7,7 @@ use uadp::{
     WriterSettingsError,
 };
 
-use crate::ms;
+use crate::state::ms;
 
 pub(crate) fn start_writer(interval: u64, keep_alive: u64, key_frames: u32) -> DataSetWriterState {
     let settings = WriterSettings::new(ms(interval), ms(keep_alive), key_frames).unwrap();

@@ -3,7 +3,7 @@
 use serde_json::{Value, json};
 use uadp::BuiltinType;
 
-use crate::found::base64;
+use crate::vectors::found::base64;
 
 /// The headers of a NetworkMessage and of the chunk in it.
 pub(crate) fn expected_headers(json: &Value) -> Value {

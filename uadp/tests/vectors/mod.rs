@@ -12,8 +12,7 @@
 
 mod found;
 mod not_read;
-#[path = "../common/rewrite.rs"]
-mod rewrite;
+use crate::rewrite;
 mod said;
 mod write;
 

@@ -1,0 +1,27 @@
+//! The tests of the router, one program so that they are linked once.
+
+mod cell;
+#[path = "../../messages/tests/support/inventor.rs"]
+mod inventor;
+#[path = "../../messages/tests/support/mod.rs"]
+mod support;
+
+mod allocation;
+mod applications;
+mod bytes;
+mod call_actions;
+mod call_freedom;
+mod call_safety;
+mod calls;
+mod fields;
+mod foreign;
+mod large;
+mod loop_freedom;
+mod metadata;
+mod publish;
+mod reload;
+mod router;
+mod secured;
+mod shaped;
+mod sharing;
+mod strangers;

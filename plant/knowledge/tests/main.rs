@@ -1,0 +1,6 @@
+//! The tests of the graph and its stores, one program so that they are linked once.
+
+mod http;
+mod memory;
+mod store;
+mod vocabulary;

@@ -1,0 +1,23 @@
+//! The tests of the codec and its states, one program so that they are linked once.
+
+#[path = "common/everything.rs"]
+mod everything;
+#[path = "common/model.rs"]
+mod model;
+#[path = "common/rewrite.rs"]
+mod rewrite;
+
+mod action;
+mod allocation;
+mod chunks;
+mod discovery;
+mod hostile;
+mod properties;
+mod raw;
+mod raw_properties;
+mod reading;
+mod security;
+mod state;
+mod template;
+mod vectors;
+mod writing;
