@@ -2,7 +2,6 @@
 #![expect(clippy::unwrap_used, reason = "test code")]
 
 use crate::inventor;
-use crate::support;
 
 use bridge_core::{decode_fields, encode_fields};
 use messages::{Dialect, Plan, Rank, Registry, Selection, Wire};

@@ -97,7 +97,7 @@ fn elements_without_bytes_are_believed_up_to_a_number_all_arrays_together() {
 
 #[test]
 fn an_empty_message_is_no_byte_on_ros_1_and_one_in_cdr() {
-    assert_eq!(write(&plan(Dialect::Ros1, ""), &[]).unwrap(), []);
+    assert!(write(&plan(Dialect::Ros1, ""), &[]).unwrap().is_empty());
     assert_eq!(
         write(&plan(Dialect::Ros2, ""), &[]).unwrap(),
         [0, 1, 0, 0, 0, 0, 0, 0]
