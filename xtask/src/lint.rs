@@ -1,4 +1,4 @@
-//! `cargo xtask lint`: everything that can be said of the code without running it.
+//! `cargo xtask lint`: the checks that do not run the code.
 
 use std::{
     ffi::OsString,
@@ -18,87 +18,89 @@ const DENY: &str = "0.20.2";
 /// The advisory database is a few megabytes; a network that takes longer has it not.
 const FETCH: Duration = Duration::from_secs(120);
 
-/// Runs all checks, so that one run shows everything there is to mend.
+/// Checks formatting, lints and documentation. All checks run, so that one run shows every finding.
+///
+/// # Errors
+/// Returns an error if cargo cannot be started or the patched sources cannot be prepared.
 pub(crate) fn run(workspace: &Workspace) -> anyhow::Result<Ended> {
     let patched = Patched::prepare(workspace)?;
-    let mut failed = Vec::new();
-    let mut check = |what: &str, command: &mut Command| -> anyhow::Result<()> {
-        step(what);
-        if !status(command)?.success() {
-            failed.push(line(command));
-        }
-        Ok(())
-    };
-    check(
+    let mut checks = Checks::default();
+    checks.run(
         "formatting",
         &mut workspace.cargo(&["fmt", "--all", "--check"]),
     )?;
-    check(
+    let clippy = ["clippy", "--workspace", "--all-targets", "--locked"];
+    checks.run(
         "clippy",
-        &mut patched.cargo(
-            workspace,
-            &[
-                "clippy",
-                "--workspace",
-                "--all-targets",
-                "--locked",
-                "--",
-                "-D",
-                "warnings",
-            ],
-        ),
+        patched
+            .cargo(workspace, &clippy)
+            .args(["--", "-D", "warnings"]),
     )?;
-    check(
-        "the workspace with all crates as published",
-        // As clippy is run above, and with examples, which need what tests need: so nothing is checked twice that is the same.
-        &mut workspace.cargo(&[
-            "clippy",
-            "--workspace",
-            "--lib",
-            "--bins",
-            "--examples",
-            "--locked",
-            "--",
-            "-D",
-            "warnings",
-        ]),
-    )?;
-    check(
+    checks.run(
         "documentation",
         patched
             .cargo(workspace, &["doc", "--workspace", "--no-deps", "--locked"])
             .env("RUSTDOCFLAGS", "-D warnings"),
     )?;
+    Ok(checks.ended())
+}
+
+/// Checks licences, sources, duplicates and advisories of the dependencies, and that the workspace compiles with all
+/// crates as published, without the patches.
+///
+/// # Errors
+/// Returns an error if cargo cannot be started or cargo-deny cannot be built.
+pub(crate) fn dependencies(workspace: &Workspace) -> anyhow::Result<Ended> {
+    let mut checks = Checks::default();
+    let published = ["clippy", "--workspace", "--lib", "--bins", "--examples"];
+    checks.run(
+        "the workspace with all crates as published",
+        workspace
+            .cargo(&published)
+            .args(["--locked", "--", "-D", "warnings"]),
+    )?;
     let deny = Deny::find(workspace)?;
-    check(
+    let kinds = ["bans", "licenses", "sources"];
+    checks.run(
         "licences, sources and duplicates of dependencies",
-        &mut deny.command(
-            workspace,
-            &[
-                "check",
-                "--hide-inclusion-graph",
-                "bans",
-                "licenses",
-                "sources",
-            ],
-        ),
+        deny.command(workspace, &["check", "--hide-inclusion-graph"])
+            .args(kinds),
     )?;
     match deny.fetch(workspace)? {
-        Ok(()) => check(
+        Ok(()) => checks.run(
             "advisories",
             &mut deny.command(workspace, &["check", "--disable-fetch", "advisories"]),
         )?,
         Err(why) => step(&format!("advisories: skipped, {why}")),
     }
+    Ok(checks.ended())
+}
 
-    if failed.is_empty() {
-        step("nothing to mend");
-        return Ok(Ended::WELL);
+/// The commands that failed, of those that ran.
+#[derive(Default)]
+struct Checks {
+    failed: Vec<String>,
+}
+
+impl Checks {
+    fn run(&mut self, title: &str, command: &mut Command) -> anyhow::Result<()> {
+        step(title);
+        if !status(command)?.success() {
+            self.failed.push(line(command));
+        }
+        Ok(())
     }
-    for command in failed {
-        eprintln!("xtask: failed: {command}");
+
+    fn ended(self) -> Ended {
+        for command in &self.failed {
+            eprintln!("xtask: failed: {command}");
+        }
+        if self.failed.is_empty() {
+            step("no findings");
+            return Ended::WELL;
+        }
+        Ended::BADLY
     }
-    Ok(Ended::BADLY)
 }
 
 /// cargo-deny, wherever it is.

@@ -27,10 +27,11 @@ cargo xtask <verb>
   demo [ARGS]                    build the programs and run the assembly line; ARGS go to it (--help lists them)
   test [--no-install] [FILTER..] install the peers of the tests (apt, pip), then run all tests whose name contains a FILTER
   peers [--build]                only install the peers; of those only what the programs are built with
-  lint                           formatting, clippy, licences and sources of dependencies, documentation
+  lint [--dependencies]          formatting, clippy, documentation; or licences, sources and advisories of dependencies, and the
+                                 workspace with all crates as published
   dist                           build the programs that are handed out, with optimisation, into target/dist
   patches [--test]               only patch the crates of patches/, which all verbs build with, and print the flags to do so by hand;
-                                 or run all tests that the patches add, of which `test` leaves out those that take minutes to build
+                                 or run the tests that the patches add, which `test` leaves out
   bench hop [ARGS]               measure one hop beside the floor and roscpp's relay
   bench ros1 [ARGS]              measure relays of ROS 1 messages beside a raw echo; bridge-ros1 with 50 topics (--help)
   bench ros2 [ARGS]              measure relays of DDS samples beside a UDP echo; both bridges from ROS 1 to ROS 2 and back
@@ -66,6 +67,7 @@ fn run(arguments: &[&str]) -> anyhow::Result<Ended> {
         ["patches"] => patches::run(&Workspace::find()?),
         ["patches", "--test"] => test::of_all_patches(&Workspace::find()?),
         ["lint"] => lint::run(&Workspace::find()?),
+        ["lint", "--dependencies"] => lint::dependencies(&Workspace::find()?),
         ["bench", "uadp", rest @ ..] => {
             instructions::run(&Workspace::find()?, "uadp", rest, |_| Ok(()))
         }

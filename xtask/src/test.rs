@@ -56,23 +56,12 @@ pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<E
     let built = ["--bins", "--tests", "--examples"];
     let build = patched.cargo(workspace, &[&["build"][..], TARGETS, &built].concat());
     let programs = programs::build(build)?;
-    let of_patches = match filters.is_empty() {
-        true => of_patches(workspace, &patched, |source| !takes_minutes(source))?,
-        false => Vec::new(),
-    };
 
     let skipped = workspace.target.join("skipped-tests.txt");
     remove(&skipped)?;
     #[expect(clippy::disallowed_methods, reason = "how long it took is told")]
     let start = Instant::now();
-    let report = Plan::of(
-        workspace,
-        &patched,
-        (&programs, of_patches),
-        &filters,
-        &skipped,
-    )?
-    .run()?;
+    let report = Plan::of(workspace, &patched, &programs, &filters, &skipped)?.run()?;
     let reasons = match fs::read_to_string(&skipped) {
         Ok(reasons) => reasons,
         Err(error) if error.kind() == ErrorKind::NotFound => String::new(),
@@ -87,7 +76,7 @@ pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<E
 /// Runs the tests that the patches add to their crates, and nothing else.
 pub(crate) fn of_all_patches(workspace: &Workspace) -> anyhow::Result<Ended> {
     let patched = Patched::prepare(workspace)?;
-    let programs = of_patches(workspace, &patched, |_| true)?;
+    let programs = of_patches(workspace, &patched)?;
     let namespaces = Namespaces::try_out();
     let jobs = programs.iter();
     let jobs = jobs.map(|(source, program)| job_of_patches(source, program, namespaces));
@@ -98,20 +87,13 @@ pub(crate) fn of_all_patches(workspace: &Workspace) -> anyhow::Result<Ended> {
     Ok(outcome.ended())
 }
 
-/// A crate whose own tests are built with the OPC UA types once more. What its patches change is asserted by system tests too,
-/// with clients of other makers.
-fn takes_minutes(source: &Source) -> bool {
-    source.name().starts_with("async-opcua")
-}
-
-/// The test programs of those patched crates that have tests of ours.
+/// Builds the test programs of the patched crates to which the patches add tests.
 fn of_patches<'a>(
     workspace: &Workspace,
     patched: &'a Patched,
-    wanted: impl Fn(&Source) -> bool,
 ) -> anyhow::Result<Vec<(&'a Source, Program)>> {
     let mut all = Vec::new();
-    for source in patched.sources().iter().filter(|source| wanted(source)) {
+    for source in patched.sources() {
         // Without names of tests it would run all that the crate has.
         if !source.tests().is_empty() {
             let built = programs::build(source.build_of_own_tests(workspace))?;
@@ -134,7 +116,7 @@ impl Plan {
     fn of(
         workspace: &Workspace,
         patched: &Patched,
-        (programs, of_patches): (&[Program], Vec<(&Source, Program)>),
+        programs: &[Program],
         filters: &[&str],
         skipped: &Path,
     ) -> anyhow::Result<Self> {
@@ -180,10 +162,6 @@ impl Plan {
                     false => plan.beside.push(job),
                 }
             }
-        }
-        for (source, program) in of_patches {
-            plan.programs
-                .push(job_of_patches(source, &program, namespaces));
         }
         let mut documents = surround(patched.cargo(workspace, &[&["test"][..], TARGETS].concat()));
         documents.args(["--doc", "--"]).args(filters);

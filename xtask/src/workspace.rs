@@ -47,9 +47,18 @@ impl Workspace {
         self.target.join("peers")
     }
 
-    /// A command of cargo, in the root.
+    /// Returns a command of cargo in the root.
+    ///
+    /// `cargo run`, which starts this program, sets variables that describe this package. Build scripts (of `ring`, for
+    /// one) run again when those change, so a cargo started by hand would build half of the workspace again.
     pub(crate) fn cargo(&self, arguments: &[&str]) -> Command {
         let mut command = Command::new(cargo_program());
+        for (name, _) in env::vars_os() {
+            let text = name.to_string_lossy();
+            if text.starts_with("CARGO_PKG_") || text.starts_with("CARGO_MANIFEST_") {
+                command.env_remove(&name);
+            }
+        }
         command.current_dir(&self.root).args(arguments);
         command
     }
