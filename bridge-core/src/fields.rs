@@ -133,7 +133,6 @@ const fn write_case(fault: &WriteFault) -> &'static str {
         WriteFault::Order => "order",
         WriteFault::Nul => "nul",
         WriteFault::WithoutValue(_) => "without value",
-        WriteFault::Time => "time",
         WriteFault::Duration => "duration",
     }
 }

@@ -28,19 +28,44 @@ pub fn date_time_to_time(value: DateTime) -> (i64, u32) {
     (ticks.div_euclid(TICKS_PER_SECOND), nanos)
 }
 
+/// Nanoseconds of the shortest and of the longest ROS duration.
+const DURATIONS: (i64, i64) = (
+    -2_147_483_648 * NANOS_PER_SECOND,
+    2_147_483_648 * NANOS_PER_SECOND - 1,
+);
+/// The longest ROS duration in milliseconds: the nearest Double is 2^31 s.
+const LONGEST: f64 = 2_147_483_648_000.0;
+
+/// A DateTime as the seconds and nanoseconds of a ROS time with seconds from `earliest` to `latest`. A DateTime beyond that is
+/// the earliest or latest time there is (OPC 10000-6, 5.2.2.5).
+pub(crate) fn date_time_within(value: DateTime, earliest: i64, latest: i64) -> (i64, u32) {
+    match date_time_to_time(value) {
+        (sec, _) if sec < earliest => (earliest, 0),
+        (sec, _) if sec > latest => (latest, 999_999_900),
+        time => time,
+    }
+}
+
 /// A ROS duration in milliseconds.
 ///
 /// The nearest Double: up to 2^33 ms (99 days) [`millis_to_duration`] gives the same seconds and nanoseconds back;
-/// beyond that a Double does not tell all nanoseconds apart, and up to 2^31 s the error is at most 245 ns.
+/// beyond that a Double does not tell all nanoseconds apart, and up to 2^31 s the error is at most 245 ns. Nanoseconds beyond
+/// a second that lead out of the range of a duration give its shortest or longest.
 pub fn duration_to_millis(sec: i32, nanosec: i64) -> f64 {
+    let (shortest, longest) = DURATIONS;
     let nanos = i64::from(sec) * NANOS_PER_SECOND + nanosec;
+    let nanos = nanos.clamp(shortest, longest);
     let whole = nanos.div_euclid(1_000_000);
     let rest = nanos.rem_euclid(1_000_000);
     lossless(whole) + lossless(rest) / 1e6
 }
 
-/// Milliseconds as seconds and 0..10^9 nanoseconds, to the nearest nanosecond; None when the seconds do not fit.
+/// Milliseconds as seconds and 0..10^9 nanoseconds, to the nearest nanosecond; None when the seconds do not fit. 2^31 s is the
+/// Double of the longest duration, which it returns.
 pub fn millis_to_duration(millis: f64) -> Option<(i32, u32)> {
+    if millis.total_cmp(&LONGEST).is_eq() {
+        return Some((i32::MAX, 999_999_999));
+    }
     let whole = millis.floor();
     if !(-3e12..3e12).contains(&whole) {
         return None;
@@ -99,7 +124,15 @@ mod tests {
         assert_eq!(duration_to_millis(1, 500_000_000), 1500.0);
         assert_eq!(duration_to_millis(-1, 999_000_000), -1.0);
         assert_eq!(millis_to_duration(-0.000_001), Some((-1, 999_999_999)));
-        assert_eq!(millis_to_duration(2_147_483_648_000.0), None);
+        let longest = Some((i32::MAX, 999_999_999));
+        assert_eq!(duration_to_millis(i32::MAX, 999_999_999), LONGEST);
+        assert_eq!(millis_to_duration(LONGEST), longest);
+        assert_eq!(millis_to_duration(LONGEST.next_up()), None);
+        // Nanoseconds that no sender should give.
+        let beyond = duration_to_millis(i32::MAX, i64::from(u32::MAX));
+        assert_eq!(millis_to_duration(beyond), longest);
+        let below = duration_to_millis(i32::MIN, i64::from(i32::MIN));
+        assert_eq!(millis_to_duration(below), Some((i32::MIN, 0)));
         assert_eq!(
             millis_to_duration(-2_147_483_648_000.0),
             Some((i32::MIN, 0))
@@ -123,14 +156,14 @@ mod tests {
         }
 
         #[test]
-        fn a_duration_that_went_to_and_fro_stays_what_it_is(sec in i32::MIN..i32::MAX, nanosec in 0u32..1_000_000_000) {
+        fn a_duration_that_went_to_and_fro_stays_what_it_is(sec in i32::MIN..=i32::MAX, nanosec in 0u32..1_000_000_000) {
             let (back, rest) = millis_to_duration(duration_to_millis(sec, i64::from(nanosec))).unwrap();
             let again = millis_to_duration(duration_to_millis(back, i64::from(rest)));
             prop_assert_eq!(again, Some((back, rest)));
         }
 
         #[test]
-        fn any_duration_returns_within_245_nanoseconds(sec in i32::MIN..i32::MAX, nanosec in 0u32..1_000_000_000) {
+        fn any_duration_returns_within_245_nanoseconds(sec in i32::MIN..=i32::MAX, nanosec in 0u32..1_000_000_000) {
             let (back, rest) = millis_to_duration(duration_to_millis(sec, i64::from(nanosec))).unwrap();
             let drift = (i64::from(back) - i64::from(sec)) * NANOS_PER_SECOND + i64::from(rest) - i64::from(nanosec);
             prop_assert!(drift.abs() <= 245, "{}", drift);

@@ -286,10 +286,7 @@ pub enum WriteFault {
     /// A text with a NUL, which CDR cannot carry.
     #[error("a NUL inside a text")]
     Nul,
-    /// A time before 1970 (ROS 1), before 1901 or after 2038 (ROS 2), or after 2106 (ROS 1).
-    #[error("the time does not fit a ROS time")]
-    Time,
-    /// A duration of 2^31 seconds or more, or no number.
+    /// A duration of more than 2^31 seconds, or no number.
     #[error("the duration does not fit a ROS duration")]
     Duration,
 }

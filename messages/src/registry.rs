@@ -165,6 +165,11 @@ impl Registry {
         self.definitions.get(name)
     }
 
+    /// The text of a message definition, as its file has it.
+    pub fn text(&self, name: &TypeName) -> Option<&str> {
+        Some(&self.definitions.get(name)?.text)
+    }
+
     /// Request and response of a service.
     pub(crate) fn service_definitions(&self, name: &TypeName) -> Option<[&Arc<Definition>; 2]> {
         self.services.get(name).map(|service| service.parts())

@@ -5,7 +5,7 @@ use uadp::{BuiltinType, Scalar};
 use super::What;
 use crate::definition::{Clock, Constant, Number, Primitive};
 use crate::resolve::{Shape, ShapeKind};
-use crate::{MessageType, PlanError, Source, SourceError, TypeName};
+use crate::{MessageType, PlanError, Source, SourceError, TypeName, millis_to_duration};
 
 /// A value as people write it.
 ///
@@ -339,7 +339,7 @@ fn float(text: &str) -> Option<f64> {
     }
 }
 
-/// A duration in milliseconds.
+/// A duration in milliseconds, that fits a ROS duration.
 fn millis(text: &str) -> Option<f64> {
     const UNITS: [(&str, f64); 4] = [("ms", 1.0), ("s", 1e3), ("min", 60e3), ("h", 3600e3)];
     if text == "0" {
@@ -347,7 +347,8 @@ fn millis(text: &str) -> Option<f64> {
     }
     let (number, unit) = text.split_at_checked(text.find(|c: char| c.is_ascii_alphabetic())?)?;
     let (_, factor) = UNITS.iter().find(|(name, _)| *name == unit)?;
-    Some(float(number)? * factor)
+    let millis = float(number)? * factor;
+    millis_to_duration(millis).map(|_| millis)
 }
 
 #[cfg(test)]
@@ -398,7 +399,7 @@ mod tests {
         assert_eq!(millis("1.5s"), Some(1500.0));
         assert_eq!(millis("-2min"), Some(-120_000.0));
         assert_eq!(millis("0"), Some(0.0));
-        for text in ["", "5", "5 s", "s", "5d", "1e3s"] {
+        for text in ["", "5", "5 s", "s", "5d", "1e3s", "596524h", "-596524h"] {
             assert_eq!(millis(text), None, "{text}");
         }
     }

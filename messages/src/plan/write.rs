@@ -4,8 +4,9 @@ use uadp::{BuiltinType, Scalar};
 
 use super::literal::Typed;
 use super::{Len, MAX_WITHOUT_BYTES, Op, Plan, What, Wire};
+use crate::convert::date_time_within;
 use crate::definition::{Clock, Number, Primitive};
-use crate::{Source, SourceError, WriteError, WriteFault, date_time_to_time, millis_to_duration};
+use crate::{Source, SourceError, WriteError, WriteFault, millis_to_duration};
 
 struct Writer<'o, 's, S> {
     out: &'o mut Vec<u8>,
@@ -211,13 +212,15 @@ impl<'a, S: Source<'a>> Writer<'_, '_, S> {
                 return self.narrow(text.bound, value.unwrap_or_default());
             }
             (Primitive::Clock(clock @ (Clock::Time1 | Clock::Time2)), Scalar::DateTime(value)) => {
-                let (sec, nanosec) = date_time_to_time(value);
-                let sec = if clock == Clock::Time1 {
-                    u32::try_from(sec)
+                let (earliest, latest) = if clock == Clock::Time1 {
+                    (0, i64::from(u32::MAX))
                 } else {
-                    i32::try_from(sec).map(i32::cast_unsigned)
+                    (i64::from(i32::MIN), i64::from(i32::MAX))
                 };
-                self.put(sec.map_err(|_| WriteFault::Time)?.to_le_bytes());
+                let (sec, nanosec) = date_time_within(value, earliest, latest);
+                // The low half of either is what the field holds.
+                let [a, b, c, d, ..] = sec.to_le_bytes();
+                self.put([a, b, c, d]);
                 self.put(nanosec.to_le_bytes());
             }
             (Primitive::Clock(Clock::Duration1 | Clock::Duration2), Scalar::Double(value)) => {
