@@ -190,6 +190,11 @@ impl Guard {
         self.of(Some(namespace)).is_some()
     }
 
+    /// Returns the index of the secured group of a namespace; `None` where the namespace is not secured.
+    pub(crate) fn group_of(&self, namespace: u16) -> Option<usize> {
+        self.of(Some(namespace))
+    }
+
     /// Whether what is said in one namespace is as well secured as what is said in the other.
     pub(crate) fn is_alike(&self, one: u16, other: u16) -> bool {
         self.of(Some(one)) == self.of(Some(other))

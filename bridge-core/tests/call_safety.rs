@@ -301,3 +301,73 @@ fn who_missed_that_a_program_was_started_anew_asks_what_it_is_when_that_shows() 
     cell.run(ms(50));
     assert_eq!(cell.executions(GRIPPER).len(), 1);
 }
+
+/// Lets a stranger request the call so many times, each under an id of its own.
+fn flood(cell: &mut Cell, count: u16, from: SocketAddr) {
+    for id in 0..count {
+        cell.hear(GRIPPER, &request(None, id), from);
+    }
+}
+
+/// Requests and responses that a program has sent.
+fn actions_of(cell: &mut Cell, at: usize) -> usize {
+    let sent = cell.datagrams_of(at);
+    sent.iter().filter(|bytes| cell::is_action(bytes)).count()
+}
+
+#[test]
+fn refused_requests_of_a_stranger_are_answered_once_each_and_no_more_than_there_is_room_for() {
+    let mut cell = Cell::new(vec![Program::new(1, Local::Fields), component(7)]);
+    cell.offer(GRIPPER, start(), offered(false));
+    cell.run(ms(200));
+    let stranger = SocketAddr::from(([192, 0, 2, 9], 5_000));
+    let before = actions_of(&mut cell, GRIPPER);
+    flood(&mut cell, 3, stranger);
+    cell.run(ms(5_000));
+    assert_eq!(actions_of(&mut cell, GRIPPER), before + 3);
+    // Other ports of its host are no other sender.
+    for port in 0..8 {
+        let stranger = SocketAddr::from(([192, 0, 2, 9], 6_000 + port));
+        for id in 0..300 {
+            cell.hear(GRIPPER, &request(None, 1_000 + port * 300 + id), stranger);
+        }
+    }
+    cell.run(ms(2_000));
+    assert!(actions_of(&mut cell, GRIPPER) <= 512);
+    assert_eq!(cell.executions(GRIPPER).len(), 0);
+    cell.ask(BRIDGE, AskId(1), (start(), &[0, 0]), ms(3_000));
+    cell.run(ms(50));
+    assert_eq!(cell.executions(GRIPPER).len(), 1);
+}
+
+#[test]
+fn a_stranger_that_fills_the_room_of_an_open_call_does_not_stop_the_calls_of_others() {
+    let mut cell = plugged_in();
+    let stranger = SocketAddr::from(([192, 0, 2, 9], 5_000));
+    flood(&mut cell, 3_000, stranger);
+    assert!(cell.dropped(GRIPPER, Reason::CallRefused) >= 900);
+    let executed = cell.executions(GRIPPER).len();
+    assert_eq!(executed, 512, "the share of one sender");
+    for from in [[127, 0, 0, 1], [192, 0, 2, 10]] {
+        let other = SocketAddr::from((from, 9_000));
+        let id = 5_000 + u16::from(from[0]);
+        cell.hear(GRIPPER, &request(None, id), other);
+        assert_eq!(cell.executions(GRIPPER).len(), 1, "{other}");
+    }
+}
+
+#[test]
+fn no_room_is_taken_for_the_chunks_of_a_stranger_where_no_call_is_open() {
+    for open in [false, true] {
+        let mut cell = Cell::new(vec![Program::new(1, Local::Fields), component(7)]);
+        cell.offer(GRIPPER, start(), offered(open));
+        cell.run(ms(200));
+        cell.programs[BRIDGE].address = SocketAddr::from(([192, 0, 2, 9], 5_000));
+        cell.ask(BRIDGE, AskId(1), (start(), &large(25_000)), ms(3_000));
+        cell.run(ms(500));
+        assert_eq!(cell.executions(GRIPPER).len(), usize::from(open));
+        let refused = cell.dropped(GRIPPER, Reason::CallRefused);
+        assert_eq!(refused > 0, !open);
+        assert_eq!(cell.dropped(GRIPPER, Reason::Incomplete), 0);
+    }
+}

@@ -101,12 +101,12 @@ impl World {
             ),
             responder: Responder::new(ResponderSettings {
                 max_requests: REQUESTS,
-                max_requests_per_requestor: REQUESTS - 1,
+                max_requests_per_sender: REQUESTS - 1,
                 max_executing: 3,
                 max_bytes: BYTES,
-                max_bytes_per_requestor: BYTES - 500,
+                max_bytes_per_sender: BYTES - 500,
                 max_over: OVER,
-                max_over_per_requestor: OVER - 1,
+                max_over_per_sender: OVER - 1,
                 remember: REMEMBER,
                 ..ResponderSettings::default()
             }),

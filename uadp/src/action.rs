@@ -92,7 +92,7 @@ pub use requestor::{
     ResponseDrop,
 };
 pub use responder::{
-    ExecutionId, FinishRefusal, RequestDrop, Requested, Responder, ResponderCounters,
-    ResponderSettings,
+    ExecutionId, FinishRefusal, RequestDrop, RequestOrigin, Requested, Responder,
+    ResponderCounters, ResponderSettings,
 };
 pub use sending::{ActionAddress, ActionToSend};

@@ -42,8 +42,8 @@ pub(super) struct Calls {
     /// What its times count from.
     start: Instant,
     requestor: Requestor,
-    /// It answers to the group, whoever asks.
-    responder: Responder<()>,
+    /// It answers to the group; the address says whose room a request takes up.
+    responder: Responder<SocketAddr>,
     /// ActionTargetId of our own in this life of the program.
     target: u16,
     table: HashMap<TopicId, Call>,
@@ -111,9 +111,10 @@ impl Calls {
             requestor: Requestor::new(OwnedPublisherId::UInt16(own.into()), instance, settings),
             responder: Responder::new(ResponderSettings {
                 max_executing: MAX_EXECUTING,
+                max_executing_per_sender: MAX_EXECUTING / 2,
                 max_answer: MAX_BLOCK,
                 max_bytes: 4 * MAX_BLOCK,
-                max_bytes_per_requestor: 2 * MAX_BLOCK,
+                max_bytes_per_sender: 2 * MAX_BLOCK,
                 ..ResponderSettings::default()
             }),
             target: target_of(instance),
@@ -602,7 +603,7 @@ impl Router {
             }
             let since = calls.since_start(now);
             let answer = calls.responder.poll_transmit(since);
-            let answer = answer.map(|((), answer)| (Of::message(&answer), encode(&answer, bytes)));
+            let answer = answer.map(|(_, answer)| (Of::message(&answer), encode(&answer, bytes)));
             let next = answer.or_else(|| {
                 let request = calls.requestor.poll_transmit(since);
                 request.map(|request| (Of::message(&request), encode(&request, bytes)))

@@ -57,8 +57,16 @@ impl Router {
             // A large request for a call of ours bears our PublisherId, as a small one does.
             let request = message.is_chunk() && !message.is_sealed() && self.calls.is_some();
             match (request && message.writer_ids().is_none(), namespace) {
-                (true, Some(namespace)) => {
+                (true, Some(namespace)) if self.may_request(namespace, from) => {
                     self.handle_chunk(message, (space, namespace), from, now);
+                }
+                (true, Some(_)) => {
+                    let cause = (Reason::CallRefused, "chunk");
+                    self.count(About::sender(from), cause, 1, || {
+                        format!(
+                            "{from} is another host, and no call of the namespace is open to others"
+                        )
+                    });
                 }
                 _ => self.drop_own(namespace, from, now),
             }

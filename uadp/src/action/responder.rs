@@ -2,6 +2,7 @@
 
 mod entry;
 mod over;
+mod refused;
 mod settings;
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -17,8 +18,10 @@ use super::{
 use crate::{OwnedPublisherId, StatusCode};
 use entry::{Entry, Key, Phase};
 use over::Over;
+use refused::{Answer, Refused};
 pub use settings::{
-    ExecutionId, FinishRefusal, RequestDrop, Requested, ResponderCounters, ResponderSettings,
+    ExecutionId, FinishRefusal, RequestDrop, RequestOrigin, Requested, ResponderCounters,
+    ResponderSettings,
 };
 
 /// Answers requests that come over a network that may lose, double, delay and reorder them
@@ -39,6 +42,10 @@ pub use settings::{
 ///
 /// Where answers go is the owner's matter: `P` is whatever it takes to send there, given with the request. To answer
 /// where a request asks to be answered lets everybody send the answers to others.
+///
+/// Each [`RequestOrigin`] has room of its own, whatever RequestorId a request carries: a sender cannot fill the room of
+/// other senders, and a group of senders cannot fill the room of another group. A request that the owner refuses
+/// by [`handle_judged`](Self::handle_judged) is remembered by its hash and answered once.
 ///
 /// A peer of [`ActionDialect::UaNetStandard`] is answered once, without repetition. Its messages have no place for a
 /// status, so an outcome that needs one is not told at all.
@@ -99,12 +106,16 @@ pub struct Responder<P> {
     entries: BTreeMap<u64, Entry<P>>,
     ids: BTreeMap<Key, u64>,
     timers: Timers,
-    /// What each Requestor takes up.
-    usage: BTreeMap<Option<OwnedPublisherId>, Usage>,
-    total: Usage,
+    /// Room taken up by each sender of each group.
+    usage: BTreeMap<RequestOrigin<P>, Usage>,
+    /// Room taken up by each group.
+    totals: BTreeMap<usize, Usage>,
     /// Requests that are over, and are remembered by little else than that.
-    over: Over,
-    executing: usize,
+    over: Over<P>,
+    /// Requests that were refused before room was taken for them.
+    refused: Refused<P>,
+    /// Answer to a refused request that is sent.
+    answer: Option<Answer<P>>,
     /// Executions past their deadline that were not told yet.
     overdue: BTreeSet<u64>,
     counters: ResponderCounters,
@@ -115,11 +126,12 @@ pub struct Responder<P> {
 struct Usage {
     requests: usize,
     bytes: usize,
+    executing: usize,
     /// Those of the requests that are over, the oldest first.
     closed: BTreeSet<u64>,
 }
 
-impl<P> Responder<P> {
+impl<P: Ord + Clone> Responder<P> {
     /// A Responder that was not asked anything.
     #[must_use]
     pub fn new(settings: ResponderSettings) -> Self {
@@ -130,9 +142,10 @@ impl<P> Responder<P> {
             ids: BTreeMap::new(),
             timers: Timers::new(),
             usage: BTreeMap::new(),
-            total: Usage::default(),
-            over: Over::default(),
-            executing: 0,
+            totals: BTreeMap::new(),
+            over: Over::new(),
+            refused: Refused::new(),
+            answer: None,
             overdue: BTreeSet::new(),
             counters: ResponderCounters::default(),
         }
@@ -148,11 +161,31 @@ impl<P> Responder<P> {
         reply_to: P,
         now: Duration,
     ) -> Result<Requested, RequestDrop> {
+        let origin = RequestOrigin {
+            group: 0,
+            sender: reply_to,
+        };
+        self.handle_judged(request, (origin, Ok(())), now)
+    }
+
+    /// Takes a request as [`handle_request`](Self::handle_request) does, with the owner's verdict on a new request. A refused
+    /// request is remembered by its hash and answered once; its repetitions are answered up to
+    /// [`refusal_repeats`](ResponderSettings::refusal_repeats) times. The verdict does not apply to a request that is
+    /// known already.
+    ///
+    /// # Errors
+    /// It is not taken, for the reason given, and not answered.
+    pub fn handle_judged(
+        &mut self,
+        request: &ActionMessage<'_>,
+        (origin, verdict): (RequestOrigin<P>, Result<(), Refusal>),
+        now: Duration,
+    ) -> Result<Requested, RequestDrop> {
         self.handle_timeout(now);
-        let requested = self.hear(request, reply_to, now);
+        let requested = self.hear(request, (origin, verdict), now);
         match requested {
             Ok(Requested::Execute(_)) => self.counters.executed += 1,
-            Ok(Requested::Refused(..)) => self.counters.refused += 1,
+            Ok(Requested::Refused(..) | Requested::Declined(_)) => self.counters.refused += 1,
             Ok(Requested::Repeated(_)) => self.counters.repeated += 1,
             Ok(Requested::Abandoned(_)) => self.counters.abandoned += 1,
             Ok(Requested::Closed(_)) => self.counters.closed += 1,
@@ -178,6 +211,7 @@ impl<P> Responder<P> {
             return Err(FinishRefusal::Finished);
         };
         let dialect = entry.dialect;
+        let entry_said = entry.last_sent.is_some();
         let (mut status, mut fields) = outcome.to_response();
         let mut told = Ok(());
         if abandoned {
@@ -193,7 +227,13 @@ impl<P> Responder<P> {
         if told.is_ok() && dialect != ActionDialect::Standard && status != StatusCode::GOOD {
             told = Err(FinishRefusal::NoStatus);
         }
-        self.conclude(id, status, fields, now);
+        // A Requestor that has received nothing repeats its request, and a repetition is answered again.
+        let is_repeated = entry_said || !matches!(outcome, Outcome::Refused(_));
+        let repeats = match is_repeated {
+            true => self.settings.done_repeats,
+            false => ONCE,
+        };
+        self.conclude(id, (status, fields), repeats, now);
         told
     }
 
@@ -213,6 +253,7 @@ impl<P> Responder<P> {
     /// Forgets what is too old, and notes which executions are past their deadline.
     pub fn handle_timeout(&mut self, now: Duration) {
         self.over.forget_until(now);
+        self.refused.forget_until(now);
         while let Some(id) = self.timers.due(now) {
             let Some(entry) = self.entries.get_mut(&id) else {
                 return;
@@ -237,6 +278,11 @@ impl<P> Responder<P> {
     /// The next response that is due to be sent, and where to.
     pub fn poll_transmit(&mut self, now: Duration) -> Option<(&P, ActionToSend<'_>)> {
         self.handle_timeout(now);
+        if let Some(answer) = self.refused.pop() {
+            self.counters.sent += 1;
+            let answer = self.answer.insert(answer);
+            return Some((&answer.origin.sender, answer.to_send()));
+        }
         let id = self.timers.due(now)?;
         let interval = self.interval();
         self.entries.get_mut(&id)?.sent(now, interval);
@@ -267,7 +313,7 @@ impl<P> Responder<P> {
             fields,
             dialect: entry.dialect,
         };
-        Some((&entry.reply_to, response))
+        Some((&entry.origin.sender, response))
     }
 
     /// An execution that is past its deadline: its Requestor does not wait any more. It is told once, and may still be
@@ -279,16 +325,21 @@ impl<P> Responder<P> {
     /// When [`poll_transmit`](Self::poll_transmit) is to be called next.
     #[must_use]
     pub fn poll_timeout(&self) -> Option<Duration> {
-        self.timers.next()
+        let next = self.timers.next();
+        next.into_iter().chain(self.refused.due()).min()
     }
 
     /// Requests that are remembered, and bytes they take up.
     #[must_use]
     pub fn held(&self) -> (usize, usize) {
-        let over = self.over.len();
+        let (over, refused) = (self.over.len(), self.refused.len());
+        let totals = self.totals.values();
+        let (requests, bytes) = totals.fold((0, 0), |(requests, bytes), total| {
+            (requests + total.requests, bytes + total.bytes)
+        });
         (
-            self.total.requests + over,
-            self.total.bytes + over * over::COST,
+            requests + over + refused,
+            bytes + (over + refused) * over::COST,
         )
     }
 
@@ -301,7 +352,7 @@ impl<P> Responder<P> {
     fn hear(
         &mut self,
         request: &ActionMessage<'_>,
-        reply_to: P,
+        (origin, verdict): (RequestOrigin<P>, Result<(), Refusal>),
         now: Duration,
     ) -> Result<Requested, RequestDrop> {
         if request.action.kind == ActionKind::Response {
@@ -322,7 +373,16 @@ impl<P> Responder<P> {
             (ActionState::Executing, Some(id)) => self.repeated(id, request, now),
             (ActionState::Idle, Some(id)) => self.acknowledged(id, request, now),
             (ActionState::Executing | ActionState::Idle, None) => {
-                self.admit(key, request, reply_to, now)
+                match self.refused.repeated(&key, request, &self.settings, now) {
+                    Some(dropped) => Err(dropped),
+                    None => match verdict {
+                        Ok(()) => self.admit(key, (request, origin), now),
+                        Err(refusal) => {
+                            let to = (origin, refusal);
+                            self.refused.refuse(key, (request, to), &self.settings, now)
+                        }
+                    },
+                }
             }
         }
     }
@@ -331,12 +391,12 @@ impl<P> Responder<P> {
     fn admit(
         &mut self,
         key: Key,
-        request: &ActionMessage<'_>,
-        reply_to: P,
+        (request, origin): (&ActionMessage<'_>, RequestOrigin<P>),
         now: Duration,
     ) -> Result<Requested, RequestDrop> {
         let cost = key.cost();
-        self.make_room(&key.requestor_id, cost)?;
+        self.make_room(&origin, cost)?;
+        let is_busy = self.is_busy(&origin);
         let settings = &self.settings;
         let id = self.next;
         self.next += 1;
@@ -344,9 +404,9 @@ impl<P> Responder<P> {
         let (phase, requested) = match request.state {
             // The request it takes back is lost or still under way: it is not executed any more.
             ActionState::Idle | ActionState::Done => (Phase::Closed, Requested::Closed(execution)),
-            ActionState::Executing if self.executing >= settings.max_executing => {
+            ActionState::Executing if is_busy => {
                 let busy = Refusal::Busy;
-                let phase = Phase::done(busy.status_code(), ActionFields::NONE, settings);
+                let phase = Phase::done(busy.status_code(), ActionFields::NONE, ONCE);
                 (phase, Requested::Refused(execution, busy))
             }
             ActionState::Executing => {
@@ -360,14 +420,14 @@ impl<P> Responder<P> {
                 (phase, Requested::Execute(execution))
             }
         };
-        self.executing += usize::from(matches!(phase, Phase::Executing { .. }));
+        let executing = usize::from(matches!(phase, Phase::Executing { .. }));
         let is_closed = matches!(phase, Phase::Closed);
         let interval = self.interval();
         let mut entry = Entry {
             key: key.clone(),
             address: request.into(),
             dialect: request.dialect,
-            reply_to,
+            origin: origin.clone(),
             arguments: fingerprint(request),
             next_send: None,
             phase,
@@ -377,9 +437,10 @@ impl<P> Responder<P> {
             wake: now,
         };
         entry.answer(now, interval);
-        self.account(&key.requestor_id, |usage| {
+        self.account(&origin, |usage| {
             usage.requests += 1;
             usage.bytes += cost;
+            usage.executing += executing;
             if is_closed {
                 usage.closed.insert(id);
             }
@@ -390,26 +451,30 @@ impl<P> Responder<P> {
         Ok(requested)
     }
 
+    /// Whether as many requests of the sender or of its group are executed as may be.
+    fn is_busy(&self, origin: &RequestOrigin<P>) -> bool {
+        let executing = |usage: Option<&Usage>| usage.map_or(0, |usage| usage.executing);
+        let settings = &self.settings;
+        executing(self.usage.get(origin)) >= settings.max_executing_per_sender
+            || executing(self.totals.get(&origin.group)) >= settings.max_executing
+    }
+
     /// Makes room for one more request, at the cost of what is known of those that are over.
-    fn make_room(
-        &mut self,
-        requestor: &Option<OwnedPublisherId>,
-        cost: usize,
-    ) -> Result<(), RequestDrop> {
+    fn make_room(&mut self, origin: &RequestOrigin<P>, cost: usize) -> Result<(), RequestDrop> {
         let settings = self.settings;
-        while let Some(used) = self.usage.get(requestor)
-            && (used.requests >= settings.max_requests_per_requestor
-                || used.bytes + cost > settings.max_bytes_per_requestor)
+        while let Some(used) = self.usage.get(origin)
+            && (used.requests >= settings.max_requests_per_sender
+                || used.bytes + cost > settings.max_bytes_per_sender)
         {
             let oldest = used.closed.first().copied();
-            self.shrink(oldest.ok_or(RequestDrop::RequestorFull)?)?;
+            self.shrink(oldest.ok_or(RequestDrop::SenderFull)?)?;
         }
-        while self.total.requests >= settings.max_requests
-            || self.total.bytes + cost > settings.max_bytes
+        while let Some(used) = self.totals.get(&origin.group)
+            && (used.requests >= settings.max_requests || used.bytes + cost > settings.max_bytes)
         {
-            let oldest = self.total.closed.first().copied();
+            let oldest = used.closed.first().copied();
             let shrunk = self.shrink(oldest.ok_or(RequestDrop::Full)?);
-            // It is not for this requestor that there is no room.
+            // The sender itself has room: it is its group that has none.
             shrunk.map_err(|_| RequestDrop::Full)?;
         }
         Ok(())
@@ -419,7 +484,8 @@ impl<P> Responder<P> {
     fn shrink(&mut self, id: u64) -> Result<(), RequestDrop> {
         let entry = self.entries.get(&id).ok_or(RequestDrop::Full)?;
         let until = entry.expires(self.settings.remember);
-        self.over.keep(&entry.key, until, &self.settings)?;
+        let of = (&entry.key, &entry.origin);
+        self.over.keep(of, until, &self.settings)?;
         self.forget(id);
         Ok(())
     }
@@ -490,30 +556,39 @@ impl<P> Responder<P> {
     }
 
     /// The execution is over, with this to say of it.
-    fn conclude(&mut self, id: u64, status: StatusCode, fields: ActionFields<'_>, now: Duration) {
+    fn conclude(
+        &mut self,
+        id: u64,
+        (status, fields): (StatusCode, ActionFields<'_>),
+        repeats: u32,
+        now: Duration,
+    ) {
         let Some(entry) = self.entries.get_mut(&id) else {
             return;
         };
-        self.executing -= 1;
         self.overdue.remove(&id);
         entry.touched = now;
         let Phase::Executing { abandoned, .. } = entry.phase else {
             return;
         };
+        let origin = entry.origin.clone();
         if abandoned {
             entry.phase = Phase::Closed;
             entry.next_send = None;
+            self.account(&origin, |usage| usage.executing -= 1);
             self.closed(id);
         } else {
             let bytes = fields.bytes().len();
             entry.answer_bytes = bytes;
-            entry.phase = Phase::done(status, fields, &self.settings);
+            entry.phase = Phase::done(status, fields, repeats);
             // Executing was said a moment ago, maybe; the answer does not wait for that.
             entry.last_sent = None;
             entry.next_send = None;
             entry.answer(now, Duration::ZERO);
-            let requestor = entry.key.requestor_id.clone();
-            self.account(&requestor, |usage| usage.bytes += bytes);
+            self.account(&origin, |usage| {
+                usage.executing -= 1;
+                usage.bytes += bytes;
+            });
         }
         self.schedule(id);
     }
@@ -522,19 +597,22 @@ impl<P> Responder<P> {
         let Some(entry) = self.entries.get(&id) else {
             return false;
         };
-        let used = self.usage.get(&entry.key.requestor_id);
-        let used = used.map_or(0, |usage| usage.bytes);
+        let used = |usage: Option<&Usage>| usage.map_or(0, |usage| usage.bytes);
+        let (sender, group) = (
+            used(self.usage.get(&entry.origin)),
+            used(self.totals.get(&entry.origin.group)),
+        );
         bytes <= self.settings.max_answer
-            && self.total.bytes + bytes <= self.settings.max_bytes
-            && used + bytes <= self.settings.max_bytes_per_requestor
+            && group + bytes <= self.settings.max_bytes
+            && sender + bytes <= self.settings.max_bytes_per_sender
     }
 
     /// A request is over: nobody will ask for its answer again, whose bytes are freed.
     fn closed(&mut self, id: u64) {
         if let Some(entry) = self.entries.get_mut(&id) {
             let bytes = std::mem::take(&mut entry.answer_bytes);
-            let requestor = entry.key.requestor_id.clone();
-            self.account(&requestor, |usage| {
+            let origin = entry.origin.clone();
+            self.account(&origin, |usage| {
                 usage.bytes -= bytes;
                 usage.closed.insert(id);
             });
@@ -548,21 +626,26 @@ impl<P> Responder<P> {
         self.timers.remove(id, entry.wake);
         self.ids.remove(&entry.key);
         self.overdue.remove(&id);
-        self.executing -= usize::from(matches!(entry.phase, Phase::Executing { .. }));
+        let executing = usize::from(matches!(entry.phase, Phase::Executing { .. }));
         let bytes = entry.key.cost() + entry.answer_bytes;
-        self.account(&entry.key.requestor_id, |usage| {
+        self.account(&entry.origin, |usage| {
+            usage.executing -= executing;
             usage.requests -= 1;
             usage.bytes -= bytes;
             usage.closed.remove(&id);
         });
     }
 
-    fn account(&mut self, requestor: &Option<OwnedPublisherId>, change: impl Fn(&mut Usage)) {
-        change(&mut self.total);
-        let usage = self.usage.entry(requestor.clone()).or_default();
+    fn account(&mut self, origin: &RequestOrigin<P>, change: impl Fn(&mut Usage)) {
+        let usage = self.usage.entry(origin.clone()).or_default();
         change(usage);
         if usage.requests == 0 {
-            self.usage.remove(requestor);
+            self.usage.remove(origin);
+        }
+        let total = self.totals.entry(origin.group).or_default();
+        change(total);
+        if total.requests == 0 {
+            self.totals.remove(&origin.group);
         }
     }
 
@@ -604,6 +687,9 @@ fn is_written_in(dialect: ActionDialect, fields: ActionFields<'_>) -> bool {
 
 const BAD_ENCODING_ERROR: StatusCode = StatusCode(0x8006_0000);
 const BAD_RESPONSE_TOO_LARGE: StatusCode = StatusCode(0x80B9_0000);
+
+/// Repetitions of an answer that nothing but a repetition of its request brings back.
+const ONCE: u32 = 0;
 
 /// What keeps a publishing interval of 0 from sending without end.
 const LEAST_INTERVAL: Duration = Duration::from_millis(1);

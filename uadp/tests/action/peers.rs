@@ -101,8 +101,18 @@ pub(super) fn ask(
     datagram: &[u8],
     now: Duration,
 ) -> Result<Requested, RequestDrop> {
+    ask_from(responder, 0, datagram, now)
+}
+
+/// As [`ask`], from another sender.
+pub(super) fn ask_from(
+    responder: &mut Responder<u16>,
+    sender: u16,
+    datagram: &[u8],
+    now: Duration,
+) -> Result<Requested, RequestDrop> {
     message(datagram, STANDARD, |request| {
-        responder.handle_request(request, 0, now)
+        responder.handle_request(request, sender, now)
     })
 }
 

@@ -4,14 +4,14 @@ use std::time::Duration;
 
 use uadp::action::{
     ActionDialect, ActionEncoding, ActionFields, ActionRequest, ActionState, ExecutionId,
-    FinishRefusal, Outcome, Refusal, RequestDrop, Requested, Requestor, RequestorSettings,
-    Responder, ResponderSettings,
+    FinishRefusal, Outcome, Refusal, RequestDrop, RequestOrigin, Requested, Requestor,
+    RequestorSettings, Responder, ResponderSettings,
 };
 use uadp::{OwnedPublisherId, StatusCode};
 
 use super::STANDARD;
 use super::peers::{
-    ask, at, block, message, number, request, requestor, requests, responder, responses,
+    ask, ask_from, at, block, message, number, request, requestor, requests, responder, responses,
 };
 
 /// One request, as bytes.
@@ -265,21 +265,24 @@ fn many(requestor_id: u16, count: i32) -> Vec<Vec<u8>> {
 fn requests_beyond_the_memory_are_dropped_by_reason_and_not_answered() {
     let mut responder = Responder::new(ResponderSettings {
         max_requests: 5,
-        max_requests_per_requestor: 3,
+        max_requests_per_sender: 3,
         ..ResponderSettings::default()
     });
     let (one, two) = (many(1, 4), many(2, 3));
     for asked in &one[..3] {
-        execute(ask(&mut responder, asked, at(0)));
+        execute(ask_from(&mut responder, 0, asked, at(0)));
     }
     assert_eq!(
         ask(&mut responder, &one[3], at(0)),
-        Err(RequestDrop::RequestorFull)
+        Err(RequestDrop::SenderFull)
     );
     for asked in &two[..2] {
-        execute(ask(&mut responder, asked, at(0)));
+        execute(ask_from(&mut responder, 1, asked, at(0)));
     }
-    assert_eq!(ask(&mut responder, &two[2], at(0)), Err(RequestDrop::Full));
+    assert_eq!(
+        ask_from(&mut responder, 1, &two[2], at(0)),
+        Err(RequestDrop::Full)
+    );
     assert_eq!(due(&mut responder, 0).len(), 5);
     // It is heard once there is room again.
     responder.handle_timeout(at(20_000));
@@ -290,14 +293,14 @@ fn requests_beyond_the_memory_are_dropped_by_reason_and_not_answered() {
 fn requests_that_are_over_make_room_for_others_and_are_still_known() {
     let mut responder = Responder::new(ResponderSettings {
         max_requests: 4,
-        max_requests_per_requestor: 2,
+        max_requests_per_sender: 2,
         max_over: 10,
-        max_over_per_requestor: 8,
+        max_over_per_sender: 8,
         ..ResponderSettings::default()
     });
     let (one, two) = (many(1, 11), many(2, 3));
-    let play = |responder: &mut Responder<u16>, asked: &[u8]| {
-        let execution = execute(ask(responder, asked, at(0)));
+    let play = |responder: &mut Responder<u16>, sender: u16, asked: &[u8]| {
+        let execution = execute(ask_from(responder, sender, asked, at(0)));
         let told = responder.finish(execution, answered(&block(1)), at(0));
         told.unwrap();
         let closed = ask(responder, &idle(asked), at(0));
@@ -305,12 +308,12 @@ fn requests_that_are_over_make_room_for_others_and_are_still_known() {
     };
     // Two with all that is known of them, and 8 more.
     for asked in &one[..10] {
-        play(&mut responder, asked);
+        play(&mut responder, 0, asked);
     }
     let full = ask(&mut responder, &one[10], at(0));
-    assert_eq!(full, Err(RequestDrop::RequestorFull));
+    assert_eq!(full, Err(RequestDrop::SenderFull));
     for asked in &two {
-        play(&mut responder, asked);
+        play(&mut responder, 1, asked);
     }
     assert_eq!(responder.held().0, 13);
     for asked in one[..10].iter().chain(&two) {
@@ -398,10 +401,10 @@ fn requests_beyond_what_can_be_executed_are_refused_as_busy() {
 }
 
 #[test]
-fn bytes_are_bounded_for_each_requestor_and_in_all() {
+fn bytes_are_bounded_for_each_sender_and_in_all() {
     let mut responder = Responder::new(ResponderSettings {
         max_bytes: 3000,
-        max_bytes_per_requestor: 2000,
+        max_bytes_per_sender: 2000,
         max_answer: 1500,
         ..ResponderSettings::default()
     });
@@ -419,15 +422,112 @@ fn bytes_are_bounded_for_each_requestor_and_in_all() {
         .unwrap();
     assert_eq!(
         ask(&mut responder, &one[2], at(0)),
-        Err(RequestDrop::RequestorFull)
+        Err(RequestDrop::SenderFull)
     );
-    let third = execute(ask(&mut responder, &two[0], at(0)));
+    let third = execute(ask_from(&mut responder, 1, &two[0], at(0)));
     let too_big = responder.finish(third, answered(&big(1000)), at(0));
     assert_eq!(too_big, Err(FinishRefusal::TooBig), "max_bytes");
     assert!(responder.held().1 <= 3000);
     responder.handle_timeout(at(60_000));
     while responder.poll_transmit(at(60_000)).is_some() {}
     assert_eq!(responder.held(), (0, 0));
+}
+
+/// Asks in a group, with the verdict of the owner.
+fn ask_judged(
+    responder: &mut Responder<u16>,
+    (group, sender): (usize, u16),
+    datagram: &[u8],
+    (verdict, now): (Result<(), Refusal>, u64),
+) -> Result<Requested, RequestDrop> {
+    let origin = RequestOrigin { group, sender };
+    message(datagram, STANDARD, |request| {
+        responder.handle_judged(request, (origin, verdict), at(now))
+    })
+}
+
+#[test]
+fn a_refused_request_is_answered_once_and_its_repetitions_a_few_times() {
+    let mut responder = responder();
+    let asked = asked(1);
+    let refused = Err(Refusal::NotAllowed);
+    let declined = ask_judged(&mut responder, (0, 0), &asked, (refused, 0));
+    assert_eq!(declined, Ok(Requested::Declined(Refusal::NotAllowed)));
+    let said = responses(&mut responder, at(0));
+    let status = message(&said[0], STANDARD, |response| response.header().status);
+    assert_eq!((said.len(), status), (1, Some(0x801F)));
+    assert_eq!(responder.poll_timeout(), None, "nothing is left to be said");
+    // A repetition within the publishing interval is not answered, and never executed.
+    let mut answers = 0;
+    for now in (50..9_000).step_by(50) {
+        let again = ask_judged(&mut responder, (0, 0), &asked, (Ok(()), now));
+        assert_eq!(again, Err(RequestDrop::Refused));
+        answers += due(&mut responder, now).len();
+    }
+    assert_eq!(answers, 3, "refusal_repeats");
+    assert_eq!(responder.held().0, 1);
+    responder.handle_timeout(at(10_000));
+    assert_eq!(responder.held(), (0, 0));
+}
+
+#[test]
+fn an_acknowledged_refusal_is_closed_at_once() {
+    let mut responder = responder();
+    let asked = asked(1);
+    let refused = Err(Refusal::NotAllowed);
+    ask_judged(&mut responder, (0, 0), &asked, (refused, 0)).unwrap();
+    assert_eq!(due(&mut responder, 0), [DONE]);
+    let closed = ask_judged(&mut responder, (0, 0), &idle(&asked), (refused, 1));
+    assert_eq!(closed, Err(RequestDrop::Refused));
+    assert_eq!(due(&mut responder, 1), [IDLE]);
+}
+
+#[test]
+fn refused_requests_fill_the_room_of_their_sender_and_group_alone() {
+    let mut responder = Responder::new(ResponderSettings {
+        max_refused: 5,
+        max_refused_per_sender: 3,
+        max_requests: 2,
+        max_executing: 1,
+        ..ResponderSettings::default()
+    });
+    let asked = many(1, 12);
+    let refused = Err(Refusal::NotAllowed);
+    let mut ask_of =
+        |of, number: usize, verdict| ask_judged(&mut responder, of, &asked[number], (verdict, 0));
+    for number in 0..3 {
+        ask_of((0, 1), number, refused).unwrap();
+    }
+    assert_eq!(ask_of((0, 1), 3, refused), Err(RequestDrop::SenderFull));
+    ask_of((0, 2), 4, refused).unwrap();
+    ask_of((0, 2), 5, refused).unwrap();
+    assert_eq!(ask_of((0, 2), 6, refused), Err(RequestDrop::Full));
+    // Refusals take no room of requests, and requests of one group none of another.
+    execute(ask_of((0, 3), 7, Ok(())));
+    let busy = ask_of((0, 4), 8, Ok(()));
+    assert!(matches!(busy, Ok(Requested::Refused(_, Refusal::Busy))));
+    assert_eq!(ask_of((0, 5), 9, Ok(())), Err(RequestDrop::Full));
+    execute(ask_of((1, 1), 10, Ok(())));
+    ask_of((1, 1), 11, refused).unwrap();
+    assert_eq!(due(&mut responder, 0).len(), 9, "one answer each");
+}
+
+#[test]
+fn a_refusal_before_anything_was_said_is_said_again_for_repetitions_alone() {
+    let mut responder = responder();
+    let asked = many(1, 2);
+    let early = execute(ask(&mut responder, &asked[0], at(0)));
+    responder.refuse(early, Refusal::Busy, at(0)).unwrap();
+    assert_eq!(due(&mut responder, 0), [DONE]);
+    assert_eq!(due(&mut responder, 1_000), []);
+    ask(&mut responder, &asked[0], at(1_000)).unwrap();
+    assert_eq!(due(&mut responder, 1_000), [DONE]);
+    // A Requestor that knows of the execution does not repeat its request.
+    let late = execute(ask(&mut responder, &asked[1], at(2_000)));
+    assert_eq!(due(&mut responder, 2_000), [EXECUTING]);
+    responder.refuse(late, Refusal::Busy, at(2_010)).unwrap();
+    assert_eq!(due(&mut responder, 2_010), [DONE]);
+    assert_eq!(due(&mut responder, 2_110), [DONE]);
 }
 
 #[test]

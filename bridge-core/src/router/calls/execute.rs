@@ -7,7 +7,8 @@ use std::time::{Duration, Instant};
 use mappings::{PubSub, SpaceId, TopicId};
 use messages::MessageType;
 use uadp::action::{
-    ActionFields, ActionMessage, ExecutionId, FinishRefusal, Outcome, Refusal, Requested,
+    ActionFields, ActionMessage, ExecutionId, FinishRefusal, Outcome, Refusal, RequestDrop,
+    RequestOrigin, Requested,
 };
 use uadp::discovery::{Announced, Announcement, DataSetMetaDataType};
 use uadp::{Fields, PublisherId, SecurityHeader, StatusCode};
@@ -227,14 +228,21 @@ impl Router {
             return self.count_call(topic, Some(from), Reason::NotAsked, String::new);
         }
         let (_, namespace, _) = topic.triple();
-        // Who has the keys is known, wherever it is.
-        let known = from.ip().is_loopback() || self.is_secured(namespace);
+        let origin = self.origin(namespace, from);
+        // A sender that has the keys is known, whatever its address.
+        let known = origin.group != STRANGERS;
+        let group = self.mapping.pubsub().address;
         let Some(calls) = &mut self.calls else {
             return self.count(About::sender(from), Reason::NotAsked, 1, String::new);
         };
         let since = calls.since_start(now);
-        let group = self.mapping.pubsub().address;
-        match calls.responder.handle_request(request, (), since) {
+        let own = calls.table.get(&topic).and_then(|call| call.own.as_ref());
+        let judged = may_be_executed(own, request, (from, group), known);
+        let verdict = judged.as_ref().map(|_| ()).map_err(|refused| refused.0);
+        let requested = calls
+            .responder
+            .handle_judged(request, (origin, verdict), since);
+        match requested {
             // A life of this program before may have executed it, of which nothing is known.
             Ok(Requested::Execute(id)) if !calls.is_of_this_life(request) => {
                 let lost = Outcome::Unknown(uadp::action::Unknown::Lost);
@@ -247,18 +255,15 @@ impl Router {
                 });
             }
             Ok(Requested::Execute(id)) => {
-                let own = calls.table.get(&topic).and_then(|call| call.own.as_ref());
-                match may_be_executed(own, request, (from, group), known) {
-                    Ok((fields, plan)) => {
-                        let read = self.read_request(plan.as_deref(), fields);
-                        self.execute((topic, id), (request, read, plan), now);
-                    }
-                    Err((refusal, case, detail)) => {
-                        // Whom it is told is who asks for it again.
-                        let _told = calls.responder.refuse(id, refusal, since).is_ok();
-                        let cause = (Reason::CallRefused, case);
-                        self.count_call(topic, Some(from), cause, || detail);
-                    }
+                if let Ok((fields, plan)) = judged {
+                    let read = self.read_request(plan.as_deref(), fields);
+                    self.execute((topic, id), (request, read, plan), now);
+                }
+            }
+            Ok(Requested::Declined(_)) => {
+                if let Err((_, case, detail)) = judged {
+                    let cause = (Reason::CallRefused, case);
+                    self.count_call(topic, Some(from), cause, || detail);
                 }
             }
             Ok(Requested::Refused(..)) => {
@@ -273,10 +278,45 @@ impl Router {
                 }
             }
             Ok(Requested::Repeated(_) | Requested::Closed(_)) => {}
+            // A repetition of a refused request, or its acknowledgement: the refusal itself is counted.
+            Err(RequestDrop::Refused) => {
+                self.count_call(topic, Some(from), Reason::NotAsked, String::new);
+            }
             Err(why) => {
                 let cause = (Reason::CallRefused, "request");
                 self.count_call(topic, Some(from), cause, || why.to_string());
             }
+        }
+    }
+
+    /// Returns whether any call of ours in the namespace may be requested from there, so that room may be taken for the chunks
+    /// of a request.
+    pub(in super::super) fn may_request(&self, namespace: u16, from: SocketAddr) -> bool {
+        let calls = self.calls.iter().flat_map(|calls| &calls.table);
+        let is_open = |(topic, call): (&TopicId, &super::Call)| {
+            topic.triple().1 == namespace && call.own.as_ref().is_some_and(|own| own.open)
+        };
+        self.origin(namespace, from).group != STRANGERS || calls.into_iter().any(is_open)
+    }
+
+    /// Returns whose room a request takes up. The members of a secured group are known by their keys and the programs of this
+    /// host by their ports. A stranger has one room for all ports of its host.
+    fn origin(&self, namespace: u16, from: SocketAddr) -> RequestOrigin<SocketAddr> {
+        let guard = self.guard.as_ref();
+        let secured = guard.and_then(|guard| guard.group_of(namespace));
+        match secured {
+            Some(at) => RequestOrigin {
+                group: SECURED.saturating_add(at),
+                sender: from,
+            },
+            None if from.ip().is_loopback() => RequestOrigin {
+                group: LOOPBACK,
+                sender: from,
+            },
+            None => RequestOrigin {
+                group: STRANGERS,
+                sender: SocketAddr::new(from.ip(), 0),
+            },
         }
     }
 
@@ -447,6 +487,12 @@ fn is_answered_at(wanted: &str, (from, group): (SocketAddr, SocketAddr)) -> bool
     wanted.is_empty() || at.is_some_and(|at| at == group || at.ip() == from.ip())
 }
 
+/// Group of the requests of other hosts in clear.
+const STRANGERS: usize = 0;
+/// Group of the requests of this host in clear.
+const LOOPBACK: usize = 1;
+/// Group of the requests of the first secured group.
+const SECURED: usize = 2;
 /// Bad_EncodingError (OPC 10000-6, A.2).
 const BAD_ENCODING_ERROR: StatusCode = StatusCode(0x8006_0000);
 /// As a Responder has them.

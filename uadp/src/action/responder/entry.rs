@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use super::{KeptFields, ResponderSettings};
+use super::{KeptFields, RequestOrigin};
 use crate::action::{ActionAddress, ActionDialect, ActionFields, ActionMessage};
 use crate::{OwnedPublisherId, StatusCode};
 
@@ -20,7 +20,7 @@ pub(super) struct Entry<P> {
     pub(super) key: Key,
     pub(super) address: ActionAddress,
     pub(super) dialect: ActionDialect,
-    pub(super) reply_to: P,
+    pub(super) origin: RequestOrigin<P>,
     /// Tells its arguments from others.
     pub(super) arguments: u64,
     pub(super) phase: Phase,
@@ -79,15 +79,11 @@ impl Key {
 }
 
 impl Phase {
-    pub(super) fn done(
-        status: StatusCode,
-        fields: ActionFields<'_>,
-        settings: &ResponderSettings,
-    ) -> Self {
+    pub(super) fn done(status: StatusCode, fields: ActionFields<'_>, left: u32) -> Self {
         Self::Done {
             status,
             fields: fields.into(),
-            left: settings.done_repeats,
+            left,
         }
     }
 }

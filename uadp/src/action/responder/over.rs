@@ -5,20 +5,79 @@ use std::hash::{DefaultHasher, Hash, Hasher};
 use std::time::Duration;
 
 use super::entry::Key;
-use super::{RequestDrop, ResponderSettings};
-use crate::OwnedPublisherId;
+use super::{RequestDrop, RequestOrigin, ResponderSettings};
 
 /// By a hash of what each is known by: two that fall together among some 100000 are not to be expected, and of those the
 /// second would be dropped and not executed twice.
-#[derive(Debug, Default)]
-pub(super) struct Over {
+#[derive(Debug)]
+pub(super) struct Over<P> {
     hashes: HashSet<u64>,
     /// In the order in which they were put in, and until when each is kept.
-    queue: VecDeque<(Duration, u64, Option<OwnedPublisherId>)>,
-    by_requestor: BTreeMap<Option<OwnedPublisherId>, usize>,
+    queue: VecDeque<(Duration, u64, RequestOrigin<P>)>,
+    counts: Counts<P>,
 }
 
-impl Over {
+/// Requests of each sender and of each group.
+#[derive(Debug)]
+pub(super) struct Counts<P> {
+    senders: BTreeMap<RequestOrigin<P>, usize>,
+    groups: BTreeMap<usize, usize>,
+}
+
+impl<P: Ord + Clone> Counts<P> {
+    pub(super) const fn new() -> Self {
+        Self {
+            senders: BTreeMap::new(),
+            groups: BTreeMap::new(),
+        }
+    }
+
+    /// Checks the room for one more request, of the group and of the sender.
+    pub(super) fn check(
+        &self,
+        origin: &RequestOrigin<P>,
+        (of_group, of_sender): (usize, usize),
+    ) -> Result<(), RequestDrop> {
+        let count = |count: Option<&usize>| count.copied().unwrap_or_default();
+        if count(self.senders.get(origin)) >= of_sender {
+            return Err(RequestDrop::SenderFull);
+        }
+        if count(self.groups.get(&origin.group)) >= of_group {
+            return Err(RequestDrop::Full);
+        }
+        Ok(())
+    }
+
+    pub(super) fn add(&mut self, origin: &RequestOrigin<P>) {
+        *self.senders.entry(origin.clone()).or_default() += 1;
+        *self.groups.entry(origin.group).or_default() += 1;
+    }
+
+    pub(super) fn remove(&mut self, origin: &RequestOrigin<P>) {
+        if let Some(count) = self.senders.get_mut(origin) {
+            *count -= 1;
+            if *count == 0 {
+                self.senders.remove(origin);
+            }
+        }
+        if let Some(count) = self.groups.get_mut(&origin.group) {
+            *count -= 1;
+            if *count == 0 {
+                self.groups.remove(&origin.group);
+            }
+        }
+    }
+}
+
+impl<P: Ord + Clone> Over<P> {
+    pub(super) fn new() -> Self {
+        Self {
+            hashes: HashSet::new(),
+            queue: VecDeque::new(),
+            counts: Counts::new(),
+        }
+    }
+
     /// Whether it is one of them.
     pub(super) fn has(&self, key: &Key) -> bool {
         !self.hashes.is_empty() && self.hashes.contains(&hash(key))
@@ -27,22 +86,16 @@ impl Over {
     /// Keeps one until then.
     pub(super) fn keep(
         &mut self,
-        key: &Key,
+        (key, origin): (&Key, &RequestOrigin<P>),
         until: Duration,
         settings: &ResponderSettings,
     ) -> Result<(), RequestDrop> {
-        if self.queue.len() >= settings.max_over {
-            return Err(RequestDrop::Full);
-        }
-        let kept = self.by_requestor.get(&key.requestor_id);
-        if kept.is_some_and(|kept| *kept >= settings.max_over_per_requestor) {
-            return Err(RequestDrop::RequestorFull);
-        }
+        let limits = (settings.max_over, settings.max_over_per_sender);
+        self.counts.check(origin, limits)?;
         let hash = hash(key);
         if self.hashes.insert(hash) {
-            let requestor = key.requestor_id.clone();
-            self.queue.push_back((until, hash, requestor.clone()));
-            *self.by_requestor.entry(requestor).or_default() += 1;
+            self.queue.push_back((until, hash, origin.clone()));
+            self.counts.add(origin);
         }
         Ok(())
     }
@@ -51,15 +104,10 @@ impl Over {
     pub(super) fn forget_until(&mut self, now: Duration) {
         while let Some((until, ..)) = self.queue.front()
             && *until <= now
-            && let Some((_, hash, requestor)) = self.queue.pop_front()
+            && let Some((_, hash, origin)) = self.queue.pop_front()
         {
             self.hashes.remove(&hash);
-            if let Some(kept) = self.by_requestor.get_mut(&requestor) {
-                *kept -= 1;
-                if *kept == 0 {
-                    self.by_requestor.remove(&requestor);
-                }
-            }
+            self.counts.remove(&origin);
         }
     }
 
@@ -68,7 +116,7 @@ impl Over {
     }
 }
 
-fn hash(key: &Key) -> u64 {
+pub(super) fn hash(key: &Key) -> u64 {
     let mut hasher = DefaultHasher::new();
     key.hash(&mut hasher);
     hasher.finish()

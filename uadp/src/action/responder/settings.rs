@@ -11,6 +11,9 @@ pub struct ResponderSettings {
     pub publishing_interval: Duration,
     /// How often an answer is said without being asked for again. Default 20.
     pub done_repeats: u32,
+    /// How often the answer to a request that [`handle_judged`](crate::action::Responder::handle_judged) refuses is said
+    /// again, each time for a repetition of the request. Default 3.
+    pub refusal_repeats: u8,
     /// How long a request is remembered after it was heard of last: longer than any the network may hold back.
     /// Default 10 s.
     pub remember: Duration,
@@ -19,24 +22,40 @@ pub struct ResponderSettings {
     /// Longest deadline that is kept: what is executed for longer goes on, but its answer is not waited for.
     /// Default 1 h.
     pub max_timeout: Duration,
-    /// Requests executed at a time; further ones are refused as [`Refusal::Busy`]. Default 256.
+    /// Requests of a group executed at a time; further ones are refused as [`Refusal::Busy`]. Default 256.
     pub max_executing: usize,
-    /// Requests remembered with all that is known of them. Default 8192.
+    /// Requests of one sender executed at a time; further ones are refused as [`Refusal::Busy`]. Default 256.
+    pub max_executing_per_sender: usize,
+    /// Requests of a group remembered with all that is known of them. Default 8192.
     pub max_requests: usize,
-    /// Those of one RequestorId. Default 2048.
-    pub max_requests_per_requestor: usize,
-    /// Requests that are over, beside those: enough of each is kept to know it again, about 100 bytes. Default 131072.
+    /// Requests of one sender remembered with all that is known of them. Default 2048.
+    pub max_requests_per_sender: usize,
+    /// Requests of a group that are over, beside those: enough of each is kept to know it again, about 100 bytes.
+    /// Default 131072.
     pub max_over: usize,
-    /// Those of one RequestorId. Default 65536.
-    pub max_over_per_requestor: usize,
-    /// Bytes of all that is remembered, but for those of [`max_over`](Self::max_over). Default 16 MiB.
+    /// Requests of one sender that are over. Default 65536.
+    pub max_over_per_sender: usize,
+    /// Refused requests of a group that are remembered, about 100 bytes each. Default 4096.
+    pub max_refused: usize,
+    /// Refused requests of one sender that are remembered. Further ones are dropped without an answer. Default 512.
+    pub max_refused_per_sender: usize,
+    /// Bytes of all that is remembered of a group, but for those of [`max_over`](Self::max_over). Default 16 MiB.
     pub max_bytes: usize,
-    /// Bytes remembered of one RequestorId. Default 4 MiB.
-    pub max_bytes_per_requestor: usize,
+    /// Bytes remembered of one sender. Default 4 MiB.
+    pub max_bytes_per_sender: usize,
     /// Bytes of the fields of one answer, which has to fit in a datagram. Default 60000.
     pub max_answer: usize,
     /// Bytes of CorrelationData. Default 64.
     pub max_correlation_data: usize,
+}
+
+/// The sender of a request, as the carrier distinguishes senders. The request takes up its room.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct RequestOrigin<P> {
+    /// Number of the group of senders that shares the limits of a group in [`ResponderSettings`], such as a SecurityGroup.
+    pub group: usize,
+    /// The sender, and where its answers go.
+    pub sender: P,
 }
 
 /// A request as its Responder knows it, unlike all others of it.
@@ -58,6 +77,8 @@ pub enum Requested {
     Execute(ExecutionId),
     /// Nothing: it is refused.
     Refused(ExecutionId, Refusal),
+    /// Nothing: the owner refuses it, and that is answered once.
+    Declined(Refusal),
     /// Nothing: it was heard before, and is answered once more.
     Repeated(ExecutionId),
     /// The Requestor does not want what is still executed: cancel it where that can be done, and finish it.
@@ -85,9 +106,12 @@ pub enum RequestDrop {
     /// It is over, and not answered any more.
     #[error("a request that is over")]
     Over,
-    /// The Requestor has as much as it may have.
-    #[error("too many requests of this requestor")]
-    RequestorFull,
+    /// The sender has as much room as it may have.
+    #[error("too many requests of this sender")]
+    SenderFull,
+    /// The request was refused before.
+    #[error("a request that was refused")]
+    Refused,
     /// There is no room to remember it.
     #[error("too many requests")]
     Full,
@@ -122,7 +146,7 @@ pub enum FinishRefusal {
 pub struct ResponderCounters {
     /// Requests handed out to be executed.
     pub executed: u64,
-    /// Requests refused for want of room to execute them.
+    /// Requests refused by the owner before room was taken for them, or for want of room to execute them.
     pub refused: u64,
     /// Requests heard before.
     pub repeated: u64,
@@ -146,13 +170,17 @@ impl Default for ResponderSettings {
             remember: Duration::from_secs(10),
             timeout: Duration::from_secs(60),
             max_timeout: Duration::from_secs(3600),
+            refusal_repeats: 3,
             max_executing: 256,
+            max_executing_per_sender: 256,
             max_requests: 8192,
-            max_requests_per_requestor: 2048,
+            max_requests_per_sender: 2048,
             max_over: 131_072,
-            max_over_per_requestor: 65_536,
+            max_over_per_sender: 65_536,
+            max_refused: 4_096,
+            max_refused_per_sender: 512,
             max_bytes: 16 << 20,
-            max_bytes_per_requestor: 4 << 20,
+            max_bytes_per_sender: 4 << 20,
             max_answer: 60_000,
             max_correlation_data: 64,
         }

@@ -1,0 +1,178 @@
+//! Requests that are refused before room is taken for them: enough of each to answer its repetitions alike, and to execute
+//! none of them, even where the owner would permit it by then.
+
+use std::collections::{HashMap, VecDeque};
+use std::time::Duration;
+
+use super::entry::Key;
+use super::over::{Counts, hash};
+use super::{RequestDrop, RequestOrigin, Requested, ResponderSettings};
+use crate::OwnedPublisherId;
+use crate::action::{
+    ActionAddress, ActionDialect, ActionFields, ActionHeader, ActionKind, ActionMessage,
+    ActionState, ActionToSend, Refusal,
+};
+
+/// The refused requests, each by a hash of its key.
+#[derive(Debug)]
+pub(super) struct Refused<P> {
+    known: HashMap<u64, Known<P>>,
+    /// Hashes in the order in which they were put in, and until when each is kept.
+    queue: VecDeque<(Duration, u64)>,
+    counts: Counts<P>,
+    /// Answers to be sent: at most one of each refused request.
+    answers: VecDeque<Answer<P>>,
+}
+
+#[derive(Debug)]
+struct Known<P> {
+    origin: RequestOrigin<P>,
+    refusal: Refusal,
+    /// When it was answered last.
+    answered: Duration,
+    /// How often a repetition is still answered.
+    left: u8,
+}
+
+/// An answer to a refused request.
+#[derive(Debug)]
+pub(super) struct Answer<P> {
+    pub(super) origin: RequestOrigin<P>,
+    key: Key,
+    address: ActionAddress,
+    state: ActionState,
+    status: Option<u16>,
+    due: Duration,
+}
+
+impl<P> Answer<P> {
+    pub(super) fn to_send(&self) -> ActionToSend<'_> {
+        ActionToSend {
+            address: &self.address,
+            action: ActionHeader {
+                correlation_data: self.key.correlation_data.as_deref(),
+                requestor_id: self.key.requestor_id.as_ref().map(OwnedPublisherId::as_id),
+                ..ActionHeader::new(ActionKind::Response)
+            },
+            request_id: self.key.request_id,
+            // An answer without fields fits every datagram, so that no chunk needs its number.
+            call: u64::MAX,
+            state: self.state,
+            status: self.status,
+            fields: ActionFields::NONE,
+            dialect: ActionDialect::Standard,
+        }
+    }
+}
+
+impl<P: Ord + Clone> Refused<P> {
+    pub(super) fn new() -> Self {
+        Self {
+            known: HashMap::new(),
+            queue: VecDeque::new(),
+            counts: Counts::new(),
+            answers: VecDeque::new(),
+        }
+    }
+
+    /// Refuses a request for the first time.
+    pub(super) fn refuse(
+        &mut self,
+        key: Key,
+        (request, (origin, refusal)): (&ActionMessage<'_>, (RequestOrigin<P>, Refusal)),
+        settings: &ResponderSettings,
+        now: Duration,
+    ) -> Result<Requested, RequestDrop> {
+        let limits = (settings.max_refused, settings.max_refused_per_sender);
+        self.counts.check(&origin, limits)?;
+        let hash = hash(&key);
+        let until = now.saturating_add(settings.remember);
+        self.counts.add(&origin);
+        self.queue.push_back((until, hash));
+        let known = Known {
+            origin: origin.clone(),
+            refusal,
+            answered: now,
+            left: settings.refusal_repeats,
+        };
+        self.known.insert(hash, known);
+        self.answer((key, origin, refusal), request, now);
+        Ok(Requested::Declined(refusal))
+    }
+
+    /// Answers a request that was refused before; `None` for any other request.
+    pub(super) fn repeated(
+        &mut self,
+        key: &Key,
+        request: &ActionMessage<'_>,
+        settings: &ResponderSettings,
+        now: Duration,
+    ) -> Option<RequestDrop> {
+        if self.known.is_empty() {
+            return None;
+        }
+        let known = self.known.get_mut(&hash(key))?;
+        let again = known.answered.saturating_add(settings.publishing_interval);
+        // The acknowledgement follows at once, and is answered like a repetition.
+        let is_due = now >= again || request.state == ActionState::Idle;
+        if known.left > 0 && is_due {
+            known.left -= 1;
+            known.answered = now;
+            let answer = (key.clone(), known.origin.clone(), known.refusal);
+            self.answer(answer, request, now);
+        }
+        Some(RequestDrop::Refused)
+    }
+
+    /// Answers with the refusal, or acknowledges an acknowledgement. The one-shot dialect has no place for a status.
+    fn answer(
+        &mut self,
+        (key, origin, refusal): (Key, RequestOrigin<P>, Refusal),
+        request: &ActionMessage<'_>,
+        now: Duration,
+    ) {
+        if request.dialect != ActionDialect::Standard {
+            return;
+        }
+        let (state, status) = match request.state {
+            ActionState::Idle => (ActionState::Idle, None),
+            ActionState::Executing | ActionState::Done => {
+                (ActionState::Done, Some(refusal.status_code().status()))
+            }
+        };
+        self.answers.push_back(Answer {
+            origin,
+            key,
+            address: request.into(),
+            state,
+            status,
+            due: now,
+        });
+    }
+
+    /// The next answer.
+    pub(super) fn pop(&mut self) -> Option<Answer<P>> {
+        self.answers.pop_front()
+    }
+
+    /// When the next answer is due.
+    pub(super) fn due(&self) -> Option<Duration> {
+        Some(self.answers.front()?.due)
+    }
+
+    /// Forgets those that are old enough.
+    pub(super) fn forget_until(&mut self, now: Duration) {
+        while let Some((until, _)) = self.queue.front()
+            && *until <= now
+            && let Some((_, hash)) = self.queue.pop_front()
+        {
+            if let Some(known) = self.known.remove(&hash) {
+                self.counts.remove(&known.origin);
+            }
+        }
+    }
+
+    pub(super) fn len(&self) -> usize {
+        self.queue.len()
+    }
+}
