@@ -361,6 +361,13 @@ impl Requestor {
         heard
     }
 
+    /// Whether a response answers a call that is open here, whoever sent it.
+    #[must_use]
+    pub fn is_awaited(&self, response: &ActionMessage<'_>) -> bool {
+        let id = self.id_of(response);
+        id.is_ok_and(|id| self.calls.contains_key(&id))
+    }
+
     /// Ends calls that are past their deadline or whose Responder is silent.
     pub fn handle_timeout(&mut self, now: Duration) {
         // An entry is moved behind `now` or left to be sent, which stands at the front then.

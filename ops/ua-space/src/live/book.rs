@@ -94,15 +94,17 @@ impl Drop {
 pub(crate) enum News<'a> {
     /// A value, or a sign of life without one.
     Sample(Sample<'a>),
-    /// A response of an Action.
-    Response(ActionMessage<'a>),
-    /// What a topic or call is, which was not known or is another now.
-    Announced(TopicId, Kind, &'a Arc<Described>),
+    /// A response of an Action, and its sender.
+    Response(ActionMessage<'a>, SocketAddr),
+    /// The announcement of a topic or call that is new or has changed, and its sender.
+    Announced(TopicId, Kind, &'a Arc<Described>, SocketAddr),
 }
 
 /// A DataSetMessage of a topic.
 pub(crate) struct Sample<'a> {
     pub(crate) topic: TopicId,
+    /// Address of its sender.
+    pub(crate) from: SocketAddr,
     /// What its writer says it is.
     pub(crate) described: Option<Arc<Described>>,
     /// Of its NetworkMessage.
@@ -145,7 +147,7 @@ impl Book {
             return self.count(Drop::NotInSpace);
         };
         if message.is_action() && !message.is_sealed() {
-            return self.actions(message, each);
+            return self.actions((message, from), each);
         }
         if message.is_chunk() && !message.is_sealed() {
             return self.chunk(message, (space, from), now, each);
@@ -180,7 +182,16 @@ impl Book {
     pub(crate) fn announced(
         &self,
     ) -> impl Iterator<Item = (TopicId, Kind, &Arc<Described>, SocketAddr)> {
-        let mut all: Vec<_> = self.announced.iter().collect();
+        self.announced_where(|_| true)
+    }
+
+    /// As [`announced`](Self::announced), by some senders only.
+    pub(crate) fn announced_where(
+        &self,
+        counts: impl Fn(SocketAddr) -> bool,
+    ) -> impl Iterator<Item = (TopicId, Kind, &Arc<Described>, SocketAddr)> {
+        let all = self.announced.iter();
+        let mut all: Vec<_> = all.filter(|((_, _, from), _)| counts(*from)).collect();
         all.sort_by_key(|((topic, kind, from), found)| (*topic, *kind, found.first, *from));
         all.dedup_by_key(|((topic, kind, _), _)| (*topic, *kind));
         all.into_iter()
@@ -205,13 +216,16 @@ impl Book {
         self.applications.iter()
     }
 
-    /// The spaces that something is heard or known of.
+    /// The spaces that something is heard or known of, and those that an application speaks for.
     pub(crate) fn spaces(&self) -> BTreeSet<u16> {
         let all = self
             .topics
             .keys()
             .chain(self.announced.keys().map(|(topic, ..)| topic));
-        all.map(|topic| topic.space.into()).collect()
+        let applications = self.applications.keys().map(|(space, _)| *space);
+        all.map(|topic| topic.space.into())
+            .chain(applications)
+            .collect()
     }
 
     /// What was not taken, and how often.
@@ -248,7 +262,7 @@ impl Book {
     fn sample(
         &mut self,
         (network, message): (NetworkHeader<'_>, DataSetMessage<'_>),
-        from: ((u16, SocketAddr), u16),
+        from @ ((_, sender), _): ((u16, SocketAddr), u16),
         now: Duration,
         each: &mut dyn FnMut(News<'_>),
     ) {
@@ -258,6 +272,7 @@ impl Book {
         if let Some(topic) = self.hear(writer_id, from, now, Some(&message)) {
             each(News::Sample(Sample {
                 topic,
+                from: sender,
                 described: self.described(topic).cloned(),
                 network,
                 message,
@@ -329,7 +344,7 @@ impl Book {
             Ok(Some(whole)) if whole.writer_id.is_none() => {
                 match NetworkMessage::decode(whole.bytes) {
                     Ok(inner) if inner.is_action() && !inner.is_sealed() => {
-                        self.actions(&inner, each);
+                        self.actions((&inner, of.1), each);
                     }
                     Ok(_) | Err(_) => self.count(Drop::Malformed),
                 }
@@ -351,7 +366,11 @@ impl Book {
         self.reassembler = reassembler;
     }
 
-    fn actions(&mut self, message: &NetworkMessage<'_>, each: &mut dyn FnMut(News<'_>)) {
+    fn actions(
+        &mut self,
+        (message, from): (&NetworkMessage<'_>, SocketAddr),
+        each: &mut dyn FnMut(News<'_>),
+    ) {
         let Ok(actions) = message.actions(ActionDialect::Standard) else {
             return self.count(Drop::Malformed);
         };
@@ -360,7 +379,7 @@ impl Book {
         }
         for action in actions {
             match action {
-                Ok(action) => each(News::Response(action)),
+                Ok(action) => each(News::Response(action, from)),
                 Err(_) => self.count(Drop::Malformed),
             }
         }
@@ -407,7 +426,7 @@ impl Book {
         match (topic, described) {
             (Some(topic), Some(Ok(described))) => {
                 if let Some(news) = self.keep((topic, kind, from), described, now) {
-                    each(News::Announced(topic, kind, &news));
+                    each(News::Announced(topic, kind, &news, from));
                 }
             }
             // What a publisher has not got, or not any more.

@@ -1,5 +1,6 @@
 //! `ua-space call`: asks for a call of the space, and follows the run of a skill or the goal of an action to its end.
 
+mod executor;
 mod goal;
 mod words;
 
@@ -16,6 +17,7 @@ use uadp::action::{
 };
 use uadp::{Extras, NetworkHeader, OwnedPublisherId, StatusCode};
 
+use self::executor::Executor;
 use super::book::{Kind, News};
 use super::described::{self, Described};
 use super::list::json;
@@ -43,6 +45,7 @@ fn ask_for(arguments: &Call, is_told: bool) -> Result<(), Failure> {
         let mut asking = Asking {
             live,
             requestor: requestor(),
+            executor: Executor::default(),
             arguments,
         };
         let (topic, described) = asking.find().await?;
@@ -120,6 +123,8 @@ enum Came {
 struct Asking<'a> {
     live: Live,
     requestor: Requestor,
+    /// The sender that announced the call.
+    executor: Executor,
     arguments: &'a Call,
 }
 
@@ -129,7 +134,11 @@ impl Asking<'_> {
         let target = &self.arguments.target;
         match target {
             Target::Topic(topic) => self.live.want(*topic),
-            Target::Name(_) => self.live.want_calls([0]),
+            // A bridge without values is found by asking which applications there are.
+            Target::Name(_) => {
+                self.live.want_all();
+                self.live.want_calls([0]);
+            }
         }
         let start = format!("{target}.Start");
         let fits = |topic: TopicId, described: &Described| match target {
@@ -139,15 +148,16 @@ impl Asking<'_> {
         let end = until(self.live.now(), Some(self.arguments.wait));
         let mut found = None;
         let mut each = |news: News<'_>, _| match news {
-            News::Announced(topic, Kind::Call, described) if fits(topic, described) => {
-                found = Some((topic, Arc::clone(described)));
+            News::Announced(topic, Kind::Call, described, from) if fits(topic, described) => {
+                found = Some((topic, Arc::clone(described), from));
                 Go::Enough
             }
-            News::Announced(..) | News::Sample(_) | News::Response(_) => Go::On,
+            News::Announced(..) | News::Sample(_) | News::Response(..) => Go::On,
         };
         let ended = self.live.listen(end, &mut each).await?;
         match (found, ended) {
-            (Some((topic, described)), _) => {
+            (Some((topic, described, from)), _) => {
+                self.executor = Executor::at(from);
                 if self.live.book.announcers(topic) > 1 {
                     warn(&format!(
                         "{topic} is announced from several addresses; the first one counts"
@@ -267,12 +277,17 @@ impl Asking<'_> {
     ) -> Result<Ended, Failure> {
         self.transmit()?;
         let Self {
-            live, requestor, ..
+            live,
+            requestor,
+            executor,
+            ..
         } = self;
         let next = requestor.poll_timeout().unwrap_or(until).min(until);
         let ended = {
             let mut each = |news: News<'_>, now| {
-                if let News::Response(response) = &news {
+                if let News::Response(response, from) = &news
+                    && executor.answers(requestor, (response, *from))
+                {
                     *came = hear(requestor, response, (described, now));
                 }
                 if came.is_some() { Go::Enough } else { Go::On }
@@ -376,6 +391,7 @@ impl Asking<'_> {
             End::Overtaken => unknown("another one began"),
             End::NoResult => unknown("it ended and no result came"),
             End::Silent => unknown("nothing was heard of the component"),
+            End::NoSuchRun => unknown("the component publishes the state of other runs only"),
         }
     }
 
@@ -388,17 +404,24 @@ impl Asking<'_> {
     ) -> Result<Ended, Failure> {
         self.transmit()?;
         let Self {
-            live, requestor, ..
+            live,
+            requestor,
+            executor,
+            ..
         } = self;
         let next = requestor.poll_timeout().unwrap_or(Duration::MAX);
         let next = next.min(live.now() + LOOK);
         let mut each = |news: News<'_>, now| {
             match &news {
-                News::Response(response) => {
+                News::Response(response, from) => {
                     // Acknowledgements, and the answer of Halt.
-                    let _heard = requestor.handle_response(response, now).is_ok();
+                    if executor.answers(requestor, (response, *from)) {
+                        let _heard = requestor.handle_response(response, now).is_ok();
+                    }
                 }
-                News::Sample(sample) if places.has(sample.topic) => {
+                News::Sample(sample)
+                    if places.has(sample.topic) && executor.publishes(sample.from) =>
+                {
                     let described = sample.described.as_deref();
                     if let Ok(value) = plain::message(&sample.message, described)
                         && described.is_some()

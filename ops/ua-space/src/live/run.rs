@@ -49,6 +49,8 @@ pub(super) enum End {
     NoResult,
     /// Nothing is heard of the component.
     Silent,
+    /// The component publishes the state of other runs only.
+    NoSuchRun,
 }
 
 /// A run that is followed.
@@ -58,6 +60,8 @@ pub(super) struct Run {
     state: Option<String>,
     progress: Option<(u32, String)>,
     ended: Option<(End, Duration)>,
+    /// First state of an earlier run, while none of this run was received.
+    earlier: Option<Duration>,
     heard: Duration,
     succeeded: Option<bool>,
 }
@@ -92,6 +96,7 @@ impl Run {
             state: None,
             progress: None,
             ended: None,
+            earlier: None,
             heard: now,
             succeeded: None,
         }
@@ -127,13 +132,16 @@ impl Run {
 
     fn state(&mut self, value: &Named, now: Duration) -> Vec<Step> {
         match value.number("run") {
-            Some(run) if run == self.number => {}
+            Some(run) if run == self.number => self.earlier = None,
             // Runs are counted.
             Some(run) if run > self.number => {
                 self.ended.get_or_insert((End::Overtaken, now));
                 return Vec::new();
             }
-            Some(_) | None => return Vec::new(),
+            Some(_) | None => {
+                self.earlier.get_or_insert(now);
+                return Vec::new();
+            }
         }
         let state = value.text("state").unwrap_or_default();
         let transition = value
@@ -200,6 +208,13 @@ impl Run {
             }),
             (None, Some((end, _))) if since >= Some(LATE) => Some(end),
             (Some(_) | None, _) if now.saturating_sub(self.heard) >= SILENT => Some(End::Silent),
+            (None, None)
+                if self
+                    .earlier
+                    .is_some_and(|at| now.saturating_sub(at) >= LATE) =>
+            {
+                Some(End::NoSuchRun)
+            }
             (Some(_) | None, _) => None,
         }
     }
@@ -319,6 +334,21 @@ mod tests {
         assert!(!places().has(topic("ua_0_8_101")));
         assert_eq!(Places::of(topic("ua_0_7_106"), "gripper.Grasp.Halt"), None);
         assert_eq!(Places::of(topic("ua_0_7_61"), "reset.Start"), None);
+    }
+
+    #[test]
+    fn a_run_that_its_component_does_not_know_comes_to_an_end() {
+        let mut run = Run::new(4242, at(0));
+        for now in 0..3 {
+            assert!(state(&mut run, 2, "Ready", 0.0, now).is_empty());
+            assert_eq!(run.end(at(now)), None, "the first state may be an old one");
+        }
+        assert!(state(&mut run, 2, "Ready", 0.0, 3).is_empty());
+        assert_eq!(run.end(at(3)), Some(End::NoSuchRun));
+        let mut late = Run::new(3, at(0));
+        assert!(state(&mut late, 2, "Ready", 0.0, 0).is_empty());
+        assert!(!state(&mut late, 3, "Running", 0.0, 1).is_empty());
+        assert_eq!(late.end(at(5)), None);
     }
 
     #[test]

@@ -1,6 +1,6 @@
 use uadp::discovery::{
-    ActionMetaData as ActionMeta, ActionTargetDataType, ConfigurationVersion, DataSetMetaDataType,
-    FieldMetaData, KeyValuePair, List,
+    ActionMetaData as ActionMeta, ActionTargetDataType, ApplicationDescription,
+    ConfigurationVersion, DataSetMetaDataType, FieldMetaData, KeyValuePair, List,
 };
 use uadp::{
     BuiltinType, Chunks, DataSetHeader, GroupHeader, LocalizedText, NetworkMessageEncoder,
@@ -151,6 +151,27 @@ fn only_who_sends_the_values_says_what_they_are() {
 }
 
 #[test]
+fn a_space_without_values_is_known_by_its_application() {
+    let mut book = Book::new();
+    let announcement = Announcement {
+        sequence_number: 1,
+        announced: Announced::ApplicationDescription {
+            description: ApplicationDescription {
+                application_uri: Some("urn:example:bridge"),
+                ..ApplicationDescription::default()
+            },
+            capabilities: List::null(),
+        },
+    };
+    let mut datagram = Vec::new();
+    announcement
+        .encode(PublisherId::UInt16(2), SecurityHeader::NONE, &mut datagram)
+        .unwrap();
+    take(&mut book, &datagram, 1);
+    assert_eq!(book.spaces(), BTreeSet::from([2]));
+}
+
+#[test]
 fn what_is_withdrawn_is_forgotten() {
     let mut book = Book::new();
     take(&mut book, &value((0, 7, 101), Scalar::Byte(1)), 1);
@@ -203,7 +224,7 @@ fn a_call_is_known_by_its_name_with_what_may_be_left_out_of_it() {
     for port in [1, 1, 2] {
         let message = NetworkMessage::decode(&datagram).unwrap();
         book.handle((&message, from(port)), NOW, &mut |news| {
-            if let News::Announced(topic, kind, described) = news {
+            if let News::Announced(topic, kind, described, _) = news {
                 heard.push((topic, kind, described.summary()));
             }
         });

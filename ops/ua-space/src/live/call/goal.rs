@@ -174,13 +174,20 @@ impl Asking<'_> {
         }
         let mut found: [Option<Arc<Described>>; 2] = [None, None];
         let mut hears_feedback = false;
-        for (topic, kind, described, _) in self.live.book.announced() {
+        let executor = self.executor;
+        for (topic, kind, described, _) in self
+            .live
+            .book
+            .announced_where(|from| executor.publishes(from))
+        {
             take(&mut found, parts, (topic, kind), described);
             hears_feedback |= (topic, kind) == (parts.feedback, Kind::Value);
         }
         let end = until(self.live.now(), Some(self.arguments.wait));
         let mut each = |news: News<'_>, _| {
-            if let News::Announced(topic, kind, described) = news {
+            if let News::Announced(topic, kind, described, from) = news
+                && executor.publishes(from)
+            {
                 take(&mut found, parts, (topic, kind), described);
                 hears_feedback |= (topic, kind) == (parts.feedback, Kind::Value);
             }
@@ -250,21 +257,28 @@ impl Asking<'_> {
     ) -> Result<(Ended, Vec<Told>, Option<Came>), Failure> {
         self.transmit()?;
         let Self {
-            live, requestor, ..
+            live,
+            requestor,
+            executor,
+            ..
         } = self;
         let next = requestor.poll_timeout().unwrap_or(Duration::MAX);
         let next = next.min(live.now() + LOOK);
         let (mut told, mut came) = (Vec::new(), None);
         let mut each = |news: News<'_>, now| {
             match &news {
-                News::Response(response) => {
-                    if let Ok(Heard::Done(call, outcome)) = requestor.handle_response(response, now)
+                News::Response(response, from) => {
+                    if executor.answers(requestor, (response, *from))
+                        && let Ok(Heard::Done(call, outcome)) =
+                            requestor.handle_response(response, now)
                         && call == goal.waits
                     {
                         came = Some(hear(&outcome, &goal.result));
                     }
                 }
-                News::Sample(sample) if sample.topic == goal.parts.feedback => {
+                News::Sample(sample)
+                    if sample.topic == goal.parts.feedback && executor.publishes(sample.from) =>
+                {
                     let described = sample.described.as_deref();
                     if let Ok(value) = plain::message(&sample.message, described)
                         && value.text(words::GOAL_ID) == Some(&goal.id)

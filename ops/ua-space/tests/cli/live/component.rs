@@ -9,7 +9,8 @@ use std::time::Duration;
 use tokio::time::Instant;
 use transport::{Options, Udp};
 use uadp::action::{
-    ActionDialect, ActionFields, ActionKind, Outcome, Requested, Responder, ResponderSettings,
+    ActionDialect, ActionFields, ActionKind, ActionMessage, Outcome, Requested, Responder,
+    ResponderSettings,
 };
 use uadp::discovery::{
     ActionMetaData, ActionTargetDataType, Announced, Announcement, DataSetMetaDataType,
@@ -45,6 +46,15 @@ struct Seen {
 
 impl Component {
     pub(crate) fn start() -> Self {
+        Self::start_beside(false)
+    }
+
+    /// With a stranger that answers every request before the component does, from a port of its own.
+    pub(crate) fn start_beside_a_forger() -> Self {
+        Self::start_beside(true)
+    }
+
+    fn start_beside(is_forged: bool) -> Self {
         let port = UdpSocket::bind("127.0.0.1:0").unwrap();
         let port = port.local_addr().unwrap().port();
         let address = SocketAddr::from((Ipv4Addr::new(239, 255, 41, 7), port));
@@ -63,8 +73,14 @@ impl Component {
                     ..Options::new(address)
                 };
                 let udp = Udp::open(&options).unwrap();
+                let mut gripper = Gripper::new(udp, its);
+                if is_forged {
+                    let udp = Udp::open(&options).unwrap();
+                    let responder = Responder::new(ResponderSettings::default());
+                    gripper.forger = Some((udp, responder));
+                }
                 ready.send(()).unwrap();
-                Gripper::new(udp, its).run().await;
+                gripper.run().await;
             });
         });
         is_ready.recv().unwrap();
@@ -110,6 +126,7 @@ struct Gripper {
     seen: Arc<Seen>,
     start: Instant,
     responder: Responder<()>,
+    forger: Option<(Udp, Responder<()>)>,
     run: u32,
     /// Since when it runs, and when it will be done.
     running: Option<(Instant, Duration)>,
@@ -125,6 +142,7 @@ impl Gripper {
             seen,
             start: Instant::now(),
             responder: Responder::new(ResponderSettings::default()),
+            forger: None,
             run: 0,
             running: None,
             last_transition: "HaltedToReady",
@@ -172,6 +190,7 @@ impl Gripper {
                 if action.action.kind == ActionKind::Response {
                     continue;
                 }
+                self.forge(&action);
                 let asked = self
                     .responder
                     .handle_request(&action, (), self.start.elapsed());
@@ -187,6 +206,24 @@ impl Gripper {
                 }
             }
         }
+    }
+
+    /// Answers in the name of the component, with a run that there is none of.
+    fn forge(&mut self, action: &ActionMessage<'_>) {
+        let now = self.start.elapsed();
+        let Some((udp, responder)) = &mut self.forger else {
+            return;
+        };
+        if let Ok(Requested::Execute(execution)) = responder.handle_request(action, (), now) {
+            let mut block = vec![3, 0, 1, 1, 12, 0, 0, 0, 0, 7];
+            block.extend(4242_u32.to_le_bytes());
+            let outcome = Outcome::Answered {
+                status: StatusCode::GOOD,
+                fields: ActionFields::Variants(&block),
+            };
+            responder.finish(execution, outcome, now).unwrap();
+        }
+        send_due(udp, responder, now);
     }
 
     /// The response: success, message, run.
@@ -365,16 +402,19 @@ impl Gripper {
     }
 
     fn transmit(&mut self) {
-        let now = self.start.elapsed();
-        while let Some(((), response)) = self.responder.poll_transmit(now) {
-            let mut datagram = Vec::new();
-            response
-                .encode(&mut datagram, &NetworkHeader::default(), &Extras::default())
-                .unwrap()
-                .finish()
-                .unwrap();
-            self.udp.try_send(&datagram).unwrap();
-        }
+        send_due(&self.udp, &mut self.responder, self.start.elapsed());
+    }
+}
+
+fn send_due(udp: &Udp, responder: &mut Responder<()>, now: Duration) {
+    while let Some(((), response)) = responder.poll_transmit(now) {
+        let mut datagram = Vec::new();
+        response
+            .encode(&mut datagram, &NetworkHeader::default(), &Extras::default())
+            .unwrap()
+            .finish()
+            .unwrap();
+        udp.try_send(&datagram).unwrap();
     }
 }
 

@@ -229,6 +229,17 @@ fn a_skill_is_started_by_its_name_and_followed_to_its_result() {
 }
 
 #[test]
+fn answers_count_only_from_the_sender_that_announced_the_call() {
+    let component = Component::start_beside_a_forger();
+    let ended = of(&component, &["call", "gripper.Grasp", "Force=12.5"]);
+    assert_eq!(ended.code, 0, "{ended:?}");
+    assert!(ended.stdout.contains("\nrun: 1\n"), "{}", ended.stdout);
+    assert!(!ended.stdout.contains("4242"), "{}", ended.stdout);
+    let told = "answers of other senders do not count";
+    assert_eq!(ended.stderr.matches(told).count(), 1, "{}", ended.stderr);
+}
+
+#[test]
 fn what_is_wrong_with_parameters_is_said_before_anything_moves() {
     let component = Component::start();
     let help = "this call takes Force: Double, [Name: String]";
