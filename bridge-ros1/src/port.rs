@@ -339,19 +339,18 @@ impl Ros1Port {
             return;
         };
         let ros_topic = source.ros_topic.clone();
+        let bound = source.bound.as_deref();
         let ours = source
             .expected
-            .clone()
-            .or_else(|| source.bound.as_ref().map(|b| b.name().clone()));
+            .as_ref()
+            .or_else(|| bound.map(MessageType::name));
+        let ours = ours.map(ToString::to_string);
+        let bound = bound.map(|bound| bound.md5().to_owned());
         self.policy
             .told
             .once(&ros_topic, "publisher of another type", || {
-                format!(
-                    "messages of {} are dropped: it publishes {} and the topic crosses as {}",
-                    peer.caller_id,
-                    peer.header.type_name().unwrap_or("?"),
-                    ours.map_or_else(|| "another type".to_owned(), |name| name.to_string()),
-                )
+                let theirs = (peer.header.type_name(), peer.header.md5sum());
+                stranger(&peer.caller_id, theirs, (ours.as_deref(), bound.as_deref()))
             });
     }
 
@@ -535,6 +534,29 @@ impl Ros1Port {
         self.policy.told.once(topic, "unknown type", || {
             format!("{what}: {}", definitions.explain(TextKind::Message, error))
         });
+    }
+}
+
+/// Returns the reason for dropping the messages of a publisher with another type or definition than the topic. The MD5 sums
+/// distinguish two definitions of one name.
+fn stranger(
+    caller: &str,
+    (theirs, sum): (Option<&str>, Option<&str>),
+    (ours, bound): (Option<&str>, Option<&str>),
+) -> String {
+    let (theirs, sum) = (theirs.unwrap_or("?"), sum.unwrap_or("none"));
+    match (ours, bound) {
+        (Some(name), Some(md5)) if name == theirs => format!(
+            "messages of {caller} are dropped: its definition of {theirs} has the MD5 sum {sum}, and the topic crosses with \
+             the definition of MD5 sum {md5}; make both equal"
+        ),
+        (Some(name), _) if name == theirs => format!(
+            "messages of {caller} are dropped: its definition of {theirs} (MD5 sum {sum}) is not that of the topic"
+        ),
+        (ours, _) => format!(
+            "messages of {caller} are dropped: it publishes {theirs} and the topic crosses as {}",
+            ours.unwrap_or("another type"),
+        ),
     }
 }
 
@@ -765,4 +787,26 @@ fn utc() -> SystemTime {
 /// Values that are latched side by side are known by when they were taken, and stand in this order.
 fn latch_key(instance: Timestamp) -> u64 {
     u64::try_from(instance.unix_nanos()).unwrap_or_default()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::stranger;
+
+    #[test]
+    fn two_definitions_of_one_name_are_named_with_their_checksums() {
+        let theirs = (Some("arm_msgs/Joint"), Some("aaaa"));
+        let told = stranger("/arm", theirs, (Some("arm_msgs/Joint"), Some("bbbb")));
+        assert!(told.contains("aaaa") && told.contains("bbbb"), "{told}");
+        let told = stranger("/arm", theirs, (Some("arm_msgs/Joint"), None));
+        assert!(
+            told.contains("aaaa") && told.contains("is not that of the topic"),
+            "{told}"
+        );
+        let told = stranger("/arm", theirs, (Some("arm_msgs/Other"), Some("bbbb")));
+        assert!(
+            told.ends_with("it publishes arm_msgs/Joint and the topic crosses as arm_msgs/Other"),
+            "{told}"
+        );
+    }
 }
