@@ -3,6 +3,10 @@
 //! DDS matches a reader with a writer only when the writer offers at least what the reader requests (DDS 1.4, 2.2.3), and
 //! tells neither of a match that did not come about but by a status that nobody looks at. So it is looked for here.
 
+use rustdds::policy::{
+    DataRepresentation, DataRepresentationId, XCDR_DATA_REPRESENTATION, XCDR2_DATA_REPRESENTATION,
+    XML_DATA_REPRESENTATION,
+};
 use rustdds::qos::QosPolicyId;
 use rustdds::{Duration, QosPolicies};
 
@@ -23,13 +27,40 @@ impl Incompatibility {
     pub fn between(offered: &QosPolicies, requested: &QosPolicies) -> Option<Self> {
         let id = offered.compliance_failure_wrt(requested)?;
         let of = |qos: &QosPolicies| described(&id, qos);
+        let (offered, requested) = if id == QosPolicyId::Representation {
+            representations(offered, requested)
+        } else {
+            (of(offered), of(requested))
+        };
         Some(Self {
             policy: name(&id),
-            offered: of(offered),
-            requested: of(requested),
+            offered,
+            requested,
         })
     }
 }
+
+/// The data representation that the writer uses, and those that the reader accepts (DDS-XTypes 1.3, 7.6.3.1.1).
+fn representations(offered: &QosPolicies, requested: &QosPolicies) -> (String, String) {
+    let writes = offered.data_representation();
+    let accepts = requested.data_representation();
+    let writes = DataRepresentation::offered_representation(writes.as_ref());
+    let accepts = DataRepresentation::accepted_representations(accepts.as_ref());
+    let accepts: Vec<String> = accepts.iter().take(SHOWN).map(|id| encoding(*id)).collect();
+    (encoding(writes), accepts.join(" or "))
+}
+
+fn encoding(id: DataRepresentationId) -> String {
+    match id {
+        XCDR_DATA_REPRESENTATION => "XCDR1".to_owned(),
+        XML_DATA_REPRESENTATION => "XML".to_owned(),
+        XCDR2_DATA_REPRESENTATION => "XCDR2".to_owned(),
+        other => format!("representation {other}"),
+    }
+}
+
+/// Data representations that are named: a peer may list thousands.
+const SHOWN: usize = 4;
 
 fn name(id: &QosPolicyId) -> &'static str {
     match id {
@@ -74,12 +105,12 @@ fn described(id: &QosPolicyId, qos: &QosPolicies) -> String {
         QosPolicyId::Presentation => show(qos.presentation()),
         QosPolicyId::LatencyBudget => show(qos.latency_budget()),
         QosPolicyId::DestinationOrder => show(qos.destination_order()),
-        QosPolicyId::TimeBasedFilter
-        | QosPolicyId::History
-        | QosPolicyId::ResourceLimits
-        | QosPolicyId::Lifespan
-        | QosPolicyId::Representation
-        | QosPolicyId::Property => show(Some(qos)),
+        QosPolicyId::TimeBasedFilter => show(qos.time_based_filter()),
+        QosPolicyId::History => show(qos.history()),
+        QosPolicyId::ResourceLimits => show(qos.resource_limits()),
+        QosPolicyId::Lifespan => show(qos.lifespan()),
+        QosPolicyId::Representation => representations(qos, qos).0,
+        QosPolicyId::Property => "other properties".to_owned(),
     }
 }
 
@@ -129,6 +160,21 @@ mod tests {
                 builder().deadline(Deadline(Duration::from_millis(100)))
             ),
             pair("deadline: none", "100 ms")
+        );
+    }
+
+    #[test]
+    fn a_writer_of_xcdr2_is_told_by_the_name_of_its_encoding() {
+        let xcdr2 = DataRepresentation {
+            value: vec![XCDR2_DATA_REPRESENTATION],
+        };
+        let offered = builder().reliable(Duration::ZERO).build();
+        let offered = offered.with_data_representation(xcdr2);
+        let found = Incompatibility::between(&offered, &builder().build()).unwrap();
+        assert_eq!(found.policy, "data representation");
+        assert_eq!(
+            (found.offered.as_str(), found.requested.as_str()),
+            ("XCDR2", "XCDR1")
         );
     }
 

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
 
+use crate::type_description::TypeSource;
 use bridge_node::{Environment, TypePaths};
 use messages::{
     ActionCalls, ActionMessages, ActionTypeHashes, DefinitionError, DescribedType, Dialect,
@@ -183,6 +184,33 @@ impl Definitions {
             Some(told) => Ok(told.types.clone()),
             None => self.known.registry().describe(name),
         }
+    }
+
+    /// The source of each of these types: the text of a message whose file is known here. A part of a service or action has no
+    /// file of its own, and neither has a type that a node described.
+    pub(crate) fn sources(&self, types: &[DescribedType]) -> Vec<TypeSource> {
+        let registry = self.known.registry();
+        let source = |described: &DescribedType| {
+            let name = described.name.parse::<TypeName>().ok();
+            let name = name.filter(|name| name.ros2() == described.name);
+            let text = name.and_then(|name| {
+                let same = registry.describe(&name).ok()?.first() == Some(described);
+                registry.text(&name).filter(|_| same)
+            });
+            match text {
+                Some(text) => TypeSource {
+                    name: described.name.clone(),
+                    encoding: "msg",
+                    text: text.to_owned(),
+                },
+                None => TypeSource {
+                    name: described.name.clone(),
+                    encoding: "implicit",
+                    text: String::new(),
+                },
+            }
+        };
+        types.iter().map(source).collect()
     }
 
     /// The description of a service that was found, and what it needs.

@@ -8,6 +8,7 @@ mod cdr;
 pub mod clock;
 pub mod compatibility;
 mod definitions;
+mod descriptors;
 pub mod discovery_info;
 pub mod domain;
 #[cfg(feature = "patched-dds")]

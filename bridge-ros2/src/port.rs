@@ -43,6 +43,7 @@ use uadp::BuiltinType;
 
 use crate::clock::RosClock;
 use crate::definitions::Definitions;
+use crate::descriptors::Descriptors;
 use crate::domain::{Domain, DomainError, DomainOptions};
 use crate::graph::{Graph, dds_topic};
 use crate::inbox::{Inbox, Taken};
@@ -124,6 +125,7 @@ pub struct Ros2Port {
     events: VecDeque<PortEvent>,
     /// Endpoints that may still be made before the next [`reconcile`](Self::reconcile).
     budget: usize,
+    descriptors: Descriptors,
     clock: RosClock,
     /// Endpoints of others that were told and counted as incompatible with ours.
     incompatible: BTreeSet<GUID>,
@@ -197,6 +199,7 @@ impl Ros2Port {
             former: VecDeque::new(),
             events: bound.into(),
             budget: MAX_BATCH,
+            descriptors: Descriptors::of_process(),
             clock,
             incompatible: BTreeSet::new(),
             misreading: BTreeSet::new(),

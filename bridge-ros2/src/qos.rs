@@ -2,6 +2,7 @@
 
 use std::num::NonZeroU16;
 
+use messages::TypeName;
 use rustdds::policy::{Deadline, Durability, History, ResourceLimits};
 use rustdds::{Duration, QosPolicies, QosPolicyBuilder};
 
@@ -10,8 +11,9 @@ use crate::graph::Endpoint;
 /// What a reader asks for, derived from what the writers of its topic offer.
 ///
 /// A reader that asks for more than a writer offers is not matched with it (DDS 1.4, 2.2.3), so it asks for the most
-/// that all of them offer. Without any writer it asks for what a ROS publisher offers unless told otherwise: reliable,
-/// so that the first message after a match is repaired when it was sent before we noticed the match, and volatile.
+/// that all of them offer. Without any writer it asks for the defaults of a ROS publisher of its type:
+/// sensor data best effort, all else reliable, so that the first message after a match is repaired when it was sent before we
+/// noticed the match; and volatile.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Requested {
     reliable: bool,
@@ -31,6 +33,16 @@ impl Requested {
             reliable: writers.iter().all(|writer| writer.reliable),
             transient_local: !writers.is_empty()
                 && writers.iter().all(|writer| writer.transient_local),
+        }
+    }
+
+    /// The request while no writer is known: the defaults of ROS publishers of that type. Drivers publish sensor data best
+    /// effort, and their nodes warn of a reader that requests more.
+    #[must_use]
+    pub fn without_writers(message_type: &TypeName) -> Self {
+        Self {
+            reliable: message_type.package() != "sensor_msgs",
+            transient_local: false,
         }
     }
 
@@ -182,6 +194,17 @@ mod tests {
     #[test]
     fn a_reader_without_writers_matches_a_default_publisher() {
         assert_eq!(asked(&[]), (true, false));
+    }
+
+    #[test]
+    fn a_reader_of_sensor_data_without_writers_asks_for_no_more_than_drivers_offer() {
+        let asked = |name: &str| {
+            let qos = Requested::without_writers(&name.parse().unwrap()).policies();
+            let offered = QosPolicyBuilder::new().best_effort().build();
+            offered.compliance_failure_wrt(&qos).is_none()
+        };
+        assert!(asked("sensor_msgs/LaserScan"));
+        assert!(!asked("geometry_msgs/Twist"));
     }
 
     #[test]

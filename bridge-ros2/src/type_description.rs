@@ -13,8 +13,26 @@ use crate::service::{
     ServiceTypes,
 };
 
-/// What is told of types by their full names, as `std_msgs/msg/Bool`: each with what it needs, itself first.
-type Known = BTreeMap<(String, TypeHash), Vec<DescribedType>>;
+/// The types of the node by their full names, as `std_msgs/msg/Bool`.
+type Known = BTreeMap<(String, TypeHash), Description>;
+
+/// A type with the types that it needs, itself first.
+#[derive(Debug)]
+struct Description {
+    types: Vec<DescribedType>,
+    sources: Vec<TypeSource>,
+}
+
+/// The source of a type, as `type_description_interfaces/msg/TypeSource` has it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct TypeSource {
+    /// The full name of the type.
+    pub(crate) name: String,
+    /// The ending of its file, or `implicit` for a type without a file of its own.
+    pub(crate) encoding: &'static str,
+    /// The contents of its file.
+    pub(crate) text: String,
+}
 
 /// Tells others what the types are that this node reads and writes. Dropping it withdraws the service.
 #[derive(Debug)]
@@ -36,9 +54,9 @@ impl TypeServer {
         let known = Arc::new(Mutex::new(Known::new()));
         let asked = Arc::clone(&known);
         let handler = move |request: ServiceRequest| {
-            let answer = read_request(&request.bytes).map(|(name, hash)| {
+            let answer = read_request(&request.bytes).map(|request| {
                 let known = asked.lock().unwrap_or_else(PoisonError::into_inner);
-                answer(&known, &name, &hash)
+                answer(&known, &request)
             });
             async { answer.map_err(|Malformed| "a request cut short".to_owned()) }
         };
@@ -48,12 +66,18 @@ impl TypeServer {
     }
 
     /// A type that is read, written or served from now on, with what it needs.
-    pub(crate) fn learn(&self, described: Vec<DescribedType>, hash: TypeHash) {
-        let Some(first) = described.first() else {
+    pub(crate) fn learn(
+        &self,
+        types: Vec<DescribedType>,
+        sources: Vec<TypeSource>,
+        hash: TypeHash,
+    ) {
+        let Some(first) = types.first() else {
             return;
         };
         let mut known = self.known.lock().unwrap_or_else(PoisonError::into_inner);
-        known.insert((first.name.clone(), hash), described);
+        let name = first.name.clone();
+        known.insert((name, hash), Description { types, sources });
     }
 
     /// Whether that is told already.
@@ -123,32 +147,55 @@ fn read_type(reader: &mut CdrReader<'_>) -> Result<DescribedType, Malformed> {
     })
 }
 
-/// What a node asks for.
-pub(crate) fn read_request(bytes: &[u8]) -> Result<(String, String), Malformed> {
-    let mut reader = CdrReader::new(bytes)?;
-    Ok((reader.string()?, reader.string()?))
+/// A request of another node.
+#[derive(Debug, PartialEq, Eq)]
+struct TypeRequest {
+    name: String,
+    hash: String,
+    /// Whether the sources are wanted.
+    sources: bool,
 }
 
-/// The answer to a request for a type that is known, or not. Texts of definitions are not told.
-fn answer(known: &Known, name: &str, hash: &str) -> Bytes {
-    let described = describe(known, name, hash);
+fn read_request(bytes: &[u8]) -> Result<TypeRequest, Malformed> {
+    let mut reader = CdrReader::new(bytes)?;
+    Ok(TypeRequest {
+        name: reader.string()?,
+        hash: reader.string()?,
+        sources: reader.bool()?,
+    })
+}
+
+/// The answer to a request for a type that is known, or not.
+fn answer(known: &Known, request: &TypeRequest) -> Bytes {
+    let found = describe(known, &request.name, &request.hash);
     let mut writer = CdrWriter::new();
-    writer.bool(described.is_ok());
-    writer.string(described.as_ref().err().map_or("", String::as_str));
-    let described = described.unwrap_or_default();
+    writer.bool(found.is_ok());
+    writer.string(found.as_ref().err().map_or("", String::as_str));
+    let (described, sources) = match found {
+        Ok(found) => (&found.types[..], &found.sources[..]),
+        Err(_) => (&[][..], &[][..]),
+    };
     let nothing = DescribedType {
         name: String::new(),
         fields: Vec::new(),
     };
     write_type(&mut writer, described.first().unwrap_or(&nothing));
     writer.sequence(described.get(1..).unwrap_or_default(), write_type);
-    // Sources and further information.
-    writer.u32(0);
+    let sources = match request.sources {
+        true => sources,
+        false => &[],
+    };
+    writer.sequence(sources, |writer, source| {
+        writer.string(&source.name);
+        writer.string(source.encoding);
+        writer.string(&source.text);
+    });
+    // No further information.
     writer.u32(0);
     writer.finish()
 }
 
-fn describe<'k>(known: &'k Known, name: &str, hash: &str) -> Result<&'k [DescribedType], String> {
+fn describe<'k>(known: &'k Known, name: &str, hash: &str) -> Result<&'k Description, String> {
     let unknown = || format!("type {name} is none of this node");
     // Of messages the short name will do.
     let full = name.parse::<TypeName>();
@@ -238,25 +285,38 @@ mod tests {
     fn known(name: &TypeName) -> (Known, TypeHash) {
         let registry = Registry::bundle(Dialect::Ros2);
         let hash = registry.type_hash(name).unwrap();
-        let described = registry.describe(name).unwrap();
-        (Known::from([((name.ros2(), hash), described)]), hash)
+        let types = registry.describe(name).unwrap();
+        let source = |described: &DescribedType| TypeSource {
+            name: described.name.clone(),
+            encoding: "msg",
+            text: format!("text of {}", described.name),
+        };
+        let sources = types.iter().map(source).collect();
+        let description = Description { types, sources };
+        (Known::from([((name.ros2(), hash), description)]), hash)
+    }
+
+    fn asked(name: &str, hash: &str, sources: bool) -> TypeRequest {
+        TypeRequest {
+            name: name.to_owned(),
+            hash: hash.to_owned(),
+            sources,
+        }
     }
 
     #[test]
     fn what_is_answered_is_read_as_the_type_it_is() {
         let wanted = name("sensor_msgs/JointState");
         let (known, hash) = known(&wanted);
-        let asked = request(&wanted, hash);
-        let (type_name, type_hash) = read_request(&asked).unwrap();
-        assert_eq!(
-            (type_name.as_str(), type_hash),
-            ("sensor_msgs/msg/JointState", hash.to_string())
-        );
-        let types = read_answer(&answer(&known, &type_name, &hash.to_string())).unwrap();
-        assert_eq!(types, known[&(wanted.ros2(), hash)]);
+        let request = read_request(&request(&wanted, hash)).unwrap();
+        let expected = asked("sensor_msgs/msg/JointState", &hash.to_string(), false);
+        assert_eq!(request, expected);
+        let types = read_answer(&answer(&known, &request)).unwrap();
+        assert_eq!(types, known[&(wanted.ros2(), hash)].types);
         for (type_name, type_hash) in [("x/msg/Y", ""), ("sensor_msgs/msg/JointState", "RIHS01_0")]
         {
-            let refused = read_answer(&answer(&known, type_name, type_hash)).unwrap_err();
+            let request = asked(type_name, type_hash, true);
+            let refused = read_answer(&answer(&known, &request)).unwrap_err();
             assert!(refused.contains("it does not tell: type"), "{refused}");
         }
     }
@@ -264,11 +324,27 @@ mod tests {
     #[test]
     fn an_answer_that_is_cut_anywhere_is_malformed() {
         let (known, _) = known(&name("geometry_msgs/Twist"));
-        let whole = answer(&known, "geometry_msgs/msg/Twist", "");
+        let whole = answer(&known, &asked("geometry_msgs/msg/Twist", "", false));
         // Behind the types come two counts that are not read, and what aligns them.
         for length in 0..whole.len() - 11 {
             assert!(read_answer(&whole[..length]).is_err(), "{length}");
         }
+    }
+
+    #[test]
+    fn the_sources_are_told_to_a_node_that_asks_for_them() {
+        let (known, _) = known(&name("geometry_msgs/Twist"));
+        let answered = answer(&known, &asked("geometry_msgs/msg/Twist", "", true));
+        let text = String::from_utf8_lossy(&answered);
+        for of in ["Twist", "Vector3"] {
+            assert!(
+                text.contains(&format!("text of geometry_msgs/msg/{of}")),
+                "{text}"
+            );
+        }
+        assert!(read_answer(&answered).is_ok());
+        let without = answer(&known, &asked("geometry_msgs/msg/Twist", "", false));
+        assert!(!String::from_utf8_lossy(&without).contains("text of"));
     }
 
     /// `type_description_interfaces/msg/TypeDescription` as ROS 2 publishes it.

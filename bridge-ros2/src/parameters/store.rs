@@ -79,21 +79,16 @@ impl Store {
         let mut changed = Vec::new();
         match question {
             Question::Describe => {
-                let names = reader.sequence(CdrReader::string)?;
-                writer.sequence(&names, |writer, name| self.describe(writer, name));
+                let found = self.declared(&reader.sequence(CdrReader::string)?);
+                writer.sequence(&found, |writer, found| describe(writer, found));
             }
             Question::Types => {
-                let names = reader.sequence(CdrReader::string)?;
-                writer.sequence(&names, |writer, name| {
-                    writer.u8(self.get(name).map_or(0, |found| found.value.kind()));
-                });
+                let found = self.declared(&reader.sequence(CdrReader::string)?);
+                writer.sequence(&found, |writer, found| writer.u8(found.value.kind()));
             }
             Question::Get => {
-                let names = reader.sequence(CdrReader::string)?;
-                writer.sequence(&names, |writer, name| match self.get(name) {
-                    Some(found) => found.value.write(writer),
-                    None => ParameterValue::NotSet.write(writer),
-                });
+                let found = self.declared(&reader.sequence(CdrReader::string)?);
+                writer.sequence(&found, |writer, found| found.value.write(writer));
             }
             Question::List => {
                 let prefixes = reader.sequence(CdrReader::string)?;
@@ -118,18 +113,11 @@ impl Store {
         Ok((writer.finish(), changed))
     }
 
-    /// Of a parameter that is not declared no more than the name.
-    fn describe(&self, writer: &mut CdrWriter, name: &str) {
-        let found = self.get(name);
-        writer.string(name);
-        writer.u8(found.map_or(0, |found| found.value.kind()));
-        writer.string(found.map_or("", |found| &found.description));
-        writer.string("");
-        writer.bool(found.is_some_and(|found| found.read_only));
-        writer.bool(false);
-        // No range, neither of numbers nor of whole ones.
-        writer.u32(0);
-        writer.u32(0);
+    /// The parameters of these names. As rclcpp and rclpy: none where any of the names is not declared, which tools take for
+    /// "not set".
+    fn declared(&self, names: &[String]) -> Vec<&Parameter> {
+        let found: Option<Vec<&Parameter>> = names.iter().map(|name| self.get(name)).collect();
+        found.unwrap_or_default()
     }
 
     /// As rclcpp: the names at or below one of the prefixes, at most `depth` parts below it; 0 is any number.
@@ -194,6 +182,19 @@ impl Store {
 /// A `rcl_interfaces/msg/Parameter`.
 fn assignment(reader: &mut CdrReader<'_>) -> Result<(String, ParameterValue), Malformed> {
     Ok((reader.string()?, ParameterValue::read(reader)?))
+}
+
+/// A `rcl_interfaces/msg/ParameterDescriptor`.
+fn describe(writer: &mut CdrWriter, parameter: &Parameter) {
+    writer.string(&parameter.name);
+    writer.u8(parameter.value.kind());
+    writer.string(&parameter.description);
+    writer.string("");
+    writer.bool(parameter.read_only);
+    writer.bool(false);
+    // No range, neither of numbers nor of whole ones.
+    writer.u32(0);
+    writer.u32(0);
 }
 
 /// A `rcl_interfaces/msg/SetParametersResult`.
@@ -263,6 +264,23 @@ mod tests {
         assert_eq!(listed(&["arm"], 1), ["arm.speed"]);
         assert_eq!(listed(&["arm", "use_sim_time"], 0), all);
         assert_eq!(listed(&["ar"], 0), [""; 0]);
+    }
+
+    /// How many elements the answer has to a request for those names.
+    fn counted(question: Question, names: &[&str]) -> u32 {
+        let mut writer = CdrWriter::new();
+        writer.sequence(names, |writer, name| writer.string(name));
+        let (answer, _) = store().answer(question, &writer.finish()).unwrap();
+        u32::from_le_bytes(answer[4..8].try_into().unwrap())
+    }
+
+    #[test]
+    fn of_names_that_are_not_all_declared_nothing_is_told_as_by_rclpy() {
+        for question in [Question::Describe, Question::Types, Question::Get] {
+            assert_eq!(counted(question, &["use_sim_time", "arm.speed"]), 2);
+            assert_eq!(counted(question, &["arm.speed", "no_such_parameter"]), 0);
+            assert_eq!(counted(question, &["no_such_parameter"]), 0);
+        }
     }
 
     #[test]

@@ -96,7 +96,8 @@ impl Ros2Port {
         if let Some(hashes) = self.definitions.action_type_hashes(name)
             && let Ok(described) = self.definitions.described_action(name)
         {
-            self.told_types.learn(described, hashes.action);
+            let sources = self.definitions.sources(&described);
+            self.told_types.learn(described, sources, hashes.action);
         }
     }
 }

@@ -159,7 +159,8 @@ impl Ros2Port {
         if let Some(hashes) = self.definitions.service_type_hashes(name)
             && let Ok(described) = self.definitions.described_service(name)
         {
-            self.told_types.learn(described, hashes.service);
+            let sources = self.definitions.sources(&described);
+            self.told_types.learn(described, sources, hashes.service);
         }
     }
 }

@@ -3,14 +3,15 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use bridge_node::PortEvent;
 use bridge_node::policy::{Found, MAX_TOPICS};
+use bridge_node::{PortEvent, Reason};
 use mappings::TopicId;
 use messages::{Selection, TypeName};
 use rustdds::GUID;
 use tokio::time::Instant;
 use tracing::{debug, info, warn};
 
+use super::calls::SETTLED;
 use super::{Ros2Port, lost};
 use crate::compatibility::Incompatibility;
 use crate::definitions::Definition;
@@ -28,7 +29,11 @@ impl Ros2Port {
         let domain = self.domain.changes();
         let is_due = self.schedule.is_look_due(domain, now) || self.descriptions.is_asking(now);
         self.schedule.reconciled = now;
-        self.budget = MAX_BATCH;
+        let free = self.descriptors.free();
+        self.budget = MAX_BATCH.min(free.mapped);
+        if free.found == 0 {
+            self.tell_scarce();
+        }
         while self.retired.front().is_some_and(|(until, _)| *until <= now) {
             self.retired.pop_front();
         }
@@ -112,6 +117,10 @@ impl Ros2Port {
     /// Zero configuration, and patterns: a topic named in our part of the space, or that a pattern is about, crosses as
     /// soon as somebody writes it.
     fn find_topics(&mut self, now: Instant) {
+        let pending = self.sources.iter();
+        let pending = pending.filter(|source| source.reading == Reading::Pending);
+        let free = self.descriptors.free().found;
+        let mut free = free.saturating_sub(pending.count());
         let unknown = |topic: &&str| !self.source_of.contains_key(*topic);
         let found: Vec<(String, TopicId, Selection)> = self
             .graph
@@ -139,13 +148,35 @@ impl Ros2Port {
                 self.policy.tell_same(&dds_topic, topic, &other);
                 continue;
             }
+            if free == 0 {
+                self.tell_scarce();
+                self.events.push_back(PortEvent::Dropped {
+                    reason: Reason::TooManyTopics,
+                    why: "topics that there are no file descriptors for",
+                    count: 1,
+                });
+                return;
+            }
             if let Some(name) = self.found_type(topic, &dds_topic, now) {
+                free -= 1;
                 let index = self.source(dds_topic, name);
                 if let Some(source) = self.sources.get_mut(index) {
                     source.values.push((topic, selection));
                 }
             }
         }
+    }
+
+    /// Reports once that further topics that the mapping does not name are left alone.
+    pub(super) fn tell_scarce(&mut self) {
+        let limit = self.descriptors.limit();
+        self.policy.told.once("", "descriptors", || {
+            format!(
+                "three quarters of the {limit} file descriptors of this process are in use: further topics that the mapping \
+                 does not name are left alone; raise the limit (`LimitNOFILE=`, `ulimit -n`), or end the nodes that \
+                 publish so many topics of the space"
+            )
+        });
     }
 
     /// The first type of a topic's writers that is known; `None` as long as none is, or a node is asked what it is.
@@ -258,14 +289,23 @@ impl Ros2Port {
             .iter()
             .find(|writer| !ours.contains(writer))
             .cloned();
-        let requested = Requested::from_writers(&ours);
+        let requested = match ours.is_empty() {
+            true => Requested::without_writers(&source.message_type),
+            false => Requested::from_writers(&ours),
+        };
         let returned = requested.is_transient_local() && !source.returned(writers).is_empty();
         match source.reading {
             Reading::Pending => {
                 let name = source.message_type.clone();
                 let known = self.definitions.get(&name).is_ok();
+                // A reader that asks for more than a writer offers has the writer's node warn: the writers that are there
+                // are known by then.
+                let is_early = ours.is_empty() && self.joined.elapsed() < SETTLED;
+                if is_early {
+                    self.schedule.look_next();
+                }
                 // What nobody knows and nobody publishes is asked for when somebody does.
-                if (known || !ours.is_empty()) && settled {
+                if (known || !ours.is_empty()) && settled && !is_early {
                     self.open_source(index, requested);
                 }
             }
@@ -519,7 +559,8 @@ impl Ros2Port {
         if !self.told_types.tells(&name.ros2(), hash)
             && let Ok(described) = self.definitions.described(name, hash)
         {
-            self.told_types.learn(described, hash);
+            let sources = self.definitions.sources(&described);
+            self.told_types.learn(described, sources, hash);
         }
     }
 

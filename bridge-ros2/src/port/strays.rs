@@ -19,7 +19,17 @@ impl Ros2Port {
         }
         let sink = Sink::new(self.policy.destination(topic));
         let subscribed = is_subscribed(&sink, &self.graph);
-        if self.policy.is_stray(topic, subscribed) && !self.take_place() {
+        let is_stray = self.policy.is_stray(topic, subscribed);
+        if is_stray && !self.has_descriptors() {
+            self.tell_scarce();
+            self.events.push_back(PortEvent::Dropped {
+                reason: Reason::TooManyTopics,
+                why: "values that there are no file descriptors for",
+                count: 1,
+            });
+            return false;
+        }
+        if is_stray && !self.take_place() {
             self.events.push_back(PortEvent::Dropped {
                 reason: Reason::TooManyTopics,
                 why: "values that the mapping does not name and nobody subscribes to",
@@ -29,6 +39,13 @@ impl Ros2Port {
         }
         self.sinks.insert(topic, Box::new(sink));
         true
+    }
+
+    /// Returns whether the process has descriptors for another writer of a value that the mapping does not name.
+    fn has_descriptors(&self) -> bool {
+        let sinks = self.sinks.values();
+        let pending = sinks.filter(|sink| sink.open.is_none()).count();
+        pending < self.descriptors.free().found
     }
 
     fn take_place(&mut self) -> bool {

@@ -1,0 +1,103 @@
+//! File descriptors of the process: each endpoint of RustDDS takes some, and what other nodes make up must leave some free.
+
+use std::fs::File;
+use std::os::fd::AsRawFd;
+
+use rustix::process::{Resource, getrlimit};
+
+/// The descriptors of this process.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Descriptors {
+    limit: usize,
+}
+
+/// Endpoints that there are descriptors for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Free {
+    /// For topics of the mapping, services and actions.
+    pub(crate) mapped: usize,
+    /// For topics that the mapping does not name. They leave a quarter of all descriptors to the others.
+    pub(crate) found: usize,
+}
+
+impl Descriptors {
+    /// Those that the limit of this process (`RLIMIT_NOFILE`) permits by now.
+    pub(crate) fn of_process() -> Self {
+        let limit = getrlimit(Resource::Nofile).current;
+        Self {
+            limit: limit.map_or(usize::MAX, |limit| limit.try_into().unwrap_or(usize::MAX)),
+        }
+    }
+
+    pub(crate) const fn limit(self) -> usize {
+        self.limit
+    }
+
+    /// Returns how many endpoints there are descriptors for. The lowest free descriptor tells how many are open.
+    pub(crate) fn free(self) -> Free {
+        let open = File::open("/dev/null").map(|file| file.as_raw_fd());
+        // Without a free descriptor it cannot be opened.
+        let open = open.ok().and_then(|open| usize::try_from(open).ok());
+        self.free_beside(open.unwrap_or(self.limit))
+    }
+
+    const fn free_beside(self, open: usize) -> Free {
+        let left = self.limit.saturating_sub(open);
+        Free {
+            mapped: left.saturating_sub(RESERVE) / OF_ENDPOINT,
+            found: left.saturating_sub(self.limit / 4) / OF_ENDPOINT,
+        }
+    }
+}
+
+/// Descriptors that RustDDS opens for an endpoint: a pair of sockets that wakes its reader, and one more at times.
+const OF_ENDPOINT: usize = 3;
+/// Descriptors that are left to status pages, files and the sockets of the space.
+const RESERVE: usize = 64;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_others_name_leaves_a_quarter_of_the_descriptors_to_the_mapping() {
+        let descriptors = Descriptors { limit: 1024 };
+        let free = |open| descriptors.free_beside(open);
+        assert_eq!(
+            free(24),
+            Free {
+                mapped: 312,
+                found: 248
+            }
+        );
+        assert_eq!(
+            free(768),
+            Free {
+                mapped: 64,
+                found: 0
+            }
+        );
+        assert_eq!(
+            free(960),
+            Free {
+                mapped: 0,
+                found: 0
+            }
+        );
+        assert_eq!(
+            free(5_000),
+            Free {
+                mapped: 0,
+                found: 0
+            }
+        );
+    }
+
+    #[test]
+    fn open_descriptors_are_counted() {
+        let descriptors = Descriptors { limit: 1_000_000 };
+        let before = descriptors.free();
+        let open: Vec<_> = (0..120).map(|_| File::open("/dev/null").unwrap()).collect();
+        assert!(descriptors.free().mapped < before.mapped, "{}", open.len());
+    }
+}
