@@ -235,8 +235,8 @@ fn an_error_names_the_field_and_the_byte() {
 
 /// Seconds and nanoseconds, little endian.
 fn clock(sec: i64, nanosec: u32) -> Vec<u8> {
-    let sec = sec.to_le_bytes();
-    [&sec[..4], &nanosec.to_le_bytes()].concat()
+    let [a, b, c, d, ..] = sec.to_le_bytes();
+    [[a, b, c, d], nanosec.to_le_bytes()].concat()
 }
 
 #[test]
