@@ -133,10 +133,12 @@ impl Source {
         &self.name
     }
 
-    /// A command of cargo that builds the unit tests of the patched source by itself, outside of the workspace.
-    pub(crate) fn build_of_own_tests(&self, workspace: &Workspace) -> Command {
+    /// A command of cargo that builds the unit tests of the patched source by itself, outside of the workspace, with the
+    /// other patched sources that it depends on.
+    pub(crate) fn build_of_own_tests(&self, workspace: &Workspace, patched: &Patched) -> Command {
         let mut command = workspace.cargo(&["test", "--no-run", "--lib", "--locked"]);
         command
+            .args(patched.configuration())
             .arg("--manifest-path")
             .arg(self.folder.join("Cargo.toml"))
             .arg("--target-dir")

@@ -96,7 +96,7 @@ fn of_patches<'a>(
     for source in patched.sources() {
         // Without names of tests it would run all that the crate has.
         if !source.tests().is_empty() {
-            let built = programs::build(source.build_of_own_tests(workspace))?;
+            let built = programs::build(source.build_of_own_tests(workspace, patched))?;
             all.extend(built.into_iter().map(|program| (source, program)));
         }
     }
