@@ -144,9 +144,20 @@ document! {
 
     /// How much clients may take up of the server. What is more is refused.
     struct LimitsEntry {
-        /// Sessions at once; default 50. The one that is too many gets BadTooManySessions.
+        /// Sessions at once; default 50. The oldest session that was never activated gives way. Without such a session
+        /// the next one gets BadTooManySessions.
         #[schemars(range(min = 1, max = 10000))]
         sessions: u16,
+        /// Sessions of one client address, which binds only while less than a quarter of the sessions is free; default half of
+        /// the sessions. SCADA hosts and gateways run many clients on one address.
+        #[schemars(range(min = 1, max = 10000))]
+        sessions_per_address: u16,
+        /// Connections; default twice the sessions and 100 more. The oldest one without an activated session gives way.
+        #[schemars(range(min = 1, max = 65535))]
+        connections: u16,
+        /// Connections of one client address; default the sessions and 50 more.
+        #[schemars(range(min = 1, max = 65535))]
+        connections_per_address: u16,
         /// Subscriptions of a session; default 50.
         #[schemars(range(min = 1, max = 1000))]
         subscriptions: u16,

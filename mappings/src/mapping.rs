@@ -457,6 +457,12 @@ pub struct Server {
 pub struct ServerLimits {
     /// Sessions at once.
     pub sessions: Option<u16>,
+    /// Sessions of one client address, while less than a quarter of the sessions is free.
+    pub sessions_per_address: Option<u16>,
+    /// Connections.
+    pub connections: Option<u16>,
+    /// Connections of one client address.
+    pub connections_per_address: Option<u16>,
     /// Subscriptions of a session.
     pub subscriptions: Option<u16>,
     /// Monitored items of a subscription.

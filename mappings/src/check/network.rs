@@ -289,6 +289,19 @@ fn limits(field: &Field<LimitsEntry>, findings: &mut Findings) -> ServerLimits {
     };
     ServerLimits {
         sessions: within(&entry.sessions, 1..=10_000, "sessions", findings),
+        sessions_per_address: within(
+            &entry.sessions_per_address,
+            1..=10_000,
+            "sessions of an address",
+            findings,
+        ),
+        connections: within(&entry.connections, 1..=u16::MAX, "connections", findings),
+        connections_per_address: within(
+            &entry.connections_per_address,
+            1..=u16::MAX,
+            "connections of an address",
+            findings,
+        ),
         subscriptions: within(&entry.subscriptions, 1..=1_000, "subscriptions", findings),
         items: within(&entry.items, 1..=u16::MAX, "items", findings),
         operations: within(&entry.operations, 1..=u16::MAX, "operations", findings),

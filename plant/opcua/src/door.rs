@@ -14,6 +14,7 @@ use std::io;
 use std::net::{Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use opcua::crypto::{CertificateStore, X509};
@@ -21,17 +22,21 @@ use opcua::sync::{Mutex, RwLock};
 use opcua::types::StatusCode;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::{Semaphore, watch};
+use tokio::sync::watch;
 use tokio::task::JoinSet;
 use tokio::time::{Instant, timeout};
 use tracing::{debug, info, warn};
 use trust::{Certificate, Fault, Known};
 
+use self::connections::Connections;
 use crate::certificates;
 use crate::judge::{self, Shown};
 use crate::known::{self, Stamp};
+use crate::limits::ClientLimits;
 use crate::pki::{OWN_CERTIFICATE, OWN_KEY};
 use crate::seldom::Seldom;
+
+mod connections;
 
 /// In front of a server that lets in whom a trusted authority has issued a certificate.
 #[derive(Debug)]
@@ -48,13 +53,21 @@ pub struct Behind {
     pub certificate: PathBuf,
     /// Its key.
     pub key: PathBuf,
+    /// The number of clients.
+    pub clients: ClientLimits,
 }
 
 impl Behind {
     /// Has a server of the library use it.
     #[must_use]
-    pub fn used_by(&self, builder: opcua::server::ServerBuilder) -> opcua::server::ServerBuilder {
+    pub fn used_by(
+        &self,
+        mut builder: opcua::server::ServerBuilder,
+    ) -> opcua::server::ServerBuilder {
+        let limits = self.clients.behind_door();
+        let limits = limits.bound(builder.limits_mut().clone());
         builder
+            .limits(limits)
             .pki_dir(&self.pki)
             .certificate_path(&self.certificate)
             .private_key_path(&self.key)
@@ -83,7 +96,10 @@ impl Door {
     ///
     /// # Errors
     /// The store or the address behind the door cannot be used.
-    pub fn of(root: &Path) -> io::Result<Option<(Self, std::net::TcpListener)>> {
+    pub fn of(
+        root: &Path,
+        clients: ClientLimits,
+    ) -> io::Result<Option<(Self, std::net::TcpListener)>> {
         if !known::trusts_authorities(root) {
             return Ok(None);
         }
@@ -101,6 +117,7 @@ impl Door {
             pki,
             certificate: root.join(OWN_CERTIFICATE),
             key: root.join(OWN_KEY),
+            clients,
         };
         let listener = std::net::TcpListener::bind((Ipv4Addr::LOCALHOST, 0))?;
         listener.set_nonblocking(true)?;
@@ -134,8 +151,9 @@ impl Door {
 
     /// Lets clients in, until it is dropped.
     pub async fn stand(self, listener: TcpListener) {
-        let places = Arc::new(Semaphore::new(MOST_CONNECTIONS));
         let shared = self.shared;
+        let limits = shared.behind.clients;
+        let mut connections = Connections::new(limits.connections, limits.connections_per_address);
         let mut tasks = JoinSet::new();
         let mut look = tokio::time::interval(LOOK);
         look.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
@@ -143,38 +161,59 @@ impl Door {
         loop {
             tokio::select! {
                 accepted = listener.accept() => match accepted {
-                    Ok((client, peer)) => shared.take(&mut tasks, &places, (client, peer)),
+                    Ok((client, peer)) => {
+                        shared.take(&mut tasks, &mut connections, (client, peer));
+                    }
                     Err(error) => {
-                        warn!(%error, "a connection cannot be taken");
+                        if let Some(suppressed) = shared.another_now("accept") {
+                            warn!(%error, suppressed, "cannot accept a connection");
+                        }
+                        // There may be no free descriptor.
+                        connections.give_way(|_| true);
                         tokio::time::sleep(PAUSE).await;
                     }
                 },
                 _ = look.tick() => shared.look(&mut stamp),
-                Some(_ended) = tasks.join_next() => {}
+                Some(ended) = tasks.join_next() => {
+                    if let Ok(number) = ended {
+                        connections.remove(number);
+                    }
+                }
             }
         }
     }
 }
 
 impl Shared {
-    /// Serves a client as one of the tasks, if there is a place.
+    /// Serves a client as one of the tasks, unless all connections are those of admitted clients.
     fn take(
         self: &Arc<Self>,
-        tasks: &mut JoinSet<()>,
-        places: &Arc<Semaphore>,
+        tasks: &mut JoinSet<u64>,
+        connections: &mut Connections,
         (client, peer): (TcpStream, SocketAddr),
     ) {
-        let Ok(place) = Arc::clone(places).try_acquire_owned() else {
-            warn!(%peer, "a client is sent away: {MOST_CONNECTIONS} connections are open");
+        if !connections.make_room(peer.ip()) {
+            if let Some(suppressed) = self.another_now("connections") {
+                warn!(%peer, suppressed, "refused a connection: the limit of connections is reached");
+            }
             return;
-        };
-        let shared = Arc::clone(self);
-        tasks.spawn(async move {
-            if let Err(error) = shared.serve(client, peer).await {
+        }
+        let number = connections.next();
+        let admitted = Arc::new(AtomicBool::new(false));
+        let (shared, is_admitted) = (Arc::clone(self), Arc::clone(&admitted));
+        let task = tasks.spawn(async move {
+            if let Err(error) = shared.serve(client, peer, &is_admitted).await {
                 debug!(%peer, %error, "a connection has ended");
             }
-            drop(place);
+            number
         });
+        connections.insert(number, peer.ip(), (admitted, task));
+    }
+
+    /// Returns the number of messages that were suppressed, if this one should be logged now.
+    fn another_now(&self, message: &str) -> Option<u64> {
+        let now = Instant::now().into_std();
+        self.refused.lock().another(message, now)
     }
 
     /// Reads what the store knows where that has changed, and has each connection judged anew.
@@ -188,7 +227,12 @@ impl Shared {
         self.changes.send_modify(|changes| *changes += 1);
     }
 
-    async fn serve(&self, mut client: TcpStream, peer: SocketAddr) -> io::Result<()> {
+    async fn serve(
+        &self,
+        mut client: TcpStream,
+        peer: SocketAddr,
+        is_admitted: &AtomicBool,
+    ) -> io::Result<()> {
         client.set_nodelay(true)?;
         let mut server = TcpStream::connect(self.inner).await?;
         server.set_nodelay(true)?;
@@ -214,6 +258,7 @@ impl Shared {
                 Err(status) => return refuse(&mut client, status).await,
             },
         };
+        is_admitted.store(admitted.is_some(), Ordering::Relaxed);
         server.write_all(&open).await?;
         let said =
             tokio::io::copy_bidirectional_with_sizes(&mut client, &mut server, AT_ONCE, AT_ONCE);
@@ -310,9 +355,7 @@ impl Shared {
             certificate.issuer_name(),
             certificate.serial()
         );
-        self.refused
-            .lock()
-            .another(&what, Instant::now().into_std())
+        self.another_now(&what)
     }
 }
 
@@ -393,8 +436,6 @@ async fn refuse(client: &mut TcpStream, status: StatusCode) -> io::Result<()> {
 
 /// The library's store behind a door, below the server's.
 const BEHIND: &str = "admitted";
-const MOST_CONNECTIONS: usize = 1000;
-/// From the connection to the certificate.
 /// The same client is told of in the log once in this time.
 const TOLD_EVERY: Duration = Duration::from_secs(10);
 const GREETING: Duration = Duration::from_secs(5);

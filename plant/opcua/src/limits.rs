@@ -22,6 +22,8 @@ pub const MOST_NOTIFICATIONS: usize = 1_000;
 pub const MOST_PER_REQUEST: usize = 500;
 /// Sessions of a server.
 pub const MOST_SESSIONS: usize = 50;
+/// Bytes of the notifications that wait for all clients of a server.
+pub const QUEUED_NOTIFICATIONS: usize = 64 << 20;
 /// How long a method or a write may take until its client is told `BadTimeout`.
 pub const LONGEST_REQUEST: Duration = Duration::from_secs(10);
 /// Bytes of the largest NodeSet file.
@@ -31,10 +33,73 @@ pub const LARGEST_NODESETS: u64 = 128 << 20;
 /// NodeSet files of a server.
 pub const MOST_NODESETS: usize = 64;
 
-/// The limits of a server.
+/// The number of clients that a server serves.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ClientLimits {
+    /// Sessions.
+    pub sessions: usize,
+    /// Sessions of one client address, while less than a quarter of the sessions is free; 0 is no limit. SCADA hosts and
+    /// gateways run many clients on one address.
+    pub sessions_per_address: usize,
+    /// Connections. The oldest one without an activated session gives way.
+    pub connections: usize,
+    /// Connections of one client address; 0 is no limit.
+    pub connections_per_address: usize,
+}
+
+impl ClientLimits {
+    /// Returns the limits of a server with that number of sessions.
+    #[must_use]
+    pub const fn of(sessions: usize) -> Self {
+        Self {
+            sessions,
+            sessions_per_address: sessions.div_ceil(2),
+            connections: sessions.saturating_mul(2).saturating_add(100),
+            connections_per_address: sessions.saturating_add(50),
+        }
+    }
+
+    /// Returns the limits of a server behind a [`crate::door::Door`]. All its connections come from one address, and the
+    /// door has bounded those of each client.
+    #[must_use]
+    pub const fn behind_door(self) -> Self {
+        Self {
+            sessions_per_address: 0,
+            connections_per_address: 0,
+            ..self
+        }
+    }
+
+    /// Sets these limits in those of the library. The published library has the number of sessions only, and ignores
+    /// the others.
+    #[must_use]
+    pub fn bound(self, mut limits: Limits) -> Limits {
+        limits.max_sessions = self.sessions;
+        let Ok(serde_json::Value::Object(mut all)) = serde_json::to_value(&limits) else {
+            return limits;
+        };
+        for (name, limit) in [
+            ("max_sessions_per_address", self.sessions_per_address),
+            ("max_connections", self.connections),
+            ("max_connections_per_address", self.connections_per_address),
+            ("max_queued_bytes", QUEUED_NOTIFICATIONS),
+        ] {
+            all.insert(name.to_owned(), limit.into());
+        }
+        serde_json::from_value(all.into()).unwrap_or(limits)
+    }
+}
+
+impl Default for ClientLimits {
+    fn default() -> Self {
+        Self::of(MOST_SESSIONS)
+    }
+}
+
+/// Returns the limits of a server.
 #[must_use]
-pub fn server() -> Limits {
-    Limits {
+pub fn server(clients: ClientLimits) -> Limits {
+    clients.bound(Limits {
         max_array_length: LARGEST_ARRAY,
         max_string_length: LARGEST_VALUE,
         max_byte_string_length: LARGEST_VALUE,
@@ -52,7 +117,25 @@ pub fn server() -> Limits {
             ..SubscriptionLimits::default()
         },
         operational: OperationalLimits::default(),
-        max_sessions: MOST_SESSIONS,
         ..Limits::default()
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_limits_of_clients_are_those_of_the_library() {
+        let clients = ClientLimits::of(7);
+        let limits = server(clients);
+        assert_eq!(limits.max_sessions, 7);
+        assert_eq!(limits.max_chunk_count, MOST_CHUNKS);
+        let shown = serde_json::to_value(server(clients.behind_door())).unwrap();
+        for name in ["max_sessions_per_address", "max_connections_per_address"] {
+            let limit = shown.get(name).and_then(serde_json::Value::as_u64);
+            // The published library has none of them.
+            assert!(limit.is_none_or(|limit| limit == 0), "{name}: {limit:?}");
+        }
     }
 }

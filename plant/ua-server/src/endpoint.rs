@@ -11,7 +11,7 @@ use plant_opcua::configuration::{Configuration, Plant};
 use plant_opcua::directory::ApplicationRecord;
 use plant_opcua::door::Door;
 use plant_opcua::endpoint::EndpointUrl;
-use plant_opcua::limits;
+use plant_opcua::limits::{self, ClientLimits};
 use plant_opcua::pki::{OWN_CERTIFICATE, OWN_KEY, Pki};
 use plant_opcua::server::Security;
 use tokio::runtime::Runtime;
@@ -66,11 +66,8 @@ pub(crate) fn server(
 
 /// How much clients may take up.
 pub(crate) fn within(told: ServerLimits) -> Limits {
-    let mut limits = limits::server();
+    let mut limits = limits::server(clients(told));
     limits.max_history_continuation_points = MOST_HISTORY_GOES_ON;
-    if let Some(sessions) = told.sessions {
-        limits.max_sessions = usize::from(sessions);
-    }
     if let Some(subscriptions) = told.subscriptions {
         limits.subscriptions.max_subscriptions_per_session = usize::from(subscriptions);
     }
@@ -83,6 +80,19 @@ pub(crate) fn within(told: ServerLimits) -> Limits {
         limits.operational.max_monitored_items_per_call = operations;
     }
     limits
+}
+
+/// Returns the number of clients that the mapping allows.
+pub(crate) fn clients(told: ServerLimits) -> ClientLimits {
+    let sessions = told.sessions.map_or(limits::MOST_SESSIONS, usize::from);
+    let usual = ClientLimits::of(sessions);
+    let set = |told: Option<u16>, usual| told.map_or(usual, usize::from);
+    ClientLimits {
+        sessions,
+        sessions_per_address: set(told.sessions_per_address, usual.sessions_per_address),
+        connections: set(told.connections, usual.connections),
+        connections_per_address: set(told.connections_per_address, usual.connections_per_address),
+    }
 }
 
 /// The server's own threads, and the listener as they take it.
@@ -112,6 +122,7 @@ pub(crate) type Standing = Option<(Door, TcpListener)>;
 pub(crate) fn door(
     pki: &Pki,
     trust_any: bool,
+    clients: ClientLimits,
     (listener, builder): (TcpListener, ServerBuilder),
 ) -> Result<(Standing, TcpListener, ServerBuilder), Failure> {
     let builder = builder.trust_client_certs(trust_any);
@@ -119,7 +130,7 @@ pub(crate) fn door(
         warn!("every client certificate is trusted, and kept as trusted: for tests only");
         None
     } else {
-        Door::of(pki.root()).map_err(io_fault)?
+        Door::of(pki.root(), clients).map_err(io_fault)?
     };
     Ok(match wanted {
         Some((door, behind)) => {

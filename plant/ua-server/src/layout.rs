@@ -430,8 +430,9 @@ impl Shape {
             VariantTypeId::Empty => false,
             VariantTypeId::Scalar(scalar) => !array && scalar.encoding_mask() == builtin.id(),
             VariantTypeId::Array(element, dimensions) => {
+                // The published library gives an array without elements an empty list of dimensions.
                 array
-                    && dimensions.is_none_or(|d| d.len() == 1)
+                    && dimensions.is_none_or(|d| d.len() <= 1)
                     && element.encoding_mask() == builtin.id()
             }
         }
@@ -446,6 +447,8 @@ const MOST_NAMESPACES: u16 = 1_000;
 
 #[cfg(test)]
 mod tests {
+    use opcua::types::{Array, VariantScalarTypeId};
+
     use super::*;
 
     #[test]
@@ -565,6 +568,17 @@ mod tests {
         assert!(array.accepts(&Variant::from(vec![1i32])));
         assert!(!array.accepts(&Variant::from(vec![1.0f64])));
         assert!(!array.accepts(&Variant::from(1i32)));
+        let empty = |dimensions: Option<Vec<u32>>| {
+            Variant::from(Array {
+                value_type: VariantScalarTypeId::Int32,
+                values: Vec::new(),
+                dimensions,
+            })
+        };
+        assert!(array.accepts(&empty(None)));
+        assert!(array.accepts(&empty(Some(Vec::new()))));
+        assert!(!array.accepts(&empty(Some(vec![0, 3]))));
+        assert!(!scalar.accepts(&empty(None)));
         assert!(Shape(None).accepts(&Variant::from("anything")));
     }
 }

@@ -149,8 +149,13 @@ impl ServerPort {
         let mdns = setup.announce.as_ref().is_some_and(|to| to.mdns.is_some());
         let core = core(&setup.sks, &pubsub, (&certificates, mdns), described);
         let builder = endpoint::server(described, (&setup.url, port), &security);
-        let (door, listener, builder) =
-            endpoint::door(&setup.pki, setup.trust_any_client, (listener, builder))?;
+        let clients = endpoint::clients(described.limits);
+        let (door, listener, builder) = endpoint::door(
+            &setup.pki,
+            setup.trust_any_client,
+            clients,
+            (listener, builder),
+        )?;
         let (server, handle) = builder
             .with_authenticator(Arc::clone(&access) as Arc<dyn AuthManager>)
             .with_node_manager(core)

@@ -23,7 +23,7 @@ use super::routed::{Front, Routed};
 use super::{Inner, Server, Waiting};
 use crate::door::Door;
 use crate::endpoint::{BindError, EndpointUrl};
-use crate::limits;
+use crate::limits::{self, ClientLimits};
 use crate::nodeset::{self, NodeSet, NodeSetError, Source};
 use crate::pki::{OWN_CERTIFICATE, OWN_KEY, Pki, PkiError};
 use crate::users::Access;
@@ -103,6 +103,8 @@ pub struct ServerConfig {
     pub trust_unknown_clients: bool,
     /// How long a session may be silent at most.
     pub session_timeout: Duration,
+    /// The number of clients.
+    pub clients: ClientLimits,
 }
 
 impl ServerConfig {
@@ -119,6 +121,7 @@ impl ServerConfig {
             pki: None,
             trust_unknown_clients: false,
             session_timeout: Duration::from_secs(60),
+            clients: ClientLimits::default(),
         }
     }
 }
@@ -241,7 +244,8 @@ impl ServerBuilder {
         let port = listener.local_addr()?.port();
         let mut listener = tokio::net::TcpListener::from_std(listener)?;
         let root = pki.as_ref().filter(|_| !config.trust_unknown_clients);
-        let door = root.map(|pki| Door::of(pki.root())).transpose()?.flatten();
+        let door = root.map(|pki| Door::of(pki.root(), config.clients));
+        let door = door.transpose()?.flatten();
         let door = match door {
             Some((door, behind)) => {
                 let behind = tokio::net::TcpListener::from_std(behind)?;
@@ -329,7 +333,7 @@ fn described(config: &ServerConfig, port: u16) -> opcua::server::ServerBuilder {
         .trust_client_certs(config.trust_unknown_clients)
         .subscription_poll_interval_ms(limits::POLL_MS)
         .max_session_timeout_ms(timeout)
-        .limits(limits::server());
+        .limits(limits::server(config.clients));
     for security in &config.security {
         for (name, endpoint) in security.endpoints(config.endpoint.path()) {
             builder = builder.add_endpoint(name, endpoint);

@@ -5,7 +5,6 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
-use argon2::{Argon2, PasswordVerifier as _};
 use async_trait::async_trait;
 use opcua::crypto::{SecurityPolicy, Thumbprint};
 use opcua::server::address_space::AccessLevel;
@@ -22,6 +21,7 @@ use tokio::sync::Semaphore;
 use tracing::{info, warn};
 
 use super::file::{Credential, LARGEST_PASSWORD, LIST, UserFault, Users};
+use super::password::has_hash;
 use super::{Role, Roles};
 
 /// What a user may do with a node.
@@ -280,7 +280,7 @@ impl Access {
         let checked = tokio::task::spawn_blocking(move || {
             let _held = permit;
             let hash = hash.as_deref().unwrap_or(NOBODYS);
-            Argon2::default().verify_password(&password, hash).is_ok()
+            has_hash(&password, hash)
         });
         checked.await.unwrap_or(false) && known
     }

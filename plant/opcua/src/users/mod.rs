@@ -4,10 +4,11 @@
 //! there, and for each request of that session what its user may do is asked again (`access`): a user that is taken away,
 //! or has other roles, is that for open sessions too.
 //!
-//! Reading order: the roles here, `file`, `access`.
+//! Reading order: the roles here, `file`, `password`, `access`.
 
 mod access;
 mod file;
+mod password;
 
 pub use self::access::{Access, Anonymous, Login, LoginFault, Permissions, Right, Rules};
 pub use self::file::{
