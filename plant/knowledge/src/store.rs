@@ -305,10 +305,8 @@ fn apply(
     added: &[Triple],
     removed: &[Triple],
 ) -> Result<(), StorageError> {
-    for triple in added {
-        transaction.insert(triple.as_ref().in_graph(graph));
-        transaction.insert(triple.as_ref().in_graph(GraphNameRef::DefaultGraph));
-    }
+    // The store keeps literals in their canonical form: `.120Z` is added again where `.12Z` is removed. Statements are
+    // therefore removed before others are added.
     for triple in removed {
         transaction.remove(triple.as_ref().in_graph(graph));
     }
@@ -329,6 +327,10 @@ fn apply(
         if !is_said {
             transaction.remove(triple.as_ref().in_graph(GraphNameRef::DefaultGraph));
         }
+    }
+    for triple in added {
+        transaction.insert(triple.as_ref().in_graph(graph));
+        transaction.insert(triple.as_ref().in_graph(GraphNameRef::DefaultGraph));
     }
     // A graph without statements is none.
     let is_empty = transaction
@@ -416,3 +418,44 @@ fn named(iri: &str) -> Result<NamedNode, KnowledgeFault> {
 const MAX_STATEMENTS: usize = 200_000;
 const MAX_SOURCES: usize = 2000;
 const MAX_DERIVED: usize = 500_000;
+
+#[cfg(test)]
+#[expect(clippy::unwrap_used, reason = "a test may")]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn literals_that_are_not_canonical_stay_when_their_source_is_replaced() {
+        let knowledge = Knowledge::new().unwrap();
+        let source = Source::new(SourceKind::File, "times.ttl");
+        let literals = [
+            r#""2026-11-27T10:00:00.120Z"^^xsd:dateTime"#,
+            r#""2026-11-27T10:00:01.000Z"^^xsd:dateTime"#,
+            r#""007"^^xsd:integer"#,
+            r#""1.50"^^xsd:decimal"#,
+            r#""1e0"^^xsd:double"#,
+            r#""1"^^xsd:boolean"#,
+            r#""P0Y14M"^^xsd:duration"#,
+        ];
+        let mut turtle = "@prefix xsd: <http://www.w3.org/2001/XMLSchema#> .\n".to_owned();
+        for (at, literal) in (1..).zip(literals) {
+            let line = format!("<urn:example:{at}> <urn:example:is> {literal} .\n");
+            turtle.push_str(&line);
+            // Each version repeats the statements of the version before.
+            knowledge.replace_turtle(&source, &turtle, 0).unwrap();
+            let own = named(&source.graph()).unwrap();
+            for graph in [own.as_ref().into(), GraphNameRef::DefaultGraph] {
+                let found = knowledge
+                    .store
+                    .quads_for_pattern(None, None, None, Some(graph))
+                    .count();
+                assert_eq!(found, at, "{literal}");
+            }
+        }
+        // A statement that is left out is removed, in whichever form its literal was written.
+        knowledge
+            .replace_turtle(&source, "<urn:a> <urn:b> <urn:c> .", 0)
+            .unwrap();
+        assert_eq!(knowledge.store.len().unwrap(), 2);
+    }
+}
