@@ -1,7 +1,6 @@
 //! Files to the graph: what capabilities are, which types there are, what modules can do, which processes are known.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::fs;
 
 use bridge_node::{Failure, FailureKind};
 use knowledge::{Knowledge, Source, SourceKind, nodeset, vocabulary as v};
@@ -20,18 +19,28 @@ pub(crate) fn all(knowledge: &Knowledge, settings: &Settings, at: u64) -> Result
     let ours = skills::model::nodeset();
     put_node_set(knowledge, "the NodeSet of skills", &ours, (at, &mut types))?;
     for file in &settings.nodesets {
-        put_node_set(knowledge, &file.name, &read(file)?, (at, &mut types))?;
+        let bytes = read(file)?;
+        let text = xml_text::decode(&bytes).map_err(|fault| refused(&file.name, &fault))?;
+        put_node_set(knowledge, &file.name, &text, (at, &mut types))?;
     }
     for file in &settings.knowledge {
         let source = Source::new(SourceKind::File, &file.name);
+        let text = String::from_utf8(read(file)?);
+        let text = text.map_err(|error| {
+            let at = error.utf8_error().valid_up_to();
+            refused(
+                &file.name,
+                &format!("it is not UTF-8 from byte {at} on; save it as UTF-8"),
+            )
+        })?;
         knowledge
-            .replace_turtle(&source, &read(file)?, at)
+            .replace_turtle(&source, &text, at)
             .map_err(|fault| refused(&file.name, &fault))?;
     }
     for manifest in &settings.manifests {
         let name = &manifest.source.name;
         let module =
-            Module::read(&read(&manifest.source)?).map_err(|fault| refused(name, &fault))?;
+            Module::from_bytes(&read(&manifest.source)?).map_err(|fault| refused(name, &fault))?;
         for finding in &module.findings {
             warn!(manifest = name, "{}: {}", finding.about, finding.what);
         }
@@ -116,12 +125,15 @@ fn put_node_set(
         .map_err(|fault| refused(name, &fault))
 }
 
-fn read(file: &settings::Source) -> Result<String, Failure> {
+fn read(file: &settings::Source) -> Result<Vec<u8>, Failure> {
     let path = file.path.display();
-    fs::read_to_string(&file.path)
+    bridge_node::read_bounded(&file.path, LARGEST)
         .map_err(|error| Failure::new(FailureKind::Io, format!("cannot read {path}: {error}")))
 }
 
 fn refused(name: &str, fault: &dyn std::fmt::Display) -> Failure {
     Failure::new(FailureKind::Configuration, format!("{name}: {fault}"))
 }
+
+/// Bytes of the largest file of knowledge.
+const LARGEST: u64 = 64 << 20;

@@ -28,6 +28,12 @@ pub enum ManifestError {
         /// What is wrong.
         what: String,
     },
+    /// The encoding of the text is not supported, or the text does not fit it.
+    #[error(transparent)]
+    Encoding(#[from] xml_text::EncodingError),
+    /// The file is a ZIP container without a readable manifest.
+    #[error("the container cannot be used: {0}")]
+    Container(String),
     /// It is XML of something else.
     #[error(
         "there is no element with the role MTPSUCLib/ModuleTypePackage: this is no manifest of an MTP"
@@ -233,6 +239,6 @@ fn line(file: &str, position: u64) -> usize {
 }
 
 /// The largest of the manifests at hand has 0.8 MB.
-const MAX_FILE: usize = 64 << 20;
+pub(crate) const MAX_FILE: usize = 64 << 20;
 const MAX_DEPTH: usize = 64;
 const MAX_ELEMENTS: usize = 1 << 20;

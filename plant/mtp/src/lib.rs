@@ -1,5 +1,6 @@
 //! Module Type Packages: what a process module can do, as its maker wrote it down (VDI/VDE/NAMUR 2658).
 //!
+//! [`Module::from_bytes`] reads a manifest as it is handed over, in its container and its encoding.
 //! [`Module::read`] makes a typed model of a manifest, the AutomationML file in an MTP: the services of the module, their
 //! procedures and parameters, and the OPC UA nodes by which each is asked, commanded and watched. Files of 2018 to 2026 differ
 //! in what they call things (`ServiceStrategy`, `ServiceProcedure`, `Service/Procedure`; `CommandEn`, `CommandEnable`,
@@ -11,6 +12,7 @@
 //! No file is opened here and no server is asked.
 
 mod caex;
+mod container;
 mod model;
 mod rdf;
 mod read;

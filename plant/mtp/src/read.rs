@@ -1,14 +1,29 @@
 //! From the tree of elements to the model.
 
+use std::borrow::Cow;
 use std::collections::HashMap;
 
 use crate::caex::{Element, ManifestError};
+use crate::container;
 use crate::model::{
     Access, Bound, Control, Finding, Identifier, Module, Node, Parameter, Procedure, Role, Service,
     ValueKind,
 };
 
 impl Module {
+    /// Reads a manifest as it is handed over: an `.aml` file in any encoding of [`xml_text`], or a ZIP container of one, an
+    /// `.mtp` or an `.amlx` file.
+    ///
+    /// # Errors
+    /// [`ManifestError`] if the file is no manifest.
+    pub fn from_bytes(file: &[u8]) -> Result<Self, ManifestError> {
+        let unpacked = match container::is_container(file) {
+            true => Cow::Owned(container::document(file)?),
+            false => Cow::Borrowed(file),
+        };
+        Self::read(&xml_text::decode(&unpacked)?)
+    }
+
     /// Reads a manifest, the text of the `.aml` file of an MTP.
     ///
     /// # Errors

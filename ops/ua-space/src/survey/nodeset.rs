@@ -3,8 +3,7 @@
 //! The file is not trusted: a document type is refused, so no entity is ever expanded, and sizes are bounded.
 
 use std::collections::{HashMap, HashSet};
-use std::fs::File;
-use std::io::Read as _;
+use std::path::Path;
 
 use mappings::{Identifier, NodeIdText};
 use quick_xml::XmlVersion;
@@ -18,15 +17,9 @@ use crate::exit::Failure;
 
 /// Reads the file.
 pub(crate) fn survey(file: &str) -> Result<Nodes, Failure> {
-    let mut xml = String::new();
-    let read = File::open(file).and_then(|opened| opened.take(LARGEST).read_to_string(&mut xml));
-    let length = read.map_err(|error| Failure::reading(file, &error))?;
-    if u64::try_from(length).is_ok_and(|length| length == LARGEST) {
-        return Err(Failure::Data(format!(
-            "{file}: a NodeSet of more than {} MiB is not read",
-            LARGEST >> 20
-        )));
-    }
+    let bytes = type_files::read_bounded(Path::new(file), LARGEST)
+        .map_err(|why| Failure::Io(format!("cannot read {file}: {why}")))?;
+    let xml = xml_text::decode(&bytes).map_err(|why| Failure::Data(format!("{file}: {why}")))?;
     parse(&xml, file).map_err(|fault| {
         let line = xml.get(..fault.at).unwrap_or(&xml).matches('\n').count() + 1;
         Failure::Data(format!("{file}:{line}: {}", fault.what))

@@ -1,0 +1,208 @@
+//! Decodes XML documents (XML 1.0, 4.3.3 and appendix F): the byte order mark decides, then the declaration, then UTF-8.
+//!
+//! Engineering tools export UTF-16 and ISO-8859-1 as well as UTF-8. The parsers of the workspace read text only.
+
+use std::borrow::Cow;
+
+/// A document that cannot be decoded.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum EncodingError {
+    /// The bytes do not fit the encoding that the document names.
+    #[error("line {line}: the bytes are not {encoding}; save the file as UTF-8")]
+    Malformed {
+        /// Line of the first wrong byte, from 1.
+        line: usize,
+        /// Name of the encoding.
+        encoding: &'static str,
+    },
+    /// The declaration names an encoding that is not supported.
+    #[error("the encoding `{0}` is not supported; save the file as UTF-8")]
+    Unsupported(String),
+}
+
+/// Decodes a document. The byte order mark is left out, the declaration stays as it is.
+///
+/// # Errors
+/// [`EncodingError`] if the encoding is unknown, or the bytes do not fit it.
+pub fn decode(bytes: &[u8]) -> Result<Cow<'_, str>, EncodingError> {
+    let (encoding, bytes) = detect(bytes)?;
+    let malformed = |before: usize| EncodingError::Malformed {
+        line: before + 1,
+        encoding: encoding.name(),
+    };
+    match encoding {
+        Encoding::Utf8 => std::str::from_utf8(bytes)
+            .map(Cow::Borrowed)
+            .map_err(|error| {
+                let before = bytes.get(..error.valid_up_to()).unwrap_or_default();
+                malformed(before.iter().filter(|byte| **byte == b'\n').count())
+            }),
+        Encoding::Utf16(order) => {
+            let (units, rest) = bytes.as_chunks::<2>();
+            let units = units.iter().map(|unit| match order {
+                Order::Little => u16::from_le_bytes(*unit),
+                Order::Big => u16::from_be_bytes(*unit),
+            });
+            let mut text = String::with_capacity(bytes.len() / 2);
+            for unit in char::decode_utf16(units) {
+                let lines = |text: &str| text.matches('\n').count();
+                text.push(unit.map_err(|_| malformed(lines(&text)))?);
+            }
+            match rest {
+                [] => Ok(Cow::Owned(text)),
+                _ => Err(malformed(text.matches('\n').count())),
+            }
+        }
+        Encoding::Latin1 => Ok(Cow::Owned(
+            bytes.iter().map(|byte| char::from(*byte)).collect(),
+        )),
+        Encoding::Windows1252 => Ok(Cow::Owned(
+            bytes.iter().map(|byte| windows(*byte)).collect(),
+        )),
+    }
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Encoding {
+    Utf8,
+    Utf16(Order),
+    Latin1,
+    Windows1252,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Order {
+    Little,
+    Big,
+}
+
+impl Encoding {
+    const fn name(self) -> &'static str {
+        match self {
+            Self::Utf8 => "UTF-8",
+            Self::Utf16(_) => "UTF-16",
+            Self::Latin1 => "ISO-8859-1",
+            Self::Windows1252 => "windows-1252",
+        }
+    }
+}
+
+/// Returns the encoding, and the bytes behind the byte order mark.
+fn detect(bytes: &[u8]) -> Result<(Encoding, &[u8]), EncodingError> {
+    Ok(match bytes {
+        [0xEF, 0xBB, 0xBF, rest @ ..] => (Encoding::Utf8, rest),
+        [0xFF, 0xFE, rest @ ..] => (Encoding::Utf16(Order::Little), rest),
+        [0xFE, 0xFF, rest @ ..] => (Encoding::Utf16(Order::Big), rest),
+        // `<?` without a byte order mark.
+        [b'<', 0, b'?', 0, ..] => (Encoding::Utf16(Order::Little), bytes),
+        [0, b'<', 0, b'?', ..] => (Encoding::Utf16(Order::Big), bytes),
+        _ => (declared(bytes)?, bytes),
+    })
+}
+
+/// The encoding that the declaration of a document in an ASCII-compatible encoding names.
+fn declared(bytes: &[u8]) -> Result<Encoding, EncodingError> {
+    let start = bytes.get(..LONGEST_DECLARATION.min(bytes.len()));
+    let start = String::from_utf8_lossy(start.unwrap_or_default());
+    let declaration = start
+        .strip_prefix("<?xml")
+        .and_then(|rest| Some(rest.split_once("?>")?.0));
+    let name = declaration.and_then(|declaration| {
+        let (_, value) = declaration.split_once("encoding")?;
+        let value = value.trim_start().strip_prefix('=')?.trim_start();
+        let quote = value.chars().next().filter(|c| matches!(c, '"' | '\''))?;
+        value.get(1..)?.split(quote).next()
+    });
+    let Some(name) = name else {
+        return Ok(Encoding::Utf8);
+    };
+    match name.to_ascii_lowercase().as_str() {
+        // A document that was converted often keeps the name of the encoding it had.
+        "utf-8" | "utf8" | "us-ascii" | "ascii" | "utf-16" | "utf16" => Ok(Encoding::Utf8),
+        "iso-8859-1" | "iso8859-1" | "latin1" | "latin-1" => Ok(Encoding::Latin1),
+        "windows-1252" | "cp1252" => Ok(Encoding::Windows1252),
+        _ => Err(EncodingError::Unsupported(name.chars().take(40).collect())),
+    }
+}
+
+/// The character of a byte in windows-1252, which differs from ISO-8859-1 in 32 bytes.
+fn windows(byte: u8) -> char {
+    let at = usize::from(byte).checked_sub(0x80);
+    let special = at.and_then(|at| WINDOWS.get(at));
+    special.copied().unwrap_or_else(|| char::from(byte))
+}
+
+/// The characters of 0x80 to 0x9F. Five bytes have none.
+const WINDOWS: [char; 32] = [
+    '€', '\u{FFFD}', '‚', 'ƒ', '„', '…', '†', '‡', 'ˆ', '‰', 'Š', '‹', 'Œ', '\u{FFFD}', 'Ž',
+    '\u{FFFD}', '\u{FFFD}', '‘', '’', '“', '”', '•', '–', '—', '˜', '™', 'š', '›', 'œ', '\u{FFFD}',
+    'ž', 'Ÿ',
+];
+/// Bytes in which a declaration ends.
+const LONGEST_DECLARATION: usize = 200;
+
+#[cfg(test)]
+#[expect(clippy::unwrap_used, reason = "a test may")]
+mod tests {
+    use super::*;
+
+    fn utf16(text: &str, bytes_of: fn(u16) -> [u8; 2]) -> Vec<u8> {
+        text.encode_utf16().flat_map(bytes_of).collect()
+    }
+
+    #[test]
+    fn documents_are_decoded_by_mark_then_declaration_then_as_utf8() {
+        let text =
+            |encoding: &str| format!("<?xml version='1.0' encoding=\"{encoding}\"?>\n<a>°Cö</a>");
+        let latin = |encoding: &str| -> Vec<u8> {
+            let text = text(encoding);
+            text.chars()
+                .map(|c| u8::try_from(u32::from(c)).unwrap())
+                .collect()
+        };
+        let wide = text("utf-16");
+        for (bytes, expected) in [
+            (text("UTF-8").into_bytes(), text("UTF-8")),
+            (
+                format!("\u{feff}{}", text("utf-8")).into_bytes(),
+                text("utf-8"),
+            ),
+            ("<a>ö</a>".into(), "<a>ö</a>".to_owned()),
+            (
+                utf16(&format!("\u{feff}{wide}"), u16::to_le_bytes),
+                wide.clone(),
+            ),
+            (
+                utf16(&format!("\u{feff}{wide}"), u16::to_be_bytes),
+                wide.clone(),
+            ),
+            (utf16(&wide, u16::to_le_bytes), wide.clone()),
+            (utf16(&wide, u16::to_be_bytes), wide.clone()),
+            (wide.clone().into_bytes(), wide.clone()),
+            (latin("ISO-8859-1"), text("ISO-8859-1")),
+            (latin("Windows-1252"), text("Windows-1252")),
+            (vec![], String::new()),
+        ] {
+            assert_eq!(decode(&bytes).unwrap(), expected);
+        }
+        let euro = b"<?xml version='1.0' encoding='windows-1252'?><a>\x80\x9f</a>";
+        assert!(decode(euro).unwrap().ends_with("<a>€Ÿ</a>"));
+    }
+
+    #[test]
+    fn bytes_that_do_not_fit_are_refused_with_their_line() {
+        let line = |bytes: &[u8]| match decode(bytes) {
+            Err(EncodingError::Malformed { line, encoding }) => (line, encoding),
+            other => (0, if other.is_ok() { "read" } else { "unsupported" }),
+        };
+        assert_eq!(line(b"<a>\n\n\xf6</a>"), (3, "UTF-8"));
+        // Half a pair of surrogates, half a unit.
+        assert_eq!(line(b"\xff\xfe<\0\n\0\0\xd8<\0"), (2, "UTF-16"));
+        assert_eq!(line(b"\xff\xfe<\0\n\0<"), (2, "UTF-16"));
+        assert_eq!(
+            decode(b"<?xml version='1.0' encoding='EBCDIC'?><a/>"),
+            Err(EncodingError::Unsupported("EBCDIC".to_owned()))
+        );
+    }
+}
