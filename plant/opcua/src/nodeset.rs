@@ -1,12 +1,14 @@
 //! NodeSet2 files (OPC 10000-6, Annex F): read, checked and put into an order in which each has what it needs.
 
+mod document;
 mod files;
 mod outline;
 mod structures;
+#[cfg(test)]
+mod tests;
 
 use std::collections::{BTreeSet, HashMap};
-use std::fs::File;
-use std::io::{self, Read as _};
+use std::io;
 use std::path::PathBuf;
 use std::str::FromStr as _;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -17,14 +19,14 @@ use opcua::types::{
     DataTypeDefinition, Identifier, NamespaceMap, NodeId, NodeSetNamespaceMapper, ReferenceTypeId,
     StructureDefinition,
 };
-use opcua::xml::load_nodeset2_file;
 use opcua::xml::schema::ua_node_set::{AliasTable, NodeIdAlias, UANode, UANodeSet};
 
-use crate::limits::{LARGEST_NODESET, MOST_NODESETS};
+use crate::limits::MOST_NODESETS;
 
 pub use self::files::{FileFault, Imported, NodeSets, fingerprint};
 pub use self::outline::{NodeKind, ValueKind, builtin};
 
+use self::document::{Parsed, Text};
 use self::outline::Outline;
 
 /// The namespace of the OPC Foundation, index 0 of every server.
@@ -51,10 +53,12 @@ pub enum NodeSetError {
         reason: String,
     },
     /// A node of the document is wrong.
-    #[error("{file}: node {node}: {reason}")]
+    #[error("{file}:{line}: node {node}: {reason}")]
     Node {
         /// The file.
         file: String,
+        /// The line, from 1.
+        line: usize,
         /// The NodeId as the file has it.
         node: String,
         /// What is wrong.
@@ -70,13 +74,23 @@ pub enum NodeSetError {
         /// How many nodes the file has.
         all: usize,
     },
-    /// Values of nodes cannot be read, such as structures of types that are not known; the nodes are there without them.
-    #[error("{file}: the values of {count} nodes cannot be read, of which the first is {first}")]
+    /// The value of a node cannot be read, such as a structure of an unknown type. The node is there without the value.
+    #[error("{file}:{line}: node {node}: the value cannot be read: {reason}")]
     Unread {
         /// The file.
         file: String,
-        /// The NodeId of the first of them, as the file has it.
-        first: String,
+        /// The line of the node, from 1.
+        line: usize,
+        /// The NodeId, as the file has it.
+        node: String,
+        /// What is wrong.
+        reason: String,
+    },
+    /// Number of nodes whose unreadable values have no finding each.
+    #[error("{file}: the values of {count} more nodes cannot be read")]
+    MoreUnread {
+        /// The file.
+        file: String,
         /// How many there are.
         count: usize,
     },
@@ -118,6 +132,7 @@ pub enum NodeSetError {
 #[derive(Debug)]
 pub(crate) enum Source {
     Text { name: String, xml: String },
+    Bytes { name: String, bytes: Vec<u8> },
     File(PathBuf),
 }
 
@@ -186,42 +201,10 @@ pub(crate) fn load(sources: Vec<Source>) -> Result<Vec<NodeSet>, NodeSetError> {
     ordered(read.collect::<Result<_, _>>()?)
 }
 
-/// The document of a source, with its name.
-fn parsed(source: Source) -> Result<(String, UANodeSet), NodeSetError> {
-    let (file, xml) = match source {
-        Source::Text { name, xml } => (name, xml),
-        Source::File(path) => {
-            let file = path.display().to_string();
-            let mut xml = String::new();
-            let read = File::open(&path)
-                .and_then(|opened| opened.take(LARGEST_NODESET + 1).read_to_string(&mut xml));
-            match read {
-                Ok(bytes) if bytes as u64 > LARGEST_NODESET => {
-                    let reason = format!("it has more than {} MiB", LARGEST_NODESET >> 20);
-                    return Err(NodeSetError::Xml { file, reason });
-                }
-                Ok(_) => (file, xml),
-                Err(source) => return Err(NodeSetError::Read { file, source }),
-            }
-        }
-    };
-    let wrong = |reason: String| NodeSetError::Xml {
-        file: file.clone(),
-        reason,
-    };
-    // A byte order mark is no part of the document.
-    let document = load_nodeset2_file(xml.trim_start_matches('\u{feff}'))
-        .map_err(|error| wrong(error.to_string()))?;
-    let set = document
-        .node_set
-        .ok_or_else(|| wrong("it has no UANodeSet element".to_owned()))?;
-    Ok((file, set))
-}
-
 impl NodeSet {
     fn read(source: Source) -> Result<Self, NodeSetError> {
-        let (file, set) = parsed(source)?;
-        let facts = Facts::of(&file, &set)?;
+        let Parsed { file, text, set } = Parsed::read(source)?;
+        let facts = Facts::of(&file, &text, &set)?;
         let (types, others) = parted(set);
         Ok(Self {
             file,
@@ -271,14 +254,13 @@ impl NodeSet {
 }
 
 impl Facts {
-    fn of(file: &str, set: &UANodeSet) -> Result<Self, NodeSetError> {
-        let table = set.namespace_uris.as_ref();
-        let uris = table.map_or_else(Vec::new, |table| table.uris.clone());
-        // Some tools list the core namespace too, as index 0.
-        let offset = usize::from(uris.first().is_none_or(|first| first != CORE));
+    fn of(file: &str, text: &Text, set: &UANodeSet) -> Result<Self, NodeSetError> {
+        let uris = document::uris(set).to_vec();
+        let offset = document::offset(set);
         let aliases = set.aliases.iter().flat_map(|table| &table.aliases);
         let check = Check {
             file,
+            text,
             uris: &uris,
             offset,
             aliases: aliases
@@ -291,17 +273,26 @@ impl Facts {
         for node in &set.nodes {
             let (id, used) = check.node(node)?;
             let uri = check.uri(id.namespace).unwrap_or(CORE);
-            if uri == CORE {
-                return Err(NodeSetError::Core {
-                    node: node.base().node_id.0.clone(),
-                    file: file.to_owned(),
-                });
-            }
             provides.insert(uri.to_owned());
             needs.extend(used);
             let resolved = |text: &str| check.id(text).ok();
             if !nodes.insert(id, node, &resolved) {
                 return Err(check.wrong(node, "there are two nodes with this NodeId"));
+            }
+        }
+        for node in &set.nodes {
+            let id = check.id(&node.base().node_id.0).unwrap_or_default();
+            let mut at = &id;
+            let is_endless = (0..DEEPEST).all(|_| match nodes.supertype(at) {
+                Some(next) => {
+                    at = next;
+                    true
+                }
+                None => false,
+            });
+            if is_endless {
+                let reason = format!("it has more than {DEEPEST} supertypes, or is one of its own");
+                return Err(check.wrong(node, reason));
             }
         }
         for model in set.models.iter().flat_map(|table| &table.models) {
@@ -340,7 +331,7 @@ impl Facts {
 
     fn register_namespaces(&self, namespaces: &mut NodeSetNamespaceMapper<'_>) {
         for (index, uri) in (0_u16..).skip(self.offset).zip(&self.uris) {
-            if uri != CORE {
+            if index > 0 {
                 namespaces.add_namespace(uri, index);
             }
         }
@@ -421,6 +412,7 @@ const DEEPEST: usize = 64;
 /// What the library would panic at, or leave out without saying so.
 struct Check<'a> {
     file: &'a str,
+    text: &'a Text,
     uris: &'a [String],
     offset: usize,
     aliases: HashMap<&'a str, &'a str>,
@@ -428,9 +420,11 @@ struct Check<'a> {
 
 impl Check<'_> {
     fn wrong(&self, node: &UANode, reason: impl Into<String>) -> NodeSetError {
+        let node = node.base().node_id.0.clone();
         NodeSetError::Node {
             file: self.file.to_owned(),
-            node: node.base().node_id.0.clone(),
+            line: self.text.lines_of(&[&node]).remove(&node).unwrap_or(1),
+            node,
             reason: reason.into(),
         }
     }

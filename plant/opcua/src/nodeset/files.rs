@@ -17,11 +17,10 @@ use opcua::types::{
 };
 use opcua::xml::schema::ua_node_set::{UANode, UANodeSet};
 
+use super::document::{Parsed, Text};
 use super::outline::{self, Found, NodeKind, ValueKind};
-use super::structures::{self, Structures, can_be_sent};
-use super::{
-    CORE, DEEPEST, Facts, NodeSet, NodeSetError, Source, imported, ordered, parsed, parted,
-};
+use super::structures::{self, Structures};
+use super::{CORE, DEEPEST, Facts, NodeSet, NodeSetError, Source, imported, ordered, parted};
 use crate::limits::{LARGEST_NODESETS, MOST_NODESETS};
 
 /// NodeSets that can be put into an address space.
@@ -58,7 +57,7 @@ impl NodeSetError {
     /// Whether the NodeSet cannot be used at all.
     #[must_use]
     pub const fn is_fatal(&self) -> bool {
-        !matches!(self, Self::Unread { .. })
+        !matches!(self, Self::Unread { .. } | Self::MoreUnread { .. })
     }
 
     /// What to do, for people.
@@ -70,7 +69,7 @@ impl NodeSetError {
                 "a NodeSet2 file is an XML document <UANodeSet xmlns=\"http://opcfoundation.org/UA/2011/03/UANodeSet.xsd\">"
             }
             Self::Node { .. } => "mend the file, or have whoever made it export it anew",
-            Self::Values { .. } | Self::Unread { .. } => {
+            Self::Values { .. } | Self::Unread { .. } | Self::MoreUnread { .. } => {
                 "a structure is read by the definition that its DataType has in one of the files; its nodes are there, without the values"
             }
             Self::Missing { .. } => {
@@ -106,12 +105,33 @@ impl NodeSets {
             }
             match length(path).and_then(|length| {
                 room = room.checked_sub(length).ok_or_else(|| too_large(path))?;
-                Document::read(path)
+                Document::read(Source::File(path.clone()))
             }) {
                 Ok(document) => documents.push((file, document)),
                 Err(error) => fault(error),
             }
         }
+        Self::assemble(documents, faults, fingerprint(files))
+    }
+
+    /// Reads a single document.
+    #[must_use]
+    pub fn of_document(name: &str, bytes: &[u8]) -> (Self, Vec<FileFault>) {
+        let source = Source::Bytes {
+            name: name.to_owned(),
+            bytes: bytes.to_vec(),
+        };
+        match Document::read(source) {
+            Ok(document) => Self::assemble(vec![(0, document)], Vec::new(), 0),
+            Err(error) => (Self::default(), vec![FileFault { file: 0, error }]),
+        }
+    }
+
+    fn assemble(
+        documents: Vec<(usize, Document)>,
+        mut faults: Vec<FileFault>,
+        fingerprint: u64,
+    ) -> (Self, Vec<FileFault>) {
         let structures = Arc::new(Structures::default());
         let mut map = NamespaceMap::new();
         let all = documents.iter().map(|(_, document)| document);
@@ -119,7 +139,7 @@ impl NodeSets {
         let mut read = Vec::new();
         for (file, document) in documents {
             let (set, unread) = document.into_set(&structures, &mut map);
-            faults.extend(unread.map(|error| FileFault { file, error }));
+            faults.extend(unread.into_iter().map(|error| FileFault { file, error }));
             read.push((file, set));
         }
         let is_whole = !faults.iter().any(|fault| fault.error.is_fatal());
@@ -134,7 +154,7 @@ impl NodeSets {
         let mut sets = Self {
             sets: Vec::new(),
             provides,
-            fingerprint: fingerprint(files),
+            fingerprint,
             structures,
         };
         match ordered(read.into_iter().map(|(_, set)| set).collect()) {
@@ -253,6 +273,7 @@ impl NodeSets {
 /// A file that is read and sound.
 struct Document {
     file: String,
+    text: Text,
     facts: Facts,
     types: NodeSet2Import,
     /// Its nodes beside the types.
@@ -260,12 +281,13 @@ struct Document {
 }
 
 impl Document {
-    fn read(path: &Path) -> Result<Self, NodeSetError> {
-        let (file, document) = parsed(Source::File(path.to_owned()))?;
-        let facts = Facts::of(&file, &document)?;
-        let (types, others) = parted(document);
+    fn read(source: Source) -> Result<Self, NodeSetError> {
+        let Parsed { file, text, set } = Parsed::read(source)?;
+        let facts = Facts::of(&file, &text, &set)?;
+        let (types, others) = parted(set);
         Ok(Self {
             file,
+            text,
             facts,
             types: imported(types),
             others,
@@ -277,15 +299,11 @@ impl Document {
         mut self,
         structures: &Arc<Structures>,
         map: &mut NamespaceMap,
-    ) -> (NodeSet, Option<NodeSetError>) {
+    ) -> (NodeSet, Vec<NodeSetError>) {
         let loader: Arc<dyn TypeLoader> = Arc::<Structures>::clone(structures);
         let nodes = without_unread(&self.facts, &mut self.others, &loader, map);
-        let fault = nodes.first().map(|first| NodeSetError::Unread {
-            file: self.file.clone(),
-            first: first.clone(),
-            count: nodes.len(),
-        });
-        let unread = nodes.iter().filter_map(|node| node.parse().ok());
+        let faults = unread(&self.file, &self.text, &nodes);
+        let unread = nodes.iter().filter_map(|(node, _)| node.parse().ok());
         let mut others = imported(self.others);
         others.add_type_loader(loader);
         let set = NodeSet {
@@ -295,9 +313,34 @@ impl Document {
             types: self.types,
             others,
         };
-        (set, fault)
+        (set, faults)
     }
 }
+
+/// The findings for nodes whose values cannot be read.
+fn unread(file: &str, text: &Text, nodes: &[(String, String)]) -> Vec<NodeSetError> {
+    if nodes.is_empty() {
+        return Vec::new();
+    }
+    let reported = nodes.get(..MOST_UNREAD).unwrap_or(nodes);
+    let ids: Vec<&str> = reported.iter().map(|(node, _)| node.as_str()).collect();
+    let lines = text.lines_of(&ids);
+    let each = reported.iter().map(|(node, reason)| NodeSetError::Unread {
+        file: file.to_owned(),
+        line: lines.get(node).copied().unwrap_or(1),
+        node: node.clone(),
+        reason: reason.clone(),
+    });
+    let count = nodes.len() - reported.len();
+    let more = (count > 0).then(|| NodeSetError::MoreUnread {
+        file: file.to_owned(),
+        count,
+    });
+    each.chain(more).collect()
+}
+
+/// Number of unreadable values of a file that have a finding each.
+const MOST_UNREAD: usize = 10;
 
 /// Has the structures known that the files define. Their namespaces are numbered as in the map.
 fn define<'d>(
@@ -315,13 +358,13 @@ fn define<'d>(
     structures.define(&items);
 }
 
-/// Takes the values out that cannot be read, and says of which nodes they are.
+/// Takes the values out that cannot be read, and returns the NodeIds of their nodes with the reasons.
 fn without_unread(
     facts: &Facts,
     document: &mut UANodeSet,
     structures: &Arc<dyn TypeLoader>,
     map: &mut NamespaceMap,
-) -> Vec<String> {
+) -> Vec<(String, String)> {
     let mut mapper = NodeSetNamespaceMapper::new(map);
     facts.register_namespaces(&mut mapper);
     let mut loaders = TypeLoaderCollection::new();
@@ -345,14 +388,15 @@ fn without_unread(
             | UANode::DataType(_)
             | UANode::ReferenceType(_) => continue,
         };
-        let readable = |one: &opcua::xml::schema::ua_node_set::Value| {
-            Variant::from_nodeset(&one.0, &context).is_ok_and(|value| can_be_sent(&value, &context))
-        };
-        if value.as_ref().is_none_or(readable) {
+        let Some(written) = value else {
             continue;
-        }
+        };
+        let read = Variant::from_nodeset(&written.0, &context).map_err(|error| error.to_string());
+        let Err(reason) = read.and_then(|read| structures::check_sent(&read, &context)) else {
+            continue;
+        };
         *value = None;
-        unread.push(node.base().node_id.0.clone());
+        unread.push((node.base().node_id.0.clone(), reason));
     }
     unread
 }

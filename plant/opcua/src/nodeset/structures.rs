@@ -130,10 +130,17 @@ impl ExpandedMessageInfo for Exact {
     }
 }
 
-/// Whether clients can be sent a value. Structures of types that nobody knows are left as the XML they are, and what a file
-/// leaves out of a structure may be what it cannot do without.
-pub(super) fn can_be_sent(value: &Variant, context: &Context<'_>) -> bool {
-    is_known(value) && BinaryEncodable::encode(value, &mut std::io::sink(), context).is_ok()
+/// Checks that a value can be sent to clients. Structures of unknown types are left as XML, and a file may leave out a field
+/// that its structure needs.
+///
+/// # Errors
+/// The reason, for people.
+pub(super) fn check_sent(value: &Variant, context: &Context<'_>) -> Result<(), String> {
+    if !is_known(value) {
+        return Err("the type of its structure is not known".to_owned());
+    }
+    let encoded = BinaryEncodable::encode(value, &mut std::io::sink(), context);
+    encoded.map_err(|error| error.to_string())
 }
 
 fn is_known(value: &Variant) -> bool {

@@ -1,0 +1,254 @@
+//! NodeSet2 documents: from the bytes of a file to nodes, with the lines that findings name.
+
+use std::collections::HashMap;
+use std::fs::File;
+use std::io::Read as _;
+use std::path::Path;
+use std::str::FromStr as _;
+
+use opcua::types::NodeId;
+use opcua::xml::schema::ua_node_set::{
+    ListOfReferences, NodeId as NodeIdText, Reference, UANode, UANodeBase, UANodeSet,
+};
+use opcua::xml::{XmlErrorInner, load_nodeset2_file};
+use quick_xml::XmlVersion;
+use quick_xml::events::Event;
+use quick_xml::reader::Reader;
+
+use super::{CORE, NodeSetError, Source};
+use crate::limits::LARGEST_NODESET;
+
+/// A document, parsed.
+pub(super) struct Parsed {
+    /// The name of its file.
+    pub(super) file: String,
+    pub(super) text: Text,
+    pub(super) set: UANodeSet,
+}
+
+impl Parsed {
+    /// Reads a document. Its nodes of the core namespace are left out.
+    pub(super) fn read(source: Source) -> Result<Self, NodeSetError> {
+        let (file, text) = match source {
+            Source::Text { name, xml } => (name, Text(xml)),
+            Source::Bytes { name, bytes } => {
+                let text = Text::of(&name, &bytes)?;
+                (name, text)
+            }
+            Source::File(path) => {
+                let file = path.display().to_string();
+                let text = Text::of(&file, &bytes(&path, &file)?)?;
+                (file, text)
+            }
+        };
+        let document = load_nodeset2_file(&text.0).map_err(|error| match error.error {
+            XmlErrorInner::Xml(reason) => not_a_document(&file, reason.to_string()),
+            reason => {
+                let (line, node) = text.place_at(error.span.start);
+                let reason = reason.to_string();
+                match node {
+                    Some(node) => NodeSetError::Node {
+                        file: file.clone(),
+                        line,
+                        node,
+                        reason,
+                    },
+                    None => not_a_document(&file, format!("line {line}: {reason}")),
+                }
+            }
+        })?;
+        let mut set = document
+            .node_set
+            .ok_or_else(|| not_a_document(&file, "it has no UANodeSet element".to_owned()))?;
+        leave_out_core(&file, &mut set)?;
+        Ok(Self { file, text, set })
+    }
+}
+
+fn not_a_document(file: &str, reason: String) -> NodeSetError {
+    NodeSetError::Xml {
+        file: file.to_owned(),
+        reason,
+    }
+}
+
+/// The bytes of a file, at most [`LARGEST_NODESET`].
+fn bytes(path: &Path, file: &str) -> Result<Vec<u8>, NodeSetError> {
+    let mut bytes = Vec::new();
+    let read = File::open(path)
+        .and_then(|opened| opened.take(LARGEST_NODESET + 1).read_to_end(&mut bytes));
+    read.map_err(|source| NodeSetError::Read {
+        file: file.to_owned(),
+        source,
+    })?;
+    if u64::try_from(bytes.len()).is_ok_and(|length| length <= LARGEST_NODESET) {
+        return Ok(bytes);
+    }
+    let reason = format!("it has more than {} MiB", LARGEST_NODESET >> 20);
+    Err(not_a_document(file, reason))
+}
+
+/// The text of a document.
+pub(super) struct Text(String);
+
+impl Text {
+    fn of(file: &str, bytes: &[u8]) -> Result<Self, NodeSetError> {
+        let text = xml_text::decode(bytes);
+        let text = text.map_err(|error| not_a_document(file, error.to_string()))?;
+        Ok(Self(text.into_owned()))
+    }
+
+    /// Returns the line of a byte, from 1.
+    fn line(&self, at: usize) -> usize {
+        let before = self.0.as_bytes().get(..at).unwrap_or(self.0.as_bytes());
+        before.iter().filter(|byte| **byte == b'\n').count() + 1
+    }
+
+    /// Calls `found` with the start and the NodeId of each node, until it returns `false`.
+    fn each_node(&self, found: &mut dyn FnMut(usize, String) -> bool) {
+        let mut reader = Reader::from_str(&self.0);
+        reader.config_mut().check_end_names = false;
+        loop {
+            let start = usize::try_from(reader.buffer_position()).unwrap_or(usize::MAX);
+            let (Event::Start(element) | Event::Empty(element)) = (match reader.read_event() {
+                Ok(Event::Eof) | Err(_) => return,
+                Ok(event) => event,
+            }) else {
+                continue;
+            };
+            if !element.local_name().into_inner().starts_with("UA") {
+                continue;
+            }
+            let id = element.try_get_attribute("NodeId").ok().flatten();
+            let id = id.and_then(|id| id.normalized_value(XmlVersion::Implicit1_0).ok());
+            if let Some(id) = id
+                && !found(start, id.trim_ascii().to_owned())
+            {
+                return;
+            }
+        }
+    }
+
+    /// Returns the line of a byte, and the NodeId of the node that the byte belongs to.
+    fn place_at(&self, at: usize) -> (usize, Option<String>) {
+        let mut node = None;
+        self.each_node(&mut |start, id| {
+            let is_before = start <= at;
+            if is_before {
+                node = Some(id);
+            }
+            is_before
+        });
+        (self.line(at), node)
+    }
+
+    /// Returns the lines of nodes, from 1. A NodeId that occurs twice has the line of the last.
+    pub(super) fn lines_of(&self, nodes: &[&str]) -> HashMap<String, usize> {
+        let mut lines = HashMap::new();
+        let (mut line, mut counted) = (1, 0);
+        self.each_node(&mut |start, id| {
+            if nodes.contains(&id.as_str()) {
+                let between = self.0.as_bytes().get(counted..start).unwrap_or_default();
+                line += between.iter().filter(|byte| **byte == b'\n').count();
+                counted = start;
+                lines.insert(id, line);
+            }
+            true
+        });
+        lines
+    }
+}
+
+/// The index of the first URI in the table of a document.
+///
+/// The table begins at index 1 (OPC 10000-6, F.2). Some tools list the core namespace first, as index 0; others list it first
+/// as index 1. In the second case the last index in use is in the table only if counted from 1.
+pub(super) fn offset(set: &UANodeSet) -> usize {
+    let uris = uris(set);
+    if uris.first().is_none_or(|first| first != CORE) {
+        return 1;
+    }
+    let index = |text: &NodeIdText| NodeId::from_str(&text.0).map_or(0, |id| id.namespace);
+    let is_last = |text: &NodeIdText| usize::from(index(text)) == uris.len();
+    let uses_last = set.nodes.iter().any(|node| {
+        let base = node.base();
+        let mut references = base.references.iter().flat_map(|list| &list.references);
+        is_last(&base.node_id)
+            || references.any(|one| is_last(&one.node_id) || is_last(&one.reference_type))
+    });
+    usize::from(uses_last)
+}
+
+pub(super) fn uris(set: &UANodeSet) -> &[String] {
+    set.namespace_uris.as_ref().map_or(&[], |table| &table.uris)
+}
+
+/// Leaves out the nodes of the core namespace, which servers export beside their own. A reference from one of them to a node
+/// of the document is kept at that node.
+///
+/// # Errors
+/// [`NodeSetError::Core`] if the document has no other nodes.
+fn leave_out_core(file: &str, set: &mut UANodeSet) -> Result<(), NodeSetError> {
+    let (offset, count) = (offset(set), uris(set).len());
+    let core_index =
+        (offset == 1 && uris(set).first().is_some_and(|first| first == CORE)).then_some(1);
+    let is_core = |id: &NodeId| id.namespace == 0 || Some(id.namespace) == core_index;
+    let id_of = |text: &NodeIdText| NodeId::from_str(&text.0).ok();
+    let is_of_core = |node: &UANode| id_of(&node.base().node_id).is_some_and(|id| is_core(&id));
+    let Some(first) = set.nodes.iter().find(|node| is_of_core(node)) else {
+        return Ok(());
+    };
+    if count == 0 || set.nodes.iter().all(is_of_core) {
+        let node = first.base().node_id.0.clone();
+        return Err(NodeSetError::Core {
+            file: file.to_owned(),
+            node,
+        });
+    }
+    let (core, own): (Vec<_>, Vec<_>) = set.nodes.drain(..).partition(is_of_core);
+    set.nodes = own;
+    let mut kept: HashMap<NodeId, Vec<Reference>> = HashMap::new();
+    for node in &core {
+        let base = node.base();
+        for one in base.references.iter().flat_map(|list| &list.references) {
+            if let Some(target) = id_of(&one.node_id).filter(|id| !is_core(id)) {
+                kept.entry(target).or_default().push(Reference {
+                    node_id: base.node_id.clone(),
+                    reference_type: one.reference_type.clone(),
+                    is_forward: !one.is_forward,
+                });
+            }
+        }
+    }
+    for node in &mut set.nodes {
+        let more = id_of(&node.base().node_id).and_then(|id| kept.remove(&id));
+        let base = base_of(node);
+        let list = base.references.get_or_insert_with(|| ListOfReferences {
+            references: Vec::new(),
+        });
+        for one in more.into_iter().flatten() {
+            let is_there = list.references.iter().any(|known| {
+                known.node_id.0 == one.node_id.0
+                    && known.reference_type.0 == one.reference_type.0
+                    && known.is_forward == one.is_forward
+            });
+            if !is_there {
+                list.references.push(one);
+            }
+        }
+    }
+    Ok(())
+}
+
+fn base_of(node: &mut UANode) -> &mut UANodeBase {
+    match node {
+        UANode::Object(node) => &mut node.base.base,
+        UANode::Variable(node) => &mut node.base.base,
+        UANode::Method(node) => &mut node.base.base,
+        UANode::View(node) => &mut node.base.base,
+        UANode::ObjectType(node) => &mut node.base.base,
+        UANode::VariableType(node) => &mut node.base.base,
+        UANode::DataType(node) => &mut node.base.base,
+        UANode::ReferenceType(node) => &mut node.base.base,
+    }
+}
