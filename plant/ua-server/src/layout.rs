@@ -35,6 +35,8 @@ pub(crate) struct TopicNode {
     pub(crate) meaning: Meaning,
     /// Its values come from another server, and from no client.
     pub(crate) sourced: bool,
+    /// Its values are written to another server, whose result answers the writes of clients.
+    pub(crate) targeted: bool,
     /// Whether past values of it are kept.
     pub(crate) historizing: bool,
 }
@@ -256,6 +258,7 @@ impl TopicNode {
         let mut node = Self {
             meaning: variable.meaning.clone(),
             sourced: variable.from.is_some(),
+            targeted: variable.to.is_some(),
             historizing: variable.history.unwrap_or(history.values) > 0,
             ..node
         };
@@ -310,6 +313,7 @@ impl TopicNode {
             compound,
             meaning: Meaning::default(),
             sourced: false,
+            targeted: false,
             historizing: true,
         }
     }

@@ -107,6 +107,26 @@ pub(crate) struct ClientWrite {
     pub(crate) room: OwnedSemaphorePermit,
     /// Told when it has left.
     pub(crate) gone_out: oneshot::Sender<()>,
+    /// Takes the result of the server that the value is written to. Dropped if there is no such server.
+    pub(crate) answer: oneshot::Sender<StatusCode>,
+}
+
+/// What becomes of a value that is on its way.
+struct OnItsWay {
+    gone_out: oneshot::Receiver<()>,
+    answered: oneshot::Receiver<StatusCode>,
+}
+
+impl OnItsWay {
+    /// Waits until the value has left.
+    async fn left(self) -> Result<oneshot::Receiver<StatusCode>, StatusCode> {
+        // The sender is dropped when the server ends.
+        match tokio::time::timeout(LONGEST_WAY_OUT, self.gone_out).await {
+            Ok(Ok(())) => Ok(self.answered),
+            Ok(Err(_)) => Err(StatusCode::BadShutdown),
+            Err(_) => Err(StatusCode::BadTimeout),
+        }
+    }
 }
 
 impl SpaceNodes {
@@ -483,7 +503,7 @@ impl SpaceNodes {
         address_space: &RwLock<AddressSpace>,
         context: &RequestContext,
         write: &ParsedWriteValue,
-    ) -> Result<(), StatusCode> {
+    ) -> Result<StatusCode, StatusCode> {
         let is_value = write.attribute_id == AttributeId::Value;
         let place = self.place(&write.node_id).filter(|_| is_value);
         let Some((topic, field)) = place else {
@@ -506,15 +526,28 @@ impl SpaceNodes {
             let arrived = self.exits.confirms.write(topic.topic, &rule, send).await?;
             // It has arrived, whether there is room to show it or not.
             let _shown = self.show(&context.subscriptions, &topic, arrived);
-            return Ok(());
+            return Ok(StatusCode::Good);
         }
-        let gone_out = self.write_and_show(context, place, write)?;
-        // Its sender is dropped where the server ends.
-        match tokio::time::timeout(LONGEST_WAY_OUT, gone_out).await {
-            Ok(Ok(())) => Ok(()),
-            Ok(Err(_)) => Err(StatusCode::BadShutdown),
-            Err(_) => Err(StatusCode::BadTimeout),
+        if topic.targeted {
+            let (sent, on_its_way) = {
+                let _alone = self.writing.lock();
+                self.send_alone(place, write, &|_| {})?
+            };
+            let answered = on_its_way.left().await?;
+            let status = match tokio::time::timeout(LONGEST_WAY_OUT, answered).await {
+                Ok(Ok(status)) => status,
+                // A reload of the mapping has taken the server away.
+                Ok(Err(_)) => StatusCode::Good,
+                Err(_) => StatusCode::BadTimeout,
+            };
+            if status.is_bad() {
+                return Err(status);
+            }
+            let _shown = self.show(&context.subscriptions, &topic, sent);
+            return Ok(status);
         }
+        let on_its_way = self.write_and_show(context, place, write)?;
+        on_its_way.left().await.map(|_| StatusCode::Good)
     }
 
     /// Has a value sent and shows it.
@@ -523,12 +556,12 @@ impl SpaceNodes {
         context: &RequestContext,
         place: (&TopicNode, Option<usize>),
         write: &ParsedWriteValue,
-    ) -> Result<oneshot::Receiver<()>, StatusCode> {
+    ) -> Result<OnItsWay, StatusCode> {
         // Until it is shown nobody else may write: what is not written stays as it is.
         let _alone = self.writing.lock();
-        let (sent, gone_out) = self.send_alone(place, write, &|_| {})?;
+        let (sent, on_its_way) = self.send_alone(place, write, &|_| {})?;
         let _shown = self.show(&context.subscriptions, place.0, sent);
-        Ok(gone_out)
+        Ok(on_its_way)
     }
 
     /// As [`send_alone`](Self::send_alone), while nobody else writes; an answer says more than that it has left.
@@ -539,7 +572,7 @@ impl SpaceNodes {
         register: &dyn Fn(&[Variant]),
     ) -> Result<Shown, StatusCode> {
         let _alone = self.writing.lock();
-        let (sent, _gone_out) = self.send_alone(place, write, register)?;
+        let (sent, _on_its_way) = self.send_alone(place, write, register)?;
         Ok(sent)
     }
 
@@ -550,7 +583,7 @@ impl SpaceNodes {
         (topic, field): (&TopicNode, Option<usize>),
         write: &ParsedWriteValue,
         register: &dyn Fn(&[Variant]),
-    ) -> Result<(Shown, oneshot::Receiver<()>), StatusCode> {
+    ) -> Result<(Shown, OnItsWay), StatusCode> {
         if self.exits.pubsub.is_off(topic.topic) {
             // Its writer is disabled, so it would not go out.
             return Err(StatusCode::BadInvalidState);
@@ -577,14 +610,14 @@ impl SpaceNodes {
         register(&fields);
         drop(fields);
         let source = source_of(&write.value);
-        let gone_out = self.send(topic, block.clone(), source)?;
+        let on_its_way = self.send(topic, block.clone(), source)?;
         let stamp = Stamp {
             status: StatusCode::Good,
             source: Some(source),
             server: DateTime::now(),
         };
         let block = Some(block);
-        Ok((Shown { block, stamp }, gone_out))
+        Ok((Shown { block, stamp }, on_its_way))
     }
 
     /// Hands a written value to the run loop.
@@ -593,7 +626,7 @@ impl SpaceNodes {
         topic: &TopicNode,
         block: Bytes,
         source: Timestamp,
-    ) -> Result<oneshot::Receiver<()>, StatusCode> {
+    ) -> Result<OnItsWay, StatusCode> {
         if block.len() > self.largest_write.load(Ordering::Relaxed) {
             return Err(StatusCode::BadRequestTooLarge);
         }
@@ -601,16 +634,18 @@ impl SpaceNodes {
         let size = u32::try_from(block.len() >> 10).map_err(|_| full)?;
         let room = Arc::clone(&self.exits.room);
         let room = room.try_acquire_many_owned(size).map_err(|_| full)?;
-        let (gone_out, told) = oneshot::channel();
+        let (left, gone_out) = oneshot::channel();
+        let (answer, answered) = oneshot::channel();
         let write = ClientWrite {
             topic: topic.topic,
             block,
             source,
             room,
-            gone_out,
+            gone_out: left,
+            answer,
         };
         self.exits.writes.try_send(write).map_err(|_| full)?;
-        Ok(told)
+        Ok(OnItsWay { gone_out, answered })
     }
 
     fn program(&self, method: &NodeId) -> Option<Drive> {
@@ -910,7 +945,8 @@ impl InMemoryNodeManagerImpl for SpaceNodes {
         self.genuine.check(context)?;
         let writes = nodes_to_write.iter_mut().map(|write| async {
             let result = self.write_one(address_space, context, write.value()).await;
-            write.set_status(result.err().unwrap_or(StatusCode::Good));
+            let (Ok(status) | Err(status)) = result;
+            write.set_status(status);
         });
         futures_util::future::join_all(writes).await;
         Ok(())

@@ -248,11 +248,11 @@ impl Port for ServerPort {
             }
             tokio::select! {
                 Some(write) = self.writes.recv() => {
-                    let ClientWrite { topic, block, source, room, gone_out } = write;
+                    let ClientWrite { topic, block, source, room, gone_out, answer } = write;
                     drop(room);
                     self.leaving = Some(gone_out);
                     self.confirms.supersede(topic);
-                    self.others.sources.put(topic, &block);
+                    self.others.sources.write(topic, &block, answer);
                     return PortEvent::Sample { topic, payload: block, received: source, latched_by: None };
                 }
                 ended = ended(&mut self.serving) => return PortEvent::Ended(ended),

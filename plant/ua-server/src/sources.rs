@@ -15,7 +15,7 @@ use bridge_node::{LinkState, now};
 use bytes::Bytes;
 use mappings::{Access, Mapping, NodeSource, NodeTarget, Overflow, TopicId, Variable};
 use opcua::types::{DataValue, NodeId, StatusCode, Variant};
-use tokio::sync::{mpsc, watch};
+use tokio::sync::{mpsc, oneshot, watch};
 use tokio::task::AbortHandle;
 use uadp::{Fields, Timestamp};
 
@@ -247,6 +247,13 @@ impl Sources {
     pub(crate) fn put(&self, topic: TopicId, block: &[u8]) {
         if let Some(outbox) = self.writes.get(&topic) {
             outbox.put(topic, block);
+        }
+    }
+
+    /// A value that a client wrote. `answer` takes the result of the other server, and is dropped where there is none.
+    pub(crate) fn write(&self, topic: TopicId, block: &[u8], answer: oneshot::Sender<StatusCode>) {
+        if let Some(outbox) = self.writes.get(&topic) {
+            outbox.write(topic, block, answer);
         }
     }
 

@@ -16,6 +16,7 @@ use opcua::types::{
     ObjectId, ReadValueId, ReferenceDescription, ReferenceTypeId, TimestampsToReturn, UAString,
     UserTokenType, VariableId, Variant,
 };
+use plant_opcua::client::{OperationLimits, PartFault, Service};
 use tokio::time::timeout;
 use uadp::BuiltinType;
 
@@ -183,6 +184,7 @@ struct Connected {
     /// Its ApplicationName.
     name: String,
     session: Arc<Session>,
+    limits: OperationLimits,
     events: tokio::task::JoinHandle<opcua::types::StatusCode>,
     pki: PathBuf,
 }
@@ -266,13 +268,16 @@ impl Connected {
         if !session.wait_for_connection().await {
             return Err(absent(url, "it refuses a session"));
         }
-        Ok(Self {
+        let connected = Self {
             url: url.to_owned(),
             name,
             session,
+            limits: OperationLimits::default(),
             events,
             pki,
-        })
+        };
+        connected.learn_limits().await?;
+        Ok(connected)
     }
 
     /// What `asking` finds, or why it does not in time.
@@ -296,6 +301,24 @@ impl Connected {
 
     fn failed(&self, error: &opcua::types::Error) -> Failure {
         absent(&self.url, &error.to_string())
+    }
+
+    fn refused(&self, fault: PartFault, service: &str) -> Failure {
+        match fault {
+            PartFault::Short => absent(
+                &self.url,
+                &format!("its answer to {service} is short of results"),
+            ),
+            PartFault::Failed(error) => self.failed(&error),
+        }
+    }
+
+    /// Asks how much the server takes in one request.
+    async fn learn_limits(&self) -> Result<(), Failure> {
+        let nodes = OperationLimits::VARIABLES.map(NodeId::from);
+        let values = self.read(&nodes, &[AttributeId::Value]).await?;
+        self.limits.learn(&values);
+        Ok(())
     }
 
     async fn namespaces(&self) -> Result<Vec<String>, Failure> {
@@ -396,8 +419,14 @@ impl Connected {
                 result_mask: BrowseResultMask::All as u32,
             })
             .collect();
-        let results = self.session.browse(&wanted, REFERENCES, None).await;
-        let results = results.map_err(|error| self.failed(&error))?;
+        let mut parts = self.limits.parts(Service::Browse, &wanted);
+        while let Some(part) = parts.next_part() {
+            let browsed = self.session.browse(part, REFERENCES, None).await;
+            parts
+                .answered(browsed)
+                .map_err(|fault| self.refused(fault, "Browse"))?;
+        }
+        let results = parts.into_answers();
         let mut all = Vec::with_capacity(nodes.len());
         for result in results {
             let mut references = result.references.unwrap_or_default();
@@ -413,14 +442,7 @@ impl Connected {
             }
             all.push(references);
         }
-        if all.len() == nodes.len() {
-            Ok(all)
-        } else {
-            Err(absent(
-                &self.url,
-                "its answer to Browse is short of results",
-            ))
-        }
+        Ok(all)
     }
 
     /// The attributes of the nodes, those of one node side by side.
@@ -438,15 +460,14 @@ impl Connected {
                     attributes.iter().map(of)
                 })
                 .collect();
-            let read = self
-                .session
-                .read(&wanted, TimestampsToReturn::Neither, 0.0)
-                .await
-                .map_err(|error| self.failed(&error))?;
-            if read.len() != wanted.len() {
-                return Err(absent(&self.url, "its answer to Read is short of results"));
+            let mut parts = self.limits.parts(Service::Read, &wanted);
+            while let Some(part) = parts.next_part() {
+                let read = self.session.read(part, TimestampsToReturn::Neither, 0.0);
+                parts
+                    .answered(read.await)
+                    .map_err(|fault| self.refused(fault, "Read"))?;
             }
-            values.extend(read);
+            values.extend(parts.into_answers());
         }
         Ok(values)
     }

@@ -4,6 +4,7 @@
 //! closures), `connector`.
 
 mod connector;
+mod parts;
 mod services;
 mod shown;
 mod subscription;
@@ -18,11 +19,12 @@ use std::time::Duration;
 use opcua::types::{NamespaceMap, StatusCode, TypeLoader};
 use tokio::sync::watch;
 
+pub use self::parts::{OperationLimits, PartFault, Parts, Service};
 pub use self::services::{Browse, CallError, CallOptions, MOST_REFERENCES};
 pub use self::subscription::{Notice, Sampled, Select, Subscription, Watch};
 pub use self::types::MOST_TYPES;
 
-use self::supervisor::Shared;
+use self::supervisor::{Shared, failed};
 
 /// Who a client is, and what it bears.
 #[derive(Debug, Clone)]
@@ -141,6 +143,15 @@ pub enum ClientError {
     /// The answer is not what was asked for.
     #[error("the server answers with {0}")]
     Answer(&'static str),
+}
+
+impl From<PartFault> for ClientError {
+    fn from(fault: PartFault) -> Self {
+        match fault {
+            PartFault::Failed(error) => failed(&error),
+            PartFault::Short => Self::Answer("another number of results"),
+        }
+    }
 }
 
 /// A client of one server. Clones are handles to the same one; it is closed when the last is dropped.

@@ -12,8 +12,7 @@ use opcua::types::{
 };
 
 use super::supervisor::failed;
-use super::{Client, ClientError};
-use crate::limits::MOST_PER_REQUEST;
+use super::{Client, ClientError, Service};
 
 /// Which references are followed.
 #[derive(Debug, Clone)]
@@ -107,26 +106,31 @@ impl Client {
                 ..ReadValueId::default()
             })
             .collect();
-        let session = self.shared.connected()?;
-        let mut values = Vec::with_capacity(nodes.len());
-        for nodes in nodes.chunks(MOST_PER_REQUEST) {
-            let read = session
-                .session
-                .read(nodes, TimestampsToReturn::Both, 0.0)
-                .await;
-            values.extend(as_many(read, nodes.len())?);
+        let connected = self.shared.connected()?;
+        let mut parts = connected.limits.parts(Service::Read, &nodes);
+        while let Some(nodes) = parts.next_part() {
+            let read = connected.session.read(nodes, TimestampsToReturn::Both, 0.0);
+            parts.answered(read.await)?;
         }
-        Ok(values)
+        Ok(parts.into_answers())
     }
 
     /// Writes values; one status for each.
     ///
     /// # Errors
-    /// No answer; of more than [`MOST_PER_REQUEST`] values the first may have been written then.
+    /// The first error. Other values may have been written; [`write_each`](Self::write_each) returns the result of each.
     pub async fn write(
         &self,
         values: &[(NodeId, Variant)],
     ) -> Result<Vec<StatusCode>, ClientError> {
+        self.write_each(values).await.into_iter().collect()
+    }
+
+    /// Writes values, and returns the result of each, also if the server takes fewer values in a request.
+    pub async fn write_each(
+        &self,
+        values: &[(NodeId, Variant)],
+    ) -> Vec<Result<StatusCode, ClientError>> {
         let writes: Vec<_> = values
             .iter()
             .map(|(node, value)| WriteValue {
@@ -139,12 +143,25 @@ impl Client {
                 ..WriteValue::default()
             })
             .collect();
-        let session = self.shared.connected()?;
-        let mut results = Vec::with_capacity(writes.len());
-        for writes in writes.chunks(MOST_PER_REQUEST) {
-            results.extend(as_many(session.session.write(writes).await, writes.len())?);
+        let connected = match self.shared.connected() {
+            Ok(connected) => connected,
+            Err(error) => return values.iter().map(|_| Err(error.clone())).collect(),
+        };
+        let mut parts = connected.limits.parts(Service::Write, &writes);
+        while let Some(writes) = parts.next_part() {
+            let written = connected.session.write(writes).await;
+            let written = written.map(|statuses| statuses.into_iter().map(Ok).collect());
+            let Err(fault) = parts.answered(written) else {
+                continue;
+            };
+            let fault = ClientError::from(fault);
+            parts.skip(&Err(fault.clone()));
+            if matches!(fault, ClientError::Lost(_)) {
+                let unsent = format!("nothing was sent after {fault}");
+                parts.skip_all(&Err(ClientError::NotConnected(unsent)));
+            }
         }
-        Ok(results)
+        parts.into_answers()
     }
 
     /// The references of a node, at most [`MOST_REFERENCES`].

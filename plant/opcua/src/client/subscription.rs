@@ -14,9 +14,9 @@ use opcua::types::{
 use tokio::sync::mpsc;
 use tracing::warn;
 
-use super::supervisor::{Connected, Shared, failed};
-use super::{Client, ClientError};
-use crate::limits::{MOST_NOTIFICATIONS, MOST_PER_REQUEST};
+use super::supervisor::{Connected, Shared};
+use super::{Client, ClientError, Service};
+use crate::limits::MOST_NOTIFICATIONS;
 
 /// What is watched.
 #[derive(Debug, Clone)]
@@ -151,11 +151,12 @@ pub(crate) struct Wanted {
     gone: bool,
 }
 
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq)]
 enum State {
     Waiting,
     Making,
-    Made(u32),
+    /// The ids of its subscriptions.
+    Made(Vec<u32>),
     /// The server does not want it.
     Refused,
 }
@@ -265,7 +266,7 @@ pub(crate) async fn renew(shared: &Shared, connected: &Connected) -> Result<(), 
                 gone = wanted.remove(&id).map(|one| one.state);
             } else if let Some((id, one)) = wanted
                 .iter_mut()
-                .find(|(_, one)| one.state == State::Waiting)
+                .find(|(_, one)| matches!(one.state, State::Waiting))
             {
                 one.state = State::Making;
                 new = Some((
@@ -277,9 +278,11 @@ pub(crate) async fn renew(shared: &Shared, connected: &Connected) -> Result<(), 
             }
         }
         match (gone, new) {
-            (Some(State::Made(id)), _) => {
-                let deleted = connected.session.delete_subscription(id).await;
-                deleted.map_err(|error| error.to_string())?;
+            (Some(State::Made(ids)), _) => {
+                for id in ids {
+                    let deleted = connected.session.delete_subscription(id).await;
+                    deleted.map_err(|error| error.to_string())?;
+                }
             }
             (Some(State::Waiting | State::Making | State::Refused), _) => {}
             (None, Some((id, watches, interval, queue))) => {
@@ -293,65 +296,117 @@ pub(crate) async fn renew(shared: &Shared, connected: &Connected) -> Result<(), 
     }
 }
 
+/// Creates subscriptions for some watches, further ones for watches that a subscription does not take.
 async fn make(
     connected: &Connected,
     watches: &[Watch],
     interval: Duration,
     queue: Queue,
 ) -> Result<State, String> {
-    let session = &connected.session;
-    let keep_alive = count(KEEP_ALIVE, interval);
-    let created = session
-        .create_subscription(
-            interval,
-            keep_alive.saturating_mul(LIFETIME),
-            keep_alive,
-            u32::try_from(MOST_NOTIFICATIONS).unwrap_or(u32::MAX),
-            0,
-            true,
-            Sink(queue.clone()),
-        )
-        .await;
-    let id = match created {
-        Ok(id) => id,
-        Err(error) if error.status() == StatusCode::BadTooManySubscriptions => {
-            for watch in 0..watches.len() {
-                let status = error.status();
-                queue.put(Notice::Refused { watch, status });
+    let mut left: Vec<(usize, &Watch)> = watches.iter().enumerate().collect();
+    let mut made = Vec::new();
+    loop {
+        let id = match create(connected, interval, &queue).await {
+            Ok(id) => id,
+            Err(error) if error.status() == StatusCode::BadTooManySubscriptions => {
+                refuse(&queue, &left, error.status());
+                break;
             }
-            return Ok(State::Refused);
+            Err(error) => return Err(error.to_string()),
+        };
+        if made.is_empty() {
+            queue.put(Notice::Subscribed);
         }
-        Err(error) => return Err(error.to_string()),
-    };
-    queue.put(Notice::Subscribed);
+        let before = left.len();
+        left = fill(connected, (id, interval), left, &queue).await?;
+        if left.is_empty() {
+            made.push(id);
+            break;
+        }
+        let is_stuck = left.len() == before;
+        if is_stuck && !made.is_empty() {
+            let deleted = connected.session.delete_subscription(id).await;
+            deleted.map_err(|error| error.to_string())?;
+        } else {
+            made.push(id);
+        }
+        if is_stuck || made.len() >= MOST_SUBSCRIPTIONS {
+            refuse(&queue, &left, StatusCode::BadTooManyMonitoredItems);
+            break;
+        }
+    }
+    Ok(match made.is_empty() {
+        true => State::Refused,
+        false => State::Made(made),
+    })
+}
+
+fn refuse(queue: &Queue, watches: &[(usize, &Watch)], status: StatusCode) {
+    for (watch, _) in watches {
+        let watch = *watch;
+        queue.put(Notice::Refused { watch, status });
+    }
+}
+
+async fn create(
+    connected: &Connected,
+    interval: Duration,
+    queue: &Queue,
+) -> Result<u32, opcua::types::Error> {
+    let keep_alive = count(KEEP_ALIVE, interval);
+    let created = connected.session.create_subscription(
+        interval,
+        keep_alive.saturating_mul(LIFETIME),
+        keep_alive,
+        u32::try_from(MOST_NOTIFICATIONS).unwrap_or(u32::MAX),
+        0,
+        true,
+        Sink(queue.clone()),
+    );
+    created.await
+}
+
+/// Puts watches into a subscription, and returns the watches that do not fit.
+async fn fill<'w>(
+    connected: &Connected,
+    (id, interval): (u32, Duration),
+    watches: Vec<(usize, &'w Watch)>,
+    queue: &Queue,
+) -> Result<Vec<(usize, &'w Watch)>, String> {
     let requests: Vec<_> = watches
         .iter()
-        .enumerate()
-        .map(|(at, watch)| request(handle(at), watch, interval))
+        .map(|(at, watch)| request(handle(*at), watch, interval))
         .collect();
-    for (page, requests) in requests.chunks(MOST_PER_REQUEST).enumerate() {
-        let made = session
-            .create_monitored_items(id, TimestampsToReturn::Both, requests.to_vec())
-            .await;
-        let each: Vec<StatusCode> = match made {
-            Ok(items) => items.iter().map(|item| item.result.status_code).collect(),
-            Err(error) => match failed(&error) {
-                ClientError::Status(status) => vec![status; requests.len()],
-                lost @ (ClientError::NotConnected(_)
-                | ClientError::Lost(_)
-                | ClientError::Answer(_)) => return Err(lost.to_string()),
-            },
+    let mut parts = connected.limits.parts(Service::MonitoredItems, &requests);
+    while let Some(part) = parts.next_part() {
+        let both = TimestampsToReturn::Both;
+        let made = connected
+            .session
+            .create_monitored_items(id, both, part.to_vec());
+        let made = made.await;
+        let statuses = made.map(|items| items.iter().map(|item| item.result.status_code).collect());
+        let Err(fault) = parts.answered(statuses) else {
+            continue;
         };
-        for (at, status) in each
-            .into_iter()
-            .enumerate()
-            .filter(|(_, status)| status.is_bad())
-        {
-            let watch = page * MOST_PER_REQUEST + at;
+        match ClientError::from(fault) {
+            ClientError::Status(full @ StatusCode::BadTooManyMonitoredItems) => {
+                parts.skip_all(&full);
+            }
+            ClientError::Status(status) => parts.skip(&status),
+            lost @ (ClientError::NotConnected(_)
+            | ClientError::Lost(_)
+            | ClientError::Answer(_)) => return Err(lost.to_string()),
+        }
+    }
+    let mut left = Vec::new();
+    for ((watch, what), status) in watches.into_iter().zip(parts.into_answers()) {
+        if status == StatusCode::BadTooManyMonitoredItems {
+            left.push((watch, what));
+        } else if status.is_bad() {
             queue.put(Notice::Refused { watch, status });
         }
     }
-    Ok(State::Made(id))
+    Ok(left)
 }
 
 /// How many intervals there are in `time`.
@@ -415,6 +470,8 @@ fn request(handle: u32, watch: &Watch, interval: Duration) -> MonitoredItemCreat
     }
 }
 
+/// Most subscriptions for a list of watches.
+const MOST_SUBSCRIPTIONS: usize = 100;
 /// How often a subscription says that it lives.
 const KEEP_ALIVE: Duration = Duration::from_secs(1);
 /// How many keep-alives a server keeps a subscription for nobody.

@@ -15,8 +15,8 @@ use opcua::client::{
 };
 use opcua::sync::Mutex;
 use opcua::types::{
-    AttributeId, DataValue, DateTime, EndpointDescription, MessageSecurityMode, NodeId,
-    ReadValueId, StatusCode, TimestampsToReturn, VariableId, Variant,
+    DataValue, DateTime, EndpointDescription, MessageSecurityMode, NodeId, ReadValueId, StatusCode,
+    TimestampsToReturn, VariableId, Variant,
 };
 use tokio::sync::{Notify, mpsc, oneshot, watch};
 use tokio::task::JoinHandle;
@@ -26,7 +26,9 @@ use tracing::{debug, info, warn};
 use super::connector::Direct;
 use super::shown::{Servers, Taken, Why};
 use super::subscription::Wanted;
-use super::{ClientConfig, ClientError, ClientUser, Link, SecurityChoice};
+use super::{
+    ClientConfig, ClientError, ClientUser, Link, OperationLimits, SecurityChoice, Service,
+};
 use crate::limits;
 use crate::pki::{OWN_CERTIFICATE, OWN_KEY, Pki};
 use crate::server::NO_PKI;
@@ -51,6 +53,8 @@ pub(crate) struct Shared {
 pub(crate) struct Connected {
     pub(crate) session: Arc<Session>,
     pub(crate) namespaces: Vec<String>,
+    /// OperationLimits of the server.
+    pub(crate) limits: OperationLimits,
     /// How many connections there have been with this one.
     pub(crate) connects: u64,
     /// The supertypes that are known.
@@ -329,13 +333,15 @@ async fn connect(
     let opened = opened.await;
     let driving = AbortOnDrop(Some(driving));
     opened.map_err(|_| format!("{} makes no session", shared.url))??;
-    let (namespaces, started) = timeout(within, what_it_is(&session))
+    let limits = OperationLimits::default();
+    let (namespaces, started) = timeout(within, what_it_is(&session, &limits))
         .await
         .map_err(|_| "the server does not tell its namespaces".to_owned())??;
     Ok(Connection {
         connected: Arc::new(Connected {
             session,
             namespaces,
+            limits,
             connects,
             supertypes: Mutex::default(),
             driving: driving.keep(),
@@ -451,20 +457,28 @@ fn no_security(shared: &Shared, offered: &[EndpointDescription]) -> String {
     )
 }
 
-async fn what_it_is(session: &Session) -> Result<(Vec<String>, DateTime), String> {
-    let wanted = [
+/// Reads the namespaces, the start time and the OperationLimits of a server.
+async fn what_it_is(
+    session: &Session,
+    limits: &OperationLimits,
+) -> Result<(Vec<String>, DateTime), String> {
+    let about = [
         VariableId::Server_NamespaceArray,
         VariableId::Server_ServerStatus_StartTime,
-    ]
-    .map(|id| ReadValueId {
-        node_id: id.into(),
-        attribute_id: AttributeId::Value as u32,
-        ..ReadValueId::default()
-    });
-    let read = session
-        .read(&wanted, TimestampsToReturn::Neither, 0.0)
-        .await;
-    let mut values = read.map_err(|error| error.to_string())?.into_iter();
+    ];
+    let wanted: Vec<ReadValueId> = about
+        .into_iter()
+        .chain(OperationLimits::VARIABLES)
+        .map(|id| ReadValueId::new_value(id.into()))
+        .collect();
+    let mut parts = limits.parts(Service::Read, &wanted);
+    while let Some(part) = parts.next_part() {
+        let read = session.read(part, TimestampsToReturn::Neither, 0.0).await;
+        parts
+            .answered(read)
+            .map_err(|fault| ClientError::from(fault).to_string())?;
+    }
+    let mut values = parts.into_answers().into_iter();
     let namespaces = values.next().and_then(strings);
     let started = values.next().and_then(|value| {
         let Some(Variant::DateTime(time)) = value.value else {
@@ -472,6 +486,7 @@ async fn what_it_is(session: &Session) -> Result<(Vec<String>, DateTime), String
         };
         Some(*time)
     });
+    limits.learn(values.as_slice());
     let namespaces = namespaces.ok_or_else(|| "the server has no NamespaceArray".to_owned())?;
     // A server that tells no start is never seen to be started again.
     Ok((namespaces, started.unwrap_or_else(DateTime::null)))

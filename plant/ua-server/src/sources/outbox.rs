@@ -6,7 +6,8 @@ use std::sync::Arc;
 use bytes::Bytes;
 use mappings::{Overflow, TopicId};
 use opcua::sync::Mutex;
-use tokio::sync::Notify;
+use opcua::types::StatusCode;
+use tokio::sync::{Notify, oneshot};
 
 use super::state::{State, Way};
 use super::{Plan, Write};
@@ -28,10 +29,28 @@ struct Waiting {
     up: bool,
 }
 
+/// A value that waits, as fields.
+#[derive(Debug)]
+pub(super) struct Value {
+    pub(super) block: Bytes,
+    /// Takes the result, where a client waits for it.
+    answer: Option<oneshot::Sender<StatusCode>>,
+}
+
+impl Value {
+    /// Answers the client that wrote the value.
+    fn answer(&mut self, status: StatusCode) {
+        if let Some(answer) = self.answer.take() {
+            // The client may have gone.
+            let _gone = answer.send(status);
+        }
+    }
+}
+
 /// One variable.
 struct Lane {
     write: Arc<Write>,
-    values: VecDeque<Bytes>,
+    values: VecDeque<Value>,
     /// The last value of a state.
     last: Option<Bytes>,
 }
@@ -64,29 +83,51 @@ impl Outbox {
 
     /// A value to be written.
     pub(super) fn put(&self, topic: TopicId, block: &[u8]) {
+        self.add(topic, block, None);
+    }
+
+    /// A value to be written, and who takes the result: the status of the server, BadRequestCancelledByRequest if a newer
+    /// value took its place, BadNoCommunication for an event that the server did not get, and GoodCompletesAsynchronously for
+    /// a state that waits for the server.
+    pub(super) fn write(&self, topic: TopicId, block: &[u8], answer: oneshot::Sender<StatusCode>) {
+        self.add(topic, block, Some(answer));
+    }
+
+    fn add(&self, topic: TopicId, block: &[u8], answer: Option<oneshot::Sender<StatusCode>>) {
         let mut waiting = self.waiting.lock();
         let up = waiting.up;
         let Some(lane) = waiting.topics.get_mut(&topic) else {
             return;
         };
         let block = Bytes::copy_from_slice(block);
+        let mut value = Value { block, answer };
         let mut dropped = 0;
         match lane.write.overflow {
             Overflow::KeepLatest => {
-                dropped = lane.values.len();
-                lane.values.clear();
-                lane.last = Some(block.clone());
-                lane.values.push_back(block);
+                for mut older in lane.values.drain(..) {
+                    older.answer(StatusCode::BadRequestCancelledByRequest);
+                    dropped += 1;
+                }
+                if !up {
+                    value.answer(StatusCode::GoodCompletesAsynchronously);
+                }
+                lane.last = Some(value.block.clone());
+                lane.values.push_back(value);
             }
             Overflow::DropOldest(depth) if up => {
-                lane.values.push_back(block);
+                lane.values.push_back(value);
                 let depth = usize::from(depth.get()).min(MOST_EVENTS);
                 while lane.values.len() > depth {
-                    lane.values.pop_front();
+                    if let Some(mut oldest) = lane.values.pop_front() {
+                        oldest.answer(StatusCode::BadRequestCancelledByRequest);
+                    }
                     dropped += 1;
                 }
             }
-            Overflow::DropOldest(_) => dropped = 1,
+            Overflow::DropOldest(_) => {
+                value.answer(StatusCode::BadNoCommunication);
+                dropped = 1;
+            }
         }
         if !waiting.turns.contains(&topic) {
             waiting.turns.push_back(topic);
@@ -112,7 +153,11 @@ impl Outbox {
         let Waiting { topics, turns, .. } = &mut *waiting;
         for (topic, lane) in topics {
             if lane.values.is_empty() {
-                lane.values.extend(lane.last.clone());
+                let last = lane.last.clone();
+                lane.values.extend(last.map(|block| Value {
+                    block,
+                    answer: None,
+                }));
             }
             if !lane.values.is_empty() && !turns.contains(topic) {
                 turns.push_back(*topic);
@@ -127,9 +172,15 @@ impl Outbox {
         waiting.up = false;
         let mut dropped = 0;
         for lane in waiting.topics.values_mut() {
-            if lane.write.overflow != Overflow::KeepLatest {
-                dropped += lane.values.len();
-                lane.values.clear();
+            if lane.write.overflow == Overflow::KeepLatest {
+                for value in &mut lane.values {
+                    value.answer(StatusCode::GoodCompletesAsynchronously);
+                }
+                continue;
+            }
+            for mut value in lane.values.drain(..) {
+                value.answer(StatusCode::BadNoCommunication);
+                dropped += 1;
             }
         }
         drop(waiting);
@@ -139,7 +190,7 @@ impl Outbox {
     }
 
     /// The next values to be written, each of another variable.
-    pub(super) fn take(&self, most: usize) -> Vec<(Arc<Write>, Bytes)> {
+    pub(super) fn take(&self, most: usize) -> Vec<(Arc<Write>, Value)> {
         let mut waiting = self.waiting.lock();
         let mut taken = Vec::new();
         for _ in 0..waiting.turns.len().min(most) {
@@ -161,16 +212,28 @@ impl Outbox {
     }
 
     /// A value that may not have reached the server: a state is written again unless there is a newer one, an event is not.
-    pub(super) fn untold(&self, write: &Write) {
-        if write.overflow != Overflow::KeepLatest {
+    pub(super) fn untold(&self, write: &Write, mut value: Value) {
+        if write.overflow == Overflow::KeepLatest {
+            value.answer(StatusCode::GoodCompletesAsynchronously);
+        } else {
+            value.answer(StatusCode::BadNoCommunication);
             self.state.not_written(1);
         }
     }
 
     /// A value that the server did not take.
-    pub(super) fn refused(&self, write: &Write, why: &str) {
+    pub(super) fn refused(&self, write: &Write, mut value: Value, why: (StatusCode, &str)) {
+        let (status, why) = why;
+        value.answer(status);
         self.state.not_written(1);
         self.state.fault(&write.name, Way::To, why);
+    }
+
+    /// A value that the server took.
+    pub(super) fn written(&self, write: &Write, mut value: Value, status: StatusCode) {
+        value.answer(status);
+        self.state.written(1);
+        self.state.sound(&write.name, Way::To);
     }
 }
 
@@ -210,7 +273,7 @@ mod tests {
 
     fn taken(outbox: &Outbox) -> Vec<Bytes> {
         let all = std::iter::from_fn(|| outbox.take(10).pop());
-        all.map(|(_, value)| value).collect()
+        all.map(|(_, value)| value.block).collect()
     }
 
     #[test]
@@ -245,5 +308,51 @@ mod tests {
         assert_eq!(taken(&outbox), [""; 0]);
         // The first, the second, and the one that waited as the server fell.
         assert_eq!(outbox.state.told().not_written, 3);
+    }
+    #[test]
+    fn each_write_of_a_client_has_its_own_result() {
+        let (state, topic) = outbox(Overflow::KeepLatest);
+        let (event, event_topic) = outbox(Overflow::DropOldest(NonZeroU16::new(1).unwrap()));
+        let write = |outbox: &Outbox, topic, block: &[u8]| {
+            let (answer, answered) = oneshot::channel();
+            outbox.write(topic, block, answer);
+            answered
+        };
+        let answer = |mut answered: oneshot::Receiver<StatusCode>| answered.try_recv().ok();
+        let only = |outbox: &Outbox| outbox.take(1).pop().unwrap();
+
+        // The server is away.
+        let waits = answer(write(&state, topic, b"1"));
+        assert_eq!(waits, Some(StatusCode::GoodCompletesAsynchronously));
+        let lost = answer(write(&event, event_topic, b"1"));
+        assert_eq!(lost, Some(StatusCode::BadNoCommunication));
+        state.up();
+        event.up();
+        // A newer value takes the place of an older one.
+        for (outbox, topic) in [(&state, topic), (&event, event_topic)] {
+            let (older, newer) = (write(outbox, topic, b"2"), write(outbox, topic, b"3"));
+            let superseded = Some(StatusCode::BadRequestCancelledByRequest);
+            assert_eq!(answer(older), superseded);
+            let (of, value) = only(outbox);
+            outbox.refused(&of, value, (StatusCode::BadOutOfRange, "no"));
+            assert_eq!(answer(newer), Some(StatusCode::BadOutOfRange));
+            let good = write(outbox, topic, b"4");
+            let (of, value) = only(outbox);
+            outbox.written(&of, value, StatusCode::Good);
+            assert_eq!(answer(good), Some(StatusCode::Good));
+        }
+        // The connection is lost before the answer.
+        for (outbox, topic, status) in [
+            (&state, topic, StatusCode::GoodCompletesAsynchronously),
+            (&event, event_topic, StatusCode::BadNoCommunication),
+        ] {
+            let unknown = write(outbox, topic, b"5");
+            let (of, value) = only(outbox);
+            outbox.untold(&of, value);
+            assert_eq!(answer(unknown), Some(status));
+            let waiting = write(outbox, topic, b"6");
+            outbox.down();
+            assert_eq!(answer(waiting), Some(status));
+        }
     }
 }

@@ -8,8 +8,7 @@ use plant_opcua::client::{Client, ClientError, Link};
 use plant_opcua::limits::MOST_PER_REQUEST;
 use tokio::sync::watch;
 
-use super::outbox::Outbox;
-use super::state::Way;
+use super::outbox::{Outbox, Value};
 use super::{Plan, Write, one_value};
 use crate::executing::local_node;
 
@@ -53,38 +52,47 @@ async fn write(client: &Client, outbox: &Outbox) {
         if batch.is_empty() {
             return;
         }
-        let mut writes: Vec<Arc<Write>> = Vec::new();
+        let mut writes: Vec<(Arc<Write>, Value)> = Vec::new();
         let mut values: Vec<(NodeId, Variant)> = Vec::new();
-        for (write, block) in batch {
-            match (node(client, &write.target.node), one_value(&block)) {
+        for (write, waits) in batch {
+            match (node(client, &write.target.node), one_value(&waits.block)) {
                 (Ok(node), Some(value)) => {
-                    writes.push(write);
+                    writes.push((write, waits));
                     values.push((node, value));
                 }
-                (Err(why), _) => outbox.refused(&write, &why),
-                (Ok(_), None) => outbox.refused(&write, "it is none, or more than one value"),
+                (Err(why), _) => {
+                    outbox.refused(&write, waits, (StatusCode::BadNodeIdUnknown, &why));
+                }
+                (Ok(_), None) => {
+                    let why = "it is none, or more than one value";
+                    outbox.refused(&write, waits, (StatusCode::BadTypeMismatch, why));
+                }
             }
         }
         if values.is_empty() {
             continue;
         }
-        let told = client.write(&values).await;
-        let statuses = match told {
-            Ok(statuses) => statuses,
-            Err(ClientError::Status(status)) => vec![status; writes.len()],
-            // A state is told anew over the next connection.
-            Err(ClientError::NotConnected(_) | ClientError::Lost(_) | ClientError::Answer(_)) => {
-                writes.iter().for_each(|write| outbox.untold(write));
-                return;
+        let mut is_lost = false;
+        let written = client.write_each(&values).await;
+        for ((write, value), result) in writes.into_iter().zip(written) {
+            match result {
+                Ok(status) | Err(ClientError::Status(status)) if status.is_bad() => {
+                    outbox.refused(&write, value, (status, &refusal(&write, status)));
+                }
+                Ok(status) | Err(ClientError::Status(status)) => {
+                    outbox.written(&write, value, status);
+                }
+                // A state is written again over the next connection.
+                Err(
+                    ClientError::NotConnected(_) | ClientError::Lost(_) | ClientError::Answer(_),
+                ) => {
+                    outbox.untold(&write, value);
+                    is_lost = true;
+                }
             }
-        };
-        for (write, status) in writes.iter().zip(statuses) {
-            if status.is_bad() {
-                outbox.refused(write, &refusal(write, status));
-            } else {
-                outbox.state.written(1);
-                outbox.state.sound(&write.name, Way::To);
-            }
+        }
+        if is_lost {
+            return;
         }
     }
 }

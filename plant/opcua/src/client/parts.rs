@@ -1,0 +1,306 @@
+//! Requests in parts of the size that a server takes.
+//!
+//! A server says in its OperationLimits how many operations it takes in one request (OPC 10000-5, 6.3.11), or answers
+//! BadTooManyOperations. Then the request is sent again in halves, and the smaller size is kept for the connection.
+
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use opcua::types::{DataValue, Error, StatusCode, VariableId, Variant};
+
+use crate::limits::MOST_PER_REQUEST;
+
+/// Services with a limit of their own.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Service {
+    /// Read.
+    Read,
+    /// Write.
+    Write,
+    /// Browse and BrowseNext.
+    Browse,
+    /// CreateMonitoredItems.
+    MonitoredItems,
+}
+
+impl Service {
+    const ALL: [Self; 4] = [Self::Read, Self::Write, Self::Browse, Self::MonitoredItems];
+
+    const fn index(self) -> usize {
+        match self {
+            Self::Read => 0,
+            Self::Write => 1,
+            Self::Browse => 2,
+            Self::MonitoredItems => 3,
+        }
+    }
+
+    /// Whether the status says that a smaller request may succeed, and that nothing of this one was executed.
+    fn is_too_large(self, status: StatusCode) -> bool {
+        match status {
+            StatusCode::BadTooManyOperations | StatusCode::BadRequestTooLarge => true,
+            StatusCode::BadTooManyMonitoredItems => self == Self::MonitoredItems,
+            // The values may be written when their answer is too large.
+            StatusCode::BadResponseTooLarge | StatusCode::BadEncodingLimitsExceeded => {
+                matches!(self, Self::Read | Self::Browse)
+            }
+            _ => false,
+        }
+    }
+}
+
+/// The most operations that a server takes in one request of each service.
+#[derive(Debug)]
+pub struct OperationLimits([AtomicUsize; 4]);
+
+impl Default for OperationLimits {
+    fn default() -> Self {
+        Self(Service::ALL.map(|_| AtomicUsize::new(MOST_PER_REQUEST)))
+    }
+}
+
+impl OperationLimits {
+    /// The variables of a server whose values [`learn`](Self::learn) takes, in its order.
+    pub const VARIABLES: [VariableId; 4] = [
+        VariableId::Server_ServerCapabilities_OperationLimits_MaxNodesPerRead,
+        VariableId::Server_ServerCapabilities_OperationLimits_MaxNodesPerWrite,
+        VariableId::Server_ServerCapabilities_OperationLimits_MaxNodesPerBrowse,
+        VariableId::Server_ServerCapabilities_OperationLimits_MaxMonitoredItemsPerCall,
+    ];
+
+    /// Takes the limits that a server names. A missing value, or 0, is no limit.
+    pub fn learn(&self, values: &[DataValue]) {
+        for (service, value) in Service::ALL.into_iter().zip(values) {
+            if let Some(Variant::UInt32(most)) = value.value
+                && most > 0
+            {
+                self.lower(service, usize::try_from(most).unwrap_or(usize::MAX));
+            }
+        }
+    }
+
+    /// Returns the largest number of operations for a request.
+    #[must_use]
+    pub fn most(&self, service: Service) -> usize {
+        let most = self.0.get(service.index());
+        most.map_or(1, |most| most.load(Ordering::Relaxed))
+    }
+
+    fn lower(&self, service: Service, most: usize) {
+        if let Some(limit) = self.0.get(service.index()) {
+            limit.fetch_min(most.max(1), Ordering::Relaxed);
+        }
+    }
+
+    /// Splits a request.
+    #[must_use]
+    pub fn parts<'l, 'q, Q, A>(
+        &'l self,
+        service: Service,
+        questions: &'q [Q],
+    ) -> Parts<'l, 'q, Q, A> {
+        Parts {
+            limits: self,
+            service,
+            rest: questions,
+            most: usize::MAX,
+            sent: 0,
+            answers: Vec::with_capacity(questions.len()),
+        }
+    }
+}
+
+/// A request that is sent in parts, and its answers.
+#[derive(Debug)]
+pub struct Parts<'l, 'q, Q, A> {
+    limits: &'l OperationLimits,
+    service: Service,
+    rest: &'q [Q],
+    /// The most operations in a part of this request, where it is less than the limit of the connection.
+    most: usize,
+    /// Length of the part that is on its way.
+    sent: usize,
+    answers: Vec<A>,
+}
+
+/// A part without an answer.
+#[derive(Debug)]
+pub enum PartFault {
+    /// The request failed.
+    Failed(Error),
+    /// The answer has another number of results.
+    Short,
+}
+
+impl<'q, Q, A> Parts<'_, 'q, Q, A> {
+    /// Returns the next part to send; `None` when all are answered.
+    pub fn next_part(&mut self) -> Option<&'q [Q]> {
+        let most = self.limits.most(self.service).min(self.most);
+        self.sent = most.min(self.rest.len());
+        self.rest.get(..self.sent).filter(|part| !part.is_empty())
+    }
+
+    /// Takes the answer to the part that was sent last. A part that is too large for the server comes again, smaller.
+    ///
+    /// # Errors
+    /// The request failed, or its answer is short. The part comes again unless [`skip`](Self::skip) is called.
+    pub fn answered(&mut self, answer: Result<Vec<A>, Error>) -> Result<(), PartFault> {
+        match answer {
+            Ok(answers) if answers.len() == self.sent => {
+                self.answers.extend(answers);
+                self.rest = self.rest.get(self.sent..).unwrap_or_default();
+                Ok(())
+            }
+            Ok(_) => Err(PartFault::Short),
+            Err(error) if self.sent > 1 && self.service.is_too_large(error.status()) => {
+                self.most = self.sent / 2;
+                // A subscription that is full says nothing about the next one.
+                if error.status() != StatusCode::BadTooManyMonitoredItems {
+                    self.limits.lower(self.service, self.most);
+                }
+                Ok(())
+            }
+            Err(error) => Err(PartFault::Failed(error)),
+        }
+    }
+
+    /// Answers each operation of the part that was sent last alike.
+    pub fn skip(&mut self, answer: &A)
+    where
+        A: Clone,
+    {
+        self.answers
+            .extend(std::iter::repeat_n(answer.clone(), self.sent));
+        self.rest = self.rest.get(self.sent..).unwrap_or_default();
+    }
+
+    /// Answers each operation that is not answered alike.
+    pub fn skip_all(&mut self, answer: &A)
+    where
+        A: Clone,
+    {
+        self.sent = self.rest.len();
+        self.skip(answer);
+    }
+
+    /// Returns the answers, in the order of the questions.
+    #[must_use]
+    pub fn into_answers(self) -> Vec<A> {
+        self.answers
+    }
+}
+
+#[cfg(test)]
+#[expect(clippy::unwrap_used, reason = "a test may")]
+mod tests {
+    use super::*;
+
+    /// A server that takes at most `most` operations and answers each with its number.
+    struct Server {
+        most: usize,
+        status: StatusCode,
+        sizes: Vec<usize>,
+    }
+
+    impl Server {
+        fn ask(&mut self, part: &[usize]) -> Result<Vec<usize>, Error> {
+            self.sizes.push(part.len());
+            match part.len() <= self.most {
+                true => Ok(part.to_vec()),
+                false => Err(Error::new(self.status, "too many")),
+            }
+        }
+    }
+
+    fn ask(
+        limits: &OperationLimits,
+        service: Service,
+        count: usize,
+        server: &mut Server,
+    ) -> (Vec<usize>, Result<(), PartFault>) {
+        let questions: Vec<usize> = (0..count).collect();
+        let mut parts = limits.parts(service, &questions);
+        let mut ended = Ok(());
+        while let Some(part) = parts.next_part() {
+            ended = parts.answered(server.ask(part));
+            if ended.is_err() {
+                break;
+            }
+        }
+        (parts.into_answers(), ended)
+    }
+
+    fn server(most: usize, status: StatusCode) -> Server {
+        Server {
+            most,
+            status,
+            sizes: Vec::new(),
+        }
+    }
+
+    #[test]
+    fn limits_that_a_server_names_are_kept_from_the_first_request_on() {
+        let limits = OperationLimits::default();
+        let named = |most: u32| DataValue::from(Variant::UInt32(most));
+        limits.learn(&[named(10), DataValue::null(), named(0), named(7)]);
+        let all = Service::ALL.map(|service| limits.most(service));
+        assert_eq!(all, [10, MOST_PER_REQUEST, MOST_PER_REQUEST, 7]);
+        let mut plc = server(10, StatusCode::BadTooManyOperations);
+        let (answers, ended) = ask(&limits, Service::Read, 25, &mut plc);
+        ended.unwrap();
+        assert_eq!(answers, (0..25).collect::<Vec<_>>());
+        assert_eq!(plc.sizes, [10, 10, 5]);
+    }
+
+    #[test]
+    fn limits_that_a_server_does_not_name_are_found_and_remembered() {
+        let limits = OperationLimits::default();
+        let mut plc = server(10, StatusCode::BadTooManyOperations);
+        let (answers, ended) = ask(&limits, Service::Write, 40, &mut plc);
+        ended.unwrap();
+        assert_eq!(answers, (0..40).collect::<Vec<_>>());
+        assert_eq!(plc.sizes, [40, 20, 10, 10, 10, 10]);
+        plc.sizes.clear();
+        drop(ask(&limits, Service::Write, 15, &mut plc));
+        assert_eq!(plc.sizes, [10, 5]);
+        assert_eq!(limits.most(Service::Read), MOST_PER_REQUEST);
+    }
+
+    #[test]
+    fn a_full_subscription_does_not_lower_the_limit_of_the_connection() {
+        let limits = OperationLimits::default();
+        let mut plc = server(25, StatusCode::BadTooManyMonitoredItems);
+        let (answers, ended) = ask(&limits, Service::MonitoredItems, 60, &mut plc);
+        ended.unwrap();
+        assert_eq!(answers.len(), 60);
+        assert_eq!(limits.most(Service::MonitoredItems), MOST_PER_REQUEST);
+        // To a reader the status says nothing about the size of its request.
+        let mut plc = server(25, StatusCode::BadTooManyMonitoredItems);
+        let (_, ended) = ask(&limits, Service::Read, 60, &mut plc);
+        assert!(matches!(ended, Err(PartFault::Failed(_))));
+    }
+
+    #[test]
+    fn answers_before_a_failure_are_kept_and_writes_are_never_repeated_after_one() {
+        let limits = OperationLimits::default();
+        limits.learn(&[DataValue::null(), DataValue::from(Variant::UInt32(10))]);
+        let questions: Vec<usize> = (0..25).collect();
+        let mut parts: Parts<'_, '_, usize, usize> = limits.parts(Service::Write, &questions);
+        let first = parts.next_part().unwrap().to_vec();
+        parts.answered(Ok(first)).unwrap();
+        parts.next_part().unwrap();
+        let lost = Error::new(StatusCode::BadResponseTooLarge, "");
+        assert!(matches!(
+            parts.answered(Err(lost)),
+            Err(PartFault::Failed(_))
+        ));
+        parts.skip(&77);
+        parts.skip_all(&78);
+        assert!(parts.next_part().is_none());
+        let expected = [(0..10).collect(), vec![77; 10], vec![78; 5]].concat();
+        assert_eq!(parts.into_answers(), expected);
+
+        let mut parts: Parts<'_, '_, usize, usize> = limits.parts(Service::Read, &questions);
+        parts.next_part().unwrap();
+        assert!(matches!(parts.answered(Ok(vec![1])), Err(PartFault::Short)));
+    }
+}
