@@ -10,9 +10,11 @@ mod definition;
 mod discovery;
 mod input;
 mod lds;
+mod manifest;
 mod mapping;
 mod mdns;
 mod message;
+mod nodeset;
 mod reader_state;
 mod registry;
 mod secured;
@@ -27,9 +29,11 @@ pub use decode::decode;
 pub use definition::definition;
 pub use discovery::discovery;
 pub use lds::lds;
+pub use manifest::manifest;
 pub use mapping::mapping;
 pub use mdns::mdns;
 pub use message::message;
+pub use nodeset::nodeset;
 pub use reader_state::reader_state;
 pub use secured::secured;
 
@@ -45,9 +49,11 @@ pub const TARGETS: &[(&str, Target)] = &[
     ("definition", definition),
     ("discovery", discovery),
     ("lds", lds),
+    ("manifest", manifest),
     ("mapping", mapping),
     ("mdns", mdns),
     ("message", message),
+    ("nodeset", nodeset),
     ("reader_state", reader_state),
     ("registry", registry),
     ("secured", secured),

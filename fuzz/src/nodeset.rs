@@ -1,0 +1,36 @@
+//! Any bytes as a NodeSet2 file.
+
+use opcua::server::address_space::AddressSpace;
+use opcua::types::NamespaceMap;
+use plant_opcua::nodeset::{NodeSetError, NodeSets};
+
+/// A file is imported or has a fatal finding; each finding names a line of the file; nodes are those of its namespaces.
+pub fn nodeset(input: &[u8]) {
+    let (sets, faults) = NodeSets::of_document("fuzz.xml", input);
+    let is_fatal = faults.iter().any(|fault| fault.error.is_fatal());
+    assert!(faults.len() <= 12, "findings are bounded");
+    // A file has no more lines than bytes.
+    for fault in &faults {
+        if let NodeSetError::Node { line, .. } | NodeSetError::Unread { line, .. } = &fault.error {
+            assert!((1..=input.len() + 1).contains(line), "{fault:?}");
+        }
+    }
+    if is_fatal {
+        assert!(sets.is_empty());
+        return;
+    }
+    let (mut space, mut namespaces) = (AddressSpace::new(), NamespaceMap::new());
+    match sets.import(&mut space, &mut namespaces) {
+        Ok(imported) => {
+            assert!(imported.unread.len() <= imported.nodes.len());
+            for node in &imported.nodes {
+                assert!(space.find(node).is_some(), "{node}");
+            }
+        }
+        // The library leaves out nodes, for example with ArrayDimensions that are no numbers.
+        Err(error) => assert!(matches!(error, NodeSetError::Values { .. }), "{error}"),
+    }
+    if let Ok(text) = xml_text::decode(input) {
+        drop(knowledge::nodeset::read(&text));
+    }
+}
