@@ -330,7 +330,7 @@ fn groups(arguments: &Arguments) -> Result<Option<Vec<SecurityGroup>>, Failure> 
         return Ok(None);
     };
     let name = path.display().to_string();
-    let text = std::fs::read_to_string(path).map_err(|error| {
+    let text = type_files::read_text_file(path).map_err(|error| {
         let message = format!("--security: cannot read {name}: {error}");
         Failure::new(FailureKind::Configuration, message)
     })?;

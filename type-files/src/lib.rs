@@ -120,7 +120,37 @@ pub fn read_text(from: impl Read) -> Result<String, String> {
         // It may end within a character.
         return Ok(String::from_utf8_lossy(&text).into_owned());
     }
-    String::from_utf8(text).map_err(|error| {
+    utf8(text)
+}
+
+/// Reads a file of any kind, such as a pipe, within a bound.
+///
+/// # Errors
+/// The reason, for people: the file cannot be read, or it has more than `most` bytes.
+pub fn read_bounded(file: &Path, most: u64) -> Result<Vec<u8>, String> {
+    let mut bytes = Vec::new();
+    File::open(file)
+        .and_then(|opened| opened.take(most.saturating_add(1)).read_to_end(&mut bytes))
+        .map_err(|error| error.to_string())?;
+    if u64::try_from(bytes.len()).is_ok_and(|length| length <= most) {
+        return Ok(bytes);
+    }
+    Err(match most >> 20 {
+        0 => format!("it has more than {} KiB", most >> 10),
+        mebibytes => format!("it has more than {mebibytes} MiB"),
+    })
+}
+
+/// Reads a file of text, such as the YAML of a program, within the bound of a mapping.
+///
+/// # Errors
+/// The reason, for people: the file cannot be read, has more than 8 MiB, or is not UTF-8.
+pub fn read_text_file(file: &Path) -> Result<String, String> {
+    utf8(read_bounded(file, MOST_OF_A_MAPPING)?)
+}
+
+fn utf8(bytes: Vec<u8>) -> Result<String, String> {
+    String::from_utf8(bytes).map_err(|error| {
         let at = error.utf8_error().valid_up_to();
         format!("it is not UTF-8 from byte {at} on; save it as UTF-8")
     })

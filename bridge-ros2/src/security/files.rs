@@ -55,9 +55,12 @@ pub(super) fn check(folder: &Path) -> Result<Vec<String>, SecurityError> {
 }
 
 fn read(folder: &Path, file: &str) -> Result<Vec<u8>, SecurityError> {
-    fs::read(folder.join(file))
+    bridge_node::read_bounded(&folder.join(file), LARGEST)
         .map_err(|error| Enclave::fault(folder, file, format!("cannot be read: {error}")))
 }
+
+/// Bytes of the largest file of an enclave.
+const LARGEST: u64 = 4 << 20;
 
 /// A certificate that is valid now.
 fn certificate(folder: &Path, file: &str) -> Result<X509, SecurityError> {

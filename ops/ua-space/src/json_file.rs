@@ -10,9 +10,13 @@ use crate::exit::Failure;
 /// The text of a file.
 pub(crate) fn read(path: &Path) -> Result<String, Failure> {
     let name = path.display().to_string();
-    let bytes = std::fs::read(path).map_err(|error| Failure::reading(&name, &error))?;
+    let bytes = type_files::read_bounded(path, LARGEST)
+        .map_err(|why| Failure::Io(format!("cannot read {name}: {why}")))?;
     String::from_utf8(bytes).map_err(|_| Failure::Data(format!("{name}: not UTF-8, so no JSON")))
 }
+
+/// Bytes of the largest file or input.
+pub(crate) const LARGEST: u64 = 64 << 20;
 
 /// The objects of an array, or one or more objects, one after the other. An error names line and column.
 pub(crate) fn one_or_many<T: DeserializeOwned>(text: &str) -> Result<Vec<T>, serde_json::Error> {

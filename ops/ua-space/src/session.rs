@@ -45,7 +45,8 @@ pub(crate) fn encode(arguments: &Encode) -> Result<(), Failure> {
     let name = input::name(&arguments.file);
     let context = context(&arguments.known)?;
     let text = match arguments.file.as_str() {
-        "-" => io::read_to_string(io::stdin()).map_err(|error| Failure::reading(name, &error))?,
+        "-" => io::read_to_string(io::stdin().lock().take(json_file::LARGEST))
+            .map_err(|error| Failure::reading(name, &error))?,
         path => json_file::read(Path::new(path))?,
     };
     let datagrams: Vec<shape::Datagram> =

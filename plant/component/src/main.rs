@@ -84,7 +84,7 @@ impl UaComponent {
             return Ok(read);
         }
         let file = self.file().display().to_string();
-        let text = std::fs::read_to_string(self.file()).map_err(|error| {
+        let text = bridge_node::read_text_file(self.file()).map_err(|error| {
             Failure::new(FailureKind::Io, format!("cannot read {file}: {error}"))
         })?;
         let folder = self.file().parent().unwrap_or_else(|| Path::new(""));

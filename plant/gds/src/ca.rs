@@ -149,12 +149,22 @@ fn open(folders: &Folders) -> Result<Store, Failure> {
 }
 
 fn read_request(file: &Path) -> Result<Request, Failure> {
-    let bytes = fs::read(file).map_err(|error| io_fault(file, &error))?;
+    let bytes = read(file)?;
     Request::read(&bytes).map_err(|why| {
         let message = format!("{} is no signing request: {why}", file.display());
         Failure::new(FailureKind::Usage, message)
     })
 }
+
+fn read(file: &Path) -> Result<Vec<u8>, Failure> {
+    bridge_node::read_bounded(file, LARGEST).map_err(|why| {
+        let message = format!("{}: {why}", file.display());
+        Failure::new(FailureKind::Io, message)
+    })
+}
+
+/// Bytes of the largest certificate or signing request.
+const LARGEST: u64 = 64 << 10;
 
 fn with_key(
     uri: &str,
@@ -179,8 +189,7 @@ fn with_key(
 fn serial(which: &str) -> Result<Serial, Failure> {
     let file = Path::new(which);
     if file.is_file() {
-        let bytes = fs::read(file).map_err(|error| io_fault(file, &error))?;
-        let read = Certificate::read(&bytes);
+        let read = Certificate::read(&read(file)?);
         return read.map(|one| one.serial()).map_err(|why| {
             Failure::new(
                 FailureKind::Usage,
@@ -222,15 +231,15 @@ fn line(one: &Issued) -> String {
 
 fn as_json(one: &Issued) -> String {
     let certificate = &one.certificate;
-    serde_json::json!({
+    let json = serde_json::json!({
         "serial": certificate.serial().to_string(),
         "name": certificate.name(),
         "application_uri": certificate.application_uri(),
         "hosts": certificate.hosts(),
         "until": day(certificate.validity().1),
         "revoked": one.revoked.map(day),
-    })
-    .to_string()
+    });
+    bridge_node::harmless_json(&json.to_string())
 }
 
 /// A day, as 2031-11-25.

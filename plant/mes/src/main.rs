@@ -145,7 +145,7 @@ impl UaMes {
 
     fn settings(&self) -> Result<Settings, Failure> {
         let file = self.mes.display().to_string();
-        let text = std::fs::read_to_string(&self.mes).map_err(|error| {
+        let text = bridge_node::read_text_file(&self.mes).map_err(|error| {
             Failure::new(FailureKind::Io, format!("cannot read {file}: {error}"))
         })?;
         let folder = self.mes.parent().unwrap_or_else(|| Path::new(""));

@@ -1,7 +1,7 @@
 //! What a certificate store holds, and who decides on it: certificates that are trusted, and those that were refused.
 
 use std::fs;
-use std::io;
+use std::io::{self, Read as _};
 use std::path::{Path, PathBuf};
 
 use opcua::crypto::{CertificateStore, X509};
@@ -240,21 +240,20 @@ fn keep(root: &Path, certificate: &X509, standing: Standing) -> Result<Stored, S
 }
 
 fn read(path: &Path) -> Result<X509, StoreFault> {
-    let about = fs::metadata(path).map_err(|source| StoreFault::Io {
-        path: path.to_owned(),
-        source,
-    })?;
     let why = |why: &str| StoreFault::Certificate {
         path: path.to_owned(),
         why: why.to_owned(),
     };
-    if about.len() > LARGEST_CERTIFICATE {
+    let mut bytes = Vec::new();
+    fs::File::open(path)
+        .and_then(|file| file.take(LARGEST_CERTIFICATE + 1).read_to_end(&mut bytes))
+        .map_err(|source| StoreFault::Io {
+            path: path.to_owned(),
+            source,
+        })?;
+    if u64::try_from(bytes.len()).is_ok_and(|length| length > LARGEST_CERTIFICATE) {
         return Err(why("it is too large"));
     }
-    let bytes = fs::read(path).map_err(|source| StoreFault::Io {
-        path: path.to_owned(),
-        source,
-    })?;
     let certificate = match bytes.starts_with(b"-----BEGIN") {
         true => X509::from_pem(&bytes),
         false => X509::from_der(&bytes),
