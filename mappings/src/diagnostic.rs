@@ -145,9 +145,7 @@ fn printable(text: &str) -> String {
 fn visible(c: char) -> char {
     match c {
         '\t' => '\u{2192}',
-        c if c.is_control() => '\u{fffd}',
-        // Marks that turn the direction of the text around them.
-        '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}' => '\u{fffd}',
+        c if crate::is_obeyed(c) => '\u{fffd}',
         c => c,
     }
 }

@@ -25,6 +25,7 @@ mod secret;
 mod security;
 mod server_entries;
 mod surroundings;
+mod terminal;
 mod topic;
 mod tree;
 mod unit;
@@ -56,5 +57,6 @@ pub use remote::{
 pub use schema::schema;
 pub use security::{GroupMode, GroupPolicy, KeySource, Replay, SecurityGroup, Served};
 pub use surroundings::{Readers, Surroundings};
+pub use terminal::{harmless_json, is_obeyed};
 pub use topic::{Part, SpaceId, TopicError, TopicId};
 pub use unit::Unit;

@@ -161,9 +161,8 @@ fn show(answer: &Answer, arguments: &Ask) -> Result<(), Failure> {
     let is_json = answer.content_type.contains("json");
     if arguments.json || !is_json {
         let text = answer.body.trim_end();
-        // What is not JSON has no escapes of its own.
         match is_json {
-            true => writeln!(out, "{text}")?,
+            true => writeln!(out, "{}", mappings::harmless_json(text))?,
             false => {
                 for line in text.lines() {
                     writeln!(out, "{}", harmless(line))?;

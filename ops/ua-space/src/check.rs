@@ -43,9 +43,8 @@ pub(crate) fn check(arguments: &Check) -> Result<(), Failure> {
         }
         let asked = seen.as_ref().map(|seen| seen.asked.as_slice());
         if arguments.json {
-            let line = serde_json::to_string(&Told::of(name, &checked, asked, &arguments.spaces))
-                .map_err(|error| Failure::Data(format!("{name}: {error}")))?;
-            writeln!(out, "{line}")?;
+            let told = Told::of(name, &checked, asked, &arguments.spaces);
+            writeln!(out, "{}", crate::live::json(&told)?)?;
         } else {
             out.write_all(checked.render_all().as_bytes())?;
             for asked in asked.unwrap_or_default() {

@@ -18,9 +18,7 @@ pub(crate) fn discover(arguments: &Discover) -> Result<(), Failure> {
     let mut out = io::stdout().lock();
     if arguments.json {
         let shown: Vec<_> = found.entries.iter().map(Entry::shown).collect();
-        let line =
-            serde_json::to_string(&shown).map_err(|error| Failure::Data(error.to_string()))?;
-        writeln!(out, "{line}")?;
+        writeln!(out, "{}", crate::live::json(&shown)?)?;
         return Ok(out.flush()?);
     }
     if found.entries.is_empty() {

@@ -465,8 +465,7 @@ fn put(arguments: &Init, before: Option<&str>, text: &str, plan: &Plan) -> Resul
     }
     let mut out = io::stdout().lock();
     if arguments.json {
-        let line = serde_json::to_string(&sum).map_err(|error| Failure::Data(error.to_string()))?;
-        writeln!(out, "{line}")?;
+        writeln!(out, "{}", crate::live::json(&sum)?)?;
     } else {
         writeln!(out, "{sum}")?;
     }

@@ -21,7 +21,7 @@ pub(crate) use all::list;
 pub(crate) use application::Application;
 pub(crate) use call::call;
 pub(crate) use echo::{echo, hz};
-pub(crate) use list::info;
+pub(crate) use list::{info, json};
 pub(crate) use skills::{HeardNames, heard_names, skills};
 pub(crate) use text::{Table, harmless, is_coloured};
 pub(crate) use trace::trace;

@@ -50,8 +50,7 @@ impl Report {
         if unread && self.style == Style::Single {
             return Ok(());
         }
-        let json = serde_json::to_string(&reading.shape)
-            .map_err(|error| Failure::Data(format!("{name}: {error}")))?;
+        let json = crate::live::json(&reading.shape)?;
         let before = match (self.style, self.shown) {
             (Style::Array, 0) => "[\n",
             (Style::Array, _) => ",\n",

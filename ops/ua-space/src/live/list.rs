@@ -46,8 +46,10 @@ pub(super) fn unheard(live: &Live, topic: TopicId, seconds: f64) -> Failure {
     Failure::Unavailable(format!("{what}\n  = help: {help}"))
 }
 
-pub(super) fn json(shown: &impl Serialize) -> Result<String, Failure> {
-    serde_json::to_string(shown).map_err(|error| Failure::Data(error.to_string()))
+/// JSON that a terminal shows as it is.
+pub(crate) fn json(shown: &impl Serialize) -> Result<String, Failure> {
+    let text = serde_json::to_string(shown).map_err(|error| Failure::Data(error.to_string()))?;
+    Ok(mappings::harmless_json(&text))
 }
 
 /// A topic or call as it is listed.

@@ -58,13 +58,9 @@ pub(crate) fn is_coloured() -> bool {
 
 /// A text of anybody without what a terminal would obey: control characters, and those that turn the direction.
 pub(crate) fn harmless(text: &str) -> String {
-    let obeyed = |c: char| {
-        c.is_control()
-            || matches!(c, '\u{200e}'..='\u{200f}' | '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}')
-    };
     let mut shown = String::with_capacity(text.len());
     for c in text.chars() {
-        match obeyed(c) {
+        match mappings::is_obeyed(c) {
             true => shown.extend(c.escape_unicode()),
             false => shown.push(c),
         }
