@@ -132,6 +132,26 @@ impl Definitions {
         }
     }
 
+    /// Explains an error of a type whose definition only files bring. `wanted` says which file is needed; a file that is there
+    /// and is of the other ROS is named instead.
+    pub fn explain_missing(
+        &mut self,
+        (kind, name): (TextKind, &TypeName),
+        error: &DefinitionError,
+        wanted: &str,
+    ) -> String {
+        let (other, tool, version) = match self.registry().dialect() {
+            Dialect::Ros1 => (Dialect::Ros2, "ament_", 2),
+            Dialect::Ros2 => (Dialect::Ros1, "catkin", 1),
+        };
+        if let Some(file) = self.files.paths().file(other, kind, name) {
+            return format!(
+                "{error}; {file} is of ROS {version} only, because the package.xml of its package names {tool} alone"
+            );
+        }
+        format!("{}; {wanted}", self.explain(kind, error))
+    }
+
     /// Notes that a peer brought the definition that counts, as `type description of /camera`.
     pub fn learned(&mut self, name: &TypeName, from: impl FnOnce() -> String) {
         if self.peers.len() < MOST_PEERS {
@@ -211,5 +231,28 @@ mod tests {
         );
         let told = (1..1000).filter(|_| explained() == first).count();
         assert_eq!(told + 1, 64);
+    }
+    #[test]
+    fn a_definition_of_the_other_ros_is_named_as_such() {
+        let folder = std::env::temp_dir().join(format!("of-other-ros-{}", std::process::id()));
+        let action = folder.join("robot_msgs/action");
+        std::fs::create_dir_all(&action).unwrap();
+        let manifest =
+            "<package><name>robot_msgs</name><buildtool_depend>catkin</buildtool_depend></package>";
+        std::fs::write(folder.join("robot_msgs/package.xml"), manifest).unwrap();
+        std::fs::write(action.join("Turn.action"), "float64 a\n---\n---\n").unwrap();
+        let types = TypePaths::read(std::slice::from_ref(&folder), &mut |_| {});
+        let mut known = Definitions::new(Dialect::Ros2, Arc::new(types), Environment::default());
+        let mut told = |name: &str| {
+            let name: TypeName = name.parse().unwrap();
+            let error = known.find_action_calls(&name).unwrap_err();
+            known.explain_missing((TextKind::Action, &name), &error, "provide it")
+        };
+        let there = told("robot_msgs/Turn");
+        let expected = "robot_msgs/action/Turn.action is of ROS 1 only, because the package.xml of its package names catkin alone";
+        assert!(there.ends_with(expected), "{there}");
+        let missing = told("robot_msgs/Move");
+        assert!(missing.ends_with("; provide it"), "{missing}");
+        std::fs::remove_dir_all(folder).unwrap();
     }
 }

@@ -82,13 +82,13 @@ impl ActionGraph for Ros1Graph<'_> {
 }
 
 fn unknown(definitions: &mut Definitions, name: &TypeName, error: &DefinitionError) -> String {
-    let error = definitions.explain(TextKind::Action, error);
-    format!(
-        "{error}; the connections of an action do not bring the definition of its goal, so a folder below \
+    let wanted = format!(
+        "the connections of an action do not bring the definition of its goal, so a folder below \
          ROS_PACKAGE_PATH must have {}/action/{}.action",
         name.package(),
         name.name()
-    )
+    );
+    definitions.explain_missing((TextKind::Action, name), error, &wanted)
 }
 
 /// The types of the topics of an action.

@@ -129,6 +129,16 @@ impl Definitions {
         self.known.explain(kind, error)
     }
 
+    /// Explains an error of a type whose definition only files bring.
+    pub(crate) fn explain_missing(
+        &mut self,
+        of: (TextKind, &TypeName),
+        error: &DefinitionError,
+        wanted: &str,
+    ) -> String {
+        self.known.explain_missing(of, error, wanted)
+    }
+
     /// The service of that name, looked for likewise.
     pub(crate) fn service(&mut self, name: &TypeName) -> Result<Arc<ServiceType>, DefinitionError> {
         self.known.find_service(name)

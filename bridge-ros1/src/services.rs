@@ -29,13 +29,14 @@ impl ServiceGraph for Ros1Graph<'_> {
 
     fn service_type(&mut self, name: &TypeName) -> Result<Arc<ServiceType>, String> {
         self.definitions.service(name).map_err(|error| {
-            let error = self.definitions.explain(TextKind::Service, &error);
-            format!(
-                "{error}; the connection to a service does not bring its definition, so a folder below \
+            let wanted = format!(
+                "the connection to a service does not bring its definition, so a folder below \
                  ROS_PACKAGE_PATH must have {}/srv/{}.srv",
                 name.package(),
                 name.name()
-            )
+            );
+            let of = (TextKind::Service, name);
+            self.definitions.explain_missing(of, &error, &wanted)
         })
     }
 

@@ -28,13 +28,14 @@ impl ActionGraph for Ros2Graph<'_> {
     fn action_calls(&mut self, name: &TypeName) -> Result<Arc<ActionCalls>, String> {
         let found = self.definitions.action_calls(name);
         found.map_err(|error| {
-            let error = self.definitions.explain(TextKind::Action, &error);
-            format!(
-                "{error}; discovery does not bring the definition of an action, so a prefix in AMENT_PREFIX_PATH or a \
+            let wanted = format!(
+                "discovery does not bring the definition of an action, so a prefix in AMENT_PREFIX_PATH or a \
                  folder of type_paths must have {}/action/{}.action",
                 name.package(),
                 name.name()
-            )
+            );
+            let of = (TextKind::Action, name);
+            self.definitions.explain_missing(of, &error, &wanted)
         })
     }
 

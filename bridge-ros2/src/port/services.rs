@@ -31,13 +31,14 @@ impl ServiceGraph for Ros2Graph<'_> {
 
     fn service_type(&mut self, name: &TypeName) -> Result<Arc<ServiceType>, String> {
         self.definitions.service(name).map_err(|error| {
-            let error = self.definitions.explain(TextKind::Service, &error);
-            format!(
-                "{error}; discovery does not bring the definition of a service, so a prefix in AMENT_PREFIX_PATH must \
+            let wanted = format!(
+                "discovery does not bring the definition of a service, so a prefix in AMENT_PREFIX_PATH must \
                  have share/{}/srv/{}.srv",
                 name.package(),
                 name.name()
-            )
+            );
+            let of = (TextKind::Service, name);
+            self.definitions.explain_missing(of, &error, &wanted)
         })
     }
 
