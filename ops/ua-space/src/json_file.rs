@@ -71,4 +71,12 @@ mod tests {
             "a.json: unknown field `publisher` at line 2 column 12"
         );
     }
+    #[test]
+    fn json_that_nests_too_deep_is_refused() {
+        for text in ["[".repeat(200_000), "{\"a\":".repeat(200_000)] {
+            assert!(one_or_many::<serde_json::Value>(&text).is_err());
+        }
+        let value = "[".repeat(100) + &"]".repeat(100);
+        assert!(one_or_many::<serde_json::Value>(&value).is_ok());
+    }
 }

@@ -253,3 +253,22 @@ const MAX_BYTES: usize = 1 << 20;
 const MAX_NODES: usize = 20_000;
 /// Deepest nesting.
 const MAX_DEPTH: usize = 16;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn values_that_nest_too_deep_are_refused() {
+        for deep in [
+            format!("x: {}", "[".repeat(100_000)),
+            format!("x: {}1{}", "{a: ".repeat(20_000), "}".repeat(20_000)),
+            (0..1_000).map(|at| " ".repeat(at) + "a:\n").collect(),
+            "- ".repeat(10_000),
+        ] {
+            assert!(parse(&deep).is_err());
+        }
+        let fits = format!("{}{}", "[".repeat(MAX_DEPTH), "]".repeat(MAX_DEPTH));
+        assert!(parse(&fits).is_ok());
+    }
+}
