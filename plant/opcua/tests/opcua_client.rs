@@ -329,3 +329,58 @@ async fn still_serves(server: &Server) {
         .unwrap();
     assert!(!below.is_empty());
 }
+
+/// A server of the library that takes few operations in a request and few items in a subscription.
+async fn small_server() -> (String, opcua::server::ServerHandle) {
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let port = listener.local_addr().unwrap().port();
+    let mut builder = opcua::server::ServerBuilder::new_anonymous("small")
+        .application_uri("urn:test:small")
+        .host("127.0.0.1")
+        .port(port);
+    let limits = builder.limits_mut();
+    limits.operational.max_nodes_per_read = 10;
+    limits.operational.max_nodes_per_write = 10;
+    limits.operational.max_monitored_items_per_call = 10;
+    limits.subscriptions.max_monitored_items_per_sub = 25;
+    let (server, handle) = builder.build().unwrap();
+    tokio::spawn(server.run_with(listener));
+    (format!("opc.tcp://127.0.0.1:{port}"), handle)
+}
+
+#[tokio::test]
+async fn a_server_with_small_limits_is_asked_in_parts() {
+    let (url, server) = small_server().await;
+    let client = Client::open(quick(), &url);
+    until(&client, is_up).await;
+    let state: NodeId = VariableId::Server_ServerStatus_State.into();
+    let values = client.read(&vec![state.clone(); 40]).await.unwrap();
+    assert_eq!(values.len(), 40);
+    assert!(
+        values.iter().all(|value| value.value.is_some()),
+        "{values:?}"
+    );
+
+    // The server refuses each value by itself, because the variable is not writable.
+    let written = client
+        .write_each(&vec![(state.clone(), Variant::Int32(0)); 15])
+        .await;
+    assert_eq!(written.len(), 15);
+    for result in written {
+        let status = result.unwrap();
+        assert!(
+            status.is_bad() && status != StatusCode::BadTooManyOperations,
+            "{status}"
+        );
+    }
+
+    let watches = vec![Watch::Value(state); 60];
+    let mut subscription = client.subscribe(watches, Duration::from_millis(10), 256);
+    assert_eq!(next(&mut subscription).await, Notice::Subscribed);
+    let mut seen = std::collections::BTreeSet::new();
+    while seen.len() < 60 {
+        seen.insert(next_value(&mut subscription).await.0);
+    }
+    client.close().await;
+    server.cancel();
+}

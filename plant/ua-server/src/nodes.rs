@@ -536,8 +536,8 @@ impl SpaceNodes {
             let answered = on_its_way.left().await?;
             let status = match tokio::time::timeout(LONGEST_WAY_OUT, answered).await {
                 Ok(Ok(status)) => status,
-                // A reload of the mapping has taken the server away.
-                Ok(Err(_)) => StatusCode::Good,
+                // A reload of the mapping dropped the value.
+                Ok(Err(_)) => StatusCode::BadNoCommunication,
                 Err(_) => StatusCode::BadTimeout,
             };
             if status.is_bad() {
