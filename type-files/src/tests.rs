@@ -516,18 +516,18 @@ fn a_type_is_kept_with_what_it_needs() {
 fn files_are_read_within_their_bound() {
     let folder = Folder::new("bounded", &[("a", "abc")]);
     let file = folder.path("a");
-    assert_eq!(crate::read_bounded(&file, 3).unwrap(), b"abc");
+    assert_eq!(read_bounded(&file, 3).unwrap(), b"abc");
     assert_eq!(
-        crate::read_bounded(&file, 2).unwrap_err(),
+        read_bounded(&file, 2).unwrap_err(),
         "it has more than 0 KiB"
     );
-    let endless = std::path::Path::new("/dev/zero");
+    let endless = Path::new("/dev/zero");
     assert_eq!(
-        crate::read_bounded(endless, 64 << 10).unwrap_err(),
+        read_bounded(endless, 64 << 10).unwrap_err(),
         "it has more than 64 KiB"
     );
     assert_eq!(
-        crate::read_text_file(endless).unwrap_err(),
+        read_text_file(endless).unwrap_err(),
         "it has more than 8 MiB"
     );
 }

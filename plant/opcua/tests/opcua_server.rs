@@ -628,11 +628,6 @@ async fn nodesets_are_loaded_in_the_order_they_need_and_refused_with_the_reason(
             "two nodes",
         ),
         (
-            "NodeId=\"ns=1;i=1002\"",
-            "NodeId=\"i=1002\"",
-            "core namespace",
-        ),
-        (
             "ReferenceType=\"GeneratesEvent\"",
             "ReferenceType=\"Generates\"",
             "`Generates`",
