@@ -50,8 +50,8 @@ impl Descriptors {
     }
 }
 
-/// Descriptors that RustDDS opens for an endpoint: a pair of sockets that wakes its reader, and one more at times.
-const OF_ENDPOINT: usize = 3;
+/// Descriptors that RustDDS opens for an endpoint: two pairs of sockets, and one more at times. Measured: 217 readers in 1000.
+const OF_ENDPOINT: usize = 5;
 /// Descriptors that are left to status pages, files and the sockets of the space.
 const RESERVE: usize = 64;
 
@@ -66,14 +66,14 @@ mod tests {
         assert_eq!(
             free(24),
             Free {
-                mapped: 312,
-                found: 248
+                mapped: 187,
+                found: 148
             }
         );
         assert_eq!(
             free(768),
             Free {
-                mapped: 64,
+                mapped: 38,
                 found: 0
             }
         );
