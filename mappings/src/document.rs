@@ -152,10 +152,10 @@ document! {
         /// the sessions. SCADA hosts and gateways run many clients on one address.
         #[schemars(range(min = 1, max = 10000))]
         sessions_per_address: u16,
-        /// Connections; default twice the sessions and 100 more. The oldest one without an activated session gives way.
+        /// Connections; default four times the sessions and 100 more. The oldest one without an activated session gives way.
         #[schemars(range(min = 1, max = 65535))]
         connections: u16,
-        /// Connections of one client address; default the sessions and 50 more.
+        /// Connections of one client address; default twice the sessions and 50 more.
         #[schemars(range(min = 1, max = 65535))]
         connections_per_address: u16,
         /// Subscriptions of a session; default 50.

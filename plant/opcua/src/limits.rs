@@ -54,8 +54,8 @@ impl ClientLimits {
         Self {
             sessions,
             sessions_per_address: sessions.div_ceil(2),
-            connections: sessions.saturating_mul(2).saturating_add(100),
-            connections_per_address: sessions.saturating_add(50),
+            connections: sessions.saturating_mul(4).saturating_add(100),
+            connections_per_address: sessions.saturating_mul(2).saturating_add(50),
         }
     }
 
