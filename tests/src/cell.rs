@@ -101,12 +101,12 @@ impl Cell {
     pub fn with(peers: &[Peer]) -> Option<Self> {
         let python = python();
         if let Some(reason) = env::var_os("UA_NO_NETWORK") {
-            skip(&reason.to_string_lossy());
+            test_data::skip(&reason.to_string_lossy());
             return None;
         }
         for peer in peers {
             if let Err(reason) = find(*peer, &python) {
-                skip(&reason);
+                test_data::skip(&reason);
                 return None;
             }
         }
@@ -118,7 +118,7 @@ impl Cell {
     /// # Panics
     /// When `CI=true`.
     pub fn skip(reason: &str) {
-        skip(reason);
+        test_data::skip(reason);
     }
 
     fn enter(python: PathBuf) -> Self {
@@ -257,35 +257,5 @@ fn find(peer: Peer, python: &Path) -> Result<(), String> {
             "the {peer:?} peer is not on this machine ({} is missing); `cargo xtask test` installs it",
             path.display()
         )),
-    }
-}
-
-/// Reports a test that cannot run here. The runner of the tests captures what a passing test prints, so the reason
-/// also goes into the file `UA_SKIPPED` names, which `cargo xtask test` shows at the end.
-fn skip(reason: &str) {
-    assert!(
-        env::var_os("CI").is_none_or(|ci| ci != "true"),
-        "with CI=true nothing is skipped, and {reason}"
-    );
-    without_data(reason);
-}
-
-/// Reports a test that needs files the project may not hold, such as definitions under another licence. Where they are
-/// not, nothing can put them there, so that is no failure even with `CI=true`.
-pub fn without_data(reason: &str) {
-    let test = std::thread::current().name().unwrap_or("a test").to_owned();
-    eprintln!("skipped: {test}: {reason}");
-    let Some(path) = env::var_os("UA_SKIPPED") else {
-        return;
-    };
-    let report = fs::OpenOptions::new()
-        .create(true)
-        .append(true)
-        .open(path)
-        .and_then(|mut file| {
-            std::io::Write::write_all(&mut file, format!("{test}: {reason}\n").as_bytes())
-        });
-    if let Err(error) = report {
-        eprintln!("and this could not be written down: {error}");
     }
 }

@@ -39,7 +39,7 @@ pub use arrows::{forbidden, tree};
 pub use asker::{Asker, Asking, Counting};
 pub use bare_node::{BareNode, BareSubscription, PATIENCE, string_frame};
 pub use capture::{Capture, Dissected, hex, is_true};
-pub use cell::{Cell, Distribution, Peer, without_data};
+pub use cell::{Cell, Distribution, Peer};
 pub use child::{Child, Started};
 pub use clock::WallClock;
 pub use codec_asker::{CodecAsker, Ended, send_from};

@@ -13,8 +13,11 @@ use uadp::{Scalar, Variant};
 
 const SOON: Duration = Duration::from_secs(30);
 const MAPPING: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../mappings/niryo-ned.yaml");
-/// The definitions of ned_ros are under the GPL: they lie beside the project, never in it.
-const DEFINITIONS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../shared/data/ros1-niryo");
+/// The definitions of ned_ros, a peer: they are under the GPL and no part of the project.
+fn definitions() -> Option<String> {
+    let path = test_data::foreign("ros1-niryo")?;
+    Some(path.to_str().unwrap().to_owned())
+}
 
 /// The request of the next call of that service the robot tells of, after those it told of before.
 fn called(robot: &Child, service: &str, before: usize) -> Value {
@@ -41,7 +44,7 @@ struct Line {
 fn start(cell: &Cell) -> Line {
     let master = cell.roscore();
     let side = UaSide::join();
-    let robot = cell.rospy("niryo.py", &[DEFINITIONS]);
+    let robot = cell.rospy("niryo.py", &[&definitions().unwrap()]);
     Line {
         side,
         robot,
@@ -52,15 +55,12 @@ fn start(cell: &Cell) -> Line {
 
 fn bridge(cell: &Cell) -> Child {
     cell.bridge_ros1_started(&[MAPPING])
-        .env("ROS_PACKAGE_PATH", DEFINITIONS)
+        .env("ROS_PACKAGE_PATH", definitions().unwrap())
         .start()
 }
 
 fn cell() -> Option<Cell> {
-    if !Path::new(DEFINITIONS).is_dir() {
-        system_tests::without_data("the definitions of ned_ros are not beside the project");
-        return None;
-    }
+    let _there = definitions()?;
     Cell::with(&[Peer::Ros1])
 }
 
@@ -199,7 +199,7 @@ fn a_state_waits_for_its_service_and_an_event_does_not() {
         let status = metrics(METRICS_ROS1)?;
         (number(&status, "call_failed") > 0).then_some(())
     });
-    line.robot = cell.rospy("niryo.py", &[DEFINITIONS]);
+    line.robot = cell.rospy("niryo.py", &[&definitions().unwrap()]);
     let request = called(&line.robot, "/niryo_robot_rpi/set_digital_io", 0);
     assert_eq!(request, json!({"name": "DO1", "value": true}));
     line.side.hear_scalar((1, 2, 46), Scalar::Int32(1));
@@ -216,7 +216,7 @@ fn a_state_waits_for_its_service_and_an_event_does_not() {
 fn a_niryos_actions_are_there_for_a_client_that_knows_their_definitions() {
     let Some(cell) = cell() else { return };
     let _master = cell.roscore();
-    let robot = cell.rospy("niryo.py", &[DEFINITIONS]);
+    let robot = cell.rospy("niryo.py", &[&definitions().unwrap()]);
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(1)
         .enable_all()
@@ -301,6 +301,7 @@ fn the_arm_its_gripper_and_its_conveyor_are_run_by_skills() {
 /// The type of RobotMove's goal topic, and a goal with one field set.
 fn move_goal(path: &str, value: &str) -> (TopicType, Vec<u8>) {
     let mut registry = Registry::bundle(Dialect::Ros1);
+    let definitions = definitions().unwrap();
     for (folder, name, kind) in [
         ("niryo_robot_arm_commander", "RobotMove", "action"),
         ("niryo_robot_arm_commander", "ArmMoveCommand", "msg"),
@@ -308,7 +309,7 @@ fn move_goal(path: &str, value: &str) -> (TopicType, Vec<u8>) {
         ("niryo_robot_msgs", "RobotState", "msg"),
         ("niryo_robot_msgs", "RPY", "msg"),
     ] {
-        let file = format!("{DEFINITIONS}/{folder}/{kind}/{name}.{kind}");
+        let file = format!("{definitions}/{folder}/{kind}/{name}.{kind}");
         let text = std::fs::read_to_string(file).unwrap();
         let name = format!("{folder}/{name}").parse().unwrap();
         match kind {

@@ -12,7 +12,6 @@ use bridge_ros2::qos::{Offered, Requested};
 use bridge_ros2::raw::Payload;
 use system_tests::{
     Cell, Child, HERE, Host, Peer, THERE, UaSide, WIRE, Wire, eventually, numbered, resident,
-    without_data,
 };
 use uadp::Scalar;
 
@@ -27,7 +26,7 @@ const EVENTS: Offered = Offered::DropOldest(NonZeroU16::new(100).unwrap());
 /// Whether RustDDS is the patched one; else the test is not for it.
 fn patched() -> bool {
     if !limits::PATCHED {
-        without_data("RustDDS is as published; `cargo xtask test` builds with the patches");
+        test_data::leave_out("RustDDS is as published; `cargo xtask test` builds with the patches");
     }
     limits::PATCHED
 }

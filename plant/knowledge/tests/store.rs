@@ -1,33 +1,13 @@
 //! What is kept of sources, and what questions find in it.
-#![expect(
-    clippy::unwrap_used,
-    clippy::panic,
-    clippy::print_stderr,
-    reason = "a test may, and reads files that stand beside the checkout"
-)]
+#![expect(clippy::unwrap_used, reason = "a test may")]
 
 use std::collections::BTreeMap;
-use std::path::Path;
 
 use knowledge::{
     Answer, ComponentFacts, Knowledge, KnowledgeFault, NodeName, OPC_UA, ParameterFacts, QUESTIONS,
     SkillFacts, Source, SourceKind, TypeFacts, nodeset,
 };
-
-/// A file of the data beside the checkout, or `None` where it is not at hand.
-fn shared(file: &str) -> Option<String> {
-    let path = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared/data")).join(file);
-    match std::fs::read_to_string(&path) {
-        Ok(text) => Some(text),
-        Err(error) if std::env::var_os("CI").is_some_and(|ci| ci == "true") => {
-            panic!("{}: {error}", path.display())
-        }
-        Err(error) => {
-            eprintln!("skipped: {}: {error}", path.display());
-            None
-        }
-    }
-}
+use test_data::{read_foreign, read_own};
 
 fn node(namespace: &str, identifier: &str) -> NodeName {
     NodeName {
@@ -435,10 +415,7 @@ fn a_manifest_stands_beside_skills_in_one_question() {
         &gripper("urn:example:gripper", vec![grasp_type()], GRASP),
         5,
     );
-    let Some(text) = shared("mtp/pimad-core/PiMAd-core.0-0-1.aml") else {
-        return;
-    };
-    let module = mtp::Module::read(&text).unwrap();
+    let module = mtp::Module::read(&read_own("mtp/stage.aml")).unwrap();
     for name in ["one", "two"] {
         let triples = module.triples(&format!("urn:ua-bridge:mtp:{name}"), &BTreeMap::new());
         knowledge
@@ -459,10 +436,32 @@ fn a_manifest_stands_beside_skills_in_one_question() {
 }
 
 #[test]
+fn types_below_a_type_are_found_over_two_node_sets_in_any_order() {
+    let knowledge = Knowledge::new().unwrap();
+    for file in ["machines.xml", "devices.xml"] {
+        let read = nodeset::read(&read_own(&format!("nodesets/{file}"))).unwrap();
+        let source = Source::new(SourceKind::NodeSet, &read.namespace);
+        knowledge.replace(&source, &read.triples, 5).unwrap();
+    }
+    let below = |id: &str| {
+        let found = ask(&knowledge, "types", &[("type", id)]);
+        column(&found, "name")
+    };
+    let devices = below("urn:ua-bridge:test:devices#i=1001");
+    for name in ["TestDeviceType", "TestPressType", "TestServoPressType"] {
+        assert!(devices.contains(&name.to_owned()), "{name}: {devices:?}");
+    }
+    assert!(!devices.contains(&"DeviceFaultEventType".to_owned()));
+    let presses = below("urn:ua-bridge:test:machines#i=1001");
+    assert!(presses.contains(&"TestServoPressType".to_owned()));
+    assert!(!presses.contains(&"TestDeviceType".to_owned()));
+}
+
+#[test]
 fn a_node_set_tells_types_below_a_type_and_what_they_declare() {
     let knowledge = Knowledge::new().unwrap();
     let load = |file: &str| {
-        let text = shared(&format!("nodesets/{file}"))?;
+        let text = read_foreign(&format!("nodesets/{file}"))?;
         let read = nodeset::read(&text).unwrap();
         knowledge
             .replace(

@@ -1,36 +1,15 @@
 //! The terms that are used are those that the ontologies have.
-#![expect(
-    clippy::panic,
-    clippy::print_stderr,
-    reason = "a test may, and reads files that stand beside the checkout"
-)]
-
 use std::collections::BTreeSet;
-use std::path::Path;
 
 use knowledge::vocabulary::{self, TermKind};
 use knowledge::{Knowledge, QUESTIONS, Source, SourceKind};
-
-/// A file of the data beside the checkout, or `None` where it is not at hand.
-fn shared(file: &str) -> Option<String> {
-    let path = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared/data")).join(file);
-    match std::fs::read_to_string(&path) {
-        Ok(text) => Some(text),
-        Err(error) if std::env::var_os("CI").is_some_and(|ci| ci == "true") => {
-            panic!("{}: {error}", path.display())
-        }
-        Err(error) => {
-            eprintln!("skipped: {}: {error}", path.display());
-            None
-        }
-    }
-}
+use test_data::read_foreign;
 
 #[test]
 fn every_foreign_term_is_in_its_ontology_as_what_it_is_used_as() {
     let knowledge = Knowledge::new().unwrap();
     for file in ["CSS-Ontology-2.0.1.ttl", "cask-3.0.1.ttl"] {
-        let Some(turtle) = shared(&format!("ontologies/{file}")) else {
+        let Some(turtle) = read_foreign(&format!("ontologies/{file}")) else {
             return;
         };
         knowledge

@@ -1,31 +1,17 @@
-//! Manifests of six makers, and what is wrong with some.
-#![expect(
-    clippy::unwrap_used,
-    clippy::panic,
-    clippy::print_stderr,
-    reason = "a test may, and reads files that stand beside the checkout"
-)]
-
-use std::fs;
-use std::path::Path;
+//! Manifests of our own and of six makers, and what is wrong with some.
+#![expect(clippy::unwrap_used, clippy::panic, reason = "a test may")]
 
 use mtp::{Bound, Identifier, ManifestError, Module, Procedure, Role, Service, ValueKind};
+use test_data::{read_foreign, read_own};
 
-const MANIFESTS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared/data/mtp");
+/// The module of a manifest of our own.
+fn own(file: &str) -> Module {
+    Module::read(&read_own(&format!("mtp/{file}"))).unwrap()
+}
 
-/// A manifest, or `None` where the manifests are not at hand.
+/// The text of a manifest of another maker.
 fn manifest(file: &str) -> Option<String> {
-    let path = Path::new(MANIFESTS).join(file);
-    match fs::read_to_string(&path) {
-        Ok(text) => Some(text),
-        Err(error) if std::env::var_os("CI").is_some_and(|ci| ci == "true") => {
-            panic!("{}: {error}", path.display())
-        }
-        Err(error) => {
-            eprintln!("skipped: {}: {error}", path.display());
-            None
-        }
-    }
+    read_foreign(&format!("mtp/{file}"))
 }
 
 fn service<'a>(module: &'a Module, name: &str) -> &'a Service {
@@ -43,6 +29,12 @@ fn procedure<'a>(service: &'a Service, name: &str) -> &'a Procedure {
         .find(|procedure| procedure.name == name)
         .unwrap()
 }
+
+/// Our own, counted by hand.
+const OWN: [(&str, &str, usize, usize, usize); 2] = [
+    ("stage.aml", "Stage:1.0.0", 2, 6, 4),
+    ("mixer.aml", "Mixer", 1, 2, 4),
+];
 
 const ALL: [(&str, &str, usize, usize, usize); 8] = [
     // File, name, services, procedures, parameters, as another XML library counts them; one that two strategies require is
@@ -93,75 +85,92 @@ const ALL: [(&str, &str, usize, usize, usize); 8] = [
     ),
 ];
 
+/// The name, and how many services, procedures and parameters there are.
+fn counts(module: &Module) -> (&str, usize, usize, usize) {
+    let of_services = module
+        .services
+        .iter()
+        .map(|service| service.parameters.len());
+    let all: Vec<_> = module
+        .services
+        .iter()
+        .flat_map(|service| &service.procedures)
+        .collect();
+    let of_procedures = all.iter().map(|procedure| procedure.parameters.len());
+    (
+        &module.name,
+        module.services.len(),
+        all.len(),
+        of_services.sum::<usize>() + of_procedures.sum::<usize>(),
+    )
+}
+
+/// How many services can be commanded and watched.
+fn commanded(module: &Module) -> usize {
+    let roles = [
+        Role::Command,
+        Role::CommandEnabled,
+        Role::State,
+        Role::ProcedureWanted,
+    ];
+    let is_whole = |service: &&Service| {
+        roles
+            .iter()
+            .all(|role| service.control.node(*role).is_some())
+    };
+    module.services.iter().filter(is_whole).count()
+}
+
+#[test]
+fn every_service_procedure_and_parameter_is_read() {
+    for (file, name, services, procedures, parameters) in OWN {
+        let module = own(file);
+        let wanted = (name, services, procedures, parameters);
+        assert_eq!(counts(&module), wanted, "{file}: {:?}", module.findings);
+        assert_eq!(module.findings, [], "{file}");
+    }
+}
+
 #[test]
 fn every_service_procedure_and_parameter_of_eight_manifests_is_read() {
     for (file, name, services, procedures, parameters) in ALL {
         let Some(text) = manifest(file) else { return };
         let module = Module::read(&text).unwrap();
-        let of_services = module
-            .services
-            .iter()
-            .map(|service| service.parameters.len());
-        let all: Vec<_> = module
-            .services
-            .iter()
-            .flat_map(|service| &service.procedures)
-            .collect();
-        let of_procedures = all.iter().map(|procedure| procedure.parameters.len());
-        let counts = (
-            &*module.name,
-            module.services.len(),
-            all.len(),
-            of_services.sum::<usize>() + of_procedures.sum::<usize>(),
-        );
-        assert_eq!(
-            counts,
-            (name, services, procedures, parameters),
-            "{file}: {:?}",
-            module.findings
-        );
+        let wanted = (name, services, procedures, parameters);
+        assert_eq!(counts(&module), wanted, "{file}: {:?}", module.findings);
     }
 }
 
 #[test]
 fn each_service_can_be_commanded_and_watched_whatever_its_nodes_are_called() {
+    for (file, _, services, ..) in OWN {
+        assert_eq!(commanded(&own(file)), services, "{file}");
+    }
+}
+
+#[test]
+fn each_service_of_eight_manifests_can_be_commanded_and_watched() {
     for (file, _, services, ..) in ALL {
         let Some(text) = manifest(file) else { return };
         let module = Module::read(&text).unwrap();
-        let roles = [
-            Role::Command,
-            Role::CommandEnabled,
-            Role::State,
-            Role::ProcedureWanted,
-        ];
-        let whole = module.services.iter().filter(|service| {
-            roles
-                .iter()
-                .all(|role| service.control.node(*role).is_some())
-        });
-        assert_eq!(whole.count(), services, "{file}: {:?}", module.findings);
+        let found = commanded(&module);
+        assert_eq!(found, services, "{file}: {:?}", module.findings);
     }
 }
 
 #[test]
 fn a_node_is_found_by_endpoint_namespace_and_identifier() {
-    let Some(text) = manifest("pimad-core/PiMAd-core.0-0-1.aml") else {
-        return;
-    };
-    let module = Module::read(&text).unwrap();
+    let module = own("stage.aml");
     assert_eq!(module.endpoints, ["opc.tcp://127.0.0.1:4840"]);
-    let state = service(&module, "HandInHand")
-        .control
-        .node(Role::State)
-        .unwrap();
+    let state = service(&module, "Duet").control.node(Role::State).unwrap();
     assert_eq!(state.endpoint, "opc.tcp://127.0.0.1:4840");
-    assert_eq!(state.namespace, "http://www.PiMAd-core.com/instances");
+    assert_eq!(state.namespace, "urn:ua-bridge:test:stage");
     assert!(
         matches!(&state.identifier, Identifier::Text(text) if text.ends_with("StateCur")),
         "{state:?}"
     );
     assert!(state.access.reads && !state.access.writes);
-    let command = service(&module, "HandInHand")
+    let command = service(&module, "Duet")
         .control
         .node(Role::Command)
         .unwrap();
@@ -170,36 +179,34 @@ fn a_node_is_found_by_endpoint_namespace_and_identifier() {
 
 #[test]
 fn two_services_with_procedures_of_one_name_stay_apart() {
-    let Some(text) = manifest("pimad-core/PiMAd-core.0-0-1.aml") else {
-        return;
-    };
-    let module = Module::read(&text).unwrap();
-    let piano = |of: &str| procedure(service(&module, of), "Piano").clone();
-    assert_ne!(piano("HandInHand").id, piano("AtomicLove").id);
-    assert_eq!(
-        (piano("HandInHand").number, piano("HandInHand").is_default),
-        (1, true)
-    );
-    assert!(procedure(service(&module, "AtomicLove"), "Allegro").is_self_completing);
+    let module = own("stage.aml");
+    let waltz = |of: &str| procedure(service(&module, of), "Waltz").clone();
+    assert_ne!(waltz("Duet").id, waltz("Solo").id);
+    let (number, is_default) = (waltz("Duet").number, waltz("Duet").is_default);
+    assert_eq!((number, is_default), (1, true));
+    assert!(procedure(service(&module, "Solo"), "Polka").is_self_completing);
 }
 
 #[test]
 fn parameters_of_a_strategy_are_those_it_requires() {
-    let Some(text) = manifest("cps-edp-mixing-1.1.2/Manifest.aml") else {
-        return;
-    };
-    let module = Module::read(&text).unwrap();
-    let dosing = service(&module, "Dienste.DosingFromB1100");
+    let module = own("mixer.aml");
+    let stirring = service(&module, "Stir");
     let names = |name: &str| -> Vec<String> {
-        let parameters = &procedure(dosing, name).parameters;
+        let parameters = &procedure(stirring, name).parameters;
         parameters
             .iter()
             .map(|parameter| parameter.name.clone())
             .collect()
     };
-    assert_eq!(names("volume_based"), ["DoseVolume", "SetFlowRate"]);
-    assert_eq!(names("continuous"), ["SetFlowRate"]);
-    let volume = &procedure(dosing, "volume_based").parameters[0];
+    assert_eq!(names("by_volume"), ["Volume", "Speed"]);
+    assert_eq!(names("continuous"), ["Speed"]);
+    let own = stirring.parameters.iter().map(|one| &*one.name);
+    assert_eq!(
+        own.collect::<Vec<_>>(),
+        ["Slow start"],
+        "no strategy names it"
+    );
+    let volume = &procedure(stirring, "by_volume").parameters[0];
     assert_eq!(volume.kind, ValueKind::Analog);
     assert!(
         volume.write.as_ref().is_some_and(|node| node.access.writes),
@@ -210,10 +217,7 @@ fn parameters_of_a_strategy_are_those_it_requires() {
 
 #[test]
 fn limits_that_the_file_tells_are_numbers() {
-    let Some(text) = manifest("huber-v14.1/Manifest.aml") else {
-        return;
-    };
-    let module = Module::read(&text).unwrap();
+    let module = own("stage.aml");
     let parameters = module.services.iter().flat_map(|service| {
         let own = service
             .procedures
@@ -222,7 +226,7 @@ fn limits_that_the_file_tells_are_numbers() {
         service.parameters.iter().chain(own)
     });
     let ramp: Vec<_> = parameters
-        .filter(|parameter| parameter.max == Some(Bound::Constant(180_000.0)))
+        .filter(|parameter| parameter.max == Some(Bound::Constant(180.0)))
         .collect();
     assert!(!ramp.is_empty());
     assert!(
@@ -234,9 +238,7 @@ fn limits_that_the_file_tells_are_numbers() {
 
 #[test]
 fn a_manifest_cut_in_half_is_refused_with_its_line_and_never_panics() {
-    let Some(text) = manifest("pimad-core/PiMAd-core.0-0-1.aml") else {
-        return;
-    };
+    let text = read_own("mtp/stage.aml");
     for part in 1..40 {
         let mut end = text.len() * part / 40;
         while !text.is_char_boundary(end) {

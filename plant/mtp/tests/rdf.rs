@@ -1,34 +1,20 @@
-//! Manifests as RDF: real ones, and what two modules of one name must not do.
-#![expect(
-    clippy::unwrap_used,
-    clippy::panic,
-    clippy::print_stderr,
-    reason = "a test may, and reads files that stand beside the checkout"
-)]
+//! Manifests of our own and of other makers as RDF, and two modules of one name.
+#![expect(clippy::unwrap_used, reason = "a test may")]
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::Path;
 
 use mtp::vocabulary as v;
 use mtp::{Module, Object, Triple};
+use test_data::{read_foreign, read_own};
 
-/// A file of the data beside the checkout, or `None` where it is not at hand.
-fn shared(file: &str) -> Option<String> {
-    let path = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared/data")).join(file);
-    match std::fs::read_to_string(&path) {
-        Ok(text) => Some(text),
-        Err(error) if std::env::var_os("CI").is_some_and(|ci| ci == "true") => {
-            panic!("{}: {error}", path.display())
-        }
-        Err(error) => {
-            eprintln!("skipped: {}: {error}", path.display());
-            None
-        }
-    }
+/// The module of a manifest of our own.
+fn own(file: &str) -> Module {
+    Module::read(&read_own(&format!("mtp/{file}"))).unwrap()
 }
 
+/// The module of a manifest of another maker.
 fn manifest(name: &str) -> Option<Module> {
-    Some(Module::read(&shared(&format!("mtp/{name}"))?).unwrap())
+    Some(Module::read(&read_foreign(&format!("mtp/{name}"))?).unwrap())
 }
 
 fn about<'a>(all: &'a [Triple], predicate: &str, object: &str) -> Vec<&'a str> {
@@ -59,49 +45,58 @@ const ALL: [(&str, usize, usize); 8] = [
 ];
 
 #[test]
+fn each_procedure_is_a_skill_with_a_capability_and_a_node() {
+    are_skills(&own("stage.aml"), ("stage.aml", 2, 6));
+    are_skills(&own("mixer.aml"), ("mixer.aml", 1, 2));
+}
+
+#[test]
 fn each_procedure_of_eight_manifests_is_a_skill_with_a_capability_and_a_node() {
     for (file, services, procedures) in ALL {
         let Some(module) = manifest(file) else { return };
-        let all = module.triples("urn:example:module", &BTreeMap::new());
-        let skills: BTreeSet<_> = about(&all, v::RDF_TYPE, v::SKILL).into_iter().collect();
-        assert_eq!(skills.len(), procedures, "{file}");
+        are_skills(&module, (file, services, procedures));
+    }
+}
+
+/// Each procedure of a module is.
+fn are_skills(module: &Module, (file, services, procedures): (&str, usize, usize)) {
+    let all = module.triples("urn:example:module", &BTreeMap::new());
+    let skills: BTreeSet<_> = about(&all, v::RDF_TYPE, v::SKILL).into_iter().collect();
+    assert_eq!(skills.len(), procedures, "{file}");
+    assert_eq!(
+        about(&all, v::RDF_TYPE, v::SERVICE).len(),
+        services,
+        "{file}"
+    );
+    for skill in skills {
         assert_eq!(
-            about(&all, v::RDF_TYPE, v::SERVICE).len(),
-            services,
-            "{file}"
+            of(&all, "urn:example:module", v::PROVIDES_SKILL)
+                .iter()
+                .filter(|object| ***object == Object::Iri(skill.to_owned()))
+                .count(),
+            1
         );
-        for skill in skills {
-            assert_eq!(
-                of(&all, "urn:example:module", v::PROVIDES_SKILL)
-                    .iter()
-                    .filter(|object| ***object == Object::Iri(skill.to_owned()))
-                    .count(),
-                1
-            );
-            let node = of(&all, skill, v::NODE_ID);
-            assert!(
-                matches!(&*node, [Object::Text(id)] if id.starts_with("nsu=") || id.starts_with("ns=")),
-                "{file} {skill}: {node:?}"
-            );
-            assert_eq!(of(&all, skill, v::ENDPOINT).len(), 1, "{file} {skill}");
-            let realised = all.iter().any(|triple| {
-                triple.predicate == v::IS_REALIZED_BY_SKILL
-                    && triple.object == Object::Iri(skill.to_owned())
-            });
-            assert!(realised, "{file} {skill}");
-        }
+        let node = of(&all, skill, v::NODE_ID);
+        assert!(
+            matches!(&*node, [Object::Text(id)] if id.starts_with("nsu=") || id.starts_with("ns=")),
+            "{file} {skill}: {node:?}"
+        );
+        assert_eq!(of(&all, skill, v::ENDPOINT).len(), 1, "{file} {skill}");
+        let realised = all.iter().any(|triple| {
+            triple.predicate == v::IS_REALIZED_BY_SKILL
+                && triple.object == Object::Iri(skill.to_owned())
+        });
+        assert!(realised, "{file} {skill}");
     }
 }
 
 #[test]
 fn each_parameter_has_a_name_a_type_and_what_limits_the_file_tells() {
-    let Some(module) = manifest("huber-v14.1/Manifest.aml") else {
-        return;
-    };
-    let all = module.triples("urn:example:huber", &BTreeMap::new());
+    let module = own("stage.aml");
+    let all = module.triples("urn:example:stage", &BTreeMap::new());
     let ramp = all
         .iter()
-        .find(|triple| triple.predicate == v::MAX && triple.object == Object::Number(180_000.0))
+        .find(|triple| triple.predicate == v::MAX && triple.object == Object::Number(180.0))
         .unwrap();
     let text = |predicate| of(&all, &ramp.subject, predicate);
     assert_eq!(text(v::HAS_VARIABLE_TYPE), [&Object::Text("Float".into())]);
@@ -117,9 +112,7 @@ fn each_parameter_has_a_name_a_type_and_what_limits_the_file_tells() {
 
 #[test]
 fn two_modules_of_one_manifest_share_nothing_but_words() {
-    let Some(module) = manifest("pimad-core/PiMAd-core.0-0-1.aml") else {
-        return;
-    };
+    let module = own("stage.aml");
     let subjects = |base: &str| -> BTreeSet<String> {
         module
             .triples(base, &BTreeMap::new())
@@ -137,10 +130,8 @@ fn two_modules_of_one_manifest_share_nothing_but_words() {
 
 #[test]
 fn procedures_of_one_name_in_two_services_have_commands_of_their_own() {
-    let Some(module) = manifest("pimad-core/PiMAd-core.0-0-1.aml") else {
-        return;
-    };
-    let all = module.triples("urn:example:pimad", &BTreeMap::new());
+    let module = own("stage.aml");
+    let all = module.triples("urn:example:stage", &BTreeMap::new());
     let starts: BTreeSet<_> = about(&all, v::RDFS_LABEL, "Start").into_iter().collect();
     assert_eq!(starts.len(), 2, "one for each service: {starts:?}");
     for start in starts {
@@ -177,15 +168,13 @@ fn things_without_an_id_or_with_the_same_one_stay_apart() {
 
 #[test]
 fn a_service_is_a_capability_of_the_plant_where_that_is_told() {
-    let Some(module) = manifest("pimad-core/PiMAd-core.0-0-1.aml") else {
-        return;
-    };
+    let module = own("stage.aml");
     let dance = "urn:example:capability:dance".to_owned();
-    let told = BTreeMap::from([("HandInHand/Piano".to_owned(), vec![dance.clone()])]);
-    let all = module.triples("urn:example:pimad", &told);
+    let told = BTreeMap::from([("Duet/Waltz".to_owned(), vec![dance.clone()])]);
+    let all = module.triples("urn:example:stage", &told);
     let able = about(&all, v::RDF_TYPE, &dance);
     assert_eq!(able.len(), 1, "{able:?}");
-    let untold = module.triples("urn:example:pimad", &BTreeMap::new());
+    let untold = module.triples("urn:example:stage", &BTreeMap::new());
     assert!(about(&untold, v::RDF_TYPE, &dance).is_empty());
 }
 

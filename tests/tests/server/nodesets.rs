@@ -1,20 +1,20 @@
 //! The nodes of NodeSet2 files beside those of the mapping.
 
 use std::collections::BTreeSet;
-use std::path::Path;
 
 use super::*;
 
-/// Of the OPC Foundation: DI, Machinery, Robotics.
-const SHARED: &str = concat!(
-    env!("CARGO_MANIFEST_DIR"),
-    "/../../shared/data/nodesets/Opc.Ua."
-);
+/// A NodeSet of the OPC Foundation, which are a peer.
+fn node_set(name: &str) -> Option<String> {
+    let path = test_data::foreign(&format!("nodesets/Opc.Ua.{name}.NodeSet2.xml"))?;
+    Some(path.to_str().unwrap().to_owned())
+}
+
 const LINE: &str = include_str!("data/line.xml");
 
 /// A line of the cell among the devices of DI. The order of the files is none that they could be loaded in.
 fn mapping(variables: &str) -> String {
-    let of = |name: &str| format!("'{SHARED}{name}.NodeSet2.xml'");
+    let of = |name: &str| format!("'{}'", node_set(name).unwrap());
     format!(
         "
 namespaces:
@@ -42,13 +42,9 @@ const LIVE: &str =
 ";
 const SPEED: (u16, u16, u16) = (2, 3, 6000);
 
-/// Whether the NodeSets are there; where they are not, that is told as for a peer.
+/// Whether the NodeSets are there.
 fn has_nodesets() -> bool {
-    let there = Path::new(&format!("{SHARED}Di.NodeSet2.xml")).exists();
-    if !there {
-        Cell::skip(&format!("there are no NodeSets at {SHARED}"));
-    }
-    there
+    node_set("Di").is_some()
 }
 
 fn started(cell: &Cell, variables: &str) -> Child {
@@ -108,8 +104,7 @@ fn nodes_of_nodesets_are_browsed_and_those_of_the_mapping_live() {
 
     are_walked_by_asyncua_and_node_opcua(&cell);
 
-    let of = |name: &str| format!("{SHARED}{name}.NodeSet2.xml");
-    let (di, robotics) = (of("Di"), of("Robotics"));
+    let [di, robotics] = ["Di", "Robotics"].map(|name| node_set(name).unwrap());
     let arguments = [
         SERVER_ENDPOINT,
         "urn:ua-bridge:system-tests:line",

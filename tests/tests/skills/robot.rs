@@ -1,17 +1,10 @@
 //! A robot to clients of OPC 40010-1, which know no skills.
 
-use std::path::Path;
-
 use serde_json::{Value, json};
 use system_tests::{Cell, Peer, eventually};
 
 use super::{ENDPOINT, SOON, component};
 
-/// Of the OPC Foundation: DI and Robotics.
-const SHARED: &str = concat!(
-    env!("CARGO_MANIFEST_DIR"),
-    "/../../shared/data/nodesets/Opc.Ua."
-);
 const ROBOT: &str = "component: arm
 application_uri: urn:ua-bridge:system-tests:component
 namespace: 6
@@ -27,12 +20,12 @@ fn a_client_that_knows_robots_and_no_skills_sees_what_it_is_and_which_program_ru
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
     };
-    if !Path::new(&format!("{SHARED}Robotics.NodeSet2.xml")).exists() {
-        Cell::skip(&format!("there are no NodeSets at {SHARED}"));
+    // Of the OPC Foundation.
+    let files = ["Robotics", "Di"].map(|name| format!("nodesets/Opc.Ua.{name}.NodeSet2.xml"));
+    let [Some(robotics), Some(di)] = files.map(|file| test_data::foreign(&file)) else {
         return;
-    }
-    let of = |name: &str| format!("'{SHARED}{name}.NodeSet2.xml'");
-    let nodesets = format!("nodesets: [{}, {}]\n", of("Robotics"), of("Di"));
+    };
+    let nodesets = format!("nodesets: ['{}', '{}']\n", robotics.display(), di.display());
     let yaml = cell.file("arm.yaml", &format!("{nodesets}{ROBOT}"));
     let _arm = component(&yaml);
     let mut client = cell.asyncua("opcua_robot.py", &[ENDPOINT]);

@@ -1,0 +1,106 @@
+//! Data for tests. The project's own data is in this folder: manifests of modules, NodeSets and definitions of a robot that do not
+//! exist elsewhere. Data of others is a peer: it has licences of its own, is no part of the project, and may be missing.
+#![expect(
+    clippy::panic,
+    clippy::print_stderr,
+    reason = "a test fails so, and says why it is left out"
+)]
+
+use std::fs::OpenOptions;
+use std::io::Write as _;
+use std::path::{Path, PathBuf};
+use std::{env, fs, thread};
+
+/// Data of others that tests read, by the folder that it is in.
+pub const FOREIGN: &[(&str, &str)] = &[
+    ("mtp", "manifests of eight modules (MIT, ISC)"),
+    ("nodesets", "NodeSets of the OPC Foundation (MIT 1.00)"),
+    ("ontologies", "CSS and CaSk ontologies (MIT)"),
+    ("ros1-niryo", "ROS definitions of ned_ros (GPL-3.0)"),
+];
+
+/// Returns the path of a file of the project's own data, as `mtp/stage.aml`.
+#[must_use]
+pub fn own(file: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join(file)
+}
+
+/// Reads a file of the project's own data.
+///
+/// # Panics
+/// The file cannot be read.
+#[must_use]
+pub fn read_own(file: &str) -> String {
+    read(&own(file))
+}
+
+/// Returns the path of data of others, as `nodesets/Opc.Ua.Di.NodeSet2.xml`. Where it is missing the test is reported as left
+/// out. The folder is the one that `UA_DATA` names, or `shared/data` beside the repository.
+///
+/// # Panics
+/// The data is missing and `CI=true`, or [`FOREIGN`] does not declare its folder.
+#[must_use]
+pub fn foreign(file: &str) -> Option<PathBuf> {
+    let folder = file.split('/').next().unwrap_or_default();
+    let Some((_, what)) = FOREIGN.iter().find(|(known, _)| *known == folder) else {
+        panic!("{file} is in no folder of FOREIGN");
+    };
+    let path = foreign_root().join(file);
+    if path.exists() {
+        return Some(path);
+    }
+    skip(&format!(
+        "the peer {folder}, {what}, is not on this machine ({} is missing); UA_DATA names the folder that has it",
+        path.display()
+    ));
+    None
+}
+
+/// Reads a file of others.
+///
+/// # Panics
+/// As [`foreign`], and where the file cannot be read.
+#[must_use]
+pub fn read_foreign(file: &str) -> Option<String> {
+    foreign(file).map(|path| read(&path))
+}
+
+/// Reports a test that is left out. The runner of the tests captures what a passing test prints, so the reason also goes into
+/// the file that `UA_SKIPPED` names, which `cargo xtask test` shows at the end.
+///
+/// # Panics
+/// `CI=true`, where no test is left out.
+pub fn skip(reason: &str) {
+    assert!(
+        env::var_os("CI").is_none_or(|ci| ci != "true"),
+        "with CI=true nothing is skipped, and {reason}"
+    );
+    leave_out(reason);
+}
+
+/// Reports a test that is left out, also with `CI=true`: it has nothing to test in this build.
+pub fn leave_out(reason: &str) {
+    let thread = thread::current();
+    let test = thread.name().unwrap_or("a test");
+    eprintln!("skipped: {test}: {reason}");
+    let Some(path) = env::var_os("UA_SKIPPED") else {
+        return;
+    };
+    let report = OpenOptions::new().create(true).append(true).open(path);
+    let report =
+        report.and_then(|mut file| file.write_all(format!("{test}: {reason}\n").as_bytes()));
+    if let Err(error) = report {
+        eprintln!("and this could not be written down: {error}");
+    }
+}
+
+fn foreign_root() -> PathBuf {
+    env::var_os("UA_DATA").map_or_else(|| own("../../../shared/data"), PathBuf::from)
+}
+
+fn read(path: &Path) -> String {
+    match fs::read_to_string(path) {
+        Ok(text) => text,
+        Err(error) => panic!("{}: {error}", path.display()),
+    }
+}
