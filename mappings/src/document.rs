@@ -117,6 +117,9 @@ document! {
         /// What users without a name may be: `off` (they are not let in), `observer`, `operator` or `engineer`. Left out:
         /// observer; and operator where the endpoint is a loopback address and the server has no users.
         anonymous: AnonymousEntry,
+        /// Whether other servers are refused at hosts that their trusted certificates do not name, as after another lease of DHCP;
+        /// default false: the server connects to them and logs a warning.
+        refuse_other_hosts: bool,
         /// A value of another program that has been uncertain for this long is bad (BadNoCommunication), where its own `quality`
         /// says nothing else. Left out: it stays uncertain.
         #[schemars(regex(pattern = DURATION))]

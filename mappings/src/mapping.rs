@@ -440,6 +440,8 @@ pub struct Server {
     pub security: Option<Vec<SecurityPolicy>>,
     /// What users without a name may be.
     pub anonymous: Anonymous,
+    /// Whether other servers are refused at hosts that their trusted certificates do not name.
+    pub refuse_other_hosts: bool,
     /// When uncertain values of other programs are bad, where they do not say it themselves.
     pub bad_after: Option<Duration>,
     /// How much is kept of what was.
@@ -492,6 +494,7 @@ impl Default for Server {
             application_uri: "urn:ua-bridge:server".to_owned(),
             security: None,
             anonymous: Anonymous::Usual,
+            refuse_other_hosts: false,
             bad_after: None,
             history: History::default(),
             limits: ServerLimits::default(),

@@ -109,6 +109,7 @@ async def main():
     parser.add_argument("--value", action="append", default=[])
     parser.add_argument("--wait", type=float, default=30.0)
     parser.add_argument("--structures", action="store_true")
+    parser.add_argument("--hold", action="store_true", help="keeps the session until a line comes on standard input")
     parser.add_argument("--gone", action="store_true", help="waits until the Method is gone again")
     args = parser.parse_args()
     lifetime.bound(args.limit)
@@ -127,6 +128,9 @@ async def main():
             kinds = [await builtin(client, kind) for _, kind, _ in takes] + [None] * 9
             given = [argument(value, kind) for value, kind in zip(json.loads(text), kinds)]
             await called(client, object_, method, given)
+        told = lifetime.told() if args.hold else None
+        while told and not told.is_set():
+            await asyncio.sleep(0.05)
         while args.gone and await found(client, args.path, 0) is not None:
             await asyncio.sleep(0.05)
         if args.gone:

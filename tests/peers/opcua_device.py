@@ -1,10 +1,12 @@
-"""A device by asyncua: a server with a method Add and one to be configured by, registered with the discovery server of its
-level. It says each place that it is told. With `--pairs`, the folder of `opcua_access.py servers`, all of it is signed and encrypted: the
+"""A device by asyncua: a server with methods, one of them to be configured by, registered with the discovery server of its
+level. It says each place that it is told. Hold takes as many seconds as it is told, in which the device answers nothing else.
+Judge is answered with the StatusCode that it is told, beside an InputArgumentResult and an output. With `--pairs`, the folder of `opcua_access.py servers`, all of it is signed and encrypted: the
 server has the pair `--pair`, and registers with `--registers-with`."""
 
 import argparse
 import asyncio
 import pathlib
+import time
 
 from asyncua import Client, Server, ua, uamethod
 
@@ -20,6 +22,23 @@ def add(parent, a, b):
 @uamethod
 def configure(parent, place, supervisor, discovery):
     lifetime.say(place=place, supervisor=supervisor, discovery=discovery)
+
+
+@uamethod
+async def hold(parent, seconds):
+    # Not of asyncio: the loop serves nothing meanwhile.
+    lifetime.say(holds=seconds)
+    time.sleep(seconds)
+    lifetime.say(held=seconds)
+    return seconds
+
+
+async def judge(parent, code):
+    result = ua.CallMethodResult()
+    result.StatusCode = ua.StatusCode(code.Value)
+    result.InputArgumentResults = [ua.StatusCode(ua.StatusCodes.BadOutOfRange)]
+    result.OutputArguments = [ua.Variant(1.5, ua.VariantType.Double)]
+    return result
 
 
 def argument(name, kind):
@@ -73,6 +92,9 @@ async def run(args):
     await device.add_method(space, "Add", add, [argument("a", double), argument("b", double)], [argument("sum", double)])
     told = [argument(name, text) for name in ["Place", "SupervisorUri", "DiscoveryUrl"]]
     await device.add_method(space, "Configure", configure, told, [])
+    number = ua.ObjectIds.UInt32
+    await device.add_method(space, "Hold", hold, [argument("seconds", double)], [argument("held", double)])
+    await device.add_method(space, "Judge", judge, [argument("code", number)], [argument("known", double)])
     await device.add_method(space, "Follow", add, [argument("node", ua.ObjectIds.NodeId)], [])
     async with server:
         await register(args)

@@ -261,6 +261,7 @@ pub(super) fn server(entry: Option<&At<ServerEntry>>, findings: &mut Findings) -
         application_uri: application_uri.unwrap_or(default.application_uri),
         security,
         anonymous: permissions::anonymous(entry),
+        refuse_other_hosts: given(&entry.refuse_other_hosts).is_some_and(|(refuse, _)| *refuse),
         bad_after: duration(&entry.bad_after, findings),
         history: history(&entry.history, findings),
         limits: limits(&entry.limits, findings),

@@ -14,6 +14,7 @@ use bridge_node::{
 use bytes::Bytes;
 use discovery::{AnnounceSettings, Announced, Interface};
 use mappings::{Mapping, PubSub, TopicId};
+use plant_opcua::supervision::Supervision;
 use program::{Method, State};
 use skills::server::{ComponentServer, ServeFault, ServeSettings};
 use skills::{Component, Owner, Security, Skill};
@@ -90,6 +91,7 @@ impl ComponentPort {
             pki: options.pki.clone(),
             trust_any_client: options.trust_any_client,
             first_run: run_number_of_now(),
+            supervision: Supervision::default(),
         };
         let mut reporters = Vec::new();
         let mut asking = Asking::new();
@@ -117,7 +119,7 @@ impl ComponentPort {
         server.start();
         let told = told_of(component, server.url(), options);
         let application = application(&told, &component.security);
-        let announced = announce(told, component, options);
+        let announced = announce(told, component, options, settings.supervision);
         if server.skills().len() > MOST_IN_SPACE {
             warn!(
                 "only the first {MOST_IN_SPACE} skills have a place in the space; OPC UA has all"
@@ -376,6 +378,7 @@ fn announce(
     server: discovery::Server,
     component: &Component,
     options: &Options,
+    supervision: Supervision,
 ) -> Option<Announced> {
     let lds = component.lds.option(discovery::DEFAULT_LDS);
     if lds.is_none() && options.mdns.is_none() {
@@ -384,6 +387,7 @@ fn announce(
     let settings = AnnounceSettings {
         mdns: options.mdns.clone(),
         pki: options.pki.clone(),
+        supervision,
         ..AnnounceSettings::registering(lds.as_deref())
     };
     match discovery::announce(server, settings) {

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use std::pin::Pin;
 use std::time::{Duration, SystemTime};
 
+use plant_opcua::supervision::{Registrar, Supervision};
 use registry::hierarchy::Choice;
 use registry::{Announcement, instance_name};
 use tokio::sync::{mpsc, watch};
@@ -54,6 +55,8 @@ pub struct AnnounceSettings {
     /// server offers one and is trusted. `None` registers over channels that are not secured, which most discovery servers
     /// take from their own host at best.
     pub pki: Option<PathBuf>,
+    /// Is told which discovery server the server is registered with.
+    pub supervision: Supervision,
 }
 
 impl Default for AnnounceSettings {
@@ -64,6 +67,7 @@ impl Default for AnnounceSettings {
             mdns: Some(Interface::LOOPBACK),
             register_every: Duration::from_secs(60),
             pki: None,
+            supervision: Supervision::default(),
         }
     }
 }
@@ -227,7 +231,8 @@ type Registering = Pin<Box<dyn Future<Output = Result<Done, AskFault>> + Send>>;
 
 /// What came of a registration.
 enum Done {
-    Registered,
+    /// With this discovery server, where it says who it is.
+    Registered(Option<Registrar>),
     /// Nobody was there: a discovery server is embedded now.
     Embedded(Embedded),
 }
@@ -402,7 +407,7 @@ impl Telling {
         if let Some(here) = &self.here {
             let registering = here.register(&server, mdns_name, is_online);
             return Some(Box::pin(async move {
-                registering.await.map(|()| Done::Registered)
+                registering.await.map(|()| Done::Registered(None))
             }));
         }
         let pki = self.settings.pki.clone();
@@ -415,7 +420,7 @@ impl Telling {
             }
             let how = (mdns_name.as_deref(), pki.as_deref());
             match client::register(&lds, &server, how, is_online).await {
-                Ok(()) => Ok(Done::Registered),
+                Ok(registrar) => Ok(Done::Registered(registrar)),
                 Err(AskFault::Connect(absent)) if embed && is_online => {
                     let embedding = Embedding {
                         lds,
@@ -440,7 +445,10 @@ impl Telling {
                 self.state.send_modify(|state| state.registered = None);
                 self.soon();
             }
-            Ok(Done::Registered) => {
+            Ok(Done::Registered(registrar)) => {
+                if let Some(registrar) = registrar {
+                    self.settings.supervision.registered_with(registrar);
+                }
                 self.register_at = Instant::now() + self.settings.register_every;
                 self.wait = FIRST_WAIT;
                 self.state.send_modify(|state| {

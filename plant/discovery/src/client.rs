@@ -25,6 +25,8 @@ use opcua::types::{
 use tokio::net::TcpStream;
 use tokio::time::timeout;
 
+use plant_opcua::supervision::Registrar;
+
 use crate::announce::Server;
 use crate::security::Security;
 use crate::url::Url;
@@ -287,6 +289,8 @@ struct Way {
     security: Security,
     server: ByteString,
     mode: MessageSecurityMode,
+    /// The ApplicationUri in the certificate of the server.
+    application_uri: String,
 }
 
 /// The best secured channel that a server offers to the application of that certificate store; `None` where it offers
@@ -324,6 +328,7 @@ async fn way(url: &str, pki: &Path) -> Result<Option<Way>, AskFault> {
                 security,
                 server,
                 mode,
+                application_uri: text(&best.server.application_uri),
             }));
         }
         Err(refused) => refused,
@@ -338,13 +343,14 @@ async fn way(url: &str, pki: &Path) -> Result<Option<Way>, AskFault> {
 }
 
 /// Registers a server, or takes its registration back: RegisterServer2, and RegisterServer where that is not known. Over
-/// a secured channel where the server has a certificate store and the discovery server such a channel.
+/// a secured channel where the server has a certificate store and the discovery server such a channel. Returns the discovery
+/// server that the server is registered with, where that is known.
 pub(crate) async fn register(
     lds: &str,
     server: &Server,
     (mdns_name, pki): (Option<&str>, Option<&Path>),
     is_online: bool,
-) -> Result<(), AskFault> {
+) -> Result<Option<Registrar>, AskFault> {
     let way = match pki {
         Some(pki) => way(lds, pki).await?,
         None => None,
@@ -378,20 +384,39 @@ pub(crate) async fn register(
         StatusCode::BadServiceUnsupported,
         StatusCode::BadNotImplemented,
     ];
-    let answer = match ask(lds, way, request.into(), REGISTER_LIMIT).await {
-        Err(AskFault::Refused(status)) if unknown.contains(&status) => {
-            let request = RegisterServerRequest {
-                request_header: header(),
-                server: registered,
-            };
-            ask(lds, way, request.into(), REGISTER_LIMIT).await?
+    // Asked meanwhile, so that the supervisor is known as soon as it learns of the server.
+    let described = async {
+        match way {
+            None if is_online => describe(lds, DESCRIBE_LIMIT).await.ok(),
+            Some(_) | None => None,
         }
-        answer => answer?,
     };
-    match answer {
-        ResponseMessage::RegisterServer2(_) | ResponseMessage::RegisterServer(_) => Ok(()),
-        other => Err(unexpected(&other)),
+    let registering = async {
+        match ask(lds, way, request.into(), REGISTER_LIMIT).await {
+            Err(AskFault::Refused(status)) if unknown.contains(&status) => {
+                let request = RegisterServerRequest {
+                    request_header: header(),
+                    server: registered,
+                };
+                ask(lds, way, request.into(), REGISTER_LIMIT).await
+            }
+            answer => answer,
+        }
+    };
+    let (answer, described) = tokio::join!(registering, described);
+    match answer? {
+        ResponseMessage::RegisterServer2(_) | ResponseMessage::RegisterServer(_) => {}
+        other => return Err(unexpected(&other)),
     }
+    let registrar = match way {
+        Some(way) => Some((way.application_uri.clone(), true)),
+        // The registration counts even if the discovery server does not describe itself.
+        None => described.map(|described| (described.application.application_uri, false)),
+    };
+    Ok(registrar.map(|(application_uri, proven)| Registrar {
+        application_uri,
+        proven,
+    }))
 }
 
 /// One question on a channel of its own.
@@ -554,5 +579,6 @@ fn texts(all: Option<&[UAString]>) -> Vec<String> {
 const MOST_ENDPOINTS: usize = 64;
 const SCHEME: &str = "opc.tcp:";
 const REGISTER_LIMIT: Duration = Duration::from_secs(5);
+const DESCRIBE_LIMIT: Duration = Duration::from_secs(1);
 /// In milliseconds: for one question.
 const CHANNEL_LIFETIME: u32 = 60_000;

@@ -136,7 +136,12 @@ impl Keeper {
                 (Event::Announce(announcement), Some(mdns)) => mdns.put(Ours {
                     announcement: announcement.clone(),
                     aside: Aside {
-                        start_time: self.started.get(&announcement.url).map(|known| known.at),
+                        // Listeners expect a server that announces its start to answer during calls.
+                        start_time: self
+                            .started
+                            .get(&announcement.url)
+                            .filter(|_| self.registry.is_concurrent(&announcement.url))
+                            .map(|known| known.at),
                         number: self.numbers.get(&announcement.url).copied(),
                     },
                 }),
@@ -206,6 +211,8 @@ impl Keeper {
                 }
                 self.registry.announced(announcement, at);
                 if start_time.is_some() {
+                    // A program of ours, which serves many requests at a time.
+                    self.registry.answers_during_calls(&url);
                     self.registry
                         .probed(&url, Outcome::Alive { start_time }, at);
                 }

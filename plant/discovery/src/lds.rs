@@ -150,6 +150,8 @@ pub enum OnLevel {
         source: String,
         /// Where the server is.
         url: String,
+        /// Whether the server registered; others are announced by mDNS only.
+        registered: bool,
     },
     /// A source tells of nobody any more.
     Left {
@@ -479,7 +481,12 @@ impl Lds {
                 info!(uri = ?server_uri, urls = ?discovery_urls, "registered");
                 if let Some(url) = discovery_urls.into_iter().next() {
                     let source = server_uri.clone();
-                    self.tell(OnLevel::Told { source, url });
+                    let registered = true;
+                    self.tell(OnLevel::Told {
+                        source,
+                        url,
+                        registered,
+                    });
                 }
                 self.since.entry(server_uri).or_insert_with(clock::wall);
             }
@@ -505,7 +512,12 @@ impl Lds {
         let after_ms = after.map(|after| after.as_millis());
         info!(name = ?instance, url, after_ms, "seen on the network");
         let source = instance.clone();
-        self.tell(OnLevel::Told { source, url });
+        let registered = false;
+        self.tell(OnLevel::Told {
+            source,
+            url,
+            registered,
+        });
         self.since.entry(instance).or_insert(now);
     }
 

@@ -2,13 +2,14 @@
 //!
 //! What is refused says why, with the command that mends it. Files of the store count as soon as they are there.
 
+use std::collections::BTreeSet;
 use std::fmt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use opcua::sync::Mutex;
 use opcua::types::StatusCode;
-use tracing::debug;
+use tracing::{debug, warn};
 use trust::{Certificate, Fault, Known, Names};
 
 use crate::certificates;
@@ -22,8 +23,23 @@ pub type Shown = (Certificate, Vec<Certificate>);
 pub struct Judge {
     root: PathBuf,
     trusts_all: bool,
+    host_names: HostNames,
+    /// The hosts that were warned of, each with the certificate.
+    warned: Mutex<BTreeSet<(String, String)>>,
     /// What was read last, and how the files were then.
     read: Mutex<Option<(Stamp, Arc<Known>)>>,
+}
+
+/// The rule for a server at a host that its certificate does not name. It holds for certificates that are trusted themselves
+/// and have the expected ApplicationUri. A client may suppress this check (OPC 10000-4, 6.1.3): a lease of DHCP changes the
+/// address, and the certificate stays.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum HostNames {
+    /// The client connects and logs a warning.
+    #[default]
+    Warn,
+    /// The client refuses the server.
+    Refuse,
 }
 
 /// Why a peer is not talked to.
@@ -55,8 +71,16 @@ impl Judge {
         Self {
             root: root.to_owned(),
             trusts_all,
+            host_names: HostNames::Refuse,
+            warned: Mutex::default(),
             read: Mutex::default(),
         }
+    }
+
+    /// Judges host names so.
+    #[must_use]
+    pub fn host_names(self, host_names: HostNames) -> Self {
+        Self { host_names, ..self }
     }
 
     /// The root of the store.
@@ -115,13 +139,44 @@ impl Judge {
         if self.trusts_all {
             Arc::make_mut(&mut known).trusted.push(certificate.clone());
         }
-        let checked = trust::check_named(certificate, sent, &known, (names, known::now()));
+        let now = known::now();
+        let mut checked = trust::check_named(certificate, sent, &known, (names, now));
+        let is_trusted_itself = known.trusted.contains(certificate);
+        if checked == Err(Fault::Host)
+            && self.host_names == HostNames::Warn
+            && is_trusted_itself
+            && names.application_uri.is_some()
+        {
+            let others = Names {
+                host: None,
+                ..names
+            };
+            checked = trust::check_named(certificate, sent, &known, (others, now));
+            if checked.is_ok() {
+                self.warn_of_host(certificate, names.host.unwrap_or_default());
+            }
+        }
         checked.map_err(|fault| Refused {
             status: StatusCode::from(fault.status()),
             may_be_told: fault.may_be_told(),
             name: certificate.name(),
             why: format!("{fault}; {}", self.help(certificate, fault, names)),
         })
+    }
+
+    /// Warns once of each host and certificate.
+    fn warn_of_host(&self, certificate: &Certificate, host: &str) {
+        let mut warned = self.warned.lock();
+        if warned.len() >= MOST_WARNED {
+            warned.clear();
+        }
+        if warned.insert((certificate.serial().to_string(), host.to_owned())) {
+            warn!(
+                host, certificate = ?certificate.name(), hosts = ?certificate.hosts(),
+                application_uri = ?certificate.application_uri().unwrap_or_default(),
+                "the trusted certificate of the server names other hosts than the one it is reached at"
+            );
+        }
     }
 
     fn help(&self, certificate: &Certificate, fault: Fault, names: Names<'_>) -> String {
@@ -193,5 +248,41 @@ pub(crate) const fn help(fault: Fault) -> &'static str {
     }
 }
 
+/// Hosts and certificates that are remembered for not being warned of again.
+const MOST_WARNED: usize = 256;
 /// Digits of a thumbprint that people are told.
 const SHOWN_DIGITS: usize = 16;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::pki::{OWN_CERTIFICATE, Pki};
+
+    #[test]
+    fn a_trusted_certificate_of_the_application_may_name_another_host_unless_that_is_refused() {
+        let root = std::env::temp_dir().join(format!("plant-opcua-judge-{}", std::process::id()));
+        drop(std::fs::remove_dir_all(&root));
+        let device = Pki::open(root.join("device")).unwrap();
+        device.ensure_own("urn:device", "192.0.2.7").unwrap();
+        let der = std::fs::read(device.root().join(OWN_CERTIFICATE)).unwrap();
+        let client = Pki::open(root.join("client")).unwrap();
+        let names = |uri| Names {
+            host: Some("192.0.2.8"),
+            application_uri: Some(uri),
+        };
+        let judge = |host_names| Judge::of(client.root(), false).host_names(host_names);
+        let status = |host_names, uri| {
+            let taken = judge(host_names).take(&der, names(uri));
+            taken.map(drop).map_err(|refused| refused.status)
+        };
+        let untrusted = Err(StatusCode::BadCertificateUntrusted);
+        assert_eq!(status(HostNames::Warn, "urn:device"), untrusted);
+        std::fs::write(client.root().join("trusted/device.der"), &der).unwrap();
+        assert_eq!(status(HostNames::Warn, "urn:device"), Ok(()));
+        let host = Err(StatusCode::BadCertificateHostNameInvalid);
+        assert_eq!(status(HostNames::Refuse, "urn:device"), host);
+        let uri = Err(StatusCode::BadCertificateUriInvalid);
+        assert_eq!(status(HostNames::Warn, "urn:another"), uri);
+        std::fs::remove_dir_all(root).unwrap();
+    }
+}

@@ -2,7 +2,7 @@
 //! types, and clients that come back by themselves. It knows no skills, no discovery, no space and no ROS.
 //!
 //! Reading order: `limits` (the bounds of both sides), `seldom` (what peers do again and again, in the log), `endpoint`, `pki`, `certificates`, `known`, `judge` and `door` (who gets
-//! in), `nodeset` (types from files), `users`, `audit` and `changes`, `server` and `client`, `file`, `trust_file`, `directory` and
+//! in), `nodeset` (types from files), `users`, `supervision`, `audit` and `changes`, `server` and `client`, `file`, `trust_file`, `directory` and
 //! `configuration` (a server's certificates as clients manage them, and as it renews them itself).
 
 pub mod audit;
@@ -21,6 +21,7 @@ pub mod nodeset;
 pub mod pki;
 pub mod seldom;
 pub mod server;
+pub mod supervision;
 pub mod trust_file;
 pub mod users;
 

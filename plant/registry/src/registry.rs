@@ -20,9 +20,11 @@ pub struct Settings {
     pub probe_every: Duration,
     /// How long one that gives no answer at all still counts as there.
     pub lost_after: Duration,
-    /// How long one whose host takes connections and that says nothing itself counts as there: longer, since a program that
-    /// computes is not gone. Ten times as long where it has never answered, since it may be starting.
+    /// How long a server that answers during calls may be silent while its host takes connections: longer than `lost_after`,
+    /// since a program that computes is not gone. Ten times as long where it has never answered, since it may be starting.
     pub hangs_after: Duration,
+    /// How long any other server may be: many serve one request at a time, and answer nothing while they execute a method.
+    pub busy_for: Duration,
     /// Servers that may be registered, and records of the network, each. What is more is refused or not taken in.
     pub most: usize,
 }
@@ -35,6 +37,7 @@ impl Default for Settings {
             probe_every: Duration::from_secs(1),
             lost_after: Duration::from_secs(2),
             hangs_after: Duration::from_secs(3),
+            busy_for: Duration::from_secs(60),
             most: 1024,
         }
     }
@@ -202,6 +205,7 @@ impl Registry {
     fn take(&mut self, server: Server, now: Instant) {
         let server_uri = server.asked.server_uri.clone();
         let discovery_urls = server.asked.discovery_urls.clone();
+        let is_concurrent = server.asked.product_uri.starts_with(CONCURRENT_PRODUCTS);
         let wished = server.announced.clone();
         let before = self.servers.insert(server_uri.clone(), server);
         let announced = before.as_ref().and_then(|before| before.announced.as_ref());
@@ -219,6 +223,9 @@ impl Registry {
         }
         for url in &discovery_urls {
             self.watch.add(url, self.settings.probe_every, now);
+            if is_concurrent {
+                self.watch.answers_during_calls(url);
+            }
         }
         self.events.push_back(Event::Registered {
             server_uri,
@@ -315,6 +322,17 @@ impl Registry {
         self.watch.started(url, start_time);
     }
 
+    /// The server at this URL answers while it executes methods, so that silence is a sign that it hangs.
+    pub fn answers_during_calls(&mut self, url: &str) {
+        self.watch.answers_during_calls(url);
+    }
+
+    /// Returns whether the server at this URL is known to answer while it executes methods.
+    #[must_use]
+    pub fn is_concurrent(&self, url: &str) -> bool {
+        self.watch.is_concurrent(url)
+    }
+
     /// What came of a try.
     pub fn probed(&mut self, url: &str, outcome: Outcome, now: Instant) {
         match outcome {
@@ -328,6 +346,7 @@ impl Registry {
             every: self.settings.probe_every,
             silent: self.settings.lost_after,
             hanging: self.settings.hangs_after,
+            busy: self.settings.busy_for,
         };
         match self.watch.probed(url, outcome, patience, now) {
             Sign::Nothing => {}
@@ -590,3 +609,6 @@ impl Asked {
         })
     }
 }
+
+/// ProductUris of servers that serve many requests at a time begin like this.
+const CONCURRENT_PRODUCTS: &str = "urn:ua-bridge:";

@@ -48,8 +48,10 @@ pub(crate) struct Patience {
     pub(crate) every: Duration,
     /// How long a host may be silent.
     pub(crate) silent: Duration,
-    /// How long a program may, whose host is there.
+    /// How long a program that answers during calls may be silent while its host is there.
     pub(crate) hanging: Duration,
+    /// How long any other program may be.
+    pub(crate) busy: Duration,
 }
 
 /// The endpoints under watch.
@@ -67,6 +69,8 @@ struct Watched {
     has_answered: bool,
     try_at: Instant,
     start_time: Option<i64>,
+    /// Whether the server answers while it executes methods.
+    answers_during_calls: bool,
 }
 
 impl Watch {
@@ -79,6 +83,7 @@ impl Watch {
                 has_answered: false,
                 try_at: now + every.mul_f64(spread(url)),
                 start_time: None,
+                answers_during_calls: false,
             };
             self.endpoints.insert(url.to_owned(), watched);
         }
@@ -146,6 +151,18 @@ impl Watch {
         }
     }
 
+    /// The server at this URL answers while it executes methods.
+    pub(crate) fn answers_during_calls(&mut self, url: &str) {
+        if let Some(watched) = self.endpoints.get_mut(url) {
+            watched.answers_during_calls = true;
+        }
+    }
+
+    pub(crate) fn is_concurrent(&self, url: &str) -> bool {
+        let watched = self.endpoints.get(url);
+        watched.is_some_and(|watched| watched.answers_during_calls)
+    }
+
     /// Takes note of what came of a try.
     pub(crate) fn probed(
         &mut self,
@@ -169,14 +186,25 @@ impl Watch {
                 }
             }
             Outcome::Refused => Sign::Lost(Loss::Unreachable),
-            Outcome::Silent => watched.waits(patience.silent, Loss::Unreachable, patience, now),
+            Outcome::Silent => {
+                // Tried again soon, so that two tries that wait fit into the time.
+                let again = patience.every / 10;
+                watched.waits(
+                    patience.silent,
+                    Loss::Unreachable,
+                    (patience.every, again),
+                    now,
+                )
+            }
             Outcome::Hanging => {
-                // Who has never answered may be starting: it listens, and serves a while later.
-                let most = match watched.has_answered {
-                    true => patience.hanging,
-                    false => patience.hanging * STARTING,
+                let (most, again) = match (watched.answers_during_calls, watched.has_answered) {
+                    (true, true) => (patience.hanging, patience.every / 10),
+                    // Who has never answered may be starting: it listens, and serves a while later.
+                    (true, false) => (patience.hanging * STARTING, patience.every / 10),
+                    // A busy server accepts no connections, and its queue has room for few.
+                    (false, _) => (patience.busy, patience.every),
                 };
-                watched.waits(most, Loss::Hanging, patience, now)
+                watched.waits(most, Loss::Hanging, (patience.every, again), now)
             }
             Outcome::Untried => {
                 // A name that nobody knows is not asked for each second.
@@ -188,14 +216,19 @@ impl Watch {
 }
 
 impl Watched {
-    /// No answer came: for how long that goes.
-    fn waits(&mut self, most: Duration, loss: Loss, patience: Patience, now: Instant) -> Sign {
+    /// No answer came, which may last so long; the server is tried again a while later.
+    fn waits(
+        &mut self,
+        most: Duration,
+        loss: Loss,
+        (every, again): (Duration, Duration),
+        now: Instant,
+    ) -> Sign {
         // A try that ends a moment before counts: the next one would take its time once more.
-        if now.saturating_duration_since(self.answered) + patience.every / 4 >= most {
+        if now.saturating_duration_since(self.answered) + every / 4 >= most {
             return Sign::Lost(loss);
         }
-        // Tried again soon, so that two tries that wait fit into the time.
-        self.try_at = now + patience.every / 10;
+        self.try_at = now + again;
         Sign::Nothing
     }
 }

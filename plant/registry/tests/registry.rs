@@ -261,6 +261,7 @@ fn a_program_that_takes_connections_and_says_nothing_hangs() {
     registry.announced(robot(), now);
     events(&mut registry);
     let url = robot().url;
+    registry.answers_during_calls(&url);
     registry.probed(&url, Outcome::Alive { start_time: None }, now);
     registry.probed(&url, Outcome::Hanging, now + SECOND * 2);
     assert_eq!(registry.poll_event(), None, "it may compute");
@@ -279,11 +280,65 @@ fn a_program_that_takes_connections_and_says_nothing_hangs() {
 }
 
 #[test]
+fn a_server_that_may_be_busy_with_a_method_is_kept_while_its_host_accepts_connections() {
+    let (mut registry, now) = start();
+    register(&mut registry, &gripper(), now).unwrap();
+    events(&mut registry);
+    let url = gripper().discovery_urls[0].clone();
+    registry.probed(&url, Outcome::Alive { start_time: None }, now);
+    for second in 1..59 {
+        registry.probed(&url, Outcome::Hanging, now + SECOND * second);
+        assert_eq!(registry.poll_event(), None, "after {second} s");
+    }
+    // Its host is gone: that is noticed as fast as for any other server.
+    let answered = now + SECOND * 59;
+    registry.probed(&url, Outcome::Alive { start_time: None }, answered);
+    registry.probed(&url, Outcome::Silent, answered + SECOND * 2);
+    let happened = events(&mut registry);
+    let is_gone = |event: &Event| {
+        matches!(
+            event,
+            Event::Gone {
+                loss: Loss::Unreachable,
+                ..
+            }
+        )
+    };
+    assert!(happened.iter().any(is_gone), "{happened:?}");
+}
+
+#[test]
+fn a_server_of_ours_answers_during_calls_and_hangs_after_three_seconds() {
+    let (mut registry, now) = start();
+    let ours = Asked {
+        product_uri: "urn:ua-bridge:plant".to_owned(),
+        ..gripper()
+    };
+    register(&mut registry, &ours, now).unwrap();
+    events(&mut registry);
+    let url = ours.discovery_urls[0].clone();
+    registry.probed(&url, Outcome::Alive { start_time: None }, now);
+    registry.probed(&url, Outcome::Hanging, now + SECOND * 3);
+    let happened = events(&mut registry);
+    let hangs = |event: &Event| {
+        matches!(
+            event,
+            Event::Gone {
+                loss: Loss::Hanging,
+                ..
+            }
+        )
+    };
+    assert!(happened.iter().any(hangs), "{happened:?}");
+}
+
+#[test]
 fn one_that_listens_and_has_never_answered_is_given_time_to_start() {
     let (mut registry, now) = start();
     registry.announced(robot(), now);
     events(&mut registry);
     let url = robot().url;
+    registry.answers_during_calls(&url);
     for second in 1..30 {
         registry.probed(&url, Outcome::Hanging, now + SECOND * second);
         assert_eq!(registry.poll_event(), None, "after {second} s");

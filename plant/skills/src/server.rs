@@ -20,7 +20,9 @@ use plant_opcua::server::{
     EndpointUrl, IdRange, Instance, InstanceError, InstanceSpec, Security as Policy, Server,
     ServerBuilder, ServerConfig, ServerError,
 };
+use plant_opcua::supervision::Supervision;
 use plant_opcua::types::{NodeId, ObjectId, ObjectTypeId, QualifiedName};
+use plant_opcua::users::{Access, Role, Roles};
 use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
 use tokio::time::{Instant, MissedTickBehavior};
@@ -50,6 +52,8 @@ pub struct ServeSettings {
     pub trust_any_client: bool,
     /// The number of each skill's first run, above those it had before the program was started anew; 0 counts as 1.
     pub first_run: u32,
+    /// The supervisor that the component is registered with.
+    pub supervision: Supervision,
 }
 
 /// Why a component is not served.
@@ -86,10 +90,12 @@ impl ComponentServer {
         settings: &ServeSettings,
         mut observers: impl FnMut(u16, &Facts) -> Vec<Box<dyn Observer>>,
     ) -> Result<Self, ServeFault> {
-        let server = server_of(component, settings)?;
+        let users = users_of(settings)?;
+        let server = server_of(component, settings, &users)?;
         let mut ids = IdRange::new(OWN, FIRST_FREE_ID);
         let root = root(&server, component, &mut ids)?;
-        place::configurable(&server, &root.node_id, &mut ids)
+        let configure_by = (settings.supervision.clone(), users);
+        place::configurable(&server, &root.node_id, &mut ids, configure_by)
             .map_err(|error| ServeFault::Space(error.to_string()))?;
         let folder = root
             .node("Skills")
@@ -196,7 +202,19 @@ impl ComponentServer {
     }
 }
 
-fn server_of(component: &Component, settings: &ServeSettings) -> Result<Server, ServeFault> {
+/// The users in the certificate store. Users without a name may have the skills run, as long as they hold the lease.
+fn users_of(settings: &ServeSettings) -> Result<Arc<Access>, ServeFault> {
+    let anonymous = Roles::of(&[Role::Observer, Role::Operator]);
+    let users = Access::of_store(settings.pki.as_deref(), anonymous);
+    let users = users.map_err(|error| ServerError::Configuration(error.to_string()))?;
+    Ok(Arc::new(users))
+}
+
+fn server_of(
+    component: &Component,
+    settings: &ServeSettings,
+    users: &Arc<Access>,
+) -> Result<Server, ServeFault> {
     let endpoint: EndpointUrl = component
         .endpoint
         .parse()
@@ -211,7 +229,9 @@ fn server_of(component: &Component, settings: &ServeSettings) -> Result<Server, 
         trust_unknown_clients: settings.trust_any_client,
         ..ServerConfig::new(&component.application_uri, &component.name, endpoint)
     };
-    let mut builder = ServerBuilder::new(config).nodeset_str(NAMESPACE, &model::nodeset());
+    let mut builder = ServerBuilder::new(config)
+        .users(Arc::clone(users))
+        .nodeset_str(NAMESPACE, &model::nodeset());
     if !component.nodesets.iter().any(|file| lock::has_di(file)) {
         builder = builder.nodeset_str(lock::NAMESPACE, lock::NODESET);
     }

@@ -23,7 +23,7 @@ pub(crate) struct Peer {
     /// The name it is shown by, which no other has on its level.
     pub(crate) name: String,
     pub(crate) uri: String,
-    /// `waiting`, `refused`, `connected` or `away`.
+    /// `waiting`, `refused`, `connected`, `busy` or `away`.
     pub(crate) state: &'static str,
     /// Why it is not connected or not configured.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -39,8 +39,17 @@ pub(crate) struct Peer {
     pub(crate) place: Option<String>,
 }
 
+impl Peer {
+    /// Returns whether there is a connection to it.
+    fn is_there(&self) -> bool {
+        self.state == CONNECTED || self.state == BUSY
+    }
+}
+
 #[derive(Debug, Default)]
 struct State {
+    /// The face below, which is listed as if it had registered; `None` without a level above.
+    own: Option<Gated>,
     place: Option<String>,
     discovery_above: Option<String>,
     peers: BTreeMap<(Level, String), Peer>,
@@ -49,22 +58,14 @@ struct State {
 /// Shared by all who tend servers.
 #[derive(Debug)]
 pub(crate) struct Board {
-    /// Our name as a gateway, and where that is on the level below; `None` without a level above.
-    gateway: Option<(String, String)>,
-    own: Option<Gated>,
     state: Mutex<State>,
     tell: watch::Sender<Added>,
 }
 
 impl Board {
-    /// `own` is the face below, which is listed as if it had registered.
-    pub(crate) fn new(own: Option<Gated>) -> (Self, watch::Receiver<Added>) {
+    pub(crate) fn new() -> (Self, watch::Receiver<Added>) {
         let (tell, added) = watch::channel(Added::default());
-        let gateway = own.as_ref();
-        let gateway = gateway.map(|own| (own.application_uri.clone(), own.url.clone()));
         let board = Self {
-            gateway,
-            own,
             state: Mutex::default(),
             tell,
         };
@@ -76,25 +77,15 @@ impl Board {
         let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
         let done = how(&mut state);
         self.tell.send_replace(Added {
-            gated: self.gated(&state),
+            gated: gated(&state),
             status: Some(status(&state)),
         });
         done
     }
 
-    fn gated(&self, state: &State) -> Vec<Gated> {
-        let above = state.peers.iter().filter(|((level, _), peer)| {
-            *level == Level::Above && peer.state == CONNECTED && peer.methods > 0
-        });
-        let through = self.gateway.iter().flat_map(|(gateway_uri, url)| {
-            above.clone().map(|(_, peer)| Gated {
-                application_uri: peer.uri.clone(),
-                name: peer.name.clone(),
-                gateway_uri: gateway_uri.clone(),
-                url: url.clone(),
-            })
-        });
-        self.own.iter().cloned().chain(through).collect()
+    /// There is a face below.
+    pub(crate) fn own(&self, own: Gated) {
+        self.change(|state| state.own = Some(own));
     }
 
     pub(crate) fn place(&self, place: Option<String>) {
@@ -131,11 +122,36 @@ impl Board {
         });
     }
 
+    /// Returns whether a server of the level has this ApplicationUri in a certificate that was checked.
+    pub(crate) fn knows(&self, level: Level, application_uri: &str) -> bool {
+        let state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+        state.peers.iter().any(|((at, _), peer)| {
+            *at == level && peer.is_there() && peer.secured && peer.uri == application_uri
+        })
+    }
+
     /// A server is gone. Gives its name.
     pub(crate) fn leave(&self, level: Level, url: &str) -> Option<String> {
         let gone = self.change(|state| state.peers.remove(&(level, url.to_owned())));
         gone.map(|peer| peer.name)
     }
+}
+
+/// What is listed beside the registered servers: the face below, and the neighbours that are called through it.
+fn gated(state: &State) -> Vec<Gated> {
+    let above = state
+        .peers
+        .iter()
+        .filter(|((level, _), peer)| *level == Level::Above && peer.is_there() && peer.methods > 0);
+    let through = state.own.iter().flat_map(|own| {
+        above.clone().map(|(_, peer)| Gated {
+            application_uri: peer.uri.clone(),
+            name: peer.name.clone(),
+            gateway_uri: own.application_uri.clone(),
+            url: own.url.clone(),
+        })
+    });
+    state.own.iter().cloned().chain(through).collect()
 }
 
 fn status(state: &State) -> serde_json::Value {
@@ -153,6 +169,8 @@ fn status(state: &State) -> serde_json::Value {
 }
 
 pub(crate) const CONNECTED: &str = "connected";
+/// Connected, and it answers no requests: it executes a method for somebody.
+pub(crate) const BUSY: &str = "busy";
 
 #[cfg(test)]
 mod tests {
@@ -166,7 +184,8 @@ mod tests {
             gateway_uri: String::new(),
             url: "opc.tcp://10.1.0.1:9".to_owned(),
         };
-        let (board, added) = Board::new(Some(own.clone()));
+        let (board, added) = Board::new();
+        board.own(own.clone());
         assert_eq!(board.enter(Level::Above, "u1", "b"), "b");
         assert_eq!(board.enter(Level::Above, "u2", "b"), "b (2)");
         assert_eq!(board.enter(Level::Above, "u2", "b"), "b (2)", "again");

@@ -3,11 +3,11 @@
 use std::collections::BTreeSet;
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::time::Duration;
 
 use async_trait::async_trait;
 use plant_opcua::changes::{Became, ModelChange};
-use plant_opcua::client::{CallError, CallOptions, Client, ClientError};
-use plant_opcua::limits::LONGEST_REQUEST;
+use plant_opcua::client::{CallOptions, ClientError};
 use plant_opcua::server::{
     EndpointUrl, InstanceError, MethodHandler, MethodRequest, MethodSpec, ObjectSpec, Refusal,
     Security, Server, ServerBuilder, ServerConfig, ServerError, VariableSpec,
@@ -16,8 +16,9 @@ use plant_opcua::types::{
     DataTypeId, DataValue, LocalizedText, NodeId, ObjectId, ObjectTypeId, QualifiedName,
     ReferenceTypeId, StatusCode, VariableTypeId, Variant,
 };
-use tracing::debug;
+use tracing::{debug, warn};
 
+use crate::callers::{Admission, AllCallers, Callers};
 use crate::mirror::{Found, Mirror};
 
 /// One face of a station.
@@ -26,6 +27,8 @@ pub(crate) struct Face {
     pub(crate) server: Server,
     /// The folder of those whose methods are shown.
     folder: &'static str,
+    admission: Admission,
+    callers: AllCallers,
 }
 
 /// How a face listens.
@@ -37,6 +40,8 @@ pub(crate) struct FaceSettings {
     pub(crate) pki: Option<PathBuf>,
     pub(crate) allow_unsecured: bool,
     pub(crate) trust_any: bool,
+    /// The judge of callers.
+    pub(crate) admission: Admission,
 }
 
 /// A server whose methods are shown.
@@ -45,7 +50,7 @@ pub(crate) struct Shown<'a> {
     pub(crate) name: &'a str,
     pub(crate) application_uri: &'a str,
     pub(crate) mirror: &'a Mirror,
-    pub(crate) client: &'a Client,
+    pub(crate) callers: &'a Arc<Callers>,
     /// The connection on which its NodeIds hold.
     pub(crate) connects: u64,
 }
@@ -60,6 +65,7 @@ impl Face {
             pki,
             allow_unsecured,
             trust_any,
+            admission,
         } = settings;
         let security = match (&pki, allow_unsecured) {
             (None, _) => vec![Security::None],
@@ -72,11 +78,25 @@ impl Face {
             trust_unknown_clients: trust_any,
             ..ServerConfig::new(&application_uri, &name, endpoint)
         };
-        let server = ServerBuilder::new(config).build()?;
-        let face = Self { server, folder };
+        let users = Arc::clone(&admission.users);
+        let server = ServerBuilder::new(config).users(users).build()?;
+        let callers = AllCallers::default();
+        let leaving = callers.clone();
+        server.on_session_closed(move |session| leaving.gone(session));
+        let face = Self {
+            server,
+            folder,
+            admission,
+            callers,
+        };
         let made = face.object(folder, &ObjectId::ObjectsFolder.into(), folder);
         made.map_err(|error| ServerError::Configuration(error.to_string()))?;
         Ok(face)
+    }
+
+    /// Has the sessions at a server end with those of its callers here.
+    pub(crate) fn follow(&self, callers: &Arc<Callers>) {
+        self.callers.add(callers);
     }
 
     /// Shows the methods of a server in the place of what was shown of it, and tells clients.
@@ -97,7 +117,8 @@ impl Face {
         let mut objects = BTreeSet::new();
         for found in &shown.mirror.methods {
             let handler = Arc::new(Passing {
-                client: shown.client.clone(),
+                admission: self.admission.clone(),
+                callers: Arc::clone(shown.callers),
                 connects: shown.connects,
                 object: found.object.clone(),
                 method: found.method.clone(),
@@ -207,9 +228,10 @@ pub(crate) fn id(path: &str) -> NodeId {
     NodeId::new(OWN, path)
 }
 
-/// Passes a call on.
+/// Passes a call on, in the session that its caller has at the server.
 struct Passing {
-    client: Client,
+    admission: Admission,
+    callers: Arc<Callers>,
     connects: u64,
     object: NodeId,
     method: NodeId,
@@ -217,32 +239,52 @@ struct Passing {
 
 #[async_trait]
 impl MethodHandler for Passing {
+    fn longest(&self) -> Duration {
+        LONGEST_CALL
+    }
+
     async fn call(&self, request: MethodRequest) -> Result<Vec<Variant>, Refusal> {
+        let caller = &request.caller;
+        self.admission.check(caller).inspect_err(|_| {
+            warn!(
+                application = ?caller.application_uri, user = ?caller.user, method = request.name,
+                "refused call: the caller needs the role operator"
+            );
+        })?;
         let options = CallOptions {
-            // So that who asked hears of it from us.
-            within: LONGEST_REQUEST * 9 / 10,
-            connection: Some(self.connects),
+            // The caller gets this answer rather than a timeout.
+            within: LONGEST_CALL * 9 / 10,
+            connection: None,
         };
         let target = (&self.object, &self.method);
-        let called = self.client.call_within(target, request.arguments, options);
-        called.await.map_err(refusal)
+        let client = self.callers.client_of(caller.session, self.connects);
+        let client = client
+            .await
+            .map_err(|error| Refusal::Status(status(error)))?;
+        if !request.presence.lasts() {
+            // The caller left while its session at the server was made.
+            self.callers.gone(caller.session);
+            return Err(Refusal::Status(StatusCode::BadSessionClosed));
+        }
+        let called = client.call_result(target, request.arguments, options);
+        match called.await {
+            Ok(result) => Err(Refusal::PassedOn(Box::new(result))),
+            Err(error) => Err(Refusal::Status(status(error))),
+        }
     }
 }
 
-fn refusal(error: CallError) -> Refusal {
+/// The status of a call that has no result.
+fn status(error: ClientError) -> StatusCode {
     match error {
-        CallError::Refused { status, arguments } if arguments.is_empty() => Refusal::Status(status),
-        CallError::Refused { arguments, .. } => Refusal::Arguments(arguments),
-        CallError::Client(ClientError::NotConnected(_)) => {
-            Refusal::Status(StatusCode::BadNoCommunication)
-        }
-        CallError::Client(ClientError::Status(status)) => Refusal::Status(status),
+        ClientError::NotConnected(_) => StatusCode::BadNoCommunication,
+        ClientError::Status(status) => status,
         // Nobody knows whether it was executed: it was sent, and the answer has not come.
-        CallError::Client(ClientError::Lost(_) | ClientError::Answer(_)) => {
-            Refusal::Status(StatusCode::BadRequestInterrupted)
-        }
+        ClientError::Lost(_) | ClientError::Answer(_) => StatusCode::BadRequestInterrupted,
     }
 }
 
+/// How long a call that is passed on may take. A caller that waits for less gives up earlier by its own timeout.
+const LONGEST_CALL: Duration = Duration::from_secs(300);
 /// The namespace of the ApplicationUri.
 const OWN: u16 = 1;

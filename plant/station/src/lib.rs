@@ -7,10 +7,11 @@
 //! Whoever comes on the level below is configured: the station connects, holds the certificate against what is registered,
 //! and calls the method `Configure` of the component with its place in the plant.
 //!
-//! Reading order: `configure` (the method), `mirror` (which methods a server has), `face` (how they are shown), `board` (what
+//! Reading order: `configure` (the method), `mirror` (which methods a server has), `callers` (who may call them), `face` (how they are shown), `board` (what
 //! is known), `tend` (one server's life), `marks` (looking for a node), `station` (all of it).
 
 mod board;
+mod callers;
 mod configure;
 mod face;
 mod marks;

@@ -8,7 +8,9 @@ use std::time::Duration;
 use bridge_node::{Failure, LogFormat, Service, run_service, serve_pages};
 use discovery::lds::LdsSettings;
 use discovery::{DEFAULT_LDS, Interface};
+use plant_opcua::client::HostNames;
 use plant_opcua::server::EndpointUrl;
+use plant_opcua::users::{Role, Roles};
 use registry::hierarchy::{Choice, Place};
 use ua_station::{StationSettings, Upper, run};
 
@@ -64,6 +66,15 @@ struct UaStation {
     /// Trust every certificate. For tests and demonstrations only
     #[arg(long, requires = "pki")]
     trust_any_certificate: bool,
+    /// The roles of callers without a user name: observer, operator, engineer, several with commas between them. Calls of
+    /// operators and engineers are passed on, and those of servers of the level, known by their certificates. Users are in
+    /// `users` of --pki (`ua-server user add`). Without it observer, and operator where channels are not secured
+    #[arg(long, value_name = "ROLES", env = "UA_ANONYMOUS")]
+    anonymous: Option<Roles>,
+    /// Refuse servers at hosts that their trusted certificates do not name, as after another lease of DHCP. Without it the station
+    /// connects to them and logs a warning
+    #[arg(long)]
+    refuse_other_hosts: bool,
     /// Serve what is known at this address: /status as JSON, /metrics for Prometheus, and /readyz
     #[arg(long, value_name = "ADDRESS:PORT", env = "UA_METRICS")]
     metrics: Option<SocketAddr>,
@@ -105,7 +116,17 @@ impl Service for UaStation {
             endpoint: self.upper_endpoint,
             discovery: self.upper_lds,
         });
+        let is_open = self.allow_unsecured || lds.pki.is_none();
+        let usual = match is_open {
+            true => Roles::of(&[Role::Observer, Role::Operator]),
+            false => Roles::of(&[Role::Observer]),
+        };
         let settings = StationSettings {
+            anonymous: self.anonymous.unwrap_or(usual),
+            host_names: match self.refuse_other_hosts {
+                true => HostNames::Refuse,
+                false => HostNames::Warn,
+            },
             name: self.name,
             place: self.place,
             lds,

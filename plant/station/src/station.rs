@@ -11,16 +11,19 @@ use discovery::{
     AnnounceSettings, Announced, Found, Interface, MdnsFault, Server, WatchSettings, Watcher,
     announce, find_lds, watch as watch_level,
 };
-use plant_opcua::client::{ClientConfig, SecurityChoice};
+use plant_opcua::client::{ClientConfig, HostNames, SecurityChoice};
 use plant_opcua::pki::Pki;
 use plant_opcua::server::{EndpointUrl, MethodRequest, MethodSpec, Refusal, ServerError, method};
+use plant_opcua::supervision::Supervision;
 use plant_opcua::types::{ObjectId, QualifiedName, StatusCode};
+use plant_opcua::users::{Access, Roles};
 use registry::hierarchy::{Change, Choice, Place, Roster};
 use tokio::sync::{mpsc, watch};
 use tokio::task::AbortHandle;
 use tracing::{info, warn};
 
 use crate::board::{Board, Level};
+use crate::callers::Admission;
 use crate::configure::{self, Told};
 use crate::face::{Face, FaceSettings, id};
 use crate::marks::Sessions;
@@ -39,6 +42,10 @@ pub struct StationSettings {
     pub devices_endpoint: Option<EndpointUrl>,
     /// The level above; `None` for the top.
     pub upper: Option<Upper>,
+    /// The roles of callers without a user name. Calls of operators and engineers are passed on.
+    pub anonymous: Roles,
+    /// The rule for servers at hosts that their trusted certificates do not name.
+    pub host_names: HostNames,
 }
 
 /// The level above.
@@ -66,58 +73,37 @@ pub async fn run(
         discovery::host_name(),
         settings.name
     );
-    let certificates = certificates(&settings, &uri)?;
-    let below = match &settings.upper {
-        Some(_) => Some(open_below(&settings, &uri, certificates.clone())?),
-        None => None,
-    };
-    let own = below.as_ref().map(|face| Gated {
-        application_uri: uri.clone(),
-        name: settings.name.clone(),
-        gateway_uri: String::new(),
-        url: face.server.url().to_owned(),
-    });
-    let (board, added) = Board::new(own);
+    let pki = certificates(&settings, &uri)?;
+    let (board, added) = Board::new();
     let board = Arc::new(board);
+    let users = Access::of_store(pki.as_deref(), settings.anonymous);
+    let users = users.map_err(|error| Failure::new(FailureKind::Io, error.to_string()))?;
     board.place(settings.place.as_ref().map(Place::to_string));
     let (place, places) = watch::channel(settings.place.clone());
-    let client = client(&settings, &uri, certificates.clone());
+    let client = client(&settings, &uri, pki.clone());
+    let common = Common {
+        settings: &settings,
+        uri: &uri,
+        pki,
+        board: Arc::clone(&board),
+        users: Arc::new(users),
+        client: client.clone(),
+    };
     let mut levels = Levels::default();
-    let mut above = None;
-    if let (Some(upper), Some(below)) = (&settings.upper, &below) {
-        let face = open_above(&settings, upper, &uri, certificates.clone())?;
-        configurable(&face, &settings.name, &board, place.clone())?;
-        face.server.start();
-        below.server.start();
-        let tending = Tending {
-            level: Level::Above,
-            board: Arc::clone(&board),
-            face: Some(below.clone()),
-            client: client.clone(),
-            place: None,
-            discovery_url: String::new(),
-            own_uri: uri.clone(),
-        };
-        levels.above = Some(follow(upper, tending)?);
-        levels.announced = tell(&settings, upper, &uri, (&face, below))?;
-        levels.registered = Some(register(
-            &settings,
-            upper,
-            &face,
-            &client,
-            Arc::clone(&board),
-        )?);
-        above = Some(face);
-    }
+    let faces = match &settings.upper {
+        Some(upper) => Some(common.open(upper, &place, &mut levels)?),
+        None => None,
+    };
     let (tell, events) = mpsc::channel(MOST_EVENTS);
     let tending = Tending {
         level: Level::Below,
         board,
-        face: above.clone(),
+        face: faces.as_ref().map(|faces| faces.above.clone()),
         client,
         place: Some(places),
         discovery_url: settings.lds.endpoint.clone(),
         own_uri: uri.clone(),
+        registered: watch::Sender::default(),
     };
     levels.below = Some(Abort(
         tokio::spawn(tend_below(events, tending)).abort_handle(),
@@ -134,10 +120,83 @@ pub async fn run(
     // The place is kept until nobody can be told it any more.
     drop(place);
     levels.leave().await;
-    for face in above.into_iter().chain(below) {
-        face.server.stop().await;
+    if let Some(Faces { above, below }) = faces {
+        above.server.stop().await;
+        below.server.stop().await;
     }
     ended
+}
+
+/// The faces of a station between two levels.
+struct Faces {
+    above: Face,
+    below: Face,
+}
+
+/// What both faces and the levels share.
+struct Common<'a> {
+    settings: &'a StationSettings,
+    uri: &'a str,
+    pki: Option<PathBuf>,
+    board: Arc<Board>,
+    users: Arc<Access>,
+    client: ClientConfig,
+}
+
+impl Common<'_> {
+    /// Opens both faces, follows the level above, and registers there.
+    fn open(
+        &self,
+        upper: &Upper,
+        place: &watch::Sender<Option<Place>>,
+        levels: &mut Levels,
+    ) -> Result<Faces, Failure> {
+        let Self {
+            settings,
+            uri,
+            board,
+            client,
+            ..
+        } = self;
+        let below = open_below(settings, uri, self.callers(Level::Below))?;
+        board.own(Gated {
+            application_uri: (*uri).to_owned(),
+            name: settings.name.clone(),
+            gateway_uri: String::new(),
+            url: below.server.url().to_owned(),
+        });
+        let above = open_above(settings, upper, uri, self.callers(Level::Above))?;
+        let supervision = Supervision::default();
+        let by = (supervision.clone(), Arc::clone(&self.users));
+        configurable(&above, &settings.name, (board, place.clone()), by)?;
+        above.server.start();
+        below.server.start();
+        let tending = Tending {
+            level: Level::Above,
+            board: Arc::clone(board),
+            face: Some(below.clone()),
+            client: client.clone(),
+            place: None,
+            discovery_url: String::new(),
+            own_uri: (*uri).to_owned(),
+            registered: watch::Sender::default(),
+        };
+        levels.above = Some(follow(upper, tending)?);
+        levels.announced = tell(settings, upper, uri, (&above, &below))?;
+        let told = (Arc::clone(board), supervision);
+        levels.registered = Some(register(settings, upper, &above, client, told)?);
+        Ok(Faces { above, below })
+    }
+
+    /// The certificate store of a face, and the judge of its callers.
+    fn callers(&self, level: Level) -> (Option<PathBuf>, Admission) {
+        let admission = Admission {
+            users: Arc::clone(&self.users),
+            board: Arc::clone(&self.board),
+            level,
+        };
+        (self.pki.clone(), admission)
+    }
 }
 
 /// How the station connects to others.
@@ -150,6 +209,8 @@ fn client(settings: &StationSettings, uri: &str, pki: Option<PathBuf>) -> Client
             (None, _) => SecurityChoice::None,
         },
         pki,
+        host_names: settings.host_names,
+        patience: BUSY_FOR,
         ..ClientConfig::new(uri, &settings.name)
     }
 }
@@ -207,7 +268,7 @@ fn certificates(settings: &StationSettings, uri: &str) -> Result<Option<PathBuf>
 fn open_below(
     settings: &StationSettings,
     uri: &str,
-    pki: Option<PathBuf>,
+    (pki, admission): (Option<PathBuf>, Admission),
 ) -> Result<Face, Failure> {
     let endpoint = endpoint(
         settings.devices_endpoint.as_ref(),
@@ -221,6 +282,7 @@ fn open_below(
         pki,
         allow_unsecured: settings.lds.allow_unsecured,
         trust_any: settings.lds.trust_any,
+        admission,
     };
     Face::open(settings, "Neighbours").map_err(|error| unavailable(&error))
 }
@@ -229,7 +291,7 @@ fn open_above(
     settings: &StationSettings,
     upper: &Upper,
     uri: &str,
-    pki: Option<PathBuf>,
+    (pki, admission): (Option<PathBuf>, Admission),
 ) -> Result<Face, Failure> {
     let endpoint = endpoint(
         upper.endpoint.as_ref(),
@@ -243,6 +305,7 @@ fn open_above(
         pki,
         allow_unsecured: settings.lds.allow_unsecured,
         trust_any: settings.lds.trust_any,
+        admission,
     };
     Face::open(settings, "Devices").map_err(|error| unavailable(&error))
 }
@@ -271,12 +334,12 @@ fn endpoint(
         .map_err(|error| Failure::new(FailureKind::Unavailable, format!("{error}")))
 }
 
-/// The object of the station itself, whose place the level above may say.
+/// The object of the station itself, whose place the supervisor above says.
 fn configurable(
     face: &Face,
     name: &str,
-    board: &Arc<Board>,
-    place: watch::Sender<Option<Place>>,
+    (board, place): (&Arc<Board>, watch::Sender<Option<Place>>),
+    (supervision, users): (Supervision, Arc<Access>),
 ) -> Result<(), Failure> {
     let failed = |error: plant_opcua::server::InstanceError| {
         Failure::new(FailureKind::Unavailable, error.to_string())
@@ -289,6 +352,15 @@ fn configurable(
     let by = face.property(STATION, "Supervisor", "").map_err(failed)?;
     let (server, board) = (face.server.clone(), Arc::clone(board));
     let handler = method(move |request: MethodRequest| {
+        let caller = &request.caller;
+        supervision
+            .admits(caller, users.roles_of(caller))
+            .inspect_err(|_| {
+                warn!(
+                    application = ?caller.application_uri, user = ?caller.user, proven = caller.proven,
+                    "refused Configure: the station is not registered with this client"
+                );
+            })?;
         let invalid = Refusal::Status(StatusCode::BadInvalidArgument);
         let told = Told::read(&request.arguments).ok_or_else(|| invalid.clone())?;
         let new: Place = told.place.parse().map_err(|_| invalid)?;
@@ -351,7 +423,7 @@ fn register(
     upper: &Upper,
     face: &Face,
     client: &ClientConfig,
-    board: Arc<Board>,
+    (board, supervision): (Arc<Board>, Supervision),
 ) -> Result<(mpsc::Sender<()>, tokio::task::JoinHandle<()>), Failure> {
     let marks = Arc::new(Sessions(client.clone()));
     let chosen = find_lds(upper.discovery.clone(), &upper.interface, Some(marks));
@@ -368,6 +440,7 @@ fn register(
                 // It announces itself.
                 mdns: None,
                 pki: pki.clone(),
+                supervision: supervision.clone(),
                 ..AnnounceSettings::default()
             };
             let registered = lds.and_then(|_| announce(server.clone(), how).ok());
@@ -417,8 +490,20 @@ async fn tend_below(mut events: mpsc::Receiver<OnLevel>, tending: Tending) {
     let mut tended = Tended::new(tending);
     while let Some(event) = events.recv().await {
         match event {
-            OnLevel::Told { source, url } => tended.told(&source, &url),
-            OnLevel::Left { source } => tended.left(&source),
+            OnLevel::Told {
+                source,
+                url,
+                registered,
+            } => {
+                if registered {
+                    tended.registered(&source, &url);
+                }
+                tended.told(&source, &url);
+            }
+            OnLevel::Left { source } => {
+                tended.unregistered(&source);
+                tended.left(&source);
+            }
             // Its client sees that for itself.
             OnLevel::Restarted { .. } => {}
         }
@@ -430,6 +515,8 @@ struct Tended {
     tending: Arc<Tending>,
     roster: Roster,
     tasks: BTreeMap<String, Abort>,
+    /// Where the servers are that registered here, by their ApplicationUris.
+    registered: BTreeMap<String, String>,
 }
 
 impl Tended {
@@ -438,7 +525,26 @@ impl Tended {
             tending: Arc::new(tending),
             roster: Roster::new(MOST_TENDED),
             tasks: BTreeMap::new(),
+            registered: BTreeMap::new(),
         }
+    }
+
+    fn registered(&mut self, source: &str, url: &str) {
+        // As the roster has it.
+        let url = url.trim_end_matches('/').to_owned();
+        self.registered.insert(source.to_owned(), url);
+        self.tell_registered();
+    }
+
+    fn unregistered(&mut self, source: &str) {
+        if self.registered.remove(source).is_some() {
+            self.tell_registered();
+        }
+    }
+
+    fn tell_registered(&self) {
+        let urls = self.registered.values().cloned().collect();
+        self.tending.registered.send_replace(urls);
     }
 
     fn told(&mut self, source: &str, url: &str) {
@@ -475,3 +581,5 @@ const STATION: &str = "Station";
 const MOST_EVENTS: usize = 1024;
 const MOST_TENDED: usize = 256;
 const LEAVE_LIMIT: Duration = Duration::from_secs(1);
+/// How long a server may answer nothing while its host is reachable: it may execute a method for somebody.
+const BUSY_FOR: Duration = Duration::from_secs(60);

@@ -1,11 +1,12 @@
 //! One server of a level: who it is, its place told to it, its methods shown, for as long as it is there.
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::Duration;
 
 use discovery::client::{Application, find_servers};
 use plant_opcua::client::{
-    CallError, Client, ClientConfig, Link, Notice, Select, Subscription, Watch,
+    CallError, Client, ClientConfig, ClientError, Link, Notice, Select, Subscription, Watch,
 };
 use plant_opcua::types::{ObjectId, ObjectTypeId};
 use registry::hierarchy::Place;
@@ -13,7 +14,8 @@ use tokio::sync::watch;
 use tokio::time::sleep;
 use tracing::{info, warn};
 
-use crate::board::{Board, CONNECTED, Level};
+use crate::board::{BUSY, Board, CONNECTED, Level};
+use crate::callers::Callers;
 use crate::configure::Told;
 use crate::face::{Face, Shown};
 use crate::mirror::{self, Mirror};
@@ -31,6 +33,8 @@ pub(crate) struct Tending {
     pub(crate) discovery_url: String,
     /// Us: our own servers are not tended.
     pub(crate) own_uri: String,
+    /// The URLs of the servers that registered here. Only these are told their place.
+    pub(crate) registered: watch::Sender<BTreeSet<String>>,
 }
 
 impl Tending {
@@ -45,6 +49,10 @@ impl Tending {
             peer.state = "waiting";
         });
         let client = Client::open(self.client.clone(), &url);
+        let callers = Arc::new(Callers::new(client.clone()));
+        if let Some(face) = &self.face {
+            face.follow(&callers);
+        }
         let mut link = client.link();
         let mut place = self.place.clone();
         loop {
@@ -59,6 +67,7 @@ impl Tending {
                     if application_uri == application.application_uri {
                         let of = Connected {
                             client: &client,
+                            callers: &callers,
                             connects,
                             secured,
                             url: &url,
@@ -135,13 +144,20 @@ impl Tending {
         let mut known = None;
         let mut changes = of.client.subscribe(vec![model_changes()], TOLD_EVERY, 10);
         loop {
-            match mirror::look(of.client).await {
-                Ok(looked) if known.as_ref() != Some(&looked) => {
-                    self.show(of, &looked);
-                    known = Some(looked);
+            // A server that executes a method may answer nothing else meanwhile.
+            if known.is_none() || !of.client.is_calling() {
+                match mirror::look(of.client).await {
+                    Ok(looked) if known.as_ref() != Some(&looked) => {
+                        self.show(of, &looked);
+                        known = Some(looked);
+                    }
+                    Ok(_) => self.answers_again(of),
+                    Err(_) if of.client.is_calling() => {}
+                    Err(ClientError::Lost(_)) if known.is_some() => {
+                        self.fault(of.url, BUSY, ANSWERS_NOTHING.to_owned());
+                    }
+                    Err(error) => self.fault(of.url, "waiting", error.to_string()),
                 }
-                Ok(_) => {}
-                Err(error) => self.fault(of.url, "waiting", error.to_string()),
             }
             // Being told its place may change a server: it is not told again for that.
             let is_told = match (&*place, &known) {
@@ -152,7 +168,8 @@ impl Tending {
                     }),
                 ) => {
                     let station = place.borrow().clone();
-                    station.is_none() || *of.told.lock().await == station
+                    let is_registered = self.registered.borrow().contains(of.url);
+                    !is_registered || station.is_none() || *of.told.lock().await == station
                 }
                 _ => true,
             };
@@ -183,7 +200,7 @@ impl Tending {
                 name: of.name,
                 application_uri: of.uri,
                 mirror: looked,
-                client: of.client,
+                callers: of.callers,
                 connects: of.connects,
             });
             if let Err(error) = shown {
@@ -206,13 +223,33 @@ impl Tending {
         );
     }
 
-    /// Tells the server its place, until it has heard it; then waits for another place.
+    /// A server that was busy answers as before.
+    fn answers_again(&self, of: &Connected<'_>) {
+        self.board.note(self.level, of.url, |peer| {
+            if peer.state == BUSY {
+                info!(name = peer.name, url = of.url, "answers again");
+                peer.state = CONNECTED;
+                peer.fault = None;
+            }
+        });
+    }
+
+    /// Tells the server its place, until it has heard it; then waits for another place. Servers that did not register here
+    /// belong to another supervisor.
     async fn keep_told(
         &self,
         of: &Connected<'_>,
         mirror: &Mirror,
         place: &mut watch::Receiver<Option<Place>>,
     ) {
+        let mut registered = self.registered.subscribe();
+        let is_gone = {
+            let is_registered = registered.wait_for(|urls| urls.contains(of.url));
+            is_registered.await.is_err()
+        };
+        if is_gone {
+            std::future::pending::<()>().await;
+        }
         let station = place.borrow().clone();
         let told = of.told.lock().await.clone();
         if let Some(station) = station.filter(|station| told.as_ref() != Some(station)) {
@@ -305,6 +342,7 @@ async fn changed(changes: &mut Subscription) {
 /// A connection to the server that it is said to be.
 struct Connected<'a> {
     client: &'a Client,
+    callers: &'a Arc<Callers>,
     connects: u64,
     secured: bool,
     url: &'a str,
@@ -314,6 +352,9 @@ struct Connected<'a> {
     told: tokio::sync::Mutex<Option<Place>>,
 }
 
+/// The fault of a server that executes a method for somebody, as far as is known.
+const ANSWERS_NOTHING: &str =
+    "it answers no requests, and its host is reachable: it may execute a method";
 const ASK_LIMIT: Duration = Duration::from_secs(2);
 /// How soon a server is to tell of a change.
 const TOLD_EVERY: Duration = Duration::from_millis(50);

@@ -4,8 +4,8 @@ use std::collections::{HashMap, HashSet};
 use std::path::Path;
 use std::time::Duration;
 
-use mappings::{Access, ExecutedBy, Mapping, SecurityPolicy};
-use plant_opcua::client::{Client, ClientConfig, ClientUser, Link, SecurityChoice};
+use mappings::{Access, ExecutedBy, Mapping, SecurityPolicy, Server};
+use plant_opcua::client::{Client, ClientConfig, ClientUser, HostNames, Link, SecurityChoice};
 
 /// The clients of other servers.
 pub(crate) struct Clients {
@@ -14,14 +14,18 @@ pub(crate) struct Clients {
 }
 
 impl Clients {
-    /// As a client with that ApplicationUri and the certificates in `pki`.
-    pub(crate) fn new(application_uri: &str, pki: &Path) -> Self {
+    /// As a client with the ApplicationUri of the server and the certificates in `pki`.
+    pub(crate) fn new(server: &Server, pki: &Path) -> Self {
         Self {
             config: ClientConfig {
                 pki: Some(pki.to_owned()),
                 timeout: ANSWERS_WITHIN,
                 keep_alive: KEEP_ALIVE,
-                ..ClientConfig::new(application_uri, "UA bridge server")
+                host_names: match server.refuse_other_hosts {
+                    true => HostNames::Refuse,
+                    false => HostNames::Warn,
+                },
+                ..ClientConfig::new(&server.application_uri, "UA bridge server")
             },
             open: HashMap::new(),
         }

@@ -30,7 +30,7 @@ pub(crate) struct Others {
 impl Others {
     /// Those of `mapping`, with the certificates in `pki`; others are heard of where this one is told of.
     pub(crate) fn new(mapping: &Arc<Mapping>, told: Option<&AnnounceSettings>, pki: &Path) -> Self {
-        let mut clients = Clients::new(&mapping.server().application_uri, pki);
+        let mut clients = Clients::new(mapping.server(), pki);
         let lds = told.and_then(|told| told.lds.as_deref());
         let mut others = Self {
             executing: Executing::new(mapping, &mut clients),

@@ -62,7 +62,7 @@ enum UserVerb {
     /// Make a user, or put another in the place of one of that name. The password is read from stdin
     Add {
         name: String,
-        /// What the user may be: observer, operator, engineer, security_admin; several with commas between them
+        /// What the user may be: observer, operator, engineer, security_admin, configure_admin; several with commas between them
         #[arg(long, value_name = "ROLES")]
         role: Roles,
         /// The user shows this certificate (DER or PEM, as .der or .pem) in place of a password

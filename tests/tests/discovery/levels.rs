@@ -299,6 +299,156 @@ fn a_device_calls_a_device_of_another_workstation_and_no_level_sees_another() {
     });
 }
 
+/// Where methods are called from above on the first workstation.
+const UPPER: &str = "opc.tcp://10.80.0.11:4870";
+
+/// An asyncua client that calls a method and keeps its session until it is told to leave.
+fn holding(cell: &Cell, site: &Site, path: &str, value: &str) -> Child {
+    let args = [UPPER, path, "--value", value, "--hold", "--patience", "20"];
+    let client = cell.asyncua_started("opcua_call.py", &args);
+    client.at(site).told().start()
+}
+
+fn answer(client: &mut Child) -> Value {
+    client.wait_for_json("the answer", SOON * 3, |line| {
+        line.get("status").map(|_| line.clone())
+    })
+}
+
+/// The URIs of the servers that the discovery server of a level lists.
+fn listed(site: &Site, uri: &str) -> bool {
+    let status = status(site);
+    let servers = status
+        .as_ref()
+        .and_then(|status| status["servers"].as_array());
+    servers.is_some_and(|servers| servers.iter().any(|one| one["uri"] == uri))
+}
+
+#[test]
+fn a_device_that_serves_one_request_at_a_time_is_called_for_long_and_keeps_its_place_meanwhile() {
+    let Some(cell) = Cell::with(&[Peer::Python, Peer::NodeOpcua]) else {
+        return;
+    };
+    let plant = plant(&cell);
+    let _station = station(&plant, 0, &["--upper-endpoint", UPPER]);
+    let mut adder = device(&cell, &plant, 0);
+    let (site, uri) = (&plant.stations[0].1, "urn:asyncua:adder-a");
+    eventually("its methods are shown", SOON * 2, || {
+        (below(site, "adder-a")?["state"] == "connected").then_some(())
+    });
+    let path = "Devices/adder-a/device/Hold";
+    let mut caller = holding(&cell, &plant.cell, path, "[7.0]");
+    adder.wait_for_json("it holds", SOON, |line| line.get("holds").map(|_| ()));
+    eventually("it has held", SOON, || {
+        assert!(listed(site, uri), "it is listed while it is called");
+        assert_ne!(below(site, "adder-a").unwrap()["state"], "away");
+        let lines = adder.json_lines();
+        lines
+            .iter()
+            .any(|line| line.get("held").is_some())
+            .then_some(())
+    });
+    let held = json!({"status": "Good", "arguments": [], "value": [7.0]});
+    assert_eq!(answer(&mut caller), held);
+    // A StatusCode arrives as the device has it: BadOutOfMemory beside what is wrong with an argument, and Uncertain.
+    for (code, name) in [
+        (0x8003_0000_u32, "BadOutOfMemory"),
+        (0x4000_0000, "Uncertain"),
+    ] {
+        let path = "Devices/adder-a/device/Judge";
+        let judged = call(&cell, &plant.cell, UPPER, path, &format!("[{code}]"));
+        let arguments = json!(["BadOutOfRange"]);
+        assert_eq!(
+            judged,
+            json!({"status": name, "arguments": arguments, "value": [1.5]})
+        );
+        let args = [UPPER, path, &format!("[{code}]")];
+        let other = cell.node_opcua_started("call.js", &args);
+        let mut other = other.at(&plant.cell).start();
+        assert!(other.wait_for_end(SOON * 3).success(), "{other}");
+        let told = other.json_lines().pop().unwrap();
+        assert_eq!(told, json!({"status": name, "value": [1.5]}));
+    }
+    // Another device of the level calls it.
+    let url = format!("opc.tcp://{}.22:4850/", INSIDE[0]);
+    let args = [&*url, "device/Hold", "--value", "[7.0]", "--patience", "20"];
+    let direct = cell.asyncua_started("opcua_call.py", &args);
+    let mut direct = direct.at(&plant.stations[0].2[0]).start();
+    let before = below(site, "adder-a").unwrap()["methods"].clone();
+    while direct.json_lines().len() < 2 {
+        assert!(direct.runs() && listed(site, uri), "{direct}");
+        std::thread::yield_now();
+    }
+    assert_eq!(below(site, "adder-a").unwrap()["methods"], before);
+    // A host that is gone is noticed in the middle of a call.
+    let mut caller = holding(&cell, &plant.cell, path, "[30.0]");
+    eventually("it holds again", SOON, || {
+        let lines = adder.json_lines();
+        lines.iter().any(|line| line["holds"] == 30.0).then_some(())
+    });
+    plant.stations[0].2[1].within(|| {
+        let down = std::process::Command::new("ip")
+            .args(["link", "set", "dev0", "down"])
+            .status();
+        assert!(down.unwrap().success());
+    });
+    let before = Instant::now();
+    assert_eq!(answer(&mut caller)["status"], "BadRequestInterrupted");
+    let took = before.elapsed();
+    assert!(took < Duration::from_millis(2_500), "{took:?}");
+}
+
+#[test]
+fn a_lock_through_a_station_is_of_its_caller_and_ends_with_the_callers_session() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let plant = plant(&cell);
+    let _station = station(&plant, 0, &["--upper-endpoint", UPPER]);
+    let _gripper = gripper(&plant, 0);
+    let gripper = "Devices/parallel-gripper/parallel-gripper";
+    let lock = format!("{gripper}/Lock/InitLock");
+    let mut first = holding(&cell, &plant.cell, &lock, r#"["first"]"#);
+    assert_eq!(answer(&mut first)["value"], json!([0]));
+    let second = || call(&cell, &plant.cell, UPPER, &lock, r#"["second"]"#);
+    assert_eq!(second()["value"], json!([-1]), "it is locked");
+    let exit = format!("{gripper}/Lock/ExitLock");
+    let exit = call(&cell, &plant.cell, UPPER, &exit, "[]");
+    assert_eq!(exit["value"], json!([-1]), "the lock is of another");
+    first.tell("leave");
+    assert!(first.wait_for_end(SOON).success());
+    eventually("the lock is free", SOON, || {
+        (second()["value"] == json!([0])).then_some(())
+    });
+}
+
+#[test]
+fn only_the_supervisor_configures_a_component_and_a_station() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let plant = plant(&cell);
+    let _top = top(&plant);
+    let more = ["--upper-lds", "uri=urn:*", "--upper-endpoint", UPPER];
+    let _station = station(&plant, 0, &more);
+    let _gripper = gripper(&plant, 0);
+    let site = &plant.stations[0].1;
+    let wanted = "plant/cell-1/station-a/parallel-gripper";
+    eventually("the gripper is configured", SOON * 3, || {
+        (place(site, "parallel-gripper")? == wanted).then_some(())
+    });
+    let elsewhere = r#"["elsewhere", "urn:x", "opc.tcp://10.9.9.9:4840"]"#;
+    let moved = call(&cell, &plant.cell, UPPER, "station-a/Configure", elsewhere);
+    assert_eq!(moved["status"], "BadUserAccessDenied", "{moved}");
+    let url = status(site).unwrap()["level"]["below"][0]["url"].clone();
+    let device = &plant.stations[0].2[1];
+    let path = "parallel-gripper/Configure";
+    let moved = call(&cell, device, url.as_str().unwrap(), path, elsewhere);
+    assert_eq!(moved["status"], "BadUserAccessDenied", "{moved}");
+    let shown = status(site).unwrap()["level"]["place"].clone();
+    assert_eq!(shown, "plant/cell-1/station-a");
+}
+
 /// Trusts a certificate, or takes up a revocation list, in a store.
 fn trust(cell: &Cell, store: &str, what: &str) {
     let told = std::process::Command::new(program("ua-server"))
@@ -308,6 +458,20 @@ fn trust(cell: &Cell, store: &str, what: &str) {
         .unwrap();
     assert!(told.status.success(), "{told:?}");
 }
+
+/// Makes the user otto, an operator, in a store.
+fn operator(cell: &Cell, store: &str) {
+    let password = cell.file("password", &format!("{PASSWORD}\n"));
+    let made = std::process::Command::new(program("ua-server"))
+        .args(["user", "add", "otto", "--role", "operator", "--pki"])
+        .arg(cell.folder().join(store))
+        .stdin(std::fs::File::open(password).unwrap())
+        .output()
+        .unwrap();
+    assert!(made.status.success(), "{made:?}");
+}
+
+const PASSWORD: &str = "correct horse battery";
 
 /// A gripper of ours over secured channels alone, with a store of its own.
 fn secured_gripper(cell: &Cell, site: &Site) -> Child {
@@ -406,7 +570,7 @@ fn over_secured_channels_a_device_is_configured_and_called_and_one_that_is_not_t
     assert_eq!(told["place"], "plant/cell-1/adder");
     let shown = below(&plant.station, "adder").unwrap();
     assert_eq!(shown["secured"], true, "{shown}");
-    // Its method is called from above over a secured channel.
+    // Its method is called from above over a secured channel. A certificate that is trusted is no role.
     let path = "Devices/adder/device/Add";
     let args = [&*plant.top, path, "--value", "[2.5, 4.0]"];
     let secured = [
@@ -415,10 +579,19 @@ fn over_secured_channels_a_device_is_configured_and_called_and_one_that_is_not_t
         "--certificates",
         &plant.pairs,
     ];
-    let called = cell.asyncua_started("opcua_call.py", &[args, secured].concat());
-    let mut called = called.at(&plant.above).start();
-    assert!(called.wait_for_end(SOON * 3).success());
-    let sum = called.json_lines().pop().unwrap();
+    let called = |user: &[&str]| {
+        let args = [&args[..], &secured, user].concat();
+        let called = cell.asyncua_started("opcua_call.py", &args);
+        let mut called = called.at(&plant.above).start();
+        assert!(called.wait_for_end(SOON * 3).success());
+        called.json_lines().pop().unwrap()
+    };
+    assert_eq!(called(&[])["status"], "BadUserAccessDenied");
+    operator(&cell, "station-pki");
+    let sum = eventually("the operator is known", SOON, || {
+        let sum = called(&["--user", "otto", "--password", PASSWORD]);
+        (sum["status"] == "Good").then_some(sum)
+    });
     assert_eq!(
         sum,
         json!({"status": "Good", "arguments": [], "value": [6.5]})

@@ -1,5 +1,6 @@
 //! TCP connections without delay for small packets: a request must not wait for the acknowledgement of another.
 
+use std::io;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -10,6 +11,7 @@ use opcua::client::transport::{
 };
 use opcua::core::comms::tcp_codec::TcpCodec;
 use opcua::types::{DecodingOptions, EndpointDescription, Error, StatusCode};
+use socket2::{SockRef, TcpKeepalive};
 use tokio::io::{ReadHalf, WriteHalf};
 use tokio::net::TcpStream;
 use tokio::time::timeout;
@@ -58,11 +60,30 @@ async fn connect(
         .map_err(|error| failed(format!("{url}: {error}")))?;
     socket
         .set_nodelay(true)
+        .and_then(|()| keep_alive(&socket))
         .map_err(|error| failed(format!("{url}: {error}")))?;
     let (reader, writer) = tokio::io::split(socket);
     let reader = FramedRead::new(reader, TcpCodec::new(options));
     Ok(StreamConnection::new(reader, writer, url))
 }
+
+/// Has the kernel notice a host that is gone, also while nothing is sent.
+fn keep_alive(socket: &TcpStream) -> io::Result<()> {
+    let socket = SockRef::from(socket);
+    let keep_alive = TcpKeepalive::new()
+        .with_time(KEEP_ALIVE)
+        .with_interval(KEEP_ALIVE);
+    socket.set_tcp_keepalive(&keep_alive)?;
+    #[cfg(target_os = "linux")]
+    socket.set_tcp_user_timeout(Some(UNACKNOWLEDGED))?;
+    Ok(())
+}
+
+/// After so long without data the kernel asks whether the host is there, and again.
+const KEEP_ALIVE: Duration = Duration::from_secs(1);
+/// How long data may stay unacknowledged; a server that is busy for long may have no room for more of it.
+#[cfg(target_os = "linux")]
+const UNACKNOWLEDGED: Duration = Duration::from_secs(5);
 
 impl Connector for Direct {
     type Transport = TcpTransport;

@@ -1,10 +1,11 @@
 //! A client that connects, watches over its connection, and comes back with all its subscriptions.
 //!
-//! Reading order: `supervisor` (the life of a connection), `shown` (whom the server proves to be), `subscription`, `types` (type
+//! Reading order: `supervisor` (the life of a connection), `reach` (whether the host of a busy server answers), `shown` (whom the server proves to be), `subscription`, `types` (type
 //! closures), `connector`.
 
 mod connector;
 mod parts;
+mod reach;
 mod services;
 mod shown;
 mod subscription;
@@ -20,9 +21,10 @@ use opcua::types::{NamespaceMap, StatusCode, TypeLoader};
 use tokio::sync::watch;
 
 pub use self::parts::{OperationLimits, PartFault, Parts, Service};
-pub use self::services::{Browse, CallError, CallOptions, MOST_REFERENCES};
+pub use self::services::{Browse, CallError, CallOptions, CallResult, MOST_REFERENCES};
 pub use self::subscription::{Notice, Sampled, Select, Subscription, Watch};
 pub use self::types::MOST_TYPES;
+pub use crate::judge::HostNames;
 
 use self::supervisor::{Shared, failed};
 
@@ -37,6 +39,8 @@ pub struct ClientConfig {
     pub pki: Option<PathBuf>,
     /// Trusts the certificate of any server that is sound otherwise. For tests and demonstrations only.
     pub accept_untrusted: bool,
+    /// The rule for servers at hosts that their trusted certificates do not name.
+    pub host_names: HostNames,
     /// What it wants of what servers offer.
     pub security: SecurityChoice,
     /// As whom it comes. A password is sent over a session without security only with [`SecurityChoice::None`].
@@ -47,6 +51,10 @@ pub struct ClientConfig {
     pub keep_alive: Duration,
     /// How long it waits before it connects again: at first, and at most.
     pub backoff: (Duration, Duration),
+    /// How long the server may leave requests unanswered while its host is reachable. A server that serves one request at a
+    /// time answers nothing while it executes a method for another client. With zero the connection is dropped once
+    /// keep-alives are missed; while a call of this client goes on, only the transport decides either way.
+    pub patience: Duration,
 }
 
 impl ClientConfig {
@@ -58,11 +66,13 @@ impl ClientConfig {
             application_name: application_name.to_owned(),
             pki: None,
             accept_untrusted: false,
+            host_names: HostNames::Warn,
             security: SecurityChoice::Best,
             user: None,
             timeout: Duration::from_secs(2),
             keep_alive: Duration::from_millis(500),
             backoff: (Duration::from_millis(250), Duration::from_secs(5)),
+            patience: Duration::ZERO,
         }
     }
 }
@@ -174,7 +184,24 @@ impl Client {
     /// Connects to the server at `url` from now on, in a task of its own.
     #[must_use]
     pub fn open(config: ClientConfig, url: &str) -> Self {
-        let shared = Arc::new(Shared::new(config, url));
+        Self::start(Shared::new(config, url))
+    }
+
+    /// Connects to the same server once more, in a session of its own. Both clients know that the server may be busy with a
+    /// call of the other.
+    #[must_use]
+    pub fn another(&self) -> Self {
+        Self::start(self.shared.another())
+    }
+
+    /// Returns whether calls of this client, or of one made by [`another`](Self::another), wait for their results.
+    #[must_use]
+    pub fn is_calling(&self) -> bool {
+        self.shared.calls.any()
+    }
+
+    fn start(shared: Shared) -> Self {
+        let shared = Arc::new(shared);
         drop(tokio::spawn(supervisor::run(Arc::clone(&shared))));
         Self {
             _open: Arc::new(Open(Arc::clone(&shared))),

@@ -61,6 +61,17 @@ pub struct CallOptions {
     pub connection: Option<u64>,
 }
 
+/// The result of one method call as the server sent it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CallResult {
+    /// The status of the call, which may be Bad or Uncertain.
+    pub status: StatusCode,
+    /// The status of each input argument; empty where the server sends none.
+    pub arguments: Vec<StatusCode>,
+    /// The output arguments.
+    pub outputs: Vec<Variant>,
+}
+
 /// Why a method has no outputs.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum CallError {
@@ -274,10 +285,30 @@ impl Client {
     /// A refusal, or no answer.
     pub async fn call_within(
         &self,
-        (object, method): (&NodeId, &NodeId),
+        target: (&NodeId, &NodeId),
         arguments: Vec<Variant>,
         options: CallOptions,
     ) -> Result<Vec<Variant>, CallError> {
+        let result = self.call_result(target, arguments, options).await?;
+        if result.status.is_bad() {
+            return Err(CallError::Refused {
+                status: result.status,
+                arguments: result.arguments,
+            });
+        }
+        Ok(result.outputs)
+    }
+
+    /// Calls a method of an object, and returns the result with its own status, Good or not.
+    ///
+    /// # Errors
+    /// No result.
+    pub async fn call_result(
+        &self,
+        (object, method): (&NodeId, &NodeId),
+        arguments: Vec<Variant>,
+        options: CallOptions,
+    ) -> Result<CallResult, ClientError> {
         let request = CallMethodRequest {
             object_id: object.clone(),
             method_id: method.clone(),
@@ -289,8 +320,9 @@ impl Client {
             .is_some_and(|one| one != session.connects)
         {
             let other = "there is another connection by now".to_owned();
-            return Err(ClientError::NotConnected(other).into());
+            return Err(ClientError::NotConnected(other));
         }
+        let _in_flight = self.shared.calls.start();
         let call = Call::new(&session.session)
             .methods_to_call(vec![request])
             .timeout(options.within);
@@ -299,13 +331,11 @@ impl Client {
         let result = as_many(called, 1)?
             .pop()
             .ok_or(ClientError::Answer("no result"))?;
-        if result.status_code.is_bad() {
-            return Err(CallError::Refused {
-                status: result.status_code,
-                arguments: result.input_argument_results.unwrap_or_default(),
-            });
-        }
-        Ok(result.output_arguments.unwrap_or_default())
+        Ok(CallResult {
+            status: result.status_code,
+            arguments: result.input_argument_results.unwrap_or_default(),
+            outputs: result.output_arguments.unwrap_or_default(),
+        })
     }
 }
 

@@ -36,7 +36,7 @@ impl Servers {
     pub(super) fn of(config: &ClientConfig) -> Option<Self> {
         let root = config.pki.as_ref()?;
         Some(Self {
-            judge: Judge::of(root, config.accept_untrusted),
+            judge: Judge::of(root, config.accept_untrusted).host_names(config.host_names),
         })
     }
 

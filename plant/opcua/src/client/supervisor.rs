@@ -6,7 +6,7 @@ use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
 use std::pin::pin;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::time::Duration;
 
 use futures_util::TryStreamExt as _;
@@ -24,6 +24,7 @@ use tokio::time::{Instant, sleep, timeout};
 use tracing::{debug, info, warn};
 
 use super::connector::Direct;
+use super::reach::{Reach, Silence};
 use super::shown::{Servers, Taken, Why};
 use super::subscription::Wanted;
 use super::{
@@ -47,6 +48,32 @@ pub(crate) struct Shared {
     pub(crate) refused: AtomicU64,
     /// `None` without certificates.
     servers: Option<Servers>,
+    pub(crate) calls: CallsInFlight,
+}
+
+/// The calls that wait for their results, of all clients of one server.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct CallsInFlight(Arc<AtomicUsize>);
+
+/// A call that waits for its result, for as long as this is kept.
+#[derive(Debug)]
+pub(crate) struct CallInFlight(Arc<AtomicUsize>);
+
+impl CallsInFlight {
+    pub(crate) fn start(&self) -> CallInFlight {
+        self.0.fetch_add(1, Ordering::Relaxed);
+        CallInFlight(Arc::clone(&self.0))
+    }
+
+    pub(crate) fn any(&self) -> bool {
+        self.0.load(Ordering::Relaxed) > 0
+    }
+}
+
+impl Drop for CallInFlight {
+    fn drop(&mut self) {
+        self.0.fetch_sub(1, Ordering::Relaxed);
+    }
 }
 
 /// A connection.
@@ -81,6 +108,15 @@ impl Shared {
             wanted: Mutex::default(),
             changed: Notify::new(),
             closing: watch::Sender::new(false),
+            calls: CallsInFlight::default(),
+        }
+    }
+
+    /// Another client of the same server.
+    pub(crate) fn another(&self) -> Self {
+        Self {
+            calls: self.calls.clone(),
+            ..Self::new(self.config.clone(), &self.url)
         }
     }
 
@@ -220,7 +256,7 @@ fn library_client(config: &ClientConfig) -> Result<opcua::client::Client, String
             .private_key_path(Path::new(OWN_KEY))
             .pki_dir(&root)
             .session_retry_limit(0)
-            .session_timeout(30_000)
+            .session_timeout(session_timeout(config.patience))
             .request_timeout(config.timeout)
             .keep_alive_interval(config.keep_alive)
             .max_failed_keep_alive_count(0)
@@ -259,8 +295,16 @@ struct Connection {
 enum Activity {
     Connected,
     KeptAlive,
+    /// A keep-alive was not answered.
     Missed,
+    /// A keep-alive was answered by a server that does not run.
+    NotRunning,
     Published,
+}
+
+/// How long a server keeps a session that it hears nothing of, in milliseconds: longer than it may be busy.
+fn session_timeout(patience: Duration) -> u32 {
+    u32::try_from((SESSION_TIMEOUT + patience).as_millis()).unwrap_or(u32::MAX)
 }
 
 fn identity(config: &ClientConfig) -> IdentityToken {
@@ -305,7 +349,8 @@ async fn connect(
                 Ok(Some(SessionPollResult::Reconnected(_))) => Activity::Connected,
                 Ok(Some(SessionPollResult::SessionActivity(activity))) => match activity {
                     SessionActivity::KeepAliveSucceeded => Activity::KeptAlive,
-                    SessionActivity::KeepAliveFailed(_) => Activity::Missed,
+                    SessionActivity::KeepAliveFailed(StatusCode::BadTimeout) => Activity::Missed,
+                    SessionActivity::KeepAliveFailed(_) => Activity::NotRunning,
                 },
                 Ok(Some(SessionPollResult::Subscription(SubscriptionActivity::Publish))) => {
                     Activity::Published
@@ -507,14 +552,18 @@ fn strings(value: DataValue) -> Option<Vec<String>> {
 
 /// Makes the subscriptions, and returns with the reason when the connection is no good any more.
 async fn watch_over(shared: &Shared, connection: &mut Connection) -> Why {
-    let mut missed = 0;
+    let mut silence = Silence::new(shared.config.patience, Instant::now());
+    let mut reach = Reach::new(&shared.url);
     let mut published = Instant::now();
     let mut look = tokio::time::interval(LOOK);
     look.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
     let mut judged = tokio::time::interval(JUDGED_EVERY);
     judged.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
     loop {
-        if let Err(reason) = super::subscription::renew(shared, &connection.connected).await {
+        // A busy server answers no request: the subscriptions are made when it is free.
+        if !shared.calls.any()
+            && let Err(reason) = super::subscription::renew(shared, &connection.connected).await
+        {
             return reason.into();
         }
         tokio::select! {
@@ -523,23 +572,30 @@ async fn watch_over(shared: &Shared, connection: &mut Connection) -> Why {
                 return reason.into();
             }
             activity = connection.activity.recv() => match activity {
-                Some(Activity::Missed) => {
-                    missed += 1;
-                    if missed >= MOST_MISSED {
-                        return "the server does not answer".to_owned().into();
-                    }
+                // Nothing is missed of a server that executes a call.
+                Some(Activity::Missed) if shared.calls.any() => {}
+                Some(Activity::Missed) => silence.missed(),
+                Some(Activity::NotRunning) => silence.not_running(),
+                Some(Activity::KeptAlive | Activity::Connected) => {
+                    silence.answered(Instant::now());
+                    reach.answered(Instant::now());
                 }
-                Some(Activity::KeptAlive | Activity::Connected) => missed = 0,
                 Some(Activity::Published) => published = Instant::now(),
                 None => {}
             },
+            () = reach.tried() => reach.answered(Instant::now()),
             () = shared.changed.notified() => {}
             _ = look.tick() => {
+                let now = Instant::now();
+                let is_calling = shared.calls.any();
                 let subscribed = shared.wanted.lock().values().any(Wanted::is_made);
-                if !subscribed {
-                    published = Instant::now();
+                if !subscribed || is_calling || silence.is_tolerated(now) {
+                    published = now;
                 } else if published.elapsed() > LONGEST_SILENCE {
                     return "the server is silent about its subscriptions".to_owned().into();
+                }
+                if let Err(reason) = reach.look(is_calling || silence.is_tolerated(now), now) {
+                    return reason.into();
                 }
             }
             _ = judged.tick() => {
@@ -549,6 +605,9 @@ async fn watch_over(shared: &Shared, connection: &mut Connection) -> Why {
                     return refused.into();
                 }
             }
+        }
+        if silence.is_too_long(shared.calls.any(), Instant::now()) {
+            return "the server does not answer".to_owned().into();
         }
     }
 }
@@ -576,8 +635,8 @@ const POLICIES: [&str; 3] = [
 ];
 /// How many endpoints of a server are told of.
 const MOST_TOLD: usize = 12;
-/// How many keep-alives in a row may be missed.
-const MOST_MISSED: u32 = 2;
+/// How long servers keep the session of a client that is gone.
+const SESSION_TIMEOUT: Duration = Duration::from_secs(30);
 /// How often the certificate of a server is judged while it is connected: it may be revoked, or be over.
 const JUDGED_EVERY: Duration = Duration::from_secs(2);
 /// How often it is looked whether subscriptions live.

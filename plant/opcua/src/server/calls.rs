@@ -3,6 +3,7 @@
 use std::collections::HashMap;
 use std::future::Future;
 use std::sync::{Arc, OnceLock};
+use std::time::Duration;
 
 use async_trait::async_trait;
 use opcua::nodes::{NodeType, TypeTree};
@@ -16,6 +17,7 @@ use tokio::time::{Instant, timeout_at};
 
 use super::nodes::Spaces;
 use super::sessions::{Caller, Presence, Sessions};
+use crate::client::CallResult;
 use crate::limits::LONGEST_REQUEST;
 
 /// A call that has passed the checks of number and types of its arguments.
@@ -36,12 +38,14 @@ pub struct MethodRequest {
 }
 
 /// Why a call is refused.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub enum Refusal {
     /// With this status.
     Status(StatusCode),
     /// With `BadInvalidArgument` and this status for each argument.
     Arguments(Vec<StatusCode>),
+    /// The result of a call at another server, which reaches the client unchanged: its status may also be Good or Uncertain.
+    PassedOn(Box<CallResult>),
 }
 
 impl From<StatusCode> for Refusal {
@@ -50,9 +54,14 @@ impl From<StatusCode> for Refusal {
     }
 }
 
-/// What carries out the calls of a method. One that takes longer than [`LONGEST_REQUEST`] is given up.
+/// What carries out the calls of a method. A call that takes longer than [`longest`](Self::longest) is given up.
 #[async_trait]
 pub trait MethodHandler: Send + Sync + 'static {
+    /// How long a call may take.
+    fn longest(&self) -> Duration {
+        LONGEST_REQUEST
+    }
+
     /// The output arguments.
     ///
     /// # Errors
@@ -139,7 +148,7 @@ impl Calls {
         methods: &'a mut [&mut MethodCall],
     ) -> Vec<&'a mut MethodCall> {
         let mut others = Vec::new();
-        let until = Instant::now() + LONGEST_REQUEST;
+        let begun = Instant::now();
         for call in methods {
             let call: &'a mut MethodCall = call;
             match self.route(call) {
@@ -155,7 +164,10 @@ impl Calls {
                         arguments: call.arguments().to_vec(),
                     };
                     let ended = match checked {
-                        Ok(()) => within(until, handler.call(request)).await,
+                        Ok(()) => {
+                            let until = begun + handler.longest();
+                            within(until, handler.call(request)).await
+                        }
                         Err(refusal) => Err(refusal),
                     };
                     end(call, ended);
@@ -220,6 +232,15 @@ pub(crate) fn end(call: &mut MethodCall, ended: Result<Vec<Variant>, Refusal>) {
         }
         Err(Refusal::Status(status)) => call.set_status(status),
         Err(Refusal::Arguments(each)) => call.set_argument_error(each),
+        Err(Refusal::PassedOn(result)) => {
+            // There is nothing to say of arguments that are all good (OPC 10000-4, 5.12.2.2).
+            if result.arguments.iter().any(|one| !one.is_good()) {
+                // Also sets the status, which is replaced below.
+                call.set_argument_error(result.arguments);
+            }
+            call.set_outputs(result.outputs);
+            call.set_status(result.status);
+        }
     }
 }
 

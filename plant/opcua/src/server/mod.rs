@@ -40,6 +40,7 @@ pub use self::instances::{
 pub use self::methods::MethodSpec;
 pub use self::nodes::{WriteHandler, WriteRequest, write};
 pub use self::overlay::{CoreMethod, core_of, core_with};
+pub(crate) use self::sessions::ANONYMOUS;
 pub use self::sessions::{Caller, Presence};
 pub use self::view::Child;
 pub use crate::endpoint::EndpointUrl;

@@ -30,7 +30,7 @@ impl Caller {
     #[must_use]
     pub fn of(context: &RequestContext) -> Self {
         let user = match context.token.0.as_str() {
-            opcua::server::ANONYMOUS_USER_TOKEN_ID => "anonymous".to_owned(),
+            opcua::server::ANONYMOUS_USER_TOKEN_ID => ANONYMOUS.to_owned(),
             user => user.to_owned(),
         };
         let session = context.session.read();
@@ -121,5 +121,7 @@ impl Sessions {
     }
 }
 
+/// The name of users without a name; no other user has it.
+pub(crate) const ANONYMOUS: &str = "anonymous";
 /// How often it is looked.
 pub(crate) const LOOK: Duration = Duration::from_millis(50);

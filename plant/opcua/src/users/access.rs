@@ -1,7 +1,7 @@
 //! Who comes in, and what each may do: the library asks here for each session and each request.
 
 use std::collections::HashMap;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
@@ -20,9 +20,10 @@ use opcua::types::{
 use tokio::sync::Semaphore;
 use tracing::{info, warn};
 
-use super::file::{Credential, LARGEST_PASSWORD, LIST, UserFault, Users};
+use super::file::{Credential, FOLDER, LARGEST_PASSWORD, LIST, UserFault, Users};
 use super::password::has_hash;
 use super::{Role, Roles};
+use crate::server::{ANONYMOUS, Caller};
 
 /// What a user may do with a node.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -176,6 +177,19 @@ impl Access {
         Ok(access)
     }
 
+    /// The users of a certificate store; users without a name have these roles.
+    ///
+    /// # Errors
+    /// A file that others can read, or that cannot be read as users.
+    pub fn of_store(pki: Option<&Path>, anonymous: Roles) -> Result<Self, UserFault> {
+        let access = Self::new(pki.map(|pki| pki.join(FOLDER)), false)?;
+        access.set_rules(Rules {
+            anonymous: Anonymous::Has(anonymous),
+            nodes: HashMap::new(),
+        });
+        Ok(access)
+    }
+
     /// Has other rules from now on, for open sessions too.
     pub fn set_rules(&self, rules: Rules) {
         *self.rules.write() = rules;
@@ -212,6 +226,18 @@ impl Access {
         }
         let users = self.users.read();
         users.get(&token.0).map_or(Roles::NONE, |user| user.roles)
+    }
+
+    /// The roles of the user of a caller.
+    #[must_use]
+    pub fn roles_of(&self, caller: &Caller) -> Roles {
+        if caller.user == ANONYMOUS {
+            return self.anonymous().unwrap_or(Roles::NONE);
+        }
+        let users = self.users.read();
+        users
+            .get(&caller.user)
+            .map_or(Roles::NONE, |user| user.roles)
     }
 
     /// Whether a user may do that with a node now. What belongs to the standard is for everybody, where nothing else is said.
@@ -287,7 +313,7 @@ impl Access {
 }
 
 /// What tells that a file has changed.
-fn stamp(folder: &std::path::Path) -> Option<Stamp> {
+fn stamp(folder: &Path) -> Option<Stamp> {
     let about = std::fs::metadata(folder.join(LIST)).ok()?;
     Some((about.len(), about.modified().ok()))
 }

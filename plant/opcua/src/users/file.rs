@@ -92,7 +92,9 @@ pub enum UserFault {
     #[error("there is no user {0}")]
     Unknown(String),
     /// A user without a role may do nothing.
-    #[error("a user has at least one role: observer, operator, engineer, security_admin")]
+    #[error(
+        "a user has at least one role: observer, operator, engineer, security_admin, configure_admin"
+    )]
     NoRole,
     /// The role does not exist.
     #[error(transparent)]

@@ -26,6 +26,8 @@ pub enum Role {
     Engineer,
     /// Says who may do what: users, certificates, keys, and what the audit tells.
     SecurityAdmin,
+    /// Configures programs: says where in the plant they are.
+    ConfigureAdmin,
 }
 
 impl Role {
@@ -35,6 +37,7 @@ impl Role {
         Self::Operator,
         Self::Engineer,
         Self::SecurityAdmin,
+        Self::ConfigureAdmin,
     ];
 
     /// As it is typed and stands in files.
@@ -45,6 +48,7 @@ impl Role {
             Self::Operator => "operator",
             Self::Engineer => "engineer",
             Self::SecurityAdmin => "security_admin",
+            Self::ConfigureAdmin => "configure_admin",
         }
     }
 
@@ -54,6 +58,7 @@ impl Role {
             Self::Operator => 2,
             Self::Engineer => 4,
             Self::SecurityAdmin => 8,
+            Self::ConfigureAdmin => 16,
         }
     }
 }
@@ -70,7 +75,7 @@ impl std::str::FromStr for Role {
 
 /// A text that names no role.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("`{0}` is no role: observer, operator, engineer, security_admin")]
+#[error("`{0}` is no role: observer, operator, engineer, security_admin, configure_admin")]
 pub struct UnknownRole(String);
 
 /// A set of roles.
@@ -81,7 +86,7 @@ impl Roles {
     /// No role.
     pub const NONE: Self = Self(0);
     /// Every role.
-    pub const ALL: Self = Self(15);
+    pub const ALL: Self = Self(31);
 
     /// Those roles.
     #[must_use]

@@ -1,12 +1,17 @@
-//! The method by which whoever supervises the component's level tells it where it is in the plant.
+//! The method by which the supervisor of the component's level tells it where it is in the plant.
+
+use std::sync::Arc;
 
 use plant_opcua::server::{
     IdRange, InstanceError, MethodRequest, MethodSpec, Refusal, Server, VariableSpec, method,
 };
+use plant_opcua::supervision::Supervision;
 use plant_opcua::types::{
     Argument, DataTypeId, DataValue, LocalizedText, NodeId, QualifiedName, ReferenceTypeId,
     StatusCode, VariableTypeId, Variant,
 };
+use plant_opcua::users::Access;
+use tracing::warn;
 
 /// What a component is told, in this order; it shows each as a property of its object.
 const TOLD: [(&str, &str); 3] = [
@@ -21,11 +26,13 @@ const TOLD: [(&str, &str); 3] = [
     ),
 ];
 
-/// Gives the object of a component the method `Configure` and what it was told last.
+/// Adds the method `Configure` and the last arguments of it to the object of a component. Only the supervisor of the component
+/// and users with the role ConfigureAdmin may call it.
 pub(super) fn configurable(
     server: &Server,
     object: &NodeId,
     ids: &mut IdRange,
+    (supervision, users): (Supervision, Arc<Access>),
 ) -> Result<(), InstanceError> {
     let mut shown = Vec::new();
     for (name, _) in TOLD {
@@ -54,6 +61,15 @@ pub(super) fn configurable(
     };
     let shower = server.clone();
     let handler = method(move |request: MethodRequest| {
+        let caller = &request.caller;
+        supervision
+            .admits(caller, users.roles_of(caller))
+            .inspect_err(|_| {
+                warn!(
+                    application = ?caller.application_uri, user = ?caller.user, proven = caller.proven,
+                    "refused Configure: the component is not registered with this client"
+                );
+            })?;
         let fits = |argument: &Variant| {
             let Variant::String(text) = argument else {
                 return false;

@@ -1,0 +1,117 @@
+//! Who may configure a program: the supervisor that it registered with, and users with the role ConfigureAdmin.
+
+use std::sync::Arc;
+
+use opcua::sync::RwLock;
+use opcua::types::StatusCode;
+
+use crate::server::Caller;
+use crate::users::{Role, Roles};
+
+/// The discovery server that a program registered with, which supervises its level.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Registrar {
+    /// The ApplicationUri.
+    pub application_uri: String,
+    /// Whether a trusted certificate has that ApplicationUri: the program registered over a secured channel.
+    pub proven: bool,
+}
+
+/// The supervisor of a program. Clones share it: the registration sets it, the method `Configure` asks for it.
+#[derive(Debug, Clone, Default)]
+pub struct Supervision(Arc<RwLock<Option<Registrar>>>);
+
+/// Two are equal where they are the same.
+impl PartialEq for Supervision {
+    fn eq(&self, other: &Self) -> bool {
+        Arc::ptr_eq(&self.0, &other.0)
+    }
+}
+
+impl Eq for Supervision {}
+
+impl Supervision {
+    /// The program is registered with this discovery server.
+    pub fn registered_with(&self, registrar: Registrar) {
+        *self.0.write() = Some(registrar);
+    }
+
+    /// Checks that a caller with these roles may configure the program.
+    ///
+    /// # Errors
+    /// BadUserAccessDenied for all but the supervisor and users with the role ConfigureAdmin.
+    pub fn admits(&self, caller: &Caller, roles: Roles) -> Result<(), StatusCode> {
+        if roles.contains(Role::ConfigureAdmin) {
+            return Ok(());
+        }
+        let supervisor = self.0.read();
+        let is_supervisor = supervisor.as_ref().is_some_and(|supervisor| {
+            // Over channels without security nobody can prove who it is, neither here nor at the registration.
+            let may_claim = !supervisor.proven && !caller.encrypted;
+            caller.application_uri == supervisor.application_uri && (caller.proven || may_claim)
+        });
+        match is_supervisor {
+            true => Ok(()),
+            false => Err(StatusCode::BadUserAccessDenied),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn caller(uri: &str, proven: bool, encrypted: bool) -> Caller {
+        Caller {
+            session: 1,
+            user: "anonymous".to_owned(),
+            application_uri: uri.to_owned(),
+            proven,
+            encrypted,
+        }
+    }
+
+    #[test]
+    fn only_the_supervisor_that_the_program_registered_with_configures_it() {
+        let none = Roles::NONE;
+        let supervision = Supervision::default();
+        let cell = caller("urn:cell", true, true);
+        let denied = Err(StatusCode::BadUserAccessDenied);
+        assert_eq!(supervision.admits(&cell, none), denied, "not registered");
+        let registration = supervision.clone();
+        registration.registered_with(Registrar {
+            application_uri: "urn:cell".to_owned(),
+            proven: true,
+        });
+        assert_eq!(supervision.admits(&cell, none), Ok(()));
+        let claims = caller("urn:cell", false, false);
+        assert_eq!(
+            supervision.admits(&claims, none),
+            denied,
+            "it proves nothing"
+        );
+        let another = caller("urn:cell-2", true, true);
+        assert_eq!(supervision.admits(&another, none), denied);
+        let admin = Roles::of(&[Role::ConfigureAdmin]);
+        assert_eq!(supervision.admits(&another, admin), Ok(()));
+        let security = Roles::of(&[Role::SecurityAdmin, Role::Engineer]);
+        assert_eq!(supervision.admits(&another, security), denied);
+    }
+
+    #[test]
+    fn without_security_the_supervisor_is_known_by_what_it_says() {
+        let supervision = Supervision::default();
+        supervision.registered_with(Registrar {
+            application_uri: "urn:cell".to_owned(),
+            proven: false,
+        });
+        let admits = |caller: &Caller| supervision.admits(caller, Roles::NONE).is_ok();
+        assert!(admits(&caller("urn:cell", false, false)));
+        assert!(admits(&caller("urn:cell", true, true)));
+        assert!(!admits(&caller("urn:other", false, false)));
+        assert!(
+            !admits(&caller("urn:cell", false, true)),
+            "its certificate is of another"
+        );
+    }
+}

@@ -1,0 +1,165 @@
+//! Who calls through a station: whether a caller may, and the session that each caller has at each server.
+//!
+//! A lock, a lease or a run of a server belongs to a session. So each caller has its own session at each server that it calls,
+//! for as long as its session at the station lasts.
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, PoisonError, Weak};
+use std::time::Duration;
+
+use plant_opcua::client::{Client, ClientError, Link};
+use plant_opcua::server::Caller;
+use plant_opcua::types::StatusCode;
+use plant_opcua::users::{Access, Role, Roles};
+use tokio::time::Instant;
+
+use crate::board::{Board, Level};
+
+/// Judges callers on one level.
+#[derive(Clone)]
+pub(crate) struct Admission {
+    pub(crate) users: Arc<Access>,
+    pub(crate) board: Arc<Board>,
+    /// The level of the callers.
+    pub(crate) level: Level,
+}
+
+impl Admission {
+    /// Checks that the calls of a caller are passed on: it is a server of its level by a certificate that was checked, or its
+    /// user is an operator or engineer.
+    ///
+    /// # Errors
+    /// BadUserAccessDenied for others.
+    pub(crate) fn check(&self, caller: &Caller) -> Result<(), StatusCode> {
+        let is_peer = caller.proven
+            && caller.encrypted
+            && self.board.knows(self.level, &caller.application_uri);
+        let calls = Roles::of(&[Role::Operator, Role::Engineer]);
+        match is_peer || self.users.roles_of(caller).meets(calls) {
+            true => Ok(()),
+            false => Err(StatusCode::BadUserAccessDenied),
+        }
+    }
+}
+
+/// The sessions at one server.
+pub(crate) struct Callers {
+    /// The station's own.
+    client: Client,
+    sessions: Mutex<BTreeMap<u32, Client>>,
+}
+
+impl Callers {
+    pub(crate) fn new(client: Client) -> Self {
+        Self {
+            client,
+            sessions: Mutex::default(),
+        }
+    }
+
+    /// Returns the client of a caller, connected to the run of the server that the station itself is connected to.
+    ///
+    /// # Errors
+    /// There is no such connection.
+    pub(crate) async fn client_of(
+        &self,
+        session: u32,
+        connects: u64,
+    ) -> Result<Client, ClientError> {
+        let client = {
+            let mut sessions = self.lock();
+            let own = sessions.entry(session);
+            own.or_insert_with(|| self.client.another()).clone()
+        };
+        let until = Instant::now() + LONGEST_WAIT;
+        while let Err(error) = client.up(CONNECT_LIMIT).await {
+            // A server that executes the call of another caller makes no session meanwhile.
+            if !client.is_calling() || Instant::now() >= until {
+                return Err(error);
+            }
+        }
+        let is_current = matches!(&*self.client.link().borrow(), Link::Up { connects: now, .. } if *now == connects);
+        // NodeIds hold as long as the namespaces are the same.
+        if is_current && client.namespaces() == self.client.namespaces() {
+            return Ok(client);
+        }
+        let another = "the server was started again".to_owned();
+        Err(ClientError::NotConnected(another))
+    }
+
+    /// The session of a caller at the station is gone, and with it those at the server.
+    pub(crate) fn gone(&self, session: u32) {
+        // The last handle closes the client.
+        let _closed = self.lock().remove(&session);
+    }
+
+    fn lock(&self) -> std::sync::MutexGuard<'_, BTreeMap<u32, Client>> {
+        self.sessions.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// The sessions at all servers that a face shows.
+#[derive(Clone, Default)]
+pub(crate) struct AllCallers(Arc<Mutex<Vec<Weak<Callers>>>>);
+
+impl AllCallers {
+    pub(crate) fn add(&self, callers: &Arc<Callers>) {
+        let mut all = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        all.retain(|known| known.strong_count() > 0);
+        all.push(Arc::downgrade(callers));
+    }
+
+    pub(crate) fn gone(&self, session: u32) {
+        let all = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        for callers in all.iter().filter_map(Weak::upgrade) {
+            callers.gone(session);
+        }
+    }
+}
+
+const CONNECT_LIMIT: Duration = Duration::from_secs(4);
+const LONGEST_WAIT: Duration = Duration::from_secs(60);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::board::CONNECTED;
+
+    #[test]
+    fn calls_of_servers_of_the_level_and_of_operators_are_passed_on_and_of_nobody_else() {
+        let (board, _added) = Board::new();
+        let board = Arc::new(board);
+        let observer = Roles::of(&[Role::Observer]);
+        let admission = |anonymous| Admission {
+            users: Arc::new(Access::of_store(None, anonymous).unwrap()),
+            board: Arc::clone(&board),
+            level: Level::Above,
+        };
+        let strict = admission(observer);
+        let caller = |proven: bool| Caller {
+            session: 1,
+            user: "anonymous".to_owned(),
+            application_uri: "urn:b".to_owned(),
+            proven,
+            encrypted: true,
+        };
+        let denied = Err(StatusCode::BadUserAccessDenied);
+        assert_eq!(
+            strict.check(&caller(true)),
+            denied,
+            "a certificate is no role"
+        );
+        let name = board.enter(Level::Above, "u", "b");
+        board.note(Level::Above, "u", |peer| {
+            peer.uri = "urn:b".to_owned();
+            peer.state = CONNECTED;
+        });
+        assert_eq!(name, "b");
+        assert_eq!(strict.check(&caller(true)), denied, "it was not checked");
+        board.note(Level::Above, "u", |peer| peer.secured = true);
+        assert_eq!(strict.check(&caller(true)), Ok(()));
+        assert_eq!(strict.check(&caller(false)), denied, "anybody says so");
+        let operator = Roles::of(&[Role::Operator]);
+        assert_eq!(admission(operator).check(&caller(false)), Ok(()));
+    }
+}
