@@ -151,7 +151,7 @@ document! {
         /// the next one gets BadTooManySessions.
         #[schemars(range(min = 1, max = 10000))]
         sessions: u16,
-        /// Sessions of one client address, which binds only while less than a quarter of the sessions is free; default half of
+        /// Sessions of one client address, which binds only while less than an eighth of the sessions is free; default half of
         /// the sessions. SCADA hosts and gateways run many clients on one address.
         #[schemars(range(min = 1, max = 10000))]
         sessions_per_address: u16,

@@ -459,7 +459,7 @@ pub struct Server {
 pub struct ServerLimits {
     /// Sessions at once.
     pub sessions: Option<u16>,
-    /// Sessions of one client address, while less than a quarter of the sessions is free.
+    /// Sessions of one client address, while less than an eighth of the sessions is free.
     pub sessions_per_address: Option<u16>,
     /// Connections.
     pub connections: Option<u16>,

@@ -38,7 +38,7 @@ pub const MOST_NODESETS: usize = 64;
 pub struct ClientLimits {
     /// Sessions.
     pub sessions: usize,
-    /// Sessions of one client address, while less than a quarter of the sessions is free; 0 is no limit. SCADA hosts and
+    /// Sessions of one client address, while less than an eighth of the sessions is free; 0 is no limit. SCADA hosts and
     /// gateways run many clients on one address.
     pub sessions_per_address: usize,
     /// Connections. The oldest one without an activated session gives way.
