@@ -237,6 +237,24 @@ async fn goals_up_to_a_time_are_cancelled_those_to_come_included() {
 }
 
 #[tokio::test]
+async fn a_goal_with_an_id_of_the_caller_is_stamped_by_its_server() {
+    let core = core();
+    let (robot, cell) = (node("robot", &core), node("cell", &core));
+    let (mut server, client) = (serve(&robot), client(&cell, ActionClientOptions::default()));
+    ready(&client).await;
+    let mut ahead = client.send_goal(b"1").goal_id().stamp;
+    goal(&mut server).await.succeed(b"", "").unwrap();
+    ahead.secs += 1000;
+    assert_eq!(client.cancel_before(ahead), 1);
+    // Any stamp of this host is earlier than the last one the server has: the goal would be recalled.
+    let _handle = client.send_goal_as("mine".to_owned(), b"2").unwrap();
+    let held = goal(&mut server).await;
+    assert_eq!(held.goal_id().id, "mine");
+    let stamp = held.goal_id().stamp;
+    assert!(RosTime::default() < stamp && stamp < ahead, "{stamp:?}");
+}
+
+#[tokio::test]
 async fn a_goal_that_the_server_drops_is_aborted_and_so_are_all_when_it_stops() {
     let core = core();
     let (robot, cell) = (node("robot", &core), node("cell", &core));

@@ -134,16 +134,18 @@ impl ActionClient {
         self.send(lock(&self.shared.state), goal_id, body)
     }
 
-    /// As [`Self::send_goal`], under an id of the caller's, which no other goal of the action has or had.
+    /// As [`Self::send_goal`], under an id of the caller's, which no other goal of the action has or had, and with the
+    /// stamp 0. A server then stamps the goal by its own clock, as actionlib does: a `SimpleActionServer` rejects a goal
+    /// with an earlier stamp than the last one, and the clocks of two hosts differ.
     ///
     /// # Errors
     /// [`IdInUse`] while there is a handle of a goal with that id; then nothing is sent.
     pub fn send_goal_as(&self, id: String, body: &[u8]) -> Result<GoalHandle, IdInUse> {
-        let stamp = self.shared.clock.now();
         let state = lock(&self.shared.state);
         if state.goals.goal(&id).is_some() {
             return Err(IdInUse { id });
         }
+        let stamp = RosTime::default();
         Ok(self.send(state, GoalId { stamp, id }, body))
     }
 
@@ -155,7 +157,8 @@ impl ActionClient {
             .sent(id.clone(), clock::now(), Arc::clone(&wake));
         let sent_to = state.outputs.as_mut().map_or(0, |outputs| {
             outputs.seq = outputs.seq.wrapping_add(1);
-            let message = wire::goal(outputs.seq, goal_id.stamp, &goal_id, body);
+            let now = self.shared.clock.now();
+            let message = wire::goal(outputs.seq, now, &goal_id, body);
             outputs.goal.publish(message).sent_to
         });
         if sent_to == 0 {
@@ -323,7 +326,8 @@ pub struct GoalHandle {
 }
 
 impl GoalHandle {
-    /// The goal's id, `<node>-<count>-<seconds>.<nanoseconds>`, and the time it was sent.
+    /// The goal's id, `<node>-<count>-<seconds>.<nanoseconds>`, and the time it was sent; of a goal with an id of the
+    /// caller's the time 0.
     pub fn goal_id(&self) -> &GoalId {
         &self.goal_id
     }
