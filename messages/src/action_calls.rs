@@ -116,8 +116,26 @@ const STATUS: &str = "_StatusValue";
 /// Tells a goal.
 const ID: &str = "uint8[16] goal_id\n";
 
+/// Returns the reason why a goal was not reached, from the fields of its result that are texts, by their names. A server of
+/// ROS 2 has no other place for a reason: `error_msg` of Nav2, `error_string` of ros2_control, `message` of many robots.
+#[must_use]
+pub fn reason_of<'a>(texts: impl IntoIterator<Item = (&'a str, &'a str)>) -> Option<&'a str> {
+    let ranked = texts.into_iter().filter_map(|(name, text)| {
+        let name = name.rsplit('.').next().unwrap_or(name);
+        let name = name.to_ascii_lowercase();
+        let rank = REASONS.iter().position(|known| name.contains(known))?;
+        (!text.trim().is_empty()).then_some((rank, text.trim()))
+    });
+    let best = ranked.min_by_key(|(rank, _)| *rank);
+    best.map(|(_, text)| text)
+}
+
+/// Parts of the names of fields with a reason, the best first.
+const REASONS: [&str; 5] = ["error", "message", "msg", "reason", "text"];
+
 #[cfg(test)]
 mod tests {
+    use super::reason_of;
     use uadp::BuiltinType;
 
     use crate::{ActionCalls, Dialect, MessageType, Registry};
@@ -215,5 +233,17 @@ mod tests {
         let name = "demo_msgs/Count".parse().unwrap();
         let why = registry.action_calls(&name).unwrap_err().to_string();
         assert!(why.contains("demo_msgs/CountGoal"), "{why}");
+    }
+
+    #[test]
+    fn a_reason_is_the_text_of_a_field_that_is_called_so() {
+        let nav2 = [
+            ("result.error_msg", "collides with the ground"),
+            ("result.frame", "map"),
+        ];
+        assert_eq!(reason_of(nav2), Some("collides with the ground"));
+        let both = [("message", "done"), ("result.ErrorString", " no path ")];
+        assert_eq!(reason_of(both), Some("no path"));
+        assert_eq!(reason_of([("error_msg", ""), ("name", "arm")]), None);
     }
 }

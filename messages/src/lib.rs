@@ -69,7 +69,7 @@ mod service;
 mod structure;
 mod type_hash;
 
-pub use action_calls::ActionCalls;
+pub use action_calls::{ActionCalls, reason_of};
 pub use convert::{date_time_to_time, duration_to_millis, millis_to_duration, time_to_date_time};
 pub use definition::Constant;
 pub use description::{DescribedField, DescribedType};
