@@ -11,6 +11,7 @@ mod facade;
 mod facades;
 mod graph;
 mod own;
+mod pending;
 mod serving;
 mod table;
 mod wire;
@@ -99,9 +100,16 @@ impl Actions {
         self.executors.execute(execution)
     }
 
-    /// Who asked for an execution does not want it any longer. Goals go on.
+    /// The caller of an execution has given it up. An accepted goal goes on. A goal that its server has not decided about is
+    /// cancelled as soon as it is accepted.
     pub fn abandoned(&mut self, execution: ExecutionId) {
         self.executors.abandoned(execution);
+    }
+
+    /// The goals whose cancellation is pending, a line each.
+    #[must_use]
+    pub fn pending(&self) -> Vec<String> {
+        self.executors.pending()
     }
 }
 

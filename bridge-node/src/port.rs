@@ -108,6 +108,15 @@ pub trait Port: Send + 'static {
         Vec::new()
     }
 
+    /// The program is to end: what this side works on elsewhere is to be cancelled as far as it ends with the program. The
+    /// shell goes on until nothing is [pending](Self::pending), 5 s at most. Never waits.
+    fn closing(&mut self) {}
+
+    /// Lists goals and runs with a pending cancellation, a line each: they are being cancelled, and their end is not known.
+    fn pending(&self) -> Vec<String> {
+        Vec::new()
+    }
+
     /// What the program tells whoever asks the group which applications there are. `None` of one that is no server: what it
     /// is says the shell.
     fn application(&self) -> Option<Application> {

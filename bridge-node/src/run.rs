@@ -54,6 +54,14 @@ pub(crate) struct Shell<P> {
     pub(crate) _told: Option<Box<dyn Send + Sync>>,
 }
 
+/// Whether a program goes on or is about to end.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Phase {
+    Running,
+    /// Only pending cancellations are waited for.
+    Closing,
+}
+
 /// What of the mapping was decided when the program started.
 #[derive(Debug)]
 pub(crate) struct Fixed {
@@ -92,10 +100,18 @@ impl<P: Port> Shell<P> {
         if self.claims {
             self.router.claim(now());
         }
-        let ended = self.carry(stop).await;
+        let mut ended = self.carry(stop, Phase::Running).await;
         // Nobody is to wait for what is executed no longer.
         self.router.withdraw_all(now());
         while self.drain() {}
+        if ended.is_ok() {
+            self.port.closing();
+            let limit = tokio::time::sleep(PENDING_AT_END);
+            ended = self.carry(limit, Phase::Closing).await;
+        }
+        for pending in self.port.pending() {
+            warn!("ending, and the outcome is unknown: {pending}");
+        }
         let status = self.status();
         let [topics, sent, delivered, dropped] = status.summary();
         info!(topics, sent, delivered, dropped, "ending");
@@ -105,7 +121,11 @@ impl<P: Port> Shell<P> {
     }
 
     /// All branches of the `select!` are cancel-safe: a socket and bounded channels that hold what was not taken.
-    async fn carry(&mut self, stop: impl Future<Output = ()> + Send) -> Result<(), Failure> {
+    async fn carry(
+        &mut self,
+        stop: impl Future<Output = ()> + Send,
+        phase: Phase,
+    ) -> Result<(), Failure> {
         let mut stop = pin!(stop);
         let mut timer = pin!(tokio::time::sleep(FAR));
         let mut looks = interval(transport::LOOK);
@@ -114,6 +134,9 @@ impl<P: Port> Shell<P> {
         let mut buffer = vec![0; 65_536];
         let mut more = false;
         loop {
+            if phase == Phase::Closing && self.port.pending().is_empty() {
+                return Ok(());
+            }
             self.arm(timer.as_mut());
             let yields = std::mem::take(&mut more) || self.busy.looks(|| now().monotonic);
             tokio::select! {
@@ -224,6 +247,7 @@ impl<P: Port> Shell<P> {
             },
         )
         .with_links(self.port.links())
+        .with_pending(self.port.pending())
     }
 
     /// What is told of secured groups without keys.
@@ -518,5 +542,7 @@ fn tell(notice: &Notice) {
 const DRAINED_AT_ONCE: usize = 64;
 /// Datagrams, or events of the port, that are carried on one behind the other.
 const TAKEN_AT_ONCE: usize = 32;
+/// How long the end of the program waits for pending cancellations.
+const PENDING_AT_END: Duration = Duration::from_secs(5);
 /// A deadline for when there is nothing to wait for.
 const FAR: Duration = Duration::from_secs(3600);

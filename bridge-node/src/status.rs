@@ -27,6 +27,8 @@ pub(crate) struct Status {
     /// Other servers that the program is a client of.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     servers: Vec<LinkState>,
+    /// Goals and runs that are being cancelled, as long as their end is not known.
+    cancellations_pending: Vec<String>,
     /// Other applications of the group, as they say of themselves.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     applications: Vec<ApplicationStatus>,
@@ -162,6 +164,7 @@ impl Status {
             topics,
             calls,
             servers: Vec::new(),
+            cancellations_pending: Vec::new(),
             applications: applications(router),
             others: router.others().into(),
             hops,
@@ -170,6 +173,11 @@ impl Status {
 
     pub(crate) fn with_links(mut self, links: Vec<LinkState>) -> Self {
         self.servers = links;
+        self
+    }
+
+    pub(crate) fn with_pending(mut self, pending: Vec<String>) -> Self {
+        self.cancellations_pending = pending;
         self
     }
 
@@ -281,6 +289,8 @@ impl Told for Status {
                 );
             }
         }
+        let pending = self.cancellations_pending.len();
+        line("cancellations_pending", &own, &pending);
         for link in &self.servers {
             link.figures(&own, &mut line);
         }

@@ -6,7 +6,7 @@
 //! its server lists it as at work.
 
 use std::collections::{BTreeMap, VecDeque};
-use std::sync::Arc;
+use std::sync::{Arc, PoisonError};
 use std::time::Duration;
 
 use bridge_node::actions::{
@@ -61,7 +61,12 @@ impl ActionGraph for Ros1Graph<'_> {
             let types = types(&action_type);
             tcpros::actionlib::ActionClient::new(self.node, action, types, options)
         })?;
-        Ok(Sender { client, waits })
+        let unsent = Unsent::default();
+        Ok(Sender {
+            client,
+            waits,
+            unsent,
+        })
     }
 
     fn serve_action(&mut self, action: &str, type_name: &TypeName) -> Result<Taker, String> {
@@ -146,17 +151,44 @@ fn read(id: &str) -> GoalId {
 pub(crate) struct Sender {
     client: Arc<tcpros::actionlib::ActionClient>,
     waits: Waits,
+    unsent: Unsent,
+}
+
+/// The goals that wait for their server to connect, and whether each is withdrawn meanwhile.
+#[derive(Debug, Clone, Default)]
+struct Unsent(Arc<std::sync::Mutex<BTreeMap<GoalId, bool>>>);
+
+impl Unsent {
+    fn lock(&self) -> std::sync::MutexGuard<'_, BTreeMap<GoalId, bool>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Withdraws a goal. Returns false for one that does not wait.
+    fn withdraw(&self, id: GoalId) -> bool {
+        let mut waiting = self.lock();
+        waiting.get_mut(&id).is_some_and(|withdrawn| {
+            *withdrawn = true;
+            true
+        })
+    }
+
+    /// The wait is over. Returns true if the goal was withdrawn meanwhile.
+    fn take(&self, id: GoalId) -> bool {
+        self.lock().remove(&id).unwrap_or_default()
+    }
 }
 
 impl ActionClient for Sender {
     type Goal = Sent;
 
     fn send_goal(&self, id: GoalId, body: &[u8]) -> Sent {
+        self.unsent.lock().insert(id, false);
         let mut goal = Sent {
             client: Arc::clone(&self.client),
+            id,
+            unsent: self.unsent.clone(),
             patience: PENDING.min(self.waits.answer / 2),
             stage: Stage::Waiting {
-                id: spelled(id),
                 body: Bytes::copy_from_slice(body),
                 until: after(self.waits.answer.min(CONNECTS)),
             },
@@ -181,6 +213,10 @@ impl ActionClient for Sender {
         };
         let (code, goals) = match what {
             CancelWhat::All => {
+                self.unsent
+                    .lock()
+                    .values_mut()
+                    .for_each(|withdrawn| *withdrawn = true);
                 let open = self.client.open_goals();
                 if self.client.cancel_all() == 0 {
                     return Err(unheard());
@@ -189,6 +225,7 @@ impl ActionClient for Sender {
             }
             CancelWhat::Goal(id) => match self.client.cancel_goal(&spelled(id)) {
                 CancelSent::Asked => (0, vec![id]),
+                CancelSent::NotFollowed if self.unsent.withdraw(id) => (0, vec![id]),
                 CancelSent::NotFollowed => (2, Vec::new()),
                 CancelSent::Ended => (3, Vec::new()),
                 CancelSent::NoServer => return Err(unheard()),
@@ -202,6 +239,8 @@ impl ActionClient for Sender {
 #[derive(Debug)]
 pub(crate) struct Sent {
     client: Arc<tcpros::actionlib::ActionClient>,
+    id: GoalId,
+    unsent: Unsent,
     /// How long its server may leave it undecided.
     patience: Duration,
     stage: Stage,
@@ -215,7 +254,6 @@ pub(crate) struct Sent {
 enum Stage {
     /// For its server, which connects to new clients within moments.
     Waiting {
-        id: String,
         body: Bytes,
         until: Instant,
     },
@@ -255,13 +293,24 @@ impl SentGoal for Sent {
     }
 }
 
+impl Drop for Sent {
+    fn drop(&mut self) {
+        self.unsent.take(self.id);
+    }
+}
+
 impl Sent {
     fn send(&mut self) {
-        let Stage::Waiting { id, body, .. } = std::mem::replace(&mut self.stage, Stage::Ended)
-        else {
+        let Stage::Waiting { body, .. } = std::mem::replace(&mut self.stage, Stage::Ended) else {
             return;
         };
-        match self.client.send_goal_as(id, &body) {
+        if self.unsent.take(self.id) {
+            return self.lose(
+                "the goal was withdrawn before it was sent".to_owned(),
+                Ran::No,
+            );
+        }
+        match self.client.send_goal_as(spelled(self.id), &body) {
             Ok(handle) => self.stage = Stage::Sent(handle),
             Err(error) => self
                 .events

@@ -756,6 +756,10 @@ impl Port for Ros1Port {
         self.address.as_ref().map(std::slice::from_ref)
     }
 
+    fn pending(&self) -> Vec<String> {
+        self.actions.pending()
+    }
+
     async fn shutdown(self) {
         let Self {
             node,

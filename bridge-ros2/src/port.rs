@@ -622,6 +622,10 @@ impl Port for Ros2Port {
         Some(&self.networks)
     }
 
+    fn pending(&self) -> Vec<String> {
+        self.actions.pending()
+    }
+
     async fn shutdown(self) {
         let Self {
             domain,

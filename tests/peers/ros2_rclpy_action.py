@@ -2,7 +2,7 @@
 
 `serve` decides about goals by their order: -1 is rejected and -2 aborted. Others get the numbers one by one as feedback and succeed,
 but from 100 on, of which three are told, and which go on until they are cancelled. Odd ones refuse to be. One of 110 succeeds
-although it was cancelled, and one of 112 is aborted.
+although it was cancelled, and one of 112 is aborted. With `--decides-after` it decides so many seconds late.
 
 `call` does what lines of standard input say: `send ORDER`, `cancel N`, `cancel_all`, `cancel_unknown`, `cancel_until N`, `result N`,
 `result_unknown`, and `back` and `gone`, which wait for a server or none, with N counting goals from 0; by itself it asks for no result unless told --results.
@@ -61,7 +61,7 @@ def lines():
 
 class Server:
     def __init__(self, node, args):
-        self.numbers = {}
+        self.numbers, self.late = {}, args.decides_after
         options = {} if args.keep is None else {"result_timeout": args.keep}
         self.end = ActionServer(
             node,
@@ -75,6 +75,9 @@ class Server:
         )
 
     def decide(self, goal):
+        if self.late:
+            lifetime.say(asked=goal.order)
+            time.sleep(self.late)
         lifetime.say(goal=goal.order, accepted=goal.order != -1)
         return GoalResponse.REJECT if goal.order == -1 else GoalResponse.ACCEPT
 
@@ -90,6 +93,8 @@ class Server:
             goal.publish_feedback(Fibonacci.Feedback(sequence=numbers))
         while order >= 100 and not goal.is_cancel_requested:
             time.sleep(TURN)
+        if self.late:
+            lifetime.say(worked=order, cancelled=goal.is_cancel_requested)
         if order in (-2, 112):
             goal.abort()
         elif order >= 100 and order != 110:
@@ -257,6 +262,7 @@ def main():
     parser.add_argument("role", choices=["serve", "call"])
     parser.add_argument("action")
     parser.add_argument("--keep", type=int, help="how many seconds the server keeps results")
+    parser.add_argument("--decides-after", type=float, default=0.0, help="how many seconds the server takes to decide")
     parser.add_argument("--results", action="store_true", help="the client asks for the result of what is accepted")
     parser.add_argument("--nested", help="a server of test_msgs/NestedMessage beside it")
     parser.add_argument("--wait", type=float, default=20.0)

@@ -56,3 +56,4 @@ mod skills;
 mod space_verbs;
 mod turtlebot3;
 mod uadp_differential;
+mod withdrawn_goals;

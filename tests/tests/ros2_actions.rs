@@ -83,6 +83,8 @@ async fn story(goal: &mut GoalHandle) -> Vec<String> {
             GoalEvent::Status(status) => format!("{status:?}"),
             GoalEvent::Feedback(body) => format!("{:?}", numbers(&body, 0)),
             GoalEvent::FeedbackDropped(count) => format!("dropped {count}"),
+            GoalEvent::Overdue(limit) => format!("overdue after {limit:?}"),
+            GoalEvent::CancelRefused => "cancel refused".to_owned(),
             GoalEvent::Ended(_) => "ended".to_owned(),
         });
     }

@@ -14,6 +14,7 @@ use tokio::task::JoinSet;
 
 use super::encoding::Encoding;
 use super::graph::{ActionGraph, Waits};
+use super::pending::AllPending;
 use super::serving::{Action, Command, Part, Serving};
 use crate::PortEvent;
 use crate::clock::now;
@@ -34,6 +35,7 @@ pub(super) struct Executors {
     /// How many of them wait for a result.
     held: usize,
     tasks: JoinSet<()>,
+    pending: AllPending,
 }
 
 #[derive(Debug)]
@@ -174,6 +176,7 @@ impl Executors {
             status,
             offered: Arc::clone(&offered),
             report: report.clone(),
+            pending: self.pending.of(topic),
         };
         self.tasks.spawn(Serving::new(action, client).run(told));
         let served = Served {
@@ -238,6 +241,11 @@ impl Executors {
         Ok(())
     }
 
+    /// See [`Actions::pending`](super::Actions::pending).
+    pub(super) fn pending(&self) -> Vec<String> {
+        self.pending.lines(now().monotonic)
+    }
+
     /// An execution has come to its end.
     pub(super) fn ended(&mut self, execution: ExecutionId) {
         if let Some((_, Part::Result)) = self.running.remove(&execution) {
@@ -249,8 +257,11 @@ impl Executors {
     pub(super) fn abandoned(&mut self, execution: ExecutionId) {
         let running = self.running.get(&execution);
         if let Some(served) = running.and_then(|(action, _)| self.served.get(action)) {
-            // Where it has much to do, the request ends at its deadline.
-            drop(served.commands.try_send(Command::Abandoned(execution)));
+            let commands = served.commands.clone();
+            // It waits for its turn and is not lost: a goal may have to be withdrawn. There are as many as executions at most.
+            self.tasks.spawn(async move {
+                let _is_over = commands.send(Command::Abandoned(execution)).await.is_err();
+            });
         }
     }
 }

@@ -69,6 +69,11 @@ pub enum GoalEvent {
     Status(i8),
     /// An `X_Feedback`.
     Feedback(Bytes),
+    /// Its server has not decided about it for as long as it may take. It is withdrawn: cancelled as soon as it is accepted.
+    /// What becomes of it follows. With the reason, for people.
+    Overdue(String),
+    /// It was withdrawn, and its server, which has accepted it, refuses to cancel it.
+    CancelRefused,
     /// It has ended: the last event.
     Ended {
         /// As `action_msgs/GoalStatus` has it: 4 succeeded, 5 canceled, 6 aborted.
@@ -116,7 +121,8 @@ pub trait ActionClient: Send + Sync + 'static {
     /// runtime.
     fn send_goal(&self, id: GoalId, body: &[u8]) -> Self::Goal;
 
-    /// Asks the server to cancel goals. Ends within [`Waits::answer`].
+    /// Asks the server to cancel goals. Ends within [`Waits::answer`]. A goal that the server has not decided about is
+    /// withdrawn: it is not sent, or is cancelled as soon as it is accepted. The answer then is that it is being cancelled.
     ///
     /// # Errors
     /// [`CallFault`], where there is no answer.

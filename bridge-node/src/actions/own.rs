@@ -20,6 +20,7 @@ use super::MOST_REPORTS;
 use super::encoding::Encoding;
 use super::executors::{EVENTS, MOST_COMMANDS, MOST_HELD, beside};
 use super::graph::ActionClient;
+use super::pending::Pending;
 use super::serving::{Action, Command, Part, Serving};
 use crate::PortEvent;
 use crate::clock::now;
@@ -111,6 +112,8 @@ impl OwnActions {
             status,
             offered: Arc::new(AtomicBool::new(true)),
             report: self.report.clone(),
+            // Its program shows the skills behind the goals.
+            pending: Pending::default(),
         };
         self.tasks.spawn(Serving::new(serving, client).run(told));
         let parts = [
@@ -149,12 +152,15 @@ impl OwnActions {
         Ok(())
     }
 
-    /// Who asked for an execution does not want it any longer. Goals go on.
+    /// The caller of an execution has given it up. An accepted goal goes on. A goal whose run has not begun is cancelled.
     pub fn abandoned(&mut self, execution: ExecutionId) {
         let running = self.running.get(&execution);
         if let Some(commands) = running.and_then(|(action, _)| self.commands.get(action)) {
-            // Where it has much to do, the request ends at its deadline.
-            drop(commands.try_send(Command::Abandoned(execution)));
+            let commands = commands.clone();
+            // It waits for its turn and is not lost. There are as many as executions at most.
+            self.tasks.spawn(async move {
+                let _is_over = commands.send(Command::Abandoned(execution)).await.is_err();
+            });
         }
     }
 

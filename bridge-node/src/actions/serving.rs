@@ -10,11 +10,13 @@ use mappings::TopicId;
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 use tokio::time::{MissedTickBehavior, timeout_at};
+use tracing::{debug, info};
 use uadp::StatusCode;
 
 use super::encoding::Encoding;
 use super::graph::{ActionClient, CancelAnswer, CancelWhat, GoalEvent, GoalId, NO_GOAL, SentGoal};
-use super::table::{Asked, Goals, Progress, Wanted};
+use super::pending::{Hex, Pending};
+use super::table::{Asked, GivenUp, Goals, Progress, Wanted};
 use super::wire::CancelRequest;
 use crate::PortEvent;
 use crate::clock::now;
@@ -49,6 +51,8 @@ pub(super) struct Action {
     /// Whether its values are taken: its server is there.
     pub(super) offered: Arc<AtomicBool>,
     pub(super) report: mpsc::Sender<PortEvent>,
+    /// Its goals whose cancellation is pending.
+    pub(super) pending: Pending,
 }
 
 /// The task.
@@ -80,7 +84,8 @@ impl<C: ActionClient> Serving<C> {
         }
     }
 
-    /// Works until nobody is left to tell it what to do. Who waits for anything then is told that it is lost; goals go on.
+    /// Serves until the command channel closes. Every waiting request is answered as lost then. Accepted goals go on. Withdrawn
+    /// goals are followed until they have ended.
     pub(super) async fn run(mut self, mut commands: mpsc::Receiver<Command>) {
         let mut ticks = tokio::time::interval(TICK);
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -94,23 +99,39 @@ impl<C: ActionClient> Serving<C> {
                     None => Err(Over),
                 },
                 // Never `None` while we hold a sender ourselves.
-                Some(news) = self.news.recv() => match news {
-                    News::Goal(id, event) => self.goal_event(id, event).await,
-                    News::Cancelled(execution, answer) => self.cancelled(execution, answer).await,
-                },
+                Some(news) = self.news.recv() => self.take(news).await,
                 // A component may have a thousand actions, most of them without any goal.
                 _ = ticks.tick(), if !self.goals.is_empty() => self.tidy().await,
             };
             while self.tasks.try_join_next().is_some() {}
+            self.show_pending();
             if is_over.is_err() {
                 break;
             }
         }
         for execution in self.goals.all_waiting() {
             if self.finish(execution, Executed::Lost).await.is_err() {
-                return;
+                break;
             }
         }
+        while !self.goals.pending().is_empty()
+            && let Some(news) = self.news.recv().await
+        {
+            // No request waits for the report.
+            let _is_over = self.take(news).await.is_err();
+            self.show_pending();
+        }
+    }
+
+    async fn take(&mut self, news: News) -> Result<(), Over> {
+        match news {
+            News::Goal(id, event) => self.goal_event(id, event).await,
+            News::Cancelled(execution, answer) => self.cancelled(execution, answer).await,
+        }
+    }
+
+    fn show_pending(&self) {
+        self.action.pending.show(self.goals.pending());
     }
 
     async fn execute(&mut self, part: Part, execution: Execution) -> Result<(), Over> {
@@ -139,6 +160,7 @@ impl<C: ActionClient> Serving<C> {
                 Ok(())
             }
             Asked::Waits => Ok(()),
+            Asked::Withdrawn => self.finish(run, Executed::Lost).await,
             Asked::Answer(answer) => {
                 let answer = self.action.encoding.goal_answer(&answer);
                 self.finish(run, answered(&answer)).await
@@ -163,16 +185,20 @@ impl<C: ActionClient> Serving<C> {
             Wanted::Waits => Ok(()),
             Wanted::Answer(answer) => self.finish(run, answered(&answer)).await,
             Wanted::NoGoal => {
-                let outcome = self.no_result("there is no such goal");
+                let outcome = self.no_result(UNKNOWN, "there is no such goal");
+                self.finish(run, outcome).await
+            }
+            Wanted::Rejected(why) => {
+                let outcome = self.no_result(NEVER_RAN, &why);
                 self.finish(run, outcome).await
             }
             Wanted::Full => self.refuse(run, Refusal::Busy).await,
         }
     }
 
-    /// The answer of a goal of which nothing is known.
-    fn no_result(&self, why: &str) -> Executed {
-        match self.empty(UNKNOWN, why) {
+    /// The answer of a goal without a result.
+    fn no_result(&self, status: i8, why: &str) -> Executed {
+        match self.empty(status, why) {
             Some(answer) => answered(&answer),
             None => Executed::Failed(BAD_UNEXPECTED_ERROR),
         }
@@ -205,6 +231,14 @@ impl<C: ActionClient> Serving<C> {
                     };
                     return self.cancelled(run, Ok(answer)).await;
                 }
+                Progress::Undecided => {
+                    self.withdraw(id).await?;
+                    let answer = CancelAnswer {
+                        code: NONE,
+                        goals: vec![id],
+                    };
+                    return self.cancelled(run, Ok(answer)).await;
+                }
                 // One of the graph's own clients may have sent it.
                 Progress::Unknown | Progress::Open => vec![CancelWhat::Goal(id)],
             },
@@ -219,6 +253,11 @@ impl<C: ActionClient> Serving<C> {
                 goals.into_iter().map(CancelWhat::Goal).collect()
             }
         };
+        if what == [CancelWhat::All] {
+            for id in self.goals.undecided() {
+                self.withdraw(id).await?;
+            }
+        }
         let (client, tell) = (Arc::clone(&self.client), self.tell.clone());
         self.tasks.spawn(async move {
             let answer = timeout_at(deadline.into(), cancel_each(&*client, what)).await;
@@ -233,6 +272,24 @@ impl<C: ActionClient> Serving<C> {
             drop(tell.send(News::Cancelled(run, answer)).await);
         });
         Ok(())
+    }
+
+    /// Withdraws a goal: it is cancelled as soon as its server accepts it. Requests for the goal are answered as unknown.
+    async fn withdraw(&mut self, id: GoalId) -> Result<(), Over> {
+        let asked = self.goals.withdraw(id, now().monotonic);
+        self.cancel_in_time(id);
+        self.finish_all(asked, &Executed::Lost).await
+    }
+
+    /// Has the client withdraw a goal. The end of the goal shows the effect.
+    fn cancel_in_time(&mut self, id: GoalId) {
+        info!(action = %self.action.topic, goal = %Hex(id), "goal is withdrawn: it is cancelled as soon as it is accepted");
+        let client = Arc::clone(&self.client);
+        self.tasks.spawn(async move {
+            if let Err(fault) = client.cancel(CancelWhat::Goal(id)).await {
+                debug!(goal = %Hex(id), error = fault.text, "cannot cancel withdrawn goal yet");
+            }
+        });
     }
 
     async fn cancelled(
@@ -264,7 +321,8 @@ impl<C: ActionClient> Serving<C> {
             }
             GoalEvent::Rejected(why) => match self.goals.rejected(id, why, now().monotonic) {
                 Some((asked, answer, waiting)) => {
-                    let none = self.no_result(&answer.message);
+                    self.report_end(id, "rejected");
+                    let none = self.no_result(NEVER_RAN, &answer.message);
                     let answer = self.action.encoding.goal_answer(&answer);
                     self.finish_all(asked, &answered(&answer)).await?;
                     self.finish_all(waiting, &none).await
@@ -289,9 +347,40 @@ impl<C: ActionClient> Serving<C> {
                     .encoding
                     .result_answer((status, &message), &result);
                 let answer = answer.or_else(|| self.empty(status, &message));
+                let end = match status {
+                    4 => "succeeded",
+                    5 => "canceled",
+                    _ => "aborted",
+                };
+                self.report_end(id, end);
                 self.ended(id, (status, answer)).await
             }
             GoalEvent::Lost { text, ran } => self.lost(id, text, ran).await,
+            GoalEvent::Overdue(text) => {
+                self.withdraw_overdue(id).await?;
+                self.tell_failure(text).await
+            }
+            GoalEvent::CancelRefused => {
+                self.goals.cancel_refused(id);
+                self.tell_failure(format!(
+                    "the action server refuses to cancel the goal {}, which was withdrawn before it was accepted: it goes on",
+                    Hex(id)
+                ))
+                .await
+            }
+        }
+    }
+
+    async fn withdraw_overdue(&mut self, id: GoalId) -> Result<(), Over> {
+        let asked = self.goals.withdraw(id, now().monotonic);
+        self.finish_all(asked, &Executed::Lost).await
+    }
+
+    /// Logs what became of a goal that was withdrawn before it was accepted.
+    fn report_end(&self, id: GoalId, end: &str) {
+        if self.goals.is_withdrawn(id) {
+            let action = self.action.topic;
+            info!(%action, goal = %Hex(id), end, "withdrawn goal has ended");
         }
     }
 
@@ -313,11 +402,13 @@ impl<C: ActionClient> Serving<C> {
 
     async fn lost(&mut self, id: GoalId, text: String, ran: Ran) -> Result<(), Over> {
         if ran == Ran::No {
-            let (asked, waiting) = self.goals.failed(id);
-            let none = self.no_result(&text);
+            self.report_end(id, &format!("never sent: {text}"));
+            let (asked, waiting) = self.goals.failed(id, &text, now().monotonic);
+            let none = self.no_result(NEVER_RAN, &text);
             self.finish_all(asked, &failed(ran)).await?;
             self.finish_all(waiting, &none).await?;
         } else {
+            self.report_end(id, &format!("unknown: {text}"));
             let answer = self.empty(UNKNOWN, &text);
             self.ended(id, (UNKNOWN, answer)).await?;
         }
@@ -326,10 +417,17 @@ impl<C: ActionClient> Serving<C> {
 
     /// Who asked does not wait any longer.
     async fn abandoned(&mut self, execution: ExecutionId) -> Result<(), Over> {
-        match self.goals.give_up(execution) {
-            true => self.refuse(execution, Refusal::NotExecutable).await,
-            // A goal is decided all the same.
-            false => Ok(()),
+        if self.goals.give_up(execution) {
+            return self.refuse(execution, Refusal::NotExecutable).await;
+        }
+        match self.goals.give_up_asking(execution, now().monotonic) {
+            GivenUp::NotAsked => Ok(()),
+            GivenUp::ByOne => self.finish(execution, Executed::Lost).await,
+            // It would begin when nobody expects it any more.
+            GivenUp::ByAll(goal) => {
+                self.cancel_in_time(goal);
+                self.finish(execution, Executed::Lost).await
+            }
         }
     }
 
@@ -402,7 +500,11 @@ async fn follow<G: SentGoal>(id: GoalId, mut goal: G, tell: mpsc::Sender<News>) 
             ran: Ran::Perhaps,
         });
         is_open = match &event {
-            GoalEvent::Accepted(_) | GoalEvent::Status(_) | GoalEvent::Feedback(_) => true,
+            GoalEvent::Accepted(_)
+            | GoalEvent::Status(_)
+            | GoalEvent::Feedback(_)
+            | GoalEvent::Overdue(_)
+            | GoalEvent::CancelRefused => true,
             GoalEvent::Ended { .. } | GoalEvent::Rejected(_) | GoalEvent::Lost { .. } => false,
         };
         if tell.send(News::Goal(id, event)).await.is_err() {
@@ -471,6 +573,9 @@ const TICK: Duration = Duration::from_millis(250);
 const MOST_NEWS: usize = 64;
 /// `action_msgs/GoalStatus`, STATUS_UNKNOWN.
 const UNKNOWN: i8 = 0;
+/// Of a goal that was rejected, or never sent: `action_msgs/GoalStatus` has no status for it, since a server of ROS 2 keeps
+/// none of such a goal.
+const NEVER_RAN: i8 = -1;
 /// `action_msgs/CancelGoal`, ERROR_NONE and ERROR_GOAL_TERMINATED.
 const NONE: i8 = 0;
 const TERMINATED: i8 = 3;

@@ -29,6 +29,10 @@ struct Goal {
     stamp: Timestamp,
     /// Who waits for its result.
     waiting: Vec<Waiting>,
+    /// Since when it is withdrawn: it is to be cancelled as soon as its server has accepted it.
+    withdrawn: Option<Instant>,
+    /// The server refuses to cancel it.
+    is_refused: bool,
 }
 
 #[derive(Debug)]
@@ -65,6 +69,8 @@ pub(super) enum Asked {
     Waits,
     /// It was decided before.
     Answer(GoalAnswer),
+    /// It was withdrawn, and is not sent again.
+    Withdrawn,
     /// There is no room for one more.
     Full,
 }
@@ -76,8 +82,10 @@ pub(super) enum Wanted {
     Waits,
     /// It has ended.
     Answer(Bytes),
-    /// There is no such goal, or it was rejected.
+    /// There is no such goal.
     NoGoal,
+    /// It was rejected, or never sent: with the reason.
+    Rejected(String),
     /// As many wait as may.
     Full,
 }
@@ -87,8 +95,21 @@ pub(super) enum Wanted {
 pub(super) enum Progress {
     /// None of the space.
     Unknown,
+    /// Its server has not decided.
+    Undecided,
     Open,
     Ended,
+}
+
+/// The effect of a request for a goal that is given up.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum GivenUp {
+    /// The request did not wait for the decision about a goal.
+    NotAsked,
+    /// Other requests wait for the decision about the same goal.
+    ByOne,
+    /// No request waits for the decision about this goal.
+    ByAll(GoalId),
 }
 
 impl Goals {
@@ -109,6 +130,7 @@ impl Goals {
                 })
             };
             return match &mut goal.state {
+                State::Sent(_) if goal.withdrawn.is_some() => Asked::Withdrawn,
                 State::Sent(asked) if asked.len() >= MOST_WAITING => Asked::Full,
                 State::Sent(asked) => {
                     asked.push(execution);
@@ -125,6 +147,8 @@ impl Goals {
             state: State::Sent(vec![execution]),
             stamp: Timestamp::from_unix_nanos(0),
             waiting: Vec::new(),
+            withdrawn: None,
+            is_refused: false,
         };
         self.known.insert(id, goal);
         self.order.push_back(id);
@@ -209,8 +233,18 @@ impl Goals {
         Some((asked, answer, goal.take_waiting()))
     }
 
-    /// The goal never came to be. Returns who asked for it, and who waits for its result; it may be asked for anew.
-    pub(super) fn failed(&mut self, id: GoalId) -> (Vec<ExecutionId>, Vec<ExecutionId>) {
+    /// Notes that the goal was never sent. Returns the requests for the goal and for its result. The goal may be sent anew,
+    /// unless it was withdrawn.
+    pub(super) fn failed(
+        &mut self,
+        id: GoalId,
+        why: &str,
+        now: Instant,
+    ) -> (Vec<ExecutionId>, Vec<ExecutionId>) {
+        if self.is_withdrawn(id) {
+            let rejected = self.rejected(id, why.to_owned(), now);
+            return rejected.map_or_else(Default::default, |(asked, _, waiting)| (asked, waiting));
+        }
         let Some(mut goal) = self.known.remove(&id) else {
             return (Vec::new(), Vec::new());
         };
@@ -263,9 +297,9 @@ impl Goals {
         match self.known.get_mut(&id) {
             None => Wanted::NoGoal,
             Some(Goal {
-                state: State::Rejected { .. },
+                state: State::Rejected { why, .. },
                 ..
-            }) => Wanted::NoGoal,
+            }) => Wanted::Rejected(why.clone()),
             Some(Goal {
                 state: State::Ended { answer, .. },
                 ..
@@ -287,12 +321,86 @@ impl Goals {
         })
     }
 
+    /// Withdraws a goal that its server has not decided about. Returns who asked for it.
+    pub(super) fn withdraw(&mut self, id: GoalId, now: Instant) -> Vec<ExecutionId> {
+        let Some(goal) = self.known.get_mut(&id) else {
+            return Vec::new();
+        };
+        match &mut goal.state {
+            State::Sent(asked) => {
+                goal.withdrawn.get_or_insert(now);
+                std::mem::take(asked)
+            }
+            State::Running(_) | State::Rejected { .. } | State::Ended { .. } => Vec::new(),
+        }
+    }
+
+    /// The goals that their server has not decided about.
+    pub(super) fn undecided(&self) -> Vec<GoalId> {
+        let sent = self.order.iter().filter(|id| {
+            let goal = self.known.get(*id);
+            goal.is_some_and(|goal| matches!(goal.state, State::Sent(_)))
+        });
+        sent.copied().collect()
+    }
+
+    /// Removes a request that waits for the decision about a goal. A goal without requests is withdrawn, since it would begin
+    /// late.
+    pub(super) fn give_up_asking(&mut self, execution: ExecutionId, now: Instant) -> GivenUp {
+        for (id, goal) in &mut self.known {
+            let State::Sent(asked) = &mut goal.state else {
+                continue;
+            };
+            let before = asked.len();
+            asked.retain(|one| *one != execution);
+            if asked.len() == before {
+                continue;
+            }
+            if asked.is_empty() {
+                goal.withdrawn.get_or_insert(now);
+                return GivenUp::ByAll(*id);
+            }
+            return GivenUp::ByOne;
+        }
+        GivenUp::NotAsked
+    }
+
+    /// The server refuses to cancel a withdrawn goal.
+    pub(super) fn cancel_refused(&mut self, id: GoalId) {
+        if let Some(goal) = self.known.get_mut(&id) {
+            goal.is_refused = true;
+        }
+    }
+
+    /// Whether a goal is to be cancelled as soon as it is accepted.
+    pub(super) fn is_withdrawn(&self, id: GoalId) -> bool {
+        self.known
+            .get(&id)
+            .is_some_and(|goal| goal.withdrawn.is_some())
+    }
+
+    /// The withdrawn goals of which the server has not said that it cancels them, or refuses to, and since when. The oldest
+    /// come first.
+    pub(super) fn pending(&self) -> Vec<(GoalId, Instant)> {
+        let pending = self.order.iter().filter_map(|id| {
+            let goal = self.known.get(id).filter(|goal| !goal.is_refused)?;
+            let is_open = match goal.state {
+                State::Sent(_) => true,
+                State::Running(status) => status != CANCELING,
+                State::Rejected { .. } | State::Ended { .. } => false,
+            };
+            goal.withdrawn.filter(|_| is_open).map(|since| (*id, since))
+        });
+        pending.collect()
+    }
+
     /// How far a goal is.
     pub(super) fn progress(&self, id: GoalId) -> Progress {
         match self.known.get(&id).map(|goal| &goal.state) {
-            None | Some(State::Rejected { .. }) => Progress::Unknown,
-            Some(State::Sent(_) | State::Running(_)) => Progress::Open,
-            Some(State::Ended { .. }) => Progress::Ended,
+            None => Progress::Unknown,
+            Some(State::Sent(_)) => Progress::Undecided,
+            Some(State::Running(_)) => Progress::Open,
+            Some(State::Rejected { .. } | State::Ended { .. }) => Progress::Ended,
         }
     }
 
@@ -390,6 +498,8 @@ const MOST_WAITING: usize = 128;
 const MOST_STATUSES: usize = 100;
 /// `action_msgs/GoalStatus`, STATUS_ACCEPTED.
 const ACCEPTED: i8 = 1;
+/// `action_msgs/GoalStatus`, STATUS_CANCELING.
+const CANCELING: i8 = 3;
 
 #[cfg(test)]
 mod tests {
@@ -426,11 +536,63 @@ mod tests {
         let (asked, answer, _) = goals.rejected(id(2), "no".to_owned(), now).unwrap();
         assert_eq!((asked, answer.accepted), (vec![run(5)], false));
         assert_eq!(goals.ask(id(2), run(6)), Asked::Answer(answer));
-        assert_eq!(goals.want(id(2), run(7), now), Wanted::NoGoal);
+        let why = "no".to_owned();
+        assert_eq!(goals.want(id(2), run(7), now), Wanted::Rejected(why));
         // One that never came to be may.
         goals.ask(id(3), run(8));
-        assert_eq!(goals.failed(id(3)), (vec![run(8)], vec![]));
+        assert_eq!(goals.failed(id(3), "none", now), (vec![run(8)], vec![]));
         assert_eq!(goals.ask(id(3), run(9)), Asked::Send);
+    }
+
+    #[test]
+    fn a_goal_that_nobody_waits_for_is_withdrawn_before_it_is_accepted() {
+        let mut goals = Goals::default();
+        let now = crate::now().monotonic;
+        goals.ask(id(1), run(1));
+        goals.ask(id(1), run(2));
+        assert_eq!(goals.give_up_asking(run(1), now), GivenUp::ByOne);
+        assert_eq!(goals.pending(), []);
+        assert_eq!(goals.give_up_asking(run(2), now), GivenUp::ByAll(id(1)));
+        assert_eq!(goals.give_up_asking(run(2), now), GivenUp::NotAsked);
+        assert_eq!(goals.pending(), [(id(1), now)]);
+        // Asking anew does not revive it.
+        assert_eq!(goals.ask(id(1), run(3)), Asked::Withdrawn);
+        let soon = now + Duration::from_secs(30);
+        assert_eq!(goals.want(id(1), run(4), soon), Wanted::Waits);
+        let (asked, _) = goals.accepted(id(1), at(1)).unwrap();
+        assert_eq!((asked, goals.pending()), (vec![], vec![(id(1), now)]));
+        goals.status(id(1), CANCELING);
+        assert_eq!(goals.pending(), []);
+        let (waiting, _) = goals.ended(id(1), (5, Bytes::new()), now);
+        assert_eq!(waiting, [run(4)]);
+        // An accepted goal goes on without its caller.
+        goals.ask(id(2), run(5));
+        goals.accepted(id(2), at(2));
+        assert_eq!(goals.give_up_asking(run(5), now), GivenUp::NotAsked);
+        assert_eq!(goals.withdraw(id(2), now), []);
+        assert_eq!(goals.pending(), []);
+    }
+
+    #[test]
+    fn a_withdrawn_goal_that_never_came_to_be_is_known_as_rejected() {
+        let mut goals = Goals::default();
+        let now = crate::now().monotonic;
+        goals.ask(id(1), run(1));
+        assert_eq!(goals.withdraw(id(1), now), [run(1)]);
+        assert_eq!(goals.want(id(1), run(2), now), Wanted::Waits);
+        assert_eq!(goals.failed(id(1), "not sent", now), (vec![], vec![run(2)]));
+        let why = "not sent".to_owned();
+        assert_eq!(goals.want(id(1), run(3), now), Wanted::Rejected(why));
+        assert_eq!(
+            (goals.progress(id(1)), goals.pending()),
+            (Progress::Ended, vec![])
+        );
+        // A refused cancellation is not pending.
+        goals.ask(id(2), run(4));
+        goals.withdraw(id(2), now);
+        goals.accepted(id(2), at(1));
+        goals.cancel_refused(id(2));
+        assert_eq!(goals.pending(), []);
     }
 
     #[test]

@@ -884,3 +884,30 @@ async fn actions_that_would_have_the_same_calls_are_not_both_offered() {
     assert_eq!(offered(&events), [66, 73]);
     assert_eq!(space.reconcile().len(), 0);
 }
+
+#[tokio::test]
+async fn a_goal_that_is_cancelled_before_its_server_decides_is_withdrawn() {
+    let mut space = Space::offered();
+    let mut heard = space.client().await;
+    let goal = space.server().await;
+    let agreed = space.cancel().await;
+    let cancel = space.cancelled().await;
+    assert_eq!(cancel.what, CancelWhat::Goal(ID));
+    assert_eq!(space.until(agreed).await, Ok(true));
+    let pending = space.executing.pending();
+    assert!(
+        matches!(&pending[..], [line] if line.contains(&"09".repeat(16))),
+        "{pending:?}"
+    );
+    // Its outcome is unknown, and it is not sent again.
+    let told = space.told(&mut heard).await;
+    assert!(matches!(told, Told::Rejected(_)), "{told:?}");
+    let accepted = GoalEvent::Accepted(Timestamp::from_unix_nanos(1_000));
+    goal.say.send(accepted).await.unwrap();
+    goal.say.send(GoalEvent::Status(3)).await.unwrap();
+    let deadline = now().monotonic + Duration::from_secs(20);
+    while !space.executing.pending().is_empty() {
+        assert!(now().monotonic < deadline, "it is being cancelled");
+        space.until(tokio::task::yield_now()).await;
+    }
+}

@@ -1,6 +1,8 @@
 //! What a client of an action asks its server, and what its goals share.
 
 use std::collections::BTreeMap;
+use std::convert::Infallible;
+use std::pin::pin;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -8,16 +10,19 @@ use std::time::Duration;
 use bytes::Bytes;
 use rustdds::GUID;
 use tokio::task::AbortHandle;
-use tokio::time::{Instant, sleep, timeout};
-use tracing::debug;
+use tokio::time::{Instant, sleep, sleep_until, timeout};
+use tracing::{debug, info};
 
 use super::client_goals::{ClientGoals, Limits, Outcome};
 use super::error::{LostReason, NoServer};
-use super::types::{CancelAnswer, CancelWhat, GoalId, Status};
+use super::types::{CancelAnswer, CancelCode, CancelWhat, GoalId, GoalInfo, Status};
 use super::{Action, wire};
 use crate::cdr::Malformed;
+use crate::clock::RosTime;
 use crate::domain::Domain;
-use crate::service::{BUSY, IDLE, Received, ServiceClient, ServiceError, ServicePeers};
+use crate::service::{
+    BUSY, CallPhase, IDLE, Recall, Received, Replied, ServiceClient, ServiceError, ServicePeers,
+};
 
 /// How long a client waits, in steady time, and how much it holds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -26,7 +31,7 @@ pub struct ActionClientOptions {
     /// is none.
     pub server_timeout: Duration,
     /// How long the server may take to accept or reject a goal; `None` waits until the server is gone. A goal that was
-    /// not answered in time may still be accepted.
+    /// not answered in time is withdrawn: it is cancelled as soon as it is accepted.
     pub answer_timeout: Option<Duration>,
     /// How long a request to cancel may take.
     pub cancel_timeout: Duration,
@@ -110,7 +115,35 @@ impl Shared {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
+    /// Asks to cancel goals. What the server has not decided about is withdrawn.
     pub(super) async fn cancel(&self, what: CancelWhat) -> Result<CancelAnswer, ServiceError> {
+        let withdrawn = self.withdraw(what);
+        if let (CancelWhat::Goal(_), [_, ..]) = (what, &withdrawn[..]) {
+            return Ok(CancelAnswer {
+                code: CancelCode::None,
+                goals: withdrawn,
+            });
+        }
+        let mut answer = self.ask_to_cancel(what).await?;
+        answer.goals.extend(withdrawn);
+        Ok(answer)
+    }
+
+    fn withdraw(&self, what: CancelWhat) -> Vec<GoalInfo> {
+        let mut state = self.lock();
+        let meant = match what {
+            CancelWhat::Goal(id) | CancelWhat::GoalAndUntil(id, _) => vec![id],
+            CancelWhat::All => state.goals.undecided(),
+            CancelWhat::Until(_) => Vec::new(),
+        };
+        let now = Instant::now();
+        let meant = meant.into_iter();
+        let withdrawn = meant.filter(|id| state.goals.withdraw(*id, now));
+        let stamp = RosTime::default();
+        withdrawn.map(|id| GoalInfo { id, stamp }).collect()
+    }
+
+    async fn ask_to_cancel(&self, what: CancelWhat) -> Result<CancelAnswer, ServiceError> {
         let server = match what {
             CancelWhat::Goal(id) => self.lock().servers.get(&id).copied(),
             CancelWhat::All | CancelWhat::Until(_) | CancelWhat::GoalAndUntil(..) => None,
@@ -128,7 +161,9 @@ impl Shared {
     /// Nobody holds the goal any more.
     pub(super) fn forget(&self, id: GoalId) {
         let mut state = self.lock();
-        state.goals.forget(id);
+        if !state.goals.forget(id) {
+            return;
+        }
         state.servers.remove(&id);
         if let Some(task) = state.tasks.remove(&id) {
             task.abort();
@@ -199,40 +234,44 @@ impl Shared {
 
     /// Sees a goal through to its end.
     pub(super) async fn drive(self: Arc<Self>, id: GoalId, request: Bytes) {
-        let outcome = self.outcome(id, request).await;
+        // Both are cancel-safe: a request to cancel is noted as sent before it is.
+        let outcome = tokio::select! {
+            outcome = self.outcome(id, request) => outcome,
+            never = self.cancel_withdrawn(id) => match never {},
+        };
         let mut state = self.lock();
-        state.goals.end(id, outcome);
+        let age = state.goals.withdrawal(id).map(|of| of.age(Instant::now()));
+        if state.goals.end(id, outcome.clone()) {
+            let action = self.action.name();
+            let end = match &outcome {
+                Outcome::Rejected => "rejected".to_owned(),
+                Outcome::Done { status, .. } => format!("{status:?}"),
+                Outcome::Lost(reason) => format!("unknown: {reason}"),
+            };
+            info!(action, goal = %id, ?age, end, "withdrawn goal has ended");
+        }
         state.servers.remove(&id);
         state.tasks.remove(&id);
     }
 
     async fn outcome(&self, id: GoalId, request: Bytes) -> Outcome {
-        if let Err(none) = self.wait_for_server(self.options.server_timeout).await {
+        let found = tokio::select! {
+            biased;
+            () = self.until(id, ClientGoals::is_withdrawn) => return Outcome::Lost(LostReason::Withdrawn),
+            found = self.wait_for_server(self.options.server_timeout) => found,
+        };
+        if let Err(none) = found {
             return Outcome::Lost(none.into());
         }
-        let answer = match self.asked.send.call_after(request, None).await {
-            Ok(answer) => answer,
-            Err(error) => return Outcome::Lost(LostReason::Unanswered(error)),
+        let server = match self.decision(id, request).await {
+            Ok(server) => server,
+            Err(outcome) => return outcome,
         };
-        match wire::read_goal_answer(&answer.reply) {
-            Ok(None) => return Outcome::Rejected,
-            Ok(Some(stamp)) => {
-                let mut state = self.lock();
-                // Unless nobody holds it any more.
-                if state.tasks.contains_key(&id) {
-                    state.servers.insert(id, answer.writer);
-                }
-                state.goals.accepted(id, stamp);
-            }
-            Err(Malformed) => {
-                return Outcome::Lost(LostReason::Malformed("answer to the goal"));
-            }
-        }
         // After a restart the old server may still be known, while of the new one not all is: it is the one to ask.
         let asked = self
             .asked
             .result
-            .call_after(wire::result_request(id), Some(answer.writer));
+            .call_after(wire::result_request(id), server);
         let result = tokio::select! {
             result = asked => result.map(|answer| answer.reply),
             () = self.wait_for_no_server() => {
@@ -250,14 +289,117 @@ impl Shared {
         }
     }
 
+    /// Sends the goal and waits until it is accepted: by the answer, which names an endpoint of the server, or by the
+    /// status of the server, since the answer can be lost. Otherwise returns how the goal ended.
+    async fn decision(&self, id: GoalId, request: Bytes) -> Result<Option<GUID>, Outcome> {
+        let recall = Recall::default();
+        let send = &self.asked.send;
+        let mut asked = pin!(send.call_recallable(request, None, &recall));
+        let mut overdue = pin!(after(self.options.answer_timeout));
+        let (mut is_overdue, mut is_withdrawn) = (false, false);
+        loop {
+            tokio::select! {
+                biased;
+                answer = &mut asked => return self.decided(id, answer),
+                () = self.until(id, ClientGoals::is_accepted) => {
+                    let answer = timeout(ANSWER_AFTER_STATUS, asked).await;
+                    let answer = answer.ok().and_then(Result::ok);
+                    return answer.map_or(Ok(None), |answer| self.decided(id, Ok(answer)));
+                }
+                () = self.until(id, ClientGoals::is_withdrawn), if !is_withdrawn => {
+                    if recall.recall() {
+                        return Err(Outcome::Lost(LostReason::Withdrawn));
+                    }
+                    is_withdrawn = true;
+                }
+                limit = &mut overdue, if !is_overdue => {
+                    if recall.recall() {
+                        return Err(Outcome::Lost(LostReason::Unanswered(ServiceError::Timeout {
+                            service: send.service().to_owned(),
+                            phase: CallPhase::Discovery,
+                            limit,
+                        })));
+                    }
+                    is_overdue = true;
+                    self.lock().goals.overdue(id, limit, Instant::now());
+                }
+            }
+        }
+    }
+
+    fn decided(
+        &self,
+        id: GoalId,
+        answer: Result<Replied, ServiceError>,
+    ) -> Result<Option<GUID>, Outcome> {
+        let lost = |reason| Err(Outcome::Lost(reason));
+        let answer = match answer {
+            Ok(answer) => answer,
+            Err(error) => return lost(LostReason::Unanswered(error)),
+        };
+        match wire::read_goal_answer(&answer.reply) {
+            Ok(None) => Err(Outcome::Rejected),
+            Ok(Some(stamp)) => {
+                let mut state = self.lock();
+                // Unless nobody holds it any more.
+                if state.tasks.contains_key(&id) {
+                    state.servers.insert(id, answer.writer);
+                }
+                state.goals.accepted(id, stamp, Instant::now());
+                Ok(Some(answer.writer))
+            }
+            Err(Malformed) => lost(LostReason::Malformed("answer to the goal")),
+        }
+    }
+
+    /// Returns when that holds for the goal.
+    async fn until(&self, id: GoalId, holds: impl Fn(&ClientGoals, GoalId) -> bool) {
+        let changed = self.lock().goals.changed(id);
+        loop {
+            let mut rung = pin!(changed.notified());
+            // From here on none is missed.
+            let _rung = rung.as_mut().enable();
+            if holds(&self.lock().goals, id) {
+                return;
+            }
+            rung.await;
+        }
+    }
+
+    /// Cancels the goal once it is withdrawn and accepted, until the server agrees or refuses.
+    async fn cancel_withdrawn(&self, id: GoalId) -> Infallible {
+        let due = |goals: &ClientGoals, id| goals.cancel_due(id).is_some();
+        loop {
+            self.until(id, due).await;
+            let at = self.lock().goals.cancel_due(id);
+            sleep_until(at.unwrap_or_else(Instant::now)).await;
+            let is_due = {
+                let mut state = self.lock();
+                let withdrawal = state.goals.withdrawal(id);
+                withdrawal.is_some_and(|withdrawal| withdrawal.take_due(Instant::now()))
+            };
+            if !is_due {
+                continue;
+            }
+            let answer = self.ask_to_cancel(CancelWhat::Goal(id)).await;
+            let answer = answer
+                .inspect_err(|error| debug!(goal = %id, %error, "cannot cancel withdrawn goal yet"))
+                .ok();
+            let code = answer.map(|answer| answer.code);
+            let mut state = self.lock();
+            state.goals.cancel_answered(id, code, Instant::now());
+        }
+    }
+
     pub(super) fn hear_status(&self, sample: Option<Received>) {
         let goals = sample.ok_or(Malformed);
         let goals = goals.and_then(|sample| wire::read_status_array(&sample.payload));
         let mut state = self.lock();
         match goals {
             Ok(goals) => {
-                for (id, status) in goals {
-                    state.goals.status(id, status);
+                let now = Instant::now();
+                for (GoalInfo { id, stamp }, status) in goals {
+                    state.goals.status(id, (status, stamp), now);
                 }
             }
             Err(Malformed) => self.malformed(&mut state, "status"),
@@ -280,3 +422,17 @@ impl Shared {
         debug!(action, what, "a sample that does not read");
     }
 }
+
+/// Returns the limit once it is over; never without one.
+async fn after(limit: Option<Duration>) -> Duration {
+    match limit {
+        Some(limit) => {
+            sleep(limit).await;
+            limit
+        }
+        None => std::future::pending().await,
+    }
+}
+
+/// How long the answer to a goal may come behind the status that says that the goal is accepted.
+const ANSWER_AFTER_STATUS: Duration = Duration::from_secs(1);

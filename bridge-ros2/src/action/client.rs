@@ -5,6 +5,8 @@ use std::time::Duration;
 
 use tokio::sync::Notify;
 use tokio::task::AbortHandle;
+use tokio::time::Instant;
+use tracing::warn;
 
 use super::asking::{ActionClientOptions, Asked, Shared, State};
 use super::client_goals::{ClientCounters, Outcome};
@@ -18,7 +20,8 @@ use crate::service::{
     ServiceClient, ServiceClientOptions, ServiceError, ServicePeers, next, policies,
 };
 
-/// Sends goals to the server of an action. Dropping it ends its goals as lost; it does not cancel them.
+/// Sends goals to the server of an action. Dropping it ends its goals as lost; it does not cancel them. Of withdrawn
+/// goals it logs then that their end is unknown.
 ///
 /// With several servers of one name, all get each goal, as everywhere in ROS 2, and the first answer counts.
 #[derive(Debug)]
@@ -52,7 +55,8 @@ impl ActionClient {
         // A goal takes as long as it takes.
         let result = open(action.get_result(), None)?;
         let cancel = open(action.cancel_goal(), Some(options.cancel_timeout))?;
-        let send = open(action.send_goal(), options.answer_timeout)?;
+        // The decision about a goal is awaited until the server has left, since a withdrawn goal is cancelled then.
+        let send = open(action.send_goal(), None)?;
         let shared = Arc::new(Shared::new(
             (domain, peers),
             action,
@@ -91,7 +95,7 @@ impl ActionClient {
         let wake: Arc<Notify> = Arc::default();
         state.goals.sent(id, Arc::clone(&wake));
         match wire::join(id, body) {
-            None => state.goals.end(id, Outcome::Lost(LostReason::Message)),
+            None => drop(state.goals.end(id, Outcome::Lost(LostReason::Message))),
             Some(request) if state.goals.outcome(id).is_none() => {
                 let task = tokio::spawn(Arc::clone(&self.shared).drive(id, request));
                 state.tasks.insert(id, task.abort_handle());
@@ -103,7 +107,8 @@ impl ActionClient {
     }
 
     /// Asks the server to cancel goals, those of other clients too where `what` includes them. The goals tell what
-    /// comes of it.
+    /// comes of it. A goal of this client that the server has not decided about is withdrawn, and named in the answer:
+    /// it is not sent, or is cancelled as soon as it is accepted.
     ///
     /// # Errors
     /// [`ServiceError`]; a server may have heard the request where [`ServiceError::may_have_run`] says so.
@@ -146,6 +151,12 @@ impl Drop for ActionClient {
         let mut state = self.shared.lock();
         for task in state.tasks.values() {
             task.abort();
+        }
+        for (goal, age) in state.goals.pending(Instant::now()) {
+            warn!(
+                action = self.name(), %goal, ?age,
+                "withdrawn goal is left behind: whether the action server works on it is unknown"
+            );
         }
         let closed = Outcome::Lost(LostReason::ClientClosed);
         state.goals.end_all(&closed);

@@ -4,12 +4,15 @@
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
+use std::time::Duration;
 
 use bytes::Bytes;
 use tokio::sync::Notify;
+use tokio::time::Instant;
 
 use super::error::LostReason;
-use super::types::{GoalId, Status};
+use super::types::{CancelCode, GoalId, Status};
+use super::withdrawal::Withdrawal;
 use crate::clock::RosTime;
 
 /// What happens to a goal that was sent, in the order in which it is told.
@@ -23,6 +26,11 @@ pub enum GoalEvent {
     Feedback(Bytes),
     /// So many reports of progress gave way to newer ones since the last event.
     FeedbackDropped(u64),
+    /// The server has not decided within that time. The goal is withdrawn: it is cancelled as soon as it is accepted.
+    /// May come before [`Accepted`](Self::Accepted).
+    Overdue(Duration),
+    /// The goal was withdrawn, the server has accepted it, and refuses to cancel it.
+    CancelRefused,
     /// The last event.
     Ended(Outcome),
 }
@@ -81,6 +89,13 @@ struct Goal {
     dropped: u64,
     outcome: Option<Outcome>,
     wake: Arc<Notify>,
+    /// Tells the task of the goal that it is accepted or withdrawn.
+    changed: Arc<Notify>,
+    withdrawal: Option<Withdrawal>,
+    /// The time the server had, until that is told.
+    overdue: Option<Duration>,
+    /// Nobody holds the goal: it is kept for its withdrawal.
+    is_left: bool,
 }
 
 /// Whether the server has answered. What it says before is kept, and told after the answer.
@@ -112,11 +127,15 @@ impl ClientGoals {
             dropped: 0,
             outcome: None,
             wake,
+            changed: Arc::default(),
+            withdrawal: None,
+            overdue: None,
+            is_left: false,
         };
         self.goals.insert(id, goal);
         if full {
             let busy = LostReason::Busy(self.limits.goals);
-            self.end(id, Outcome::Lost(busy));
+            let _is_left = self.end(id, Outcome::Lost(busy));
         }
     }
 
@@ -126,10 +145,14 @@ impl ClientGoals {
     }
 
     /// A server has accepted the goal.
-    pub(super) fn accepted(&mut self, id: GoalId, stamp: RosTime) {
+    pub(super) fn accepted(&mut self, id: GoalId, stamp: RosTime, now: Instant) {
         if let Some(goal) = self.open(id)
             && goal.answer == Answer::Awaited
         {
+            if let Some(withdrawal) = &mut goal.withdrawal {
+                withdrawal.accepted(now);
+            }
+            goal.changed.notify_waiters();
             goal.answer = Answer::Had;
             if goal.status == Status::Unknown {
                 goal.status = Status::Accepted;
@@ -139,8 +162,12 @@ impl ClientGoals {
         }
     }
 
-    /// The server's list says so. It may be older than what is known, as other topics overtake it.
-    pub(super) fn status(&mut self, id: GoalId, status: Status) {
+    /// The server's list says so. It may be older than what is known, as other topics overtake it. A goal in the list
+    /// is accepted, even if the answer that says so is lost.
+    pub(super) fn status(&mut self, id: GoalId, (status, stamp): (Status, RosTime), now: Instant) {
+        if status != Status::Unknown {
+            self.accepted(id, stamp, now);
+        }
         let Some(goal) = self.open(id) else {
             return;
         };
@@ -178,11 +205,95 @@ impl ClientGoals {
         self.counters.feedback_dropped += dropped;
     }
 
-    /// The goal has ended.
-    pub(super) fn end(&mut self, id: GoalId, outcome: Outcome) {
+    /// Has the goal cancelled as soon as it is accepted, or not sent. Returns false if the server has decided about the
+    /// goal, or nobody holds such a goal here.
+    pub(super) fn withdraw(&mut self, id: GoalId, now: Instant) -> bool {
+        let goal = self.open(id);
+        let Some(goal) = goal.filter(|goal| goal.answer == Answer::Awaited) else {
+            return false;
+        };
+        goal.withdrawal.get_or_insert_with(|| Withdrawal::new(now));
+        goal.changed.notify_waiters();
+        true
+    }
+
+    /// The goals that no server has decided about.
+    pub(super) fn undecided(&self) -> Vec<GoalId> {
+        let open = self
+            .goals
+            .iter()
+            .filter(|(_, goal)| goal.outcome.is_none() && goal.answer == Answer::Awaited);
+        open.map(|(id, _)| *id).collect()
+    }
+
+    /// The server has not decided within `limit`: the goal is withdrawn.
+    pub(super) fn overdue(&mut self, id: GoalId, limit: Duration, now: Instant) {
+        if self.withdraw(id, now)
+            && let Some(goal) = self.open(id)
+        {
+            goal.overdue = Some(limit);
+            goal.wake.notify_one();
+        }
+    }
+
+    /// Whether the goal is to be cancelled once it is accepted.
+    pub(super) fn is_withdrawn(&self, id: GoalId) -> bool {
+        self.goals
+            .get(&id)
+            .is_some_and(|goal| goal.withdrawal.is_some())
+    }
+
+    /// Whether a server has accepted the goal.
+    pub(super) fn is_accepted(&self, id: GoalId) -> bool {
+        let goal = self.goals.get(&id);
+        goal.is_some_and(|goal| goal.answer == Answer::Had)
+    }
+
+    /// What rings when a goal is accepted or withdrawn.
+    pub(super) fn changed(&self, id: GoalId) -> Arc<Notify> {
+        let goal = self.goals.get(&id);
+        goal.map(|goal| Arc::clone(&goal.changed))
+            .unwrap_or_default()
+    }
+
+    /// The withdrawal of a goal that has not ended.
+    pub(super) fn withdrawal(&mut self, id: GoalId) -> Option<&mut Withdrawal> {
+        self.open(id)?.withdrawal.as_mut()
+    }
+
+    /// When the next request to cancel a withdrawn goal is due.
+    pub(super) fn cancel_due(&self, id: GoalId) -> Option<Instant> {
+        self.goals.get(&id)?.withdrawal.as_ref()?.due()
+    }
+
+    /// What the server has answered to a request to cancel a withdrawn goal.
+    pub(super) fn cancel_answered(&mut self, id: GoalId, answer: Option<CancelCode>, now: Instant) {
         let Some(goal) = self.open(id) else {
             return;
         };
+        let withdrawal = goal.withdrawal.as_mut();
+        if withdrawal.is_some_and(|withdrawal| withdrawal.answered(answer, now)) {
+            goal.tell(GoalEvent::CancelRefused);
+        }
+    }
+
+    /// The withdrawn goals that have not ended, and for how long.
+    pub(super) fn pending(&self, now: Instant) -> Vec<(GoalId, Duration)> {
+        let open = self.goals.iter().filter(|(_, goal)| goal.outcome.is_none());
+        let withdrawn =
+            open.filter_map(|(id, goal)| Some((*id, goal.withdrawal.as_ref()?.age(now))));
+        withdrawn.collect()
+    }
+
+    /// The goal has ended. Returns true if nobody holds it, and it is forgotten.
+    pub(super) fn end(&mut self, id: GoalId, outcome: Outcome) -> bool {
+        let Some(goal) = self.open(id) else {
+            return false;
+        };
+        if goal.is_left {
+            self.goals.remove(&id);
+            return true;
+        }
         match &outcome {
             Outcome::Rejected => goal.forget_events(),
             Outcome::Done { status, .. } => goal.status = *status,
@@ -192,18 +303,22 @@ impl ClientGoals {
         goal.answer = Answer::Had;
         goal.outcome = Some(outcome.clone());
         goal.tell(GoalEvent::Ended(outcome));
+        false
     }
 
     /// Ends all goals.
     pub(super) fn end_all(&mut self, outcome: &Outcome) {
         for id in self.goals.keys().copied().collect::<Vec<_>>() {
-            self.end(id, outcome.clone());
+            let _is_left = self.end(id, outcome.clone());
         }
     }
 
     /// The next event of a goal.
     pub(super) fn next_event(&mut self, id: GoalId) -> Option<GoalEvent> {
         let goal = self.goals.get_mut(&id)?;
+        if let Some(limit) = goal.overdue.take() {
+            return Some(GoalEvent::Overdue(limit));
+        }
         if goal.answer == Answer::Awaited {
             return None;
         }
@@ -233,9 +348,17 @@ impl ClientGoals {
         self.goals.get(&id)?.outcome.as_ref()
     }
 
-    /// Nobody holds the goal any more.
-    pub(super) fn forget(&mut self, id: GoalId) {
+    /// Nobody holds the goal any more. Returns false if it is withdrawn and has not ended: it is kept until then.
+    pub(super) fn forget(&mut self, id: GoalId) -> bool {
+        if let Some(goal) = self.open(id)
+            && goal.withdrawal.is_some()
+        {
+            goal.is_left = true;
+            goal.forget_events();
+            return false;
+        }
         self.goals.remove(&id);
+        true
     }
 
     fn open(&mut self, id: GoalId) -> Option<&mut Goal> {
@@ -246,6 +369,9 @@ impl ClientGoals {
 
 impl Goal {
     fn tell(&mut self, event: GoalEvent) {
+        if self.is_left {
+            return;
+        }
         self.events.push_back(event);
         self.wake.notify_one();
     }

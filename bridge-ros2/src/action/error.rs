@@ -43,6 +43,9 @@ pub enum LostReason {
     /// The client has as many goals as its options allow. It was not sent.
     #[error("{0} goals of the action are open already")]
     Busy(usize),
+    /// It was withdrawn before it was sent.
+    #[error("the goal was withdrawn before it was sent")]
+    Withdrawn,
     /// The message is not CDR in little endian with its encapsulation header. It was not sent.
     #[error("the goal is not CDR in little endian")]
     Message,
@@ -74,7 +77,7 @@ impl LostReason {
     #[must_use]
     pub const fn may_run(&self) -> bool {
         match self {
-            Self::NoServer(_) | Self::Busy(_) | Self::Message => false,
+            Self::NoServer(_) | Self::Busy(_) | Self::Withdrawn | Self::Message => false,
             Self::Unanswered(error) => error.may_have_run(),
             Self::ServerLost(_)
             | Self::ServerGone { .. }

@@ -10,7 +10,8 @@ use super::error::LostReason;
 use super::types::{CancelAnswer, CancelWhat, GoalId, Status};
 use crate::service::ServiceError;
 
-/// A goal that was sent. Dropping it ends the interest in the goal; it does not cancel it.
+/// A goal that was sent. Dropping it ends the interest in the goal; it does not cancel it. A goal that was cancelled
+/// before the server decided about it is cancelled on acceptance all the same.
 #[derive(Debug)]
 pub struct GoalHandle {
     shared: Arc<Shared>,
@@ -63,7 +64,8 @@ impl GoalHandle {
     }
 
     /// Asks the server to cancel the goal, and returns what it says to that. The goal goes on until the server ends it,
-    /// be it as succeeded.
+    /// be it as succeeded. While the server has not decided about the goal, the answer is that it is being cancelled:
+    /// the request goes to the server as soon as it accepts the goal.
     ///
     /// # Errors
     /// [`ServiceError`]; the server may have heard the request where [`ServiceError::may_have_run`] says so.

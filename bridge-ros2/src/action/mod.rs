@@ -21,6 +21,7 @@ mod server_handles;
 mod serving;
 mod types;
 mod wire;
+mod withdrawal;
 
 use messages::{ActionTypeHashes, Dialect, Registry, TypeName};
 use rustdds::policy::{Durability, History, ResourceLimits};

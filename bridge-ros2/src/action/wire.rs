@@ -129,12 +129,12 @@ pub(super) fn status_array(goals: &[(GoalInfo, Status)]) -> Bytes {
 }
 
 /// `action_msgs/GoalStatusArray`, without goals whose status is none.
-pub(super) fn read_status_array(message: &[u8]) -> Result<Vec<(GoalId, Status)>, Malformed> {
+pub(super) fn read_status_array(message: &[u8]) -> Result<Vec<(GoalInfo, Status)>, Malformed> {
     let goals = CdrReader::new(message)?.sequence(|reader| {
         let info = read_info(reader)?;
-        Ok((info.id, Status::from_code(read_code(reader)?)))
+        Ok((info, Status::from_code(read_code(reader)?)))
     })?;
-    let known = |(id, status): (GoalId, Option<Status>)| Some((id, status?));
+    let known = |(info, status): (GoalInfo, Option<Status>)| Some((info, status?));
     Ok(goals.into_iter().filter_map(known).collect())
 }
 
@@ -292,7 +292,7 @@ mod tests {
         assert_eq!(bytes.len(), 4 + 4 + 25 + 28);
         assert_eq!(
             read_status_array(&bytes),
-            Ok(vec![(SEVEN, Status::Executing), (SEVEN, Status::Aborted)])
+            Ok(vec![(info, Status::Executing), (info, Status::Aborted)])
         );
         assert_eq!(read_status_array(&bytes[..30]), Err(Malformed));
         assert_eq!(

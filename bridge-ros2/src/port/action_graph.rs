@@ -155,6 +155,11 @@ impl SentGoal for Goal {
                     debug!(%goal, count, "feedback gave way to newer one");
                     continue;
                 }
+                action::GoalEvent::Overdue(limit) => GoalEvent::Overdue(format!(
+                    "the action server has not decided about the goal within {limit:?}; it is cancelled as soon as it \
+                     is accepted"
+                )),
+                action::GoalEvent::CancelRefused => GoalEvent::CancelRefused,
                 action::GoalEvent::Ended(outcome) => ended(outcome),
             };
             return Some(event);

@@ -169,13 +169,23 @@ impl ServiceClient {
         &self,
         request: Bytes,
         endpoint: Option<GUID>,
-    ) -> Result<Answer, ServiceError> {
-        let phase = Arc::new(AtomicU8::new(CallPhase::Queue.into()));
+    ) -> Result<Replied, ServiceError> {
+        let recall = Recall::default();
+        self.call_recallable(request, endpoint, &recall).await
+    }
+
+    /// The same, for a request that can be [recalled](Recall::recall) until it is sent.
+    pub(crate) async fn call_recallable(
+        &self,
+        request: Bytes,
+        endpoint: Option<GUID>,
+        Recall(phase): &Recall,
+    ) -> Result<Replied, ServiceError> {
         let (done, reply) = oneshot::channel();
         let call = Call {
             request,
             companion: endpoint.map(|endpoint| (endpoint, Instant::now() + COMPANION)),
-            phase: Arc::clone(&phase),
+            phase: Arc::clone(phase),
             done,
         };
         let at = || CallPhase::from(phase.load(Ordering::Relaxed));
@@ -217,9 +227,30 @@ impl ServiceClient {
     }
 }
 
+/// Takes a request back that is not sent yet.
+#[derive(Debug)]
+pub(crate) struct Recall(Arc<AtomicU8>);
+
+impl Default for Recall {
+    fn default() -> Self {
+        Self(Arc::new(AtomicU8::new(CallPhase::Queue.into())))
+    }
+}
+
+impl Recall {
+    /// Keeps the request from being sent. Returns false if it was sent, or is being sent.
+    pub(crate) fn recall(&self) -> bool {
+        let before = |phase: u8| (phase < CallPhase::Request.into()).then_some(RECALLED);
+        let moved = self
+            .0
+            .fetch_update(Ordering::AcqRel, Ordering::Acquire, before);
+        moved.is_ok() || self.0.load(Ordering::Acquire) == RECALLED
+    }
+}
+
 /// What a server replied, and the writer it came from.
 #[derive(Debug)]
-pub(crate) struct Answer {
+pub(crate) struct Replied {
     pub(crate) reply: Bytes,
     pub(crate) writer: GUID,
 }
@@ -230,12 +261,17 @@ struct Call {
     /// An endpoint of the participant that is to be among the servers, and until when that is waited for.
     companion: Option<(GUID, Instant)>,
     phase: Arc<AtomicU8>,
-    done: oneshot::Sender<Result<Answer, Failure>>,
+    done: oneshot::Sender<Result<Replied, Failure>>,
 }
 
 impl Call {
-    fn enter(&self, phase: CallPhase) {
-        self.phase.store(phase.into(), Ordering::Relaxed);
+    /// Returns false if the request was recalled: it is not to be sent.
+    fn enter(&self, phase: CallPhase) -> bool {
+        let moved = |now: u8| (now != RECALLED).then_some(phase.into());
+        let entered = self
+            .phase
+            .fetch_update(Ordering::AcqRel, Ordering::Acquire, moved);
+        entered.is_ok()
     }
 
     /// Whether to ask those servers now.
@@ -248,7 +284,7 @@ impl Call {
         })
     }
 
-    fn end(self, result: Result<Answer, Failure>) {
+    fn end(self, result: Result<Replied, Failure>) {
         // Who gave the call up does not listen.
         drop(self.done.send(result));
     }
@@ -336,7 +372,9 @@ impl Driver {
             call.end(Err(Failure::Busy));
             return;
         }
-        call.enter(CallPhase::Discovery);
+        if !call.enter(CallPhase::Discovery) {
+            return;
+        }
         self.waiting.push_back(call);
         let now = Instant::now();
         if self.looked.is_none_or(|looked| looked + FRESH <= now) {
@@ -390,12 +428,12 @@ impl Driver {
             && may_ask(self.asked.values().rev().map(|asked| asked.since), now)
             && let Some(call) = self.next_call(now)
         {
-            if call.done.is_closed() {
+            if call.done.is_closed() || !call.enter(CallPhase::Request) {
                 // Whoever called has given it up.
                 continue;
             }
-            call.enter(CallPhase::Request);
             if let Some(unsent) = self.ask(call, &servers, now) {
+                let _recalled = !unsent.enter(CallPhase::Discovery);
                 self.waiting.push_front(unsent);
                 return;
             }
@@ -460,7 +498,7 @@ impl Driver {
         if keys.is_empty() {
             return Some(call);
         }
-        call.enter(CallPhase::Answer);
+        let _is_sent = call.enter(CallPhase::Answer);
         for key in &keys {
             self.keys.insert(*key, self.count);
         }
@@ -518,7 +556,7 @@ impl Driver {
             && let Some(asked) = self.keys.get(&key).and_then(|id| self.asked.remove(id))
         {
             self.forget_keys(&asked.keys);
-            asked.call.end(Ok(Answer { reply, writer }));
+            asked.call.end(Ok(Replied { reply, writer }));
             if !self.waiting.is_empty() {
                 self.ask_waiting(Instant::now());
             }
@@ -568,5 +606,7 @@ enum Unsent {
 
 /// How long a call waits for a certain server. What the others know it asks them then.
 const COMPANION: Duration = Duration::from_secs(5);
+/// Of a request that was taken back before it was sent; no [`CallPhase`].
+const RECALLED: u8 = u8::MAX;
 /// Calls that may wait to be taken; more wait in [`ServiceClient::call`].
 const QUEUE: usize = 64;

@@ -29,6 +29,7 @@ pub use self::peers::ServicePeers;
 pub use self::server::{ServiceCounters, ServiceOptions, ServiceRequest, ServiceServer};
 
 pub(crate) use self::audience::Audience;
+pub(crate) use self::client::{Recall, Replied};
 pub(crate) use self::mapping::Received;
 pub(crate) use self::opening::Opening;
 pub(crate) use self::peers::{Snapshot, action_type, service_type};

@@ -2,7 +2,7 @@
 //!
 //! A goal resets a skill that is Halted: who sends goals knows no Reset, and every run ends in Halted that does not succeed.
 
-use std::collections::VecDeque;
+use std::collections::{HashMap, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -77,7 +77,7 @@ impl Reporter {
 impl Observer for Reporter {
     fn told(&self, what: Told<'_>, shown: &Shown) {
         let heard = match what {
-            Told::Transition(_) | Told::Step => stands(shown, false),
+            Told::Transition(_) | Told::Step | Told::Pending(_) => stands(shown, false),
             Told::Progress => stands(shown, true),
             Told::Outcome(outcome) => Heard::Ended(Arc::new(outcome.clone())),
             Told::Parameters(_) | Told::Called => return,
@@ -110,7 +110,22 @@ fn stands(shown: &Shown, passing: bool) -> Heard {
 pub(crate) struct Doer {
     skill: Executor,
     reporter: Reporter,
-    current: Arc<Mutex<Option<Current>>>,
+    doing: Arc<Mutex<Doing>>,
+}
+
+/// The goals of a skill.
+#[derive(Debug, Default)]
+struct Doing {
+    current: Option<Current>,
+    /// Goals whose runs are about to begin, and whether each is cancelled meanwhile.
+    beginning: HashMap<GoalId, bool>,
+}
+
+impl Doing {
+    /// A run has begun or failed to begin. Returns true if its goal was cancelled meanwhile.
+    fn begun(&mut self, id: GoalId) -> bool {
+        self.beginning.remove(&id).unwrap_or_default()
+    }
 }
 
 /// The goal whose run is the newest of those that goals began.
@@ -126,7 +141,7 @@ impl Doer {
         Self {
             skill,
             reporter,
-            current: Arc::default(),
+            doing: Arc::default(),
         }
     }
 }
@@ -138,16 +153,32 @@ impl ActionClient for Doer {
         // Before it begins: nothing of it is missed.
         let heard = self.reporter.0.subscribe();
         let (skill, body) = (self.skill.clone(), body.to_vec());
-        let current = Arc::clone(&self.current);
+        let doing = Arc::clone(&self.doing);
+        lock(&doing).beginning.insert(id, false);
         let begun = tokio::spawn(async move {
-            let run = begin(&skill, &body).await?;
-            let cancelled = false;
-            *lock(&current) = Some(Current { id, run, cancelled });
-            Ok(run)
+            if lock(&doing).beginning.get(&id) == Some(&true) {
+                lock(&doing).begun(id);
+                return Err("the goal was cancelled before its run began".to_owned());
+            }
+            let run = begin(&skill, &body).await;
+            let cancelled = {
+                let mut doing = lock(&doing);
+                let cancelled = doing.begun(id);
+                if let Ok(run) = &run {
+                    let run = *run;
+                    doing.current = Some(Current { id, run, cancelled });
+                }
+                cancelled
+            };
+            if cancelled && run.is_ok() {
+                // The end of the run tells whether it could be halted.
+                let _halted = skill.call(OWNER, Method::Halt).await;
+            }
+            run
         });
         Sent {
             skill: self.skill.clone(),
-            current: Arc::clone(&self.current),
+            doing: Arc::clone(&self.doing),
             heard,
             stage: Stage::Begins(begun),
             events: VecDeque::new(),
@@ -169,8 +200,22 @@ impl ActionClient for Doer {
             CancelWhat::Goal(id) => current.id == id,
         };
         let open = {
-            let mut current = lock(&self.current);
-            let current = current.as_mut().filter(|current| wanted(current));
+            let mut doing = lock(&self.doing);
+            let beginning = doing.beginning.iter_mut();
+            let meant = beginning.filter(|(id, _)| match what {
+                CancelWhat::All => true,
+                CancelWhat::Goal(wanted) => **id == wanted,
+            });
+            let goals: Vec<GoalId> = meant
+                .map(|(id, cancelled)| {
+                    *cancelled = true;
+                    *id
+                })
+                .collect();
+            if !goals.is_empty() {
+                return Ok(CancelAnswer { code: NONE, goals });
+            }
+            let current = doing.current.as_mut().filter(|current| wanted(current));
             let open = current.filter(|current| self.skill.outcome(current.run).is_none());
             open.map(|current| {
                 current.cancelled = true;
@@ -191,8 +236,8 @@ impl ActionClient for Doer {
             Err(_) if self.skill.outcome(open.run).is_some() => none(TERMINATED),
             Err(_) => {
                 // It goes on.
-                let mut current = lock(&self.current);
-                if let Some(current) = current.as_mut().filter(|now| now.run == open.run) {
+                let mut doing = lock(&self.doing);
+                if let Some(current) = doing.current.as_mut().filter(|now| now.run == open.run) {
                     current.cancelled = false;
                 }
                 none(REJECTED)
@@ -208,7 +253,14 @@ async fn begin(skill: &Executor, body: &[u8]) -> Result<u32, String> {
     // Looked at before anything moves; Start looks again.
     let complete = Parameters::complete(&skill.facts().parameters, given.clone());
     complete.map_err(|refusal| refusal.to_string())?;
-    if skill.shown().state == State::Halted {
+    let shown = skill.shown();
+    if shown.needs_reset {
+        return Err(format!(
+            "BadInvalidState: the outcome of run {} is unknown; Reset makes the skill ready",
+            shown.run
+        ));
+    }
+    if shown.state == State::Halted {
         skill.call(OWNER, Method::Reset).await?;
     }
     skill.start_with(OWNER, given).await
@@ -239,7 +291,7 @@ fn parameters(facts: &Facts, body: &[u8]) -> Result<Vec<(String, Value)>, String
 #[derive(Debug)]
 pub(crate) struct Sent {
     skill: Executor,
-    current: Arc<Mutex<Option<Current>>>,
+    doing: Arc<Mutex<Doing>>,
     heard: broadcast::Receiver<Heard>,
     stage: Stage,
     events: VecDeque<GoalEvent>,
@@ -375,7 +427,7 @@ impl Sent {
     }
 
     fn is_cancelled(&self, run: u32) -> bool {
-        let current = *lock(&self.current);
+        let current = lock(&self.doing).current;
         current.is_some_and(|of| of.run == run && of.cancelled)
     }
 

@@ -1,9 +1,9 @@
 //! The local side of a component: its OPC UA server and skills, with values and calls of the space.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::num::NonZeroU16;
 use std::path::PathBuf;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use bridge_node::actions::OwnActions;
@@ -70,6 +70,8 @@ pub struct ComponentPort {
     asking: Asking,
     /// As the group is told.
     application: Application,
+    /// The skills that are being halted for the end of the component.
+    closing: Arc<Mutex<BTreeSet<String>>>,
 }
 
 impl ComponentPort {
@@ -144,6 +146,7 @@ impl ComponentPort {
             _looks: looks,
             asking,
             application,
+            closing: Arc::default(),
         })
     }
 
@@ -260,6 +263,32 @@ impl Port for ComponentPort {
         Vec::new()
     }
 
+    fn closing(&mut self) {
+        for skill in self.server.skills() {
+            let (skill, closing) = (skill.clone(), Arc::clone(&self.closing));
+            let name = skill.facts().name.clone();
+            lock(&closing).insert(name.clone());
+            drop(tokio::spawn(async move {
+                skill.close().await;
+                lock(&closing).remove(&name);
+            }));
+        }
+    }
+
+    fn pending(&self) -> Vec<String> {
+        let closing = lock(&self.closing);
+        let pending = self.server.skills().iter().filter_map(|skill| {
+            let (shown, name) = (skill.shown(), &skill.facts().name);
+            match &shown.pending {
+                Some(why) => Some(format!("{name}, run {}: {why}", shown.run)),
+                None => closing
+                    .contains(name)
+                    .then(|| format!("{name}, run {}: it is halted", shown.run)),
+            }
+        });
+        pending.collect()
+    }
+
     async fn shutdown(self) {
         let leaving = async {
             if let Some(announced) = self.announced {
@@ -297,6 +326,10 @@ pub fn check(component: &Component, options: &Options) -> Result<(), Failure> {
         server.stop().await;
         Ok(())
     })
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// The number of the first run of a component that starts now: above all that it had before, if it ran fewer than 62 a second

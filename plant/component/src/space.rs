@@ -422,7 +422,7 @@ impl Observer for Speaker {
                 self.event(happened);
                 self.state(shown, false);
             }
-            Told::Step => self.state(shown, false),
+            Told::Step | Told::Pending(_) => self.state(shown, false),
             Told::Progress => {
                 let mut progressed = self
                     .progressed

@@ -1,6 +1,8 @@
 //! A skill whose work a call or an action of the space does: of ROS, of another component, of a server.
 
 use std::hash::{BuildHasher as _, RandomState};
+use std::pin::pin;
+use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use async_trait::async_trait;
@@ -13,7 +15,7 @@ use skills::{
     Asked, Builtin, Component, Driver, DriverSetup, Parameters, Results, Shape, SpaceWork, Stopped,
     Value, Work,
 };
-use tokio::time::{sleep, timeout};
+use tokio::time::sleep;
 use uadp::{BuiltinType, Fields};
 
 use crate::asking::{Asking, Asks};
@@ -32,7 +34,7 @@ pub(crate) fn with_drivers(component: &Component, asking: &mut Asking) -> Compon
                 topic,
                 asks: asking.asks(topic),
             };
-            skill.driver = DriverSetup::Given(std::sync::Arc::new(driver));
+            skill.driver = DriverSetup::Given(Arc::new(driver));
         }
     }
     component
@@ -47,101 +49,211 @@ struct SpaceDriver {
 
 #[async_trait]
 impl Driver for SpaceDriver {
+    fn halt_timeout(&self) -> Option<Duration> {
+        Some(self.work.halt_timeout)
+    }
+
     async fn run(&self, work: Work) -> Result<Results, String> {
         match self.work.asked {
-            Asked::Call => {
-                tokio::select! {
-                    // What is asked is executed all the same: a call cannot be cancelled.
-                    () = work.stopped() => Err(Stopped.into()),
-                    done = self.call(&work) => done,
-                }
-            }
+            Asked::Call => self.call(&work).await,
             Asked::Action => self.act(&work).await,
         }
     }
 }
 
+/// Why a goal was not accepted.
+enum NotSent {
+    /// It never ran.
+    Never(String),
+    /// It may run, or may run later.
+    Unknown(String),
+}
+
 impl SpaceDriver {
     async fn call(&self, work: &Work) -> Result<Results, String> {
-        let call = self.asks.known(self.topic, self.work.within).await?;
+        let call = tokio::select! {
+            () = work.stopped() => return Err(Stopped.into()),
+            call = self.asks.known(self.topic, self.work.within) => call?,
+        };
         let request = self.request(&call.request, work.parameters(), None)?;
         work.step("Asked").await;
-        let answer = self.asks.ask(self.topic, request, self.work.within).await;
+        let mut asked = pin!(self.asks.ask(self.topic, request, self.work.within));
+        let answer = tokio::select! {
+            answer = &mut asked => answer,
+            () = work.stopped() => {
+                work.pending(format!(
+                    "cancellation pending: the call {} cannot be cancelled, and its answer is awaited",
+                    self.topic
+                ))
+                .await;
+                asked.await
+            }
+        };
+        if let Err(fault) = &answer
+            && is_unknown(fault.as_ref())
+        {
+            work.unknown(why(fault.clone())).await;
+        }
         let answer = read(&answer.map_err(why)?, &call.response)?;
         self.outcome(&answer, "", work.parameters())
     }
 
     async fn act(&self, work: &Work) -> Result<Results, String> {
         let id = new_id();
+        let sending = OnceLock::new();
         let sent = tokio::select! {
-            () = work.stopped() => None,
-            sent = self.send(work, id) => Some(sent),
+            () = work.stopped() => Err(NotSent::Unknown(Stopped.to_string())),
+            sent = self.send(work, id, &sending) => sent,
         };
-        let Some(sent) = sent else {
-            // It may have been accepted.
-            if let Ok(goal) = self.asks.known(self.topic, Duration::ZERO).await
-                && let CallRole::Goal(family) = goal.role
-                && let Ok(cancel) = self.part(family.cancel)
-            {
-                self.cancel(cancel, id).await;
+        // Without it no request is on its way.
+        let action = sending.get();
+        let action = match (sent, action) {
+            (Ok(()), Some(action)) => action,
+            (Err(NotSent::Unknown(why)), Some(action)) => {
+                // It may have been accepted, or may be later.
+                return self.withdraw(work, action, (id, &why)).await;
             }
-            return Err(Stopped.into());
+            (Err(NotSent::Never(why) | NotSent::Unknown(why)), _) => return Err(why),
+            (Ok(()), None) => return Err(format!("{} has no parts", self.topic)),
         };
-        let action = sent?;
         work.step("Accepted").await;
         let result = tokio::select! {
             () = work.stopped() => None,
-            result = self.result(&action, id) => Some(result),
+            result = self.result(action, id) => Some(result),
         };
-        let Some(result) = result else {
-            let stands = async {
-                self.cancel(action.cancel, id).await;
-                self.result(&action, id).await
-            };
-            // What moves is at a stand when the goal has ended.
-            return match timeout(STANDS_WITHIN, stands).await {
-                Ok(_) => Err(Stopped.into()),
-                Err(_) => Err(format!(
-                    "stopped; whether {} has cancelled the goal is not known",
-                    self.topic
-                )),
-            };
+        let answer = match result {
+            None => {
+                let stopped = Stopped.to_string();
+                return self.withdraw(work, action, (id, &stopped)).await;
+            }
+            Some(Err(why)) => {
+                work.unknown(why.clone()).await;
+                return Err(why);
+            }
+            Some(Ok(answer)) => answer,
         };
-        let answer = result?;
-        let message = text(&answer, "message");
-        let ended = |how: &str| match message.is_empty() {
-            true => Err(format!("the goal was {how}")),
-            false => Err(format!("the goal was {how}: {message}")),
-        };
-        match field(&answer, "status").and_then(Json::as_i64) {
-            Some(SUCCEEDED) => self.outcome(&answer, "result.", work.parameters()),
-            Some(CANCELED) => ended("cancelled by somebody else"),
-            Some(ABORTED) => ended("aborted"),
-            Some(_) | None => Err(format!("{} has lost the goal", self.topic)),
+        match End::of(&answer) {
+            End::Succeeded => self.outcome(&answer, "result.", work.parameters()),
+            End::Canceled => Err(end("cancelled by somebody else", &answer)),
+            End::Aborted => Err(end("aborted", &answer)),
+            End::NeverRan => Err(end("rejected", &answer)),
+            End::Unknown => {
+                let why = self.lost(&answer);
+                work.unknown(why.clone()).await;
+                Err(why)
+            }
         }
     }
 
-    /// Sends the goal: it is accepted then.
-    async fn send(&self, work: &Work, id: [u8; 16]) -> Result<Action, String> {
-        let goal = self.asks.known(self.topic, self.work.within).await?;
+    /// Cancels the goal until its end is known.
+    async fn withdraw(
+        &self,
+        work: &Work,
+        action: &Action,
+        (id, why): ([u8; 16], &str),
+    ) -> Result<Results, String> {
+        work.pending(format!(
+            "cancellation pending: the goal at {} has not ended",
+            self.topic
+        ))
+        .await;
+        let ended = async {
+            loop {
+                let why = match self.result(action, id).await {
+                    Ok(answer) => match End::of(&answer) {
+                        End::Unknown => self.lost(&answer),
+                        End::Succeeded | End::Canceled | End::Aborted | End::NeverRan => {
+                            return Ok(answer);
+                        }
+                    },
+                    Err(why) => why,
+                };
+                work.unknown(why.clone()).await;
+                // After Halt, the skill stays Running until its client knows that the outcome is unknown.
+                if !work.is_stopped() {
+                    return Err(why);
+                }
+                sleep(ASK_AGAIN).await;
+            }
+        };
+        let cancels = async {
+            loop {
+                if self.cancel(action, id).await == Some(REJECTED) {
+                    work.cancel_refused(format!(
+                        "the executor of {} refuses to cancel the goal, which goes on",
+                        self.topic
+                    ))
+                    .await;
+                }
+                sleep(ASK_AGAIN).await;
+            }
+        };
+        let answer = tokio::select! {
+            answer = ended => answer?,
+            never = cancels => never,
+        };
+        let why = |how: &str| match why == Stopped.to_string() {
+            true => why.to_owned(),
+            false => format!("{why}; {}", end(how, &answer)),
+        };
+        match End::of(&answer) {
+            End::Succeeded => self.outcome(&answer, "result.", work.parameters()),
+            End::Canceled => Err(why("cancelled")),
+            End::NeverRan => Err(why("rejected")),
+            End::Aborted | End::Unknown => Err(why("aborted")),
+        }
+    }
+
+    fn lost(&self, answer: &Answer) -> String {
+        format!(
+            "the executor of {} has lost the goal, whose end is unknown: {}",
+            self.topic,
+            text(answer, "message")
+        )
+    }
+
+    /// Sends the goal: it is accepted then. Notes when the request is on its way.
+    async fn send(
+        &self,
+        work: &Work,
+        id: [u8; 16],
+        sending: &OnceLock<Action>,
+    ) -> Result<(), NotSent> {
+        let never = NotSent::Never;
+        let goal = self.asks.known(self.topic, self.work.within).await;
+        let goal = goal.map_err(never)?;
+        let action = self.action(self.work.within).await.map_err(never)?;
+        let request = self.request(&goal.request, work.parameters(), Some(id));
+        let request = request.map_err(never)?;
+        work.step("Sent").await;
+        let _is_first = sending.set(action).is_ok();
+        let answer = self.asks.ask(self.topic, request, self.work.within).await;
+        let answer = answer.map_err(|fault| match is_unknown(fault.as_ref()) {
+            true => NotSent::Unknown(why(fault)),
+            false => NotSent::Never(why(fault)),
+        })?;
+        let answer = read(&answer, &goal.response).map_err(NotSent::Unknown)?;
+        if field(&answer, "accepted") != Some(&true.into()) {
+            return Err(NotSent::Never(format!(
+                "the goal is rejected: {}",
+                text(&answer, "message")
+            )));
+        }
+        Ok(())
+    }
+
+    /// The calls that cancel goals of the action and wait for their results, once somebody executes them.
+    async fn action(&self, within: Duration) -> Result<Action, String> {
+        let goal = self.asks.known(self.topic, within).await?;
         let CallRole::Goal(family) = goal.role else {
             return Err(format!("{} is a call and no action", self.topic));
         };
         let (cancel, result) = (self.part(family.cancel)?, self.part(family.result)?);
-        let described = self.asks.known(result, self.work.within).await?;
-        self.asks.known(cancel, self.work.within).await?;
-        let request = self.request(&goal.request, work.parameters(), Some(id))?;
-        work.step("Sent").await;
-        let answer = self.asks.ask(self.topic, request, self.work.within).await;
-        let answer = read(&answer.map_err(why)?, &goal.response)?;
-        if field(&answer, "accepted") != Some(&true.into()) {
-            return Err(format!(
-                "the goal is rejected: {}",
-                text(&answer, "message")
-            ));
-        }
+        let described = self.asks.known(result, within).await?;
+        let cancels = self.asks.known(cancel, within).await?;
         Ok(Action {
             cancel,
+            cancels,
             result,
             described,
         })
@@ -176,11 +288,14 @@ impl SpaceDriver {
         }
     }
 
-    async fn cancel(&self, cancel: TopicId, id: [u8; 16]) {
+    /// Asks to cancel the goal. Returns the code of `action_msgs/CancelGoal`, or `None` without an answer.
+    async fn cancel(&self, action: &Action, id: [u8; 16]) -> Option<i64> {
         let no_time = [&[DATE_TIME][..], &UNIX_EPOCH.to_le_bytes()].concat();
         let request = Bytes::from(block(&[bytes(&id), no_time]));
-        // What it is answered is of no interest: whether the goal ends is.
-        drop(self.asks.ask(cancel, request, CANCEL_WITHIN).await);
+        let answer = self.asks.ask(action.cancel, request, CANCEL_WITHIN).await;
+        let answer = read(&answer.ok()?, &action.cancels.response).ok()?;
+        let (_, code) = answer.first()?;
+        code.as_i64()
     }
 
     /// The request: what the YAML says of its fields, the parameters of their names, and nothing in the others.
@@ -280,8 +395,49 @@ impl SpaceDriver {
 /// An action whose goal was accepted.
 struct Action {
     cancel: TopicId,
+    cancels: Arc<CallDescription>,
     result: TopicId,
-    described: std::sync::Arc<CallDescription>,
+    described: Arc<CallDescription>,
+}
+
+/// How a goal ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum End {
+    Succeeded,
+    Canceled,
+    Aborted,
+    /// It was rejected, or not sent.
+    NeverRan,
+    Unknown,
+}
+
+impl End {
+    fn of(answer: &Answer) -> Self {
+        match field(answer, "status").and_then(Json::as_i64) {
+            Some(4) => Self::Succeeded,
+            Some(5) => Self::Canceled,
+            Some(6) => Self::Aborted,
+            Some(-1) => Self::NeverRan,
+            Some(_) | None => Self::Unknown,
+        }
+    }
+}
+
+/// How a goal ended, for people: what its server says, and otherwise how.
+fn end(how: &str, answer: &Answer) -> String {
+    let message = text(answer, "message").trim();
+    let fields = answer.iter();
+    let texts = fields.filter_map(|(name, value)| Some((name.as_str(), value.as_str()?)));
+    let message = Some(message).filter(|message| !message.is_empty());
+    match message.or_else(|| messages::reason_of(texts)) {
+        None => format!("the goal was {how}"),
+        Some(message) => format!("the goal was {how}: {message}"),
+    }
+}
+
+/// Whether what was asked for may have been executed, or may be later.
+fn is_unknown(fault: Option<&AskError>) -> bool {
+    fault.is_none_or(|fault| fault.kind == AskErrorKind::Unknown)
 }
 
 /// The fields of an answer, as far as a skill has values of their types.
@@ -489,14 +645,12 @@ const GOAL_ID: &str = "goal_id";
 /// How long a request for a result is held at a time.
 const RESULT_WITHIN: Duration = Duration::from_secs(30);
 const CANCEL_WITHIN: Duration = Duration::from_secs(4);
-/// A driver is dropped a second after Halt.
-const STANDS_WITHIN: Duration = Duration::from_millis(900);
+/// Before a goal is cancelled once more.
+const ASK_AGAIN: Duration = Duration::from_millis(500);
 /// Before it is asked anew.
 const PAUSE: Duration = Duration::from_millis(200);
-/// As `action_msgs/GoalStatus` has them.
-const SUCCEEDED: i64 = 4;
-const CANCELED: i64 = 5;
-const ABORTED: i64 = 6;
+/// `action_msgs/CancelGoal`, ERROR_REJECTED.
+const REJECTED: i64 = 1;
 /// EncodingMasks of OPC 10000-6, 5.2.2.16.
 const NULL: u8 = 0;
 const ARRAY: u8 = 0x80;

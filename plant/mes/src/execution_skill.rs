@@ -2,9 +2,10 @@
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
 
 use async_trait::async_trait;
-use skills::{Driver, Parameters, Results, Teller, Value, Work};
+use skills::{COMPOSITE_HALT_TIMEOUT, Driver, Parameters, Results, Teller, Value, Work};
 
 use crate::cell::Cell;
 use crate::execute::{Plant, dry_run, execute};
@@ -18,6 +19,11 @@ pub(crate) struct ExecuteProcess {
 
 #[async_trait]
 impl Driver for ExecuteProcess {
+    /// Halt waits for the skills that the work is done with.
+    fn halt_timeout(&self) -> Option<Duration> {
+        Some(COMPOSITE_HALT_TIMEOUT)
+    }
+
     fn check(&self, parameters: &Parameters) -> Result<(), String> {
         let iri = parameters.text("ProcessIri").unwrap_or_default();
         if self.cell.process(iri).is_none() {

@@ -14,7 +14,7 @@ use tokio::time::{Instant, sleep_until, timeout};
 use tracing::{debug, info, warn};
 
 use crate::authority::{Authority, Owner};
-use crate::driver::{Driver, Line, Reins, Results, Signal, Work};
+use crate::driver::{Driver, Line, Reins, Results, Signal, Stopped, Work};
 use crate::parameters::Parameters;
 use crate::refusal::{Code, Refusal};
 use crate::shown::{Diagnostic, LastCall, Observer, Outcome, Shown, Told, Transitioned};
@@ -80,6 +80,28 @@ struct Running {
     left: Option<Duration>,
     /// How it ended, while that cannot be told: what is suspended ends only when it is resumed.
     ended: Option<Result<Results, String>>,
+    /// It was told to stop, is done elsewhere, and its end is awaited.
+    halting: Option<Halting>,
+    /// Why its end is not known, and may never be.
+    unknown: Option<String>,
+}
+
+/// The way of a run that is done elsewhere to its end, after it was told to stop.
+struct Halting {
+    /// Who had it stopped, for people.
+    message: String,
+    then: Then,
+    /// From when on a second Halt ends the run with an unknown outcome.
+    over: Instant,
+}
+
+/// The transition after the end of a run that was told to stop.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Then {
+    /// To Halted, whatever it came to.
+    Halt,
+    /// As every end of a run, which has failed where its work is not done.
+    End,
 }
 
 type Store = (Arc<Mutex<Pending>>, Arc<Mutex<VecDeque<Arc<Outcome>>>>);
@@ -106,6 +128,8 @@ impl Actor {
             step: String::new(),
             parameters: Arc::default(),
             outcome: None,
+            pending: None,
+            needs_reset: false,
             diagnostic: Diagnostic {
                 created,
                 last_call: None,
@@ -158,10 +182,35 @@ impl Actor {
     }
 
     async fn close(&mut self) {
-        if self.program.is_executable(Method::Halt)
-            && let Err(refusal) = self.halt("the end of the component").await
-        {
+        if !self.program.is_executable(Method::Halt) {
+            return;
+        }
+        if let Err(refusal) = self.halt("the end of the component").await {
             warn!(skill = self.facts.name, "{refusal}");
+        }
+        if self.is_halting().is_none() {
+            return;
+        }
+        // The run loop of the component carries what is asked of others meanwhile.
+        let ended = timeout(PENDING_AT_END, async {
+            while self.work.is_some() {
+                match happens(&mut self.work).await {
+                    Happened::Line(line) => self.line(line),
+                    Happened::Ended(result) => self.settle(result),
+                    Happened::Call(_) | Happened::Progress(_) | Happened::Late => {}
+                }
+            }
+        });
+        if ended.await.is_err() {
+            let run = self.now.run;
+            let why = self.now.pending.clone().unwrap_or_default();
+            warn!(
+                skill = self.facts.name,
+                run,
+                why,
+                "component ends with a pending cancellation: the outcome of the run is unknown"
+            );
+            self.give_up("the end of the component");
         }
     }
 
@@ -199,6 +248,13 @@ impl Actor {
         let is_running = self.program.state() == State::Running;
         let is_its_capability = method == Method::Suspend && is_running;
         let is_made_ready = given.readies && self.program.state() == State::Halted;
+        if is_made_ready && self.now.needs_reset {
+            let text = format!(
+                "the outcome of run {} is unknown; Reset makes the skill ready",
+                self.now.run
+            );
+            return Err(Refusal::new(Code::InvalidState, text));
+        }
         if !self.program.is_executable(method) && !is_its_capability && !is_made_ready {
             return Err(not_now(method, self.program.state()));
         }
@@ -274,6 +330,8 @@ impl Actor {
             deadline: within.map(|within| Instant::now() + within),
             left: None,
             ended: None,
+            halting: None,
+            unknown: None,
         });
         Ok(())
     }
@@ -297,7 +355,19 @@ impl Actor {
         let goes_on = matches!(self.program.state(), State::Running | State::Suspended);
         let mut message = format!("halted by {by}");
         if goes_on {
+            if let Some(over) = self.is_halting() {
+                if over {
+                    self.give_up(&message);
+                }
+                // Its cancellation is on its way.
+                return Ok(());
+            }
             match self.stop_work().await {
+                Stop::Pending => {
+                    self.await_end(message, Then::Halt);
+                    return Ok(());
+                }
+                Stop::Refused(why) => return Err(Refusal::new(Code::RequestNotAllowed, why)),
                 // It was done before it could be stopped.
                 Stop::Done(result) if self.program.state() == State::Running => {
                     self.settle(Ok(result))
@@ -333,8 +403,15 @@ impl Actor {
     async fn late(&mut self) {
         let within = self.work.as_ref().and_then(|work| work.within);
         let within = within.unwrap_or_default();
+        if let Some(work) = &mut self.work {
+            work.deadline = None;
+        }
         match self.stop_work().await {
             Stop::Done(result) => self.settle(Ok(result)),
+            Stop::Pending | Stop::Refused(_) => {
+                let message = format!("the work was not done within {within:?}");
+                self.await_end(message, Then::End);
+            }
             Stop::Stopped | Stop::BrokenOff(_) => {
                 let run = self.program.run();
                 let message = format!("the work was not done within {within:?}");
@@ -357,6 +434,9 @@ impl Actor {
             self.work = None;
             return ended.map_or(Stop::Stopped, Stop::Done);
         }
+        if self.driver.halt_timeout().is_some() {
+            return self.stop_elsewhere().await;
+        }
         if let Ok(ended) = timeout(TIME_TO_STOP, &mut work.task).await {
             let ended = outcome_of(ended);
             self.take_steps();
@@ -374,9 +454,139 @@ impl Actor {
         Stop::BrokenOff(how)
     }
 
+    /// Waits a moment for the end of work that is done elsewhere, which is never broken off.
+    async fn stop_elsewhere(&mut self) -> Stop {
+        let until = Instant::now() + TIME_TO_STOP;
+        loop {
+            let Some(work) = &mut self.work else {
+                return Stop::Stopped;
+            };
+            let happened = tokio::select! {
+                biased;
+                Some(line) = work.reins.steps.recv() => Happened::Line(line),
+                ended = &mut work.task => Happened::Ended(outcome_of(ended)),
+                () = sleep_until(until) => return Stop::Pending,
+            };
+            match happened {
+                Happened::Line(line) => {
+                    let refused = match &line {
+                        Line::Refused(why) => Some(why.clone()),
+                        Line::Step(_) | Line::Note(_) | Line::Pending(_) | Line::Unknown(_) => None,
+                    };
+                    self.line(line);
+                    if let Some(why) = refused {
+                        return Stop::Refused(why);
+                    }
+                }
+                Happened::Ended(ended) => {
+                    self.take_steps();
+                    if self
+                        .work
+                        .as_ref()
+                        .is_some_and(|work| work.unknown.is_some())
+                    {
+                        self.now.needs_reset = true;
+                    }
+                    self.work = None;
+                    return match ended {
+                        Ok(results) => Stop::Done(results),
+                        Err(why) if why == Stopped.to_string() => Stop::Stopped,
+                        Err(why) => Stop::BrokenOff(why),
+                    };
+                }
+                Happened::Call(_) | Happened::Progress(_) | Happened::Late => {}
+            }
+        }
+    }
+
+    /// Has the run go on until the end of its work is known.
+    fn await_end(&mut self, message: String, then: Then) {
+        let limit = self.driver.halt_timeout().unwrap_or_default();
+        let Some(work) = &mut self.work else {
+            return;
+        };
+        work.halting = Some(Halting {
+            message: message.clone(),
+            then,
+            over: Instant::now() + limit,
+        });
+        let why = self.now.pending.clone();
+        let why = why.unwrap_or_else(|| "cancellation pending: the work has not ended".to_owned());
+        info!(
+            skill = self.facts.name,
+            run = self.now.run,
+            "{message}; {why}"
+        );
+        self.pends(why);
+    }
+
+    /// Whether a Halt is on its way, and if so whether the next one ends the run with an unknown outcome.
+    fn is_halting(&self) -> Option<bool> {
+        let work = self.work.as_ref()?;
+        let halting = work.halting.as_ref()?;
+        Some(work.unknown.is_some() || halting.over <= Instant::now())
+    }
+
+    /// Ends a run whose work goes on elsewhere, or may: its outcome is unknown.
+    fn give_up(&mut self, message: &str) {
+        let Some(work) = self.work.take() else {
+            return;
+        };
+        work.task.abort();
+        let why = work.unknown.or_else(|| self.now.pending.clone());
+        let why = why.unwrap_or_else(|| "the work has not ended".to_owned());
+        let message = format!("{message}; the outcome is unknown: {why}");
+        warn!(skill = self.facts.name, run = self.now.run, "{message}");
+        self.now.needs_reset = true;
+        self.end_without_work(message.clone());
+        if let Err(refusal) = self.take(Method::Halt, &message) {
+            warn!(skill = self.facts.name, "{refusal}");
+        }
+    }
+
+    /// Shows why a run that was told to stop goes on.
+    fn pends(&mut self, why: String) {
+        self.now.step.clone_from(&why);
+        self.now.pending = Some(why.clone());
+        self.tell(Told::Pending(&why));
+    }
+
+    /// The work of a run that was told to stop has ended.
+    fn settle_halted(&mut self, halting: Halting, result: Result<Results, String>) {
+        let Halting { message, then, .. } = halting;
+        match (result, then) {
+            (Ok(results), then) => {
+                self.finish(Ok(results));
+                if then == Then::Halt
+                    && self.program.state() == State::Ready
+                    && let Err(refusal) = self.take(Method::Halt, &message)
+                {
+                    warn!(skill = self.facts.name, "{refusal}");
+                }
+            }
+            (Err(why), Then::End) => self.finish(Err(with(message, &why))),
+            (Err(why), Then::Halt) => {
+                let message = with(message, &why);
+                self.take_steps();
+                self.work = None;
+                self.end_without_work(message.clone());
+                if let Err(refusal) = self.take(Method::Halt, &message) {
+                    warn!(skill = self.facts.name, "{refusal}");
+                }
+            }
+        }
+    }
+
     /// The work has ended by itself.
     fn settle(&mut self, result: Result<Results, String>) {
         self.take_steps();
+        let work = self.work.as_mut();
+        if work.as_ref().is_some_and(|work| work.unknown.is_some()) {
+            self.now.needs_reset = true;
+        }
+        if let Some(halting) = work.and_then(|work| work.halting.take()) {
+            return self.settle_halted(halting, result);
+        }
         match (self.program.state(), &result) {
             (State::Running, _) | (State::Suspended, Err(_)) => self.finish(result),
             (State::Suspended, Ok(_)) => {
@@ -482,6 +692,10 @@ impl Actor {
         self.now.executable = Method::ALL.map(|method| self.program.is_executable(method));
         if matches!(transition.to, State::Halted | State::Ready) {
             self.now.step.clear();
+            self.now.pending = None;
+        }
+        if transition.to == State::Ready {
+            self.now.needs_reset = false;
         }
         if matches!(transition.from, State::Running | State::Suspended)
             && !matches!(transition.to, State::Running | State::Suspended)
@@ -499,7 +713,11 @@ impl Actor {
 
     fn line(&mut self, line: Line) {
         let text = match &line {
-            Line::Step(text) | Line::Note(text) => text,
+            Line::Step(text)
+            | Line::Note(text)
+            | Line::Pending(text)
+            | Line::Refused(text)
+            | Line::Unknown(text) => text,
         };
         if let Some(work) = &self.work
             && self.trace.len() < MOST_TRACED
@@ -508,9 +726,28 @@ impl Actor {
             let seconds = work.began.elapsed().as_secs_f64();
             self.trace.push(format!("{seconds:.3} {text}"));
         }
-        if let Line::Step(step) = line {
-            self.now.step = step;
-            self.tell(Told::Step);
+        match line {
+            Line::Step(step) => {
+                self.now.step = step;
+                self.tell(Told::Step);
+            }
+            Line::Note(_) => {}
+            Line::Pending(why) => self.pends(why),
+            Line::Refused(why) | Line::Unknown(why) if self.now.pending.as_ref() == Some(&why) => {}
+            Line::Refused(why) => {
+                warn!(skill = self.facts.name, run = self.now.run, "{why}");
+                if let Some(work) = &mut self.work {
+                    work.halting = None;
+                }
+                self.pends(why);
+            }
+            Line::Unknown(why) => {
+                warn!(skill = self.facts.name, run = self.now.run, "{why}");
+                if let Some(work) = &mut self.work {
+                    work.unknown = Some(why.clone());
+                }
+                self.pends(why);
+            }
         }
     }
 
@@ -562,6 +799,18 @@ enum Stop {
     Stopped,
     /// It did not.
     BrokenOff(String),
+    /// It is done elsewhere, and its end is not known yet.
+    Pending,
+    /// Whoever does it refuses to cancel it.
+    Refused(String),
+}
+
+/// The message of a run that was told to stop, with the reason that its work gave.
+fn with(message: String, why: &str) -> String {
+    match why == Stopped.to_string() {
+        true => message,
+        false => format!("{message}; {why}"),
+    }
 }
 
 /// The next thing that the work does. Pends where there is none.
@@ -645,5 +894,7 @@ const MOST_TRACED: usize = 256;
 const LONGEST_TRACED: usize = 240;
 /// Of refused calls of a skill one is told in this time, with the number of those before it that were not.
 const TOLD_EVERY: Duration = Duration::from_secs(1);
+/// How long the end of the component waits for work elsewhere that it has cancelled.
+const PENDING_AT_END: Duration = Duration::from_millis(4_500);
 /// The outcomes of so many runs can be asked for.
 const MOST_OUTCOMES: usize = 64;

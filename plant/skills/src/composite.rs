@@ -8,7 +8,7 @@ use tracing::{debug, warn};
 
 use crate::driver::{Driver, Results, Work};
 use crate::parameters::Parameters;
-use crate::runs::{Runs, SkillFault};
+use crate::runs::{COMPOSITE_HALT_TIMEOUT, Runs, SkillFault};
 use crate::value::Value;
 
 /// Skills of other components that together bring a thing from one place to another.
@@ -266,6 +266,11 @@ fn lost(skill: &dyn Runs, why: &str) -> String {
 
 #[async_trait]
 impl Driver for PickAndPlace {
+    /// Halt waits for the skills that the work is done with.
+    fn halt_timeout(&self) -> Option<Duration> {
+        Some(COMPOSITE_HALT_TIMEOUT)
+    }
+
     fn check(&self, parameters: &Parameters) -> Result<(), String> {
         job(parameters).map(drop)
     }

@@ -21,6 +21,13 @@ pub trait Driver: Send + Sync + 'static {
         false
     }
 
+    /// How long the end of work that is done elsewhere is waited for after Halt. Such work is never broken off before: the
+    /// skill stays Running until its end is known, and a second Halt after this time ends it with an unknown outcome. `None`
+    /// for work that is done here, which ends with its future.
+    fn halt_timeout(&self) -> Option<Duration> {
+        None
+    }
+
     /// Looks at parameters that fit the type, before anything moves.
     ///
     /// # Errors
@@ -36,7 +43,7 @@ pub trait Driver: Send + Sync + 'static {
     }
 
     /// Does the work of one run. It is told of Halt by [`Work::stopped`], and has a second to bring the machine to a stand;
-    /// then the future is dropped.
+    /// then the future is dropped, unless there is a [`halt_timeout`](Self::halt_timeout).
     ///
     /// # Errors
     /// Why the work is not done, for people.
@@ -59,6 +66,12 @@ pub(crate) enum Line {
     Step(String),
     /// Of a part of the step, for the trace only.
     Note(String),
+    /// The work was cancelled, and has not ended.
+    Pending(String),
+    /// Whoever does the work refuses to cancel it.
+    Refused(String),
+    /// How the work ends, or has ended, is not known.
+    Unknown(String),
 }
 
 /// The work was stopped by Halt, Reset, or the end of the program.
@@ -127,6 +140,27 @@ impl Work {
     /// Puts something that was done on the way into the trace of the run.
     pub async fn note(&self, what: impl Into<String>) {
         self.say(Line::Note(what.into())).await;
+    }
+
+    /// Reports that the work is being cancelled, and why it has not ended.
+    pub async fn pending(&self, why: impl Into<String>) {
+        self.say(Line::Pending(why.into())).await;
+    }
+
+    /// Reports that whoever does the work refuses to cancel it: the work goes on.
+    pub async fn cancel_refused(&self, why: impl Into<String>) {
+        self.say(Line::Refused(why.into())).await;
+    }
+
+    /// Reports that the end of the work is not known, and may never be. The skill is not started again before a Reset.
+    pub async fn unknown(&self, why: impl Into<String>) {
+        self.say(Line::Unknown(why.into())).await;
+    }
+
+    /// Whether the run is to end without its work being done.
+    #[must_use]
+    pub fn is_stopped(&self) -> bool {
+        *self.signal.borrow() == Signal::Stop
     }
 
     async fn say(&self, line: Line) {

@@ -37,7 +37,7 @@ pub use driver::{Driver, Results, Stopped, Work};
 pub use model::NAMESPACE;
 pub use parameters::{NoTypeName, Parameter, Parameters, TypeName};
 pub use refusal::{Code, Refusal};
-pub use runs::{LocalRun, Runs, SkillFault};
+pub use runs::{COMPOSITE_HALT_TIMEOUT, LocalRun, Runs, SkillFault};
 pub use shown::{Diagnostic, LastCall, Observer, Outcome, Shown, Told, Transitioned};
 pub use skill::{Facts, Skill};
 pub use value::{Builtin, Shape, Value};

@@ -23,6 +23,8 @@ pub enum Code {
     Shutdown,
     /// Too much waits already.
     TooManyOperations,
+    /// The executor of the work refuses the request.
+    RequestNotAllowed,
 }
 
 impl Code {
@@ -39,6 +41,7 @@ impl Code {
             Self::NotFound => "BadNotFound",
             Self::Shutdown => "BadShutdown",
             Self::TooManyOperations => "BadTooManyOperations",
+            Self::RequestNotAllowed => "BadRequestNotAllowed",
         }
     }
 
@@ -55,6 +58,7 @@ impl Code {
             Self::NotFound => 0x803E_0000,
             Self::Shutdown => 0x800C_0000,
             Self::TooManyOperations => 0x8010_0000,
+            Self::RequestNotAllowed => 0x80E4_0000,
         }
     }
 }

@@ -7,7 +7,7 @@ use async_trait::async_trait;
 use program::{Method, State};
 
 use crate::authority::Owner;
-use crate::refusal::Refusal;
+use crate::refusal::{Code, Refusal};
 use crate::shown::Outcome;
 use crate::skill::Skill;
 use crate::value::Value;
@@ -29,7 +29,8 @@ pub trait Runs: Send + Sync {
         within: Duration,
     ) -> Result<Outcome, SkillFault>;
 
-    /// Halts it, where it is anything but Halted.
+    /// Halts it, where it is anything but Halted, and waits until its run has ended: a run whose work is done elsewhere may go
+    /// on for a while.
     ///
     /// # Errors
     /// Why it may not have come to a stand.
@@ -92,7 +93,17 @@ impl Runs for LocalRun {
         parameters: Vec<(String, Value)>,
         within: Duration,
     ) -> Result<Outcome, SkillFault> {
-        if self.skill.shown().state == State::Halted {
+        let shown = self.skill.shown();
+        if shown.needs_reset {
+            return Err(SkillFault::Refused {
+                status: Code::InvalidState.name().to_owned(),
+                text: format!(
+                    "the outcome of run {} is unknown; Reset makes the skill ready",
+                    shown.run
+                ),
+            });
+        }
+        if shown.state == State::Halted {
             let reset = self.skill.call(self.by.clone(), Method::Reset).await;
             // One that was given up before may have come first.
             if self.skill.shown().state != State::Ready {
@@ -123,6 +134,23 @@ impl Runs for LocalRun {
         if self.skill.shown().state != State::Halted {
             self.skill.call(self.by.clone(), Method::Halt).await?;
         }
-        Ok(())
+        let mut watch = self.skill.watch();
+        let ended = watch.wait_for(|shown| matches!(shown.state, State::Ready | State::Halted));
+        match tokio::time::timeout(HALTS_WITHIN, ended).await {
+            Ok(_ended_or_gone) => Ok(()),
+            Err(_) => Err(goes_on(&self.name())),
+        }
     }
 }
+
+/// Why a skill that was told to halt may not have come to a stand.
+pub(crate) fn goes_on(name: &str) -> SkillFault {
+    SkillFault::Unexpected(format!(
+        "{name} was told to halt, and its run has not ended within {HALTS_WITHIN:?}: whether it moves is unknown"
+    ))
+}
+
+/// How long the end of a run that was told to halt is waited for.
+pub(crate) const HALTS_WITHIN: Duration = Duration::from_secs(10);
+/// How long after Halt a composite waits for the ends of the runs that it is made of.
+pub const COMPOSITE_HALT_TIMEOUT: Duration = Duration::from_secs(12);

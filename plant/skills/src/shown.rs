@@ -31,6 +31,10 @@ pub struct Shown {
     pub outcome: Option<Arc<Outcome>>,
     /// Who did what last.
     pub diagnostic: Diagnostic,
+    /// Why a run that is being cancelled has not ended.
+    pub pending: Option<String>,
+    /// The outcome of the newest run is unknown: only a Reset makes the skill ready.
+    pub needs_reset: bool,
     /// For each of [`Method::ALL`] whether a call would be taken now.
     pub executable: [bool; 5],
 }
@@ -94,6 +98,8 @@ pub enum Told<'a> {
     Transition(&'a Transitioned),
     /// The run has come to another step.
     Step,
+    /// The run is being cancelled and has not ended, or cannot be cancelled: why, for people.
+    Pending(&'a str),
     /// More of the run is done.
     Progress,
     /// How a run has ended; its transition follows.

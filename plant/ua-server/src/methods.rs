@@ -183,6 +183,11 @@ impl Methods {
         self.programs.reported(topic, block);
     }
 
+    /// See [`Programs::pending`].
+    pub(crate) fn pending(&self) -> Vec<String> {
+        self.programs.pending()
+    }
+
     fn remove(&mut self, topic: TopicId) {
         self.refused.remove(&topic);
         let Some(node) = self.shown.remove(&topic) else {

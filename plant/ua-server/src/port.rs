@@ -415,6 +415,10 @@ impl Port for ServerPort {
         restart
     }
 
+    fn pending(&self) -> Vec<String> {
+        self.methods.pending()
+    }
+
     fn links(&self) -> Vec<LinkState> {
         self.others.links()
     }

@@ -8,7 +8,7 @@
 mod nodes;
 mod run;
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 
 use bridge_node::{ActionFamily, CallDescription, CallRole};
@@ -34,6 +34,8 @@ pub(crate) struct Programs {
     shown: HashMap<TopicId, Shown>,
     /// Whose feedback each value is.
     feedback: HashMap<TopicId, TopicId>,
+    /// The calls that send the goals of Programs that went while they were at one: its outcome is unknown.
+    unknown: HashSet<TopicId>,
     told_full: bool,
 }
 
@@ -58,6 +60,7 @@ impl Programs {
             parts: HashMap::new(),
             shown: HashMap::new(),
             feedback: HashMap::new(),
+            unknown: HashSet::new(),
             told_full: false,
         }
     }
@@ -112,7 +115,8 @@ impl Programs {
         let node = nodes.program();
         let feedback = beside(goal, family.feedback);
         let methods = nodes.methods();
-        let run = Run::new(name, nodes, [send, cancel, result]);
+        let needs_reset = self.unknown.remove(&goal);
+        let run = Run::new(name, nodes, [send, cancel, result], needs_reset);
         let inner = self.manager.inner();
         let sends = goal_node(goal, inner);
         let drive = |method| run.drive(method, inner.questions(), sends.clone());
@@ -144,7 +148,9 @@ impl Programs {
         if let Some(feedback) = shown.feedback {
             self.feedback.remove(&feedback);
         }
-        shown.run.leave();
+        if shown.run.leave() && self.unknown.len() < MOST_PARTS {
+            self.unknown.insert(goal);
+        }
         let nodes = shown.run.nodes();
         let mut programs = self.manager.inner().programs().lock();
         for (method, _) in nodes.methods() {
@@ -157,6 +163,12 @@ impl Programs {
         };
         let around = shown.around.iter().filter(|object| !taken(object));
         nodes.remove(&around.collect::<Vec<_>>());
+    }
+
+    /// The Programs whose goals are being cancelled and have not ended, a line each.
+    pub(crate) fn pending(&self) -> Vec<String> {
+        let all = self.shown.values();
+        all.filter_map(|shown| shown.run.pending()).collect()
     }
 
     /// Shows what an action reports of a goal, if that is a Program's.

@@ -10,7 +10,7 @@ use program::{Method, State};
 use super::find::{FoundParameter, FoundSkill};
 use super::{called, lost, refused};
 use crate::model::DEVICES;
-use crate::runs::{Runs, SkillFault};
+use crate::runs::{HALTS_WITHIN, Runs, SkillFault, goes_on};
 use crate::shown::Outcome;
 use crate::value::Value;
 use crate::variant::{from_pairs, from_variant, to_pairs, to_variant};
@@ -447,7 +447,15 @@ impl Runs for SkillHandle {
             .call(&self.found.nodes.skill, node, Vec::new())
             .await;
         let Err(error) = halted else {
-            return Ok(());
+            if matches!(self.state().await?.state, State::Ready | State::Halted) {
+                return Ok(());
+            }
+            // What it has its work done by has not ended.
+            let ended = tokio::time::timeout(HALTS_WITHIN, self.ended()).await;
+            return match ended {
+                Ok(ended) => ended.map(drop),
+                Err(_) => Err(goes_on(&self.name())),
+            };
         };
         // It may be Halted already, which is all that is wanted.
         match &error {

@@ -11,6 +11,7 @@ use crate::composite::{self, PickAndPlace};
 use crate::driver::{Driver, Results, Work};
 use crate::model::SKILL_TYPE;
 use crate::parameters::{Parameters, TypeName};
+use crate::runs::COMPOSITE_HALT_TIMEOUT;
 
 /// The driver of PickAndPlaceSkillType that runs the skills of a robot and a gripper, each a server of its own. It has their
 /// leases for as long as a run takes.
@@ -30,6 +31,11 @@ impl Remote {
 
 #[async_trait]
 impl Driver for Remote {
+    /// Halt waits for the skills that the work is done with.
+    fn halt_timeout(&self) -> Option<Duration> {
+        Some(COMPOSITE_HALT_TIMEOUT)
+    }
+
     fn check(&self, parameters: &Parameters) -> Result<(), String> {
         composite::job(parameters).map(drop)
     }

@@ -16,6 +16,8 @@ pub struct SpaceWork {
     pub topic: String,
     /// How long the answer of a call is waited for, or the word on a goal.
     pub within: Duration,
+    /// How long after Halt the end of the work is waited for until a second Halt ends the run with an unknown outcome.
+    pub halt_timeout: Duration,
     /// What fields of the request are made of, by their names; of an action those of the goal. Others are made of the
     /// parameters that are called so.
     pub request: Vec<(String, Source)>,
@@ -116,15 +118,29 @@ impl Source {
 
 /// Reads what stands under `call` or `action`.
 pub(super) fn read(asked: Asked, node: &Node, reader: &mut Reader<'_>) -> Option<SpaceWork> {
-    let (topic, [within, request, results, succeeds]) = match (&node.kind, asked) {
-        (Kind::Scalar(_), _) => (Some(node), [None; 4]),
+    let (topic, [within, halt_timeout, request, results, succeeds]) = match (&node.kind, asked) {
+        (Kind::Scalar(_), _) => (Some(node), [None; 5]),
         (_, Asked::Call) => {
-            let keys = ["name", "within", "request", "results", "succeeds"];
+            let keys = [
+                "name",
+                "within",
+                "halt_timeout",
+                "request",
+                "results",
+                "succeeds",
+            ];
             let [topic, rest @ ..] = reader.map(node, keys)?;
             (topic, rest)
         }
         (_, Asked::Action) => {
-            let keys = ["name", "within", "goal", "results", "succeeds"];
+            let keys = [
+                "name",
+                "within",
+                "halt_timeout",
+                "goal",
+                "results",
+                "succeeds",
+            ];
             let [topic, rest @ ..] = reader.map(node, keys)?;
             (topic, rest)
         }
@@ -133,6 +149,7 @@ pub(super) fn read(asked: Asked, node: &Node, reader: &mut Reader<'_>) -> Option
         .needed(topic, "name", node.place)
         .and_then(|node| read_topic(node, reader));
     let within = within.map_or(Some(USUALLY_WITHIN), |node| reader.duration(node));
+    let halt_timeout = halt_timeout.map_or(Some(HALT_TIMEOUT), |node| reader.duration(node));
     let request = entries(request, reader, |node, reader| {
         read_source(node, false, reader)
     });
@@ -146,6 +163,7 @@ pub(super) fn read(asked: Asked, node: &Node, reader: &mut Reader<'_>) -> Option
         asked,
         topic: topic?,
         within: within?,
+        halt_timeout: halt_timeout?,
         request,
         results,
         succeeds,
@@ -265,6 +283,8 @@ fn read_source(node: &Node, of_answer: bool, reader: &mut Reader<'_>) -> Option<
 
 /// As who asks a call of the space without saying otherwise.
 const USUALLY_WITHIN: Duration = Duration::from_secs(10);
+/// The usual `halt_timeout`.
+const HALT_TIMEOUT: Duration = Duration::from_secs(10);
 
 #[cfg(test)]
 mod tests {
@@ -294,14 +314,17 @@ mod tests {
             (work.asked, work.topic.as_str()),
             (Asked::Call, "ua_1_2_61")
         );
-        assert_eq!(work.within, USUALLY_WITHIN);
+        assert_eq!(
+            (work.within, work.halt_timeout),
+            (USUALLY_WITHIN, HALT_TIMEOUT)
+        );
         assert!(work.request.is_empty() && work.results.is_empty());
     }
 
     #[test]
     fn fields_are_made_of_constants_parameters_and_parts_of_them() {
         let work = driver(
-            "{action: {name: ua_2_2_70, within: 5 s, goal: {tree: '', list: [1, 2], x: {parameter: Goal, at: 0}, \
+            "{action: {name: ua_2_2_70, within: 5 s, halt_timeout: 3 s, goal: {tree: '', list: [1, 2], x: {parameter: Goal, at: 0}, \
              z: {parameter: Goal, at: 2, as: quaternion_z}, w: {parameter: Goal, at: 2, as: quaternion_w}}, \
              results: {Pose: {parameter: Goal}, Code: {field: code}}, succeeds: {status: 1}}}",
         )
@@ -311,6 +334,7 @@ mod tests {
             .unwrap()
             .parameters();
         let parameters = Parameters::complete(&declared, vec![goal]).unwrap();
+        assert_eq!(work.halt_timeout, Duration::from_secs(3));
         let none = |_: &str| None;
         let of = |name: &str| {
             let (_, source) = work

@@ -14,6 +14,7 @@ use crate::shown::{Told, Transitioned};
 
 const ME: Owner = Owner::Session(1);
 const OTHER: Owner = Owner::Session(2);
+const HALT_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// Does what its `how` says, as often as it is let.
 struct Scripted {
@@ -31,12 +32,32 @@ enum How {
     Deaf,
     /// Does not even give its thread back.
     Blocks(Duration),
+    /// Is done elsewhere, and says that when it is stopped. Then it ends as stopped when it is let.
+    Elsewhere(Elsewhere),
+}
+
+#[derive(Clone, Copy)]
+enum Elsewhere {
+    Cancels,
+    NeverEnds,
+    Refuses,
+    IsLost,
 }
 
 #[async_trait]
 impl Driver for Scripted {
     fn can_suspend(&self) -> bool {
         matches!(self.how, How::WhenLet)
+    }
+
+    fn halt_timeout(&self) -> Option<Duration> {
+        match self.how {
+            How::Elsewhere(Elsewhere::NeverEnds) => Some(Duration::ZERO),
+            How::Elsewhere(_) => Some(HALT_TIMEOUT),
+            How::AtOnce | How::WhenLet | How::Panics | How::Fails | How::Deaf | How::Blocks(_) => {
+                None
+            }
+        }
     }
 
     async fn run(&self, work: Work) -> Result<Results, String> {
@@ -53,6 +74,18 @@ impl Driver for Scripted {
             How::Fails => return Err("nothing is there".to_owned()),
             How::Deaf => std::future::pending().await,
             How::Blocks(time) => block(time),
+            How::Elsewhere(how) => {
+                work.stopped().await;
+                match how {
+                    Elsewhere::Cancels | Elsewhere::NeverEnds => {
+                        work.pending("the goal has not ended").await
+                    }
+                    Elsewhere::Refuses => work.cancel_refused("the robot goes on").await,
+                    Elsewhere::IsLost => work.unknown("the robot is lost").await,
+                }
+                self.gate.acquire().await.unwrap().forget();
+                return Err("stopped".to_owned());
+            }
         }
         Ok(vec![("Gripped".to_owned(), true.into())])
     }
@@ -87,6 +120,7 @@ impl Observer for Log {
                 seen.story.push(transition.name.to_owned());
             }
             Told::Step => seen.story.push(format!("step {}", shown.step)),
+            Told::Pending(why) => seen.story.push(format!("pending {why}")),
             Told::Outcome(outcome) => seen.story.push(format!("outcome {}", outcome.succeeded)),
             Told::Progress | Told::Called => {}
         }
@@ -614,5 +648,75 @@ async fn at_the_end_of_the_component_what_runs_is_halted() {
     assert_eq!(
         bench.call(Method::Reset).await.unwrap_err().code,
         Code::Shutdown
+    );
+}
+
+#[tokio::test]
+async fn work_elsewhere_is_halted_when_it_has_ended() {
+    let bench = bench(How::Elsewhere(Elsewhere::Cancels));
+    bench.run_to(State::Running).await;
+    bench.call(Method::Halt).await.unwrap();
+    let shown = bench.skill.shown();
+    assert_eq!(shown.state, State::Running);
+    assert_eq!(shown.pending.as_deref(), Some("the goal has not ended"));
+    // Once more: it is on its way.
+    bench.call(Method::Halt).await.unwrap();
+    assert_eq!(bench.skill.shown().state, State::Running);
+    bench.gate.add_permits(1);
+    let shown = bench.until(State::Halted).await;
+    assert_eq!((shown.pending.as_deref(), shown.needs_reset), (None, false));
+    assert_eq!(bench.numbers(), [1, 2, 3]);
+    let story = lock(&bench.seen).story.join(", ");
+    assert!(
+        story.contains("pending the goal has not ended, pending"),
+        "{story}"
+    );
+}
+
+#[tokio::test]
+async fn work_elsewhere_without_an_end_is_unknown_and_needs_a_reset() {
+    for how in [Elsewhere::NeverEnds, Elsewhere::IsLost] {
+        let bench = bench(How::Elsewhere(how));
+        bench.run_to(State::Running).await;
+        bench.call(Method::Halt).await.unwrap();
+        assert_eq!(bench.skill.shown().state, State::Running);
+        let run = bench.call(Method::Halt).await.unwrap();
+        let shown = bench.skill.shown();
+        assert_eq!((shown.state, shown.needs_reset), (State::Halted, true));
+        let outcome = bench.skill.outcome(run).unwrap();
+        assert!(outcome.message.contains("unknown"), "{outcome:?}");
+        let refused = bench.skill.execute(ME, Vec::new(), None).await.unwrap_err();
+        assert_eq!(refused.code, Code::InvalidState, "{refused}");
+        bench.call(Method::Reset).await.unwrap();
+        bench.skill.execute(ME, Vec::new(), None).await.unwrap();
+    }
+}
+
+#[tokio::test]
+async fn a_refused_cancellation_is_shown_as_refused() {
+    let bench = bench(How::Elsewhere(Elsewhere::Refuses));
+    bench.run_to(State::Running).await;
+    let refused = bench.call(Method::Halt).await.unwrap_err();
+    assert_eq!(refused.code, Code::RequestNotAllowed, "{refused}");
+    let shown = bench.skill.shown();
+    assert_eq!(shown.state, State::Running);
+    assert_eq!(shown.pending.as_deref(), Some("the robot goes on"));
+}
+
+#[tokio::test]
+async fn a_run_that_takes_too_long_elsewhere_ends_with_its_work() {
+    let limit = Some(Duration::from_millis(50));
+    let how = How::Elsewhere(Elsewhere::Cancels);
+    let bench = bench_of(how, "GraspSkillType", limit);
+    bench.run_to(State::Running).await;
+    let mut watch = bench.skill.watch();
+    let pending = watch.wait_for(|shown| shown.pending.is_some()).await;
+    assert_eq!(pending.unwrap().state, State::Running);
+    bench.gate.add_permits(1);
+    let shown = bench.until(State::Halted).await;
+    let outcome = shown.outcome.clone().unwrap();
+    assert!(
+        outcome.message.contains("not done within 50ms"),
+        "{outcome:?}"
     );
 }

@@ -15,7 +15,7 @@ use opcua::types::{
 use plant_opcua::server::{StateRef, TransitionEvent};
 use program::{Method, State, Transition};
 
-use super::run::{SUCCEEDED, whole};
+use super::run::{NEVER_RAN, SUCCEEDED, whole};
 use crate::address;
 use crate::argument_types::ArgumentTypes;
 use crate::nodes::SpaceManager;
@@ -56,6 +56,15 @@ impl Outcome {
         }
     }
 
+    /// It was rejected, or not sent.
+    pub(super) const fn never_ran(message: String) -> Self {
+        Self {
+            status: NEVER_RAN,
+            message,
+            fields: Vec::new(),
+        }
+    }
+
     /// Nothing is known of it.
     pub(super) const fn lost(message: String) -> Self {
         Self {
@@ -71,6 +80,7 @@ impl Outcome {
             ("", SUCCEEDED) => "the goal is reached".to_owned(),
             ("", 5) => "the goal was cancelled".to_owned(),
             ("", 6) => "the goal was aborted".to_owned(),
+            ("", NEVER_RAN) => "the goal never ran".to_owned(),
             ("", _) => "the goal is lost".to_owned(),
             (message, _) => message.to_owned(),
         }
@@ -163,6 +173,26 @@ impl Nodes {
         ]);
     }
 
+    /// How a goal ended, for people, with the reason that its result has.
+    pub(super) fn said(&self, outcome: &Outcome) -> String {
+        let said = outcome.said();
+        if !outcome.message.is_empty() || outcome.status == SUCCEEDED {
+            return said;
+        }
+        let fields = self.results.iter().zip(&outcome.fields);
+        let texts = fields.filter_map(|(name, value)| {
+            if let Variant::String(text) = value {
+                Some((name.as_str(), text.as_ref()))
+            } else {
+                None
+            }
+        });
+        match messages::reason_of(texts) {
+            None => said,
+            Some(reason) => format!("{said}: {reason}"),
+        }
+    }
+
     pub(super) fn show_outcome(&self, outcome: &Outcome) {
         let status = i32::try_from(outcome.status).unwrap_or_default();
         self.show(vec![
@@ -174,6 +204,34 @@ impl Nodes {
         ]);
         let nodes = self.results.iter().map(|name| self.node(&result(name)));
         self.write(nodes.zip(outcome.fields.iter().cloned()).collect());
+    }
+
+    /// Shows why a goal that is being cancelled has not ended, or is not cancelled, and raises an event without a transition.
+    pub(super) fn show_pending(&self, why: &str, now: State) {
+        self.show(vec![("FinalResultData.Message", Variant::from(why))]);
+        let state = StateRef {
+            name: now.name().to_owned(),
+            id: NodeId::new(0, now.node_id()),
+            number: now.number(),
+        };
+        let event = TransitionEvent {
+            source: self.program(),
+            source_name: self.name.clone(),
+            event_type: ObjectTypeId::BaseEventType.into(),
+            message: why.to_owned(),
+            severity: FAILED,
+            from_state: state.clone(),
+            to_state: state,
+            transition: StateRef {
+                name: String::new(),
+                id: NodeId::null(),
+                number: 0,
+            },
+            intermediate_result: Variant::Empty,
+            fields: Vec::new(),
+            time: DateTime::now(),
+        };
+        event.raise(&self.subscriptions);
     }
 
     /// What its action reports: the only field, or all of them.

@@ -8,8 +8,8 @@ use opcua::sync::Mutex;
 use opcua::types::{ByteString, DateTime, NodeId, StatusCode, Variant};
 use program::{Ending, Method, Nature, Program, Rest, RunId, State};
 use tokio::sync::watch;
-use tokio::time::{sleep, timeout};
-use tracing::info;
+use tokio::time::{Instant, sleep, timeout};
+use tracing::{info, warn};
 use uadp::Fields;
 
 use super::nodes::{Nodes, Outcome};
@@ -32,28 +32,55 @@ struct Inner {
     program: Program,
     /// The goal that is at work, or is being sent.
     goal: Option<ByteString>,
-    /// It is being sent: nothing else may be called.
+    /// It is being sent: Halt alone may be called.
     starting: bool,
-    halting: bool,
+    /// It is being cancelled, and its end is not known.
+    halting: Option<Halting>,
     /// The action is gone.
     left: bool,
 }
 
+/// A cancellation that is pending.
+struct Halting {
+    why: String,
+    /// From when on a second Halt ends the run with an unknown outcome.
+    over: Instant,
+    /// The action server has lost the goal: a second Halt ends the run at once.
+    is_lost: bool,
+}
+
+impl Inner {
+    /// The cancellation that is pending from now on, if it is not already.
+    fn cancel(&mut self) -> &mut Halting {
+        self.halting.get_or_insert_with(|| Halting {
+            why: PENDING.to_owned(),
+            over: Instant::now() + HALT_TIMEOUT,
+            is_lost: false,
+        })
+    }
+}
+
 impl Run {
-    /// A Program that is ready.
+    /// Makes a Program in Ready, or in Halted after a goal with an unknown outcome.
     pub(super) fn new(
         name: String,
         nodes: Nodes,
         [send, cancel, result]: [Callable; 3],
+        needs_reset: bool,
     ) -> Arc<Self> {
         let mut program = Program::new(Nature {
             can_suspend: false,
             rests_in: Rest::Ready,
         });
-        // Nobody has to make ready what is there.
-        let _ready = program.call(Method::Reset);
+        if !needs_reset {
+            // An action that is there is ready.
+            let _ready = program.call(Method::Reset);
+        }
         let (state, _) = watch::channel(program.state());
         nodes.show_first(program.state());
+        if needs_reset {
+            nodes.show_outcome(&Outcome::lost(GONE.to_owned()));
+        }
         Arc::new(Self {
             name,
             nodes,
@@ -64,7 +91,7 @@ impl Run {
                 program,
                 goal: None,
                 starting: false,
-                halting: false,
+                halting: None,
                 left: false,
             }),
             state,
@@ -132,48 +159,91 @@ impl Run {
         let answer = self.send.call(&goal, &questions, || false).await;
         let accepted = match answer {
             Ok(answer) => self.is_accepted(&answer),
-            Err(refused) => {
-                if is_unknown(&refused) {
-                    // It may be at work, and nobody would follow it.
-                    drop(self.ask_to_cancel(&id, &questions).await);
-                }
-                Err(in_terms_of_start(refused))
-            }
+            Err(refused) => Err((in_terms_of_start(refused), None)),
         };
-        let run = {
-            let mut inner = self.inner.lock();
-            inner.starting = false;
-            if let Err(refused) = accepted {
-                inner.goal = None;
+        let mut inner = self.inner.lock();
+        inner.starting = false;
+        if inner.left {
+            return Err(Refused::Status(StatusCode::BadNoCommunication));
+        }
+        // Where it runs already, it was halted meanwhile, and what the goal comes to is followed.
+        let runs = inner.program.state() == State::Running;
+        match accepted {
+            Ok(()) if runs => {}
+            Ok(()) => self.runs(&mut inner, &id, ("the goal is accepted", &questions))?,
+            Err((refused, _)) if is_unknown(&refused) => {
+                if !runs {
+                    let why = "whether the goal is accepted is not known: it is being cancelled";
+                    self.runs(&mut inner, &id, (why, &questions))?;
+                }
+                self.pends(&mut inner, PENDING);
+                let again = Arc::clone(&self).cancel_until_ended(id, questions.clone());
+                tokio::spawn(again);
                 return Err(refused);
             }
-            if inner.left {
-                return Err(Refused::Status(StatusCode::BadNoCommunication));
+            Err((refused, why)) => {
+                let outcome = Outcome::never_ran(why.unwrap_or_default());
+                match inner.program.run().filter(|_| runs) {
+                    Some(run) => {
+                        drop(inner);
+                        self.ended(run, outcome);
+                    }
+                    None => {
+                        inner.goal = None;
+                        self.nodes.show_goal(&id);
+                        self.nodes.show_outcome(&outcome);
+                    }
+                }
+                return Err(refused);
             }
-            let started = inner.program.call(Method::Start);
-            let transition = started.map_err(|_| Refused::Status(StatusCode::BadInvalidState))?;
-            inner.halting = false;
-            self.nodes.show_goal(&id);
-            self.nodes
-                .show_transition(transition, "the goal is accepted");
-            self.state.send_replace(inner.program.state());
-            inner.program.run()
-        };
-        if let Some(run) = run {
-            tokio::spawn(Arc::clone(&self).follow(id.clone(), run, questions));
         }
         Ok(vec![Variant::from(id)])
     }
 
-    fn is_accepted(&self, answer: &[Variant]) -> Result<(), Refused> {
+    /// Is running from now on, and follows the goal.
+    fn runs(
+        self: &Arc<Self>,
+        inner: &mut Inner,
+        id: &ByteString,
+        (why, questions): (&str, &Questions),
+    ) -> Result<(), Refused> {
+        let started = inner.program.call(Method::Start);
+        let transition = started.map_err(|_| Refused::Status(StatusCode::BadInvalidState))?;
+        inner.halting = None;
+        self.nodes.show_goal(id);
+        self.nodes.show_transition(transition, why);
+        self.state.send_replace(inner.program.state());
+        if let Some(run) = inner.program.run() {
+            tokio::spawn(Arc::clone(self).follow(id.clone(), run, questions.clone()));
+        }
+        Ok(())
+    }
+
+    /// Shows why a cancellation is pending.
+    fn pends(&self, inner: &mut Inner, why: &str) {
+        info!(program = self.name, "{why}");
+        self.nodes.show_pending(why, inner.program.state());
+        why.clone_into(&mut inner.cancel().why);
+    }
+
+    /// Why a goal that was cancelled has not ended, if there is one.
+    pub(super) fn pending(&self) -> Option<String> {
+        let inner = self.inner.lock();
+        let halting = inner.halting.as_ref()?;
+        Some(format!("Program {}: {}", self.name, halting.why))
+    }
+
+    /// With the reason of a rejection, for people.
+    fn is_accepted(&self, answer: &[Variant]) -> Result<(), (Refused, Option<String>)> {
         match answer {
             [Variant::Boolean(true), ..] => Ok(()),
             [Variant::Boolean(false), rest @ ..] => {
                 let why = rest.last().map(ToString::to_string).unwrap_or_default();
                 info!(program = self.name, "a goal is rejected: {why}");
-                Err(Refused::Status(StatusCode::BadRequestNotAllowed))
+                let refused = Refused::Status(StatusCode::BadRequestNotAllowed);
+                Err((refused, Some(why)))
             }
-            _ => Err(Refused::Status(StatusCode::BadDecodingError)),
+            _ => Err((Refused::Status(StatusCode::BadDecodingError), None)),
         }
     }
 
@@ -183,7 +253,12 @@ impl Run {
         loop {
             let asked = [Variant::from(id.clone())];
             match self.result.call(&asked, &questions, || false).await {
-                Ok(answer) => return self.ended(run, Outcome::of(answer)),
+                Ok(answer) => {
+                    let outcome = Outcome::of(answer);
+                    if outcome.status != UNKNOWN || !self.is_lost(&outcome.said()) {
+                        return self.ended(run, outcome);
+                    }
+                }
                 Err(Refused::Asked(error)) if error.kind == AskErrorKind::Failed => {
                     return self.ended(run, Outcome::lost(error.text));
                 }
@@ -194,7 +269,7 @@ impl Run {
                 // It goes on, or nobody is heard for the moment; when it is gone for good, so is the action.
                 Err(Refused::Status(_) | Refused::Asked(_)) => {}
             }
-            if self.inner.lock().left {
+            if self.is_over(run) {
                 return;
             }
             sleep(pause).await;
@@ -202,13 +277,60 @@ impl Run {
         }
     }
 
+    fn is_over(&self, run: RunId) -> bool {
+        let inner = self.inner.lock();
+        let runs = inner.program.state() == State::Running && inner.program.run() == Some(run);
+        inner.left || !runs
+    }
+
+    /// The action server knows nothing of the goal. Returns true if it is being cancelled: then it stays Running until a client
+    /// has taken note of that by a second Halt.
+    fn is_lost(&self, said: &str) -> bool {
+        let mut inner = self.inner.lock();
+        let Some(halting) = &mut inner.halting else {
+            return false;
+        };
+        if !std::mem::replace(&mut halting.is_lost, true) {
+            let why = format!("the outcome is unknown: {said}; Halt ends the Program");
+            self.pends(&mut inner, &why);
+        }
+        true
+    }
+
+    /// Cancels a goal again and again until it has ended: a request may come before the goal, or get lost.
+    async fn cancel_until_ended(self: Arc<Self>, id: ByteString, questions: Questions) {
+        loop {
+            let answer = self.ask_to_cancel(&id, &questions).await;
+            let is_current = {
+                let mut inner = self.inner.lock();
+                let is_current = inner.goal.as_ref() == Some(&id) && inner.halting.is_some();
+                if is_current && matches!(answer, Ok(REJECTED)) {
+                    self.refused(&mut inner);
+                }
+                is_current && inner.halting.is_some()
+            };
+            if !is_current {
+                return;
+            }
+            sleep(LAST_PAUSE).await;
+        }
+    }
+
+    /// The action server refuses to cancel the goal, which goes on.
+    fn refused(&self, inner: &mut Inner) {
+        inner.halting = None;
+        let why = "the action server refuses to cancel the goal, which goes on";
+        info!(program = self.name, "{why}");
+        self.nodes.show_pending(why, inner.program.state());
+    }
+
     fn ended(&self, run: RunId, outcome: Outcome) {
         let mut inner = self.inner.lock();
         if inner.left {
             return;
         }
-        let halted = inner.halting && outcome.status == CANCELED;
-        let message = outcome.said();
+        let halted = inner.halting.is_some();
+        let message = self.nodes.said(&outcome);
         let ended = match outcome.status {
             _ if inner.program.run() != Some(run) => return,
             SUCCEEDED => inner.program.ended(run, Ending::Success).ok(),
@@ -216,7 +338,7 @@ impl Run {
             _ => inner.program.ended(run, Ending::Failure).ok(),
         };
         inner.goal = None;
-        inner.halting = false;
+        inner.halting = None;
         // Whoever sees the state change can read what came out.
         self.nodes.show_outcome(&outcome);
         if let Some(transition) = ended {
@@ -225,36 +347,65 @@ impl Run {
         self.state.send_replace(inner.program.state());
     }
 
-    /// Has the goal cancelled, and waits until it is. One that is ready is so no longer.
-    async fn halt(&self, questions: &Questions) -> Result<Vec<Variant>, Refused> {
-        let id = {
+    /// Has the goal cancelled. Returns once the cancellation is on its way, and has waited a moment for the end of the goal. A
+    /// second Halt after [`HALT_TIMEOUT`], or when the action server has lost the goal, ends the run with an unknown outcome.
+    /// A Program that is ready is so no longer.
+    async fn halt(self: &Arc<Self>, questions: &Questions) -> Result<Vec<Variant>, Refused> {
+        let (id, is_first) = {
             let mut inner = self.inner.lock();
-            if inner.left || inner.starting || !inner.program.is_executable(Method::Halt) {
+            if inner.left || !(inner.starting || inner.program.is_executable(Method::Halt)) {
                 return Err(Refused::Status(StatusCode::BadInvalidState));
             }
-            match inner.goal.clone() {
-                Some(id) => {
-                    inner.halting = true;
-                    id
-                }
-                None => return self.called(&mut inner, Method::Halt),
+            let Some(id) = inner.goal.clone() else {
+                return self.called(&mut inner, Method::Halt);
+            };
+            if inner.program.state() != State::Running {
+                let why = "halted before the action server has decided about the goal";
+                self.runs(&mut inner, &id, (why, questions))?;
             }
+            if let Some(halting) = &inner.halting
+                && (halting.is_lost || halting.over <= Instant::now())
+            {
+                return self.give_up(&mut inner);
+            }
+            let is_first = inner.halting.is_none();
+            inner.cancel();
+            (id, is_first)
         };
-        match self.ask_to_cancel(&id, questions).await {
-            Ok(AGREED | TERMINATED) => {}
-            refused => {
-                self.inner.lock().halting = false;
-                refused?;
-                info!(program = self.name, "its action server does not cancel");
-                return Err(Refused::Status(StatusCode::BadRequestNotAllowed));
+        let answer = self.ask_to_cancel(&id, questions).await;
+        if let Ok(REJECTED) = answer {
+            self.refused(&mut self.inner.lock());
+            return Err(Refused::Status(StatusCode::BadRequestNotAllowed));
+        }
+        if is_first {
+            let again = Arc::clone(self).cancel_until_ended(id, questions.clone());
+            tokio::spawn(again);
+        }
+        answer?;
+        let mut state = self.state.subscribe();
+        let ends = timeout(AT_ONCE, state.wait_for(|now| *now != State::Running));
+        if ends.await.is_err() {
+            let mut inner = self.inner.lock();
+            if inner
+                .halting
+                .as_ref()
+                .is_some_and(|halting| !halting.is_lost)
+            {
+                self.pends(&mut inner, PENDING);
             }
         }
-        let mut state = self.state.subscribe();
-        let ends = timeout(HALTS_WITHIN, state.wait_for(|now| *now != State::Running));
-        match ends.await {
-            Ok(_) => Ok(Vec::new()),
-            Err(_) => Err(Refused::Status(StatusCode::BadTimeout)),
-        }
+        Ok(Vec::new())
+    }
+
+    /// Ends a run whose goal goes on elsewhere, or may.
+    fn give_up(&self, inner: &mut Inner) -> Result<Vec<Variant>, Refused> {
+        let halting = inner.halting.take();
+        let why = halting.map(|halting| halting.why).unwrap_or_default();
+        let message = format!("the outcome is unknown, the goal may go on: {why}");
+        warn!(program = self.name, "{message}");
+        inner.goal = None;
+        self.nodes.show_outcome(&Outcome::lost(message));
+        self.called(inner, Method::Halt)
     }
 
     /// The `return_code` of `action_msgs/CancelGoal`.
@@ -282,9 +433,16 @@ impl Run {
     }
 
     /// The action is gone, and what it was at is nobody's any more.
-    pub(super) fn leave(&self) {
+    ///
+    /// Returns true if it was at a goal, whose outcome is unknown then.
+    pub(super) fn leave(&self) -> bool {
         let mut inner = self.inner.lock();
         inner.left = true;
+        let is_open = inner.goal.take().is_some();
+        if is_open {
+            warn!(program = self.name, "{GONE}");
+        }
+        inner.halting = None;
         let run = inner.program.run();
         let ended = run.and_then(|run| inner.program.ended(run, Ending::Failure).ok());
         if let Some(transition) = ended {
@@ -293,6 +451,7 @@ impl Run {
             self.nodes.show_transition(transition, GONE);
         }
         self.state.send_replace(State::Halted);
+        is_open
     }
 
     /// Shows feedback, if it is of the goal that is at work.
@@ -345,15 +504,18 @@ pub(super) fn whole(value: &Variant) -> Option<i64> {
 }
 
 const NOT_NOW_AND_NEVER: Refused = Refused::Status(StatusCode::BadNotSupported);
-const GONE: &str = "who executes the action is gone; the goal may go on";
-/// Of `action_msgs/GoalStatus`.
+const PENDING: &str = "cancellation pending: the goal has not ended";
+const GONE: &str = "the executor of the action is lost: the outcome is unknown, the goal may go on";
+/// Of `action_msgs/GoalStatus`, and of goals that never ran.
 pub(super) const SUCCEEDED: i64 = 4;
-const CANCELED: i64 = 5;
-/// Of `action_msgs/CancelGoal`: ERROR_NONE and ERROR_GOAL_TERMINATED.
-const AGREED: i64 = 0;
-const TERMINATED: i64 = 3;
-/// How long a goal may take to end once it is being cancelled.
-const HALTS_WITHIN: Duration = Duration::from_secs(30);
+pub(super) const NEVER_RAN: i64 = -1;
+const UNKNOWN: i64 = 0;
+/// Of `action_msgs/CancelGoal`: ERROR_REJECTED.
+const REJECTED: i64 = 1;
+/// How long Halt waits for the end of the goal before it says that the cancellation is pending.
+const AT_ONCE: Duration = Duration::from_secs(1);
+/// How long the end of a goal is waited for until a second Halt ends the run with an unknown outcome.
+const HALT_TIMEOUT: Duration = Duration::from_secs(10);
 /// Before a result is asked for anew, doubling from the first to the last.
 const FIRST_PAUSE: Duration = Duration::from_millis(100);
 const LAST_PAUSE: Duration = Duration::from_secs(1);

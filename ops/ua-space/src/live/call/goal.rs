@@ -93,6 +93,18 @@ struct Goal {
     cancel: Arc<Described>,
     /// The call that waits for the result.
     waits: CallId,
+    cancelling: Option<Cancelling>,
+}
+
+/// A goal that is being cancelled.
+struct Cancelling {
+    /// The newest request.
+    call: CallId,
+    /// When the next one is due: a request may come before the goal, or get lost.
+    again: Duration,
+    /// When the end of the goal is waited for no longer.
+    until: Duration,
+    is_refused: bool,
 }
 
 /// What came of the call that waits.
@@ -121,12 +133,31 @@ impl Asking<'_> {
         let [result, cancel] = self.parts_of(topic, parts).await?;
         let bytes = new_id();
         let request = behind(bytes, &block).ok_or_else(|| usage("too many fields".to_owned()))?;
+        let waiting = |waits| Goal {
+            parts,
+            id: BASE64.encode(bytes),
+            bytes,
+            result: Arc::clone(&result),
+            cancel: Arc::clone(&cancel),
+            waits,
+            cancelling: None,
+        };
+        let of_result = (parts.result, &*result);
         let answer = match self.ask((topic, described), &request, None).await {
-            Err(Failure::Interrupted) => {
-                // It may have been accepted.
-                self.cancel_goal((parts.cancel, &cancel), bytes)?;
-                self.acknowledge().await?;
-                return Err(Failure::Interrupted);
+            // The goal may be accepted already or later. Its result tells the end in both cases.
+            Err(failure @ (Failure::Interrupted | Failure::Unavailable(_))) => {
+                if let Failure::Unavailable(why) = &failure {
+                    warn(why);
+                }
+                warn("cancelling the goal (Ctrl-C leaves at once)");
+                let waits = self.begin(of_result, &behind_nothing(bytes), RESULT_WITHIN)?;
+                let mut goal = waiting(waits);
+                self.cancel_goal(&mut goal)?;
+                let end = self.follow_goal(goal).await?;
+                return match failure {
+                    Failure::Unavailable(_) => end,
+                    failure => Err(failure),
+                };
             }
             answer => answer?,
         };
@@ -147,20 +178,8 @@ impl Asking<'_> {
         if self.arguments.no_wait {
             return Ok(());
         }
-        let waits = self.begin(
-            (parts.result, &result),
-            &behind_nothing(bytes),
-            RESULT_WITHIN,
-        )?;
-        let goal = Goal {
-            parts,
-            id: BASE64.encode(bytes),
-            bytes,
-            result,
-            cancel,
-            waits,
-        };
-        self.follow_goal(goal).await
+        let waits = self.begin(of_result, &behind_nothing(bytes), RESULT_WITHIN)?;
+        self.follow_goal(waiting(waits)).await?
     }
 
     /// What the calls of an action are that wait for results and cancel.
@@ -207,11 +226,14 @@ impl Asking<'_> {
         }
     }
 
-    async fn follow_goal(&mut self, mut goal: Goal) -> Result<(), Failure> {
+    /// Waits for the end of a goal, and gives how it ended.
+    ///
+    /// # Errors
+    /// It is not waited for any longer, or its end is unknown.
+    async fn follow_goal(&mut self, mut goal: Goal) -> Result<Result<(), Failure>, Failure> {
         let limit = until(self.live.now(), self.arguments.run_timeout);
-        let mut cancelled = false;
         loop {
-            let (ended, told, came) = self.hear_goal(&goal).await?;
+            let (ended, told, came) = self.hear_goal(&mut goal).await?;
             for told in &told {
                 self.tell(told, &told.told())?;
             }
@@ -220,7 +242,7 @@ impl Asking<'_> {
                 Some(Came::Result(fields)) => {
                     let end = self.end_goal(&fields)?;
                     self.acknowledge().await?;
-                    return end;
+                    return Ok(end);
                 }
                 Some(Came::Nothing) => {
                     let request = behind_nothing(goal.bytes);
@@ -229,31 +251,56 @@ impl Asking<'_> {
                 }
                 Some(Came::Failed(failure)) => return Err(failure),
             }
-            let is_over = !cancelled && self.live.now() >= limit;
-            if is_over {
-                warn("the time for the goal is over");
-            }
-            if ended == Ended::Interrupted || is_over {
-                if cancelled {
+            let now = self.live.now();
+            match &goal.cancelling {
+                Some(_) if ended == Ended::Interrupted => {
+                    warn(
+                        "leaving: the goal may still be accepted or go on, and its outcome is unknown",
+                    );
                     return Err(Failure::Interrupted);
                 }
-                cancelled = true;
-                warn("cancelling the goal (once more to leave at once)");
-                self.cancel_goal((goal.parts.cancel, &goal.cancel), goal.bytes)?;
+                Some(cancelling) if cancelling.until <= now => {
+                    return Err(Failure::Unavailable(format!(
+                        "the goal has not ended {} s after it was cancelled: its outcome is unknown",
+                        ENDS_WITHIN.as_secs()
+                    )));
+                }
+                Some(cancelling) if cancelling.again <= now => self.cancel_goal(&mut goal)?,
+                Some(_) => {}
+                None => {
+                    let is_over = now >= limit;
+                    if is_over {
+                        warn("the time for the goal is over");
+                    }
+                    if is_over || ended == Ended::Interrupted {
+                        warn("cancelling the goal (once more to leave at once)");
+                        self.cancel_goal(&mut goal)?;
+                    }
+                }
             }
         }
     }
 
-    /// What that is answered is of no interest: its effect is, which is followed.
-    fn cancel_goal(&mut self, of: (TopicId, &Described), id: [u8; 16]) -> Result<(), Failure> {
-        let request = cancel_request(&behind_nothing(id));
-        self.begin(of, &request, CANCEL_WITHIN).map(drop)
+    /// Asks to cancel the goal. Its end is followed, whatever that is answered.
+    fn cancel_goal(&mut self, goal: &mut Goal) -> Result<(), Failure> {
+        let request = cancel_request(&behind_nothing(goal.bytes));
+        let cancel = Arc::clone(&goal.cancel);
+        let call = self.begin((goal.parts.cancel, &cancel), &request, CANCEL_WITHIN)?;
+        let now = self.live.now();
+        let before = goal.cancelling.as_ref();
+        goal.cancelling = Some(Cancelling {
+            call,
+            again: now + CANCEL_AGAIN,
+            until: before.map_or(now + ENDS_WITHIN, |before| before.until),
+            is_refused: before.is_some_and(|before| before.is_refused),
+        });
+        Ok(())
     }
 
     /// Hears a moment of what is told of a goal.
     async fn hear_goal(
         &mut self,
-        goal: &Goal,
+        goal: &mut Goal,
     ) -> Result<(Ended, Vec<Told>, Option<Came>), Failure> {
         self.transmit()?;
         let Self {
@@ -271,9 +318,16 @@ impl Asking<'_> {
                     if executor.answers(requestor, (response, *from))
                         && let Ok(Heard::Done(call, outcome)) =
                             requestor.handle_response(response, now)
-                        && call == goal.waits
                     {
-                        came = Some(hear(&outcome, &goal.result));
+                        if call == goal.waits {
+                            came = Some(hear(&outcome, &goal.result));
+                        } else if let Some(cancelling) = &mut goal.cancelling
+                            && call == cancelling.call
+                            && is_refused(&outcome, &goal.cancel)
+                            && !std::mem::replace(&mut cancelling.is_refused, true)
+                        {
+                            warn("the action server refuses to cancel the goal, which goes on");
+                        }
                     }
                 }
                 News::Sample(sample)
@@ -311,12 +365,18 @@ impl Asking<'_> {
             Some(4) => "SUCCEEDED",
             Some(5) => "CANCELED",
             Some(6) => "ABORTED",
+            Some(-1) => "REJECTED",
             Some(_) | None => "UNKNOWN",
         };
         let message = fields.text("message").unwrap_or_default().to_owned();
         let mut rest = fields.clone();
         rest.0
             .retain(|(name, _)| name != "status" && name != "message");
+        let texts = rest.0.iter();
+        let texts = texts.filter_map(|(name, value)| Some((name.as_str(), value.as_str()?)));
+        let said = Some(message.trim()).filter(|message| !message.is_empty());
+        let why = said.or_else(|| messages::reason_of(texts));
+        let why = why.map(|why| format!(": {why}")).unwrap_or_default();
         let told = Told::Result {
             status,
             message,
@@ -325,11 +385,11 @@ impl Asking<'_> {
         self.tell(&told, &told.told())?;
         Ok(match status {
             "SUCCEEDED" => Ok(()),
-            "UNKNOWN" => Err(Failure::Unavailable(
-                "who executes the action has lost the goal; how it ended is not known".to_owned(),
-            )),
+            "UNKNOWN" => Err(Failure::Unavailable(format!(
+                "the executor of the action has lost the goal, and its outcome is unknown{why}"
+            ))),
             _ => Err(Failure::Failed(format!(
-                "the goal was {}",
+                "the goal was {}{why}",
                 status.to_lowercase()
             ))),
         })
@@ -369,6 +429,19 @@ fn hear(outcome: &Outcome<'_>, described: &Described) -> Came {
         ))),
         Outcome::Unknown(why) => unknown(*why),
     }
+}
+
+/// Whether the answer to a request to cancel is that the server goes on.
+fn is_refused(outcome: &Outcome<'_>, cancel: &Described) -> bool {
+    let Outcome::Answered { status, fields } = outcome else {
+        return false;
+    };
+    let answer = plain::response(*fields, cancel.fields()).ok();
+    let code = answer.and_then(|answer| {
+        let code = answer.get("return_code")?;
+        code.as_i64()
+    });
+    status.0 & super::BAD == 0 && code == Some(REJECTED)
 }
 
 fn unknown(why: Unknown) -> Came {
@@ -431,6 +504,12 @@ fn cancel_request(of: &[u8]) -> Vec<u8> {
 const RESULT_WITHIN: Duration = Duration::from_secs(30);
 /// How long a request to cancel waits.
 const CANCEL_WITHIN: Duration = Duration::from_secs(5);
+/// How often a goal is cancelled until it has ended.
+const CANCEL_AGAIN: Duration = Duration::from_secs(1);
+/// How long the end of a goal is waited for once it is cancelled.
+const ENDS_WITHIN: Duration = Duration::from_secs(60);
+/// `action_msgs/CancelGoal`, ERROR_REJECTED.
+const REJECTED: i64 = 1;
 /// EncodingMasks of OPC 10000-6, 5.2.2.16.
 const BYTE_STRING: u8 = 15;
 const DATE_TIME: u8 = 13;

@@ -65,6 +65,8 @@ impl Seen {
                 created,
                 last_call: None,
             },
+            pending: None,
+            needs_reset: false,
             executable: [false; 5],
         };
         let (shown, watched) = watch::channel(Arc::new(now.clone()));

@@ -1,0 +1,133 @@
+//! Withdrawn goals: a goal that its client gives up before the server has decided about it is cancelled as soon as it
+//! is accepted.
+//!
+//! No clock and no network: times and answers come in, requests to cancel come out.
+
+use std::time::Duration;
+
+use tokio::time::Instant;
+
+use super::types::CancelCode;
+
+/// The way of one withdrawn goal to its end.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Withdrawal {
+    since: Instant,
+    stage: Stage,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Stage {
+    /// The server has not decided about the goal.
+    Undecided,
+    /// The server has accepted the goal. The next request to cancel is due at that time.
+    Due(Instant),
+    /// A request to cancel is on its way.
+    Asked,
+    /// The server cancels the goal, or has ended it.
+    Agreed,
+    /// The server does not cancel the goal.
+    Refused,
+}
+
+impl Withdrawal {
+    pub(super) const fn new(now: Instant) -> Self {
+        Self {
+            since: now,
+            stage: Stage::Undecided,
+        }
+    }
+
+    /// Notes that the server has accepted the goal.
+    pub(super) const fn accepted(&mut self, now: Instant) {
+        if matches!(self.stage, Stage::Undecided) {
+            self.stage = Stage::Due(now);
+        }
+    }
+
+    /// Returns when the next request to cancel is due.
+    pub(super) const fn due(&self) -> Option<Instant> {
+        match self.stage {
+            Stage::Due(at) => Some(at),
+            Stage::Undecided | Stage::Asked | Stage::Agreed | Stage::Refused => None,
+        }
+    }
+
+    /// Returns true once for each request to cancel that is to be sent at that time.
+    pub(super) fn take_due(&mut self, now: Instant) -> bool {
+        let is_due = self.due().is_some_and(|at| at <= now);
+        if is_due {
+            self.stage = Stage::Asked;
+        }
+        is_due
+    }
+
+    /// Notes the answer to a request to cancel, or that there was none, in which case it is sent again. Returns true if
+    /// the server refuses for the first time.
+    pub(super) fn answered(&mut self, answer: Option<CancelCode>, now: Instant) -> bool {
+        let before = self.stage;
+        self.stage = match answer {
+            Some(CancelCode::None | CancelCode::Terminated) => Stage::Agreed,
+            Some(CancelCode::Rejected) => Stage::Refused,
+            // A server with several threads may take the request before it has noted the goal.
+            Some(CancelCode::UnknownGoal) | None => Stage::Due(now + AGAIN),
+        };
+        self.stage == Stage::Refused && before != Stage::Refused
+    }
+
+    /// How long ago the goal was withdrawn.
+    pub(super) fn age(&self, now: Instant) -> Duration {
+        now.saturating_duration_since(self.since)
+    }
+}
+
+/// The pause before a request to cancel is sent again.
+const AGAIN: Duration = Duration::from_millis(200);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn begin() -> (Withdrawal, Instant) {
+        let now = Instant::now();
+        (Withdrawal::new(now), now)
+    }
+
+    #[test]
+    fn a_request_to_cancel_is_sent_once_the_goal_is_accepted() {
+        let (mut goal, now) = begin();
+        let late = now + Duration::from_secs(3);
+        assert!(!goal.take_due(late), "the server has not decided");
+        goal.accepted(late);
+        assert_eq!(goal.due(), Some(late));
+        assert!(goal.take_due(late));
+        assert!(!goal.take_due(late), "one request at a time");
+        assert!(!goal.answered(Some(CancelCode::None), late));
+        goal.accepted(late);
+        assert_eq!((goal.due(), goal.age(late)), (None, late - now));
+    }
+
+    #[test]
+    fn a_request_without_an_answer_is_sent_again() {
+        for answer in [None, Some(CancelCode::UnknownGoal)] {
+            let (mut goal, now) = begin();
+            goal.accepted(now);
+            assert!(goal.take_due(now));
+            assert!(!goal.answered(answer, now));
+            assert!(!goal.take_due(now));
+            assert!(goal.take_due(now + AGAIN));
+            assert!(!goal.answered(Some(CancelCode::Terminated), now));
+            assert!(!goal.take_due(now + AGAIN + AGAIN));
+        }
+    }
+
+    #[test]
+    fn a_refusal_is_reported_once() {
+        let (mut goal, now) = begin();
+        goal.accepted(now);
+        assert!(goal.take_due(now));
+        assert!(goal.answered(Some(CancelCode::Rejected), now));
+        assert!(!goal.answered(Some(CancelCode::Rejected), now));
+        assert_eq!(goal.due(), None);
+    }
+}
