@@ -4,7 +4,7 @@ use std::net::SocketAddr;
 
 use uadp::{
     DataSetHeader, DataSetMessage, DataValue, DecodeError, FieldEncoding, FieldValue,
-    NetworkHeader, NetworkMessageEncoder,
+    NetworkHeader, NetworkMessageEncoder, Timestamp,
 };
 
 use crate::counters::Reason;
@@ -22,6 +22,8 @@ pub(crate) struct Base {
     from: SocketAddr,
     version: (Option<u32>, Option<u32>),
     sequence: Option<u16>,
+    /// Timestamp of the key frame; none once delta frames have changed it.
+    stamp: Option<Timestamp>,
     /// Of each field whether it is in doubt; empty where none is.
     in_doubt: Vec<bool>,
 }
@@ -43,6 +45,7 @@ impl Base {
             from: place.from,
             version: (None, None),
             sequence: None,
+            stamp: None,
             in_doubt: Vec::new(),
         };
         base.renew(message, place);
@@ -58,7 +61,15 @@ impl Base {
         self.from = place.from;
         self.version = version(&header);
         self.sequence = place.sequence;
+        self.stamp = place.stamp;
         self.in_doubt.clear();
+    }
+
+    /// Whether a key frame has the fields of the last one, as far as that one came under this stamp.
+    pub(crate) fn is_same(&self, message: &DataSetMessage<'_>, stamp: Timestamp) -> bool {
+        self.stamp != Some(stamp)
+            || (self.message.first() == Some(&flags(message.encoding()))
+                && self.message.get(1..) == Some(message.payload()))
     }
 
     /// The key frame has come once more.
@@ -94,6 +105,7 @@ impl Base {
             (Some(_), None) | (None, Some(_)) => false,
         };
         self.sequence = place.sequence;
+        self.stamp = None;
         let merged = merged(&self.message, delta, out);
         if !follows || merged.is_err() {
             let count = self.count();

@@ -25,6 +25,7 @@ mod hops;
 mod layout;
 mod learned;
 mod loop_rule;
+mod loss;
 mod network;
 mod output;
 mod pace;

@@ -55,6 +55,11 @@ pub enum Output {
         /// Why the last value was dropped, where the writer is heard all the same. Only a value ends such a silence.
         dropped: Option<Reason>,
     },
+    /// The commander of a topic has ended or timed out: what the mapping says under `on_loss` is delivered.
+    CommanderLost {
+        /// Which value.
+        topic: TopicId,
+    },
     /// Of the values a topic of another space has side by side, one is no longer repeated: who comes late is not to
     /// get it any more.
     Retired {
@@ -159,12 +164,14 @@ pub struct Delivery {
     /// The DataSetMessage Status, or that of the DataValue that is the value if that is worse: the upper 16 bits of an OPC UA
     /// StatusCode, 0 is Good.
     pub status: u16,
-    /// When its datagram arrived here.
+    /// When its datagram arrived here; of a sample that waited for its local type, when that was known.
     pub arrived: Timestamp,
     /// The DataSetMessage Timestamp, where it tells this value from all others of the topic.
     pub instance: Option<Timestamp>,
     /// What it is to the others.
     pub kept: Kept,
+    /// Whether subscribers that come late get it: it is a state, and no event.
+    pub lasting: bool,
 }
 
 /// A drop worth a line in the log. One that is repeated for the same cause is told at its 1st, 10th, 100th ... occurrence.

@@ -1,6 +1,7 @@
 //! The place of a DataSetMessage among the others of its writer.
 
 use std::net::SocketAddr;
+use std::time::Duration;
 
 use uadp::Timestamp;
 
@@ -14,6 +15,10 @@ pub(crate) struct Place {
     /// When its NetworkMessage was sent.
     pub(crate) sent: Option<Timestamp>,
     pub(crate) from: SocketAddr,
+    /// How long the writer may hold a sample back before it sends it.
+    pub(crate) held_back: Duration,
+    /// Whether the stamps may be of clients of an OPC UA server, whose clocks are their own.
+    pub(crate) by_clients: bool,
 }
 
 impl Place {
@@ -29,8 +34,21 @@ impl Place {
         };
         (0..FRESH).contains(&(sent.unix_nanos() - stamp.unix_nanos()))
     }
+
+    /// Whether the sample was taken so long before it was sent that it is a stored value. Both stamps are of the writer, so
+    /// no clocks are compared. Stamps that were never filled in say nothing.
+    pub(crate) fn is_stored(&self) -> bool {
+        let (Some(stamp), Some(sent), true) = (self.stamp, self.sent, self.fine) else {
+            return false;
+        };
+        let held_back = i128::try_from(self.held_back.as_nanos()).unwrap_or(i128::MAX);
+        stamp.time.0 != 0
+            && sent.unix_nanos() - stamp.unix_nanos() >= STORED.saturating_add(held_back)
+    }
 }
 
 /// How many nanoseconds after it was taken a sample is sent at most that is no repetition; those that a rate held back or
 /// that are long in their chunks are not among them.
 const FRESH: i128 = 100_000_000;
+/// How many nanoseconds after it was taken a sample is sent at least that is a stored value.
+const STORED: i128 = 500_000_000;

@@ -4,12 +4,14 @@ use std::collections::VecDeque;
 use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
-use uadp::{BuiltinType, Timestamp};
+use mappings::Lasting;
+use uadp::{BuiltinType, DataSetMessage, SequenceOrder, Timestamp};
 
 use crate::base::Base;
 use crate::counters::Reason;
 use crate::output::Kept;
 use crate::place::Place;
+use crate::settings::Local;
 use crate::writer::MAX_KEPT;
 
 /// The state of a topic we receive.
@@ -37,6 +39,17 @@ pub(crate) struct Reader {
     /// `Some` while the writer repeats several values side by side, as it does for several latched publishers: when it
     /// last repeated another than the newest.
     several: Option<Instant>,
+    /// Whether the writer repeats its values as states, which is learnt from its messages.
+    lasting: bool,
+    /// Whether the writer was seen to send a sample right after it was taken, so that its stamps tell stored values from
+    /// new ones.
+    prompt: bool,
+    /// Whether samples with other values came under one stamp, so that the stamp tells nothing.
+    still: bool,
+    /// Whether the writer has ended or timed out since its last message, so that it may number its messages anew.
+    over: bool,
+    /// A stored value that was found to be no state.
+    withdrawn: Option<Timestamp>,
     /// A sample that waits for its local type.
     pub(crate) held: Option<Box<Held>>,
     /// The state that delta frames change.
@@ -87,6 +100,54 @@ struct Known {
     repeated: bool,
     /// Whether it is one of the topic's values now.
     live: bool,
+    /// How it was handed on.
+    handed: Handed,
+}
+
+/// How a sample was handed to the local side.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Handed {
+    /// Not at all: it was stored by its writer, and may be an event.
+    No,
+    /// To present subscribers.
+    Once,
+    /// For subscribers that come late, too.
+    Lasting,
+}
+
+/// How the values of a topic reach the local side.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Handling {
+    /// The last value is shown, whatever it is.
+    Shown,
+    /// Each value is published once into ROS.
+    Event,
+    /// The value is published into ROS and stored there for subscribers that come late.
+    State,
+    /// A state where its writer repeats it as one, else an event.
+    AsSource,
+}
+
+impl Handling {
+    pub(crate) const fn of(local: Local, lasting: Lasting) -> Self {
+        match (local, lasting) {
+            (Local::Fields, _) => Self::Shown,
+            (_, Lasting::Event) => Self::Event,
+            (_, Lasting::State) => Self::State,
+            (_, Lasting::AsSource) => Self::AsSource,
+        }
+    }
+}
+
+/// What a message that is taken is to the others of its writer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Admitted {
+    /// Messages that are missing before it.
+    pub(crate) missing: u16,
+    /// What it is to the topic's other values.
+    pub(crate) kept: Kept,
+    /// Whether subscribers that come late get it.
+    pub(crate) lasting: bool,
 }
 
 /// A sample that came before its local type was known; the newest one is kept.
@@ -97,6 +158,7 @@ pub(crate) struct Held {
     pub(crate) instance: Option<Timestamp>,
     pub(crate) status: u16,
     pub(crate) arrived: Timestamp,
+    pub(crate) lasting: bool,
 }
 
 impl Reader {
@@ -112,6 +174,11 @@ impl Reader {
             silent: false,
             known: VecDeque::new(),
             several: None,
+            lasting: false,
+            prompt: false,
+            still: false,
+            over: false,
+            withdrawn: None,
             held: None,
             base: None,
             deltas: false,
@@ -228,6 +295,7 @@ impl Reader {
         if fell {
             // Who comes back may send something else.
             self.shape = None;
+            self.over = true;
         }
         fell
     }
@@ -235,6 +303,7 @@ impl Reader {
     /// Takes note that the writer says it has ended, and says whether the topic was not silent before.
     pub(crate) fn leave(&mut self) -> bool {
         self.shape = None;
+        self.over = true;
         !std::mem::replace(&mut self.silent, true)
     }
 
@@ -248,50 +317,126 @@ impl Reader {
         (!self.silent).then(|| self.good + timeout)
     }
 
-    /// Admits a key frame into the sequence, and gives the number of messages missing before it and what it is to the
-    /// topic's other values.
+    /// Admits a message into the sequence.
     ///
-    /// The arithmetic is that of OPC 10000-14 7.2.3: ahead by less than a quarter of the range is newer, behind by
-    /// less than a quarter is old. A writer that starts over looks old by its numbers; its stamps or its new address
-    /// tell. One whose clock was set back looks by its stamps as if it repeated older values; that its numbers go on and
-    /// the sample is fresh tells.
-    pub(crate) fn admit(&mut self, place: Place, now: Instant) -> Result<(u16, Kept), Reason> {
+    /// The order of the sequence numbers is that of OPC 10000-14, 7.2.3. A writer that starts over looks old by its
+    /// numbers; its stamps or its new address tell. One whose clock was set back looks by its stamps as if it repeated older
+    /// values; that its numbers go on and the sample is fresh tells.
+    ///
+    /// # Errors
+    /// The reason to drop it: it came before under this number, a newer one came before, it repeats a value that the local
+    /// side has, or it is a stored value that may be an event.
+    pub(crate) fn admit(
+        &mut self,
+        place: Place,
+        message: Option<&DataSetMessage<'_>>,
+        handling: Handling,
+        now: Instant,
+    ) -> Result<Admitted, Reason> {
         let moved = self.from.is_some_and(|from| from != place.from);
-        let restarted =
-            moved || matches!((place.stamp, self.stamp), (Some(new), Some(last)) if new > last);
+        let again = place.stamp.is_some() && place.stamp == self.stamp;
+        let restarted = moved
+            || (self.over && !again)
+            || matches!((place.stamp, self.stamp), (Some(new), Some(last)) if new > last);
+        let first = self.sequence.is_none() || moved || self.over;
         let mut next = false;
         let missing = match (self.sequence, place.sequence) {
-            (Some(last), Some(sequence)) => match sequence.wrapping_sub(last) {
-                0 if !restarted => return Err(Reason::Duplicate),
-                0 => 0,
-                ahead @ 1..=QUARTER => {
+            (Some(last), Some(sequence)) => match SequenceOrder::of_u16(last, sequence) {
+                // The local side does not have it yet.
+                SequenceOrder::Same if handling == Handling::Shown && self.owed => 0,
+                SequenceOrder::Same if !restarted => return Err(self.again(&place)),
+                SequenceOrder::Older { .. } if !restarted => return Err(Reason::Stale),
+                SequenceOrder::Newer { missed } => {
                     next = true;
-                    ahead - 1
+                    u16::try_from(missed).unwrap_or(u16::MAX)
                 }
-                OLD.. if !restarted => return Err(Reason::Stale),
-                _ => 0,
+                SequenceOrder::Same | SequenceOrder::Older { .. } | SequenceOrder::Invalid => 0,
             },
             (_, _) => 0,
         };
         self.sequence = place.sequence;
+        self.over = false;
         self.from = Some(place.from);
         self.moved += u64::from(moved);
+        if moved {
+            self.lasting = false;
+            self.prompt = false;
+            self.still = false;
+        }
+        self.prompt |= place.is_fresh();
         if next && self.is_set_back(place) {
             self.forget_all();
             self.stamp = None;
         }
-        let kept = match place.instance() {
+        let stamp = place.instance().filter(|_| !self.still);
+        let same = stamp.is_none_or(|stamp| self.is_same(stamp, message));
+        if !same {
+            // Another value under the same stamp.
+            self.still = true;
+            self.known.clear();
+        }
+        let stamp = stamp.filter(|_| same);
+        let kept = match stamp {
             // Newer than all before, as nearly every sample is.
             Some(stamp) if self.several.is_none() && self.stamp.is_none_or(|last| stamp > last) => {
                 Kept::Alone
             }
-            Some(stamp) => self.recognise(stamp, now)?,
+            Some(stamp) => self.recognise((stamp, &place), handling, now)?,
             None => Kept::Alone,
         };
         if kept != Kept::Again {
             self.stamp = place.stamp.or(self.stamp);
         }
-        Ok((missing, kept))
+        let lasting = match handling {
+            Handling::State => true,
+            Handling::AsSource => self.lasting,
+            Handling::Shown | Handling::Event => false,
+        };
+        let into_ros = matches!(handling, Handling::Event | Handling::AsSource);
+        // Clients of an OPC UA server set the stamps of its values.
+        let is_stored = place.is_stored() && stamp.is_some() && !place.by_clients;
+        if into_ros && !lasting && is_stored && (first || self.prompt) {
+            if let Some(stamp) = stamp {
+                self.note(stamp, (kept, Handed::No), now);
+            }
+            return Err(Reason::Repeat);
+        }
+        Ok(Admitted {
+            missing,
+            kept,
+            lasting,
+        })
+    }
+
+    /// The newest message came once more under its number: its writer sends events again in case they were lost, and stored
+    /// values for readers that show them.
+    fn again(&mut self, place: &Place) -> Reason {
+        let (Some(stamp), Some(last)) = (place.instance(), self.stamp) else {
+            return Reason::Duplicate;
+        };
+        if stamp != last {
+            return Reason::Duplicate;
+        }
+        if place.is_stored() && std::mem::take(&mut self.lasting) {
+            self.withdrawn = Some(stamp);
+        }
+        Reason::Repeat
+    }
+
+    /// The value that the local side is to store no longer.
+    pub(crate) const fn take_withdrawn(&mut self) -> Option<Timestamp> {
+        self.withdrawn.take()
+    }
+
+    /// Whether a message under the stamp of the newest one has its value, as far as that is known.
+    fn is_same(&self, stamp: Timestamp, message: Option<&DataSetMessage<'_>>) -> bool {
+        if self.stamp != Some(stamp) {
+            return true;
+        }
+        match (&self.base, message) {
+            (Some(base), Some(message)) => base.is_same(message, stamp),
+            (_, _) => true,
+        }
     }
 
     /// Whether a sample that follows the last one was taken before it, by a clock that was set back in between.
@@ -306,7 +451,12 @@ impl Reader {
     }
 
     /// What a sample is that may be a repetition.
-    fn recognise(&mut self, stamp: Timestamp, now: Instant) -> Result<Kept, Reason> {
+    fn recognise(
+        &mut self,
+        (stamp, place): (Timestamp, &Place),
+        handling: Handling,
+        now: Instant,
+    ) -> Result<Kept, Reason> {
         let newest = self.stamp == Some(stamp);
         let older = self.stamp.is_some_and(|last| stamp < last);
         let known = self.known.iter_mut().find(|known| known.stamp == stamp);
@@ -323,10 +473,22 @@ impl Reader {
         };
         known.heard = now;
         known.repeated = true;
-        if known.live {
-            Err(Reason::Repeat)
-        } else {
-            Ok(Kept::Again)
+        // Only states are repeated under numbers of their own.
+        self.lasting = true;
+        let handed = known.handed;
+        match (handling, handed) {
+            (Handling::Event, _) if place.is_stored() => Err(Reason::Repeat),
+            // The same event twice under one stamp.
+            (Handling::Event, _) | (_, Handed::No) => {
+                self.known.retain(|known| known.stamp != stamp);
+                Ok(match self.several {
+                    Some(_) => Kept::Beside,
+                    None => Kept::Alone,
+                })
+            }
+            (Handling::AsSource, Handed::Once) => Ok(Kept::Again),
+            (_, Handed::Once | Handed::Lasting) if known.live => Err(Reason::Repeat),
+            (_, Handed::Once | Handed::Lasting) => Ok(Kept::Again),
         }
     }
 
@@ -335,19 +497,33 @@ impl Reader {
     pub(crate) fn delivered(
         &mut self,
         instance: Option<Timestamp>,
-        kept: Kept,
+        (kept, lasting): (Kept, bool),
         now: Instant,
     ) -> Option<Timestamp> {
         self.owed = false;
-        let Some(stamp) = instance else {
+        let Some(stamp) = instance.filter(|_| !self.still) else {
             self.known.clear();
             return None;
         };
+        let handed = match lasting {
+            true => Handed::Lasting,
+            false => Handed::Once,
+        };
+        self.note(stamp, (kept, handed), now)
+    }
+
+    fn note(
+        &mut self,
+        stamp: Timestamp,
+        (kept, handed): (Kept, Handed),
+        now: Instant,
+    ) -> Option<Timestamp> {
         let mut repeated = false;
         match kept {
             Kept::Again => {
                 if let Some(known) = self.known.iter_mut().find(|known| known.stamp == stamp) {
                     known.live = true;
+                    known.handed = handed;
                 }
                 return None;
             }
@@ -366,11 +542,20 @@ impl Reader {
             heard: now,
             repeated,
             live: true,
+            handed,
         });
         evicted
             .flatten()
             .filter(|known| known.live)
             .map(|known| known.stamp)
+    }
+
+    /// The local side no longer stores any value of the writer, which has ended or timed out. A repetition brings the value
+    /// back.
+    pub(crate) fn withdraw(&mut self) {
+        for known in &mut self.known {
+            known.live = false;
+        }
     }
 
     /// Removes the oldest one; among several values rather one that was never repeated.
@@ -424,10 +609,6 @@ const MAX_KNOWN: usize = MAX_KEPT;
 /// How long the second other word on what a topic is has to wait for, and how often that is doubled.
 const RENAME_AFTER: Duration = Duration::from_secs(10);
 const MOST_DOUBLINGS: u32 = 8;
-/// A quarter of the sequence numbers' range.
-const QUARTER: u16 = 0x4000;
-/// From here on a number counts as behind the last one.
-const OLD: u16 = 0xC000;
 
 #[cfg(test)]
 mod tests {
@@ -444,7 +625,15 @@ mod tests {
             fine: true,
             sent: None,
             from: address(1),
+            held_back: Duration::ZERO,
+            by_clients: false,
         }
+    }
+
+    /// Admits a message that is shown.
+    fn admit(reader: &mut Reader, place: Place, now: Instant) -> Result<(u16, Kept), Reason> {
+        let admitted = reader.admit(place, None, Handling::Shown, now)?;
+        Ok((admitted.missing, admitted.kept))
     }
 
     #[expect(
@@ -459,10 +648,16 @@ mod tests {
     #[test]
     fn numbers_wrap_and_gaps_are_counted() {
         let (mut reader, now) = reader();
-        assert_eq!(reader.admit(place(65_534, 1000), now), Ok((0, Kept::Alone)));
-        assert_eq!(reader.admit(place(65_535, 2000), now), Ok((0, Kept::Alone)));
         assert_eq!(
-            reader.admit(place(2, 3000), now),
+            admit(&mut reader, place(65_534, 1000), now),
+            Ok((0, Kept::Alone))
+        );
+        assert_eq!(
+            admit(&mut reader, place(65_535, 2000), now),
+            Ok((0, Kept::Alone))
+        );
+        assert_eq!(
+            admit(&mut reader, place(2, 3000), now),
             Ok((2, Kept::Alone)),
             "0 and 1 are missing"
         );
@@ -471,11 +666,18 @@ mod tests {
     #[test]
     fn old_and_equal_numbers_are_dropped_unless_the_writer_started_over() {
         let (mut reader, now) = reader();
-        assert_eq!(reader.admit(place(500, 9000), now), Ok((0, Kept::Alone)));
-        assert_eq!(reader.admit(place(500, 9000), now), Err(Reason::Duplicate));
-        assert_eq!(reader.admit(place(499, 8000), now), Err(Reason::Stale));
+        assert_eq!(hear(&mut reader, 500, 9000, now), Ok(Kept::Alone));
         assert_eq!(
-            reader.admit(place(0, 10_000), now),
+            admit(&mut reader, place(500, 9000), now),
+            Err(Reason::Repeat),
+            "sent again under its number"
+        );
+        assert_eq!(
+            admit(&mut reader, place(499, 8000), now),
+            Err(Reason::Stale)
+        );
+        assert_eq!(
+            admit(&mut reader, place(0, 10_000), now),
             Ok((0, Kept::Alone)),
             "a newer stamp tells of a restart"
         );
@@ -484,7 +686,7 @@ mod tests {
             ..place(0, 10_000)
         };
         assert_eq!(
-            reader.admit(moved, now),
+            admit(&mut reader, moved, now),
             Ok((0, Kept::Alone)),
             "another address tells of a restart"
         );
@@ -494,11 +696,11 @@ mod tests {
     fn a_repeated_key_frame_is_known_by_its_stamp() {
         let (mut reader, now) = reader();
         let first = place(1, 1000);
-        assert_eq!(reader.admit(first, now), Ok((0, Kept::Alone)));
-        reader.delivered(first.instance(), Kept::Alone, now);
-        assert_eq!(reader.admit(place(2, 1000), now), Err(Reason::Repeat));
+        assert_eq!(admit(&mut reader, first, now), Ok((0, Kept::Alone)));
+        reader.delivered(first.instance(), (Kept::Alone, false), now);
+        assert_eq!(admit(&mut reader, place(2, 1000), now), Err(Reason::Repeat));
         assert_eq!(
-            reader.admit(place(3, 2000), now),
+            admit(&mut reader, place(3, 2000), now),
             Ok((0, Kept::Alone)),
             "another sample"
         );
@@ -508,16 +710,20 @@ mod tests {
             ..place(1, 1000)
         };
         assert_eq!(
-            coarse.admit(stamp_without_picoseconds, now),
+            admit(&mut coarse, stamp_without_picoseconds, now),
             Ok((0, Kept::Alone))
         );
-        coarse.delivered(stamp_without_picoseconds.instance(), Kept::Alone, now);
+        coarse.delivered(
+            stamp_without_picoseconds.instance(),
+            (Kept::Alone, false),
+            now,
+        );
         let next = Place {
             sequence: Some(2),
             ..stamp_without_picoseconds
         };
         assert_eq!(
-            coarse.admit(next, now),
+            admit(&mut coarse, next, now),
             Ok((0, Kept::Alone)),
             "a coarse stamp may be shared by two samples"
         );
@@ -528,8 +734,8 @@ mod tests {
     /// Plays a key frame through, as the Router does.
     fn hear(reader: &mut Reader, sequence: u16, stamp: i128, now: Instant) -> Result<Kept, Reason> {
         let place = place(sequence, stamp);
-        let (_, kept) = reader.admit(place, now)?;
-        reader.delivered(place.instance(), kept, now);
+        let (_, kept) = admit(reader, place, now)?;
+        reader.delivered(place.instance(), (kept, false), now);
         Ok(kept)
     }
 
@@ -612,8 +818,8 @@ mod tests {
         };
         let (second, soon) = (1_000_000_000, 50_000);
         let mut hear = |place: Place| {
-            let (_, kept) = reader.admit(place, now)?;
-            reader.delivered(place.instance(), kept, now);
+            let (_, kept) = admit(&mut reader, place, now)?;
+            reader.delivered(place.instance(), (kept, false), now);
             Ok(kept)
         };
         let first = hear(sent_at(1, 1000 * second, 1000 * second + soon));

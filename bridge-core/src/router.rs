@@ -22,7 +22,7 @@ use std::collections::{BinaryHeap, HashMap, VecDeque};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use mappings::{Mapping, Overflow, SpaceId, TopicId};
+use mappings::{Lasting, Mapping, SpaceId, TopicId};
 use messages::{Dialect, MessageType, PlanError, Selection, Wire};
 use uadp::{Fields, Timestamp};
 
@@ -32,6 +32,7 @@ use crate::gate::{Passage, Waiting};
 use crate::guard::Guard;
 use crate::hops::{Hop, Hops};
 use crate::loop_rule::{Owned, Side, What};
+use crate::loss::{Loss, Reaction, trigger};
 use crate::network::{check_size, data_set_header, encode, keep_alive};
 use crate::output::{Delivery, Heard, Kept, Output, PublisherKey};
 use crate::pace::Pace;
@@ -150,6 +151,13 @@ impl Router {
             Local::Fields => return Ok(()),
         };
         let plan = self.plans.plan(message_type, selection, wire)?;
+        let reactions = if self.is_home(topic) {
+            None
+        } else {
+            let of = (message_type, selection);
+            let loss = Loss::new(&self.mapping, topic, of, wire)?;
+            Some((loss, trigger(&self.mapping, topic, message_type, wire)?))
+        };
         // A message as bytes is in the dialect of its origin; that of an OPC UA origin is taken as it is.
         let origin = match topic.space {
             SpaceId::UA => None,
@@ -167,6 +175,10 @@ impl Router {
         };
         entry.plan = Some(plan);
         entry.transcoder = transcoder;
+        if let Some((loss, trigger)) = reactions {
+            entry.loss = loss.map(Box::new);
+            entry.trigger = trigger.map(Box::new);
+        }
         let held = match &mut entry.role {
             Role::Theirs(reader) => {
                 reader.forget_all();
@@ -180,27 +192,36 @@ impl Router {
                 None
             }
         };
-        if let Some(held) = held
-            && let Ok(fields) = Fields::parse(&held.fields)
-        {
-            let Held {
-                source,
-                instance,
-                status,
-                arrived,
-                ..
-            } = *held;
-            let sample = Sample {
-                fields,
-                source,
-                instance,
-                kept: Kept::Alone,
-                status,
-                arrived,
-            };
-            self.deliver(topic, &sample, now);
+        if let Some(held) = held {
+            self.deliver_held(topic, &held, now);
         }
         Ok(())
+    }
+
+    /// Delivers a sample that waited for its local type; an event only while it is young.
+    fn deliver_held(&mut self, topic: TopicId, held: &Held, now: Now) {
+        let age = now.utc.unix_nanos() - held.arrived.unix_nanos();
+        if !held.lasting && age >= MAX_WAIT {
+            self.forget(topic, held.instance);
+            self.count(About::topic(topic), Reason::NotPublished, 1, || {
+                "its local type was known too late for an event".to_owned()
+            });
+            return;
+        }
+        let Ok(fields) = Fields::parse(&held.fields) else {
+            return;
+        };
+        let sample = Sample {
+            fields,
+            source: held.source,
+            instance: held.instance,
+            kept: Kept::Alone,
+            lasting: held.lasting,
+            status: held.status,
+            // The wait is no delay of this program.
+            arrived: now.utc,
+        };
+        self.deliver(topic, &sample, now);
     }
 
     /// A sample was heard on the local side.
@@ -301,7 +322,7 @@ impl Router {
         let large = encoded.bytes.len() > usize::from(max_datagram);
         let Some(Topic {
             role: Role::Ours(writer),
-            overflow,
+            lasting,
             ..
         }) = self.topics.get_mut(&topic)
         else {
@@ -315,7 +336,13 @@ impl Router {
             Message::Datagram(encoded)
         };
         writer.sent(now.monotonic);
-        let gave_way = *overflow == Overflow::KeepLatest && writer.keep(latched_by, &message);
+        let is_state = match lasting {
+            Lasting::State => true,
+            Lasting::Event => false,
+            Lasting::AsSource => latched_by.is_some(),
+        };
+        let gave_way = *lasting != Lasting::Event && writer.keep((latched_by, is_state), &message);
+        writer.send_again(&message, is_state, now.monotonic);
         if gave_way {
             self.count(About::topic(topic), Reason::TooManyPublishers, 1, || {
                 format!(
@@ -511,8 +538,16 @@ impl Router {
         match &mut entry.role {
             Role::Theirs(reader) => {
                 if reader.fell_silent(now.monotonic, silence) {
+                    if self.settings.local != Local::Fields {
+                        reader.withdraw();
+                    }
                     self.tell_silence(topic);
                     self.forget_base(topic);
+                    self.lose(topic, now);
+                } else if (entry.loss.as_ref().and_then(|loss| loss.due()))
+                    .is_some_and(|at| at <= now.monotonic)
+                {
+                    self.lose(topic, now);
                 }
             }
             Role::Ours(writer) => {
@@ -523,6 +558,10 @@ impl Router {
                 {
                     self.let_go(topic, Some(held), now);
                     return;
+                }
+                if writer.look_again(now.monotonic) && !entry.ready {
+                    entry.ready = true;
+                    self.ready.push_back(topic);
                 }
                 let Some((at, idle)) = writer.due(key_frames, keep_alives) else {
                     return;
@@ -564,6 +603,50 @@ impl Router {
         }
     }
 
+    /// The commander of a topic is lost: delivers what the mapping says, if a value was delivered since it did so last.
+    pub(super) fn lose(&mut self, topic: TopicId, now: Now) {
+        let loss = self.topics.get_mut(&topic).and_then(|of| of.loss.as_mut());
+        let Some(reaction) = loss.and_then(|loss| loss.take()) else {
+            return;
+        };
+        let (of, stop) = match reaction {
+            Reaction::Publish(stop) => (topic, Some(stop)),
+            Reaction::Call(by) => {
+                let trigger = self.topics.get(&by).and_then(|of| of.trigger.as_deref());
+                (by, trigger.cloned())
+            }
+        };
+        self.tell(Output::CommanderLost { topic });
+        let mut payload = self.buffer();
+        let written = match stop {
+            Some(stop) => stop.write(now.utc, &mut payload),
+            None => Err(format!("the service of {by} is not known here", by = of)),
+        };
+        if let Err(detail) = written {
+            self.recycle(payload);
+            self.count(
+                About::topic(topic),
+                (Reason::NotPublished, "on_loss"),
+                1,
+                || format!("`on_loss`: {detail}"),
+            );
+            return;
+        }
+        self.push(
+            of,
+            Item::Delivery(Delivery {
+                topic: of,
+                payload,
+                source: Some(now.utc),
+                status: GOOD,
+                arrived: now.utc,
+                instance: None,
+                kept: Kept::Alone,
+                lasting: false,
+            }),
+        );
+    }
+
     /// Puts the topic on the timer list at the time it wants to be looked at.
     fn schedule(&mut self, topic: TopicId) {
         let (key_frames, keep_alives, silence) = self.periods();
@@ -574,10 +657,15 @@ impl Router {
             Role::Ours(writer) => {
                 let held = entry.gate.as_ref().and_then(|gate| gate.due());
                 let idle = writer.due(key_frames, keep_alives).map(|(at, _)| at);
-                let again = entry.announce_at;
-                held.into_iter().chain(idle).chain(again).min()
+                let announce = entry.announce_at;
+                let again = writer.again_at();
+                let due = held.into_iter().chain(idle).chain(announce);
+                due.chain(again).min()
             }
-            Role::Theirs(reader) => reader.due(silence),
+            Role::Theirs(reader) => {
+                let hold = entry.loss.as_ref().and_then(|loss| loss.due());
+                reader.due(silence).into_iter().chain(hold).min()
+            }
         };
         // An earlier entry stays: it finds nothing due and asks again, which spares the list an entry per sample.
         if let Some(due) = due
@@ -665,8 +753,10 @@ impl Router {
     }
 }
 
-/// Buffers kept for reuse, and how large each may have grown.
+/// How many nanoseconds an event may wait for its local type.
+const MAX_WAIT: i128 = 1_000_000_000;
 /// The upper half of the StatusCode Good.
 const GOOD: u16 = 0;
+/// Buffers kept for reuse, and how large each may have grown.
 const SPARE_BUFFERS: usize = 64;
 const SPARE_CAPACITY: usize = 128 * 1024;

@@ -3,13 +3,14 @@
 use std::sync::Arc;
 use std::time::Instant;
 
-use mappings::Overflow;
+use mappings::{Lasting, Overflow};
 use messages::{MessageType, Plan, Selection};
 
 use crate::call::ValueDescription;
 use crate::counters::Counters;
 use crate::description::Description;
 use crate::gate::Gate;
+use crate::loss::{Loss, Stop};
 use crate::output::Delivery;
 use crate::queue::Queue;
 use crate::reader::Reader;
@@ -35,8 +36,14 @@ pub(crate) struct Topic {
     /// A large message of which chunks are still to be sent, before anything of the queue.
     pub(crate) sending: Option<Sending>,
     pub(crate) overflow: Overflow,
+    /// Whether its last value is stored for readers that come late.
+    pub(crate) lasting: Lasting,
     /// What of the fields of messages of another space is taken.
     pub(crate) takes: Takes,
+    /// What is published when its commander is lost.
+    pub(crate) loss: Option<Box<Loss>>,
+    /// The value that calls the service of the topic, where that is the reaction to the loss of a commander.
+    pub(crate) trigger: Option<Box<Stop>>,
     /// What holds samples of our own space back.
     pub(crate) gate: Option<Box<Gate>>,
     /// What is announced of it, if it is of our own space and its type is known.
@@ -88,7 +95,7 @@ impl Item {
 }
 
 impl Topic {
-    pub(crate) fn new(role: Role, overflow: Overflow) -> Self {
+    pub(crate) fn new(role: Role, (overflow, lasting): (Overflow, Lasting)) -> Self {
         Self {
             role,
             plan: None,
@@ -98,7 +105,10 @@ impl Topic {
             queue: Queue::new(overflow),
             sending: None,
             overflow,
+            lasting,
             takes: Takes::default(),
+            loss: None,
+            trigger: None,
             gate: None,
             description: None,
             said: None,

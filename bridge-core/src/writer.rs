@@ -28,12 +28,29 @@ pub(crate) struct Writer {
     next: usize,
     /// Whether anything was sent at all.
     started: bool,
+    /// The newest event, while it is sent again in case it is lost.
+    again: Option<Again>,
+}
+
+/// An event of one datagram that is sent again under its sequence number.
+#[derive(Debug)]
+struct Again {
+    message: Encoded,
+    /// When it was sent first.
+    since: Instant,
+    /// How often it was sent again.
+    times: usize,
+    /// Whether its next time has come.
+    is_due: bool,
 }
 
 /// The last sample of one latched publisher, or of all that do not latch.
 #[derive(Debug)]
 struct Kept {
     publisher: Option<PublisherKey>,
+    /// Whether it is repeated as a state: under a new sequence number. The last event is repeated under its own for
+    /// readers that show it; readers that have it drop it.
+    is_state: bool,
     message: Message,
 }
 
@@ -125,6 +142,7 @@ impl Writer {
             kept: Vec::new(),
             next: usize::MAX,
             started: false,
+            again: None,
         }
     }
 
@@ -166,7 +184,11 @@ impl Writer {
 
     /// Keeps a sample for repeating, in the place of the one before of that publisher. Says whether the oldest one
     /// gave way, since there are [`MAX_KEPT`].
-    pub(crate) fn keep(&mut self, publisher: Option<PublisherKey>, message: &Message) -> bool {
+    pub(crate) fn keep(
+        &mut self,
+        (publisher, is_state): (Option<PublisherKey>, bool),
+        message: &Message,
+    ) -> bool {
         let found = self
             .kept
             .iter()
@@ -174,6 +196,7 @@ impl Writer {
         let mut gave_way = false;
         match found.and_then(|at| Some((at, self.kept.get_mut(at)?))) {
             Some((at, kept)) => {
+                kept.is_state = is_state;
                 match (&mut kept.message, message) {
                     (Message::Datagram(last), Message::Datagram(new)) => {
                         last.bytes.clone_from(&new.bytes);
@@ -196,6 +219,7 @@ impl Writer {
                 }
                 self.kept.push(Kept {
                     publisher,
+                    is_state,
                     message: message.share(),
                 });
             }
@@ -210,6 +234,7 @@ impl Writer {
     /// No longer repeats anything.
     pub(crate) fn keep_nothing(&mut self) {
         self.kept.clear();
+        self.again = None;
         self.next = usize::MAX;
     }
 
@@ -238,43 +263,119 @@ impl Writer {
     }
 
     /// Whether the round is not over.
-    pub(crate) const fn repeats(&self) -> bool {
-        self.next < self.kept.len()
+    pub(crate) fn repeats(&self) -> bool {
+        self.next < self.kept.len() || self.again.as_ref().is_some_and(|again| again.is_due)
     }
 
     /// What the round repeats next, unless it is large and still on its way.
     pub(crate) fn next_repeated(&self) -> Option<&Message> {
+        if self.again.as_ref().is_some_and(|again| again.is_due) {
+            // Alone: it is short and must not wait.
+            return None;
+        }
         self.kept.get(self.next).map(|kept| &kept.message)
     }
 
-    /// The next sample of the round with a fresh sequence number. `buffer` gives one to write a datagram into.
+    /// The newest event once more if its time has come, else the next sample of the round: a state with a fresh sequence
+    /// number, an event under its own. `buffer` gives one to write a datagram into.
     pub(crate) fn repeat(&mut self, buffer: impl FnOnce() -> Vec<u8>) -> Option<Message> {
-        let sequence = self.sequence;
+        if let Some(again) = self.again.as_mut().filter(|again| again.is_due) {
+            again.is_due = false;
+            let mut bytes = buffer();
+            bytes.clone_from(&again.message.bytes);
+            let message = Encoded {
+                bytes,
+                ..again.message
+            };
+            if again.times >= AGAIN.len() {
+                self.again = None;
+            }
+            return Some(Message::Datagram(message));
+        }
+        let next = self.sequence;
+        let newest = next.wrapping_sub(1);
         let kept = loop {
             let kept = self.kept.get_mut(self.next)?;
             self.next += 1;
             // One that is still on its way needs no repetition.
-            match &mut kept.message {
-                Message::Large(last) => {
-                    if let Some(last) = Arc::get_mut(last) {
-                        last.number(sequence);
-                        break kept;
+            let Some(sequence) = (match &mut kept.message {
+                Message::Large(last) => Arc::get_mut(last).map(|last| {
+                    if kept.is_state {
+                        last.number(next);
                     }
-                }
-                Message::Datagram(_) => break kept,
+                    last.sequence()
+                }),
+                Message::Datagram(last) => Some(last.sequence()),
+            }) else {
+                continue;
+            };
+            // An event that is not the newest message would come late.
+            if kept.is_state || sequence == newest {
+                break kept;
             }
         };
-        self.sequence = sequence.wrapping_add(1);
+        if kept.is_state {
+            self.sequence = next.wrapping_add(1);
+        }
         Some(match &kept.message {
             Message::Datagram(last) => {
                 let mut bytes = buffer();
                 bytes.clone_from(&last.bytes);
                 let mut again = Encoded { bytes, ..*last };
-                again.number(sequence);
+                if kept.is_state {
+                    again.number(next);
+                }
                 Message::Datagram(again)
             }
             large @ Message::Large(_) => large.share(),
         })
+    }
+
+    /// Plans to send a sample again if it is an event of one datagram. It takes the place of the event before, which is not
+    /// sent any more.
+    pub(crate) fn send_again(&mut self, message: &Message, is_state: bool, now: Instant) {
+        let Message::Datagram(message) = message else {
+            self.again = None;
+            return;
+        };
+        if is_state {
+            self.again = None;
+            return;
+        }
+        let again = self.again.get_or_insert_with(|| Again {
+            message: Encoded::default(),
+            since: now,
+            times: 0,
+            is_due: false,
+        });
+        again.message.bytes.clone_from(&message.bytes);
+        again.message.timestamp_at = message.timestamp_at;
+        again.message.payload_at = message.payload_at;
+        again.message.sequence_at = message.sequence_at;
+        (again.since, again.times, again.is_due) = (now, 0, false);
+    }
+
+    /// When the newest event is sent again next.
+    pub(crate) fn again_at(&self) -> Option<Instant> {
+        let again = self.again.as_ref()?;
+        Some(again.since + *AGAIN.get(again.times)?)
+    }
+
+    /// Looks whether the newest event is to be sent again now. One whose time has passed long ago is not: it would come late.
+    pub(crate) fn look_again(&mut self, now: Instant) -> bool {
+        if self.again_at().is_none_or(|at| at > now) {
+            return false;
+        }
+        let Some(again) = &mut self.again else {
+            return false;
+        };
+        if now.saturating_duration_since(again.since) > AGAIN_WITHIN {
+            self.again = None;
+            return false;
+        }
+        again.times += 1;
+        again.is_due = true;
+        true
     }
 
     pub(crate) const fn set_live(&mut self, live: bool) {
@@ -318,6 +419,10 @@ impl Writer {
     }
 }
 
+/// When an event is sent again after it was sent first.
+const AGAIN: [Duration; 2] = [Duration::from_millis(30), Duration::from_millis(80)];
+/// From then on it is not sent again.
+const AGAIN_WITHIN: Duration = Duration::from_millis(150);
 /// Samples kept per topic: more latched publishers of one topic are not known of any graph.
 pub(crate) const MAX_KEPT: usize = 32;
 /// Samples of one topic come from several publishers, whose stamps may cross by as much; in nanoseconds.
@@ -356,7 +461,7 @@ mod tests {
         if let (Some(PublisherKey(key)), Some(byte)) = (publisher, sample.bytes.last_mut()) {
             *byte = u8::try_from(key).unwrap();
         }
-        let gave_way = writer.keep(publisher, &Message::Datagram(sample));
+        let gave_way = writer.keep((publisher, true), &Message::Datagram(sample));
         writer.sent(now);
         gave_way
     }
@@ -420,7 +525,7 @@ mod tests {
             bytes: vec![0; 20_000_000],
             ..sample()
         });
-        writer.keep(None, &Message::Large(Arc::clone(&large)));
+        writer.keep((None, true), &Message::Large(Arc::clone(&large)));
         writer.sent(now);
         let minute = SECOND * 60;
         assert_eq!(

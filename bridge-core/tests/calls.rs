@@ -640,6 +640,7 @@ fn a_server_shows_the_values_of_components_beside_its_own() {
     let now = cell.now();
     let both = Owned::Only([2, 7].into());
     cell.programs[0].router.set_owned(both, now);
+    cell.describe(GRIPPER, theirs, state());
     cell.say(GRIPPER, theirs, "again");
     cell.run(ms(100));
     assert_eq!(cell.texts(0, theirs), Vec::<String>::new());

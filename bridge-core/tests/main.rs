@@ -15,6 +15,7 @@ mod call_actions;
 mod call_freedom;
 mod call_safety;
 mod calls;
+mod events;
 mod fields;
 mod foreign;
 mod large;

@@ -13,7 +13,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use bridge_core::{
-    Delivery, Heard, Hop, Local, Notice, Now, Output, Reason, Router, Settings, Verdict,
+    Delivery, Heard, Hop, Local, Notice, Now, Output, PublisherKey, Reason, Router, Settings,
+    Verdict,
 };
 use mappings::{Mapping, SpaceId, TopicId};
 use messages::{Dialect, Registry, Selection};
@@ -326,13 +327,13 @@ fn a_topic_whose_first_value_is_null_gets_the_type_of_the_first_that_is_not() {
     let double = Variant::Scalar(Scalar::Double(1.5));
     let mut asked = Vec::new();
     for (sequence, value) in [(1, Variant::Null), (2, double)] {
+        bench.wait(SECOND);
         bench.hear(&Frame::new(10, sequence, 0).bytes_with(&value));
         for output in bench.outputs() {
             if let Output::Unbound { shape, .. } = output {
                 asked.push(shape);
             }
         }
-        bench.wait(SECOND);
     }
     assert_eq!(
         asked,
@@ -532,10 +533,12 @@ fn a_state_is_repeated_with_its_time_and_its_readers_deliver_it_once() {
     // What it consists of is announced meanwhile.
     sender.wait(SECOND);
     sender.router.handle_timeout(sender.now);
-    assert_eq!(
-        sender.say(topic("ua_1_5_10"), &[7, 0, 0, 0]),
-        Verdict::Forward
-    );
+    let state = Heard {
+        latched_by: Some(PublisherKey(1)),
+        ..heard(topic("ua_1_5_10"), &[7, 0, 0, 0], sender.now.utc)
+    };
+    let now = sender.now;
+    assert_eq!(sender.router.handle_local(state, now), Verdict::Forward);
     let first = sender.datagrams().remove(0);
     assert_eq!(
         sender.router.poll_timeout(),

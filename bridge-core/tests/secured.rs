@@ -14,7 +14,7 @@ use std::time::Duration;
 
 use bridge_core::{
     AskId, CallDescription, CallField, CallRole, Executed, Guard, KeyDelivery, Local, Offered,
-    Reason,
+    Reason, ValueDescription,
 };
 use cell::{Cell, Program, component, ms, topic};
 use mappings::{Mapping, TopicId};
@@ -255,6 +255,14 @@ fn without_keys_nothing_is_said_and_what_was_said_last_comes_with_them() {
     let mut cell = secured(ENCRYPTED);
     cell.start(WRITER, component(7));
     follows(&mut cell, WRITER, ENCRYPTED);
+    let state = ValueDescription {
+        name: "gripper.State".to_owned(),
+        message_type: Some("std_msgs/String".parse().unwrap()),
+        about: String::new(),
+        fields: Vec::new(),
+        overflow: mappings::Overflow::KeepLatest,
+    };
+    cell.describe(WRITER, said(), state);
     cell.say(WRITER, said(), "early");
     cell.run(ms(100));
     assert_eq!(last(&mut cell, READER, said()), None);
@@ -406,4 +414,27 @@ fn bridges_of_both_ros_are_as_closed() {
     }
     offer(&mut cell);
     assert_eq!(cell.known(READER), [start()]);
+}
+
+#[test]
+fn each_copy_of_an_event_is_sealed_anew_under_a_nonce_of_its_own() {
+    let mut cell = secured(ENCRYPTED);
+    cell.say(WRITER, said(), "stop");
+    cell.run(ms(200));
+    let copies = cell.datagrams_of(WRITER);
+    let of_value = |datagram: &&Vec<u8>| {
+        let message = NetworkMessage::decode(datagram).unwrap();
+        message.message_type() == uadp::NetworkMessageType::DataSet
+    };
+    let copies: Vec<_> = copies.iter().filter(of_value).collect();
+    let nonces: std::collections::BTreeSet<Vec<u8>> = copies
+        .iter()
+        .map(|datagram| {
+            let message = NetworkMessage::decode(datagram).unwrap();
+            message.security().unwrap().nonce.to_vec()
+        })
+        .collect();
+    assert!(copies.len() >= 3, "{}", copies.len());
+    assert_eq!(nonces.len(), copies.len());
+    assert_eq!(cell.texts(READER, said()), ["stop"]);
 }

@@ -325,7 +325,7 @@ fn events_of_a_topic_share_a_datagram_in_their_order_and_states_have_one_value_i
         assert_eq!(texts(&bench.sent()), [[text]]);
     }
     bench.wait(Duration::from_secs(1));
-    assert_eq!(texts(&bench.sent()), [vec!["one", "alive"], vec!["two"]]);
+    assert_eq!(texts(&bench.sent()), [vec!["alive", "one"], vec!["two"]]);
 }
 
 #[test]

@@ -181,6 +181,8 @@ pub struct Delivery {
     pub instance: Option<Timestamp>,
     /// What the value is to the others of its topic.
     pub kept: Kept,
+    /// Whether subscribers that come late get it: it is a state, and no event.
+    pub lasting: bool,
 }
 
 /// What a port reports.

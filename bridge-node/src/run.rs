@@ -457,6 +457,9 @@ impl<P: Port> Shell<P> {
                     dropped,
                 } => self.silent(topic, silent, dropped),
                 Output::Retired { topic, instance } => self.port.retired(topic, instance),
+                Output::CommanderLost { topic } => {
+                    warn!(%topic, "commander lost, `on_loss` is published");
+                }
                 Output::Notice(notice) => tell(&notice),
                 Output::KeysWanted { group } => self.keys.want(&group),
                 other => self.call_output(other),
@@ -488,6 +491,7 @@ impl<P: Port> Shell<P> {
             arrived,
             instance,
             kept,
+            lasting,
         } = delivery;
         if self.dry_run {
             self.router.recycle(payload);
@@ -500,6 +504,7 @@ impl<P: Port> Shell<P> {
             status,
             instance,
             kept,
+            lasting,
         };
         match self.port.publish(sample) {
             Ok(()) => self.router.published(topic, arrived, now()),

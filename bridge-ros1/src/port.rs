@@ -622,6 +622,7 @@ impl Port for Ros1Port {
         };
         let payload = open.stamped(sample.payload, self.node.now());
         let key = sample.instance.map_or(0, latch_key);
+        open.publisher.set_latching(sample.lasting);
         let latched = match sample.kept {
             Kept::Alone => Latched::Alone(key),
             Kept::Beside => Latched::Beside(key),
@@ -687,9 +688,12 @@ impl Port for Ros1Port {
     }
 
     fn silent(&mut self, topic: TopicId, silent: bool) {
-        // ROS 1 has no word for it; the last value stays with its subscribers.
         tracing::debug!(%topic, silent, "the writer in the space");
         if let Some(sink) = self.sinks.get_mut(&topic) {
+            // The value stays with the subscribers that have it, and goes to no other.
+            if let Some(open) = sink.open.as_ref().filter(|_| silent) {
+                open.publisher.forget_all_latched();
+            }
             sink.silent = silent.then(|| bridge_node::now().monotonic);
         }
     }

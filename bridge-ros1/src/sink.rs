@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use bridge_node::policy::{Choice, Destination};
 use bytes::{Bytes, BytesMut};
-use mappings::Overflow;
+use mappings::Lasting;
 use messages::{MessageType, TypeName};
 use tcpros::{Publisher, PublisherOptions, RosTime};
 
@@ -19,7 +19,7 @@ pub(crate) struct Sink {
     pub(crate) open: Option<Open>,
     /// Since when its writer in the space is silent.
     pub(crate) silent: Option<Instant>,
-    latch: bool,
+    lasting: Lasting,
 }
 
 /// A publisher and its type.
@@ -57,15 +57,15 @@ impl Sink {
         let Destination {
             ros_topic,
             mapped,
-            overflow,
+            lasting,
+            ..
         } = destination;
         Self {
             ros_topic,
             choice: Choice::new(mapped),
             open: None,
             silent: None,
-            // The value of a state is of use to who comes late, an event is not.
-            latch: overflow == Overflow::KeepLatest,
+            lasting,
         }
     }
 
@@ -73,7 +73,7 @@ impl Sink {
     pub(crate) fn is_like(&self, other: &Self) -> bool {
         self.ros_topic == other.ros_topic
             && self.choice.mapped() == other.choice.mapped()
-            && self.latch == other.latch
+            && self.lasting == other.lasting
     }
 
     /// The types it could have, best first. `asked_for` is the one the master names.
@@ -94,10 +94,11 @@ impl Sink {
         })
     }
 
-    /// The Router's queue says what waits; behind it, as much is held for a slow subscriber as for any.
+    /// The Router's queue says what waits; behind it, as much is held for a slow subscriber as for any. Whether a topic is
+    /// latched whose kind its source decides is known with its first state.
     pub(crate) fn options(&self) -> PublisherOptions {
         PublisherOptions {
-            latch: self.latch,
+            latch: self.lasting == Lasting::State,
             ..PublisherOptions::default()
         }
     }
@@ -106,6 +107,7 @@ impl Sink {
 #[cfg(test)]
 mod tests {
     use bridge_node::policy::{Step, Word};
+    use mappings::Overflow;
     use messages::Selection;
 
     use super::*;
@@ -116,6 +118,7 @@ mod tests {
             ros_topic: "/ua_2_2_3".to_owned(),
             mapped: None,
             overflow: Overflow::KeepLatest,
+            lasting: Lasting::State,
         });
         let word = Word {
             standard: Some("std_msgs/Float64".parse().unwrap()),
@@ -138,6 +141,7 @@ mod tests {
             ros_topic: "/button".to_owned(),
             mapped: Some(("std_msgs/Bool".parse().unwrap(), Selection::Whole)),
             overflow: Overflow::DropOldest(8.try_into().unwrap()),
+            lasting: Lasting::Event,
         });
         assert!(!sink.options().latch);
     }

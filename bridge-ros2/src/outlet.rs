@@ -32,6 +32,8 @@ pub struct Outlet {
     in_flight: usize,
     /// Of a state topic, the value its readers have: another writer has to begin with it.
     last: Option<Sample>,
+    /// Since when the writer's history holds a sample that no reader is to find there, once those that are present have it.
+    to_forget: Option<Instant>,
     /// Writers that were replaced, oldest first, while their readers may lack something of what they wrote.
     former: VecDeque<Former>,
 }
@@ -46,14 +48,16 @@ pub struct Former {
 struct Sample {
     payload: Payload,
     source: Option<Timestamp>,
+    /// Whether readers that come late get it.
+    lasting: bool,
 }
 
 /// Who listens.
 #[derive(Debug)]
 enum Audience {
-    /// Nobody. A state topic holds its last value back: a volatile reader that comes would not be given what was written before,
-    /// and in the history of RustDDS as published what nobody acknowledged would become a trail of old values. The value
-    /// before it is no longer true and must not be in the history either.
+    /// Nobody. The last state stands alone in the history for a transient-local reader that comes; a volatile one gets nothing
+    /// that was written before. In the history of RustDDS as published what nobody acknowledged would become a trail of old
+    /// values: there the state is held back until transient-local readers, and no others, have come.
     Nobody { held: Option<Sample> },
     /// Somebody, whom a sample of at most that size reaches.
     Present {
@@ -111,6 +115,7 @@ impl Outlet {
             full_since: None,
             in_flight: 0,
             last: None,
+            to_forget: None,
             former: VecDeque::new(),
         }
     }
@@ -162,10 +167,47 @@ impl Outlet {
         self.writer.guid()
     }
 
-    /// Whether samples wait for room; [`flush`](Self::flush) sends them when there is some.
+    /// Whether samples wait for room, or to be forgotten; [`flush`](Self::flush) sees to both.
     #[must_use]
     pub fn is_waiting(&self) -> bool {
-        !self.waiting.is_empty()
+        !self.waiting.is_empty() || self.to_forget.is_some()
+    }
+
+    /// Whether readers that come late get a value that is not older than `source`.
+    #[must_use]
+    pub fn stores_newer_than(&self, source: Option<Timestamp>) -> bool {
+        let held = match &self.audience {
+            Audience::Nobody { held } => held.as_ref(),
+            Audience::Present { .. } => None,
+        };
+        held.or(self.last.as_ref())
+            .is_some_and(|stored| stored.source >= source)
+    }
+
+    /// Gives readers that come late nothing of what was written so far. Those that are present still get it.
+    pub fn forget_stored(&mut self, now: Instant) {
+        if let Audience::Nobody { held } = &mut self.audience {
+            *held = None;
+        }
+        for sample in &mut self.waiting {
+            sample.lasting = false;
+        }
+        if self.last.take().is_some() {
+            self.to_forget = Some(now);
+        }
+        self.look_back(now);
+    }
+
+    /// Clears the history of samples that no reader is to find there, once the readers that are present have acknowledged them
+    /// or had the time to.
+    fn look_back(&mut self, now: Instant) {
+        let Some(since) = self.to_forget else {
+            return;
+        };
+        if now.saturating_duration_since(since) >= STUCK_AFTER || self.is_acknowledged() {
+            self.forget_written();
+            self.to_forget = None;
+        }
     }
 
     /// Whether a writer that was replaced is still there; [`set_readers`](Self::set_readers) lets go of it.
@@ -174,7 +216,7 @@ impl Outlet {
         !self.former.is_empty()
     }
 
-    /// Writes a sample, or queues it. Never waits.
+    /// Writes a sample, or queues it. Never waits. Of a state topic readers that come late get it, too.
     ///
     /// # Errors
     /// [`Refusal`]: one sample was lost, this or an older one.
@@ -184,16 +226,44 @@ impl Outlet {
         source: Option<Timestamp>,
         now: Instant,
     ) -> Result<(), Refusal> {
-        let sample = Sample { payload, source };
+        let lasting = self.offered == Offered::KeepLatest;
+        self.offer_sample(
+            Sample {
+                payload,
+                source,
+                lasting,
+            },
+            now,
+        )
+    }
+
+    /// As [`offer`](Self::offer), of an event: for the readers that are present.
+    ///
+    /// # Errors
+    /// [`Refusal`]: one sample was lost, this or an older one.
+    pub fn offer_once(
+        &mut self,
+        payload: Payload,
+        source: Option<Timestamp>,
+        now: Instant,
+    ) -> Result<(), Refusal> {
+        self.offer_sample(
+            Sample {
+                payload,
+                source,
+                lasting: false,
+            },
+            now,
+        )
+    }
+
+    fn offer_sample(&mut self, sample: Sample, now: Instant) -> Result<(), Refusal> {
         if matches!(self.audience, Audience::Nobody { .. }) {
             self.notice_matches(now);
         }
         match &mut self.audience {
-            Audience::Nobody { held } if self.offered == Offered::KeepLatest => {
-                if held.replace(sample).is_none() {
-                    self.forget_written();
-                }
-                return Ok(());
+            Audience::Nobody { .. } if self.offered == Offered::KeepLatest => {
+                return self.store(sample, now);
             }
             Audience::Nobody { .. } => {}
             Audience::Present { sample_size, .. } if sample.payload.len() > *sample_size => {
@@ -225,6 +295,7 @@ impl Outlet {
     /// # Errors
     /// [`Refusal::Failed`], with the sample lost.
     pub fn flush(&mut self, now: Instant) -> Result<(), Refusal> {
+        self.look_back(now);
         if self.waiting.is_empty() || !self.is_settled(now) {
             return Ok(());
         }
@@ -249,14 +320,35 @@ impl Outlet {
         if readers.is_empty() {
             self.former.clear();
             if !matches!(self.audience, Audience::Nobody { .. }) {
-                self.leave_alone();
+                self.leave_alone(now);
             }
             return Ok(());
         }
         match self.greet(now, readers.len(), limits::sample_size(readers)) {
-            Some(held) => self.offer(held.payload, held.source, now),
-            None => Ok(()),
+            // A volatile reader is not given what was written before it came.
+            Some(held) if readers.iter().all(|reader| reader.transient_local) => {
+                self.offer_sample(held, now)
+            }
+            Some(_) | None => Ok(()),
         }
+    }
+
+    /// Keeps a state for readers that come, in the place of the one before, which is no longer true. An event is for nobody.
+    fn store(&mut self, sample: Sample, now: Instant) -> Result<(), Refusal> {
+        self.forget_written();
+        self.to_forget = None;
+        self.last = None;
+        let mut rest = None;
+        if sample.lasting {
+            rest = match limits::PATCHED {
+                true => self.write(sample, now)?,
+                false => Some(sample),
+            };
+        }
+        if let Audience::Nobody { held } = &mut self.audience {
+            *held = rest;
+        }
+        Ok(())
     }
 
     /// Whether what is written now reaches the readers there are. Asked for the first time when there is something to
@@ -296,15 +388,25 @@ impl Outlet {
     }
 
     /// Nobody listens any more.
-    fn leave_alone(&mut self) {
+    fn leave_alone(&mut self, now: Instant) {
         let mut held = None;
         if self.offered == Offered::KeepLatest {
             held = self.waiting.drain(..).next_back();
         }
-        if held.is_some() {
-            self.forget_written();
+        self.audience = Audience::Nobody { held: None };
+        if let Some(held) = held {
+            // A writer that fails says so at the next value.
+            drop(self.store(held, now));
         }
-        self.audience = Audience::Nobody { held };
+    }
+
+    /// Whether the readers that are present have all that was written.
+    fn is_acknowledged(&self) -> bool {
+        #[cfg(feature = "patched-dds")]
+        let acknowledged = self.writer.unacknowledged().samples == 0;
+        #[cfg(not(feature = "patched-dds"))]
+        let acknowledged = false;
+        acknowledged
     }
 
     /// Takes back what was written, for a newer value that is not.
@@ -364,15 +466,25 @@ impl Outlet {
 
     /// Gives a sample to RustDDS; returns it when the send window is full.
     fn write(&mut self, sample: Sample, now: Instant) -> Result<Option<Sample>, Refusal> {
-        let Sample { payload, source } = sample;
+        let Sample {
+            payload,
+            source,
+            lasting,
+        } = sample;
         let size = payload.len();
         if !self.has_room(size) {
             self.full_since.get_or_insert(now);
-            return Ok(Some(Sample { payload, source }));
+            return Ok(Some(Sample {
+                payload,
+                source,
+                lasting,
+            }));
         }
-        let kept = (self.offered == Offered::KeepLatest).then(|| Sample {
+        let is_state = self.offered == Offered::KeepLatest;
+        let kept = (is_state && lasting).then(|| Sample {
             payload: payload.clone(),
             source,
+            lasting,
         });
         let mut written = self.writer.write(payload, source);
         if let Err(WriteError::WouldBlock { data }) = written {
@@ -386,6 +498,8 @@ impl Outlet {
             Ok(()) => {
                 self.full_since = None;
                 self.in_flight += size;
+                // The newest sample pushes the one before out of the history.
+                self.to_forget = (is_state && !lasting).then_some(now);
                 self.last = kept;
                 Ok(None)
             }
@@ -394,6 +508,7 @@ impl Outlet {
                 Ok(Some(Sample {
                     payload: data,
                     source,
+                    lasting,
                 }))
             }
             Err(

@@ -470,11 +470,17 @@ impl Port for Ros2Port {
             source,
             status,
             kept,
+            lasting,
             ..
         } = sample;
         if kept == Kept::Again {
-            // A writer of depth 1 has no place for more than the last value.
-            return Ok(());
+            // A service is no late subscriber, and a writer of depth 1 has no place for more than the newest value.
+            let sink = self.sinks.get(&topic).and_then(|sink| sink.open.as_ref());
+            let stores_newer =
+                sink.is_none_or(|open| open.outlet.stores_newer_than(source.map(dds_time)));
+            if !lasting || self.services.takes(topic) || stores_newer {
+                return Ok(());
+            }
         }
         if is_bad(status) {
             return Err("bad status");
@@ -501,9 +507,11 @@ impl Port for Ros2Port {
         let payload = open.stamped(payload, || self.clock.now());
         let payload = Payload::to_write(payload).map_err(|error| error.label())?;
         let size = payload.len();
-        let offered = open
-            .outlet
-            .offer(payload, source.map(dds_time), Instant::now());
+        let (source, now) = (source.map(dds_time), Instant::now());
+        let offered = match lasting {
+            true => open.outlet.offer(payload, source, now),
+            false => open.outlet.offer_once(payload, source, now),
+        };
         self.schedule.waiting |= open.outlet.is_waiting();
         if let Err(Refusal::TooLarge(limit)) = offered {
             let dds_topic = dds_topic.clone();
@@ -569,9 +577,13 @@ impl Port for Ros2Port {
     }
 
     fn silent(&mut self, topic: TopicId, silent: bool) {
-        // DDS has no word for it; the last value stays with its subscribers.
         debug!(%topic, silent, "the writer in the space");
         if let Some(sink) = self.sinks.get_mut(&topic) {
+            // The value stays with the subscribers that have it, and goes to no other.
+            if let Some(open) = sink.open.as_mut().filter(|_| silent) {
+                open.outlet.forget_stored(Instant::now());
+                self.schedule.waiting |= open.outlet.is_waiting();
+            }
             sink.silent = silent.then(|| now().monotonic);
         }
     }

@@ -1,10 +1,11 @@
 //! A topic of the domain that we write values of other spaces to.
 
+use std::num::NonZeroU16;
 use std::time::Instant;
 
 use bridge_node::policy::{Choice, Destination};
 use bytes::{Bytes, BytesMut};
-use mappings::Overflow;
+use mappings::{Lasting, Overflow};
 use messages::TypeName;
 use rustdds::Duration;
 
@@ -80,10 +81,11 @@ impl Sink {
             ros_topic,
             mapped,
             overflow,
+            lasting,
         } = destination;
         Self {
             dds_topic: dds_topic(&ros_topic),
-            offered: offered(overflow),
+            offered: offered(overflow, lasting),
             choice: Choice::new(mapped),
             open: None,
             silent: None,
@@ -125,9 +127,17 @@ impl Sink {
 /// Each other deadline needs another writer, so readers get that many.
 const MOST_TIGHTENED: u32 = 8;
 
-fn offered(overflow: Overflow) -> Offered {
+/// The policies of a topic. Where its source decides whether it is a state, it is offered as one and its events are forgotten
+/// once they are delivered, which RustDDS as published cannot do.
+fn offered(overflow: Overflow, lasting: Lasting) -> Offered {
+    let is_offered = match lasting {
+        Lasting::State => true,
+        Lasting::Event => false,
+        Lasting::AsSource => crate::limits::PATCHED,
+    };
     match overflow {
-        Overflow::KeepLatest => Offered::KeepLatest,
+        Overflow::KeepLatest if is_offered => Offered::KeepLatest,
+        Overflow::KeepLatest => Offered::DropOldest(NonZeroU16::MIN),
         Overflow::DropOldest(depth) => Offered::DropOldest(depth),
     }
 }
@@ -160,6 +170,7 @@ mod tests {
             ros_topic: ros_topic.to_owned(),
             mapped: mapped.map(|name| (name.parse().unwrap(), Selection::Whole)),
             overflow: Overflow::KeepLatest,
+            lasting: Lasting::State,
         })
     }
 

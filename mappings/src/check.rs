@@ -6,6 +6,7 @@ mod cell;
 mod confirm;
 mod environment;
 mod finding;
+mod loss;
 mod meaning;
 mod names;
 mod network;

@@ -214,10 +214,18 @@ document! {
         from: FromEntry,
         /// The node of another OPC UA server that each value is written to, be it of this space or of another.
         to: ToEntry,
-        /// What its queue does when full: `keep_latest` (the default, for states) or `{drop_oldest: 100}` (for events). Of
-        /// values that call a service, `keep_latest` tries the newest until it is taken or replaced, `drop_oldest` each
-        /// once within its `timeout`.
+        /// `keep_latest` for a state: the newest value counts and ROS subscribers that come late get it. `{drop_oldest: 100}`
+        /// for events: each value is delivered once, to the subscribers that are present. Left out: an event for values of
+        /// origin 0 and values that call a service; others are what their ROS publisher is, a state where it is latched or
+        /// transient-local and an event otherwise.
         queue: Queue,
+        /// What is published once into ROS when the commander of the value has ended or timed out, if a value of it was published
+        /// since: `zero`, the value of the bound `field`, fields of the message as {linear.x: 0.1}, or {call: ns=2;i=48} for
+        /// the service that the values of that variable call.
+        on_loss: OnLossEntry,
+        /// With `on_loss`: a value that is not renewed for this long is lost, too, as 500ms.
+        #[schemars(regex(pattern = DURATION))]
+        hold: String,
         /// Which values its origin sends: `always` (the default) each, `on_change` those that differ from the last one sent.
         publish: PublishEntry,
         /// As `publish: on_change`, and numbers (each of an array) have to differ by more than this.
@@ -246,6 +254,13 @@ document! {
         /// (BadNoCommunication) and is not shown. Left out: as `server.bad_after` says.
         #[schemars(regex(pattern = DURATION))]
         bad_after: String,
+    }
+
+    /// A service that stops the robot.
+    struct StopCallEntry {
+        /// Node of the variable whose values call it with the same request each time, as ns=2;i=48.
+        #[schemars(required, regex(pattern = r"^(ns=[0-9]+;)?[isgb]="))]
+        call: String,
     }
 
     /// What says that a value a client wrote has arrived. Without it in time the write is BadTimeout, the variable shows what it
@@ -662,6 +677,60 @@ impl JsonSchema for Request {
 
     fn json_schema(_: &mut schemars::SchemaGenerator) -> schemars::Schema {
         schemars::json_schema!({ "type": "object" })
+    }
+}
+
+/// What is published when the commander of a value is lost.
+#[derive(Clone, Debug)]
+pub(crate) enum OnLossEntry {
+    /// A message of zeros.
+    Zero,
+    /// The value of the bound field.
+    Value(Literal),
+    /// Fields of the message.
+    Fields(Request),
+    /// A service.
+    Call(StopCallEntry),
+}
+
+impl Read for OnLossEntry {
+    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
+        match &node.kind {
+            Kind::Scalar(text) if text == "zero" => Some(Self::Zero),
+            Kind::Scalar(text) => Some(Self::Value(Literal::One(text.clone().into_owned()))),
+            Kind::Map(pairs) if pairs.iter().any(|(key, _)| is_scalar(key, "call")) => {
+                StopCallEntry::read(node, reader).map(Self::Call)
+            }
+            Kind::Map(_) => Request::read(node, reader).map(Self::Fields),
+            Kind::Null | Kind::List(_) => {
+                reader.wrong(
+                    node,
+                    "`zero`, a value, the fields of a message as {linear.x: 0.1}, or {call: ns=2;i=48}",
+                );
+                None
+            }
+        }
+    }
+}
+
+fn is_scalar(node: &Node<'_>, wanted: &str) -> bool {
+    matches!(&node.kind, Kind::Scalar(text) if text == wanted)
+}
+
+impl JsonSchema for OnLossEntry {
+    fn inline_schema() -> bool {
+        true
+    }
+
+    fn schema_name() -> std::borrow::Cow<'static, str> {
+        "OnLoss".into()
+    }
+
+    fn json_schema(generator: &mut schemars::SchemaGenerator) -> schemars::Schema {
+        let call = generator.subschema_for::<StopCallEntry>();
+        schemars::json_schema!({
+            "anyOf": [{ "const": "zero" }, { "type": ["number", "boolean", "string"] }, call, { "type": "object" }]
+        })
     }
 }
 

@@ -11,6 +11,7 @@ mod environment;
 mod findings;
 mod include;
 mod key_text;
+mod loss;
 mod mapping;
 mod nearest;
 mod node_id;
@@ -42,9 +43,10 @@ pub use difference::Difference;
 pub use endpoint::Endpoint;
 pub use environment::{Environment, LiveNode, LiveRemote, LiveServer, LiveSpace, LiveTopic};
 
+pub use loss::{Loss, LossAction};
 pub use mapping::{
-    Binding, Mapping, Meaning, Overflow, PubSub, Publish, PublisherIdRule, SecurityPolicy, Server,
-    ServerLimits, ServiceBinding, ServiceRole, Space, Trigger, UaField, Variable,
+    Binding, Lasting, Mapping, Meaning, Overflow, PubSub, Publish, PublisherIdRule, SecurityPolicy,
+    Server, ServerLimits, ServiceBinding, ServiceRole, Space, Trigger, UaField, Variable,
 };
 pub use node_id::{ExpandedNodeIdText, Identifier, NamespaceText, NodeIdError, NodeIdText};
 pub use nodesets::{NodeSetFault, NodeSetNode, NodeSetType, NodeSets};

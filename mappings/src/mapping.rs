@@ -11,6 +11,7 @@ use uadp::BuiltinType;
 
 use crate::call::{Call, CallBinding};
 use crate::endpoint::Endpoint;
+use crate::loss::Loss;
 use crate::node_id::NodeIdText;
 use crate::pattern::{Pattern, PatternFault, PatternReason, PatternVariable};
 use crate::permission::{Anonymous, Permissions};
@@ -560,6 +561,8 @@ pub struct Variable {
     pub service: Option<Box<ServiceBinding>>,
     /// What its queue does when full.
     pub overflow: Overflow,
+    /// Whether readers that come late get its last value.
+    pub lasting: Lasting,
     /// Which of its values its origin sends.
     pub publish: Publish,
     /// What its numbers mean.
@@ -570,6 +573,8 @@ pub struct Variable {
     pub ages: Ages,
     /// How many past values are kept; `None` as many as of all.
     pub history: Option<u16>,
+    /// What is published when its commander is lost.
+    pub loss: Option<Box<Loss>>,
     /// What says that a written value has arrived.
     pub confirm: Option<Box<Confirm>>,
     /// The node of another OPC UA server it comes from; its origin is the OPC UA side then.
@@ -682,6 +687,29 @@ pub enum Overflow {
     KeepLatest,
     /// That many places: the oldest goes. For events.
     DropOldest(NonZeroU16),
+}
+
+/// Whether the last value of a variable is stored for readers that come late.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Lasting {
+    /// A state: the last value is repeated while its producer is alive, and latched on the ROS side.
+    State,
+    /// An event or a command: delivered once, to the subscribers that are present.
+    Event,
+    /// A state where the ROS publisher is latched or transient-local, else an event on the ROS side. OPC UA clients see the
+    /// last value in both cases.
+    #[default]
+    AsSource,
+}
+
+impl From<Overflow> for Lasting {
+    /// The kind of a value whose queue is declared.
+    fn from(overflow: Overflow) -> Self {
+        match overflow {
+            Overflow::KeepLatest => Self::State,
+            Overflow::DropOldest(_) => Self::Event,
+        }
+    }
 }
 
 #[cfg(test)]

@@ -61,6 +61,7 @@ fn every_type_of_both_bundles_crosses_or_is_told_with_the_fields_of_both_sides()
     let told: BTreeSet<(String, String)> = checked
         .findings
         .iter()
+        .filter(|found| found.code != Code::EndlessMotion)
         .map(|found| {
             let name = names.get(found.at.line - 4).unwrap();
             let help = found.help.clone().unwrap_or_default();

@@ -1,7 +1,7 @@
 //! Publishing: one topic, its subscribers, and the message a late one gets.
 
 use std::collections::VecDeque;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 
 use bytes::Bytes;
@@ -115,6 +115,19 @@ impl Publisher {
             .retain(|(other, _)| *other != key);
     }
 
+    /// Late subscribers no longer get anything of what was published so far.
+    pub fn forget_all_latched(&self) {
+        lock(&self.hub.state).latched.clear();
+    }
+
+    /// Changes whether late subscribers get the last message. A publisher that stops to latch forgets what it latched.
+    pub fn set_latching(&self, latch: bool) {
+        let was = self.hub.latching.swap(latch, Ordering::Relaxed);
+        if was && !latch {
+            self.forget_all_latched();
+        }
+    }
+
     /// How many subscribers are connected.
     pub fn subscribers(&self) -> usize {
         lock(&self.hub.state).subscribers.len()
@@ -158,6 +171,8 @@ pub(crate) struct Hub {
     /// Tells this registration from an earlier one of the same topic.
     pub(crate) generation: u64,
     options: PublisherOptions,
+    /// Whether late subscribers get the last message by now.
+    latching: AtomicBool,
     state: Mutex<HubState>,
     dropped: AtomicU64,
     /// The node's count of connections to subscribers.
@@ -206,6 +221,7 @@ impl Hub {
             topic_type,
             generation,
             options,
+            latching: AtomicBool::new(options.latch),
             state: Mutex::default(),
             dropped: AtomicU64::new(0),
             draining,
@@ -230,8 +246,8 @@ impl Hub {
             published.sent_to += 1;
         }
         let mut dropped = published.dropped_oldest;
-        if self.options.latch {
-            state.note(latched.key());
+        state.note(latched.key());
+        if self.is_latching() {
             dropped += state.latch(message, latched);
         }
         drop(state);
@@ -239,8 +255,12 @@ impl Hub {
         published
     }
 
+    fn is_latching(&self) -> bool {
+        self.latching.load(Ordering::Relaxed)
+    }
+
     fn latch(&self, message: Bytes, latched: Latched) {
-        if self.options.latch {
+        if self.is_latching() {
             let mut state = lock(&self.state);
             let mut dropped = state.make_up(latched.key(), &message);
             dropped += state.latch(message, latched);
@@ -335,7 +355,7 @@ impl Hub {
             .with("type", &*ours.name)
             .with("message_definition", &*ours.definition)
             .with("topic", &*self.topic)
-            .with("latching", if self.options.latch { "1" } else { "0" });
+            .with("latching", if self.is_latching() { "1" } else { "0" });
         Ok(reply)
     }
 }

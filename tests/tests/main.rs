@@ -19,6 +19,7 @@ mod interfaces;
 mod knowledge;
 mod large;
 mod latched;
+mod late_subscribers;
 mod loop_silence;
 mod mes;
 mod metadata;

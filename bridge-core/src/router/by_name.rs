@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use mappings::{FieldMap, TopicId};
+use mappings::{FieldMap, Lasting, TopicId};
 use messages::{MessageType, Plan, PlanError, Selection};
 use uadp::Fields;
 
@@ -83,8 +83,9 @@ impl Router {
                 arranged: None,
             }));
         }
-        if entry.overflow != overflow {
-            self.requeue(topic, overflow);
+        let rules = (overflow, Lasting::from(overflow));
+        if (entry.overflow, entry.lasting) != rules {
+            self.requeue(topic, rules);
         }
         if ours {
             return self.bind(topic, message_type, &Selection::Whole, now);

@@ -98,7 +98,7 @@ impl Router {
         else {
             return Takes::All;
         };
-        if message.kind != MessageKind::KeyFrame || message.encoding() == FieldEncoding::RawData {
+        if message.kind != MessageKind::KeyFrame {
             return *takes;
         }
         let before = reader.base.as_ref().map_or(0, |base| base.weight());

@@ -4,7 +4,7 @@
 use std::net::SocketAddr;
 use std::time::Instant;
 
-use mappings::{Overflow, TopicId};
+use mappings::{Lasting, Overflow, SpaceId, TopicId};
 
 use super::{About, Router};
 use crate::counters::Reason;
@@ -45,13 +45,20 @@ impl Router {
     ) -> Option<&mut Topic> {
         if !self.topics.contains_key(&topic) {
             let variable = self.mapping.variable(topic);
-            let overflow = variable.map_or(Overflow::KeepLatest, |found| found.overflow);
+            let rules = match variable {
+                Some(found) => (found.overflow, found.lasting),
+                // A command, unless the local side says that it is a state.
+                None if topic.space == SpaceId::UA && self.is_home(topic) => {
+                    (Overflow::default(), Lasting::Event)
+                }
+                None => <(Overflow, Lasting)>::default(),
+            };
             let role = if self.is_home(topic) {
                 Role::Ours(Box::new(Writer::new(now.monotonic)))
             } else {
                 Role::Theirs(Box::new(Reader::new(from, now.monotonic)))
             };
-            let mut entry = Topic::new(role, overflow);
+            let mut entry = Topic::new(role, rules);
             entry.takes = Takes::of(variable);
             entry.gate = match variable {
                 Some(variable) if self.is_home(topic) => Gate::new(variable.publish),

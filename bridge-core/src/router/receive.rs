@@ -17,7 +17,7 @@ use crate::hops::Hop;
 use crate::loop_rule::{Owned, Side, What, may_cross};
 use crate::output::{Delivery, Kept, Output};
 use crate::place::Place;
-use crate::reader::Held;
+use crate::reader::{Admitted, Handling, Held};
 use crate::settings::{Local, Now};
 use crate::topic::{Item, Role, Topic};
 
@@ -192,9 +192,16 @@ impl Router {
         let mut place = place(&message.header(), (from, sent));
         // Only key frames are repeated.
         place.fine &= message.kind == MessageKind::KeyFrame;
+        place.by_clients = topic.space == SpaceId::UA;
+        place.held_back = self
+            .mapping
+            .variable(topic)
+            .map_or(Duration::ZERO, |variable| variable.publish.period);
+        let local = self.settings.local;
         let Some(Topic {
             role: Role::Theirs(reader),
             counters,
+            lasting,
             ..
         }) = self.entry(topic, from, now)
         else {
@@ -208,12 +215,14 @@ impl Router {
             // It says that the writer lives, and that is all.
             MessageKind::KeepAlive => None,
             MessageKind::KeyFrame | MessageKind::DeltaFrame | MessageKind::Event => {
-                Some(reader.admit(place, now.monotonic))
+                let handling = Handling::of(local, *lasting);
+                Some(reader.admit(place, Some(message), handling, now.monotonic))
             }
         };
-        if let Some(Ok((missing, _))) = admitted {
-            counters.missing += u64::from(missing);
+        if let Some(Ok(admitted)) = &admitted {
+            counters.missing += u64::from(admitted.missing);
         }
+        let withdrawn = reader.take_withdrawn();
         counters.sender_changed += reader.take_moved();
         let returned = match admitted {
             None => reader.lives(now.monotonic),
@@ -227,6 +236,14 @@ impl Router {
             self.ask_what(topic, now);
         }
         self.retire(topic, now);
+        let entry = self.topics.get(&topic);
+        if entry.is_some_and(|entry| entry.timer.is_none()) {
+            // The port has it since before its writer was heard.
+            self.schedule(topic);
+        }
+        if let Some(instance) = withdrawn {
+            self.tell(Output::Retired { topic, instance });
+        }
         match admitted {
             None => {}
             Some(Err(reason)) => {
@@ -239,7 +256,7 @@ impl Router {
                 };
                 self.count(about, reason, 1, String::new);
             }
-            Some(Ok((_, kept))) => self.take_in(topic, message, (&place, kept, sent), now),
+            Some(Ok(admitted)) => self.take_in(topic, message, (&place, &admitted, sent), now),
         }
     }
 
@@ -248,7 +265,7 @@ impl Router {
         &mut self,
         topic: TopicId,
         message: &DataSetMessage<'_>,
-        (place, kept, sent): (&Place, Kept, Option<Timestamp>),
+        (place, admitted, sent): (&Place, &Admitted, Option<Timestamp>),
         now: Now,
     ) {
         let status = message.header().status.unwrap_or_default();
@@ -256,14 +273,15 @@ impl Router {
             fields,
             source: quality.source.or(place.stamp),
             instance: place.instance(),
-            kept,
+            kept: admitted.kept,
+            lasting: admitted.lasting,
             status: quality.status(status),
             arrived: now.utc,
         };
         let takes = self.take_base(topic, message, place);
         match Self::plain(message, takes) {
             Some(Ok(fields)) => {
-                self.record_way(place.stamp, sent, now);
+                self.record_way(place, sent, now);
                 self.route(topic, &sample(fields, Quality::default()), now);
                 return;
             }
@@ -279,7 +297,7 @@ impl Router {
                 let message = DataSetMessage::decode(None, &content);
                 match message.and_then(|message| message.fields()) {
                     Ok(fields) => {
-                        self.record_way(place.stamp, sent, now);
+                        self.record_way(place, sent, now);
                         self.route(topic, &sample(fields, quality), now);
                     }
                     Err(error) => self.drop_undecoded(Some(topic), place.from, &error),
@@ -362,6 +380,7 @@ impl Router {
             instance: sample.instance,
             status: sample.status,
             arrived: sample.arrived,
+            lasting: sample.lasting,
         };
         reader.held = (fields.len() <= MAX_HELD).then(|| Box::new(held()));
         if asks {
@@ -380,7 +399,11 @@ impl Router {
         else {
             return;
         };
-        let evicted = reader.delivered(sample.instance, sample.kept, now.monotonic);
+        let evicted = reader.delivered(
+            sample.instance,
+            (sample.kept, sample.lasting),
+            now.monotonic,
+        );
         if let Some(instance) = evicted {
             self.tell(Output::Retired { topic, instance });
         }
@@ -421,10 +444,19 @@ impl Router {
             source,
             instance,
             kept,
+            lasting,
             status,
             arrived,
             ..
         } = *sample;
+        let loss = self.topics.get_mut(&topic).and_then(|of| of.loss.as_mut());
+        let holds = loss.is_some_and(|loss| {
+            loss.deliver(now.monotonic);
+            loss.due().is_some()
+        });
+        if holds {
+            self.schedule(topic);
+        }
         self.push(
             topic,
             Item::Delivery(Delivery {
@@ -435,6 +467,7 @@ impl Router {
                 arrived,
                 instance,
                 kept,
+                lasting,
             }),
         );
     }
@@ -460,14 +493,19 @@ impl Router {
         }
     }
 
-    fn record_way(&mut self, taken: Option<Timestamp>, sent: Option<Timestamp>, now: Now) {
+    /// Records the delays of a sample. Of a stored value or one that its rate held back only the way through the network
+    /// counts: it waited on purpose.
+    fn record_way(&mut self, place: &Place, sent: Option<Timestamp>, now: Now) {
         // Stacks that never fill the stamps send zeros.
         let filled = |stamp: &Timestamp| stamp.time.0 != 0;
         let Some(sent) = sent.filter(filled) else {
             return;
         };
         self.hops.record(Hop::Network, sent, now.utc);
-        if let Some(taken) = taken.filter(filled) {
+        let waited = place.is_stored() || (!place.held_back.is_zero() && !place.is_fresh());
+        if let Some(taken) = place.stamp.filter(filled)
+            && !waited
+        {
             self.hops.record(Hop::Origin, taken, sent);
         }
     }
@@ -496,6 +534,7 @@ pub(super) struct Sample<'a> {
     pub(super) source: Option<Timestamp>,
     pub(super) instance: Option<Timestamp>,
     pub(super) kept: Kept,
+    pub(super) lasting: bool,
     pub(super) status: u16,
     pub(super) arrived: Timestamp,
 }
@@ -529,6 +568,8 @@ fn place(header: &DataSetHeader, (from, sent): (SocketAddr, Option<Timestamp>)) 
         fine: header.picoseconds.is_some(),
         sent,
         from,
+        held_back: Duration::ZERO,
+        by_clients: false,
     }
 }
 

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use mappings::{Mapping, Overflow, PubSub, TopicId};
+use mappings::{Lasting, Mapping, Overflow, PubSub, TopicId};
 
 use super::{About, Router};
 use crate::counters::Reason;
@@ -39,7 +39,10 @@ impl Router {
             let rules = |mapping: &Mapping| {
                 let variable = mapping.variable(topic);
                 variable
-                    .map(|variable| (variable.overflow, variable.publish))
+                    .map(|variable| {
+                        let queue = (variable.overflow, variable.lasting);
+                        (queue, variable.publish)
+                    })
                     .unwrap_or_default()
             };
             let (was, is) = (rules(&before), rules(&self.mapping));
@@ -83,6 +86,8 @@ impl Router {
         entry.bound = None;
         entry.transcoder = None;
         entry.by_name = None;
+        entry.loss = None;
+        entry.trigger = None;
         match &mut entry.role {
             Role::Ours(writer) => {
                 writer.keep_nothing();
@@ -125,14 +130,15 @@ impl Router {
     }
 
     /// Lets the samples that wait stand in a queue of another kind.
-    pub(super) fn requeue(&mut self, topic: TopicId, overflow: Overflow) {
+    pub(super) fn requeue(&mut self, topic: TopicId, (overflow, lasting): (Overflow, Lasting)) {
         let Some(entry) = self.topics.get_mut(&topic) else {
             return;
         };
         entry.overflow = overflow;
+        entry.lasting = lasting;
         let mut before = std::mem::replace(&mut entry.queue, Queue::new(overflow));
         if let Role::Ours(writer) = &mut entry.role
-            && overflow != Overflow::KeepLatest
+            && lasting == Lasting::Event
         {
             writer.keep_nothing();
         }

@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::net::SocketAddr;
 use std::time::Duration;
 
-use mappings::{SpaceId, TopicId};
+use mappings::{Lasting, SpaceId, TopicId};
 use uadp::discovery::{Included, List, Probe, ProbeLimits, ProbeStep, ProbeTimer, Subject};
 use uadp::{PublisherId, SecurityHeader};
 
@@ -27,8 +27,9 @@ impl Router {
             return;
         };
         entry.said = Some(Box::new(description));
-        if entry.overflow != overflow {
-            self.requeue(topic, overflow);
+        let rules = (overflow, Lasting::from(overflow));
+        if (entry.overflow, entry.lasting) != rules {
+            self.requeue(topic, rules);
         }
         self.describe(topic, None, now);
     }
@@ -183,9 +184,15 @@ impl Router {
             ..
         }) = self.topics.get_mut(&topic)
             && reader.may_be(from, now.monotonic, timeout)
-            && reader.leave()
         {
-            self.tell_silence(topic);
+            let left = reader.leave();
+            if self.settings.local != Local::Fields {
+                reader.withdraw();
+            }
+            if left {
+                self.tell_silence(topic);
+            }
+            self.lose(topic, now);
         }
         self.unlearn_call(topic, from);
         self.settle(now);

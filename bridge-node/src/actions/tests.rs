@@ -389,6 +389,7 @@ impl Space {
                     status: 0,
                     instance: None,
                     kept: Kept::Alone,
+                    lasting: true,
                 };
                 self.offering.publish(&delivery).unwrap();
             }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use bridge_core::PublisherKey;
 use bytes::Bytes;
-use mappings::{Overflow, TopicId};
+use mappings::{Lasting, Overflow, TopicId};
 use messages::{MessageType, Selection, TypeName};
 use uadp::Timestamp;
 
@@ -23,8 +23,10 @@ pub struct Destination {
     pub ros_topic: String,
     /// The type, and what of a message the value is, where the mapping says it.
     pub mapped: Option<(TypeName, Selection)>,
-    /// What waits, and whether who comes late gets the last value.
+    /// How many values wait.
     pub overflow: Overflow,
+    /// Whether subscribers that come late get the last value.
+    pub lasting: Lasting,
 }
 
 impl Policy {
@@ -55,17 +57,20 @@ impl Policy {
     #[must_use]
     pub fn destination(&self, topic: TopicId) -> Destination {
         let variable = self.mapping.variable(topic);
-        let overflow = variable.map(|v| v.overflow).unwrap_or_default();
+        let rules = variable.map(|v| (v.overflow, v.lasting));
+        let (overflow, lasting) = rules.unwrap_or_default();
         match variable.and_then(|variable| variable.binding(self.own)) {
             Some(binding) => Destination {
                 ros_topic: binding.ros_topic.clone(),
                 mapped: Some((binding.message_type.clone(), binding.selection.clone())),
                 overflow,
+                lasting,
             },
             None => Destination {
                 ros_topic: format!("/{topic}"),
                 mapped: None,
                 overflow,
+                lasting,
             },
         }
     }

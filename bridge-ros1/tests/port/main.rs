@@ -137,6 +137,7 @@ fn delivery(topic: &str, payload: &'static [u8]) -> Delivery {
         status: 0,
         instance: None,
         kept: Kept::Alone,
+        lasting: true,
     }
 }
 

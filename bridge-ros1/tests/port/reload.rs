@@ -172,7 +172,7 @@ spaces:
 namespaces:
   2: urn:test
 variables:
-  - {{node: ns=2;i=1, name: Light, type: Boolean, origin: 0, ros: {{space: 1, call: {name}, type: std_srvs/SetBool, field: data}}}}
+  - {{node: ns=2;i=1, name: Light, type: Boolean, origin: 0, queue: keep_latest, ros: {{space: 1, call: {name}, type: std_srvs/SetBool, field: data}}}}
   - {{node: ns=2;i=2, name: Said, origin: 1, ros: {{answer: ns=2;i=1, field: message}}}}
   - {{node: ns=2;i=5, name: Told, origin: 1, ros: {{poll: /ask, type: std_srvs/Trigger, every: {every}, field: message}}}}
 "

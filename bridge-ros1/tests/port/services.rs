@@ -17,9 +17,9 @@ spaces:
 namespaces:
   2: urn:test
 variables:
-  - {node: ns=2;i=1, name: Light, type: Boolean, origin: 0, ros: {space: 1, call: /light, type: std_srvs/SetBool, field: data}}
+  - {node: ns=2;i=1, name: Light, type: Boolean, origin: 0, queue: keep_latest, ros: {space: 1, call: /light, type: std_srvs/SetBool, field: data}}
   - {node: ns=2;i=2, name: Said, origin: 1, ros: {answer: ns=2;i=1, field: message}}
-  - {node: ns=2;i=3, name: Go, type: Boolean, origin: 0, ros: {space: 1, call: /go, type: std_srvs/Trigger}}
+  - {node: ns=2;i=3, name: Go, type: Boolean, origin: 0, queue: keep_latest, ros: {space: 1, call: /go, type: std_srvs/Trigger}}
   - {node: ns=2;i=4, name: Beep, type: Boolean, origin: 0, queue: {drop_oldest: 4}, ros: {space: 1, call: /light, type: std_srvs/SetBool, field: data}}
   - {node: ns=2;i=5, name: Told, origin: 1, ros: {poll: /ask, type: std_srvs/Trigger, every: 50ms, field: message}}
 ";

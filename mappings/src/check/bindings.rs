@@ -91,6 +91,11 @@ impl<'c> Bindings<'c> {
         }
     }
 
+    /// The types that bindings name.
+    pub(super) const fn types(&mut self) -> &mut Types {
+        self.types
+    }
+
     pub(super) fn check(
         &mut self,
         entries: Option<&At<document::Bindings>>,

@@ -11,11 +11,13 @@ use super::bindings::{self, Bindings};
 use super::servers::Servers;
 use super::services::Calls;
 use super::types::{self, Types, ValueType};
-use super::{Declared, confirm, meaning, permissions, quality, remote, required};
+use super::{Declared, confirm, loss, meaning, permissions, quality, remote, required};
 use crate::code::Code;
 use crate::document::{PublishEntry, Queue, UaFieldEntry, VariableEntry};
 use crate::findings::Findings;
-use crate::mapping::{Binding, Overflow, Publish, ServiceBinding, Space, UaField, Variable};
+use crate::mapping::{
+    Binding, Lasting, Overflow, Publish, ServiceBinding, ServiceRole, Space, UaField, Variable,
+};
 use crate::node_id::{Identifier, NodeIdText};
 use crate::read::{At, given, short};
 use crate::topic::{SpaceId, TopicId};
@@ -96,7 +98,8 @@ pub(super) fn check(
     let entries = drafts
         .iter()
         .filter_map(|draft| Some((draft.topic()?, draft.entry)));
-    confirm::check(entries, &mut variables, findings);
+    confirm::check(entries.clone(), &mut variables, findings);
+    loss::check(entries, &mut variables, bindings.types(), findings);
     // Kept as long as the mapping.
     variables.shrink_to_fit();
     bindings.conflicts(findings);
@@ -340,9 +343,10 @@ fn variable(
         [one] => Some(declared.unwrap_or_else(|| types::value_type(one))),
         _ => declared,
     };
-    let overflow = match given(&entry.queue) {
-        Some((Queue::DropOldest(size), _)) => Overflow::DropOldest(NonZeroU16::new(*size)?),
-        Some((Queue::KeepLatest, _)) | None => Overflow::KeepLatest,
+    let queue = match given(&entry.queue) {
+        Some((Queue::DropOldest(size), _)) => Some(Overflow::DropOldest(NonZeroU16::new(*size)?)),
+        Some((Queue::KeepLatest, _)) => Some(Overflow::KeepLatest),
+        None => None,
     };
     let publish = publish(entry, (value_type, &fields), findings);
     let several = fields.len() > 1;
@@ -352,6 +356,15 @@ fn variable(
     let service = bound
         .service
         .map(|service| Box::new(service.settled(value_type, findings)));
+    let calls = service
+        .as_ref()
+        .is_some_and(|service| matches!(service.role, ServiceRole::Call { .. }));
+    let is_command = calls || draft.origin == Some(SpaceId::UA);
+    let (overflow, lasting) = match queue {
+        Some(queue) => (queue, Lasting::from(queue)),
+        None if is_command => (Overflow::DropOldest(NonZeroU16::MIN), Lasting::Event),
+        None => (Overflow::KeepLatest, Lasting::AsSource),
+    };
     let ua_field = ua_field(
         draft,
         &bound.bindings,
@@ -382,11 +395,13 @@ fn variable(
         bindings: bound.bindings,
         service,
         overflow,
+        lasting,
         publish: publish?,
         meaning: meaning?,
         permissions: permissions?,
         ages: ages?,
         history: given(&entry.history).map(|(count, _)| *count),
+        loss: None,
         confirm: None,
         from,
         to,

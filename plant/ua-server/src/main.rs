@@ -24,6 +24,7 @@ mod browse;
 mod budget;
 mod changes;
 mod clients;
+mod commanders;
 mod components;
 mod confirm;
 mod endpoint;

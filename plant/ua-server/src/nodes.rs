@@ -36,6 +36,7 @@ use crate::access::{self, Genuine};
 use crate::address;
 use crate::asking::{Drive, Drives, Questions, Refused, Table};
 use crate::budget::{Answers, LARGEST, SMALL, Watched};
+use crate::commanders::Commander;
 use crate::confirm::Confirms;
 use crate::folders;
 use crate::history::{Past, Room, Series};
@@ -103,6 +104,8 @@ pub(crate) struct ClientWrite {
     /// The fields of the DataSet as a key frame carries them.
     pub(crate) block: Bytes,
     pub(crate) source: Timestamp,
+    /// The session that wrote it.
+    pub(crate) commander: Commander,
     /// Given back when it has left.
     pub(crate) room: OwnedSemaphorePermit,
     /// Told when it has left.
@@ -522,7 +525,8 @@ impl SpaceNodes {
         }
         let place = (&*topic, field);
         if let Some(rule) = self.exits.confirms.of(topic.topic) {
-            let send = |register: &dyn Fn(&[Variant])| self.send_written(place, write, register);
+            let send =
+                |register: &dyn Fn(&[Variant])| self.send_written(context, place, write, register);
             let arrived = self.exits.confirms.write(topic.topic, &rule, send).await?;
             // It has arrived, whether there is room to show it or not.
             let _shown = self.show(&context.subscriptions, &topic, arrived);
@@ -559,7 +563,7 @@ impl SpaceNodes {
     ) -> Result<OnItsWay, StatusCode> {
         // Until it is shown nobody else may write: what is not written stays as it is.
         let _alone = self.writing.lock();
-        let (sent, on_its_way) = self.send_alone(place, write, &|_| {})?;
+        let (sent, on_its_way) = self.send_alone(context, place, write, &|_| {})?;
         let _shown = self.show(&context.subscriptions, place.0, sent);
         Ok(on_its_way)
     }
@@ -567,12 +571,13 @@ impl SpaceNodes {
     /// As [`send_alone`](Self::send_alone), while nobody else writes; an answer says more than that it has left.
     fn send_written(
         &self,
+        context: &RequestContext,
         place: (&TopicNode, Option<usize>),
         write: &ParsedWriteValue,
         register: &dyn Fn(&[Variant]),
     ) -> Result<Shown, StatusCode> {
         let _alone = self.writing.lock();
-        let (sent, _on_its_way) = self.send_alone(place, write, register)?;
+        let (sent, _on_its_way) = self.send_alone(context, place, write, register)?;
         Ok(sent)
     }
 
@@ -580,6 +585,7 @@ impl SpaceNodes {
     /// shown then, and what tells that it has left.
     fn send_alone(
         &self,
+        context: &RequestContext,
         (topic, field): (&TopicNode, Option<usize>),
         write: &ParsedWriteValue,
         register: &dyn Fn(&[Variant]),
@@ -610,7 +616,7 @@ impl SpaceNodes {
         register(&fields);
         drop(fields);
         let source = source_of(&write.value);
-        let on_its_way = self.send(topic, block.clone(), source)?;
+        let on_its_way = self.send(topic, (block.clone(), source), Commander::of(context))?;
         let stamp = Stamp {
             status: StatusCode::Good,
             source: Some(source),
@@ -624,8 +630,8 @@ impl SpaceNodes {
     fn send(
         &self,
         topic: &TopicNode,
-        block: Bytes,
-        source: Timestamp,
+        (block, source): (Bytes, Timestamp),
+        commander: Commander,
     ) -> Result<OnItsWay, StatusCode> {
         if block.len() > self.largest_write.load(Ordering::Relaxed) {
             return Err(StatusCode::BadRequestTooLarge);
@@ -640,6 +646,7 @@ impl SpaceNodes {
             topic: topic.topic,
             block,
             source,
+            commander,
             room,
             gone_out: left,
             answer,

@@ -36,6 +36,7 @@ use crate::access;
 use crate::asking::{Heard, Questions};
 use crate::auditing;
 use crate::browse::Ordered;
+use crate::commanders::Commanders;
 use crate::components::{Components, Happened};
 use crate::confirm::Confirms;
 use crate::endpoint;
@@ -105,6 +106,8 @@ pub(crate) struct ServerPort {
     readers: Readers,
     /// Writes that wait for an answer.
     confirms: Arc<Confirms>,
+    /// The sessions that wrote what is stopped when they are gone.
+    commanders: Commanders,
     /// Who is told that the write that was reported last has left.
     leaving: Option<oneshot::Sender<()>>,
     /// When a publisher that is not heard counts as away.
@@ -205,6 +208,7 @@ impl ServerPort {
             pubsub,
             readers: Readers::default(),
             confirms,
+            commanders: Commanders::new(mapping),
             leaving: None,
             receive_timeout: mapping.pubsub().receive_timeout,
             application,
@@ -248,7 +252,8 @@ impl Port for ServerPort {
             }
             tokio::select! {
                 Some(write) = self.writes.recv() => {
-                    let ClientWrite { topic, block, source, room, gone_out, answer } = write;
+                    let ClientWrite { topic, block, source, commander, room, gone_out, answer } = write;
+                    self.commanders.wrote(topic, commander);
                     drop(room);
                     self.leaving = Some(gone_out);
                     self.confirms.supersede(topic);
@@ -271,6 +276,10 @@ impl Port for ServerPort {
                     Happened::Heard(found) => self.others.heard(&found),
                 },
                 () = self.others.finding.changed() => self.others.found(),
+                lost = self.commanders.lost() => {
+                    // The bridges that hear the writer fall silent publish `on_loss`.
+                    self.live.extend(lost.into_iter().map(|topic| (topic, false)));
+                }
                 () = self.confirms.called() => {
                     let taken_back = self.confirms.take_back().into_iter();
                     self.live.extend(taken_back.map(|topic| (topic, false)));
@@ -381,6 +390,7 @@ impl Port for ServerPort {
         .collect();
         self.receive_timeout = mapping.pubsub().receive_timeout;
         self.confirms.follow(mapping);
+        self.commanders.follow(mapping);
         self.space.limit_writes(largest_write(mapping));
         self.space.limit_past(mapping);
         self.types.replace(types);

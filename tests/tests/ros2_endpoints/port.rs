@@ -110,6 +110,7 @@ fn delivery(topic: TopicId, text: &str) -> Delivery {
         status: 0,
         instance: None,
         kept: Kept::Alone,
+        lasting: true,
     }
 }
 

@@ -299,6 +299,7 @@ async fn a_value_is_written_to_a_subscriber_whose_type_only_its_node_knows() {
         status: 0,
         instance: None,
         kept: Kept::Alone,
+        lasting: true,
     };
     port.publish(delivery).unwrap();
     run_until(&mut port, "the value is read", || {

@@ -1,0 +1,221 @@
+//! What is published when the commander of a value is lost.
+
+use std::collections::{BTreeMap, HashMap};
+
+use messages::{Plan, Selection, TypeName, Wire};
+
+use super::types::{Types, dialect};
+use super::{network, required};
+use crate::code::Code;
+use crate::document::{OnLossEntry, Request, VariableEntry};
+use crate::findings::Findings;
+use crate::loss::{Loss, LossAction};
+use crate::mapping::{Binding, Lasting, ServiceRole, Variable};
+use crate::node_id::NodeIdText;
+use crate::read::short;
+use crate::topic::{SpaceId, TopicId};
+use crate::tree::Place;
+
+/// Reads `on_loss` and `hold`, and warns of commands that move a robot without an end. What is faulty is noted.
+pub(super) fn check<'d>(
+    entries: impl Iterator<Item = (TopicId, &'d VariableEntry)>,
+    variables: &mut [Variable],
+    types: &mut Types,
+    findings: &mut Findings,
+) {
+    let by_node: HashMap<NodeIdText, TopicId> = variables
+        .iter()
+        .filter(|variable| is_stop_call(variable))
+        .map(|variable| (variable.node.clone(), variable.topic))
+        .collect();
+    let at: HashMap<TopicId, usize> = (0..)
+        .zip(variables.iter())
+        .map(|(at, variable)| (variable.topic, at))
+        .collect();
+    for (topic, entry) in entries {
+        let Some(variable) = at.get(&topic).and_then(|at| variables.get_mut(*at)) else {
+            continue;
+        };
+        variable.loss = loss(entry, variable, (&by_node, types), findings).map(Box::new);
+        warn(entry, variable, findings);
+    }
+}
+
+/// `None` without `on_loss`, or when something is faulty, which is noted.
+fn loss(
+    entry: &VariableEntry,
+    variable: &Variable,
+    (by_node, types): (&HashMap<NodeIdText, TopicId>, &mut Types),
+    findings: &mut Findings,
+) -> Option<Loss> {
+    let hold = network::duration(&entry.hold, findings);
+    let Some(at) = &entry.on_loss else {
+        if let Some(hold) = &entry.hold {
+            findings
+                .error(Code::OnLoss, hold.place, "`hold` stands without `on_loss`")
+                .help("say what is published when the time is over, as `on_loss: zero`");
+        }
+        return None;
+    };
+    let said = at.value.as_ref()?;
+    if entry.hold.is_some() && hold.is_none() {
+        return None;
+    }
+    let written: Vec<&Binding> = commanded(variable).collect();
+    if written.is_empty() {
+        findings
+            .error(
+                Code::OnLoss,
+                at.place,
+                "the value is published to no ROS topic",
+            )
+            .help("`on_loss` goes with a topic in another space than the `origin`");
+        return None;
+    }
+    let action = match said {
+        OnLossEntry::Zero => LossAction::Message(BTreeMap::new()),
+        OnLossEntry::Value(literal) => LossAction::Field(literal.clone()),
+        OnLossEntry::Fields(Request(all)) => {
+            let fields = all.iter();
+            let fields = fields.map(|(path, _, literal)| (path.clone(), literal.clone()));
+            LossAction::Message(fields.collect())
+        }
+        OnLossEntry::Call(call) => LossAction::Call(stop_call(call, at.place, by_node, findings)?),
+    };
+    if !matches!(action, LossAction::Call(_)) {
+        for binding in written {
+            fits(binding, &action, (at.place, types), findings)?;
+        }
+    }
+    Some(Loss { action, hold })
+}
+
+/// The variable whose service stops the robot.
+fn stop_call(
+    call: &crate::document::StopCallEntry,
+    place: Place,
+    by_node: &HashMap<NodeIdText, TopicId>,
+    findings: &mut Findings,
+) -> Option<TopicId> {
+    let (node, at) = required(&call.call, "call", "`on_loss`", place, findings)?;
+    let found = node.parse::<NodeIdText>().ok();
+    let found = found.and_then(|node| by_node.get(&node));
+    if found.is_none() {
+        let message = format!("no variable with the node `{}` stops anything", short(node));
+        findings
+            .error(Code::OnLoss, at, message)
+            .help("a variable with a `call` that has no `field`, as {call: /stop, type: std_srvs/Trigger}");
+    }
+    found.copied()
+}
+
+/// Whether the message can be made; a type that is not known here is looked at by the host that has it.
+fn fits(
+    binding: &Binding,
+    action: &LossAction,
+    (place, types): (Place, &mut Types),
+    findings: &mut Findings,
+) -> Option<()> {
+    let Some(template) = action.template(&binding.selection) else {
+        findings
+            .error(
+                Code::OnLoss,
+                place,
+                "one value for a topic that is bound to several fields",
+            )
+            .help("`zero`, or the fields of the message, as {linear.x: 0.1}");
+        return None;
+    };
+    if binding.selection == Selection::Bytes {
+        findings
+            .error(
+                Code::OnLoss,
+                place,
+                "the message crosses as bytes, of which no field is known",
+            )
+            .help("leave `as: bytes` out");
+        return None;
+    }
+    let dialect = dialect(binding.space);
+    let Ok(message) = types.get((dialect, place), &binding.message_type, findings) else {
+        return Some(());
+    };
+    let wire = match binding.space {
+        SpaceId::ROS1 => Wire::Ros1,
+        _ => Wire::Cdr,
+    };
+    match Plan::compile(&message, &template, wire) {
+        Ok(_) => Some(()),
+        Err(error) => {
+            findings.of_part([binding.space]);
+            findings.error(Code::OnLoss, place, error.to_string());
+            findings.of_part(None);
+            None
+        }
+    }
+}
+
+/// The topics that the values of a variable command.
+fn commanded(variable: &Variable) -> impl Iterator<Item = &Binding> {
+    let origin = variable.topic.space;
+    let bindings = variable.bindings.iter();
+    bindings.filter(move |binding| binding.space != origin)
+}
+
+/// Whether the values of a variable call a service with the same request each time.
+fn is_stop_call(variable: &Variable) -> bool {
+    variable.service.as_ref().is_some_and(|service| {
+        matches!(
+            &service.role,
+            ServiceRole::Call { request: Selection::Template { fields, .. }, .. } if fields.is_empty()
+        )
+    })
+}
+
+/// Warns of a motion that goes on when its commander is lost, and of one that is stored for late subscribers.
+fn warn(entry: &VariableEntry, variable: &Variable, findings: &mut Findings) {
+    let Some(place) = entry.ros.as_ref().map(|at| at.place) else {
+        return;
+    };
+    let types = commanded(variable).map(|binding| &binding.message_type);
+    let Some((message_type, motion)) = types.filter_map(|name| Some((name, motion(name)?))).next()
+    else {
+        return;
+    };
+    if variable.lasting == Lasting::State {
+        let place = entry.queue.as_ref().map_or(place, |at| at.place);
+        let message =
+            format!("`keep_latest` hands an old {message_type} to a subscriber that starts late");
+        findings
+            .warning(Code::StoredMotion, place, message)
+            .help("leave `queue` out, so that only present subscribers get it");
+    }
+    if motion == Motion::NotByZero && entry.on_loss.is_none() {
+        let message = format!(
+            "nothing ends the movement of the last {message_type} when its commander is lost"
+        );
+        findings
+            .warning(Code::EndlessMotion, place, message)
+            .help("zero is a movement of this type: `on_loss` with the fields of a message that stops, or with a `call`");
+    }
+}
+
+/// How a command of motion is ended.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Motion {
+    /// By a message of zeros.
+    ByZero,
+    /// Zero is a movement.
+    NotByZero,
+}
+
+fn motion(message_type: &TypeName) -> Option<Motion> {
+    match message_type.to_string().as_str() {
+        "geometry_msgs/Twist"
+        | "geometry_msgs/TwistStamped"
+        | "ackermann_msgs/AckermannDrive"
+        | "ackermann_msgs/AckermannDriveStamped" => Some(Motion::ByZero),
+        "sensor_msgs/Joy" | "trajectory_msgs/JointTrajectory" => Some(Motion::NotByZero),
+        _ => None,
+    }
+}

@@ -1,0 +1,53 @@
+//! What becomes of a robot whose commander is lost.
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use messages::{Literal, Selection};
+
+use crate::topic::TopicId;
+
+/// What is published once for a value when its commander has ended or timed out.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Loss {
+    /// The reaction.
+    pub action: LossAction,
+    /// The time after which a value that is not renewed counts as lost; `None`: only the end of its commander counts.
+    pub hold: Option<Duration>,
+}
+
+/// A reaction to the loss of a commander.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum LossAction {
+    /// A message with these fields, by their paths in it; all others are zero or empty.
+    Message(BTreeMap<String, Literal>),
+    /// A message in which the bound field has this value.
+    Field(Literal),
+    /// The service that the values of this variable call.
+    Call(TopicId),
+}
+
+impl LossAction {
+    /// The message for a topic of which the value is `selection`; `None` for a call, and for one value where the topic is bound
+    /// to several.
+    #[must_use]
+    pub fn template(&self, selection: &Selection) -> Option<Selection> {
+        let rest = match self {
+            Self::Message(rest) => rest.clone(),
+            Self::Field(literal) => {
+                let field = match selection {
+                    Selection::Field(field) | Selection::Value { field, .. } => field,
+                    Selection::Whole
+                    | Selection::Fields(_)
+                    | Selection::Structure(_)
+                    | Selection::Template { .. }
+                    | Selection::Bytes => return None,
+                };
+                BTreeMap::from([(field.clone(), literal.clone())])
+            }
+            Self::Call(_) => return None,
+        };
+        let fields = Vec::new();
+        Some(Selection::Template { fields, rest })
+    }
+}
