@@ -62,7 +62,7 @@ impl Stop {
     /// Writes the message.
     ///
     /// # Errors
-    /// In words, why there is none.
+    /// The reason in words.
     pub(crate) fn write(&self, now: Timestamp, out: &mut Vec<u8>) -> Result<(), String> {
         if !self.is_stamped {
             let written = self.plan.write(&mut NoFields, out);

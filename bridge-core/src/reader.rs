@@ -44,7 +44,7 @@ pub(crate) struct Reader {
     /// Whether the writer was seen to send a sample right after it was taken, so that its stamps tell stored values from
     /// new ones.
     prompt: bool,
-    /// Whether samples with other values came under one stamp, so that the stamp tells nothing.
+    /// Whether different values came under the same stamp, so that the stamp identifies no sample.
     still: bool,
     /// Whether the writer has ended or timed out since its last message, so that it may number its messages anew.
     over: bool,
@@ -118,7 +118,7 @@ enum Handed {
 /// How the values of a topic reach the local side.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Handling {
-    /// The last value is shown, whatever it is.
+    /// The last value is shown, event or state.
     Shown,
     /// Each value is published once into ROS.
     Event,
@@ -320,7 +320,7 @@ impl Reader {
     /// Admits a message into the sequence.
     ///
     /// The order of the sequence numbers is that of OPC 10000-14, 7.2.3. A writer that starts over looks old by its
-    /// numbers; its stamps or its new address tell. One whose clock was set back looks by its stamps as if it repeated older
+    /// numbers; its stamps or its new address show it. A writer whose clock was set back seems to repeat older
     /// values; that its numbers go on and the sample is fresh tells.
     ///
     /// # Errors

@@ -361,7 +361,7 @@ impl Writer {
         Some(again.since + *AGAIN.get(again.times)?)
     }
 
-    /// Looks whether the newest event is to be sent again now. One whose time has passed long ago is not: it would come late.
+    /// Returns whether the newest event is to be sent again now. An overdue event is given up, because it would come late.
     pub(crate) fn look_again(&mut self, now: Instant) -> bool {
         if self.again_at().is_none_or(|at| at > now) {
             return false;

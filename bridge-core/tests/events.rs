@@ -343,7 +343,7 @@ fn an_older_number_after_a_newer_one_is_dropped_and_counted() {
     assert_eq!(dropped(&robot, Reason::Stale), 1);
 }
 
-/// What a foreign writer sends of ua_2_9_11: one UInt32.
+/// A key frame of ua_2_9_11 by a foreign writer: one UInt32.
 fn frame(header: &DataSetHeader, value: u32) -> Vec<u8> {
     let network = NetworkHeader {
         publisher_id: Some(PublisherId::UInt16(2)),

@@ -55,9 +55,9 @@ struct Sample {
 /// Who listens.
 #[derive(Debug)]
 enum Audience {
-    /// Nobody. The last state stands alone in the history for a transient-local reader that comes; a volatile one gets nothing
-    /// that was written before. In the history of RustDDS as published what nobody acknowledged would become a trail of old
-    /// values: there the state is held back until transient-local readers, and no others, have come.
+    /// No reader. The history holds the last state alone, for transient-local readers that come; volatile readers get nothing
+    /// that was written before. The history of RustDDS as published would keep all values without acknowledgement: there the
+    /// state is held back until transient-local readers, and no others, have come.
     Nobody { held: Option<Sample> },
     /// Somebody, whom a sample of at most that size reaches.
     Present {
@@ -184,7 +184,7 @@ impl Outlet {
             .is_some_and(|stored| stored.source >= source)
     }
 
-    /// Gives readers that come late nothing of what was written so far. Those that are present still get it.
+    /// Removes the values written so far from the history. Present readers still get them, late readers do not.
     pub fn forget_stored(&mut self, now: Instant) {
         if let Audience::Nobody { held } = &mut self.audience {
             *held = None;
@@ -333,7 +333,7 @@ impl Outlet {
         }
     }
 
-    /// Keeps a state for readers that come, in the place of the one before, which is no longer true. An event is for nobody.
+    /// Stores a state for readers that come, in place of the state before. An event is dropped, because no reader is present.
     fn store(&mut self, sample: Sample, now: Instant) -> Result<(), Refusal> {
         self.forget_written();
         self.to_forget = None;

@@ -43,7 +43,7 @@ pub use difference::Difference;
 pub use endpoint::Endpoint;
 pub use environment::{Environment, LiveNode, LiveRemote, LiveServer, LiveSpace, LiveTopic};
 
-pub use loss::{Loss, LossAction};
+pub use loss::{Loss, LossAction, Motion};
 pub use mapping::{
     Binding, Lasting, Mapping, Meaning, Overflow, PubSub, Publish, PublisherIdRule, SecurityPolicy,
     Server, ServerLimits, ServiceBinding, ServiceRole, Space, Trigger, UaField, Variable,

@@ -1,9 +1,9 @@
-//! What becomes of a robot whose commander is lost.
+//! The reaction to the loss of a commander.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use messages::{Literal, Selection};
+use messages::{Literal, Selection, TypeName};
 
 use crate::topic::TopicId;
 
@@ -49,5 +49,29 @@ impl LossAction {
         };
         let fields = Vec::new();
         Some(Selection::Template { fields, rest })
+    }
+}
+
+/// How the movement that a command of some message type starts is ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Motion {
+    /// By a message of zeros.
+    ByZero,
+    /// Not by zeros, which are a movement, too.
+    NotByZero,
+}
+
+impl Motion {
+    /// The motion that messages of a type command; `None` for other types.
+    #[must_use]
+    pub fn of(message_type: &TypeName) -> Option<Self> {
+        match (message_type.package(), message_type.name()) {
+            ("geometry_msgs", "Twist" | "TwistStamped")
+            | ("ackermann_msgs", "AckermannDrive" | "AckermannDriveStamped") => Some(Self::ByZero),
+            ("sensor_msgs", "Joy") | ("trajectory_msgs", "JointTrajectory") => {
+                Some(Self::NotByZero)
+            }
+            _ => None,
+        }
     }
 }

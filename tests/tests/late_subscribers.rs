@@ -1,4 +1,4 @@
-//! Values that were published before a subscriber came: an event reaches nobody late, a state nobody whose producer is gone.
+//! Subscribers that start after a value was published: they get no event, and no state of a producer that has ended.
 
 use std::time::Duration;
 

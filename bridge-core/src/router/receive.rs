@@ -493,8 +493,8 @@ impl Router {
         }
     }
 
-    /// Records the delays of a sample. Of a stored value or one that its rate held back only the way through the network
-    /// counts: it waited on purpose.
+    /// Records the delays of a sample. A stored value, or a sample held back by its rate, waited on purpose: only its delay in
+    /// the network counts.
     fn record_way(&mut self, place: &Place, sent: Option<Timestamp>, now: Now) {
         // Stacks that never fill the stamps send zeros.
         let filled = |stamp: &Timestamp| stamp.time.0 != 0;

@@ -2,14 +2,14 @@
 
 use std::collections::{BTreeMap, HashMap};
 
-use messages::{Plan, Selection, TypeName, Wire};
+use messages::{Plan, Selection, Wire};
 
 use super::types::{Types, dialect};
 use super::{network, required};
 use crate::code::Code;
 use crate::document::{OnLossEntry, Request, VariableEntry};
 use crate::findings::Findings;
-use crate::loss::{Loss, LossAction};
+use crate::loss::{Loss, LossAction, Motion};
 use crate::mapping::{Binding, Lasting, ServiceRole, Variable};
 use crate::node_id::NodeIdText;
 use crate::read::short;
@@ -178,7 +178,7 @@ fn warn(entry: &VariableEntry, variable: &Variable, findings: &mut Findings) {
         return;
     };
     let types = commanded(variable).map(|binding| &binding.message_type);
-    let Some((message_type, motion)) = types.filter_map(|name| Some((name, motion(name)?))).next()
+    let Some((message_type, motion)) = types.filter_map(|name| Some((name, Motion::of(name)?))).next()
     else {
         return;
     };
@@ -197,25 +197,5 @@ fn warn(entry: &VariableEntry, variable: &Variable, findings: &mut Findings) {
         findings
             .warning(Code::EndlessMotion, place, message)
             .help("zero is a movement of this type: `on_loss` with the fields of a message that stops, or with a `call`");
-    }
-}
-
-/// How a command of motion is ended.
-#[derive(Clone, Copy, PartialEq, Eq)]
-enum Motion {
-    /// By a message of zeros.
-    ByZero,
-    /// Zero is a movement.
-    NotByZero,
-}
-
-fn motion(message_type: &TypeName) -> Option<Motion> {
-    match message_type.to_string().as_str() {
-        "geometry_msgs/Twist"
-        | "geometry_msgs/TwistStamped"
-        | "ackermann_msgs/AckermannDrive"
-        | "ackermann_msgs/AckermannDriveStamped" => Some(Motion::ByZero),
-        "sensor_msgs/Joy" | "trajectory_msgs/JointTrajectory" => Some(Motion::NotByZero),
-        _ => None,
     }
 }

@@ -71,7 +71,7 @@ impl Commanders {
         }
     }
 
-    /// The topics whose commander is gone, each once. Cancel-safe; waits while there are none.
+    /// Returns the topics whose commander is gone, each once. Cancel-safe; waits until there is such a topic.
     pub(crate) async fn lost(&mut self) -> Vec<TopicId> {
         loop {
             if self.last.is_empty() {

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::ops::Range;
 
-use mappings::SpaceId;
+use mappings::{Motion, SpaceId};
 
 use super::plan::{Bound, Entry, Plan};
 use super::topics::Form;
@@ -153,6 +153,15 @@ fn entry(entry: &Entry, indent: &str, lines: &mut Vec<String>) {
         say(format!(
             "{mark}  {word}: {{server: {server}, node: {node}}}"
         ));
+    }
+    let commanded = entry.bindings.iter().filter(|one| one.space != entry.origin);
+    match commanded.filter_map(|one| Motion::of(&one.kind)).next() {
+        Some(Motion::ByZero) => say(format!("{mark}  on_loss: zero")),
+        Some(Motion::NotByZero) => say(
+            "  # on_loss: zero is a movement of this type; name the fields that stop the robot, or a call"
+                .to_owned(),
+        ),
+        None => {}
     }
     match entry.bindings.as_slice() {
         [] => {}

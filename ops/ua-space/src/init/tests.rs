@@ -421,3 +421,23 @@ fn the_cells_own_server_stays_the_cells_own() {
         "{text}"
     );
 }
+
+#[test]
+fn a_command_of_motion_is_proposed_with_what_ends_it() {
+    let robot = graph(
+        2,
+        &[
+            ("/cmd_vel", "geometry_msgs/Twist", false),
+            ("/arm", "trajectory_msgs/JointTrajectory", false),
+            ("/speed", "geometry_msgs/Twist", true),
+        ],
+    );
+    let mut plan = Plan::new(&[robot], &[], &WISHES, &mut Known::default());
+    let text = written("", &[], &mut plan).unwrap();
+    assert_eq!(text.matches("  on_loss: zero\n").count(), 1, "{text}");
+    let of_arm = text.split("name: Arm").nth(1).unwrap();
+    assert!(of_arm.contains("# on_loss: zero is a movement of this type"));
+    let checked = Mapping::from_yaml(&text, "cell.yaml");
+    let codes: Vec<_> = checked.findings.iter().map(|found| found.code).collect();
+    assert_eq!(codes, [mappings::Code::EndlessMotion], "{}", checked.render(&text));
+}
