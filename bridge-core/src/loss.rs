@@ -108,6 +108,12 @@ impl Loss {
         }))
     }
 
+    /// The same, after another mapping or type: the last value was delivered when it was.
+    pub(crate) fn following(self, before: Option<&Self>) -> Self {
+        let delivered = before.and_then(|before| before.delivered);
+        Self { delivered, ..self }
+    }
+
     /// Takes note of a value that is delivered.
     pub(crate) const fn deliver(&mut self, now: Instant) {
         self.delivered = Some(now);

@@ -32,7 +32,7 @@ use crate::gate::{Passage, Waiting};
 use crate::guard::Guard;
 use crate::hops::{Hop, Hops};
 use crate::loop_rule::{Owned, Side, What};
-use crate::loss::{Loss, Reaction, trigger};
+use crate::loss::{Loss, Reaction, Stop, trigger};
 use crate::network::{check_size, data_set_header, encode, keep_alive};
 use crate::output::{Delivery, Heard, Kept, Output, PublisherKey};
 use crate::pace::Pace;
@@ -151,13 +151,7 @@ impl Router {
             Local::Fields => return Ok(()),
         };
         let plan = self.plans.plan(message_type, selection, wire)?;
-        let reactions = if self.is_home(topic) {
-            None
-        } else {
-            let of = (message_type, selection);
-            let loss = Loss::new(&self.mapping, topic, of, wire)?;
-            Some((loss, trigger(&self.mapping, topic, message_type, wire)?))
-        };
+        let reactions = self.reactions(topic, (message_type, selection), wire)?;
         // A message as bytes is in the dialect of its origin; that of an OPC UA origin is taken as it is.
         let origin = match topic.space {
             SpaceId::UA => None,
@@ -175,10 +169,8 @@ impl Router {
         };
         entry.plan = Some(plan);
         entry.transcoder = transcoder;
-        if let Some((loss, trigger)) = reactions {
-            entry.loss = loss.map(Box::new);
-            entry.trigger = trigger.map(Box::new);
-        }
+        entry.bound = Some(Box::new((Arc::clone(message_type), selection.clone())));
+        entry.react(reactions);
         let held = match &mut entry.role {
             Role::Theirs(reader) => {
                 reader.forget_all();
@@ -187,7 +179,6 @@ impl Router {
                 held
             }
             Role::Ours(_) => {
-                entry.bound = Some(Box::new((Arc::clone(message_type), selection.clone())));
                 self.describe(topic, Some((message_type, selection)), now);
                 None
             }
@@ -196,6 +187,20 @@ impl Router {
             self.deliver_held(topic, &held, now);
         }
         Ok(())
+    }
+
+    /// What is done about a topic of another space when a commander is lost.
+    fn reactions(
+        &self,
+        topic: TopicId,
+        of: (&Arc<MessageType>, &Selection),
+        wire: Wire,
+    ) -> Result<(Option<Loss>, Option<Stop>), PlanError> {
+        if self.is_home(topic) {
+            return Ok((None, None));
+        }
+        let loss = Loss::new(&self.mapping, topic, of, wire)?;
+        Ok((loss, trigger(&self.mapping, topic, of.0, wire)?))
     }
 
     /// Delivers a sample that waited for its local type; an event only while it is young.

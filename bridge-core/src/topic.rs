@@ -26,7 +26,7 @@ pub(crate) struct Topic {
     /// How its bytes become fields or the other way. `None` until the local type is known, and for a local side
     /// that speaks in fields.
     pub(crate) plan: Option<Arc<Plan>>,
-    /// What the plan of a topic of our own space was made of.
+    /// The type and selection that the plan was made of.
     pub(crate) bound: Option<Box<(Arc<MessageType>, Selection)>>,
     /// For bytes of the other ROS, what makes them ours, or why nothing does.
     pub(crate) transcoder: Option<Box<Result<Transcoder, String>>>,
@@ -155,6 +155,14 @@ impl Topic {
             Message::Datagram(datagram) => Some(datagram.data_set_message().len()),
             Message::Large(_) => None,
         }
+    }
+
+    /// Takes over what is done when a commander is lost. A value that moves the robot stays known.
+    pub(crate) fn react(&mut self, (loss, trigger): (Option<Loss>, Option<Stop>)) {
+        let before = self.loss.take();
+        let loss = loss.map(|loss| loss.following(before.as_deref()));
+        self.loss = loss.map(Box::new);
+        self.trigger = trigger.map(Box::new);
     }
 
     /// Whether there is something to poll.

@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use mappings::{Lasting, Mapping, Overflow, PubSub, TopicId};
+use messages::Wire;
 
 use super::{About, Router};
 use crate::counters::Reason;
@@ -62,6 +63,11 @@ impl Router {
                     reader.owed = true;
                 }
             }
+            let reacts = is.is_some_and(|v| v.service.is_some());
+            if reacts || was.map(|v| &v.loss) != is.map(|v| &v.loss) {
+                self.react_again(topic);
+            }
+            let (was, is) = (before.variable(topic), self.mapping.variable(topic));
             let meant = was.map(|v| &v.meaning) != is.map(|v| &v.meaning);
             // Only there does the mapping alone say what the values are.
             let typed = self.settings.local == Local::Fields && was != is;
@@ -118,14 +124,35 @@ impl Router {
 
     /// Describes a topic of our own space by the mapping there is now.
     fn describe_again(&mut self, topic: TopicId, now: Now) {
+        if !self.is_home(topic) {
+            return;
+        }
         let bound = self
             .topics
             .get(&topic)
             .and_then(|entry| entry.bound.clone());
         if let Some((message_type, selection)) = bound.as_deref() {
             self.describe(topic, Some((message_type, selection)), now);
-        } else if self.settings.local == Local::Fields && self.is_home(topic) {
+        } else if self.settings.local == Local::Fields {
             self.describe(topic, None, now);
+        }
+    }
+
+    /// Takes over what the mapping there is now says of lost commanders.
+    fn react_again(&mut self, topic: TopicId) {
+        let wire = match self.settings.local {
+            Local::Ros1 => Wire::Ros1,
+            Local::Cdr => Wire::Cdr,
+            Local::Fields => return,
+        };
+        let bound = self.topics.get(&topic).and_then(|of| of.bound.clone());
+        let Some((message_type, selection)) = bound.as_deref() else {
+            return;
+        };
+        let reactions = self.reactions(topic, (message_type, selection), wire);
+        if let (Some(entry), Ok(reactions)) = (self.topics.get_mut(&topic), reactions) {
+            // The check of the mapping says what cannot be made.
+            entry.react(reactions);
         }
     }
 
