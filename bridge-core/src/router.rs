@@ -346,8 +346,9 @@ impl Router {
             Lasting::Event => false,
             Lasting::AsSource => latched_by.is_some(),
         };
-        let gave_way = *lasting != Lasting::Event && writer.keep((latched_by, is_state), &message);
-        writer.send_again(&message, is_state, now.monotonic);
+        let is_kept = *lasting != Lasting::Event;
+        let gave_way = is_kept && writer.keep((latched_by, is_state), &message);
+        writer.send_again(&message, (is_state, is_kept), now.monotonic);
         if gave_way {
             self.count(About::topic(topic), Reason::TooManyPublishers, 1, || {
                 format!(

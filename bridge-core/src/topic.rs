@@ -1,7 +1,7 @@
 //! Everything the Router keeps for one topic.
 
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use mappings::{Lasting, Overflow};
 use messages::{MessageType, Plan, Selection};
@@ -40,7 +40,9 @@ pub(crate) struct Topic {
     pub(crate) lasting: Lasting,
     /// What of the fields of messages of another space is taken.
     pub(crate) takes: Takes,
-    /// What is published when its commander is lost.
+    /// How long its writer may hold a sample back for its rate.
+    pub(crate) held_back: Duration,
+    /// The reaction to the loss of its commander.
     pub(crate) loss: Option<Box<Loss>>,
     /// The value that calls the service of the topic, where that is the reaction to the loss of a commander.
     pub(crate) trigger: Option<Box<Stop>>,
@@ -107,6 +109,7 @@ impl Topic {
             overflow,
             lasting,
             takes: Takes::default(),
+            held_back: Duration::ZERO,
             loss: None,
             trigger: None,
             gate: None,

@@ -35,7 +35,8 @@ pub(crate) struct Writer {
 /// An event of one datagram that is sent again under its sequence number.
 #[derive(Debug)]
 struct Again {
-    message: Encoded,
+    /// The message, unless it is kept as the last value, too.
+    message: Option<Encoded>,
     /// When it was sent first.
     since: Instant,
     /// How often it was sent again.
@@ -264,12 +265,12 @@ impl Writer {
 
     /// Whether the round is not over.
     pub(crate) fn repeats(&self) -> bool {
-        self.next < self.kept.len() || self.again.as_ref().is_some_and(|again| again.is_due)
+        self.next < self.kept.len() || self.is_again_due()
     }
 
     /// What the round repeats next, unless it is large and still on its way.
     pub(crate) fn next_repeated(&self) -> Option<&Message> {
-        if self.again.as_ref().is_some_and(|again| again.is_due) {
+        if self.is_again_due() {
             // Alone: it is short and must not wait.
             return None;
         }
@@ -279,18 +280,8 @@ impl Writer {
     /// The newest event once more if its time has come, else the next sample of the round: a state with a fresh sequence
     /// number, an event under its own. `buffer` gives one to write a datagram into.
     pub(crate) fn repeat(&mut self, buffer: impl FnOnce() -> Vec<u8>) -> Option<Message> {
-        if let Some(again) = self.again.as_mut().filter(|again| again.is_due) {
-            again.is_due = false;
-            let mut bytes = buffer();
-            bytes.clone_from(&again.message.bytes);
-            let message = Encoded {
-                bytes,
-                ..again.message
-            };
-            if again.times >= AGAIN.len() {
-                self.again = None;
-            }
-            return Some(Message::Datagram(message));
+        if self.is_again_due() {
+            return self.event_again(buffer);
         }
         let next = self.sequence;
         let newest = next.wrapping_sub(1);
@@ -331,28 +322,62 @@ impl Writer {
         })
     }
 
+    /// The newest event, once more.
+    fn event_again(&mut self, buffer: impl FnOnce() -> Vec<u8>) -> Option<Message> {
+        let again = self.again.as_mut()?;
+        again.is_due = false;
+        let mut kept = self.kept.iter();
+        let message = match &again.message {
+            Some(message) => Some(message),
+            None => kept.find_map(|kept| match &kept.message {
+                Message::Datagram(message) if kept.publisher.is_none() => Some(message),
+                Message::Datagram(_) | Message::Large(_) => None,
+            }),
+        };
+        let message = message.map(|message| {
+            let mut bytes = buffer();
+            bytes.clone_from(&message.bytes);
+            Message::Datagram(Encoded { bytes, ..*message })
+        });
+        if again.times >= AGAIN.len() {
+            self.again = None;
+        }
+        message
+    }
+
+    /// Whether it is time to send the newest event again.
+    fn is_again_due(&self) -> bool {
+        self.again.as_ref().is_some_and(|again| again.is_due)
+    }
+
     /// Plans to send a sample again if it is an event of one datagram. It takes the place of the event before, which is not
     /// sent any more.
-    pub(crate) fn send_again(&mut self, message: &Message, is_state: bool, now: Instant) {
-        let Message::Datagram(message) = message else {
+    pub(crate) fn send_again(
+        &mut self,
+        message: &Message,
+        (is_state, is_kept): (bool, bool),
+        now: Instant,
+    ) {
+        let (Message::Datagram(message), false) = (message, is_state) else {
             self.again = None;
             return;
         };
-        if is_state {
-            self.again = None;
-            return;
-        }
         let again = self.again.get_or_insert_with(|| Again {
-            message: Encoded::default(),
+            message: None,
             since: now,
             times: 0,
             is_due: false,
         });
-        again.message.bytes.clone_from(&message.bytes);
-        again.message.timestamp_at = message.timestamp_at;
-        again.message.payload_at = message.payload_at;
-        again.message.sequence_at = message.sequence_at;
         (again.since, again.times, again.is_due) = (now, 0, false);
+        if is_kept {
+            again.message = None;
+            return;
+        }
+        let copy = again.message.get_or_insert_default();
+        copy.bytes.clone_from(&message.bytes);
+        copy.timestamp_at = message.timestamp_at;
+        copy.payload_at = message.payload_at;
+        copy.sequence_at = message.sequence_at;
     }
 
     /// When the newest event is sent again next.

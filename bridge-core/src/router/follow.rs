@@ -60,6 +60,9 @@ impl Router {
             };
             let mut entry = Topic::new(role, rules);
             entry.takes = Takes::of(variable);
+            entry.held_back = variable
+                .map(|found| found.publish.period)
+                .unwrap_or_default();
             entry.gate = match variable {
                 Some(variable) if self.is_home(topic) => Gate::new(variable.publish),
                 Some(_) | None => None,

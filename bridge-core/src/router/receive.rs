@@ -193,20 +193,18 @@ impl Router {
         // Only key frames are repeated.
         place.fine &= message.kind == MessageKind::KeyFrame;
         place.by_clients = topic.space == SpaceId::UA;
-        place.held_back = self
-            .mapping
-            .variable(topic)
-            .map_or(Duration::ZERO, |variable| variable.publish.period);
         let local = self.settings.local;
         let Some(Topic {
             role: Role::Theirs(reader),
             counters,
             lasting,
+            held_back,
             ..
         }) = self.entry(topic, from, now)
         else {
             return;
         };
+        place.held_back = *held_back;
         reader.heard(now.monotonic);
         // A keep-alive says nothing of the content.
         let changed = message.kind != MessageKind::KeepAlive

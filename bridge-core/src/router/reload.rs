@@ -58,6 +58,7 @@ impl Router {
                 && was != is
             {
                 entry.takes = Takes::of(is);
+                entry.held_back = is.map(|is| is.publish.period).unwrap_or_default();
                 if let Role::Theirs(reader) = &mut entry.role {
                     // Another field may be the value now.
                     reader.owed = true;

@@ -178,7 +178,9 @@ fn warn(entry: &VariableEntry, variable: &Variable, findings: &mut Findings) {
         return;
     };
     let types = commanded(variable).map(|binding| &binding.message_type);
-    let Some((message_type, motion)) = types.filter_map(|name| Some((name, Motion::of(name)?))).next()
+    let Some((message_type, motion)) = types
+        .filter_map(|name| Some((name, Motion::of(name)?)))
+        .next()
     else {
         return;
     };
