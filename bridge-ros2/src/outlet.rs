@@ -396,7 +396,7 @@ impl Outlet {
         self.audience = Audience::Nobody { held: None };
         if let Some(held) = held {
             // A writer that fails says so at the next value.
-            drop(self.store(held, now));
+            let _stored = self.store(held, now);
         }
     }
 

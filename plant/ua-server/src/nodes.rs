@@ -535,7 +535,7 @@ impl SpaceNodes {
         if topic.targeted {
             let (sent, on_its_way) = {
                 let _alone = self.writing.lock();
-                self.send_alone(place, write, &|_| {})?
+                self.send_alone(context, place, write, &|_| {})?
             };
             let answered = on_its_way.left().await?;
             let status = match tokio::time::timeout(LONGEST_WAY_OUT, answered).await {

@@ -441,7 +441,7 @@ fn a_command_of_motion_is_proposed_with_what_ends_it() {
     let codes: Vec<_> = checked.findings.iter().map(|found| found.code).collect();
     assert_eq!(
         codes,
-        [mappings::Code::EndlessMotion],
+        [Code::EndlessMotion],
         "{}",
         checked.render(&text)
     );
