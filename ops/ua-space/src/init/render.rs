@@ -154,7 +154,10 @@ fn entry(entry: &Entry, indent: &str, lines: &mut Vec<String>) {
             "{mark}  {word}: {{server: {server}, node: {node}}}"
         ));
     }
-    let commanded = entry.bindings.iter().filter(|one| one.space != entry.origin);
+    let commanded = entry
+        .bindings
+        .iter()
+        .filter(|one| one.space != entry.origin);
     match commanded.filter_map(|one| Motion::of(&one.kind)).next() {
         Some(Motion::ByZero) => say(format!("{mark}  on_loss: zero")),
         Some(Motion::NotByZero) => say(

@@ -439,10 +439,5 @@ fn a_command_of_motion_is_proposed_with_what_ends_it() {
     assert!(of_arm.contains("# on_loss: zero is a movement of this type"));
     let checked = Mapping::from_yaml(&text, "cell.yaml");
     let codes: Vec<_> = checked.findings.iter().map(|found| found.code).collect();
-    assert_eq!(
-        codes,
-        [Code::EndlessMotion],
-        "{}",
-        checked.render(&text)
-    );
+    assert_eq!(codes, [Code::EndlessMotion], "{}", checked.render(&text));
 }
