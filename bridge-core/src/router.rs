@@ -494,10 +494,17 @@ impl Router {
         self.count(About::topic(topic), Reason::IncompatibleQos, 1, String::new);
     }
 
-    /// Samples that were lost before the Router saw them, in a queue of the port or the kernel.
-    pub fn lost(&mut self, topic: Option<TopicId>, count: u64, why: &'static str) {
-        let about = About { topic, from: None };
-        self.count(about, (Reason::Overflow, why), count, || why.to_owned());
+    /// Counts samples that were lost before the Router saw them, such as in a queue of the port or the kernel. Which values
+    /// of its writer are received does not depend on them.
+    pub fn lost(
+        &mut self,
+        topic: Option<TopicId>,
+        count: u64,
+        (reason, why): (Reason, &'static str),
+    ) {
+        self.count_only(About { topic, from: None }, (reason, why), count, || {
+            why.to_owned()
+        });
     }
 
     /// What a port dropped that belongs to no topic.

@@ -48,7 +48,7 @@ impl Cell {
     #[expect(clippy::disallowed_methods, reason = "some instant to count from")]
     fn new(spaces: &[SpaceId], mode: GroupMode) -> Self {
         let yaml = match mode {
-            GroupMode::None => String::new(),
+            GroupMode::None => "variables: []".to_owned(),
             secured => format!(
                 "security: [{{group: cell, mode: {}, keys: {{file: k}}}}]",
                 secured.name()

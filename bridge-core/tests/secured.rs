@@ -356,7 +356,7 @@ fn without_a_secured_group_a_call_of_another_host_stays_refused() {
 fn a_group_that_is_no_longer_secured_speaks_in_clear_after_a_reload() {
     let mut cell = secured(ENCRYPTED);
     for at in [WRITER, READER] {
-        follows(&mut cell, at, "");
+        follows(&mut cell, at, "variables: []");
     }
     cell.say(WRITER, said(), "plain");
     cell.run(ms(100));

@@ -280,8 +280,12 @@ fn a_frequent_drop_does_not_hide_a_rare_one() {
     let mut bridge = Bridge::new(Local::Fields);
     let robot = topic("ua_2_5_11");
     bridge.hear(robot, WRITER);
-    bridge.router.lost(Some(robot), 55, "read too slowly");
-    bridge.router.lost(Some(robot), 1, "service too slow");
+    bridge
+        .router
+        .lost(Some(robot), 55, (Reason::Overflow, "read too slowly"));
+    bridge
+        .router
+        .lost(Some(robot), 1, (Reason::Overflow, "service too slow"));
     let good = frame(robot, DataSetHeader::default(), None);
     let mut no_variant = good.clone();
     let value = good.len() - 5;

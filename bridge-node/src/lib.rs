@@ -5,6 +5,7 @@
 
 pub mod actions;
 mod arguments;
+mod awaited;
 mod busy_poll;
 mod calls;
 mod clock;
@@ -29,6 +30,7 @@ mod status;
 
 pub use actions::{ActionGraph, Actions};
 pub use arguments::{Arguments, Flags, WithoutMapping};
+pub use awaited::{AwaitedPeers, near};
 pub use bridge_core::{
     ActionFamily, Answered, Application, AskError, AskErrorKind, AskId, CallDescription, CallField,
     CallMap, CallRole, CallStructure, Counters, Described, Executed, ExecutionId, Kept, Offered,

@@ -29,6 +29,11 @@ pub trait Told: Send + 'static {
 
     /// What keeps it from its work, a line each; nothing where it can do it. For /readyz.
     fn not_ready(&self) -> Vec<String>;
+
+    /// Returns the peers that the program waits for, a line each. The program is ready without them. For /readyz.
+    fn waiting_for(&self) -> Vec<String> {
+        Vec::new()
+    }
 }
 
 /// The run loops that answer, in the order of their spaces.
@@ -183,10 +188,11 @@ async fn page<T: Told>(request: &Request<Incoming>, ask: &Ask<T>) -> Response<Fu
         ),
         Page::Ready => {
             let reasons: String = all.iter().flat_map(T::not_ready).collect();
+            let waiting: String = all.iter().flat_map(T::waiting_for).collect();
             if reasons.is_empty() {
-                text(StatusCode::OK, "ready\n".to_owned())
+                text(StatusCode::OK, format!("ready\n{waiting}"))
             } else {
-                text(StatusCode::SERVICE_UNAVAILABLE, reasons)
+                text(StatusCode::SERVICE_UNAVAILABLE, reasons + &waiting)
             }
         }
         Page::Status => match all.as_slice() {

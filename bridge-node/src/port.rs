@@ -16,6 +16,8 @@ use serde::Serialize;
 use type_files::TypePaths;
 use uadp::{BuiltinType, Timestamp};
 
+use crate::awaited::AwaitedPeers;
+
 /// The local side of a bridge: a ROS 1 graph, a DDS domain, or an OPC UA address space.
 ///
 /// The shell polls [`recv`](Self::recv) beside the socket, and hands over what the Router lets pass. Topic names are
@@ -101,6 +103,12 @@ pub trait Port: Send + 'static {
     /// What keeps this side from doing its work now, such as a ROS master that does not answer: for people.
     fn hindrance(&self) -> Option<String> {
         None
+    }
+
+    /// Adds the peers of this side that the mapping needs and that are missing, such as a topic without a publisher. The
+    /// run loop asks each second.
+    fn add_awaited(&self, missing: &mut AwaitedPeers) {
+        let _needs_no_peers = missing;
     }
 
     /// The other servers that this side is connected to, or tries to be.
@@ -257,10 +265,12 @@ pub enum PortEvent {
         /// How many.
         count: u64,
     },
-    /// Samples were lost before the Router saw them, in a bounded queue that was full.
+    /// Samples were lost before the Router saw them, such as in a bounded queue that was full.
     Lost {
         /// Which value, if it is known.
         topic: Option<TopicId>,
+        /// The counter.
+        reason: Reason,
         /// Why, in two or three words; the counter's label.
         why: &'static str,
         /// How many.

@@ -19,6 +19,7 @@ use transport::{Held, Options, Udp};
 use type_files::TypePaths;
 
 use crate::arguments::Arguments;
+use crate::awaited::PeerWatch;
 use crate::busy_poll::BusyPoll;
 use crate::clock::now;
 use crate::descriptors;
@@ -284,6 +285,7 @@ async fn prepare<P: Program>(
         },
         restart: Vec::new(),
         taken: BTreeMap::new(),
+        awaited: PeerWatch::new(now().monotonic),
         busy: BusyPoll::new(Duration::from_micros(arguments.flags.busy_poll.into())),
         dry_run: arguments.flags.dry_run,
         _told: told,

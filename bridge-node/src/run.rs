@@ -1,5 +1,6 @@
 //! The run loop: the only place where a bridge waits.
 
+mod awaited;
 mod calls;
 
 use std::collections::BTreeMap;
@@ -18,6 +19,7 @@ use tokio::time::{Instant as TokioInstant, MissedTickBehavior, Sleep, interval};
 use tracing::{debug, info, warn};
 use transport::{Change, Finding, Held, SendError, Udp};
 
+use crate::awaited::PeerWatch;
 use crate::busy_poll::BusyPoll;
 use crate::clock::now;
 use crate::exit::{Failure, FailureKind};
@@ -48,6 +50,8 @@ pub(crate) struct Shell<P> {
     pub(crate) restart: Vec<String>,
     /// The namespaces that somebody else writes, with what is told of each.
     pub(crate) taken: BTreeMap<u16, String>,
+    /// The peers that are missing.
+    pub(crate) awaited: PeerWatch,
     pub(crate) busy: BusyPoll,
     pub(crate) dry_run: bool,
     /// Elsewhere than in the group, for as long as it is here.
@@ -150,6 +154,7 @@ impl<P: Port> Shell<P> {
                     self.follow_group();
                     self.look_at_held()?;
                     self.port.counted(&self.router);
+                    self.look_for_peers();
                 }
                 Ok(()) = self.changes.changed() => self.reload(),
                 Some(NewKeys { group, delivery }) = self.keys.next() => {
@@ -243,6 +248,7 @@ impl<P: Port> Shell<P> {
                     .chain(self.taken.values().cloned())
                     .chain(self.keyless())
                     .collect(),
+                waiting_for: self.awaited.reported(),
                 interfaces,
             },
         )
@@ -393,7 +399,12 @@ impl<P: Port> Shell<P> {
             PortEvent::Unbound { topic } => self.unbound(topic),
             PortEvent::Left { topic, publisher } => self.router.left(topic, publisher, now()),
             PortEvent::Live { topic, live } => self.router.set_live(topic, live, now()),
-            PortEvent::Lost { topic, why, count } => self.router.lost(topic, count, why),
+            PortEvent::Lost {
+                topic,
+                reason,
+                why,
+                count,
+            } => self.router.lost(topic, count, (reason, why)),
             PortEvent::Dropped { reason, why, count } => self.router.dropped(reason, count, why),
             PortEvent::Unmatched { topic } => self.router.unmatched(topic),
             PortEvent::CallFailed { topic, detail } => self.router.call_failed(topic, &detail),

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 
-use bridge_core::{CallCounters, Counters, Delays, Hop, Router};
+use bridge_core::{CallCounters, Counters, Delays, Hop, Reason, Router};
 use mappings::SpaceId;
 use serde::Serialize;
 
@@ -42,6 +42,8 @@ pub(crate) struct Status {
 pub(crate) struct Readiness {
     /// Why it cannot, for people; nothing where it can.
     pub(crate) not_ready: Vec<String>,
+    /// The peers that are missing, each with the reason. The program works without them.
+    pub(crate) waiting_for: Vec<String>,
     pub(crate) interfaces: Interfaces,
 }
 
@@ -93,6 +95,8 @@ struct TopicStatus {
     keep_alives: u64,
     missing: u64,
     sender_changed: u64,
+    /// Our own datagrams that the group brought back, and values that the local side heard of itself: no drops.
+    looped: u64,
     dropped: BTreeMap<&'static str, u64>,
 }
 
@@ -181,7 +185,7 @@ impl Status {
         self
     }
 
-    /// How many topics there are, and how many samples were sent, delivered and dropped, routine drops included.
+    /// How many topics there are, and how many samples were sent, delivered and dropped.
     pub(crate) fn summary(&self) -> [u64; 4] {
         let all = || self.topics.values().chain([&self.others]);
         [
@@ -215,6 +219,14 @@ impl Told for Status {
             .collect()
     }
 
+    fn waiting_for(&self) -> Vec<String> {
+        let (program, space) = (self.program, self.space);
+        let peers = self.readiness.waiting_for.iter();
+        peers
+            .map(|peer| format!("{program}, space {space}: waiting for {peer}\n"))
+            .collect()
+    }
+
     fn json(&self) -> String {
         // All keys are strings and no number is special, so there is nothing that could fail.
         serde_json::to_string(self).unwrap_or_default()
@@ -229,9 +241,11 @@ impl Told for Status {
         let own = format!("program=\"{}\",space=\"{}\"", self.program, self.space);
         let Readiness {
             not_ready,
+            waiting_for,
             interfaces: Interfaces { pubsub, local },
         } = &self.readiness;
         line("ready", &own, &u8::from(not_ready.is_empty()));
+        line("awaited_peers", &own, &waiting_for.len());
         let sides = [("pubsub", Some(*pubsub)), ("local", *local)];
         for (side, up) in sides {
             if let Some(up) = up {
@@ -265,6 +279,7 @@ impl Told for Status {
             line("keep_alives_total", &labels, &status.keep_alives);
             line("messages_missing_total", &labels, &status.missing);
             line("sender_changed_total", &labels, &status.sender_changed);
+            line("samples_looped_total", &labels, &status.looped);
             for (reason, count) in &status.dropped {
                 line(
                     "samples_dropped_total",
@@ -349,6 +364,7 @@ impl CallStatus {
             executed: *executed,
             dropped: drops
                 .drops()
+                .filter(|(reason, _)| *reason != Reason::Looped)
                 .map(|(reason, count)| (reason.label(), count))
                 .collect(),
         }
@@ -366,8 +382,10 @@ impl From<&Counters> for TopicStatus {
             keep_alives: counters.keep_alives,
             missing: counters.missing,
             sender_changed: counters.sender_changed,
+            looped: counters.dropped(Reason::Looped),
             dropped: counters
                 .drops()
+                .filter(|(reason, _)| *reason != Reason::Looped)
                 .map(|(reason, count)| (reason.label(), count))
                 .collect(),
         }
@@ -432,6 +450,7 @@ mod tests {
         }
         let ready = Readiness {
             not_ready: Vec::new(),
+            waiting_for: Vec::new(),
             interfaces: Interfaces {
                 pubsub: 1,
                 local: None,
@@ -463,6 +482,7 @@ mod tests {
         router.ask(AskId(1), (call, &[0, 0]), timeout, crate::clock::now());
         let ready = Readiness {
             not_ready: Vec::new(),
+            waiting_for: Vec::new(),
             interfaces: Interfaces {
                 pubsub: 1,
                 local: None,

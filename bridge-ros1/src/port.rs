@@ -3,6 +3,7 @@
 //! One task owns everything; [`Ros1Port::recv`](Port::recv) is its only wait.
 
 mod actions;
+mod awaited;
 mod calls;
 mod found;
 mod reload;
@@ -16,8 +17,9 @@ use std::time::SystemTime;
 
 use bridge_node::policy::{Policy, Step, TYPE_CHANGES, Word, is_bad, type_changes};
 use bridge_node::{
-    Actions, Answered, AskId, CallDescription, Calls, Delivery, Described, Executed, Executing,
-    Execution, ExecutionId, Kept, Port, PortEvent, Services, TypePaths, timestamp,
+    Actions, Answered, AskId, AwaitedPeers, CallDescription, Calls, Delivery, Described, Executed,
+    Executing, Execution, ExecutionId, Kept, Port, PortEvent, Reason, Services, TypePaths,
+    timestamp,
 };
 use bytes::Bytes;
 use mappings::{Mapping, SpaceId, TopicId, Variable};
@@ -233,7 +235,9 @@ impl Ros1Port {
             } => {
                 self.with_live(index, |source| source.part(&peer, publishers));
             }
-            InboxEvent::Dropped(count) => self.lost(index, "read too slowly", count),
+            InboxEvent::Dropped(count) => {
+                self.lost(index, (Reason::Overflow, "read too slowly"), count);
+            }
         }
     }
 
@@ -248,7 +252,7 @@ impl Ros1Port {
             .get(index)
             .and_then(|source| source.knows(&peer));
         if !known.unwrap_or_else(|| self.meet(index, &peer)) {
-            self.lost(index, "publisher of another type", 1);
+            self.lost(index, (Reason::Mismatch, "publisher of another type"), 1);
             return;
         }
         let received = timestamp(received);
@@ -376,13 +380,14 @@ impl Ros1Port {
         }));
     }
 
-    fn lost(&mut self, index: usize, why: &'static str, count: u64) {
+    fn lost(&mut self, index: usize, (reason, why): (Reason, &'static str), count: u64) {
         let Some(source) = self.sources.get(index) else {
             return;
         };
         for (topic, _) in &source.values {
             self.events.push_back(PortEvent::Lost {
                 topic: Some(*topic),
+                reason,
                 why,
                 count,
             });
@@ -434,6 +439,7 @@ impl Ros1Port {
                 let why = "subscriber too slow or late";
                 self.events.push_back(PortEvent::Lost {
                     topic: Some(topic),
+                    reason: Reason::Overflow,
                     why,
                     count,
                 });
@@ -608,6 +614,7 @@ impl Port for Ros1Port {
             if replaced > 0 {
                 self.events.push_back(PortEvent::Lost {
                     topic: Some(sample.topic),
+                    reason: Reason::Overflow,
                     why: "service too slow",
                     count: replaced,
                 });
@@ -753,6 +760,10 @@ impl Port for Ros1Port {
 
     fn hindrance(&self) -> Option<String> {
         (!self.has_master).then(|| format!("no ROS master answers at {}", self.master))
+    }
+
+    fn add_awaited(&self, missing: &mut AwaitedPeers) {
+        self.add_missing(missing);
     }
 
     fn addresses(&self) -> Option<&[IpAddr]> {

@@ -200,6 +200,11 @@ impl Source {
             .retain(|known| publishers > 0 && !Arc::ptr_eq(known, peer));
     }
 
+    /// Whether a publisher of another type is connected.
+    pub(crate) const fn has_strangers(&self) -> bool {
+        !self.strangers.is_empty()
+    }
+
     /// Whether somebody publishes it in a type that can be read.
     pub(crate) const fn is_live(&self) -> bool {
         !self.peers.is_empty()

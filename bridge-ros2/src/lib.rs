@@ -13,6 +13,7 @@ pub mod discovery_info;
 pub mod domain;
 #[cfg(feature = "patched-dds")]
 mod driver;
+pub mod environment;
 pub mod graph;
 pub mod inbox;
 pub mod limits;

@@ -13,7 +13,7 @@ use bridge_ros2::discovery_info::GidLength;
 use bridge_ros2::domain::{DiscoveryRange, DomainError, DomainOptions};
 use bridge_ros2::node::NodeOptions;
 use bridge_ros2::security::Security;
-use bridge_ros2::{PortOptions, Ros2Port, RosArgs, limits};
+use bridge_ros2::{PortOptions, Ros2Port, RosArgs, environment, limits};
 use clap::Parser;
 use discovery::{Bridge, TellingArguments, tell_bridge};
 use mappings::{Mapping, SpaceId};
@@ -244,6 +244,11 @@ impl Program for BridgeRos2 {
             own,
         } = context;
         let security = self.security()?;
+        if self.spaces(&mapping)?.first() == Some(&own) {
+            for warning in environment::ignored(|name| std::env::var(name).ok()) {
+                warn!("{warning}");
+            }
+        }
         let options = PortOptions {
             domain: DomainOptions {
                 domain: self.domain(own, &mapping),
@@ -347,8 +352,12 @@ fn choose_space(
     }
     if let Some(domain) = domain {
         return mapping.space_of_domain(domain).ok_or_else(|| {
+            let free = (FIRST_FREE..=232).filter_map(SpaceId::new);
+            let free = free.filter(|id| mapping.space(*id).is_none()).min();
+            let id = free.map_or(FIRST_FREE, u16::from);
             format!(
-                "DDS domain {domain} has no space: declare one in the mapping (spaces), or say --space N, 2 to 232"
+                "DDS domain {domain} has no space: add `- {{id: {id}, domain: {domain}}}` to `spaces` of the mapping, or say \
+                 --space N, 2 to 232"
             )
         });
     }
@@ -364,7 +373,8 @@ fn choose_space(
                 .to_owned(),
         ),
         (None, _) => Err(
-            "which DDS domain? Say --domain N (or set ROS_DOMAIN_ID), or declare a ROS 2 space in the mapping"
+            "which DDS domain? Add `- {id: 2}` to `spaces` of the mapping (space 2 in DDS domain 2; `- {id: 2, domain: 0}` \
+             for domain 0), or say --domain N (or set ROS_DOMAIN_ID)"
                 .to_owned(),
         ),
     }
@@ -383,6 +393,8 @@ fn gid_length(text: &str) -> Result<GidChoice, &'static str> {
     }
 }
 
+/// The first number that is proposed for the space of another domain. Lower numbers are kept for domains of the same number.
+const FIRST_FREE: u16 = 40;
 /// How the bridge appears in `ros2 node list`.
 const NODE_NAME: &str = "ua_bridge_ros2";
 
@@ -456,5 +468,6 @@ mod tests {
     fn without_a_domain_or_a_mapping_nothing_is_guessed() {
         let error = choose_space(None, None, &Mapping::default()).unwrap_err();
         assert!(error.contains("--domain"), "{error}");
+        assert!(error.contains("`- {id: 2}`"), "{error}");
     }
 }

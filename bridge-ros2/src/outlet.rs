@@ -9,6 +9,7 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
+use bridge_node::Reason;
 use rustdds::dds::WriteError;
 use rustdds::{DataWriterStatus, GUID, StatusEvented, Timestamp};
 use tokio::time::Instant;
@@ -90,6 +91,16 @@ pub enum Refusal {
 }
 
 impl Refusal {
+    /// Returns the counter and the label under which it is counted.
+    #[must_use]
+    pub fn cause(self) -> (Reason, &'static str) {
+        let reason = match self {
+            Self::Overflow => Reason::Overflow,
+            Self::TooLarge(_) | Self::Failed => Reason::NotPublished,
+        };
+        (reason, self.label())
+    }
+
     /// The label under which it is counted.
     #[must_use]
     pub fn label(self) -> &'static str {

@@ -6,6 +6,7 @@
 
 mod action_graph;
 mod actions;
+mod awaited;
 mod bridges;
 mod calls;
 mod descriptions;
@@ -29,8 +30,8 @@ use std::task::{Context, Poll};
 
 use bridge_node::policy::{Policy, Read, Step, TYPE_CHANGES, Word, is_bad, type_changes};
 use bridge_node::{
-    Actions, Answered, AskId, CallDescription, Calls, Delivery, Described, Executed, Executing,
-    Execution, ExecutionId, Kept, Port, PortEvent, Services, TypePaths, now,
+    Actions, Answered, AskId, AwaitedPeers, CallDescription, Calls, Delivery, Described, Executed,
+    Executing, Execution, ExecutionId, Kept, Port, PortEvent, Reason, Services, TypePaths, now,
 };
 use bytes::Bytes;
 use futures_util::StreamExt;
@@ -322,6 +323,7 @@ impl Ros2Port {
             }
             self.events.push_back(PortEvent::Lost {
                 topic: None,
+                reason: Reason::Unsecured,
                 why: KEPT_OUT,
                 count: 1,
             });
@@ -345,8 +347,7 @@ impl Ros2Port {
                 }
                 if self.graph.is_bridge(writer) {
                     for (topic, _) in &source.values {
-                        self.events
-                            .push_back(lost(*topic, "published by another bridge", 1));
+                        self.events.push_back(lost(*topic, BY_BRIDGE, 1));
                     }
                     return;
                 }
@@ -360,11 +361,10 @@ impl Ros2Port {
                 for (topic, _) in &source.values {
                     let topic = *topic;
                     if missing > 0 {
-                        self.events
-                            .push_back(lost(topic, "lost before they were read", missing));
+                        self.events.push_back(lost(topic, UNREAD, missing));
                     }
                     self.events.push_back(match stranger {
-                        Some(why) => lost(topic, why, 1),
+                        Some(why) => lost(topic, (Reason::Mismatch, why), 1),
                         None => PortEvent::Sample {
                             topic,
                             payload: payload.clone(),
@@ -380,8 +380,11 @@ impl Ros2Port {
                 };
                 debug!(topic = source.dds_topic, why, "unreadable sample");
                 for (topic, _) in &source.values {
-                    self.events
-                        .push_back(lost(*topic, "unreadable encoding", 1));
+                    self.events.push_back(lost(
+                        *topic,
+                        (Reason::Malformed, "unreadable encoding"),
+                        1,
+                    ));
                 }
             }
         }
@@ -410,7 +413,7 @@ impl Ros2Port {
         for (topic, sink) in &mut self.sinks {
             let Some(open) = &mut sink.open else { continue };
             if let Err(refusal) = open.outlet.flush(now) {
-                self.events.push_back(lost(*topic, refusal.label(), 1));
+                self.events.push_back(lost(*topic, refusal.cause(), 1));
             }
             waiting |= open.outlet.is_waiting();
         }
@@ -487,8 +490,11 @@ impl Port for Ros2Port {
         }
         if let Some(replaced) = self.services.hand_over(topic, &payload) {
             if replaced > 0 {
-                self.events
-                    .push_back(lost(topic, "service too slow", replaced));
+                self.events.push_back(lost(
+                    topic,
+                    (Reason::Overflow, "service too slow"),
+                    replaced,
+                ));
             }
             return Ok(());
         }
@@ -629,6 +635,10 @@ impl Port for Ros2Port {
         restart
     }
 
+    fn add_awaited(&self, missing: &mut AwaitedPeers) {
+        self.add_missing(missing);
+    }
+
     fn addresses(&self) -> Option<&[IpAddr]> {
         // RustDDS joins its groups and names its addresses to others when the participant is made, and never again.
         Some(&self.networks)
@@ -688,13 +698,19 @@ impl std::fmt::Debug for Ros2Port {
     }
 }
 
-fn lost(topic: TopicId, why: &'static str, count: u64) -> PortEvent {
+fn lost(topic: TopicId, (reason, why): (Reason, &'static str), count: u64) -> PortEvent {
     PortEvent::Lost {
         topic: Some(topic),
+        reason,
         why,
         count,
     }
 }
+
+/// Why samples are counted that another bridge published: they are values of the space.
+const BY_BRIDGE: (Reason, &str) = (Reason::Looped, "published by another bridge");
+/// Why samples are counted that RustDDS says were lost.
+const UNREAD: (Reason, &str) = (Reason::Overflow, "lost before they were read");
 
 /// Whether a discovery event may mean another set of endpoints.
 fn is_change(event: &DomainParticipantStatusEvent) -> bool {

@@ -10,7 +10,7 @@ use schemars::JsonSchema;
 use crate::call::Assigned;
 use crate::code::Code;
 use crate::mapping::UaField;
-use crate::read::{At, Read, Reader, choice, document, short};
+use crate::read::{At, Read, Reader, choice, document, help_octal, is_octal, short};
 use crate::server_entries::{FindSkillsEntry, FromEntry, RemoteServerEntry, ToEntry};
 use crate::tree::{Kind, Node, Place};
 
@@ -575,17 +575,17 @@ impl Read for Namespaces {
     fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
         let pairs = reader.pairs(node, "a map of namespace index and URI")?;
         let read = pairs.into_iter().map(|pair| {
-            let key = pair
-                .key
-                .parse()
-                .ok()
-                .filter(|_| pair.key.bytes().all(|b| b.is_ascii_digit()));
+            let key =
+                pair.key.parse().ok().filter(|_| {
+                    pair.key.bytes().all(|b| b.is_ascii_digit()) && !is_octal(pair.key)
+                });
             if key.is_none() {
                 let message = format!(
                     "expected a namespace index from 1 to 65535, found `{}`",
                     short(pair.key)
                 );
-                reader.findings.error(Code::WrongValue, pair.place, message);
+                let note = reader.findings.error(Code::WrongValue, pair.place, message);
+                help_octal(note, pair.key);
             }
             (
                 At {
@@ -606,10 +606,11 @@ impl Read for EnumTexts {
     fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
         let pairs = reader.pairs(node, "a map of value and text, as {0: idle, 1: moving}")?;
         let read = pairs.into_iter().map(|pair| {
-            let value = pair.key.parse().ok();
+            let value = pair.key.parse().ok().filter(|_| !is_octal(pair.key));
             if value.is_none() {
                 let message = format!("expected a whole number, found `{}`", short(pair.key));
-                reader.findings.error(Code::WrongValue, pair.place, message);
+                let note = reader.findings.error(Code::WrongValue, pair.place, message);
+                help_octal(note, pair.key);
             }
             let place = pair.place;
             (At { place, value }, reader.at(pair.value))
@@ -1106,6 +1107,12 @@ impl Default for Document {
 /// Reads the whole document; an empty one is one without any key.
 pub(crate) fn read(root: &Node<'_>, reader: &mut Reader<'_>) -> Option<(Document, Place)> {
     if matches!(root.kind, Kind::Null) {
+        // A file that another includes may be empty.
+        if root.place.file == 0 {
+            let message = "the document is empty: it declares no spaces, values or calls";
+            let note = reader.findings.error(Code::MissingKey, root.place, message);
+            note.help("`ua-space init` writes a mapping of what is there; programs that need no mapping are started without one");
+        }
         return Some((Document::default(), root.place));
     }
     Some((Document::read(root, reader)?, root.place))

@@ -48,6 +48,7 @@ pub use mapping::{
     Binding, Lasting, Mapping, Meaning, Overflow, PubSub, Publish, PublisherIdRule, SecurityPolicy,
     Server, ServerLimits, ServiceBinding, ServiceRole, Space, Trigger, UaField, Variable,
 };
+pub use nearest::nearest;
 pub use node_id::{ExpandedNodeIdText, Identifier, NamespaceText, NodeIdError, NodeIdText};
 pub use nodesets::{NodeSetFault, NodeSetNode, NodeSetType, NodeSets};
 pub use pattern::{Pattern, PatternFault, PatternReason, PatternVariable};

@@ -7,7 +7,7 @@ use std::rc::Rc;
 use schemars::{JsonSchema, Schema, SchemaGenerator};
 
 use crate::code::Code;
-use crate::findings::Findings;
+use crate::findings::{Findings, Note};
 use crate::nearest::nearest;
 use crate::tree::{Kind, Node, Place};
 
@@ -149,7 +149,8 @@ impl<'f> Reader<'f> {
         Some(found)
     }
 
-    /// The values of a map in the order of `keys`. Keys that are none of them are noted.
+    /// The values of a map in the order of `keys`. Keys that are none of them are noted; a misspelt one is then read as the key
+    /// that it resembles, so that the rest of the document is not held to lack it.
     pub(crate) fn keys<'n, const N: usize>(
         &mut self,
         node: &'n Node<'n>,
@@ -157,6 +158,7 @@ impl<'f> Reader<'f> {
     ) -> Option<[Option<&'n Node<'n>>; N]> {
         let mut values = [None; N];
         let wanted = || format!("a map with {}", list(&keys));
+        let mut misspelt = Vec::new();
         for Pair { key, place, value } in self.pairs_of(node, wanted)? {
             if let Some((_, slot)) = keys
                 .iter()
@@ -168,10 +170,18 @@ impl<'f> Reader<'f> {
             }
             let message = format!("unknown key `{}`", short(key));
             let note = self.findings.error(Code::UnknownKey, place, message);
-            note.help_with(|| match nearest(key, keys) {
+            let near = nearest(key, keys);
+            note.help_with(|| match near {
                 Some(near) => format!("did you mean `{near}`? Known here are {}", list(&keys)),
                 None => format!("known here are {}", list(&keys)),
             });
+            misspelt.extend(near.map(|near| (near, &**value)));
+        }
+        for (near, value) in misspelt {
+            let mut slots = keys.iter().zip(&mut values);
+            if let Some((_, slot @ None)) = slots.find(|(known, _)| **known == near) {
+                *slot = Some(value);
+            }
         }
         Some(values)
     }
@@ -210,10 +220,11 @@ impl Read for u16 {
         let number = text
             .parse()
             .ok()
-            .filter(|_| text.bytes().all(|b| b.is_ascii_digit()));
+            .filter(|_| text.bytes().all(|b| b.is_ascii_digit()) && !is_octal(text));
         if number.is_none() {
             let message = format!("expected a number from 0 to 65535, found `{}`", short(text));
-            reader.findings.error(Code::WrongValue, node.place, message);
+            let note = reader.findings.error(Code::WrongValue, node.place, message);
+            help_octal(note, text);
         }
         number
     }
@@ -226,10 +237,11 @@ impl Read for f64 {
         let number = text
             .parse()
             .ok()
-            .filter(|_| text.contains(|c: char| c.is_ascii_digit()));
+            .filter(|_| text.contains(|c: char| c.is_ascii_digit()) && !is_octal(text));
         if number.is_none() {
             let message = format!("expected a number as 0.001, found `{}`", short(text));
-            reader.findings.error(Code::WrongValue, node.place, message);
+            let note = reader.findings.error(Code::WrongValue, node.place, message);
+            help_octal(note, text);
         }
         number
     }
@@ -256,6 +268,25 @@ impl<T: Read> Read for Vec<At<T>> {
             return None;
         };
         Some(items.iter().map(|item| reader.at(item)).collect())
+    }
+}
+
+/// Whether a number has zeros in front, which YAML 1.1 reads as octal and YAML 1.2 as decimal.
+pub(crate) fn is_octal(text: &str) -> bool {
+    let digits = text.trim_start_matches(['-', '+']);
+    let mut bytes = digits.bytes();
+    bytes.next() == Some(b'0') && bytes.next().is_some_and(|b| b.is_ascii_digit())
+}
+
+/// Says of a number with zeros in front how it is written.
+pub(crate) fn help_octal(note: Note<'_>, text: &str) {
+    if is_octal(text) {
+        let plain = text.trim_start_matches('0');
+        let plain = if plain.is_empty() { "0" } else { plain };
+        note.help(format!(
+            "zeros in front make a number octal in YAML 1.1; write `{}`",
+            short(plain)
+        ));
     }
 }
 

@@ -222,7 +222,13 @@ impl<'t> Builder<'_, 't> {
                 if secret::is_written(&text) {
                     self.secrets.push(place);
                 }
-                let text = self.expand(text, place)?;
+                let text = match self.is_key() {
+                    true => self.key(text, place),
+                    false => {
+                        self.look_for_bare_variable(&text, style, place);
+                        self.expand(text, place)?
+                    }
+                };
                 let null = style == ScalarStyle::Plain
                     && matches!(&*text, "" | "~" | "null" | "Null" | "NULL");
                 let kind = if null { Kind::Null } else { Kind::Scalar(text) };
@@ -292,6 +298,47 @@ impl<'t> Builder<'_, 't> {
             Kind::List(open.children)
         };
         self.close(open.anchor, open.place, kind, depth)
+    }
+
+    /// Whether the node that begins now is a key.
+    fn is_key(&self) -> bool {
+        let open = self.open.last();
+        open.is_some_and(|open| open.map && open.children.len().is_multiple_of(2))
+    }
+
+    /// Returns a key as it is written; notes a variable in it.
+    fn key(&mut self, text: Cow<'t, str>, place: Place) -> Cow<'t, str> {
+        if text.contains("${") {
+            self.faults.push(Fault {
+                code: Code::EnvironmentVariable,
+                place,
+                message: "an environment variable stands in a key".to_owned(),
+                help: Some("variables stand in values only; write the key out"),
+            });
+        }
+        text
+    }
+
+    /// Notes a value that is a variable as a shell writes it, as `$NAME` or `$(NAME)`, outside of quotes.
+    fn look_for_bare_variable(&mut self, text: &str, style: ScalarStyle, place: Place) {
+        let Some(behind) = text
+            .strip_prefix('$')
+            .filter(|_| style == ScalarStyle::Plain)
+        else {
+            return;
+        };
+        let inside = behind
+            .strip_prefix('(')
+            .and_then(|name| name.strip_suffix(')'));
+        let name = inside.unwrap_or(behind);
+        if variables::is_name(name) {
+            self.faults.push(Fault {
+                code: Code::EnvironmentVariable,
+                place,
+                message: format!("`{text}` is no environment variable here, but the text itself"),
+                help: Some("a variable is written ${NAME}; the text itself stands in quotes"),
+            });
+        }
     }
 
     /// A scalar with the values of the variables it names.
@@ -446,14 +493,45 @@ fn fault(place: Place, message: String, help: Option<&'static str>) -> Fault {
 
 fn syntax(text: &str, error: &ScanError) -> Fault {
     let place = place(text, Marks::empty(*error.marker()));
-    let line = text.lines().nth(place.line - 1).unwrap_or_default();
-    let help = if line.trim_start_matches(' ').starts_with('\t') {
-        Some("YAML is indented with spaces, never with tabs")
-    } else {
-        Some("nothing after this place has been checked")
+    let before = place.line.saturating_sub(LINES_BEFORE);
+    let lines: Vec<(usize, &str)> = (1..)
+        .zip(text.lines())
+        .skip(before)
+        .take(place.line - before + 1)
+        .collect();
+    let indented = |line: &str| {
+        let indent = line.len() - line.trim_start_matches([' ', '\t']).len();
+        line.get(..indent)?.find('\t')
     };
-    fault(place, error.info(), help)
+    let tab = lines
+        .iter()
+        .rev()
+        .find_map(|(number, line)| Some((*number, indented(line)?)));
+    if let Some((line, column)) = tab {
+        let help = Some("YAML is indented with spaces, never with tabs");
+        if line == place.line {
+            return fault(place, error.info(), help);
+        }
+        let at = Place {
+            line,
+            column: column + 1,
+            len: 1,
+            ..place
+        };
+        return fault(at, "a tab indents this line".to_owned(), help);
+    }
+    let is_variable = lines
+        .iter()
+        .any(|(number, line)| *number == place.line && line.contains("${"));
+    let help = match is_variable {
+        true => "a text with ${NAME} stands in quotes between braces or brackets: \"${NAME}\"",
+        false => "nothing after this place has been checked",
+    };
+    fault(place, error.info(), Some(help))
 }
+
+/// How many lines up to a syntax error are searched for its cause.
+const LINES_BEFORE: usize = 3;
 
 /// The first line of what is marked.
 fn place(text: &str, marks: Marks) -> Place {
@@ -551,6 +629,20 @@ mod tests {
     }
 
     #[test]
+    fn variables_stand_in_values_and_are_written_with_braces() {
+        let messages = |text: &str| {
+            let tree = super::parse(text, 0, &|_| Some("x".to_owned())).unwrap();
+            let messages = tree.faults.into_iter();
+            messages.map(|fault| fault.message).collect::<Vec<_>>()
+        };
+        assert_eq!(messages("a: ${X}\nb: '$X'\nc: costs $5\nd: $\n"), [""; 0]);
+        assert_eq!(messages("${X}: 1\n").len(), 1);
+        assert_eq!(messages("a: {'${X}': 1}\n").len(), 1);
+        assert_eq!(messages("a: $IFACE\n").len(), 1);
+        assert_eq!(messages("a: $(IFACE)\n").len(), 1);
+    }
+
+    #[test]
     fn an_alias_shares_the_node_it_names() {
         let root = parse("a: &x {b: 1}\nc: *x\n").unwrap();
         let root = map(&root);
@@ -586,6 +678,13 @@ mod tests {
             );
             assert!(fault.message.contains(word), "{fault:?}");
         }
+        let late = parse("a:\n  b: 1\n\tc: 2\n").unwrap_err();
+        assert!(
+            late.place.line == 3 && late.help.unwrap().contains("tabs"),
+            "{late:?}"
+        );
+        let flow = parse("a: {b: ${X}}\n").unwrap_err();
+        assert!(flow.help.unwrap().contains("quotes"), "{flow:?}");
         let tab = parse("a:\n\tb: 1\n").unwrap_err();
         assert!(tab.help.unwrap().contains("tabs"), "{tab:?}");
     }

@@ -138,8 +138,8 @@ fn a_finding_is_told_with_its_own_file_and_what_it_collides_with() {
             "M053 plant/more.yaml:5 first at line 6 of plant/cell.yaml",
             "M006 plant/more.yaml:6",
             "M006 plant/more.yaml:6",
-            "M006 plant/more.yaml:6",
             "M003 plant/more.yaml:6",
+            "M050 plant/more.yaml:6",
         ]
     );
     let rendered = checked.render_all();

@@ -35,14 +35,17 @@ fn codes(checked: &Checked) -> Vec<Code> {
 }
 
 #[test]
-fn an_empty_document_is_zero_configuration() {
-    for text in [
-        "",
-        "# nothing yet\n",
-        "{}",
-        "spaces:\nvariables:\n",
-        "pubsub: {}\nserver: ~\n",
-    ] {
+fn an_empty_document_is_refused() {
+    for text in ["", "# nothing yet\n", "---\n"] {
+        let checked = Mapping::from_yaml(text, "cell.yaml");
+        assert!(checked.mapping.is_none(), "{text:?}");
+        assert!(checked.findings[0].message.contains("is empty"));
+    }
+}
+
+#[test]
+fn a_document_whose_keys_have_no_values_is_zero_configuration() {
+    for text in ["{}", "spaces:\nvariables:\n", "pubsub: {}\nserver: ~\n"] {
         let mapping = sound(text);
         assert_eq!(*mapping.pubsub(), PubSub::default(), "{text:?}");
         assert!(mapping.variables().is_empty() && mapping.spaces().is_empty());

@@ -126,9 +126,9 @@ fn the_assembly_line_names_each_value_on_both_sides() {
 }
 
 #[test]
-fn the_first_mapping_of_the_readme_has_ten_lines() {
+fn the_first_mapping_of_the_readme_has_eleven_lines() {
     let path = folder().join("minimal.yaml");
-    assert_eq!(std::fs::read_to_string(&path).unwrap().lines().count(), 10);
+    assert_eq!(std::fs::read_to_string(&path).unwrap().lines().count(), 11);
     let mapping = load(&path);
     let variable = mapping.variable("ua_1_2_10".parse().unwrap()).unwrap();
     assert_eq!(

@@ -139,6 +139,12 @@ impl Publisher {
         state.subscribers.iter().any(|s| s.caller_id == node)
     }
 
+    /// Whether the node of this resolved name asked for the topic without TCPROS among its protocols.
+    pub fn asks_for_udp(&self, node: &str) -> bool {
+        let state = lock(&self.hub.state);
+        state.without_tcpros.iter().any(|one| one == node)
+    }
+
     /// The topic's resolved name.
     pub fn topic(&self) -> &str {
         &self.hub.topic
@@ -189,6 +195,8 @@ struct HubState {
     /// The keys of the last of them, each with the count before it; at most [`MAX_LATCHED`].
     recent: VecDeque<(u64, u64)>,
     refused_type: Option<String>,
+    /// The nodes that asked for other protocols than TCPROS only, at most [`MAX_WITHOUT_TCPROS`].
+    without_tcpros: VecDeque<String>,
     closed: bool,
 }
 
@@ -322,6 +330,18 @@ impl Hub {
         lock(&self.state).subscribers.clone()
     }
 
+    /// Notes that a node asked for the topic over other protocols than TCPROS only.
+    pub(crate) fn refuse_protocols(&self, caller: &str) {
+        let mut state = lock(&self.state);
+        if state.without_tcpros.iter().any(|one| one == caller) {
+            return;
+        }
+        if state.without_tcpros.len() >= MAX_WITHOUT_TCPROS {
+            state.without_tcpros.pop_front();
+        }
+        state.without_tcpros.push_back(caller.to_owned());
+    }
+
     /// What a subscriber is told of this topic, or why it does not fit.
     pub(crate) fn reply_to(
         &self,
@@ -435,6 +455,8 @@ impl Drop for Joined {
     }
 }
 
+/// Nodes without TCPROS that are remembered of a topic.
+const MAX_WITHOUT_TCPROS: usize = 16;
 /// Messages latched side by side.
 pub const MAX_LATCHED: usize = 64;
 

@@ -54,12 +54,12 @@ fn param_update(node: &Inner, params: &[Value]) -> Value {
 }
 
 fn request_topic(node: &Inner, params: &[Value]) -> Value {
-    let [_, Value::String(topic), Value::Array(protocols)] = params else {
+    let [caller, Value::String(topic), Value::Array(protocols)] = params else {
         return refused("requestTopic takes (caller_id, topic, protocols)");
     };
-    if node.publication(topic).is_none() {
+    let Some(hub) = node.publication(topic) else {
         return triple(-1, &format!("not a publisher of [{topic}]"), Vec::new());
-    }
+    };
     let tcpros = |protocol: &Value| {
         protocol
             .as_array()
@@ -68,6 +68,7 @@ fn request_topic(node: &Inner, params: &[Value]) -> Value {
             == Some("TCPROS")
     };
     if !protocols.iter().any(tcpros) {
+        hub.refuse_protocols(clipped(caller.as_str().unwrap_or_default()));
         return triple(0, "only TCPROS is spoken here", Vec::new());
     }
     let port = i32::from(node.topics_port);

@@ -2,6 +2,7 @@
 
 mod assembly_line;
 mod asyncua_pubsub;
+mod awaited;
 mod bad_input;
 mod call_actionlib;
 mod call_actions;

@@ -185,6 +185,17 @@ impl Udp {
         self.watch.as_ref()?.lost()
     }
 
+    /// Returns the name of the network interface that the sockets use.
+    #[must_use]
+    pub fn interface(&self) -> String {
+        let held = self
+            .watch
+            .as_ref()
+            .map(|watch| watch.interface().name.clone());
+        let named = held.or_else(|| self.options.interface.clone());
+        named.unwrap_or_else(|| "the default interface".to_owned())
+    }
+
     /// Waits for a datagram and gives its length and sender. Cancel-safe: nothing is lost when dropped.
     ///
     /// A datagram larger than `buffer` is cut to it; 65 536 bytes hold any.

@@ -56,6 +56,11 @@ impl Watch {
         self.lost.as_deref()
     }
 
+    /// Returns the interface as it was when the sockets were made.
+    pub(crate) const fn interface(&self) -> &Interface {
+        &self.held
+    }
+
     /// Looks at the interfaces. Where the wanted one is there and is not what it was, `take` makes the sockets anew; what
     /// it cannot is tried again with the next look.
     pub(crate) fn look(

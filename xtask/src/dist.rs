@@ -23,6 +23,18 @@ const PROGRAMS: [(&str, &str); 9] = [
     ("ua-station", "ua-station"),
 ];
 
+/// Builds the programs without optimisation into `target/debug`.
+pub(crate) fn build(workspace: &Workspace) -> anyhow::Result<Ended> {
+    let patched = Patched::prepare(workspace)?;
+    step("building the programs (some minutes the first time)");
+    let mut build = patched.cargo(workspace, &["build", "--locked", "--bins"]);
+    for (package, _) in PROGRAMS {
+        build.args(["--package", package]);
+    }
+    must(&mut build)?;
+    Ok(Ended::WELL)
+}
+
 /// Builds the programs with optimisation and puts them into `target/dist`.
 pub(crate) fn run(workspace: &Workspace) -> anyhow::Result<Ended> {
     let patched = Patched::prepare(workspace)?;

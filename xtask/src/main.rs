@@ -29,6 +29,7 @@ cargo xtask <verb>
   peers [--build]                only install the peers; of those only what the programs are built with
   lint [--dependencies]          formatting, clippy, documentation; or licences, sources and advisories of dependencies, and the
                                  workspace with all crates as published
+  build                          build the programs without optimisation into target/debug
   dist                           build the programs that are handed out, with optimisation, into target/dist
   patches [--test]               only patch the crates of patches/, which all verbs build with, and print the flags to do so by hand;
                                  or run the tests that the patches add, which `test` leaves out
@@ -63,6 +64,7 @@ fn run(arguments: &[&str]) -> anyhow::Result<Ended> {
         ["test", rest @ ..] => test::run(&Workspace::find()?, rest),
         ["peers"] => Ok(peers::run(&Workspace::find()?)),
         ["peers", "--build"] => peers::for_building(),
+        ["build"] => dist::build(&Workspace::find()?),
         ["dist"] => dist::run(&Workspace::find()?),
         ["patches"] => patches::run(&Workspace::find()?),
         ["patches", "--test"] => test::of_all_patches(&Workspace::find()?),

@@ -5,7 +5,9 @@ use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
 use mappings::SpaceId;
-use uadp::discovery::{ApplicationDescription, List, Probe, ProbeLimits, ProbeStep, ProbeTimer};
+use uadp::discovery::{
+    ApplicationDescription, Included, List, Probe, ProbeLimits, ProbeStep, ProbeTimer, Subject,
+};
 use uadp::{NetworkMessage, NetworkMessageType, PublisherId, SecurityHeader};
 
 use super::discovery::Discovery;
@@ -31,7 +33,8 @@ impl Applications {
 }
 
 impl Router {
-    /// A program says what it is: it tells whoever asks for applications or for its Endpoints, and asks once who else is there.
+    /// Takes the description of this program: it is announced once, and to everyone who asks for applications or for its
+    /// Endpoints, and the other applications are asked for once. A program without values is known to others by it.
     pub fn introduce(&mut self, own: Application, now: Now) {
         let random = u32::try_from(now.utc.unix_nanos() & 0xFFFF_FFFF).unwrap_or_default();
         let discovery = self.discovery(now);
@@ -41,6 +44,12 @@ impl Router {
             attempts: 1,
         };
         discovery.applications.own = Some(own);
+        let subject = Subject::ApplicationInformation;
+        // An announcement that is planned already says it all.
+        let _planned = discovery
+            .announcer
+            .announce(subject, Included::default(), since)
+            .is_ok();
         discovery
             .applications
             .asking

@@ -21,13 +21,25 @@ impl Router {
         detail: impl FnOnce() -> String,
     ) {
         let cause = cause.into();
+        if let Some(entry) = topic.and_then(|topic| self.topics.get_mut(&topic))
+            && let Role::Theirs(reader) = &mut entry.role
+        {
+            reader.dropped(cause.reason);
+        }
+        self.count_only(About { topic, from }, cause, count, detail);
+    }
+
+    /// As [`count`](Self::count), for drops that leave the reader of the topic as it is.
+    pub(super) fn count_only(
+        &mut self,
+        About { topic, from }: About,
+        cause: impl Into<Cause>,
+        count: u64,
+        detail: impl FnOnce() -> String,
+    ) {
+        let cause = cause.into();
         let counters = match topic.and_then(|topic| self.topics.get_mut(&topic)) {
-            Some(entry) => {
-                if let Role::Theirs(reader) = &mut entry.role {
-                    reader.dropped(cause.reason);
-                }
-                &mut entry.counters
-            }
+            Some(entry) => &mut entry.counters,
             None => &mut self.others,
         };
         let total = counters.add(cause, count);

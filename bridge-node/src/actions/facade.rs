@@ -4,7 +4,7 @@
 use std::collections::HashMap;
 use std::time::{Duration, Instant};
 
-use bridge_core::AskErrorKind;
+use bridge_core::{AskErrorKind, Reason};
 use bytes::Bytes;
 use mappings::TopicId;
 use messages::Wire;
@@ -101,6 +101,7 @@ impl<A: ActionServer> Facade<A> {
             // Where nothing more can be reported either, that is counted with the next.
             drop(self.report.try_send(PortEvent::Lost {
                 topic: Some(self.feedback),
+                reason: Reason::Overflow,
                 why: "goal is slow",
                 count: 1,
             }));

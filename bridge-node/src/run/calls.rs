@@ -107,12 +107,12 @@ impl<P: Port> Shell<P> {
     }
 
     fn call_known(&mut self, topic: TopicId, description: &Arc<CallDescription>) {
-        info!(%topic, name = description.name, "a call can be asked for");
+        debug!(%topic, name = description.name, "call offered by another program");
         self.port.call_known(topic, description);
     }
 
     fn call_gone(&mut self, topic: TopicId) {
-        info!(%topic, "a call is gone");
+        debug!(%topic, "call withdrawn by its program");
         self.port.call_gone(topic);
     }
 

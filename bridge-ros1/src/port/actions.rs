@@ -80,8 +80,15 @@ impl Ros1Port {
     }
 }
 
+/// The actions that nodes other than `own` serve.
+pub(super) fn served<'g>(graph: &'g Graph, own: &str) -> impl Iterator<Item = &'g str> {
+    let goals = graph.subscribers.keys();
+    let actions = goals.filter_map(|topic| topic.strip_suffix("/goal"));
+    actions.filter(move |action| server(graph, own, action).is_some())
+}
+
 /// Another node that serves that action: it takes goals and requests to cancel, and tells of both.
-fn server<'g>(graph: &'g Graph, own: &str, action: &str) -> Option<&'g str> {
+pub(super) fn server<'g>(graph: &'g Graph, own: &str, action: &str) -> Option<&'g str> {
     let subscribed = |topic: &str| graph.subscribers.get(&format!("{action}/{topic}"));
     let published = |topic: &str| graph.publishers.get(&format!("{action}/{topic}"));
     let others = [

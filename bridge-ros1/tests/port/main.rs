@@ -168,7 +168,9 @@ fn line(event: &PortEvent) -> String {
         PortEvent::Unmatched { topic } => format!("{topic} unmatched"),
         PortEvent::Dropped { reason, why, count } => format!("{count} {} {why}", reason.label()),
         PortEvent::CallFailed { topic, detail } => format!("{topic} call failed: {detail}"),
-        PortEvent::Lost { topic, why, count } => {
+        PortEvent::Lost {
+            topic, why, count, ..
+        } => {
             format!(
                 "{} lost {count}: {why}",
                 topic.map_or_else(String::new, |t| t.to_string())

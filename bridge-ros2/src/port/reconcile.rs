@@ -262,7 +262,8 @@ impl Ros2Port {
             )
         });
         if first {
-            self.events.push_back(lost(topic, UNKNOWN_TYPE, 1));
+            self.events
+                .push_back(lost(topic, (Reason::Untyped, UNKNOWN_TYPE), 1));
         }
     }
 
@@ -402,8 +403,9 @@ impl Ros2Port {
                 let first = self.tell_unknown_type(&topic, "the topic cannot cross", &error);
                 if first {
                     let uncrossed = values.into_iter();
-                    self.events
-                        .extend(uncrossed.map(|topic| lost(topic, UNKNOWN_TYPE, 1)));
+                    self.events.extend(
+                        uncrossed.map(|topic| lost(topic, (Reason::Untyped, UNKNOWN_TYPE), 1)),
+                    );
                 }
                 return;
             }

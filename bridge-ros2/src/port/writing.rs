@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use bridge_node::PortEvent;
+use bridge_node::{PortEvent, Reason};
 use mappings::TopicId;
 use messages::Selection;
 use tokio::time::Instant;
@@ -40,7 +40,7 @@ impl Ros2Port {
         if let Some(open) = &mut sink.open {
             match open.outlet.set_readers(readers, now) {
                 Ok(()) => {}
-                Err(refusal) => self.events.push_back(lost(topic, refusal.label(), 1)),
+                Err(refusal) => self.events.push_back(lost(topic, refusal.cause(), 1)),
             }
             self.schedule.waiting |= open.outlet.is_waiting();
             if open.outlet.is_repairing() {
@@ -106,7 +106,8 @@ impl Ros2Port {
             if !self.misreading.insert(reader.guid) {
                 continue;
             }
-            self.events.push_back(lost(topic, OTHER_DEFINITION_READ, 1));
+            self.events
+                .push_back(lost(topic, (Reason::Mismatch, OTHER_DEFINITION_READ), 1));
             let owner = self.domain.owner(reader.guid);
             self.policy.told.once(&dds_topic, OTHER_DEFINITION_READ, || {
                 format!(
@@ -223,7 +224,7 @@ impl Ros2Port {
         info!(topic = dds_topic, message_type = %definition.name(), definition = %definition.from, ?offered, "advertised");
         let mut outlet = Outlet::new(writer, offered, self.domain.joined());
         if let Err(refusal) = outlet.set_readers(&readers, Instant::now()) {
-            self.events.push_back(lost(topic, refusal.label(), 1));
+            self.events.push_back(lost(topic, refusal.cause(), 1));
         }
         let message_type = Arc::clone(&definition.message_type);
         let mut selection = Selection::Whole;
@@ -252,7 +253,13 @@ impl Ros2Port {
 /// What goes with a writer that is given up: values that still wait to be written.
 pub(super) fn unwritten(topic: TopicId, open: &Open) -> Option<PortEvent> {
     let waiting = open.outlet.waiting();
-    (waiting > 0).then(|| lost(topic, "its writer was given up", waiting))
+    (waiting > 0).then(|| {
+        lost(
+            topic,
+            (Reason::Overflow, "its writer was given up"),
+            waiting,
+        )
+    })
 }
 
 /// Why a reader is counted that announces another hash than the one that is written.

@@ -35,7 +35,8 @@ pub(super) fn check(
         findings.error(Code::TooLarge, first.place, message);
         return Vec::new();
     }
-    let mut patterns = Vec::new();
+    let mut patterns: Vec<Pattern> = Vec::new();
+    let mut places = Vec::new();
     for at in entries {
         let Some(entry) = &at.value else { continue };
         let origin = required(&entry.origin, "origin", "the pattern", at.place, findings);
@@ -48,6 +49,20 @@ pub(super) fn check(
         else {
             continue;
         };
+        let first = patterns.iter().zip(&places).find(|(first, _)| {
+            first.origin == origin
+                && first.topics == texts.topics
+                && first.exclude == texts.exclude
+                && (first.message_type.is_none() || first.message_type == message_type)
+        });
+        if let Some((first, place)) = first {
+            let message = format!("the pattern `{}` is there already", first.topics());
+            let label = format!("first at {}", findings.line(*place, at.place));
+            let note = findings.warning(Code::TopicPattern, at.place, message);
+            note.label(label)
+                .help("the first pattern that fits a topic counts, so this one has no effect");
+        }
+        places.push(at.place);
         patterns.push(Pattern {
             topics: texts.topics,
             exclude: texts.exclude,

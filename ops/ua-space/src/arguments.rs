@@ -41,7 +41,7 @@ pub(crate) enum Verb {
     /// actions, transforms) is left out, with a comment.
     ///
     /// A file that is there keeps every byte: with --merge what is new is put behind it, and topics or nodes that its
-    /// comments name are not proposed again.
+    /// comments name are not proposed again, unless this command made them a comment because a definition was missing.
     ///
     /// Exit codes: 0 done, 64 usage, 65 a NodeSet is malformed, 69 a master, domain or server is not there, 74 a file that
     /// cannot be read or written, or is there and --merge was not said, 78 the file that is there cannot run.

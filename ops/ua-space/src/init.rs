@@ -424,6 +424,11 @@ fn settled(
         let here = findings.iter().filter(|finding| *finding.at.file == *file);
         let marked = here.filter(|finding| rendered.mark(finding, plan)).count();
         if marked > 0 {
+            // The file has the comment already.
+            plan.entries
+                .retain(|entry| entry.faulty.is_none() || !entry.is_set_aside);
+            plan.calls
+                .retain(|call| call.faulty.is_none() || !call.is_set_aside);
             continue;
         }
         // Such as that there is too much of it.
@@ -587,7 +592,7 @@ impl std::fmt::Display for Sum<'_> {
 /// Spaces of domains 0 and 1 begin here: lower numbers are those of the domains people have.
 const FIRST_FREE: u16 = 40;
 /// More than a mapping may have (M002).
-const MOST: u64 = 5 << 20;
+const MOST: u64 = (32 << 20) + 1;
 
 #[cfg(test)]
 mod tests;

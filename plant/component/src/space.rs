@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use bridge_core::{CallDescription, CallField, CallRole, Offered, ValueDescription};
-use bridge_node::{PortEvent, now};
+use bridge_node::{PortEvent, Reason, now};
 use bytes::Bytes;
 use mappings::{Overflow, TopicId};
 use messages::{Leaf, Rank, TypeName};
@@ -259,6 +259,7 @@ impl Outbox {
         if let Some((topic, count)) = waiting.lost.pop_front() {
             return Some(PortEvent::Lost {
                 topic: Some(topic),
+                reason: Reason::Overflow,
                 why: "the space is slow",
                 count,
             });

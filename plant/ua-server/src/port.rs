@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use bridge_node::{
     Answered, Application, AskId, CallDescription, Delivery, Described, Execution, ExecutionId,
-    Failure, FailureKind, Kept, LinkState, Port, PortEvent, Router, TypePaths,
+    Failure, FailureKind, Kept, LinkState, Port, PortEvent, Reason, Router, TypePaths,
 };
 use bytes::Bytes;
 use discovery::{AnnounceSettings, Announced, MdnsFault, WatchSettings, announce, watch};
@@ -481,6 +481,7 @@ impl ServerPort {
         let refused = self.space.status(topic);
         self.events.push_back(PortEvent::Lost {
             topic: Some(topic),
+            reason: Reason::NotPublished,
             why,
             count: 1,
         });

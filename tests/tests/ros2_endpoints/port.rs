@@ -314,7 +314,9 @@ async fn a_value_that_waits_for_room_when_its_topic_is_given_up_is_counted() {
         "variables: [{node: ns=2;i=3, name: Written, origin: 1, queue: {drop_oldest: 10}}]";
     reload(&mut port, &cell_of(events));
     let lost = event(&mut port, |event| match event {
-        PortEvent::Lost { topic, why, count } => Some((topic, why, count)),
+        PortEvent::Lost {
+            topic, why, count, ..
+        } => Some((topic, why, count)),
         PortEvent::Unbound { .. } => Some((None, "it is given up", 0)),
         _ => None,
     })

@@ -77,7 +77,7 @@ fn a_node_of_ros_2_without_an_enclave_gets_and_gives_nothing_and_is_told_of() {
         assert!(!values.contains(&BACK.0), "{values:?}");
         eventually("who is kept out is counted", SOON, || {
             let status = metrics(METRICS_ROS2)?;
-            (status["others"]["dropped"]["overflow"] == 1).then_some(())
+            (status["others"]["dropped"]["unsecured"] == 1).then_some(())
         });
     }
 }

@@ -147,9 +147,9 @@ pub(crate) struct WatchSkills {
 
 #[derive(Debug, Args)]
 pub(crate) struct ListSkills {
-    /// Only those of this component
-    #[arg(value_name = "COMPONENT")]
-    pub(crate) component: Option<String>,
+    /// Only the skills of this component, as parallel-gripper, or only this skill, as parallel-gripper.Grasp
+    #[arg(value_name = "COMPONENT|SKILL")]
+    pub(crate) what: Option<String>,
     /// How long to listen
     #[arg(long, value_name = "SECONDS", default_value = "3", value_parser = seconds)]
     pub(crate) seconds: f64,

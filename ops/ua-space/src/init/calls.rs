@@ -19,6 +19,8 @@ pub(super) struct CallEntry {
     pub(super) what: Executor,
     /// Why it is a comment.
     pub(super) faulty: Option<String>,
+    /// Whether the file has it as a comment already.
+    pub(super) is_set_aside: bool,
 }
 
 /// Who executes a call.
@@ -77,6 +79,7 @@ pub(super) fn candidates(
             }
             match types.first().filter(|_| types.len() == 1) {
                 Some(kind) => found.push(ros(CallKind::Service, graph.space, name, kind)),
+                None if known.is_set_aside(name) => {}
                 None => {
                     let all = untyped.entry(graph.space).or_default();
                     all.insert(name.clone());
@@ -221,9 +224,7 @@ pub(super) fn render(
     for (space, services) in untyped {
         lines.extend([
             String::new(),
-            format!(
-                "{indent}# Services of space {space} whose type nobody tells, or several differ"
-            ),
+            format!("{indent}# Services of space {space} {UNTYPED}"),
         ]);
         let services = services.iter().map(|name| comment(name));
         lines.extend(wrapped(&lead, services));
@@ -259,6 +260,8 @@ fn entry(call: &CallEntry, indent: &str, lines: &mut Vec<String>) {
     });
 }
 
+/// The end of the heading of services without a type.
+pub(super) const UNTYPED: &str = "whose type nobody tells, or several differ";
 /// Services that nodes have for those who run them.
 const EACH_NODE: [&str; 10] = [
     "describe_parameters",

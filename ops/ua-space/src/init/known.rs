@@ -5,7 +5,9 @@ use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 use mappings::{Mapping, NodeIdText, SpaceId, TopicId};
 use messages::TypeName;
 
+use super::calls::UNTYPED;
 use super::nodes::is_same;
+use super::topics::LeftOut;
 use super::yaml;
 use crate::survey::UaSource;
 
@@ -21,6 +23,8 @@ pub(super) struct Known {
     numbers: HashMap<u16, BTreeSet<u16>>,
     /// Words of comments that begin with a slash.
     mentioned: HashSet<String>,
+    /// Such words in comments that `init` wrote because something was missing, such as the definition of a type.
+    set_aside: HashSet<String>,
     /// Nodes of other servers that variables come from or go to: the server's name, and the node there.
     sources: HashSet<(String, String)>,
     /// Names that were given to servers.
@@ -77,20 +81,29 @@ impl Known {
                 known.use_number(topic.namespace.get(), topic.identifier.get());
             }
         }
+        let mut is_set_aside = false;
         for line in text.lines() {
-            if let Some((_, comment)) = line.split_once('#') {
-                known.hear(comment);
-            }
+            let Some((before, comment)) = line.split_once('#') else {
+                is_set_aside = false;
+                continue;
+            };
+            is_set_aside &= before.trim().is_empty();
+            is_set_aside |= begins_set_aside(comment);
+            known.hear(comment, is_set_aside);
         }
         known.mapping = mapping;
         known
     }
 
-    fn hear(&mut self, comment: &str) {
+    fn hear(&mut self, comment: &str, is_set_aside: bool) {
         let is_name = |c: char| c.is_ascii_alphanumeric() || c == '/' || c == '_';
         let words = comment.split(|c: char| !is_name(c));
         let topics = words.filter(|word| word.starts_with('/') && word.len() > 1);
-        self.mentioned.extend(topics.map(str::to_owned));
+        let known = match is_set_aside {
+            true => &mut self.set_aside,
+            false => &mut self.mentioned,
+        };
+        known.extend(topics.map(str::to_owned));
         if let Some(source) = source_in(comment) {
             self.sources.insert(source);
         } else if let Some((_, written)) = comment.split_once("node: ") {
@@ -233,6 +246,11 @@ impl Known {
         self.mentioned.contains(topic)
     }
 
+    /// Whether `init` wrote the topic or service as a comment because something was missing.
+    pub(super) fn is_set_aside(&self, name: &str) -> bool {
+        self.set_aside.contains(name)
+    }
+
     /// Whether a comment has the Method, as `object: .., method: ..`.
     pub(super) fn mentions_method(&self, target: &str) -> bool {
         self.methods.contains(target)
@@ -270,6 +288,17 @@ impl Known {
             .find(|(_, count)| *count == most)
             .map(|(namespace, _)| *namespace)
     }
+}
+
+/// Whether a comment of `init` begins what it left out because something was missing: the code of a finding, or the heading
+/// of names without a type.
+fn begins_set_aside(comment: &str) -> bool {
+    let comment = comment.trim();
+    let has_code = comment.split_once(": ").is_some_and(|(code, _)| {
+        let number = code.strip_prefix('M');
+        number.is_some_and(|number| number.len() == 3 && number.bytes().all(|b| b.is_ascii_digit()))
+    });
+    has_code || comment.ends_with(LeftOut::Untyped.heading()) || comment.ends_with(UNTYPED)
 }
 
 /// The node of another server that a comment speaks of, as `render` writes it.

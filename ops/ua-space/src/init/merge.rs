@@ -14,6 +14,7 @@ pub(super) fn append(text: &str, key: &str, block: &[String]) -> Option<(String,
     };
     let at = lines.iter().position(is_key);
     let mut before: Vec<String> = Vec::new();
+    let mut emptied = None;
     let place = match at {
         None => {
             before.extend([String::new(), format!("{key}:")]);
@@ -22,7 +23,12 @@ pub(super) fn append(text: &str, key: &str, block: &[String]) -> Option<(String,
         Some(at) => {
             let (_, rest) = lines.get(at)?.split_once(':')?;
             let rest = rest.trim();
-            if !rest.is_empty() && !rest.starts_with('#') {
+            // An empty list, as a document has whose entries are all comments.
+            let behind = rest.strip_prefix("[]").map(str::trim_start);
+            if let Some(behind) = behind.filter(|behind| is_comment(behind)) {
+                let space = if behind.is_empty() { "" } else { " " };
+                emptied = Some((at, format!("{key}:{space}{behind}{newline}")));
+            } else if !is_comment(rest) {
                 return None;
             }
             let after = lines.iter().enumerate().skip(at + 1);
@@ -38,7 +44,13 @@ pub(super) fn append(text: &str, key: &str, block: &[String]) -> Option<(String,
             last + 1
         }
     };
-    let mut merged: String = lines.iter().take(place).copied().collect();
+    let kept = lines.iter().enumerate().take(place);
+    let mut merged: String = kept
+        .map(|(number, line)| match &emptied {
+            Some((at, key)) if *at == number => key.as_str(),
+            Some(_) | None => *line,
+        })
+        .collect();
     if !merged.is_empty() && !merged.ends_with('\n') {
         merged.push_str(newline);
     }
@@ -49,6 +61,10 @@ pub(super) fn append(text: &str, key: &str, block: &[String]) -> Option<(String,
     }
     merged.extend(lines.iter().skip(place).copied());
     Some((merged, start))
+}
+
+fn is_comment(text: &str) -> bool {
+    text.is_empty() || text.starts_with('#')
 }
 
 /// How far the entries of that key are indented.
@@ -98,6 +114,14 @@ mod tests {
         assert_eq!(merged, "a:\r\n- a\r\n  - b\r\n");
         assert_eq!(append("a: [1]\n", "a", &block()), None);
         assert_eq!(append("a: # comment\n  - a\n", "a", &block()).unwrap().1, 2);
+    }
+
+    #[test]
+    fn an_empty_list_is_opened() {
+        let (merged, at) = append("a: []\n\n  # c\nb: 1\n", "a", &block()).unwrap();
+        assert_eq!((merged.as_str(), at), ("a:\n\n  # c\n  - b\nb: 1\n", 3));
+        let (merged, _) = append("a: [] # none\n", "a", &block()).unwrap();
+        assert_eq!(merged, "a: # none\n  - b\n");
     }
 
     #[test]

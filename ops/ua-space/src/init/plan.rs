@@ -6,7 +6,7 @@ use mappings::{LiveTopic, NodeIdText, SpaceId};
 use messages::{Registry, TypeName};
 use uadp::BuiltinType;
 
-use super::calls::{self, CallEntry, Untyped};
+use super::calls::{self, CallEntry, Executor, Untyped};
 use super::known::{Known, Named, Whose};
 use super::nodes::{Indexes, is_at, is_same, source_of};
 use super::topics::{Form, LeftOut, camel, normal, registry};
@@ -47,6 +47,8 @@ pub(super) struct Entry {
     pub(super) guessed: bool,
     /// Why it is a comment.
     pub(super) faulty: Option<String>,
+    /// Whether the file has it as a comment already.
+    pub(super) is_set_aside: bool,
 }
 
 /// A topic it is tied to.
@@ -261,6 +263,9 @@ impl Planner<'_> {
                 continue;
             }
             let Some(kind) = kind else {
+                if self.known.is_set_aside(name) {
+                    continue;
+                }
                 self.leave_out(space, LeftOut::Untyped, name);
                 continue;
             };
@@ -360,6 +365,7 @@ impl Planner<'_> {
             notes,
             guessed,
             faulty: None,
+            is_set_aside: self.known.is_set_aside(&topic),
         });
     }
 
@@ -404,6 +410,7 @@ impl Planner<'_> {
                 notes,
                 guessed: false,
                 faulty: None,
+                is_set_aside: false,
             };
             self.push(entry);
         }
@@ -441,7 +448,12 @@ impl Planner<'_> {
                 namespace,
                 identifier: mappings::Identifier::Numeric(number.into()),
             };
+            let is_set_aside = match &one.what {
+                Executor::Ros(_, name, _) => self.known.is_set_aside(name),
+                Executor::Method { .. } => false,
+            };
             self.plan.calls.push(CallEntry {
+                is_set_aside,
                 node,
                 name: self.known.free_name(namespace, &one.name),
                 origin: one.origin,

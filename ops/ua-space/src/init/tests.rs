@@ -153,6 +153,31 @@ fn a_topic_that_a_comment_names_or_a_pattern_takes_stays_out() {
 }
 
 #[test]
+fn what_was_left_out_for_want_of_a_definition_is_proposed_once_it_is_there() {
+    let mut seen = graph(1, &[("/a", "other_msgs/Thing", true), ("/u", "*", true)]);
+    let service =
+        |kind: &str| BTreeMap::from([("/s".to_owned(), BTreeSet::from([kind.to_owned()]))]);
+    seen.live.services = Some(service("other_msgs/Do"));
+    let without = fresh(std::slice::from_ref(&seen));
+    assert!(
+        origins(&without).is_empty() && without.contains("#   ros: {topic: /a,"),
+        "{without}"
+    );
+    assert_eq!(merged(&without, std::slice::from_ref(&seen)), without);
+    // The same names, of types that are known.
+    let mut typed = graph(
+        1,
+        &[("/a", "std_msgs/Bool", true), ("/u", "std_msgs/Bool", true)],
+    );
+    typed.live.services = Some(service("std_srvs/SetBool"));
+    let with = merged(&without, std::slice::from_ref(&typed));
+    let names: Vec<String> = origins(&with).into_iter().map(|(name, ..)| name).collect();
+    assert_eq!(names, ["A", "U"], "{with}");
+    assert_eq!(mapping(&with).calls().len(), 1, "{with}");
+    assert_eq!(merged(&with, &[typed]), with);
+}
+
+#[test]
 fn what_calls_have_is_not_given_away_and_their_services_are_not_told_of() {
     let text = "spaces:\n  - {id: 1}\n  - {id: 2}\nnamespaces:\n  2: urn:cell\ncalls:\n  - {node: ns=2;i=61, name: A, origin: \
                 1, ros: [{service: /a, type: std_srvs/SetBool}, {space: 2, service: /b, type: std_srvs/SetBool}]}\n";

@@ -45,8 +45,14 @@ pub(crate) fn skills(arguments: &Skills) -> Result<(), Failure> {
 fn list(arguments: &ListSkills) -> Result<(), Failure> {
     in_group(&arguments.group, async |mut live| {
         let (mut found, _) = hear(&mut live, arguments.seconds, &|_| false).await?;
-        if let Some(component) = &arguments.component {
-            found.retain(|skill| skill.component == *component);
+        if let Some(what) = &arguments.what {
+            let (meant, others): (Vec<Skill>, Vec<Skill>) = found
+                .into_iter()
+                .partition(|skill| watch::is_meant(&skill.name(), Some(what)));
+            if meant.is_empty() && !others.is_empty() {
+                return Err(info::not_found(what, &others, arguments.seconds));
+            }
+            found = meant;
         }
         let mut out = io::stdout().lock();
         if arguments.json {

@@ -24,7 +24,7 @@ impl<'f> Reader<'f> {
     }
 
     /// The values of a map in the order of `keys`; a key without a value counts as left out. Keys that are none of them are
-    /// noted. `None` where it is no map.
+    /// noted; a misspelt one is then read as the key that it resembles. `None` where it is no map.
     pub fn map<'n, const N: usize>(
         &mut self,
         node: &'n Node,
@@ -36,6 +36,7 @@ impl<'f> Reader<'f> {
         };
         let mut values = [None; N];
         let mut seen: Vec<&str> = Vec::new();
+        let mut misspelt = Vec::new();
         for (key, value) in pairs {
             let Kind::Scalar(text) = &key.kind else {
                 self.wrong(key, "a key");
@@ -55,7 +56,9 @@ impl<'f> Reader<'f> {
                 Some((_, slot)) => *slot = Some(value).filter(|value| value.kind != Kind::Null),
                 None => {
                     let message = format!("unknown key `{}`", shortened(text));
-                    let help = match nearest(text, &keys) {
+                    let near = nearest(text, &keys);
+                    misspelt.extend(near.map(|near| (near, value)));
+                    let help = match near {
                         Some(near) => {
                             format!("did you mean `{near}`? Known here are {}", list(&keys))
                         }
@@ -64,6 +67,12 @@ impl<'f> Reader<'f> {
                     self.findings
                         .error_with(Code::UnknownKey, key.place, message, help);
                 }
+            }
+        }
+        for (near, value) in misspelt {
+            let mut slots = keys.iter().zip(&mut values);
+            if let Some((_, slot @ None)) = slots.find(|(known, _)| **known == near) {
+                *slot = Some(value).filter(|value| value.kind != Kind::Null);
             }
         }
         Some(values)
@@ -202,25 +211,35 @@ pub(crate) fn nearest<'k>(name: &str, known: &[&'k str]) -> Option<&'k str> {
         .map(|(_, name)| name)
 }
 
-/// Letters to insert, delete or change, case apart.
+/// Counts the letters to insert, delete, change or swap with their neighbour, case apart (the optimal string alignment
+/// distance).
 fn distance(a: &str, b: &str) -> usize {
     let (a, b) = (a.to_lowercase(), b.to_lowercase());
-    let mut row: Vec<usize> = (0..=b.chars().count()).collect();
-    for (above, x) in a.chars().enumerate() {
-        let mut left = above + 1;
-        let mut diagonal = above;
-        for (slot, y) in row.iter_mut().skip(1).zip(b.chars()) {
-            let best = (diagonal + usize::from(x != y))
+    let mut above: Vec<usize> = (0..=b.chars().count()).collect();
+    // The row of the letter before the last one, in which a swap of both letters continues.
+    let mut before: Vec<usize> = Vec::new();
+    let mut last = None;
+    for (line, x) in a.chars().enumerate() {
+        let mut row = Vec::with_capacity(above.len());
+        let mut left = line + 1;
+        row.push(left);
+        let mut behind = None;
+        for (at, y) in b.chars().enumerate() {
+            let cell = |row: &[usize], at: usize| row.get(at).copied().unwrap_or(usize::MAX / 2);
+            let mut best = (cell(&above, at) + usize::from(x != y))
                 .min(left + 1)
-                .min(*slot + 1);
-            diagonal = std::mem::replace(slot, best);
+                .min(cell(&above, at + 1) + 1);
+            if last == Some(y) && behind == Some(x) {
+                best = best.min(cell(&before, at.saturating_sub(1)) + 1);
+            }
+            row.push(best);
             left = best;
+            behind = Some(y);
         }
-        if let Some(first) = row.first_mut() {
-            *first = above + 1;
-        }
+        before = std::mem::replace(&mut above, row);
+        last = Some(x);
     }
-    row.last().copied().unwrap_or_default()
+    above.last().copied().unwrap_or_default()
 }
 
 #[cfg(test)]
@@ -246,6 +265,7 @@ mod tests {
             Some("capabilities")
         );
         assert_eq!(nearest("Grasp", &["grasp"]), Some("grasp"));
+        assert_eq!(nearest("tpye", &["name", "type"]), Some("type"));
         assert_eq!(nearest("speed", &["name", "type"]), None);
     }
 }

@@ -132,7 +132,7 @@ impl Known {
 }
 
 /// Whether a skill is the wanted one, or of the wanted component.
-fn is_meant(skill: &str, only: Option<&str>) -> bool {
+pub(super) fn is_meant(skill: &str, only: Option<&str>) -> bool {
     let Some(only) = only else {
         return true;
     };

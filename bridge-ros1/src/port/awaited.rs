@@ -1,0 +1,174 @@
+//! The peers in the ROS graph that the mapping needs and that are missing.
+
+use std::collections::BTreeMap;
+use std::net::IpAddr;
+
+use bridge_node::{Actions, AwaitedPeers, Executing, near};
+use mappings::{Mapping, ServiceRole, SpaceId};
+
+use super::Ros1Port;
+use super::actions::{served, server};
+use crate::services::Executor;
+use crate::sink::Sink;
+use crate::source::Source;
+
+impl Ros1Port {
+    pub(super) fn add_missing(&self, missing: &mut AwaitedPeers) {
+        if let Some(address) = self.address.filter(|address| !is_local(*address)) {
+            missing.add("other ROS nodes", || {
+                format!(
+                    "this node says it is at {address}, which is no address of this host; correct ROS_IP or ROS_HOSTNAME"
+                )
+            });
+        }
+        // Without a master nothing is known; that is reported as not ready.
+        if !self.has_master {
+            return;
+        }
+        for source in &self.sources {
+            self.add_publisher(source, missing);
+        }
+        for (topic, sink) in &self.sinks {
+            let is_named = sink.ros_topic != format!("/{topic}");
+            if is_named && self.policy.mapping().variable(*topic).is_some() {
+                self.add_mistaken(sink, missing);
+            }
+            self.add_subscribers(sink, missing);
+        }
+        self.add_servers(missing);
+    }
+
+    /// Returns the nodes in `named` other than this one.
+    fn others<'g>(
+        &self,
+        named: &'g BTreeMap<String, Vec<String>>,
+        name: &str,
+    ) -> impl Iterator<Item = &'g str> {
+        let nodes = named.get(name).into_iter().flatten().map(String::as_str);
+        let own = self.node.name().to_owned();
+        nodes.filter(move |node| *node != own)
+    }
+
+    /// Returns the names in `named` that another node has.
+    fn names<'g>(
+        &'g self,
+        named: &'g BTreeMap<String, Vec<String>>,
+    ) -> impl Iterator<Item = &'g str> {
+        let of_others = named
+            .iter()
+            .filter(|(_, nodes)| nodes.iter().any(|node| node != self.node.name()));
+        of_others.map(|(name, _)| name.as_str())
+    }
+
+    /// Adds the publisher of a topic that the mapping reads.
+    fn add_publisher(&self, source: &Source, missing: &mut AwaitedPeers) {
+        if source.found || source.values.is_empty() || source.is_live() {
+            return;
+        }
+        let (publishers, topic) = (&self.graph.publishers, source.ros_topic.as_str());
+        let Some(publisher) = self.others(publishers, topic).next() else {
+            let known = self.names(publishers);
+            missing.add_named(("topic", topic), "no publisher", known);
+            return;
+        };
+        missing.add(format!("topic {topic}"), || {
+            let typed = source.expected.as_ref().filter(|_| source.has_strangers());
+            match typed {
+                Some(expected) => format!("{publisher} does not publish it as {expected}"),
+                None => format!(
+                    "its publisher {publisher} is not connected: it cannot be reached, or it has died (rosnode cleanup)"
+                ),
+            }
+        });
+    }
+
+    /// Adds a topic that the mapping writes and no node reads, if another node publishes it or reads one with a similar
+    /// name.
+    fn add_mistaken(&self, sink: &Sink, missing: &mut AwaitedPeers) {
+        let topic = sink.ros_topic.as_str();
+        let subscribers = &self.graph.subscribers;
+        if self.others(subscribers, topic).next().is_some() {
+            return;
+        }
+        let peer = format!("subscriber of {topic}");
+        if let Some(publisher) = self.others(&self.graph.publishers, topic).next() {
+            missing.add(peer, || {
+                format!(
+                    "no node reads it, and {publisher} publishes it too; if the value comes from there, its `origin` is {}",
+                    self.policy.own()
+                )
+            });
+        } else if let Some(near) = near(topic, self.names(subscribers)) {
+            missing.add(peer, || format!("no subscriber; did you mean {near}?"));
+        }
+    }
+
+    /// Adds the subscribers of a topic of ours that the master names and that do not connect.
+    fn add_subscribers(&self, sink: &Sink, missing: &mut AwaitedPeers) {
+        let Some(open) = &sink.open else { return };
+        let publisher = &open.publisher;
+        let others = self.others(&self.graph.subscribers, publisher.topic());
+        for node in others.filter(|node| !publisher.is_subscribed_by(node)) {
+            missing.add(format!("subscriber {node}"), || {
+                if let Some(refused) = publisher.refused_type() {
+                    return format!(
+                        "it reads {} as {refused}, which is published as {}",
+                        publisher.topic(),
+                        open.message_type.name()
+                    );
+                }
+                if publisher.asks_for_udp(node) {
+                    return format!(
+                        "it asks for {} over UDPROS only; let it use TCPROS",
+                        publisher.topic()
+                    );
+                }
+                format!(
+                    "it cannot reach {} (set ROS_IP to an address that it reaches), or it has died (rosnode cleanup)",
+                    self.node.uri()
+                )
+            });
+        }
+    }
+
+    /// Adds the services and actions that the mapping calls and no node serves.
+    fn add_servers(&self, missing: &mut AwaitedPeers) {
+        let (mapping, services) = (self.policy.mapping(), &self.graph.services);
+        let executed = Executing::<Executor>::mapped(mapping, &self.policy).into_iter();
+        for service in executed.chain(called(mapping, self.policy.own())) {
+            if self.others(services, service).next().is_none() {
+                let known = self.names(services);
+                missing.add_named(("service", service), "no server", known);
+            }
+        }
+        for action in Actions::mapped(mapping, &self.policy) {
+            if server(&self.graph, self.node.name(), action).is_none() {
+                let known = served(&self.graph, self.node.name());
+                missing.add_named(("action", action), "no server", known);
+            }
+        }
+    }
+}
+
+/// Returns the services that values call.
+fn called(mapping: &Mapping, own: SpaceId) -> impl Iterator<Item = &str> {
+    mapping
+        .services(own)
+        .filter_map(|(_, binding)| match &binding.role {
+            ServiceRole::Call { service, .. } | ServiceRole::Poll { service, .. } => {
+                Some(service.as_str())
+            }
+            ServiceRole::Answer { .. } => None,
+        })
+}
+
+/// Whether an interface of this host has the address; true if the interfaces cannot be listed.
+fn is_local(address: IpAddr) -> bool {
+    let IpAddr::V4(address) = address else {
+        return true;
+    };
+    let interfaces = transport::interfaces().unwrap_or_default();
+    address.is_loopback()
+        || interfaces.is_empty()
+        || interfaces.iter().any(|one| one.address == address)
+}

@@ -1,0 +1,160 @@
+//! The peers in the DDS domain that the mapping needs and that are missing.
+
+use std::collections::BTreeSet;
+
+use bridge_node::{Actions, AwaitedPeers, Executing, near};
+use mappings::ServiceRole;
+use tokio::time::Instant;
+
+use super::Ros2Port;
+use super::calls::SEEN;
+use super::services::Client;
+use crate::graph::{Endpoint, ros_topic};
+use crate::sink::Sink;
+use crate::source::Source;
+
+impl Ros2Port {
+    pub(super) fn add_missing(&self, missing: &mut AwaitedPeers) {
+        let bridges = self.graph.bridges().count();
+        if self.graph.participants().len() <= bridges {
+            missing.add(format!("nodes in DDS domain {}", self.domain_id), || {
+                let networks = match self.networks.as_slice() {
+                    [] => "all interfaces".to_owned(),
+                    networks => {
+                        let networks: Vec<String> = networks.iter().map(ToString::to_string).collect();
+                        networks.join(", ")
+                    }
+                };
+                format!(
+                    "no participant was discovered on {networks}; compare ROS_DOMAIN_ID, the network and the discovery \
+                     settings of the robot"
+                )
+            });
+            return;
+        }
+        for source in &self.sources {
+            self.add_publisher(source, missing);
+        }
+        for (topic, sink) in &self.sinks {
+            let name = ros_topic(&sink.dds_topic);
+            if name != Some(topic.to_string().as_str())
+                && self.policy.mapping().variable(*topic).is_some()
+            {
+                self.add_mistaken(sink, missing);
+            }
+        }
+        self.add_servers(missing);
+    }
+
+    /// Adds the publisher of a topic that the mapping reads.
+    fn add_publisher(&self, source: &Source, missing: &mut AwaitedPeers) {
+        let mapping = self.policy.mapping();
+        let mut values = source.values.iter();
+        if source.live || !values.any(|(topic, _)| mapping.variable(*topic).is_some()) {
+            return;
+        }
+        let Some(name) = ros_topic(&source.dds_topic) else {
+            return;
+        };
+        let writers = self.graph.writers(&source.dds_topic);
+        let dds_type = source.message_type.dds();
+        if writers.is_empty() {
+            let known = self.graph.written_topics().filter_map(ros_topic);
+            add_topic(("topic", name), "no publisher", known, missing);
+        } else {
+            missing.add(format!("topic /{name}"), || {
+                match writers.iter().any(|writer| writer.type_name == dds_type) {
+                    true => format!(
+                        "no definition of {} that its publisher has",
+                        source.message_type
+                    ),
+                    false => format!("no publisher of type {}", source.message_type),
+                }
+            });
+        }
+    }
+
+    /// Adds a topic that the mapping writes and no node reads, if another node publishes it or reads one with a similar
+    /// name.
+    fn add_mistaken(&self, sink: &Sink, missing: &mut AwaitedPeers) {
+        let Some(name) = ros_topic(&sink.dds_topic) else {
+            return;
+        };
+        if !self.graph.readers(&sink.dds_topic).is_empty() {
+            return;
+        }
+        let peer = format!("subscriber of /{name}");
+        if let Some(writer) = self.graph.writers(&sink.dds_topic).first() {
+            missing.add(peer, || {
+                let owner = self.domain.owner(writer.guid);
+                format!(
+                    "no node reads it, and {} publishes it too; if the value comes from there, its `origin` is {}",
+                    owner.as_deref().unwrap_or("an unnamed node"),
+                    self.policy.own()
+                )
+            });
+        } else if let Some(near) = near(name, self.graph.read_topics().filter_map(ros_topic)) {
+            missing.add(peer, || format!("no subscriber; did you mean /{near}?"));
+        }
+    }
+
+    /// Adds the services and actions that the mapping calls and no node serves.
+    fn add_servers(&self, missing: &mut AwaitedPeers) {
+        let mapping = self.policy.mapping();
+        let services = Executing::<Client>::mapped(mapping, &self.policy);
+        let called = mapping.services(self.policy.own());
+        let called = called.filter_map(|(_, binding)| match &binding.role {
+            ServiceRole::Call { service, .. } | ServiceRole::Poll { service, .. } => {
+                Some(service.as_str())
+            }
+            ServiceRole::Answer { .. } => None,
+        });
+        let services: Vec<&str> = services.into_iter().chain(called).collect();
+        let actions = Actions::mapped(mapping, &self.policy);
+        if services.is_empty() && actions.is_empty() {
+            return;
+        }
+        let snapshot = self.peers.look(Instant::now(), SEEN);
+        let served = self.of_nodes(snapshot.offered());
+        add_unserved("service", services, &served, missing);
+        let served = self.of_nodes(snapshot.served_actions());
+        add_unserved("action", actions, &served, missing);
+    }
+
+    /// Returns the names of the servers that are no bridges.
+    fn of_nodes<'s>(
+        &self,
+        served: impl Iterator<Item = (&'s str, &'s [Endpoint])>,
+    ) -> BTreeSet<&'s str> {
+        let is_node = |one: &Endpoint| !self.graph.is_bridge(one.guid);
+        let of_nodes = served.filter(|(_, servers)| servers.iter().any(is_node));
+        of_nodes.map(|(name, _)| name).collect()
+    }
+}
+
+fn add_unserved<'n>(
+    kind: &str,
+    wanted: impl IntoIterator<Item = &'n str>,
+    served: &BTreeSet<&str>,
+    missing: &mut AwaitedPeers,
+) {
+    for name in wanted {
+        let name = name.trim_start_matches('/');
+        if !served.contains(name) {
+            add_topic((kind, name), "no server", served.iter().copied(), missing);
+        }
+    }
+}
+
+/// Adds a name of ROS without its leading slash, as DDS has them.
+fn add_topic<'k>(
+    (kind, name): (&str, &str),
+    reason: &str,
+    known: impl Iterator<Item = &'k str>,
+    missing: &mut AwaitedPeers,
+) {
+    missing.add(format!("{kind} /{name}"), || match near(name, known) {
+        Some(near) => format!("{reason}; did you mean /{near}?"),
+        None => reason.to_owned(),
+    });
+}
