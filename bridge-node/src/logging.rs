@@ -1,6 +1,8 @@
 //! Log lines for people (text) or for machines (one JSON object a line), on stderr; and what a program warns of, for
 //! whoever in it publishes that elsewhere.
 
+mod limit;
+
 use std::borrow::Cow;
 use std::fmt::Write as _;
 use std::io::{self, IsTerminal, Write};
@@ -8,10 +10,13 @@ use std::sync::{Arc, PoisonError, RwLock, Weak};
 
 use tracing::field::{Field, Visit};
 use tracing::{Event, Level, Subscriber};
-use tracing_subscriber::filter::LevelFilter;
+use tracing_subscriber::filter::{FilterExt as _, LevelFilter};
 use tracing_subscriber::layer::{Context, SubscriberExt as _};
 use tracing_subscriber::util::SubscriberInitExt as _;
 use tracing_subscriber::{EnvFilter, Layer};
+
+use self::limit::{PerCallsite, take_suppressed};
+use crate::clock;
 
 /// How log lines look.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
@@ -27,6 +32,7 @@ pub enum LogFormat {
 pub(crate) fn start(format: LogFormat, quiet: &str) {
     let levels = std::env::var("UA_LOG").unwrap_or_else(|_| "info".to_owned());
     let filter = EnvFilter::builder().parse_lossy(format!("{quiet},{levels}"));
+    let filter = filter.and(PerCallsite::counted());
     let colour = io::stderr().is_terminal();
     let lines = tracing_subscriber::fmt::layer()
         .with_writer(move || OneLine {
@@ -42,10 +48,13 @@ pub(crate) fn start(format: LogFormat, quiet: &str) {
     // A second start, as tests make it, keeps the first one's.
     let started = tracing_subscriber::registry()
         .with(lines)
-        .with(Warnings.with_filter(LevelFilter::WARN))
+        .with(Warnings.with_filter(LevelFilter::WARN.and(PerCallsite::default())))
         .try_init();
     if let Err(error) = started {
         tracing::debug!(%error, "logging had been started before");
+    }
+    if let Some(fault) = clock::fault(clock::now().utc) {
+        tracing::warn!("{fault}");
     }
 }
 
@@ -64,12 +73,24 @@ impl<W: Write> Write for OneLine<W> {
         let line = event.strip_suffix(b"\n").unwrap_or(event);
         let line = String::from_utf8_lossy(line);
         let line = escaped(&line, |c| self.colour && c == '\x1b');
+        let line = with_suppressed(&line, take_suppressed());
         self.to.write_all(format!("{line}\n").as_bytes())?;
         Ok(event.len())
     }
 
     fn flush(&mut self) -> io::Result<()> {
         self.to.flush()
+    }
+}
+
+/// Adds the number of suppressed messages to a line: a further field of JSON, or of a line for people.
+fn with_suppressed(line: &str, suppressed: u64) -> Cow<'_, str> {
+    match (suppressed, line.strip_suffix('}')) {
+        (0, _) => Cow::Borrowed(line),
+        (count, Some(object)) if line.starts_with('{') => {
+            Cow::Owned(format!("{object},\"suppressed_here\":{count}}}"))
+        }
+        (count, _) => Cow::Owned(format!("{line} suppressed_here={count}")),
     }
 }
 
@@ -148,11 +169,11 @@ impl<S: Subscriber> Layer<S> for Warnings {
         }
         let mut text = Text::default();
         event.record(&mut text);
+        let message = escaped(&format!("{}{}", text.message, text.fields), |_| false).into_owned();
         for sink in sinks {
             sink.hear(LogRecord {
                 level: *metadata.level(),
-                message: escaped(&format!("{}{}", text.message, text.fields), |_| false)
-                    .into_owned(),
+                message: message.clone(),
                 file: metadata.file(),
                 module: metadata.module_path(),
                 line: metadata.line(),
@@ -224,7 +245,8 @@ mod tests {
                 to: to.clone(),
                 colour: false,
             })
-            .with_ansi(false);
+            .with_ansi(false)
+            .with_filter(PerCallsite::counted());
         tracing::subscriber::with_default(tracing_subscriber::registry().with(lines), log);
         let bytes = written.0.lock().unwrap().clone();
         String::from_utf8(bytes).unwrap()
@@ -240,6 +262,21 @@ mod tests {
         assert!(lines.contains(r"gone\n2026"), "{lines}");
         let harmful = |c: char| (c.is_control() && c != '\n') || c == '\u{2028}' || c == '\u{202e}';
         assert!(!lines.contains(harmful), "{lines:?}");
+    }
+
+    #[test]
+    fn a_flood_of_one_message_is_limited_and_counted() {
+        let lines = written(|| {
+            for number in 0..10_000 {
+                tracing::warn!(number, "unmapped name");
+            }
+            tracing::warn!("another message");
+        });
+        let most = usize::try_from(limit::MOST).unwrap();
+        assert_eq!(lines.lines().count(), most + 1, "{lines}");
+        assert!(lines.ends_with("another message\n"), "{lines}");
+        let line = with_suppressed("{\"a\":1}", 7);
+        assert_eq!(line, "{\"a\":1,\"suppressed_here\":7}");
     }
 
     #[test]

@@ -6,9 +6,10 @@ use std::fmt::Display;
 use std::net::IpAddr;
 use std::time::Duration;
 
+use log_limit::Throttle;
 use tracing::{debug, info, warn};
 
-use crate::clock::{self, Throttle};
+use crate::clock;
 
 pub(crate) fn master_awaited(uri: &str, error: &dyn Display) {
     warn!(

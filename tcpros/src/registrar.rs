@@ -7,10 +7,11 @@ use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Duration;
 
+use log_limit::Throttle;
 use tokio::task::JoinSet;
 use tokio::time::{Instant, sleep, timeout};
 
-use crate::clock::{self, Throttle};
+use crate::clock;
 use crate::events;
 use crate::master::{self, Master, MasterError, Request};
 use crate::node::{Inner, MasterState, Registration, ResourceKind};

@@ -6,10 +6,11 @@ use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
+use log_limit::Throttle;
 use tokio::sync::Notify;
 use tokio::task::AbortHandle;
 
-use crate::clock::{self, Throttle};
+use crate::clock;
 use crate::events;
 use crate::inbox::{Deliver, Message, Peer};
 use crate::link::{self, LinkContext};

@@ -17,6 +17,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
+use log_limit::LogLimit;
 use opcua::crypto::{CertificateStore, X509};
 use opcua::sync::{Mutex, RwLock};
 use opcua::types::StatusCode;
@@ -34,7 +35,6 @@ use crate::judge::{self, Shown};
 use crate::known::{self, Stamp};
 use crate::limits::ClientLimits;
 use crate::pki::{OWN_CERTIFICATE, OWN_KEY};
-use crate::seldom::Seldom;
 
 mod connections;
 
@@ -88,7 +88,7 @@ struct Shared {
     /// Counts the changes of what is known.
     changes: watch::Sender<u64>,
     /// Who was turned away, by the certificate and why.
-    refused: Mutex<Seldom>,
+    refused: Mutex<LogLimit>,
 }
 
 impl Door {
@@ -132,7 +132,7 @@ impl Door {
             inner: listener.local_addr()?,
             admitted: Mutex::default(),
             changes: watch::Sender::new(0),
-            refused: Mutex::new(Seldom::every(TOLD_EVERY)),
+            refused: Mutex::new(LogLimit::every(TOLD_EVERY)),
         };
         info!("those whom a trusted authority issued certificates are let in");
         Ok(Some((
@@ -212,8 +212,7 @@ impl Shared {
 
     /// Returns the number of messages that were suppressed, if this one should be logged now.
     fn another_now(&self, message: &str) -> Option<u64> {
-        let now = Instant::now().into_std();
-        self.refused.lock().another(message, now)
+        self.refused.lock().admit(message, Instant::now())
     }
 
     /// Reads what the store knows where that has changed, and has each connection judged anew.

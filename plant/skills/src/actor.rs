@@ -6,7 +6,7 @@ use std::future::pending;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, SystemTime};
 
-use plant_opcua::seldom::Seldom;
+use log_limit::LogLimit;
 use program::{Ending, Method, Nature, Program, Refused, RunId, State, Transition};
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::task::{JoinError, JoinHandle};
@@ -63,7 +63,7 @@ pub(crate) struct Actor {
     /// What was said of the run that goes on.
     trace: Vec<String>,
     /// Of its refusals one is told at a time: a client that asks again and again must not fill the log.
-    refusals: Seldom,
+    refusals: LogLimit,
 }
 
 /// The work of a run, until it has really ended.
@@ -149,7 +149,7 @@ impl Actor {
             now,
             work: None,
             trace: Vec::new(),
-            refusals: Seldom::every(TOLD_EVERY),
+            refusals: LogLimit::every(TOLD_EVERY),
         };
         (actor, watched)
     }
@@ -231,7 +231,7 @@ impl Actor {
         });
         self.tell(Told::Called);
         if let Err(refusal) = &answer
-            && let Some(untold) = self.refusals.another("", Instant::now().into_std())
+            && let Some(untold) = self.refusals.admit("", Instant::now().into_std())
         {
             info!(
                 skill = self.facts.name,

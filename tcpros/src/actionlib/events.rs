@@ -3,9 +3,10 @@
 use std::fmt::Display;
 use std::time::Duration;
 
+use log_limit::Throttle;
 use tracing::warn;
 
-use crate::clock::{self, Throttle};
+use crate::clock;
 
 /// What was received and could not be used, with one line per ten seconds.
 #[derive(Debug)]

@@ -6,9 +6,10 @@
 use std::collections::BTreeMap;
 use std::sync::Mutex;
 
+use log_limit::Throttle;
 use tokio::sync::watch;
 
-use crate::clock::{self, Throttle};
+use crate::clock;
 use crate::events;
 use crate::master::MasterError;
 use crate::node::Inner;

@@ -7,6 +7,7 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use bytes::{BufMut, Bytes, BytesMut};
+use log_limit::Throttle;
 use thiserror::Error;
 use tokio::io::AsyncReadExt;
 use tokio::net::TcpStream;
@@ -16,7 +17,7 @@ use tokio::task::JoinSet;
 use tokio::time::{sleep, timeout};
 
 use super::{DEFAULT_MAX_BODY, ServiceType};
-use crate::clock::{self, Throttle};
+use crate::clock;
 use crate::events;
 use crate::frame::{FrameTooLong, Frames};
 use crate::header::{ConnectionHeader, clipped};

@@ -1,0 +1,72 @@
+//! The number of log lines that one place in a program writes. What peers send causes most messages of a program, so that a
+//! peer in a loop could fill a disk. A place that knows its cause limits by it with `LogLimit`; this is the bound for all.
+
+use std::cell::Cell;
+use std::collections::HashMap;
+use std::sync::{Mutex, PoisonError};
+use std::time::Duration;
+
+use log_limit::Throttle;
+use tracing::callsite::Identifier;
+use tracing::{Event, Level, Metadata, Subscriber};
+use tracing_subscriber::layer::{Context, Filter};
+
+use crate::clock::now;
+
+/// Admits [`MOST`] messages per callsite and [`PERIOD`]. Debug and trace levels are not limited: the operator asked for them.
+#[derive(Debug, Default)]
+pub(super) struct PerCallsite {
+    throttles: Mutex<HashMap<Identifier, Throttle>>,
+    /// Whether the count of suppressed messages is for [`take_suppressed`].
+    is_counted: bool,
+}
+
+impl PerCallsite {
+    /// The limit of a layer that writes the count of suppressed messages, too.
+    pub(super) fn counted() -> Self {
+        Self {
+            is_counted: true,
+            ..Self::default()
+        }
+    }
+}
+
+impl<S: Subscriber> Filter<S> for PerCallsite {
+    fn enabled(&self, _: &Metadata<'_>, _: &Context<'_, S>) -> bool {
+        true
+    }
+
+    fn event_enabled(&self, event: &Event<'_>, _: &Context<'_, S>) -> bool {
+        let metadata = event.metadata();
+        if *metadata.level() > Level::INFO {
+            return true;
+        }
+        let mut throttles = self
+            .throttles
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner);
+        let throttle = throttles
+            .entry(metadata.callsite())
+            .or_insert_with(|| Throttle::several(MOST, PERIOD));
+        let admitted = throttle.admit(now().monotonic);
+        drop(throttles);
+        if self.is_counted {
+            SUPPRESSED.set(admitted.unwrap_or_default());
+        }
+        admitted.is_some()
+    }
+}
+
+/// Returns the number of messages that were suppressed before the one that this thread writes.
+pub(super) fn take_suppressed() -> u64 {
+    SUPPRESSED.take()
+}
+
+thread_local! {
+    /// An event is filtered and written on one thread.
+    static SUPPRESSED: Cell<u64> = const { Cell::new(0) };
+}
+
+/// Messages of one callsite in a [`PERIOD`].
+pub(super) const MOST: u32 = 300;
+const PERIOD: Duration = Duration::from_secs(60);
