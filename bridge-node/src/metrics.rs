@@ -17,6 +17,7 @@ use tokio::sync::{mpsc, oneshot};
 use tokio::task::AbortHandle;
 use tracing::{debug, info};
 
+use crate::clock;
 use crate::exit::{Failure, FailureKind};
 
 /// What a program says of itself at one moment.
@@ -187,7 +188,11 @@ async fn page<T: Told>(request: &Request<Incoming>, ask: &Ask<T>) -> Response<Fu
             all.iter().map(T::prometheus).collect::<String>(),
         ),
         Page::Ready => {
-            let reasons: String = all.iter().flat_map(T::not_ready).collect();
+            let clock = clock::fault(clock::now().utc).map(|fault| format!("{fault}\n"));
+            let reasons: String = clock
+                .into_iter()
+                .chain(all.iter().flat_map(T::not_ready))
+                .collect();
             let waiting: String = all.iter().flat_map(T::waiting_for).collect();
             if reasons.is_empty() {
                 text(StatusCode::OK, format!("ready\n{waiting}"))

@@ -1,16 +1,16 @@
 //! Whom a secured channel is opened for, and with which certificate of ours (OPC 10000-6, 6.2 and 6.7).
 
-use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use bridge_node::{Failure, FailureKind};
-use opcua::crypto::{CertificateStore, PrivateKey, X509, X509Data};
+use log_limit::LogLimit;
+use opcua::crypto::{CertificateStore, PrivateKey, X509};
 use opcua::sync::Mutex;
 use opcua::types::StatusCode;
 use plant_opcua::judge::{Judge, Refused};
-use plant_opcua::seldom::Seldom;
-use tracing::{info, warn};
+use plant_opcua::pki::Pki;
+use tracing::warn;
 use trust::Names;
 use x509_cert::Certificate;
 use x509_cert::der::Decode as _;
@@ -26,7 +26,7 @@ pub(crate) struct Security {
     pub(crate) key: PrivateKey,
     judge: Judge,
     /// Who was turned away, by the certificate and why.
-    refused: Mutex<Seldom>,
+    refused: Mutex<LogLimit>,
 }
 
 impl Security {
@@ -44,21 +44,10 @@ impl Security {
             );
             Failure::new(FailureKind::Io, message)
         };
-        for folder in ["own", "private", "trusted"] {
-            fs::create_dir_all(root.join(folder)).map_err(|error| failed(&error))?;
-        }
-        owner_only(&root.join("private")).map_err(|error| failed(&error))?;
+        let pki = Pki::open(root.to_owned()).map_err(|error| failed(&error))?;
+        pki.ensure_own_named(application_uri, &[host.to_owned()], NAME)
+            .map_err(|error| failed(&error))?;
         let (certificate, key) = pair(root);
-        if !certificate.exists() && !key.exists() {
-            let made = CertificateStore::create_certificate_and_key(
-                &data(application_uri, host),
-                false,
-                &certificate,
-                &key,
-            );
-            made.map_err(|error| failed(&error))?;
-            info!(certificate = %certificate.display(), application_uri, "made a certificate");
-        }
         if trust_any {
             warn!("every client certificate is trusted: for tests only");
         }
@@ -67,7 +56,7 @@ impl Security {
                 .map_err(|error| failed(&error))?,
             key: CertificateStore::read_pkey(&key).map_err(|error| failed(&error))?,
             judge: Judge::of(root, trust_any),
-            refused: Mutex::new(Seldom::every(TOLD_EVERY)),
+            refused: Mutex::new(LogLimit::every(TOLD_EVERY)),
         })
     }
 
@@ -79,7 +68,7 @@ impl Security {
             certificate: CertificateStore::read_cert(&certificate).map_err(failed)?,
             key: CertificateStore::read_pkey(&key).map_err(failed)?,
             judge: Judge::of(root, false),
-            refused: Mutex::new(Seldom::every(TOLD_EVERY)),
+            refused: Mutex::new(LogLimit::every(TOLD_EVERY)),
         })
     }
 
@@ -107,7 +96,7 @@ impl Security {
             return Ok(());
         };
         let told = refused.to_string();
-        if let Some(untold) = self.refused.lock().another(&told, clock::now()) {
+        if let Some(untold) = self.refused.lock().admit(&told, clock::now()) {
             warn!(untold, "a client is not talked to: {told}");
         }
         // Not which of the checks it was (OPC 10000-4, 6.1.3).
@@ -140,34 +129,8 @@ fn pair(root: &Path) -> (PathBuf, PathBuf) {
     (root.join("own/cert.der"), root.join("private/private.pem"))
 }
 
-fn data(application_uri: &str, host: &str) -> X509Data {
-    let mut addresses = vec![host.to_owned(), "127.0.0.1".to_owned()];
-    addresses.dedup();
-    X509Data {
-        key_size: 2048,
-        common_name: "UA bridge discovery server".to_owned(),
-        organization: "UA bridge".to_owned(),
-        organizational_unit: "UA bridge".to_owned(),
-        country: "XX".to_owned(),
-        state: "-".to_owned(),
-        alt_host_names: X509Data::alt_host_names(
-            application_uri,
-            Some(addresses),
-            true,
-            true,
-            false,
-        ),
-        certificate_duration_days: CERTIFICATE_DAYS,
-    }
-}
-
-fn owner_only(path: &Path) -> std::io::Result<()> {
-    use std::os::unix::fs::PermissionsExt as _;
-    fs::set_permissions(path, fs::Permissions::from_mode(0o700))
-}
-
-/// Five years, as other stacks make them.
-const CERTIFICATE_DAYS: u32 = 1826;
+/// The common name of its certificate.
+const NAME: &str = "UA bridge discovery server";
 
 /// The same client is told of in the log once in this time.
 pub(crate) const TOLD_EVERY: Duration = Duration::from_secs(10);

@@ -1,7 +1,7 @@
 //! OPC UA for the programs of the plant: servers whose address space is made of NodeSets and of instances of their
 //! types, and clients that come back by themselves. It knows no skills, no discovery, no space and no ROS.
 //!
-//! Reading order: `limits` (the bounds of both sides), `seldom` (what peers do again and again, in the log), `endpoint`, `pki`, `certificates`, `known`, `judge` and `door` (who gets
+//! Reading order: `limits` (the bounds of both sides), `endpoint`, `pair` and `pki`, `certificates`, `known`, `judge` and `door` (who gets
 //! in), `nodeset` (types from files), `users`, `supervision`, `audit` and `changes`, `server` and `client`, `file`, `trust_file`, `directory` and
 //! `configuration` (a server's certificates as clients manage them, and as it renews them itself).
 
@@ -18,8 +18,8 @@ pub mod judge;
 pub mod known;
 pub mod limits;
 pub mod nodeset;
+mod pair;
 pub mod pki;
-pub mod seldom;
 pub mod server;
 pub mod supervision;
 pub mod trust_file;

@@ -4,11 +4,15 @@ use std::collections::BTreeSet;
 use std::fs::{self, File};
 use std::io;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
-use opcua::crypto::{CertificateStore, X509Data};
+use opcua::crypto::{CertificateStore, PrivateKey, X509, X509Data};
 use tracing::{info, warn};
+use trust::Certificate;
 
 use crate::certificates::{self, REJECTED_KEPT, Standing};
+use crate::known;
+use crate::pair::{self, PairFiles};
 
 /// The directories of an OPC UA certificate store: `own`, `private`, `trusted` and `rejected` under one root.
 #[derive(Debug)]
@@ -97,27 +101,101 @@ impl Pki {
     /// # Errors
     /// Files that cannot be read or written, or half a pair.
     pub fn ensure_own_at(&self, application_uri: &str, hosts: &[String]) -> Result<(), PkiError> {
+        self.ensure_own_named(application_uri, hosts, NAME)
+    }
+
+    /// The same, for an application of that name.
+    ///
+    /// # Errors
+    /// Files that cannot be read or written, or half a pair.
+    pub fn ensure_own_named(
+        &self,
+        application_uri: &str,
+        hosts: &[String],
+        name: &str,
+    ) -> Result<(), PkiError> {
         let _alone = self.lock()?;
         let certificate = self.root.join(OWN_CERTIFICATE);
         let key = self.root.join(OWN_KEY);
-        match (certificate.exists(), key.exists()) {
-            (true, true) => check_own(&certificate, &key, application_uri),
-            (true, false) => Err(PkiError::Half {
-                present: certificate,
-                missing: key,
-            }),
-            (false, true) => Err(PkiError::Half {
-                present: key,
-                missing: certificate,
-            }),
-            (false, false) => {
-                let data = certificate_data(application_uri, hosts);
-                CertificateStore::create_certificate_and_key(&data, false, &certificate, &key)
-                    .map_err(PkiError::Make)?;
+        let files = pair::settle(&self.root).map_err(|source| PkiError::Directory {
+            path: self.root.clone(),
+            source,
+        })?;
+        let now = known::now();
+        let data = certificate_data(application_uri, hosts, name, now);
+        match files {
+            PairFiles::Both => {
+                match is_made_too_early(&certificate, now) {
+                    true => {
+                        let key =
+                            CertificateStore::read_pkey(&key).map_err(PkiError::Unreadable)?;
+                        self.make_own(&data, Some(key))?;
+                        warn!(
+                            certificate = %certificate.display(),
+                            "made the application's own certificate anew: it was made before the clock was set, and has expired. \
+                             Whoever trusted it has to trust the new one"
+                        );
+                    }
+                    false => {}
+                }
+                check_own(&certificate, &key, application_uri)
+            }
+            PairFiles::Certificate => {
+                // Earlier versions wrote the certificate first, and no key belongs to one that was interrupted then.
+                if !is_self_made(&certificate) {
+                    return Err(PkiError::Half {
+                        present: certificate,
+                        missing: key,
+                    });
+                }
+                let aside = certificate.with_extension("without-key");
+                fs::rename(&certificate, &aside).map_err(|source| PkiError::Directory {
+                    path: certificate.clone(),
+                    source,
+                })?;
+                self.make_own(&data, None)?;
+                warn!(
+                    certificate = %certificate.display(), aside = %aside.display(),
+                    "made the application's own pair anew: there was a certificate without its key"
+                );
+                Ok(())
+            }
+            PairFiles::Key => {
+                let known = CertificateStore::read_pkey(&key);
+                let known = known.map_err(|_unreadable| PkiError::Half {
+                    present: key.clone(),
+                    missing: certificate.clone(),
+                })?;
+                self.make_own(&data, Some(known))?;
+                warn!(
+                    certificate = %certificate.display(),
+                    "made the application's own certificate anew: there was a key without its certificate"
+                );
+                Ok(())
+            }
+            PairFiles::Neither => {
+                self.make_own(&data, None)?;
                 info!(certificate = %certificate.display(), application_uri, "made the application's own certificate");
                 Ok(())
             }
         }
+    }
+
+    /// Makes the pair, or a certificate for a key that is there.
+    fn make_own(&self, data: &X509Data, key: Option<PrivateKey>) -> Result<(), PkiError> {
+        let made = |error: &dyn std::fmt::Display| PkiError::Make(error.to_string());
+        let (certificate, new_key) = match key {
+            Some(key) => (X509::from_pkey(&key, data).map_err(PkiError::Make)?, None),
+            None => {
+                let (certificate, key) = X509::cert_and_pkey(data).map_err(PkiError::Make)?;
+                (certificate, Some(key))
+            }
+        };
+        let der = certificate.to_der().map_err(|error| made(&error))?;
+        let key = new_key.map(|key| key.to_der()).transpose();
+        let key = key.map_err(|error| made(&error))?;
+        let key = key.as_ref().map(|key| key.as_bytes());
+        pair::write(&self.root, &der, key).map_err(|error| made(&error))
     }
 
     /// Waits until no other server is making its certificate here, and keeps others from it until the file is dropped.
@@ -226,7 +304,41 @@ fn remove(refused: &Path) {
     }
 }
 
-fn certificate_data(application_uri: &str, hosts: &[String]) -> X509Data {
+/// Returns whether a certificate is one that this project makes for itself, which no authority has issued.
+fn is_self_made(certificate: &Path) -> bool {
+    let read = fs::read(certificate).ok();
+    let read = read.and_then(|bytes| Certificate::read(&bytes).ok());
+    read.is_some_and(|certificate| {
+        certificate.is_self_signed() && certificate.name().contains(ORGANIZATION)
+    })
+}
+
+/// Returns whether a self-made certificate has expired that was made while the clock was not set.
+fn is_made_too_early(certificate: &Path, now: Duration) -> bool {
+    let read = fs::read(certificate).ok();
+    let Some(read) = read.and_then(|bytes| Certificate::read(&bytes).ok()) else {
+        return false;
+    };
+    is_too_early(read.validity(), now) && is_self_made(certificate)
+}
+
+fn is_too_early((from, until): (Duration, Duration), now: Duration) -> bool {
+    from < PLAUSIBLE && until <= now
+}
+
+/// The number of days for which a certificate is valid that is made now. One that is made while the clock is not set is valid
+/// from then on, and for the usual time from the first plausible day.
+fn days_from(now: Duration) -> u32 {
+    let early = PLAUSIBLE.saturating_sub(now).as_secs() / 86_400;
+    CERTIFICATE_DAYS.saturating_add(u32::try_from(early).unwrap_or_default())
+}
+
+fn certificate_data(
+    application_uri: &str,
+    hosts: &[String],
+    name: &str,
+    now: Duration,
+) -> X509Data {
     let mut addresses: Vec<String> = Vec::new();
     for host in hosts.iter().map(String::as_str).chain(["127.0.0.1", "::1"]) {
         if !addresses.iter().any(|one| one == host) {
@@ -235,9 +347,9 @@ fn certificate_data(application_uri: &str, hosts: &[String]) -> X509Data {
     }
     X509Data {
         key_size: 2048,
-        common_name: "UA bridge".to_owned(),
-        organization: "UA bridge".to_owned(),
-        organizational_unit: "UA bridge".to_owned(),
+        common_name: name.to_owned(),
+        organization: ORGANIZATION.to_owned(),
+        organizational_unit: ORGANIZATION.to_owned(),
         country: "XX".to_owned(),
         state: "-".to_owned(),
         // Without the addresses of the computer's name: they are asked of a name service, which may not answer.
@@ -248,7 +360,7 @@ fn certificate_data(application_uri: &str, hosts: &[String]) -> X509Data {
             true,
             false,
         ),
-        certificate_duration_days: CERTIFICATE_DAYS,
+        certificate_duration_days: days_from(now),
     }
 }
 
@@ -291,6 +403,11 @@ pub const OWN_KEY: &str = "private/private.pem";
 const LOCK: &str = "private/lock";
 /// Five years, as other stacks make them: clients trust this very file, so a new one is work for people.
 const CERTIFICATE_DAYS: u32 = 1826;
+/// The common name of an application without a name of its own.
+const NAME: &str = "UA bridge";
+const ORGANIZATION: &str = "UA bridge";
+/// The first day that a clock can show: 2026-01-01, before this version was made.
+const PLAUSIBLE: Duration = Duration::from_secs(1_767_225_600);
 
 #[cfg(test)]
 mod tests {
@@ -401,7 +518,7 @@ mod tests {
     }
 
     #[test]
-    fn half_a_pair_is_refused_and_both_files_are_named() {
+    fn a_key_that_cannot_be_read_is_no_half_of_a_pair() {
         let root = scratch("half");
         let pki = Pki::open(root.clone()).unwrap();
         fs::write(root.join(OWN_KEY), "key").unwrap();
@@ -413,6 +530,82 @@ mod tests {
             error.contains("private.pem") && error.contains("cert.der"),
             "{error}"
         );
+        fs::remove_dir_all(root).unwrap();
+    }
+
+    #[test]
+    fn a_first_start_that_was_interrupted_is_completed_by_the_next_one() {
+        type Interrupted = fn(&Path);
+        let (certificate, key) = (OWN_CERTIFICATE, OWN_KEY);
+        let cases: [(&str, Interrupted); 6] = [
+            ("the certificate alone", |root| {
+                fs::remove_file(root.join(OWN_KEY)).unwrap();
+            }),
+            ("the key alone", |root| {
+                fs::remove_file(root.join(OWN_CERTIFICATE)).unwrap();
+            }),
+            ("an empty key of a full disk", |root| {
+                fs::write(root.join(OWN_KEY), "").unwrap();
+            }),
+            ("an empty certificate of a full disk", |root| {
+                fs::write(root.join(OWN_CERTIFICATE), "").unwrap();
+            }),
+            ("the key renamed, its certificate beside", |root| {
+                let path = root.join(OWN_CERTIFICATE);
+                fs::rename(&path, path.with_extension("new")).unwrap();
+            }),
+            ("half a certificate beside", |root| {
+                for file in [OWN_CERTIFICATE, OWN_KEY] {
+                    fs::remove_file(root.join(file)).unwrap();
+                }
+                fs::write(root.join(OWN_CERTIFICATE).with_extension("new"), "x").unwrap();
+            }),
+        ];
+        for (number, (what, interrupt)) in cases.into_iter().enumerate() {
+            let root = scratch(&format!("interrupted-{number}"));
+            let pki = Pki::open(root.clone()).unwrap();
+            pki.ensure_own("urn:a", "localhost").unwrap();
+            interrupt(&root);
+            let again = pki.ensure_own("urn:a", "localhost");
+            again.unwrap_or_else(|error| panic!("{what}: {error}"));
+            let made = Certificate::read(&fs::read(root.join(certificate)).unwrap()).unwrap();
+            let der = pair::from_pem(&fs::read(root.join(key)).unwrap()).unwrap();
+            assert!(made.is_of_private_key(&der), "{what}");
+            for file in [certificate, key] {
+                let beside = root.join(file).with_extension("new");
+                assert!(!beside.exists(), "{what}");
+            }
+            fs::remove_dir_all(root).unwrap();
+        }
+    }
+
+    #[test]
+    fn a_certificate_made_in_1970_is_valid_once_the_clock_is_set() {
+        let day = Duration::from_secs(86_400);
+        let until = |now: Duration| now + day * days_from(now);
+        assert_eq!(days_from(PLAUSIBLE + day), CERTIFICATE_DAYS);
+        assert!(until(day) >= PLAUSIBLE + day * (CERTIFICATE_DAYS - 1));
+    }
+
+    #[test]
+    fn a_certificate_of_1970_that_has_expired_is_to_be_made_anew() {
+        let year = Duration::from_secs(365 * 86_400);
+        let now = PLAUSIBLE + year;
+        assert!(is_too_early((Duration::ZERO, year * 5), now));
+        assert!(!is_too_early((Duration::ZERO, now + year), now));
+        assert!(!is_too_early((PLAUSIBLE, PLAUSIBLE + year / 2), now));
+        let root = scratch("self-made");
+        let pki = Pki::open(root.clone()).unwrap();
+        pki.ensure_own("urn:a", "localhost").unwrap();
+        let path = root.join(OWN_CERTIFICATE);
+        assert!(is_self_made(&path));
+        let before = Certificate::read(&fs::read(&path).unwrap()).unwrap();
+        let key = CertificateStore::read_pkey(&root.join(OWN_KEY)).unwrap();
+        let data = certificate_data("urn:a", &["other".to_owned()], NAME, known::now());
+        pki.make_own(&data, Some(key)).unwrap();
+        let after = Certificate::read(&fs::read(&path).unwrap()).unwrap();
+        assert_ne!(before.der(), after.der());
+        pki.ensure_own("urn:a", "localhost").unwrap();
         fs::remove_dir_all(root).unwrap();
     }
 

@@ -18,11 +18,14 @@ pub enum Step {
     Late,
 }
 
-/// The plan for one certificate: asked for anew when four fifths of its life are over, and again after each failure, at first soon.
+/// The plan for the renewal of a certificate: when four fifths of its life are over, or at once if the application has made it
+/// itself. A failed renewal is repeated with growing pauses.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Renewal {
     from: Duration,
     until: Duration,
+    /// Whether no authority has issued it.
+    is_self_made: bool,
     /// When it was asked for last in vain, and how often that was.
     failed: Option<(Duration, u32)>,
 }
@@ -35,6 +38,7 @@ impl Renewal {
         Self {
             from,
             until,
+            is_self_made: certificate.is_self_signed(),
             failed: None,
         }
     }
@@ -43,7 +47,10 @@ impl Renewal {
     #[must_use]
     pub fn due(&self) -> Duration {
         let life = self.until.saturating_sub(self.from);
-        self.from + life / 5 * 4
+        match self.is_self_made {
+            true => self.from,
+            false => self.from + life / 5 * 4,
+        }
     }
 
     /// The last moment of the certificate.

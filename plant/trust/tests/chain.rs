@@ -351,6 +351,15 @@ fn a_certificate_is_asked_for_at_four_fifths_of_its_life_and_again_while_that_fa
     }
 }
 
+#[test]
+fn a_certificate_that_an_application_made_itself_is_replaced_at_once() {
+    let Cell { authority, .. } = cell();
+    let mut plan = Renewal::of(authority.certificate());
+    assert_eq!(plan.step(NOW), Step::Ask);
+    plan.failed(NOW);
+    assert!(matches!(plan.step(NOW), Step::Wait { .. }));
+}
+
 proptest::proptest! {
     #[test]
     fn no_bytes_are_too_bad_to_be_refused(bytes in proptest::collection::vec(proptest::prelude::any::<u8>(), 0..300)) {

@@ -10,7 +10,6 @@ mod renewing;
 mod store;
 
 use std::fs;
-use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
@@ -24,13 +23,13 @@ use opcua::types::{
 use tokio::sync::Notify;
 use tracing::{info, warn};
 use trust::{Certificate, Request};
-use x509_cert::der::pem::{self, LineEnding};
 
 pub use self::renewing::Plant;
 
 use self::store::StoreList;
 use crate::file::{FileMethod, LARGEST, LONGEST_UNUSED};
 use crate::known;
+use crate::pair;
 use crate::pki::{OWN_CERTIFICATE, OWN_KEY};
 use crate::server::{CoreMethod, MethodHandler, MethodRequest, Refusal, method};
 use crate::trust_file::TrustFile;
@@ -247,7 +246,7 @@ impl Configuration {
         let given = match key.value.as_deref().unwrap_or_default() {
             [] => None,
             _ if format.as_ref() != PEM => return Err(StatusCode::BadNotSupported.into()),
-            pem => Some(from_pem(pem).ok_or(StatusCode::BadInvalidArgument)?),
+            pem => Some(pair::from_pem(pem).ok_or(StatusCode::BadInvalidArgument)?),
         };
         let key = self.key_of(&certificate, given)?;
         self.store.judge(&certificate, issuers)?;
@@ -301,7 +300,7 @@ impl Configuration {
         let waiting = self.state.lock().waiting.take();
         let is_new = waiting.is_some();
         if let Some((certificate, key)) = waiting {
-            let written = write_pair(&self.root, &certificate, key.as_deref());
+            let written = pair::write(&self.root, certificate.der(), key.as_deref());
             if let Err(error) = written {
                 warn!(%error, "the new certificate of the server cannot be written");
                 self.state.lock().waiting = Some((certificate, key));
@@ -435,45 +434,6 @@ fn part(subject: &str, wanted: &str) -> Option<String> {
     let mut pairs = each.filter_map(|one| one.trim().split_once('='));
     let found = pairs.find(|(key, _)| key.trim().eq_ignore_ascii_case(wanted));
     found.map(|(_, value)| value.trim().to_owned())
-}
-
-/// The DER of PKCS #8 of a key in PEM.
-fn from_pem(bytes: &[u8]) -> Option<Vec<u8>> {
-    let key = PrivateKey::from_pem(bytes).ok()?;
-    Some(key.to_der().ok()?.as_bytes().to_vec())
-}
-
-/// Puts a pair in the place of the server's own. The key goes first: what is there is known by neither then, and is told so.
-fn write_pair(root: &Path, certificate: &Certificate, key: Option<&[u8]>) -> io::Result<()> {
-    let beside = root.join(OWN_CERTIFICATE).with_extension("new");
-    fs::write(&beside, certificate.der())?;
-    if let Some(key) = key {
-        let pem = pem::encode_string("PRIVATE KEY", LineEnding::LF, key);
-        let pem = pem.map_err(|error| io::Error::other(error.to_string()))?;
-        let path = root.join(OWN_KEY);
-        let beside = path.with_extension("new");
-        drop(fs::remove_file(&beside));
-        let mut file = owners_file(&beside)?;
-        file.write_all(pem.as_bytes())?;
-        file.sync_all()?;
-        fs::rename(&beside, &path)?;
-    }
-    fs::rename(&beside, root.join(OWN_CERTIFICATE))
-}
-
-#[cfg(unix)]
-fn owners_file(path: &Path) -> io::Result<fs::File> {
-    use std::os::unix::fs::OpenOptionsExt as _;
-    fs::OpenOptions::new()
-        .write(true)
-        .create_new(true)
-        .mode(0o600)
-        .open(path)
-}
-
-#[cfg(not(unix))]
-fn owners_file(path: &Path) -> io::Result<fs::File> {
-    fs::File::create_new(path)
 }
 
 type CarryOut = fn(&Arc<Configuration>, &MethodRequest) -> Answer;

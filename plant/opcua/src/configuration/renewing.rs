@@ -9,10 +9,12 @@ use tokio::time::{Instant, sleep, timeout};
 use tracing::{debug, info, warn};
 use trust::{Certificate, Renewal, Request, Step};
 
-use super::{Configuration, write_pair};
+use super::Configuration;
 use crate::client::{Client, ClientConfig, Link, SecurityChoice};
 use crate::directory::{ApplicationRecord, Directory, DirectoryError};
+use crate::endpoint::EndpointUrl;
 use crate::known;
+use crate::pair;
 use crate::pki::OWN_CERTIFICATE;
 
 /// Where certificates come from, and for whom.
@@ -22,6 +24,27 @@ pub struct Plant {
     pub url: String,
     /// As what the server is registered there.
     pub record: ApplicationRecord,
+}
+
+impl Plant {
+    /// Returns the hosts for which a certificate is requested: the hosts of the current certificate if an authority issued it.
+    /// Of a self-made certificate only the hosts in the DiscoveryUrls are requested, since the authority refuses others.
+    fn hosts(&self, old: &Certificate) -> Vec<String> {
+        let hosts = old.hosts();
+        if !old.is_self_signed() {
+            return hosts;
+        }
+        let urls = self.record.discovery_urls.iter().flatten();
+        let registered: Vec<String> = urls
+            .filter_map(|url| url.as_ref().parse::<EndpointUrl>().ok())
+            .flat_map(|url| url.hosts())
+            .collect();
+        let is_registered = |host: &String| {
+            let mut known = registered.iter().map(String::as_str).chain(LOOPBACK);
+            known.any(|one| one.eq_ignore_ascii_case(host))
+        };
+        hosts.into_iter().filter(is_registered).collect()
+    }
 }
 
 /// What the server is without now, for people.
@@ -124,7 +147,8 @@ impl Configuration {
             warn!(gds = plant.url, "revocation lists are not fetched: {why}");
         }
         let key = self.own_key().map_err(|status| status.to_string())?;
-        let request = Request::make(&key, &self.application_uri, (&old.name(), ""), &old.hosts());
+        let hosts = plant.hosts(old);
+        let request = Request::make(&key, &self.application_uri, (&old.name(), ""), &hosts);
         let request = request.map_err(|why| why.to_string())?;
         let issued = directory.issued(&application, &request).await;
         let (certificate, above) = issued.map_err(text)?;
@@ -162,7 +186,7 @@ impl Configuration {
             .judge_among(certificate, above)
             .map_err(refused)?;
         self.store.keep_all(above).map_err(refused)?;
-        write_pair(&self.root, certificate, None)
+        pair::write(&self.root, certificate.der(), None)
             .map_err(|error| format!("the certificate cannot be written: {error}"))
     }
 
@@ -187,6 +211,8 @@ impl Configuration {
     }
 }
 
+/// The names of the computer itself, which every certificate may have.
+const LOOPBACK: [&str; 3] = ["localhost", "127.0.0.1", "::1"];
 /// How often the store is looked at: somebody may have changed the certificate, and the clock may have been set.
 const LOOK: Duration = Duration::from_secs(2);
 /// How often revocation lists are fetched; an authority signs a new one when half of the time of the last is over.

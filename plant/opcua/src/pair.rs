@@ -1,0 +1,177 @@
+//! The files of an application's own certificate and private key. They are written so that a program that is killed, or a
+//! disk that is full, leaves a pair that the next start can use: beside, synced, and renamed with the key first.
+
+use std::fs::{self, File};
+use std::io::{self, Write as _};
+use std::path::Path;
+
+use trust::Certificate;
+use x509_cert::der::pem::{self, LineEnding};
+
+use crate::pki::{OWN_CERTIFICATE, OWN_KEY};
+
+/// The state of the files of a pair.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum PairFiles {
+    /// Both are there.
+    Both,
+    /// The key alone.
+    Key,
+    /// The certificate alone.
+    Certificate,
+    /// Neither is there.
+    Neither,
+}
+
+/// Puts a certificate, and a key in the DER of PKCS #8 if there is a new one, in the place of the pair below `root`.
+///
+/// # Errors
+/// A file that cannot be written. The pair that was there is left as it was then.
+pub(crate) fn write(root: &Path, certificate: &[u8], key: Option<&[u8]>) -> io::Result<()> {
+    let (path, key_path) = (root.join(OWN_CERTIFICATE), root.join(OWN_KEY));
+    let beside = path.with_extension(BESIDE);
+    let key_beside = key_path.with_extension(BESIDE);
+    let written = write_synced(&beside, certificate).and_then(|()| match key {
+        Some(key) => {
+            let pem = pem::encode_string("PRIVATE KEY", LineEnding::LF, key);
+            let pem = pem.map_err(|error| io::Error::other(error.to_string()))?;
+            write_synced_for_owner(&key_beside, pem.as_bytes())
+        }
+        None => Ok(()),
+    });
+    if let Err(error) = written {
+        for path in [&beside, &key_beside] {
+            // What is left of them is removed at the next start.
+            drop(fs::remove_file(path));
+        }
+        return Err(error);
+    }
+    if key.is_some() {
+        rename_synced(&key_beside, &key_path)?;
+    }
+    rename_synced(&beside, &path)
+}
+
+/// Completes or removes what an interrupted [`write`] has left, and gives the key to its owner alone.
+///
+/// # Errors
+/// A file that cannot be read, renamed or removed.
+pub(crate) fn settle(root: &Path) -> io::Result<PairFiles> {
+    let (path, key_path) = (root.join(OWN_CERTIFICATE), root.join(OWN_KEY));
+    let beside = path.with_extension(BESIDE);
+    if let Some(waiting) = content(&beside)?
+        && let Ok(waiting) = Certificate::read(&waiting)
+        && let Some(key) = content(&key_path)?
+        && let Some(key) = from_pem(&key)
+        && waiting.is_of_private_key(&key)
+    {
+        let current = content(&path)?.and_then(|bytes| Certificate::read(&bytes).ok());
+        // The key was renamed already, and its certificate was not.
+        if !current.is_some_and(|current| current.is_of_private_key(&key)) {
+            rename_synced(&beside, &path)?;
+        }
+    }
+    for path in [&beside, &key_path.with_extension(BESIDE)] {
+        match fs::remove_file(path) {
+            Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
+            Ok(()) | Err(_) => {}
+        }
+    }
+    let (certificate, key) = (content(&path)?, content(&key_path)?);
+    if key.is_some() {
+        for_owner_alone(&key_path)?;
+    }
+    Ok(match (certificate.is_some(), key.is_some()) {
+        (true, true) => PairFiles::Both,
+        (true, false) => PairFiles::Certificate,
+        (false, true) => PairFiles::Key,
+        (false, false) => PairFiles::Neither,
+    })
+}
+
+/// Reads the DER of PKCS #8 of a key in PEM.
+pub(crate) fn from_pem(bytes: &[u8]) -> Option<Vec<u8>> {
+    let key = opcua::crypto::PrivateKey::from_pem(bytes).ok()?;
+    Some(key.to_der().ok()?.as_bytes().to_vec())
+}
+
+/// Reads a file. One that is not there, or that a full disk has left empty, has no content.
+fn content(path: &Path) -> io::Result<Option<Vec<u8>>> {
+    match fs::read(path) {
+        Ok(bytes) => Ok(Some(bytes).filter(|bytes| !bytes.is_empty())),
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
+        Err(error) => Err(error),
+    }
+}
+
+fn write_synced(path: &Path, content: &[u8]) -> io::Result<()> {
+    let mut file = File::create(path)?;
+    file.write_all(content)?;
+    file.sync_all()
+}
+
+/// Writes a file that its owner alone reads, from the first byte on.
+fn write_synced_for_owner(path: &Path, content: &[u8]) -> io::Result<()> {
+    match fs::remove_file(path) {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
+        Ok(()) | Err(_) => {}
+    }
+    let mut file = owners_file(path)?;
+    file.write_all(content)?;
+    file.sync_all()
+}
+
+/// Renames a file, and has the folder know it after a loss of power.
+fn rename_synced(from: &Path, to: &Path) -> io::Result<()> {
+    fs::rename(from, to)?;
+    match to.parent() {
+        // Some file systems cannot sync a folder; the file itself is written.
+        Some(folder) => {
+            drop(File::open(folder).and_then(|folder| folder.sync_all()));
+            Ok(())
+        }
+        None => Ok(()),
+    }
+}
+
+#[cfg(unix)]
+fn owners_file(path: &Path) -> io::Result<File> {
+    use std::os::unix::fs::OpenOptionsExt as _;
+    fs::OpenOptions::new()
+        .write(true)
+        .create_new(true)
+        .mode(0o600)
+        .open(path)
+}
+
+#[cfg(not(unix))]
+fn owners_file(path: &Path) -> io::Result<File> {
+    File::create_new(path)
+}
+
+/// Takes a key away from other users. Of a key that belongs to another user nothing is changed.
+#[cfg(unix)]
+fn for_owner_alone(path: &Path) -> io::Result<()> {
+    use std::os::unix::fs::PermissionsExt as _;
+    let mode = fs::metadata(path)?.permissions().mode();
+    if mode & 0o077 == 0 {
+        return Ok(());
+    }
+    match fs::set_permissions(path, fs::Permissions::from_mode(0o600)) {
+        Ok(()) => {
+            tracing::info!(key = %path.display(), "the private key can be read by its owner alone");
+        }
+        Err(error) => {
+            tracing::warn!(key = %path.display(), %error, "other users can read the private key: `chmod 600` it");
+        }
+    }
+    Ok(())
+}
+
+#[cfg(not(unix))]
+fn for_owner_alone(_path: &Path) -> io::Result<()> {
+    Ok(())
+}
+
+/// The extension of files that are being written.
+const BESIDE: &str = "new";
