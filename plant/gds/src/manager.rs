@@ -1,6 +1,7 @@
 //! The certificates of applications (OPC 10000-12, 7.9): asked for, finished, revoked.
 
 use std::collections::VecDeque;
+use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -29,6 +30,8 @@ struct Waiting {
     request: Request,
     /// In PEM, where the authority was to make it.
     key: Option<String>,
+    /// What was issued. It is kept for a client that did not get the answer.
+    issued: Option<Certificate>,
 }
 
 impl Requests {
@@ -47,17 +50,18 @@ impl Requests {
             since,
             request,
             key,
+            issued: None,
         });
         NodeId::new(OWN, format!("request-{}", self.last))
     }
 
-    fn take(&mut self, application: u32, id: &NodeId) -> Option<Waiting> {
-        let mut all = self.waiting.iter();
-        let place = all.position(|one| {
+    fn find(&mut self, application: u32, id: &NodeId) -> Option<&mut Waiting> {
+        let now = now();
+        self.waiting.iter_mut().find(|one| {
             one.application == application
+                && now.saturating_sub(one.since) < LONGEST_WAIT
                 && *id == NodeId::new(OWN, format!("request-{}", one.number))
-        })?;
-        self.waiting.remove(place)
+        })
     }
 }
 
@@ -79,6 +83,7 @@ pub(crate) fn start_signing(gds: &Gds, request: &MethodRequest) -> Answer {
     if wanted.application_uri() != record.uri {
         return Err(unfit(&record, "it is for another ApplicationUri"));
     }
+    gds.may_have_hosts(&request.caller, &record, wanted.hosts())?;
     Ok(vec![Variant::from(gds.requests.lock().put(
         record.number,
         wanted,
@@ -112,6 +117,7 @@ impl MethodHandler for StartNewKeyPair {
         }
         let (name, organization) = parts(subject, &record);
         let hosts = texts(hosts);
+        gds.may_have_hosts(&request.caller, &record, &hosts)?;
         let made = tokio::task::spawn_blocking(|| new_key(KEY_BITS)).await;
         let key = made.map_err(|_| StatusCode::BadInternalError)?;
         let key = key.map_err(|fault| refused(&fault))?;
@@ -134,20 +140,26 @@ pub(crate) fn finish(gds: &Gds, request: &MethodRequest) -> Answer {
     };
     let caller = &request.caller;
     let record = gds.own(caller, application)?;
-    let waiting = gds.requests.lock().take(record.number, id);
+    let mut requests = gds.requests.lock();
+    let waiting = requests.find(record.number, id);
     let waiting = waiting.ok_or(StatusCode::BadNotFound)?;
     let store = gds.store.lock();
-    let issued = store.issue(&waiting.request, now(), gds.life);
     let authority = ByteString::from(store.certificate().der().to_vec());
-    drop(store);
-    let issued = issued.map_err(|fault| refused(&fault))?;
-    info!(
-        application = ?record.uri, name = ?issued.name(), hosts = ?issued.hosts(), serial = %issued.serial(), by = ?caller.user,
-        "a certificate is issued"
-    );
-    let key = waiting
-        .key
-        .map_or_else(ByteString::null, |key| ByteString::from(key.into_bytes()));
+    let issued = match &waiting.issued {
+        Some(issued) => issued.clone(),
+        None => {
+            let issued = store.issue(&waiting.request, now(), gds.life);
+            let issued = issued.map_err(|fault| refused(&fault))?;
+            info!(
+                application = ?record.uri, name = ?issued.name(), hosts = ?issued.hosts(), serial = %issued.serial(), by = ?caller.user,
+                "a certificate is issued"
+            );
+            waiting.issued.insert(issued).clone()
+        }
+    };
+    let key = waiting.key.as_ref().map_or_else(ByteString::null, |key| {
+        ByteString::from(key.clone().into_bytes())
+    });
     Ok(vec![
         Variant::ByteString(ByteString::from(issued.der().to_vec())),
         Variant::ByteString(key),
@@ -260,6 +272,37 @@ pub(crate) fn check(gds: &Gds, request: &MethodRequest) -> Answer {
 }
 
 impl Gds {
+    /// Checks the hosts that a certificate is to name: those of the DiscoveryUrls of the application and of the certificate that
+    /// it has, and the computer itself. A security administrator may ask for others.
+    fn may_have_hosts(
+        &self,
+        caller: &Caller,
+        record: &Record,
+        hosts: &[String],
+    ) -> Result<(), Refusal> {
+        if self.is_administrator(caller) {
+            return Ok(());
+        }
+        let current = self.store.lock().of_application(&record.uri);
+        let current = current.map_err(|fault| refused(&fault))?;
+        let current = current.first().map(Certificate::hosts).unwrap_or_default();
+        let own = record.hosts();
+        let is_own = |host: &String| {
+            let mut known = own.iter().chain(&current);
+            is_loopback(host) || known.any(|one| one.eq_ignore_ascii_case(host))
+        };
+        match hosts.iter().find(|host| !is_own(host)) {
+            None => Ok(()),
+            Some(host) => Err(unfit(
+                record,
+                &format!(
+                    "the host {host:?} is in none of its DiscoveryUrls; register the application with it, or ask as a user with \
+                     the role security_admin"
+                ),
+            )),
+        }
+    }
+
     fn group(&self) -> NodeId {
         NodeId::new(self.namespace, GROUP)
     }
@@ -294,6 +337,14 @@ fn is_ours(gds: &Gds, group: &NodeId, wanted: &NodeId) -> Result<(), StatusCode>
 /// RsaSha256ApplicationCertificateType.
 pub(crate) fn kind() -> NodeId {
     ObjectTypeId::RsaSha256ApplicationCertificateType.into()
+}
+
+/// Returns whether a host is the computer itself, wherever that is.
+fn is_loopback(host: &str) -> bool {
+    match host.parse::<IpAddr>() {
+        Ok(address) => address.is_loopback(),
+        Err(_) => host.eq_ignore_ascii_case("localhost"),
+    }
 }
 
 fn unfit(record: &Record, why: &str) -> Refusal {

@@ -267,6 +267,11 @@ impl Record {
         ApplicationType::try_from(self.kind).unwrap_or(ApplicationType::Client)
     }
 
+    /// Returns the hosts of the DiscoveryUrls, addresses of IPv6 without brackets.
+    pub(crate) fn hosts(&self) -> Vec<String> {
+        self.urls.iter().filter_map(|url| host(url)).collect()
+    }
+
     fn fits(&self, query: &Query<'_>) -> bool {
         let kind = match query.kinds {
             0 | 3 => true,
@@ -289,6 +294,22 @@ impl Record {
             && (query.product_uri.is_empty() || query.product_uri == self.product_uri)
             && query.capabilities.iter().all(has)
     }
+}
+
+/// Returns the host of a URL.
+fn host(url: &str) -> Option<String> {
+    let (_, rest) = url.split_once("://")?;
+    let authority = rest.split(['/', '?', '#']).next()?;
+    let authority = authority
+        .rsplit_once('@')
+        .map_or(authority, |(_, host)| host);
+    let host = match authority.strip_prefix('[') {
+        Some(literal) => literal.split_once(']')?.0,
+        None => authority
+            .split_once(':')
+            .map_or(authority, |(host, _)| host),
+    };
+    (!host.is_empty()).then(|| host.to_owned())
 }
 
 /// Whether what a client tells of an application can be kept.
@@ -461,6 +482,22 @@ mod tests {
             assert_eq!(numbers(&query).0, wanted, "{query:?}");
         }
         fs::remove_file(&all.path).unwrap();
+    }
+
+    #[test]
+    fn the_hosts_of_an_application_are_those_of_its_urls() {
+        let record = Record {
+            urls: [
+                "opc.tcp://robot:4840/a",
+                "opc.tcp://[fe80::1]:4840",
+                "https://10.0.0.7",
+                "none",
+            ]
+            .map(str::to_owned)
+            .to_vec(),
+            ..robot(1)
+        };
+        assert_eq!(record.hosts(), ["robot", "fe80::1", "10.0.0.7"]);
     }
 
     #[test]

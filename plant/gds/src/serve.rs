@@ -22,7 +22,7 @@ use tracing::{info, warn};
 use crate::manager::{self, StartNewKeyPair, TRUST_LIST};
 use crate::records::Records;
 use crate::service::{Answer, Gds, GroupList, now};
-use crate::store::{Store, StoreFault};
+use crate::store::{Store, StoreFault, claim};
 use crate::{directory, service};
 use plant_opcua::directory::{NAMESPACE, Types};
 
@@ -43,6 +43,7 @@ pub(crate) async fn serve(
     stop: impl Future<Output = ()>,
 ) -> Result<(), Failure> {
     let store = Store::open(&settings.authority).map_err(|fault| of_store(&fault))?;
+    let _claimed = claim(&settings.authority).map_err(|fault| of_store(&fault))?;
     let server = Serving::start(&settings, store)?;
     let told = server.tell(&settings)?;
     let mut look = interval(LOOK);
@@ -216,6 +217,7 @@ impl Serving {
 pub(crate) fn of_store(fault: &StoreFault) -> Failure {
     let kind = match fault {
         StoreFault::Io { .. } | StoreFault::Key(_) => FailureKind::Io,
+        StoreFault::Claimed(_) => FailureKind::Unavailable,
         StoreFault::Missing(_) | StoreFault::Unfit { .. } | StoreFault::Open(_) => {
             FailureKind::Configuration
         }

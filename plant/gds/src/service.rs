@@ -63,7 +63,7 @@ impl Gds {
         }
     }
 
-    fn is_administrator(&self, caller: &Caller) -> bool {
+    pub(crate) fn is_administrator(&self, caller: &Caller) -> bool {
         // No user can be called so.
         let name = match caller.user.as_str() {
             "anonymous" => ANONYMOUS_USER_TOKEN_ID,

@@ -1,7 +1,7 @@
 //! The authority in its folder: its certificate and key, what it has issued and revoked.
 
 use std::fmt;
-use std::fs::{self, File};
+use std::fs::{self, File, TryLockError};
 use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -42,6 +42,10 @@ pub(crate) enum StoreFault {
     Present(PathBuf),
     #[error("{path} cannot be used: {why}")]
     Unfit { path: PathBuf, why: Unfit },
+    #[error(
+        "another ua-gds serves the authority in {0}: two would give one ApplicationId twice; end it, or give another --authority"
+    )]
+    Claimed(PathBuf),
     #[error("{0} can be read by others than its owner: `chmod 600` it")]
     Open(PathBuf),
     #[error("no certificate that was issued here has the number {0} (`ua-gds ca list`)")]
@@ -69,18 +73,29 @@ impl Store {
     ) -> Result<Self, StoreFault> {
         make_folder(folder).map_err(io_at(folder))?;
         let _alone = lock(folder)?;
-        if folder.join(CERTIFICATE).exists() || folder.join(KEY).exists() {
+        if folder.join(CERTIFICATE).exists() {
             return Err(StoreFault::Present(folder.to_owned()));
         }
-        let key = new_key(AUTHORITY_BITS)?;
+        // A key without a certificate is of an interrupted start, and has signed nothing.
+        let path = folder.join(KEY);
+        let known = match path.exists() {
+            true => Some(read_key(&path)?),
+            false => None,
+        };
+        let is_new = known.is_none();
+        let key = match known {
+            Some(key) => key,
+            None => new_key(AUTHORITY_BITS)?,
+        };
         let issue = Issue {
             serial: random_serial(),
             from: now.saturating_sub(CLOCKS_DIFFER),
             until: now + life,
         };
         let authority = Authority::make(&key, names, &issue).map_err(StoreFault::Request)?;
-        let path = folder.join(KEY);
-        write_key(&path, &pem_of(&key)?).map_err(io_at(&path))?;
+        if is_new {
+            write_key(&path, &pem_of(&key)?).map_err(io_at(&path))?;
+        }
         let path = folder.join(CERTIFICATE);
         let content = authority.certificate().pem();
         replace(&path, content.as_bytes()).map_err(io_at(&path))?;
@@ -107,8 +122,7 @@ impl Store {
         };
         let bytes = fs::read(&path).map_err(io_at(&path))?;
         let certificate = Certificate::read(&bytes).map_err(unfit(&path))?;
-        let bytes = fs::read(&key).map_err(io_at(&key))?;
-        let (_, der) = pem::decode_vec(&bytes).map_err(|_| unfit(&key)(Unfit::Unreadable))?;
+        let der = read_key(&key)?;
         let authority = Authority::open(certificate, &der).map_err(unfit(&key))?;
         Ok(Self {
             folder: folder.to_owned(),
@@ -289,8 +303,23 @@ pub(crate) fn pem_of(key: &[u8]) -> Result<String, StoreFault> {
         .map_err(|error| StoreFault::Key(error.to_string()))
 }
 
-/// Writes a key that only its owner reads, and in no other's place.
+/// Reads the DER of PKCS #8 of a key.
+fn read_key(path: &Path) -> Result<Vec<u8>, StoreFault> {
+    let bytes = fs::read(path).map_err(io_at(path))?;
+    let (_, der) = pem::decode_vec(&bytes).map_err(|_| StoreFault::Unfit {
+        path: path.to_owned(),
+        why: Unfit::Unreadable,
+    })?;
+    Ok(der)
+}
+
+/// Writes a key that only its owner reads, beside and as a whole. A key that is there already is never replaced.
 pub(crate) fn write_key(path: &Path, pem: &str) -> io::Result<()> {
+    let beside = path.with_extension("new");
+    match fs::remove_file(&beside) {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
+        Ok(()) | Err(_) => {}
+    }
     let mut options = fs::OpenOptions::new();
     options.write(true).create_new(true);
     #[cfg(unix)]
@@ -298,9 +327,38 @@ pub(crate) fn write_key(path: &Path, pem: &str) -> io::Result<()> {
         use std::os::unix::fs::OpenOptionsExt as _;
         options.mode(0o600);
     }
-    let mut file = options.open(path)?;
-    file.write_all(pem.as_bytes())?;
-    file.sync_all()
+    let mut file = options.open(&beside)?;
+    let written = file
+        .write_all(pem.as_bytes())
+        .and_then(|()| file.sync_all())
+        // Unlike a rename, a link fails where there is a file already.
+        .and_then(|()| match fs::hard_link(&beside, path) {
+            // Some file systems have no links.
+            Err(error) if error.kind() != io::ErrorKind::AlreadyExists && !path.exists() => {
+                fs::rename(&beside, path)
+            }
+            linked => linked,
+        });
+    match fs::remove_file(&beside) {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => Err(error),
+        Ok(()) | Err(_) => written,
+    }
+}
+
+/// Keeps other servers from a folder until the file is dropped.
+///
+/// # Errors
+/// Another server has it.
+pub(crate) fn claim(folder: &Path) -> Result<File, StoreFault> {
+    let path = folder.join("running");
+    let file = File::create(&path).map_err(io_at(&path))?;
+    match file.try_lock() {
+        Ok(()) => Ok(file),
+        Err(TryLockError::WouldBlock) => Err(StoreFault::Claimed(folder.to_owned())),
+        // Some network file systems have no locks.
+        Err(TryLockError::Error(error)) if error.kind() == io::ErrorKind::Unsupported => Ok(file),
+        Err(TryLockError::Error(source)) => Err(StoreFault::Io { path, source }),
+    }
 }
 
 fn random_serial() -> Serial {
@@ -400,6 +458,33 @@ mod tests {
         );
         let unknown = store.revoke(&Serial::of(&[1, 2, 3]), NOW);
         assert!(matches!(unknown, Err(StoreFault::Unknown(_))));
+        fs::remove_dir_all(folder).unwrap();
+    }
+
+    #[test]
+    fn an_authority_whose_making_was_interrupted_is_made_with_its_key() {
+        let folder = scratch("interrupted");
+        fs::create_dir_all(&folder).unwrap();
+        let key = new_key(2048).unwrap();
+        write_key(&folder.join(KEY), &pem_of(&key).unwrap()).unwrap();
+        assert!(
+            write_key(&folder.join(KEY), "other").is_err(),
+            "it is never replaced"
+        );
+        Store::init(&folder, ("Plant authority", "Plant"), NOW, YEAR).unwrap();
+        assert_eq!(read_key(&folder.join(KEY)).unwrap(), key);
+        Store::open(&folder).unwrap();
+        fs::remove_dir_all(folder).unwrap();
+    }
+
+    #[test]
+    fn a_second_server_of_one_folder_is_told_of_the_first() {
+        let folder = scratch("claimed");
+        fs::create_dir_all(&folder).unwrap();
+        let first = claim(&folder).unwrap();
+        assert!(matches!(claim(&folder), Err(StoreFault::Claimed(_))));
+        drop(first);
+        claim(&folder).unwrap();
         fs::remove_dir_all(folder).unwrap();
     }
 
