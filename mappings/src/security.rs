@@ -77,7 +77,8 @@ pub struct Served {
     pub endpoint: Endpoint,
     /// How long each is used.
     pub lifetime: Duration,
-    /// The ApplicationUris of those that get them, where `*` at the end stands for any characters; empty: all that are trusted.
+    /// The ApplicationUris of those that get them, where `*` at the end stands for any characters. The cell's
+    /// own server and bridges get them in any case.
     pub members: Vec<String>,
 }
 

@@ -14,7 +14,7 @@ use crate::document::{
 use crate::endpoint::Endpoint;
 use crate::findings::Findings;
 use crate::key_text::is_key;
-use crate::mapping::{Mapping, SecurityPolicy};
+use crate::mapping::{Mapping, SecurityPolicy, Server};
 use crate::read::{At, given, short};
 use crate::security::{GroupMode, GroupPolicy, KeySource, Replay, SecurityGroup, Served};
 use crate::tree::Place;
@@ -315,6 +315,15 @@ fn own_service(mapping: &Mapping, document: &Document, findings: &mut Findings) 
         return;
     };
     let server = mapping.server();
+    for entry in at.value.iter().flatten() {
+        let name = entry.value.as_ref().and_then(|entry| given(&entry.group));
+        let mut groups = mapping.security().iter();
+        if let Some((name, _)) = name
+            && let Some(group) = groups.find(|group| group.id == *name)
+        {
+            without_members(entry.place, group, server, findings);
+        }
+    }
     if server.policies(server.endpoint.is_loopback()) == [SecurityPolicy::None] {
         let message = format!(
             "the server makes the keys of the group `{}`, and hands them out over encrypted sessions, of which it offers none",
@@ -335,6 +344,28 @@ fn own_service(mapping: &Mapping, document: &Document, findings: &mut Findings) 
             .warning(Code::KeyService, at.place, message)
             .help("server: {endpoint: \"opc.tcp://NAME:4840\"}, with the name or address of its host; ua-server --endpoint says where it listens");
     }
+}
+
+/// Reports a group without `members`, whose keys are for the programs of the cell alone.
+fn without_members(place: Place, group: &SecurityGroup, server: &Server, findings: &mut Findings) {
+    let Some(KeySource::Own(served)) = &group.keys else {
+        return;
+    };
+    if !served.members.is_empty() {
+        return;
+    }
+    let message = format!(
+        "the keys of the group `{}` are for the cell's own server and bridges alone: `members` is left out",
+        short(&group.id)
+    );
+    let help = format!(
+        "for components and programs of others list the ApplicationUris in their certificates: sks: {{members: [\"{}\", \
+         \"urn:HOST:ua-bridge:bridge-ros1\", \"urn:HOST:ua-bridge:bridge-ros2\"]}}",
+        short(&server.application_uri)
+    );
+    findings
+        .warning(Code::KeyService, place, message)
+        .help(help);
 }
 
 /// Where a call stands.

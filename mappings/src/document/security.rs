@@ -44,7 +44,7 @@ document! {
         #[schemars(regex(pattern = r"^[0-9]+(\.[0-9]+)?(ms|s|min|h)$"))]
         key_lifetime: String,
         /// With the cell's own server: the ApplicationUris of the programs that get the keys, as they stand in their certificates;
-        /// `*` at the end stands for any characters. Left out: every program whose certificate the server trusts.
+        /// `*` at the end stands for any characters. The cell's own server and bridges get them in any case.
         members: Vec<At<String>>,
     }
 }

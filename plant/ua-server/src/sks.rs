@@ -39,8 +39,17 @@ struct State {
 #[derive(Debug)]
 struct Group {
     policy: SecurityPolicy,
-    members: Vec<String>,
+    members: Members,
     ring: Ring,
+}
+
+/// The programs that have the role SecurityKeyServerAccess (OPC 10000-3, 4.9.2) for a group.
+#[derive(Debug, Default)]
+struct Members {
+    /// The ApplicationUri of the cell's own server.
+    server: String,
+    /// The ApplicationUris that the mapping lists; `*` at the end stands for any characters.
+    listed: Vec<String>,
 }
 
 impl Sks {
@@ -85,7 +94,10 @@ impl Sks {
                 Some(before) => Ring::after(&before.ring, served.lifetime, now),
                 None => Ring::new(served.lifetime, now),
             };
-            let members = served.members.clone();
+            let members = Members {
+                server: mapping.server().application_uri.clone(),
+                listed: served.members.clone(),
+            };
             let made = Group {
                 policy,
                 members,
@@ -192,7 +204,7 @@ impl State {
     /// Takes up the keys of a run before.
     fn load(&mut self, now: Now) -> Result<(), String> {
         for (id, policy, ring) in self.store.load(now)? {
-            let members = Vec::new();
+            let members = Members::default();
             self.groups.insert(
                 id,
                 Group {
@@ -244,17 +256,25 @@ impl State {
 }
 
 impl Group {
-    /// Whether a client is one of those that get the keys.
+    /// Returns whether a client gets the keys: by the ApplicationUri in its certificate, whatever its user.
     fn has(&self, caller: &Caller) -> bool {
-        if self.members.is_empty() {
-            return true;
-        }
-        let uri = &caller.application_uri;
-        let is = |member: &String| match member.strip_suffix('*') {
+        caller.proven && self.members.contains(&caller.application_uri)
+    }
+}
+
+impl Members {
+    /// Returns whether an ApplicationUri is listed, or that of a program of the cell.
+    fn contains(&self, uri: &str) -> bool {
+        let is_listed = |member: &String| match member.strip_suffix('*') {
             Some(start) => uri.starts_with(start),
             None => uri == member,
         };
-        caller.proven && self.members.iter().any(is)
+        let parts: Vec<&str> = uri.split(':').collect();
+        let is_bridge = matches!(
+            parts.as_slice(),
+            ["urn", _, "ua-bridge", "bridge-ros1" | "bridge-ros2"]
+        );
+        is_bridge || (!uri.is_empty() && uri == self.server) || self.listed.iter().any(is_listed)
     }
 }
 
@@ -288,4 +308,35 @@ fn random_key(length: usize) -> Vec<u8> {
 
 fn milliseconds(time: Duration) -> f64 {
     time.as_secs_f64() * 1e3
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn keys_are_for_listed_programs_and_those_of_the_cell() {
+        let mut members = Members {
+            server: "urn:cell:server".to_owned(),
+            listed: Vec::new(),
+        };
+        for uri in [
+            "urn:cell:server",
+            "urn:robot-7:ua-bridge:bridge-ros1",
+            "urn:robot-7:ua-bridge:bridge-ros2",
+        ] {
+            assert!(members.contains(uri), "{uri}");
+        }
+        for uri in [
+            "",
+            "urn:attacker",
+            "urn:a:b:ua-bridge:bridge-ros1",
+            "urn:robot-7:ua-bridge:bridge-ros1:x",
+        ] {
+            assert!(!members.contains(uri), "{uri}");
+        }
+        members.listed = vec!["urn:plant:*".to_owned(), "urn:one".to_owned()];
+        assert!(members.contains("urn:plant:robot") && members.contains("urn:one"));
+        assert!(!members.contains("urn:one:more"));
+    }
 }
