@@ -42,6 +42,8 @@ pub struct FindSkills {
     pub security: Option<SecurityPolicy>,
     /// Whether their skills are run for other hosts too.
     pub open: bool,
+    /// IPv4 networks outside the subnets of the interface whose servers are accepted too, as 10.77.0.0/16.
+    pub networks: Vec<String>,
 }
 
 impl FindSkills {

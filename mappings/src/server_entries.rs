@@ -45,6 +45,9 @@ document! {
         security: SecurityEntry,
         /// Whether these skills are run for other hosts too where the group is not secured; default false.
         open: bool,
+        /// Networks behind routers, as 10.77.0.0/16, whose servers are accepted too. Left out: only servers with addresses in the
+        /// subnets of the interface, since anyone on the network can announce any address.
+        networks: Vec<At<String>>,
     }
 
     /// The node of another server that the value comes from.

@@ -1,5 +1,7 @@
 //! `server.find_skills`: the servers with skills that discovery finds.
 
+use std::net::Ipv4Addr;
+
 use super::cell::is_uri;
 use super::network::{policy, within};
 use super::required;
@@ -26,7 +28,11 @@ pub(super) fn check(of: Option<&At<ServerEntry>>, findings: &mut Findings) -> Op
         None => Some(FindSkills::MOST),
         Some(_) => within(&entry.most, 1..=FindSkills::LIMIT, "servers", findings),
     };
-    let (uris, first, most) = (uris?, first?, most?);
+    let networks = match given(&entry.networks) {
+        Some((entries, place)) => networks(entries, place, findings),
+        None => Some(Vec::new()),
+    };
+    let (uris, first, most, networks) = (uris?, first?, most?, networks?);
     if first < 2 || first.checked_add(most - 1).is_none() {
         let message = format!("{most} servers from namespace {first} on");
         findings
@@ -40,7 +46,39 @@ pub(super) fn check(of: Option<&At<ServerEntry>>, findings: &mut Findings) -> Op
         most,
         security: given(&entry.security).map(|(entry, _)| policy(*entry)),
         open: given(&entry.open).is_some_and(|(open, _)| *open),
+        networks,
     })
+}
+
+/// IPv4 networks of at most 65536 addresses. `None` when one is faulty, which is noted.
+fn networks(entries: &[At<String>], place: Place, findings: &mut Findings) -> Option<Vec<String>> {
+    if entries.len() > MOST_NETWORKS {
+        let message = format!(
+            "{} networks; at most {MOST_NETWORKS} are read",
+            entries.len()
+        );
+        findings.error(Code::Servers, place, message);
+        return None;
+    }
+    let mut networks = Vec::new();
+    for entry in entries {
+        let text = entry.value.as_ref()?;
+        let (address, prefix) = text.split_once('/').unwrap_or((text, "32"));
+        let is_address = address.parse::<Ipv4Addr>().is_ok();
+        if !is_address
+            || !prefix
+                .parse()
+                .is_ok_and(|prefix: u8| (16..=32).contains(&prefix))
+        {
+            let message = format!("`{}` is no IPv4 network", short(text));
+            findings
+                .error(Code::Servers, entry.place, message)
+                .help("networks: [10.77.0.0/16], at most 65536 addresses each");
+            return None;
+        }
+        networks.push(text.clone());
+    }
+    Some(networks)
 }
 
 /// ApplicationUris, or how they begin. `None` when one is faulty, which is noted.
@@ -125,5 +163,7 @@ pub(super) fn alone(
     }
 }
 
+/// Most entries of `networks`.
+const MOST_NETWORKS: usize = 64;
 /// Most entries of `uris`.
 const MOST_URIS: usize = 64;

@@ -49,6 +49,15 @@ struct UaComponent {
     /// Trust every client certificate, and keep it as trusted. For tests and demonstrations only
     #[arg(long)]
     trust_any_client_certificate: bool,
+    /// Networks behind routers whose servers are accepted too, as 10.77.0.0/16. Without it only servers with addresses in the
+    /// subnets of the interface are, since anyone on the network can announce any address
+    #[arg(
+        long = "network",
+        value_name = "CIDR",
+        env = "UA_NETWORKS",
+        value_delimiter = ','
+    )]
+    networks: Vec<discovery::scan::Range>,
     #[command(flatten)]
     arguments: WithoutMapping,
     #[arg(skip)]
@@ -122,6 +131,7 @@ impl UaComponent {
             None => discovery::Interface::LOOPBACK,
             Some(interface) => discovery::Interface::parse(interface),
         };
+        let mdns = mdns.with_networks(self.networks.iter().copied());
         Options {
             pki,
             trust_any_client: self.trust_any_client_certificate,

@@ -13,6 +13,7 @@ use tokio::task::JoinHandle;
 use tokio::time::{Instant, sleep_until, timeout};
 use tracing::{debug, info, warn};
 
+use crate::address::reachable;
 use crate::chosen::find_lds;
 use crate::client::{self, AskFault};
 use crate::clock;
@@ -219,7 +220,8 @@ struct Telling {
     wait: Duration,
     /// The discovery server, where it is embedded.
     here: Option<Embedded>,
-    /// Ready when the discovery server of another program is gone, in whose place one may be embedded.
+    /// Ready when the connection to the discovery server of another program breaks off. The server registers again then, or
+    /// embeds a discovery server.
     there: Option<Pin<Box<dyn Future<Output = ()> + Send>>>,
     /// When a connection to that one may be held next.
     look_from: Instant,
@@ -240,6 +242,11 @@ enum Done {
 impl Telling {
     async fn run(mut self, mut stopped: mpsc::Receiver<()>) {
         self.put();
+        if self.settings.embed
+            && let Some(lds) = self.settings.lds.clone()
+        {
+            drop(tokio::spawn(self.embedding(lds).prepare()));
+        }
         let mut registering: Option<Registering> = None;
         loop {
             let due = registering.is_none() && self.settings.lds.is_some();
@@ -404,35 +411,43 @@ impl Telling {
         let server = self.server.borrow().clone();
         // Whoever announces itself is not announced by another.
         let mdns_name = self.mdns.is_none().then(|| name(&server));
+        let interface = self.settings.mdns.clone();
         if let Some(here) = &self.here {
-            let registering = here.register(&server, mdns_name, is_online);
+            let here = here.asking();
             return Some(Box::pin(async move {
+                let server = reachable(server, &lds, interface.as_ref()).await;
+                let registering = here.register(&server, mdns_name, is_online);
                 registering.await.map(|()| Done::Registered(None))
             }));
         }
         let pki = self.settings.pki.clone();
-        let interface = self.settings.mdns.clone();
+        let embedding = self.embedding(lds.clone());
         let embed = self.settings.embed;
         Some(Box::pin(async move {
             if embed && same_port(&lds, &server.url) {
                 let message = format!("the server itself is at {lds}; give it another endpoint");
                 return Err(AskFault::Embed(message));
             }
+            let server = reachable(server, &lds, interface.as_ref()).await;
             let how = (mdns_name.as_deref(), pki.as_deref());
             match client::register(&lds, &server, how, is_online).await {
                 Ok(registrar) => Ok(Done::Registered(registrar)),
                 Err(AskFault::Connect(absent)) if embed && is_online => {
-                    let embedding = Embedding {
-                        lds,
-                        interface: interface.unwrap_or(Interface::LOOPBACK),
-                        pki,
-                        name: server.name,
-                    };
                     embedding.start(absent).await.map(Done::Embedded)
                 }
                 Err(fault) => Err(fault),
             }
         }))
+    }
+
+    fn embedding(&self, lds: String) -> Embedding {
+        let interface = self.settings.mdns.clone();
+        Embedding {
+            lds,
+            interface: interface.unwrap_or(Interface::LOOPBACK),
+            pki: self.settings.pki.clone(),
+            name: self.server.borrow().name.clone(),
+        }
     }
 
     fn registered(&mut self, result: Result<Done, AskFault>) {
@@ -458,7 +473,8 @@ impl Telling {
                     }
                     state.fault = None;
                 });
-                if self.settings.embed && self.here.is_none() && self.there.is_none() {
+                // A discovery server that is killed and restarted has lost its registrations, and its announcement may be lost.
+                if self.here.is_none() && self.there.is_none() {
                     self.there = Some(Box::pin(lost(lds.to_owned(), self.look_from)));
                 }
             }

@@ -288,6 +288,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
         Channel {
             is_secured: is_secured || of_host,
             certificate_uri,
+            peer: Some(self.peer.ip().to_canonical()),
         }
     }
 

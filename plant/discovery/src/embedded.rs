@@ -10,7 +10,7 @@ use registry::{ApplicationType, Asked, Channel, MdnsConfiguration};
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinHandle;
 use tokio::time::{Instant, sleep, sleep_until, timeout};
-use tracing::info;
+use tracing::{debug, info};
 
 use crate::announce::Server;
 use crate::client::AskFault;
@@ -35,14 +35,32 @@ pub(crate) struct Embedding {
 }
 
 impl Embedding {
+    /// Makes the certificate of the discovery server while there is another one, so that it can be replaced at once.
+    pub(crate) async fn prepare(self) {
+        if let Err(error) = self.settings().prepare().await {
+            debug!(%error, "the certificate of the embedded discovery server is made later");
+        }
+    }
+
+    fn settings(&self) -> LdsSettings {
+        LdsSettings {
+            interface: self.interface.clone(),
+            pki: self.pki.as_ref().map(|root| root.join(STORE)),
+            embedded: Some(EmbeddedIn {
+                name: self.name.clone(),
+                trusts: self.pki.clone(),
+            }),
+            ..LdsSettings::at(self.lds.clone())
+        }
+    }
+
     /// Serves a discovery server, where nobody answered because of `absent`.
     pub(crate) async fn start(self, absent: std::io::Error) -> Result<Embedded, AskFault> {
-        let Self {
-            lds: at,
-            interface,
-            pki,
-            name,
-        } = self;
+        let at = self.lds.clone();
+        let settings = self.settings();
+        // Before others can connect.
+        let prepared = settings.prepare().await;
+        prepared.map_err(|fault| AskFault::Embed(fault.to_string()))?;
         let listening = match listen(&at).await {
             Ok(listening) => listening,
             // Another one was faster, and is asked next.
@@ -53,15 +71,6 @@ impl Embedding {
             lds = at,
             "no discovery server is there: it is in this program from now on"
         );
-        let settings = LdsSettings {
-            interface,
-            pki: pki.as_ref().map(|root| root.join(STORE)),
-            embedded: Some(EmbeddedIn {
-                name,
-                trusts: pki.clone(),
-            }),
-            ..LdsSettings::at(at)
-        };
         let started = Lds::start(&settings, listening).await;
         let (mut lds, questions) = started.map_err(|fault| AskFault::Embed(fault.to_string()))?;
         let ask = lds.asking();
@@ -89,7 +98,31 @@ pub(crate) struct Embedded {
     task: JoinHandle<()>,
 }
 
+/// Where the program itself asks the discovery server in it.
+#[derive(Debug, Clone)]
+pub(crate) struct EmbeddedAsking(mpsc::Sender<Asking>);
+
 impl Embedded {
+    pub(crate) fn asking(&self) -> EmbeddedAsking {
+        EmbeddedAsking(self.ask.clone())
+    }
+
+    /// Waits until it has ended by itself. Whoever drops it before loses nothing.
+    pub(crate) async fn ended(&mut self) {
+        // Whether it failed or not: it is not there.
+        let _ended = (&mut self.task).await;
+    }
+
+    /// Lets go of the port, and says goodbye.
+    pub(crate) async fn leave(self) {
+        let Self { stop, task, .. } = self;
+        drop(stop);
+        // A failure of it has been told.
+        let _ended = task.await;
+    }
+}
+
+impl EmbeddedAsking {
     /// Registers the program's own server, or takes that back. It is announced under `mdns_name` where one is given.
     pub(crate) fn register(
         &self,
@@ -115,8 +148,9 @@ impl Embedded {
         let channel = Channel {
             is_secured: true,
             certificate_uri: Some(server.application_uri.clone()),
+            peer: None,
         };
-        let ask = self.ask.clone();
+        let ask = self.0.clone();
         async move {
             let asking = async {
                 let (reply, answer) = oneshot::channel();
@@ -138,20 +172,6 @@ impl Embedded {
                 }
             }
         }
-    }
-
-    /// Waits until it has ended by itself. Whoever drops it before loses nothing.
-    pub(crate) async fn ended(&mut self) {
-        // Whether it failed or not: it is not there.
-        let _ended = (&mut self.task).await;
-    }
-
-    /// Lets go of the port, and says goodbye.
-    pub(crate) async fn leave(self) {
-        let Self { stop, task, .. } = self;
-        drop(stop);
-        // A failure of it has been told.
-        let _ended = task.await;
     }
 }
 

@@ -10,6 +10,7 @@ use registry::{Announcement, Registry, Settings};
 use tokio::sync::mpsc;
 
 use crate::connection::{Asking, Shared, serve};
+use crate::interface::Subnets;
 use crate::services::{Answer, Own, Question};
 use crate::{clock, mdns, url::Url};
 
@@ -97,7 +98,8 @@ pub fn heard(instance: &str, port: u16, path: &[u8], capabilities: &[u8]) -> Opt
         &texts[..],
     );
     let service = info.ok()?.as_resolved_service();
-    mdns::heard(&service, false).map(|(announcement, _)| announcement)
+    let subnets = Subnets::of(Ipv4Addr::new(10, 0, 0, 1), Ipv4Addr::new(255, 0, 0, 0));
+    mdns::heard(&service, &subnets).map(|(announcement, _)| announcement)
 }
 
 /// A URL of OPC UA over TCP as it is written again; `None` for any other text.

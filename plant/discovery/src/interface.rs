@@ -1,13 +1,23 @@
 //! The network interface on which servers are announced and heard.
 
 use std::net::{IpAddr, Ipv4Addr};
+use std::time::Duration;
 
 use mdns_sd::{IfKind, IfPredicate};
+use tokio::net::lookup_host;
+use tokio::time::timeout;
+
+use crate::scan::Range;
+use crate::url::Url;
 
 /// One network interface, by name or by an address it has. One level of a plant is one network: what is announced on one
 /// does not appear on another.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
-pub struct Interface(Which);
+pub struct Interface {
+    which: Which,
+    /// Networks behind routers, from which announcements are accepted too.
+    beyond: Vec<Range>,
+}
 
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 enum Which {
@@ -17,15 +27,30 @@ enum Which {
 
 impl Interface {
     /// The host with itself.
-    pub const LOOPBACK: Self = Self(Which::Address(IpAddr::V4(Ipv4Addr::LOCALHOST)));
+    pub const LOOPBACK: Self = Self::of(Which::Address(IpAddr::V4(Ipv4Addr::LOCALHOST)));
+
+    const fn of(which: Which) -> Self {
+        Self {
+            which,
+            beyond: Vec::new(),
+        }
+    }
 
     /// By an address, or else by name.
     #[must_use]
     pub fn parse(text: &str) -> Self {
-        Self(match text.parse() {
+        Self::of(match text.parse() {
             Ok(address) => Which::Address(address),
             Err(_) => Which::Name(text.to_owned()),
         })
+    }
+
+    /// Accepts announcements of addresses in these networks, too. Without them only addresses in the subnets of the
+    /// interface are accepted, since anyone on the network can announce any address.
+    #[must_use]
+    pub fn with_networks(mut self, networks: impl IntoIterator<Item = Range>) -> Self {
+        self.beyond.extend(networks);
+        self
     }
 
     /// All of this host that have an IPv4 address.
@@ -35,13 +60,13 @@ impl Interface {
         let addresses = all.iter().map(if_addrs::Interface::ip);
         addresses
             .filter(IpAddr::is_ipv4)
-            .map(|address| Self(Which::Address(address)))
+            .map(|address| Self::of(Which::Address(address)))
             .collect()
     }
 
     /// Whether it is this one.
     fn is(&self, interface: &if_addrs::Interface) -> bool {
-        match &self.0 {
+        match &self.which {
             Which::Name(name) => interface.name == *name,
             Which::Address(address) => interface.ip() == *address,
         }
@@ -62,9 +87,43 @@ impl Interface {
 
     /// Whether only this host is on it.
     pub(crate) fn is_loopback(&self) -> bool {
-        match &self.0 {
+        match &self.which {
             Which::Address(address) => address.is_loopback(),
             Which::Name(_) => self.addresses().iter().all(Ipv4Addr::is_loopback),
+        }
+    }
+
+    /// Returns whether a URL is that of a server in the subnets of the interface, or in a network that is accepted too. For URLs
+    /// that someone on the network has named: a name is looked up, and all of its addresses have to be there.
+    pub async fn accepts(&self, url: &str) -> bool {
+        let Some(place) = Url::parse(url) else {
+            return false;
+        };
+        let looked_up = lookup_host((place.host.as_str(), place.port));
+        let Ok(Ok(all)) = timeout(LOOK_UP_LIMIT, looked_up).await else {
+            return false;
+        };
+        let subnets = self.subnets();
+        let mut all = all.map(|address| address.ip().to_canonical()).peekable();
+        all.peek().is_some()
+            && all.all(|address| match address {
+                IpAddr::V4(address) => subnets.contains(address),
+                IpAddr::V6(_) => false,
+            })
+    }
+
+    /// Returns the networks from which announcements are accepted.
+    pub(crate) fn subnets(&self) -> Subnets {
+        let all = if_addrs::get_if_addrs().unwrap_or_default();
+        let own = all.iter().filter(|interface| self.is(interface));
+        let networks = own.filter_map(|interface| match &interface.addr {
+            if_addrs::IfAddr::V4(address) => Some((address.ip, address.netmask)),
+            if_addrs::IfAddr::V6(_) => None,
+        });
+        Subnets {
+            is_loopback: self.is_loopback(),
+            networks: networks.collect(),
+            beyond: self.beyond.clone(),
         }
     }
 
@@ -77,11 +136,76 @@ impl Interface {
     }
 }
 
+/// The networks from which announcements are accepted: the subnets of an interface, and those that the operator adds.
+#[derive(Debug, Clone)]
+pub(crate) struct Subnets {
+    is_loopback: bool,
+    /// Addresses of the interface, with their masks.
+    networks: Vec<(Ipv4Addr, Ipv4Addr)>,
+    beyond: Vec<Range>,
+}
+
+impl Subnets {
+    /// Returns the subnets of an interface with a single address.
+    pub(crate) fn of(address: Ipv4Addr, mask: Ipv4Addr) -> Self {
+        Self {
+            is_loopback: address.is_loopback(),
+            networks: vec![(address, mask)],
+            beyond: Vec::new(),
+        }
+    }
+
+    /// Returns whether only this host is on the network.
+    pub(crate) const fn is_loopback(&self) -> bool {
+        self.is_loopback
+    }
+
+    /// Returns whether a server at that address may be connected to.
+    pub(crate) fn contains(&self, ip: Ipv4Addr) -> bool {
+        let mut networks = self.networks.iter();
+        let is_near =
+            networks.any(|(own, mask)| (own.to_bits() ^ ip.to_bits()) & mask.to_bits() == 0);
+        is_near || self.beyond.iter().any(|range| range.contains(ip))
+    }
+}
+
 impl std::fmt::Display for Interface {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        match &self.0 {
+        match &self.which {
             Which::Name(name) => f.write_str(name),
             Which::Address(address) => write!(f, "{address}"),
         }
+    }
+}
+
+const LOOK_UP_LIMIT: Duration = Duration::from_secs(1);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn a_url_outside_the_subnets_of_the_interface_is_not_accepted() {
+        let loopback = Interface::LOOPBACK;
+        assert!(loopback.accepts("opc.tcp://127.0.0.1:4840/a").await);
+        for url in [
+            "opc.tcp://192.0.2.7:4840",
+            "opc.tcp://[2001:db8::1]:4840",
+            "http://127.0.0.1",
+            "opc.tcp://no-such-host.invalid",
+        ] {
+            assert!(!loopback.accepts(url).await, "{url}");
+        }
+    }
+
+    #[test]
+    fn an_address_counts_in_the_subnets_of_the_interface_and_where_the_operator_says_so() {
+        let mut subnets = Subnets::of(Ipv4Addr::new(10, 9, 0, 1), Ipv4Addr::new(255, 255, 255, 0));
+        assert!(subnets.contains(Ipv4Addr::new(10, 9, 0, 77)));
+        assert!(!subnets.contains(Ipv4Addr::new(10, 77, 0, 9)));
+        subnets.beyond.push("10.77.0.0/24".parse().unwrap());
+        assert!(subnets.contains(Ipv4Addr::new(10, 77, 0, 9)));
+        assert!(!subnets.contains(Ipv4Addr::new(10, 78, 0, 9)));
+        assert!(Interface::LOOPBACK.subnets().contains(Ipv4Addr::LOCALHOST));
     }
 }

@@ -55,6 +55,9 @@ enum Happened {
 struct Asleep {
     announcement: Announcement,
     try_at: Instant,
+    /// The time to the next try, which doubles with each.
+    pause: Duration,
+    longest_pause: Duration,
     forget_at: Instant,
 }
 
@@ -198,6 +201,7 @@ impl Keeper {
                     None if start_time.is_none() => {}
                     None => drop(self.numbers.remove(&url)),
                 }
+                let instance = announcement.instance.clone();
                 if let Some(start_time) = start_time {
                     let asked = self.started.get(&url).filter(|known| !known.tells);
                     if asked.is_some_and(|known| start_time < known.at.saturating_add(SAME_RUN)) {
@@ -210,27 +214,32 @@ impl Keeper {
                     keep(&mut self.started, self.most, &url, started);
                 }
                 self.registry.announced(announcement, at);
-                if start_time.is_some() {
+                if let Some(start_time) = start_time {
                     // A program of ours, which serves many requests at a time.
                     self.registry.answers_during_calls(&url);
-                    self.registry
-                        .probed(&url, Outcome::Alive { start_time }, at);
+                    self.registry.announced_start(&instance, start_time);
                 }
             }
             Heard::Withdrawn { instance } => {
                 self.asleep.remove(&instance);
                 self.registry.withdrawn(&instance);
             }
-            Heard::Renamed { from, to } => self.registry.renamed(&from, &to),
+            Heard::Renamed { from, to } => self.registry.renamed(&from, &to, at),
         }
     }
 
     fn sleeps(&mut self, announcement: Announcement) {
         if self.asleep.len() < self.most {
             let at = now();
+            let had_answered = self.answered.contains_key(&announcement.url);
             let asleep = Asleep {
                 announcement,
                 try_at: at + TRY_ASLEEP,
+                pause: TRY_ASLEEP,
+                longest_pause: match had_answered {
+                    true => LONGEST_PAUSE_KNOWN,
+                    false => LONGEST_PAUSE,
+                },
                 forget_at: at + FORGET_ASLEEP,
             };
             self.asleep
@@ -248,14 +257,18 @@ impl Keeper {
                 let mut all = self.asleep.values();
                 all.any(|asleep| asleep.announcement.url == url)
             };
-            self.liveness
-                .keep(|url| self.registry.watches(url) || sleeping(url));
+            let is_wanted = |url: &str| self.registry.watches(url) || sleeping(url);
+            self.liveness.keep(is_wanted);
+            self.answered.retain(|url, _| is_wanted(url));
+            self.started.retain(|url, _| is_wanted(url));
+            self.numbers.retain(|url, _| is_wanted(url));
         }
         while self.liveness.has_room() {
             let next = self.asleep.values_mut().find(|asleep| asleep.try_at <= at);
             let url = match next {
                 Some(asleep) => {
-                    asleep.try_at = at + TRY_ASLEEP;
+                    asleep.pause = (asleep.pause * 2).min(asleep.longest_pause);
+                    asleep.try_at = at + asleep.pause;
                     asleep.announcement.url.clone()
                 }
                 None => match self.registry.poll_probe(at) {
@@ -299,12 +312,12 @@ impl Keeper {
     }
 }
 
-/// Keeps what is known of an endpoint, for no more of them than there may be; others lose it first.
+/// Keeps what is known of an endpoint, for no more of them than there may be. Endpoints that nothing is known of any more
+/// are removed every second.
 fn keep<T>(map: &mut BTreeMap<String, T>, most: usize, url: &str, value: T) {
-    if map.len() >= 4 * most && !map.contains_key(url) {
-        map.clear();
+    if map.len() < 4 * most || map.contains_key(url) {
+        map.insert(url.to_owned(), value);
     }
-    map.insert(url.to_owned(), value);
 }
 
 /// How late a step may come on a machine with much to do.
@@ -313,5 +326,9 @@ const LATE: Duration = Duration::from_millis(500);
 const SAME_RUN: i64 = 20_000_000;
 const TIDY_EVERY: Duration = Duration::from_secs(1);
 const TRY_ASLEEP: Duration = Duration::from_secs(1);
+/// The longest pause between tries of an endpoint that answered before it was lost.
+const LONGEST_PAUSE_KNOWN: Duration = Duration::from_secs(8);
+/// The longest pause between tries of an endpoint that never answered.
+const LONGEST_PAUSE: Duration = Duration::from_secs(64);
 /// By then mDNS has forgotten them too, and tells of them when they come back.
 const FORGET_ASLEEP: Duration = Duration::from_secs(150);

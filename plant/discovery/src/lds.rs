@@ -2,14 +2,15 @@
 
 use std::collections::{BTreeMap, VecDeque};
 use std::io::ErrorKind;
+use std::net::IpAddr;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, SystemTime};
 
 use bridge_node::{Failure, FailureKind, Requests};
+use log_limit::LogLimit;
 use opcua::types::ApplicationType;
-use plant_opcua::seldom::Seldom;
 use registry::{Announcement, Asked, Event, Loss, Settings, instance_name};
 use serde::Serialize;
 use tokio::net::TcpListener;
@@ -85,6 +86,19 @@ impl LdsSettings {
             None => NAME.to_owned(),
             Some(program) => format!("{NAME} in {}", program.name),
         }
+    }
+
+    /// Makes the pair of the certificate store where there is none. A key takes seconds on a small computer, in which a port
+    /// that is listened at already would keep clients waiting.
+    pub(crate) async fn prepare(&self) -> Result<(), Failure> {
+        let place = Url::parse(&self.endpoint).map(|place| place.host);
+        let host = own_host(place.as_deref().unwrap_or_default(), &self.interface);
+        self.open_security(&self.uri(), &host).await.map(drop)
+    }
+
+    fn uri(&self) -> String {
+        let given = self.application_uri.clone();
+        given.unwrap_or_else(|| format!("urn:{}:ua-lds", host_name()))
     }
 
     /// Its certificate store, with its own pair made.
@@ -289,7 +303,7 @@ pub(crate) struct Lds {
     missed: u64,
     register_every: Duration,
     /// Which registrations were refused, by the URI and why.
-    refused: Seldom,
+    refused: LogLimit,
     /// Lets clients in while it is kept.
     accepting: JoinSet<()>,
 }
@@ -316,19 +330,14 @@ impl Lds {
                 settings.interface
             );
         }
-        // On all addresses: as those reach it who hear of it.
-        let host = match (at.ip().is_unspecified(), addresses.first()) {
-            (true, Some(address)) => address.to_string(),
-            _ => place.host.clone(),
-        };
+        let host = own_host(&place.host, &settings.interface);
         let url = Url {
             host,
             port: at.port(),
             path: place.path,
         }
         .to_string();
-        let given = settings.application_uri.clone();
-        let application_uri = given.unwrap_or_else(|| format!("urn:{}:ua-lds", host_name()));
+        let application_uri = settings.uri();
         let host = Url::parse(&url).map_or_else(host_name, |url| url.host);
         let security = settings.open_security(&application_uri, &host).await?;
         let certificate = security
@@ -364,7 +373,7 @@ impl Lds {
             around: None,
             missed: 0,
             register_every: settings.register_every,
-            refused: Seldom::every(TOLD_EVERY),
+            refused: LogLimit::every(TOLD_EVERY),
             accepting,
         };
         lds.announce();
@@ -458,7 +467,7 @@ impl Lds {
                     Err(fault) => {
                         let (uri, why) = (cut(&uri), cut(&fault.to_string()));
                         let what = format!("{uri} {why}");
-                        if let Some(untold) = self.refused.another(&what, clock::now()) {
+                        if let Some(untold) = self.refused.admit(&what, clock::now()) {
                             warn!(?uri, untold, "a registration is refused: {why}");
                         }
                         Answer::Refused(fault.status())
@@ -626,6 +635,7 @@ impl Lds {
             ("lost_total", self.lost),
             ("level_missed_total", self.missed),
             ("no_room_total", self.keeper.registry.refused()),
+            ("displaced_total", self.keeper.registry.displaced()),
             (
                 "announcements_ignored_total",
                 self.keeper.mdns.as_ref().map_or(0, Mdns::ignored),
@@ -700,6 +710,16 @@ impl std::fmt::Display for ListenFault {
             Self::Url => f.write_str("that is no URL as opc.tcp://host:port"),
             Self::Io(error) => error.fmt(f),
         }
+    }
+}
+
+/// The host of its own URL: of one that listens at all addresses, that by which the interface is reached.
+fn own_host(host: &str, interface: &Interface) -> String {
+    let address: Option<IpAddr> = host.parse().ok();
+    let is_wildcard = address.is_some_and(|address| address.is_unspecified());
+    match (is_wildcard, interface.addresses().first()) {
+        (true, Some(address)) => address.to_string(),
+        _ => host.to_owned(),
     }
 }
 

@@ -8,6 +8,7 @@ use std::net::{IpAddr, Ipv4Addr};
 use std::num::NonZeroU16;
 use std::time::Duration;
 
+use log_limit::LogLimit;
 use mdns_sd::{
     DaemonEvent, IfKind, MDNS_PORT, Receiver, ResolvedService, ServiceDaemon, ServiceEvent,
     ServiceInfo,
@@ -17,9 +18,10 @@ use tokio::net::UdpSocket;
 use tokio::time::{Instant, sleep_until};
 use tracing::{debug, info, warn};
 
+use crate::clock;
 use crate::goodbye::{goodbyes, listen};
 use crate::host_name;
-use crate::interface::Interface;
+use crate::interface::{Interface, Subnets};
 use crate::url::Url;
 
 /// No mDNS daemon can be started.
@@ -102,7 +104,11 @@ pub(crate) struct Mdns {
     /// What the daemon holds for outdated though no goodbye was heard, and when that is told. It takes a clock that is set
     /// forward for a sleep of the machine, forgets whom it knew, and hears of them anew in a moment.
     outdated: BTreeMap<String, (Announcement, Aside, Instant)>,
+    /// Where announced servers may be, and when that was read.
+    subnets: (Subnets, Instant),
     ignored: u64,
+    /// Ignored announcements in the log.
+    ignored_log: LogLimit,
 }
 
 #[derive(Debug)]
@@ -141,7 +147,9 @@ impl Mdns {
             there: BTreeMap::new(),
             doubted: BTreeMap::new(),
             outdated: BTreeMap::new(),
+            subnets: (interface.subnets(), Instant::now()),
             ignored: 0,
+            ignored_log: LogLimit::every(LOG_EVERY),
         })
     }
 
@@ -157,8 +165,7 @@ impl Mdns {
             return;
         };
         let fullname = info.get_fullname().to_owned();
-        let loopback = self.interface.is_loopback();
-        let place = heard(&info.clone().as_resolved_service(), loopback);
+        let place = heard(&info.clone().as_resolved_service(), &self.subnets.0);
         let place = place.map_or_else(
             || ours.announcement.url.clone(),
             |(announcement, _)| announcement.url,
@@ -351,10 +358,9 @@ impl Mdns {
     fn take(&mut self, event: ServiceEvent) -> Option<Heard> {
         match event {
             ServiceEvent::ServiceResolved(service) => {
-                let heard = heard(&service, self.interface.is_loopback());
-                let Some((announcement, aside)) = heard else {
-                    self.ignored += 1;
-                    debug!(name = ?service.fullname, "an announcement that is none of a server");
+                self.read_subnets();
+                let Some((announcement, aside)) = heard(&service, &self.subnets.0) else {
+                    self.ignore(&service);
                     return None;
                 };
                 if let Some(ours) = self.ours.get(&announcement.instance) {
@@ -402,6 +408,39 @@ impl Mdns {
                 (!self.ours.contains_key(&instance)).then_some(Heard::Withdrawn { instance })
             }
             _ => None,
+        }
+    }
+
+    /// Reads the subnets of the interface, which may have got another address.
+    fn read_subnets(&mut self) {
+        let now = Instant::now();
+        if now.saturating_duration_since(self.subnets.1) >= READ_SUBNETS_EVERY {
+            self.subnets = (self.interface.subnets(), now);
+        }
+    }
+
+    fn ignore(&mut self, service: &ResolvedService) {
+        self.ignored += 1;
+        let all = service.get_addresses_v4();
+        let is_elsewhere = !all.is_empty() && address(all.clone(), &self.subnets.0).is_none();
+        let cause = match is_elsewhere {
+            true => "address",
+            false => "form",
+        };
+        let Some(suppressed) = self.ignored_log.admit(cause, clock::now()) else {
+            return;
+        };
+        let name: String = service.fullname.chars().take(MOST_NAME).collect();
+        match is_elsewhere {
+            true => info!(
+                ?name, addresses = ?all, interface = %self.interface, suppressed,
+                hint = "to accept servers there: --network, or server.find_skills.networks in the mapping",
+                "ignored an announcement: its address is in no subnet of the interface"
+            ),
+            false => debug!(
+                ?name,
+                suppressed, "ignored an announcement that is none of a server"
+            ),
         }
     }
 
@@ -498,7 +537,7 @@ fn hear_goodbyes(interface: &Interface) -> Option<UdpSocket> {
 }
 
 /// Whether a name is that of this host, with or without a domain.
-fn is_own(name: &str) -> bool {
+pub(crate) fn is_own(name: &str) -> bool {
     let first = |name: &str| {
         name.split('.')
             .next()
@@ -515,7 +554,7 @@ pub(crate) fn same_place(one: &str, other: &str) -> bool {
 }
 
 /// An announcement as the registry takes it.
-pub(crate) fn heard(service: &ResolvedService, loopback: bool) -> Option<(Announcement, Aside)> {
+pub(crate) fn heard(service: &ResolvedService, subnets: &Subnets) -> Option<(Announcement, Aside)> {
     let instance = instance(&service.fullname)?;
     let text = |key| service.get_property_val(key).flatten();
     let path = match text("path").map(std::str::from_utf8) {
@@ -528,7 +567,7 @@ pub(crate) fn heard(service: &ResolvedService, loopback: bool) -> Option<(Announ
     } else {
         "/"
     };
-    let ip = address(service.get_addresses_v4(), loopback)?;
+    let ip = address(service.get_addresses_v4(), subnets)?;
     let port = service.port;
     if port == 0 {
         return None;
@@ -551,11 +590,12 @@ pub(crate) fn heard(service: &ResolvedService, loopback: bool) -> Option<(Announ
     Some((announcement, aside))
 }
 
-/// The address to try: on a network never one that means the host itself.
-fn address(all: impl IntoIterator<Item = Ipv4Addr>, loopback: bool) -> Option<Ipv4Addr> {
+/// Returns the address to try. Loopback addresses of a network and addresses outside its subnets are left out.
+fn address(all: impl IntoIterator<Item = Ipv4Addr>, subnets: &Subnets) -> Option<Ipv4Addr> {
+    let loopback = subnets.is_loopback();
     let usable = |ip: &Ipv4Addr| {
         let one = !(ip.is_unspecified() || ip.is_multicast() || ip.is_broadcast());
-        one && (loopback || !ip.is_loopback())
+        one && (loopback || !ip.is_loopback()) && subnets.contains(*ip)
     };
     // The one that says more first: of a host with several, its loopback address means this host only.
     let all = all.into_iter().filter(usable);
@@ -593,11 +633,24 @@ const PACKET: usize = 9000;
 /// Instances that are kept in mind.
 const MOST: usize = 4096;
 const MOST_CAPABILITIES: usize = 32;
+/// Characters of a name in the log.
+const MOST_NAME: usize = 256;
+const READ_SUBNETS_EVERY: Duration = Duration::from_secs(1);
+/// Announcements that are ignored for one cause are logged once in this time.
+const LOG_EVERY: Duration = Duration::from_secs(60);
 const MOST_CONTESTED: u32 = 4;
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    fn here() -> Subnets {
+        Subnets::of(Ipv4Addr::LOCALHOST, Ipv4Addr::new(255, 0, 0, 0))
+    }
+
+    fn network() -> Subnets {
+        Subnets::of(Ipv4Addr::new(10, 0, 0, 1), Ipv4Addr::new(255, 255, 255, 0))
+    }
 
     fn resolved(instance: &str, address: &str, texts: &[(&str, &str)]) -> ResolvedService {
         let info = ServiceInfo::new(SERVICE, instance, "host.local.", address, 4841, texts);
@@ -613,7 +666,7 @@ mod tests {
             ("ns", "7"),
         ];
         let (announcement, aside) =
-            heard(&resolved("arm.left", "127.0.0.1", &texts), true).unwrap();
+            heard(&resolved("arm.left", "127.0.0.1", &texts), &here()).unwrap();
         assert_eq!(announcement.instance, "arm.left");
         assert_eq!(announcement.url, "opc.tcp://127.0.0.1:4841/arm");
         assert_eq!(announcement.capabilities, ["DA", "HD", "AC"]);
@@ -624,34 +677,39 @@ mod tests {
     #[test]
     fn hostile_records_are_not_heard() {
         let plain = [("path", "/")];
-        for (what, service, loopback) in [
+        for (what, service, subnets) in [
             (
                 "a line break in the name",
                 resolved("a\nb", "127.0.0.1", &plain),
-                true,
+                here(),
             ),
             (
                 "a line break in the path",
                 resolved("a", "127.0.0.1", &[("path", "/\r\nX: y")]),
-                true,
+                here(),
             ),
             (
                 "our own host, from the network",
                 resolved("a", "127.0.0.1", &plain),
-                false,
+                network(),
+            ),
+            (
+                "an address outside the subnets of the interface",
+                resolved("a", "10.0.1.9", &plain),
+                network(),
             ),
             (
                 "no address of a host",
                 resolved("a", "224.0.0.1", &plain),
-                false,
+                network(),
             ),
         ] {
-            assert_eq!(heard(&service, loopback), None, "{what}");
+            assert_eq!(heard(&service, &subnets), None, "{what}");
         }
         let many = vec!["X"; 200].join(",");
         let (kept, _) = heard(
             &resolved("a", "10.0.0.1", &[("caps", many.get(..250).unwrap())]),
-            false,
+            &network(),
         )
         .unwrap();
         assert_eq!(kept.capabilities.len(), MOST_CAPABILITIES);
@@ -662,8 +720,8 @@ mod tests {
     #[test]
     fn of_several_addresses_that_of_the_network_is_taken() {
         let all = || ["127.0.0.1", "169.254.7.7", "10.0.0.2"].map(|ip| ip.parse().unwrap());
-        assert_eq!(address(all(), false), Some(Ipv4Addr::new(10, 0, 0, 2)));
-        assert_eq!(address(all(), true), Some(Ipv4Addr::LOCALHOST));
+        assert_eq!(address(all(), &network()), Some(Ipv4Addr::new(10, 0, 0, 2)));
+        assert_eq!(address(all(), &here()), Some(Ipv4Addr::LOCALHOST));
     }
 
     #[tokio::test]

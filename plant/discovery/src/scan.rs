@@ -16,7 +16,7 @@ use crate::client::{Described, describe};
 use crate::url::Url;
 
 /// IPv4 addresses that are tried: those of hosts in a network.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Range {
     first: u32,
     count: u32,
@@ -39,6 +39,13 @@ impl Range {
     #[must_use]
     pub const fn hosts(self) -> u32 {
         self.count
+    }
+
+    /// Returns whether an address is that of a host in the network.
+    #[must_use]
+    pub fn contains(self, address: Ipv4Addr) -> bool {
+        let at = address.to_bits().checked_sub(self.first);
+        at.is_some_and(|at| at < self.count)
     }
 
     fn addresses(self) -> impl Iterator<Item = Ipv4Addr> {

@@ -121,6 +121,7 @@ pub fn watch(settings: WatchSettings) -> Result<Watcher, MdnsFault> {
         servers: Servers::default(),
         asking: JoinSet::new(),
         ask: VecDeque::new(),
+        ask_later: BTreeSet::new(),
     };
     tokio::spawn(watching.run(tell));
     Ok(Watcher(found))
@@ -133,6 +134,8 @@ struct Watching {
     asking: JoinSet<(String, Option<String>)>,
     /// Who is asked next.
     ask: VecDeque<String>,
+    /// Who is asked once a probe was answered: earlier probes failed, or too many servers appeared at once.
+    ask_later: BTreeSet<String>,
 }
 
 impl Watching {
@@ -160,12 +163,41 @@ impl Watching {
             for (url, started) in self.keeper.take_started() {
                 self.servers.started(&url, clock::of_ticks(started));
             }
+            self.ask_answering();
             while self.asking.len() < MOST_ASKED
                 && let Some(url) = self.ask.pop_front()
             {
-                self.asking.spawn(application_uri(url));
+                // Many forged names appear and go before it is their turn.
+                if self.keeper.registry.watches(&url) {
+                    self.asking.spawn(application_uri(url));
+                }
             }
         }
+    }
+
+    /// Asks a server who it is, now or when it answers probes.
+    fn ask(&mut self, url: String) {
+        let is_paused = self.keeper.registry.is_paused(&url, clock::now());
+        if !is_paused && self.ask.len() < MOST_WAITING {
+            self.ask.push_back(url);
+        } else if self.ask_later.len() < MOST_LATER {
+            self.ask_later.insert(url);
+        }
+    }
+
+    fn ask_answering(&mut self) {
+        let registry = &self.keeper.registry;
+        if self.ask_later.is_empty() {
+            return;
+        }
+        let ask = &mut self.ask;
+        self.ask_later.retain(|url| {
+            let answers = registry.has_answered(url);
+            if answers {
+                ask.push_back(url.clone());
+            }
+            !answers && registry.watches(url)
+        });
     }
 
     #[expect(clippy::wildcard_enum_match_arm, reason = "nobody registers here")]
@@ -173,8 +205,9 @@ impl Watching {
         match event {
             Event::Seen(record) => {
                 let url = record.announcement.url.clone();
-                let ask = self.servers.seen(record.announcement, clock::wall());
-                self.ask.extend(ask);
+                if let Some(ask) = self.servers.seen(record.announcement, clock::wall()) {
+                    self.ask(ask);
+                }
                 self.servers.numbered(&url, self.keeper.number(&url));
                 if let Some(started) = self.keeper.started(&url) {
                     self.servers.started(&url, clock::of_ticks(started));
@@ -211,6 +244,8 @@ async fn application_uri(url: String) -> (String, Option<String>) {
 }
 
 const MOST_ASKED: usize = 32;
+const MOST_WAITING: usize = 256;
+const MOST_LATER: usize = 1024;
 const ASK_LIMIT: Duration = Duration::from_millis(500);
 
 /// The servers that are there, and what their reader is still to be told.

@@ -68,6 +68,15 @@ struct UaMes {
     /// Trust every client certificate, and keep it as trusted. For tests and demonstrations only
     #[arg(long)]
     trust_any_client_certificate: bool,
+    /// Networks behind routers whose servers are accepted too, as 10.77.0.0/16. Without it only servers with addresses in the
+    /// subnets of the interface are, since anyone on the network can announce any address
+    #[arg(
+        long = "network",
+        value_name = "CIDR",
+        env = "UA_NETWORKS",
+        value_delimiter = ','
+    )]
+    networks: Vec<discovery::scan::Range>,
     #[command(flatten)]
     arguments: WithoutMapping,
     #[arg(skip)]
@@ -189,10 +198,11 @@ impl UaMes {
     }
 
     fn interface(&self) -> discovery::Interface {
-        match self.arguments.0.flags.interface.as_deref() {
+        let interface = match self.arguments.0.flags.interface.as_deref() {
             None => discovery::Interface::LOOPBACK,
             Some(interface) => discovery::Interface::parse(interface),
-        }
+        };
+        interface.with_networks(self.networks.iter().copied())
     }
 
     /// Answers questions, and follows who comes and goes.

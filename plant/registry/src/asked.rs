@@ -1,5 +1,7 @@
 //! What a server asks for when it registers (OPC 10000-4, 5.5.5 and 5.5.6), and why it may be refused.
 
+use std::net::IpAddr;
+
 use thiserror::Error;
 
 /// The ApplicationType of OPC 10000-4, 7.4.
@@ -54,6 +56,8 @@ pub struct Channel {
     pub is_secured: bool,
     /// The ApplicationUri in the client's certificate.
     pub certificate_uri: Option<String>,
+    /// The address of the client; `None` within the program.
+    pub peer: Option<IpAddr>,
 }
 
 /// Why a registration is refused. Nothing of it was taken.
@@ -195,14 +199,45 @@ impl Asked {
             return Err(RegisterFault::Invalid { what });
         }
         let strange = |url: &String| url.contains(|c: char| c.is_control() || c.is_whitespace());
-        match self.discovery_urls.iter().any(strange) {
-            true => Err(RegisterFault::Invalid {
-                what: "a discovery URL with a space or a control character",
+        if self.discovery_urls.iter().any(strange) {
+            let what = "a discovery URL with a space or a control character";
+            return Err(RegisterFault::Invalid { what });
+        }
+        match self.discovery_urls.iter().all(|url| is_endpoint(url)) {
+            true => Ok(()),
+            false => Err(RegisterFault::Invalid {
+                what: "a discovery URL that is none of a server: `opc.tcp`, `opc.wss` or `https` with a host and a port from 1 on",
             }),
-            false => Ok(()),
         }
     }
 }
+
+/// Returns whether a server can be at a URL: a scheme of OPC 10000-6, 7, a host, and no port 0.
+fn is_endpoint(url: &str) -> bool {
+    let Some((scheme, rest)) = url.split_once("://") else {
+        return false;
+    };
+    let authority = rest.split(['/', '?', '#']).next().unwrap_or_default();
+    let (host, port) = match authority.rsplit_once(':') {
+        Some((host, port)) if !port.contains(']') => (host, Some(port)),
+        _ => (authority, None),
+    };
+    let has_port = port.is_none_or(|port| port.parse().is_ok_and(|port: u16| port > 0));
+    SCHEMES
+        .iter()
+        .any(|known| known.eq_ignore_ascii_case(scheme))
+        && !host.is_empty()
+        && has_port
+}
+
+const SCHEMES: [&str; 6] = [
+    "opc.tcp",
+    "opc.tls",
+    "opc.wss",
+    "opc.https",
+    "https",
+    "http",
+];
 
 const MAX_TEXT: usize = 1024;
 const MAX_NAMES: usize = 16;

@@ -14,6 +14,7 @@ mod loss;
 mod name;
 mod network;
 mod registry;
+mod share;
 mod watch;
 
 pub use asked::{ApplicationType, Asked, Channel, MdnsConfiguration, RegisterFault};

@@ -15,6 +15,8 @@ pub enum Loss {
     Unreachable,
     /// Its host takes connections, and it does not answer.
     Hanging,
+    /// It was never verified, and gave way to another one.
+    Displaced,
 }
 
 impl Loss {
@@ -28,6 +30,7 @@ impl Loss {
             Self::SemaphoreGone => "semaphore_gone",
             Self::Unreachable => "unreachable",
             Self::Hanging => "hanging",
+            Self::Displaced => "displaced",
         }
     }
 }

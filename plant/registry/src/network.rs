@@ -1,6 +1,7 @@
 //! What FindServersOnNetwork lists (OPC 10000-4, 5.5.3).
 
 use std::collections::BTreeMap;
+use std::time::Instant;
 
 /// A server as mDNS tells of it, resolved to a URL.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -26,14 +27,43 @@ pub struct NetworkRecord {
 #[derive(Debug, Default)]
 pub(crate) struct Network {
     records: BTreeMap<String, NetworkRecord>,
+    /// When each name was announced first.
+    arrivals: BTreeMap<String, Arrival>,
+    last_arrival: u64,
     last_id: u32,
+}
+
+/// When a name was announced first, and where its server is.
+#[derive(Debug)]
+pub(crate) struct Arrival {
+    /// Ascends with each name.
+    pub(crate) order: u64,
+    pub(crate) since: Instant,
+    /// The [`place`] of its URL.
+    pub(crate) place: String,
 }
 
 impl Network {
     /// Takes a record in. One that changed gets a new id. Gives the record it takes the place of, or itself where nothing
     /// is new.
-    pub(crate) fn put(&mut self, announcement: Announcement) -> Option<NetworkRecord> {
+    pub(crate) fn put(
+        &mut self,
+        announcement: Announcement,
+        now: Instant,
+    ) -> Option<NetworkRecord> {
         let key = announcement.instance.to_ascii_lowercase();
+        let place = place(&announcement.url);
+        if let Some(arrival) = self.arrivals.get_mut(&key) {
+            arrival.place = place;
+        } else {
+            self.last_arrival += 1;
+            let arrival = Arrival {
+                order: self.last_arrival,
+                since: now,
+                place,
+            };
+            self.arrivals.insert(key.clone(), arrival);
+        }
         let known = self.records.get(&key);
         if let Some(known) = known.filter(|known| known.announcement == announcement) {
             return Some(known.clone());
@@ -47,7 +77,24 @@ impl Network {
     }
 
     pub(crate) fn remove(&mut self, instance: &str) -> Option<NetworkRecord> {
-        self.records.remove(&instance.to_ascii_lowercase())
+        let key = instance.to_ascii_lowercase();
+        self.arrivals.remove(&key);
+        self.records.remove(&key)
+    }
+
+    /// Returns all records with their arrivals.
+    pub(crate) fn arrivals(&self) -> impl Iterator<Item = (&NetworkRecord, &Arrival)> {
+        // Both have the same keys.
+        self.records.values().zip(self.arrivals.values())
+    }
+
+    /// Returns whether a name is not the first one that was announced for its endpoint.
+    pub(crate) fn is_further(&self, instance: &str) -> bool {
+        let own = self.arrivals.get(&instance.to_ascii_lowercase());
+        own.is_some_and(|own| {
+            let mut all = self.arrivals.values();
+            all.any(|other| other.place == own.place && other.order < own.order)
+        })
     }
 
     pub(crate) fn get(&self, instance: &str) -> Option<&NetworkRecord> {
@@ -83,5 +130,46 @@ impl NetworkRecord {
         wanted
             .iter()
             .all(|wanted| has.iter().any(|has| has.eq_ignore_ascii_case(wanted)))
+    }
+}
+
+/// Returns the endpoint that a URL is served at: scheme, host in small letters and port, without the path.
+pub(crate) fn place(url: &str) -> String {
+    let (scheme, rest) = url.split_once("://").unwrap_or(("", url));
+    let authority = rest.split('/').next().unwrap_or_default();
+    let authority = authority.to_ascii_lowercase();
+    let has_port = match authority.rsplit_once(':') {
+        Some((_, port)) => port.bytes().all(|byte| byte.is_ascii_digit()),
+        None => false,
+    };
+    match has_port {
+        true => format!("{scheme}://{authority}"),
+        false => format!("{scheme}://{authority}:{DEFAULT_PORT}"),
+    }
+}
+
+/// Returns the host of a [`place`].
+pub(crate) fn host(place: &str) -> &str {
+    place.rsplit_once(':').map_or(place, |(host, _)| host)
+}
+
+/// The port of OPC UA over TCP (OPC 10000-6, 7.2).
+const DEFAULT_PORT: u16 = 4840;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn urls_of_one_host_and_port_are_one_place() {
+        for (url, wanted) in [
+            ("opc.tcp://PC:4841/a", "opc.tcp://pc:4841"),
+            ("opc.tcp://pc", "opc.tcp://pc:4840"),
+            ("opc.tcp://[fe80::1]/", "opc.tcp://[fe80::1]:4840"),
+            ("opc.tcp://[fe80::1]:7/b", "opc.tcp://[fe80::1]:7"),
+        ] {
+            assert_eq!(place(url), wanted);
+        }
+        assert_eq!(host(&place("opc.tcp://[fe80::1]:7")), "opc.tcp://[fe80::1]");
     }
 }

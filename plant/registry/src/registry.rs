@@ -1,12 +1,14 @@
 //! The registry itself: what is heard goes in, who is there comes out.
 
-use std::collections::{BTreeMap, VecDeque};
+mod room;
+
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::time::{Duration, Instant};
 
 use crate::asked::{Asked, Channel, RegisterFault};
 use crate::loss::Loss;
 use crate::name::{label, renamed};
-use crate::network::{Announcement, Network, NetworkRecord};
+use crate::network::{Announcement, Network, NetworkRecord, place};
 use crate::watch::{Outcome, Patience, Probe, Sign, Watch};
 
 /// How careful and how patient a registry is.
@@ -108,6 +110,8 @@ pub struct Registry {
     watch: Watch,
     events: VecDeque<Event>,
     refused: u64,
+    displaced: u64,
+    last_arrival: u64,
 }
 
 #[derive(Debug, Clone)]
@@ -117,6 +121,12 @@ struct Server {
     announced: Option<Announcement>,
     /// Whether a certificate said who registers it.
     certified: bool,
+    /// The address that it is registered from.
+    sender: String,
+    /// Host and port of its first endpoint.
+    place: String,
+    /// The order of arrival.
+    arrival: u64,
     since: Instant,
     forget_at: Instant,
 }
@@ -133,6 +143,8 @@ impl Registry {
             watch: Watch::default(),
             events: VecDeque::new(),
             refused: 0,
+            displaced: 0,
+            last_arrival: 0,
         }
     }
 
@@ -159,28 +171,33 @@ impl Registry {
         if semaphore_is_there == Some(false) {
             return Err(RegisterFault::NoSemaphore);
         }
-        let most = self.settings.most;
-        let known = self.servers.get_mut(&asked.server_uri);
-        if known.is_none() && self.servers.len() >= most {
-            self.refused += 1;
-            return Err(RegisterFault::Full { most });
+        let sender = channel.peer.map(|peer| peer.to_string());
+        let sender = sender.unwrap_or_default();
+        if !self.servers.contains_key(&asked.server_uri) {
+            self.make_room(&asked, &sender, certified, now)?;
         }
         let forget_at = now + self.settings.forget_after;
         let known = self.servers.get_mut(&asked.server_uri);
-        let (registered, since) = match known {
+        let (registered, since, arrival) = match known {
             Some(server) if server.asked == asked => {
                 server.forget_at = forget_at;
                 server.certified |= certified;
                 return Ok(Registered::Again);
             }
-            Some(server) => (Registered::Changed, server.since),
-            None => (Registered::New, now),
+            Some(server) => (Registered::Changed, server.since, server.arrival),
+            None => {
+                self.last_arrival += 1;
+                (Registered::New, now, self.last_arrival)
+            }
         };
         let announced = self.free(&asked);
         let server = Server {
+            place: room::place_of(&asked),
             asked,
             announced,
             certified,
+            sender,
+            arrival,
             since,
             forget_at,
         };
@@ -232,7 +249,7 @@ impl Registry {
             discovery_urls,
         });
         if let Some(wished) = wished {
-            self.network.put(wished.clone());
+            self.network.put(wished.clone(), now);
             self.events.push_back(Event::Announce(wished));
         }
     }
@@ -248,13 +265,12 @@ impl Registry {
         if known.is_some_and(|known| known.announcement == announcement) {
             return;
         }
-        if known.is_none() && self.network.len() >= self.settings.most {
-            self.refused += 1;
+        if known.is_none() && !self.make_room_on_network(&announcement, now) {
             return;
         }
-        let instance = instance.clone();
+        let instance = announcement.instance.clone();
         let url = announcement.url.clone();
-        if let Some(before) = self.network.put(announcement) {
+        if let Some(before) = self.network.put(announcement, now) {
             self.unwatch(&before.announcement.url);
         }
         self.watch.add(&url, self.settings.probe_every, now);
@@ -276,7 +292,7 @@ impl Registry {
     }
 
     /// What we announce for a server is called otherwise from now on: another host has that name (RFC 6762, 9).
-    pub fn renamed(&mut self, from: &str, to: &str) {
+    pub fn renamed(&mut self, from: &str, to: &str, now: Instant) {
         let mut announced = self
             .servers
             .values_mut()
@@ -287,7 +303,7 @@ impl Registry {
         to.clone_into(&mut ours.instance);
         let ours = ours.clone();
         self.network.remove(from);
-        self.network.put(ours);
+        self.network.put(ours, now);
     }
 
     /// Whether an endpoint is looked after.
@@ -333,6 +349,47 @@ impl Registry {
         self.watch.is_concurrent(url)
     }
 
+    /// An announcement by `instance` says when its program started. It is no proof that the program runs; another start time
+    /// than before is a restart, unless the name is a further one of an endpoint that has others.
+    pub fn announced_start(&mut self, instance: &str, start_time: i64) {
+        let Some(record) = self.network.get(instance) else {
+            return;
+        };
+        let url = record.announcement.url.clone();
+        if self.network.is_further(instance) {
+            return;
+        }
+        if self.watch.announced_start(&url, start_time) == Sign::Restarted {
+            self.restarted(&url);
+        }
+    }
+
+    /// Returns whether an endpoint has answered a probe.
+    #[must_use]
+    pub fn has_answered(&self, url: &str) -> bool {
+        self.watch.has_answered(url)
+    }
+
+    /// Returns whether probes of an endpoint failed lately, so that it is left alone for a while.
+    #[must_use]
+    pub fn is_paused(&self, url: &str, now: Instant) -> bool {
+        self.watch.is_paused(url, now)
+    }
+
+    /// Reports a restart of the program behind an endpoint.
+    fn restarted(&mut self, url: &str) {
+        let place_of_url = place(url);
+        let registered = self.servers.values();
+        let urls: BTreeSet<&String> = registered
+            .flat_map(|server| &server.asked.discovery_urls)
+            .chain(self.network.iter().map(|record| &record.announcement.url))
+            .filter(|url| place(url) == place_of_url)
+            .collect();
+        let urls: Vec<String> = urls.into_iter().cloned().collect();
+        self.events
+            .extend(urls.into_iter().map(|url| Event::Restarted { url }));
+    }
+
     /// What came of a try.
     pub fn probed(&mut self, url: &str, outcome: Outcome, now: Instant) {
         match outcome {
@@ -350,9 +407,7 @@ impl Registry {
         };
         match self.watch.probed(url, outcome, patience, now) {
             Sign::Nothing => {}
-            Sign::Restarted => self.events.push_back(Event::Restarted {
-                url: url.to_owned(),
-            }),
+            Sign::Restarted => self.restarted(url),
             Sign::Lost(loss) => self.lose(url, loss, outcome == Outcome::Refused, now),
         }
     }
@@ -410,44 +465,53 @@ impl Registry {
         self.network.find(from, most, capabilities)
     }
 
-    /// How often a server was not taken in because [`Settings::most`] were there.
+    /// How often a server was refused for want of room: in the whole table, or in the share of its endpoint or sender.
     #[must_use]
     pub fn refused(&self) -> u64 {
         self.refused
     }
 
-    /// Nobody answers at a URL: all that was said of it goes.
+    /// How often an unverified server gave way to another one.
+    #[must_use]
+    pub fn displaced(&self) -> u64 {
+        self.displaced
+    }
+
+    /// Nobody answers at the endpoint of a URL: all that was said of it goes.
     fn lose(&mut self, url: &str, loss: Loss, ended: bool, now: Instant) {
+        let place_of_url = place(url);
+        let is_there = |known: &String| place(known) == place_of_url;
+        let had_answered = self.watch.has_answered(url);
         self.watch.remove(url);
-        let has = |asked: &Asked| asked.discovery_urls.iter().any(|known| known == url);
-        let servers: Vec<String> = self
+        let servers: Vec<(String, bool)> = self
             .servers
             .values()
-            .filter(|server| has(&server.asked))
-            .map(|server| server.asked.server_uri.clone())
+            .filter(|server| server.asked.discovery_urls.iter().any(is_there))
+            .map(|server| (server.asked.server_uri.clone(), server.certified))
             .collect();
         let records: Vec<String> = self
             .network
             .iter()
-            .filter(|record| record.announcement.url == url)
+            .filter(|record| is_there(&record.announcement.url))
             .map(|record| record.announcement.instance.clone())
             .collect();
-        for uri in servers {
+        for (uri, certified) in servers {
             // One that has another endpoint is looked after there, and announced with it.
             let Some(server) = self.servers.get_mut(&uri) else {
                 continue;
             };
-            if server.asked.discovery_urls.iter().all(|known| known == url) {
-                self.leave(&uri, loss, ended);
+            if server.asked.discovery_urls.iter().all(is_there) {
+                // What was never verified is not kept for its return.
+                self.leave(&uri, loss, ended || !(had_answered || certified));
                 continue;
             }
-            server.asked.discovery_urls.retain(|known| known != url);
+            server.asked.discovery_urls.retain(|known| !is_there(known));
             let Some(other) = server.asked.discovery_urls.first() else {
                 continue;
             };
-            if let Some(announced) = server.announced.as_mut().filter(|old| old.url == url) {
+            if let Some(announced) = server.announced.as_mut().filter(|old| is_there(&old.url)) {
                 announced.url.clone_from(other);
-                self.network.put(announced.clone());
+                self.network.put(announced.clone(), now);
                 self.events.push_back(Event::Announce(announced.clone()));
             }
         }
@@ -456,7 +520,10 @@ impl Registry {
                 self.vanish(&instance, loss);
             }
         }
-        if self.away.values().any(|server| has(&server.asked)) {
+        if let Some(url) = self.away_at(url).first().and_then(|uri| {
+            let away = self.away.get(uri)?;
+            away.asked.discovery_urls.iter().find(|url| is_there(url))
+        }) {
             self.watch.add(url, self.settings.probe_every, now);
         }
     }
@@ -487,7 +554,9 @@ impl Registry {
     }
 
     fn away_at(&self, url: &str) -> Vec<String> {
-        let has = |server: &Server| server.asked.discovery_urls.iter().any(|known| known == url);
+        let place_of_url = place(url);
+        let is_there = |known: &String| place(known) == place_of_url;
+        let has = |server: &Server| server.asked.discovery_urls.iter().any(is_there);
         let away = self.away.iter().filter(|(_, server)| has(server));
         away.map(|(uri, _)| uri.clone()).collect()
     }
@@ -546,7 +615,8 @@ impl Registry {
         let mut urls = registered
             .flat_map(|server| &server.asked.discovery_urls)
             .chain(self.network.iter().map(|record| &record.announcement.url));
-        if !urls.any(|known| known == url) {
+        let place_of_url = place(url);
+        if !urls.any(|known| place(known) == place_of_url) {
             self.watch.remove(url);
         }
     }

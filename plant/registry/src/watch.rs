@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
 use crate::loss::Loss;
+use crate::network::place;
 
 /// An endpoint to try now: open a connection to it, and tell [`Registry::probed`](crate::Registry::probed) what came of it.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -54,16 +55,30 @@ pub(crate) struct Patience {
     pub(crate) busy: Duration,
 }
 
-/// The endpoints under watch.
+/// The endpoints under watch, by host and port: URLs that differ in their path only are one endpoint, which is probed once.
 #[derive(Debug, Default)]
 pub(crate) struct Watch {
     endpoints: BTreeMap<String, Watched>,
+    pauses: BTreeMap<String, Pause>,
     /// Until when the tries that were made take up what may be tried.
     taken_until: Option<Instant>,
 }
 
+/// How long a host and port is left alone after failed probes. The pause outlives its records, so that a record that is
+/// repeated under other names does not reset it.
+#[derive(Debug, Clone, Copy)]
+struct Pause {
+    failures: u32,
+    /// When the last probe ended.
+    probed: Instant,
+    until: Instant,
+    has_answered: bool,
+}
+
 #[derive(Debug)]
 struct Watched {
+    /// The URL that is probed.
+    url: String,
     answered: Instant,
     /// Whether it ever did; before, `answered` is when it was heard of.
     has_answered: bool,
@@ -74,55 +89,85 @@ struct Watched {
 }
 
 impl Watch {
-    /// Looks after a URL from now on. What is heard of a server is a sign of life only the first time: an announcement
+    /// Watches the endpoint of a URL. What is heard of a server is a sign of life only the first time: an announcement
     /// outlives its server. Many that appear together are not tried together.
     pub(crate) fn add(&mut self, url: &str, every: Duration, now: Instant) {
-        if !self.endpoints.contains_key(url) {
-            let watched = Watched {
-                answered: now,
-                has_answered: false,
-                try_at: now + every.mul_f64(spread(url)),
-                start_time: None,
-                answers_during_calls: false,
-            };
-            self.endpoints.insert(url.to_owned(), watched);
+        let first_try = now + every.mul_f64(spread(url));
+        let watched = || Watched {
+            url: url.to_owned(),
+            answered: now,
+            has_answered: false,
+            try_at: first_try,
+            start_time: None,
+            answers_during_calls: false,
+        };
+        let place = place(url);
+        // A server that comes back is found soon; forged records cause one probe per `every` there.
+        if let Some(pause) = self.pauses.get_mut(&place)
+            && pause.has_answered
+        {
+            pause.until = pause.until.min(pause.probed + every);
         }
+        self.endpoints.entry(place).or_insert_with(watched);
     }
 
     pub(crate) fn contains(&self, url: &str) -> bool {
-        self.endpoints.contains_key(url)
+        self.endpoints.contains_key(&place(url))
     }
 
-    /// How often each of them is tried: less often where there are many.
+    /// Returns whether the endpoint has answered a probe since it is under watch.
+    pub(crate) fn has_answered(&self, url: &str) -> bool {
+        self.has_answered_at(&place(url))
+    }
+
+    /// The same by host and port.
+    pub(crate) fn has_answered_at(&self, place: &str) -> bool {
+        let watched = self.endpoints.get(place);
+        watched.is_some_and(|watched| watched.has_answered)
+    }
+
+    /// Returns whether probes of the endpoint failed and its pause is not over.
+    pub(crate) fn is_paused(&self, url: &str, now: Instant) -> bool {
+        let pause = self.pauses.get(&place(url));
+        pause.is_some_and(|pause| pause.failures > 0 && pause.until > now)
+    }
+
+    /// How often each of them is tried: less often where there are many. Endpoints that never answered do not slow down
+    /// the probes of live ones.
     fn pace(&self, every: Duration) -> Duration {
-        let count = u32::try_from(self.endpoints.len()).unwrap_or(u32::MAX);
+        let live = self.endpoints.values().filter(|one| one.has_answered);
+        let count = u32::try_from(live.count()).unwrap_or(u32::MAX);
         every.max(LEAST_APART.saturating_mul(count))
     }
 
     pub(crate) fn remove(&mut self, url: &str) {
-        self.endpoints.remove(url);
+        self.endpoints.remove(&place(url));
     }
 
-    /// The endpoint whose turn it is, if any; its next turn is after `every`, or later where there are many.
+    /// The endpoint whose turn it is, if any; its next turn is after `every`, or later where there are many. Live endpoints
+    /// come first.
     pub(crate) fn next(&mut self, every: Duration, now: Instant) -> Option<Probe> {
         let every = self.pace(every);
         if self.taken_until.is_some_and(|until| until > now + BURST) {
             return None;
         }
-        let (url, watched) = self
-            .endpoints
+        let Self {
+            endpoints, pauses, ..
+        } = self;
+        let (_, watched) = endpoints
             .iter_mut()
-            .filter(|(_, watched)| watched.try_at <= now)
-            .min_by_key(|(_, watched)| watched.try_at)?;
+            .filter(|(place, watched)| watched.due(pauses.get(*place)) <= now)
+            .min_by_key(|(_, watched)| (!watched.has_answered, watched.try_at))?;
         watched.try_at = now + every;
+        let url = watched.url.clone();
         let from = self.taken_until.map_or(now, |until| until.max(now));
         self.taken_until = Some(from + LEAST_APART);
-        Some(Probe { url: url.clone() })
+        Some(Probe { url })
     }
 
     /// Has a URL tried at the next opportunity.
     pub(crate) fn hasten(&mut self, url: &str) {
-        if let Some(watched) = self.endpoints.get_mut(url) {
+        if let Some(watched) = self.endpoints.get_mut(&place(url)) {
             watched.try_at = watched.answered;
         }
     }
@@ -137,8 +182,8 @@ impl Watch {
     pub(crate) fn due(&self) -> Option<Instant> {
         let due = self
             .endpoints
-            .values()
-            .map(|watched| watched.try_at)
+            .iter()
+            .map(|(place, watched)| watched.due(self.pauses.get(place)))
             .min()?;
         let free = self.taken_until.and_then(|until| until.checked_sub(BURST));
         Some(free.map_or(due, |free| free.max(due)))
@@ -146,21 +191,36 @@ impl Watch {
 
     /// The run that is known started then, as it is told another way: that is no other run.
     pub(crate) fn started(&mut self, url: &str, start_time: i64) {
-        if let Some(watched) = self.endpoints.get_mut(url) {
+        if let Some(watched) = self.endpoints.get_mut(&place(url)) {
             watched.start_time = Some(start_time);
         }
     }
 
     /// The server at this URL answers while it executes methods.
     pub(crate) fn answers_during_calls(&mut self, url: &str) {
-        if let Some(watched) = self.endpoints.get_mut(url) {
+        if let Some(watched) = self.endpoints.get_mut(&place(url)) {
             watched.answers_during_calls = true;
         }
     }
 
     pub(crate) fn is_concurrent(&self, url: &str) -> bool {
-        let watched = self.endpoints.get(url);
+        let watched = self.endpoints.get(&place(url));
         watched.is_some_and(|watched| watched.answers_during_calls)
+    }
+
+    /// An announcement names a start time. It proves nothing, but another start time than before is another run, which is
+    /// probed at once.
+    pub(crate) fn announced_start(&mut self, url: &str, start_time: i64) -> Sign {
+        let Some(watched) = self.endpoints.get_mut(&place(url)) else {
+            return Sign::Nothing;
+        };
+        match watched.start_time.replace(start_time) {
+            Some(before) if before != start_time => {
+                watched.try_at = watched.answered;
+                Sign::Restarted
+            }
+            _ => Sign::Nothing,
+        }
     }
 
     /// Takes note of what came of a try.
@@ -171,7 +231,17 @@ impl Watch {
         patience: Patience,
         now: Instant,
     ) -> Sign {
-        let Some(watched) = self.endpoints.get_mut(url) else {
+        let place = place(url);
+        let is_alive = matches!(outcome, Outcome::Alive { .. });
+        let had_answered = self
+            .endpoints
+            .get(&place)
+            .is_some_and(|watched| watched.has_answered);
+        // A live endpoint is tried twice before it is lost.
+        if is_alive || !had_answered {
+            self.pause(&place, is_alive, patience.every, now);
+        }
+        let Some(watched) = self.endpoints.get_mut(&place) else {
             return Sign::Nothing;
         };
         match outcome {
@@ -213,9 +283,47 @@ impl Watch {
             }
         }
     }
+
+    /// Doubles the pause of a host and port with each failure, and ends it with an answer.
+    fn pause(&mut self, place: &str, is_alive: bool, every: Duration, now: Instant) {
+        let before = self.pauses.get(place).copied();
+        if before.is_none() && self.pauses.len() >= MOST_PAUSES {
+            let oldest = self.pauses.iter().min_by_key(|(_, pause)| pause.until);
+            if let Some(oldest) = oldest.map(|(place, _)| place.clone()) {
+                self.pauses.remove(&oldest);
+            }
+        }
+        let has_answered = is_alive || before.is_some_and(|pause| pause.has_answered);
+        let failures = match (is_alive, before) {
+            (true, _) => 0,
+            (false, Some(pause)) if now < pause.until + FORGET_PAUSE => pause.failures + 1,
+            (false, _) => 1,
+        };
+        let longest = match has_answered {
+            true => LONGEST_PAUSE_KNOWN,
+            false => LONGEST_PAUSE,
+        };
+        let until = match failures {
+            0 => now,
+            failures => now + every * (1 << (failures - 1).min(longest)),
+        };
+        let pause = Pause {
+            failures,
+            probed: now,
+            until,
+            has_answered,
+        };
+        self.pauses.insert(place.to_owned(), pause);
+    }
 }
 
 impl Watched {
+    /// When it may be tried next.
+    fn due(&self, pause: Option<&Pause>) -> Instant {
+        let pause = pause.filter(|pause| pause.failures > 0);
+        pause.map_or(self.try_at, |pause| pause.until.max(self.try_at))
+    }
+
     /// No answer came, which may last so long; the server is tried again a while later.
     fn waits(
         &mut self,
@@ -248,3 +356,11 @@ const LEAST_APART: Duration = Duration::from_millis(2);
 const BURST: Duration = Duration::from_millis(20);
 const UNTRIED: u32 = 10;
 const STARTING: u32 = 10;
+/// The longest pause, as a power of two of the time between probes: 64 s.
+const LONGEST_PAUSE: u32 = 6;
+/// The longest pause of an endpoint that has answered before: 8 s.
+const LONGEST_PAUSE_KNOWN: u32 = 3;
+/// Pauses that are remembered; the one that ends first gives way.
+const MOST_PAUSES: usize = 4096;
+/// An endpoint that is left alone for that long after its pause starts anew.
+const FORGET_PAUSE: Duration = Duration::from_secs(300);

@@ -17,6 +17,7 @@ fn secured(uri: &str) -> Channel {
     Channel {
         is_secured: true,
         certificate_uri: Some(uri.to_owned()),
+        peer: None,
     }
 }
 
@@ -106,6 +107,7 @@ fn each_fault_has_its_status() {
     let open = Channel {
         is_secured: false,
         certificate_uri: None,
+        peer: None,
     };
     assert_eq!(
         fault(&|_| {}, &open, None),
@@ -423,7 +425,7 @@ fn what_is_announced_for_a_server_follows_when_it_is_called_otherwise() {
     register(&mut registry, &gripper(), now).unwrap();
     events(&mut registry);
     let before = registry.find_servers_on_network(0, 0, &[])[0].clone();
-    registry.renamed("gripper-pc-4841", "gripper-pc-4841 (2)");
+    registry.renamed("gripper-pc-4841", "gripper-pc-4841 (2)", now);
     let records = registry.find_servers_on_network(0, 0, &[]);
     assert_eq!(records.len(), 1);
     assert_eq!(records[0].announcement.instance, "gripper-pc-4841 (2)");
@@ -660,7 +662,7 @@ fn made_up_servers_take_no_more_room_than_there_is() {
         registry.announced(announcement, now);
     }
     assert_eq!(registry.find_servers_on_network(0, 0, &[]).len(), 3);
-    assert_eq!(registry.refused(), 8);
+    assert_eq!((registry.refused(), registry.displaced()), (0, 8));
     assert_eq!(
         register(&mut registry, &gripper(), now),
         Ok(Registered::Again),
@@ -720,6 +722,7 @@ fn what_a_certificate_registered_nobody_changes_without_one() {
     let on_this_host = Channel {
         is_secured: true,
         certificate_uri: None,
+        peer: None,
     };
     let offline = Asked {
         is_online: false,

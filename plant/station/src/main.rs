@@ -35,6 +35,15 @@ struct UaStation {
     /// The network interface of the level below, by name or address. Without it only this host is told and heard
     #[arg(long, value_name = "NAME|ADDRESS", env = "UA_INTERFACE")]
     interface: Option<String>,
+    /// Networks behind routers whose servers are accepted too, as 10.77.0.0/16. Without it only servers with addresses in the
+    /// subnets of the interface are, since anyone on the network can announce any address
+    #[arg(
+        long = "network",
+        value_name = "CIDR",
+        env = "UA_NETWORKS",
+        value_delimiter = ','
+    )]
+    networks: Vec<discovery::scan::Range>,
     /// Where the methods of neighbours are called by devices; any port of the interface without it
     #[arg(long, value_name = "URL")]
     devices_endpoint: Option<EndpointUrl>,
@@ -104,7 +113,9 @@ impl Service for UaStation {
         let pages = serve_pages(self.metrics).await?;
         let interface = self.interface.as_deref().map(Interface::parse);
         let lds = LdsSettings {
-            interface: interface.unwrap_or(Interface::LOOPBACK),
+            interface: interface
+                .unwrap_or(Interface::LOOPBACK)
+                .with_networks(self.networks.iter().copied()),
             allow_unsecured: self.allow_unsecured,
             register_every: Duration::from_secs(self.register_period.into()),
             pki: self.pki,
@@ -112,7 +123,7 @@ impl Service for UaStation {
             ..LdsSettings::at(self.endpoint)
         };
         let upper = self.upper_interface.as_deref().map(|interface| Upper {
-            interface: Interface::parse(interface),
+            interface: Interface::parse(interface).with_networks(self.networks.iter().copied()),
             endpoint: self.upper_endpoint,
             discovery: self.upper_lds,
         });

@@ -8,7 +8,7 @@ mod places;
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
-use discovery::{Found, client};
+use discovery::{Found, Interface, client};
 use mappings::{Access, Endpoint, FindSkills, Mapping};
 use tokio::task::JoinSet;
 use tokio::time::{Interval, MissedTickBehavior, interval};
@@ -38,6 +38,8 @@ pub(crate) struct Finding {
     speaking: BTreeMap<String, String>,
     /// Discovery servers whose lists are read, by who told of them.
     lists: BTreeMap<Source, String>,
+    /// Where servers may be that a discovery server lists which was only announced.
+    near: Option<Interface>,
     asking: JoinSet<Answer>,
     look: Interval,
     /// Whether those that do not answer any more are to be asked again.
@@ -60,6 +62,9 @@ struct Heard {
     says: Option<Says>,
     /// Whether it is to be asked, again where something has happened to it.
     due: bool,
+    /// Rounds in which it is not asked again, and how many times in a row it did not answer.
+    pause: u32,
+    failures: u32,
     is_asked: bool,
     /// Whether there is no connection where there should be one.
     is_missed: bool,
@@ -94,7 +99,7 @@ enum Answer {
 
 impl Finding {
     /// As the mapping says; with the discovery server that the command line names, if it does.
-    pub(crate) fn new(mapping: &Mapping, lds: Option<&str>) -> Self {
+    pub(crate) fn new(mapping: &Mapping, lds: Option<&str>, near: Option<Interface>) -> Self {
         let mut look = interval(LOOK_AGAIN);
         look.set_missed_tick_behavior(MissedTickBehavior::Delay);
         let lds = lds.filter(|lds| Endpoint::parse(lds).is_some());
@@ -109,6 +114,7 @@ impl Finding {
                 .map(|lds| (Source::Named, lds.to_owned()))
                 .into_iter()
                 .collect(),
+            near,
             asking: JoinSet::new(),
             look,
             is_time: false,
@@ -192,8 +198,11 @@ impl Finding {
             return;
         }
         let heard = self.heard.entry(url).or_default();
+        if is_new {
+            (heard.pause, heard.failures) = (0, 0);
+        }
         if is_new || heard.by.is_empty() {
-            heard.due = true;
+            heard.due = heard.pause == 0;
             heard.is_left_alone = false;
         }
         heard.by.insert(by);
@@ -224,12 +233,15 @@ impl Finding {
             }
             _ = self.look.tick() => {
                 self.is_time = true;
-                for heard in self.heard.values_mut() {
-                    heard.due |= heard.says.is_none();
+                for heard in self.heard.values_mut().filter(|heard| heard.says.is_none()) {
+                    heard.due |= heard.pause == 0;
+                    heard.pause = heard.pause.saturating_sub(1);
                 }
                 let lists: BTreeSet<String> = self.lists.values().cloned().collect();
                 for lds in lists.into_iter().take(MOST_LISTS) {
-                    self.asking.spawn(listed(lds));
+                    let is_named = self.lists.get(&Source::Named) == Some(&lds);
+                    let near = self.near.clone().filter(|_| !is_named);
+                    self.asking.spawn(listed(lds, near));
                 }
             }
         }
@@ -256,6 +268,11 @@ impl Finding {
             Answer::Is(url, says) => {
                 if let Some(heard) = self.heard.get_mut(&url) {
                     heard.is_asked = false;
+                    heard.failures = match says {
+                        Some(_) => 0,
+                        None => (heard.failures + 1).min(MOST_DOUBLED),
+                    };
+                    heard.pause = (1 << heard.failures) - 1;
                     // A busy one that is connected has not gone.
                     if says.is_some() || heard.is_missed {
                         heard.says = says;
@@ -407,8 +424,9 @@ async fn described(url: String) -> Answer {
     Answer::Is(url, says)
 }
 
-/// Of a discovery server that does not answer the list is empty.
-async fn listed(lds: String) -> Answer {
+/// Of a discovery server that does not answer the list is empty. Anyone can announce one, so that its list has servers that are
+/// `near` only.
+async fn listed(lds: String, near: Option<Interface>) -> Answer {
     let listed = client::find_servers(&lds, ANSWERS_WITHIN).await;
     let listed = listed.unwrap_or_default().into_iter().take(MOST_HEARD);
     let servers = listed
@@ -418,12 +436,23 @@ async fn listed(lds: String) -> Answer {
             let url = urls.find(|url| Endpoint::parse(url).is_some())?;
             Some((server.application_uri, url))
         });
-    let servers = servers.collect();
-    Answer::Lists(lds, servers)
+    let mut accepted = Vec::new();
+    for (uri, url) in servers {
+        let is_accepted = match &near {
+            Some(near) => near.accepts(&url).await,
+            None => true,
+        };
+        if is_accepted {
+            accepted.push((uri, url));
+        }
+    }
+    Answer::Lists(lds, accepted)
 }
 
 /// How often lists are read, and those asked again that have not said who they are.
 const LOOK_AGAIN: Duration = Duration::from_secs(3);
+/// The pause of a server that does not answer doubles so often: to 32 rounds.
+const MOST_DOUBLED: u32 = 5;
 /// How long who is asked may take. A busy one takes seconds.
 const ANSWERS_WITHIN: Duration = Duration::from_secs(3);
 /// So many are looked at.
@@ -449,7 +478,7 @@ servers: [{name: press, endpoint: 'opc.tcp://127.0.0.1:5000'}]
 
     fn finding() -> Finding {
         let checked = Mapping::from_yaml(MAPPING, "m.yaml");
-        Finding::new(&checked.mapping.unwrap(), None)
+        Finding::new(&checked.mapping.unwrap(), None, None)
     }
 
     fn seen(name: &str, port: u16, number: u16) -> Found {

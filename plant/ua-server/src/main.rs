@@ -60,6 +60,7 @@ use std::sync::{Arc, OnceLock};
 use bridge_node::{
     Arguments, Context, Failure, FailureKind, KeyService, NodeSetReader, Owned, Program,
 };
+use discovery::scan::Range;
 use discovery::{AnnounceSettings, Interface};
 use mappings::{FindSkills, Mapping, SpaceId};
 use plant_opcua::endpoint::EndpointUrl;
@@ -122,7 +123,11 @@ impl UaServer {
     }
 
     /// To whom the server is told of, if to anybody.
-    fn announcement(&self) -> Option<AnnounceSettings> {
+    fn announcement(&self, mapping: &Mapping) -> Option<AnnounceSettings> {
+        let found = mapping.server().find_skills.as_ref();
+        let networks = found.into_iter().flat_map(|found| &found.networks);
+        // The mapping has checked them.
+        let networks: Vec<Range> = networks.filter_map(|text| text.parse().ok()).collect();
         let interface = self
             .arguments
             .flags
@@ -132,7 +137,8 @@ impl UaServer {
         let settings = AnnounceSettings {
             mdns: self
                 .announce
-                .then(|| interface.unwrap_or(Interface::LOOPBACK)),
+                .then(|| interface.unwrap_or(Interface::LOOPBACK))
+                .map(|interface| interface.with_networks(networks)),
             // That of --pki is made by then.
             pki: Some(self.pki_root()),
             ..AnnounceSettings::registering(self.lds.as_deref())
@@ -204,7 +210,7 @@ impl Program for UaServer {
             types: Types::new(&context.types),
             mapped_url: self.endpoint.is_none(),
             gds: self.gds.as_ref().map(ToString::to_string),
-            announce: self.announcement(),
+            announce: self.announcement(&context.mapping),
         };
         ServerPort::start(&context.mapping, setup)
     }

@@ -36,7 +36,7 @@ impl Others {
             executing: Executing::new(mapping, &mut clients),
             sources: Sources::new(mapping, &mut clients),
             skills: ForeignSkills::default(),
-            finding: Finding::new(mapping, lds),
+            finding: Finding::new(mapping, lds, told.and_then(|told| told.mdns.clone())),
             placed: Vec::new(),
             clients,
             mapping: Arc::clone(mapping),

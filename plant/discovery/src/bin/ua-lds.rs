@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use bridge_node::{Failure, LogFormat, Service, run_service, serve_pages};
 use discovery::lds::{self, LdsSettings};
+use discovery::scan::Range;
 use discovery::{DEFAULT_LDS, Interface};
 
 /// Tells who is there: a Local Discovery Server with multicast extension.
@@ -23,6 +24,15 @@ struct UaLds {
     /// The network interface of mDNS, by name or address. Without it only this host is told and heard
     #[arg(long, value_name = "NAME|ADDRESS", env = "UA_INTERFACE")]
     interface: Option<String>,
+    /// Networks behind routers whose servers are accepted too, as 10.77.0.0/16. Without it only servers with addresses in the
+    /// subnets of the interface are, since anyone on the network can announce any address
+    #[arg(
+        long = "network",
+        value_name = "CIDR",
+        env = "UA_NETWORKS",
+        value_delimiter = ','
+    )]
+    networks: Vec<Range>,
     /// Let servers of other hosts register over channels that are not secured. Without it only those of this host may, over
     /// a loopback address
     #[arg(long)]
@@ -70,7 +80,9 @@ impl Service for UaLds {
         let pages = serve_pages(self.metrics).await?;
         let interface = self.interface.as_deref().map(Interface::parse);
         let settings = LdsSettings {
-            interface: interface.unwrap_or(Interface::LOOPBACK),
+            interface: interface
+                .unwrap_or(Interface::LOOPBACK)
+                .with_networks(self.networks),
             allow_unsecured: self.allow_unsecured,
             secured_only: self.secured_only,
             register_every: Duration::from_secs(self.register_period.into()),

@@ -1,0 +1,114 @@
+//! Room for new servers and names: unverified entries give way.
+
+use std::collections::BTreeSet;
+use std::time::Instant;
+
+use super::Registry;
+use crate::asked::{Asked, RegisterFault};
+use crate::loss::Loss;
+use crate::network::{Announcement, host, place};
+use crate::share::{Entry, Newcomer, Verdict, admit};
+
+impl Registry {
+    /// Makes room for a server that is not registered. A registration that nothing verifies gives way.
+    pub(super) fn make_room(
+        &mut self,
+        asked: &Asked,
+        sender: &str,
+        certified: bool,
+        now: Instant,
+    ) -> Result<(), RegisterFault> {
+        let most = self.settings.most;
+        // The share of an endpoint does not bind a server with a certificate.
+        let place = match certified {
+            true => String::new(),
+            false => place_of(asked),
+        };
+        let newcomer = Newcomer {
+            place: &place,
+            sender,
+        };
+        let entries: Vec<Entry<'_>> = self
+            .servers
+            .values()
+            .map(|server| Entry {
+                key: &server.asked.server_uri,
+                place: &server.place,
+                sender: &server.sender,
+                arrival: (server.arrival, server.since),
+                is_certified: server.certified,
+                is_live: self.is_live(&server.asked),
+            })
+            .collect();
+        match admit(&entries, &newcomer, most, now) {
+            Verdict::Room => Ok(()),
+            Verdict::InsteadOf(uri) => {
+                self.displaced += 1;
+                self.end(&uri, Loss::Displaced);
+                Ok(())
+            }
+            Verdict::Full => {
+                self.refused += 1;
+                Err(RegisterFault::Full { most })
+            }
+        }
+    }
+
+    /// Returns whether one of the endpoints of a server has answered.
+    fn is_live(&self, asked: &Asked) -> bool {
+        let mut urls = asked.discovery_urls.iter();
+        urls.any(|url| self.watch.has_answered(url))
+    }
+
+    /// Makes room for a name that was not announced. Names that we announce and the URLs of registered servers stay.
+    pub(super) fn make_room_on_network(
+        &mut self,
+        announcement: &Announcement,
+        now: Instant,
+    ) -> bool {
+        let place = place(&announcement.url);
+        let newcomer = Newcomer {
+            sender: host(&place),
+            place: &place,
+        };
+        let registered: BTreeSet<&str> = self
+            .servers
+            .values()
+            .flat_map(|server| &server.asked.discovery_urls)
+            .map(|url| url.trim_end_matches('/'))
+            .collect();
+        let entries: Vec<Entry<'_>> = self
+            .network
+            .arrivals()
+            .map(|(record, arrival)| {
+                let Announcement { instance, url, .. } = &record.announcement;
+                Entry {
+                    key: instance,
+                    place: &arrival.place,
+                    sender: host(&arrival.place),
+                    arrival: (arrival.order, arrival.since),
+                    is_certified: registered.contains(url.trim_end_matches('/')),
+                    is_live: self.watch.has_answered_at(&arrival.place),
+                }
+            })
+            .collect();
+        match admit(&entries, &newcomer, self.settings.most, now) {
+            Verdict::Room => true,
+            Verdict::InsteadOf(instance) => {
+                self.displaced += 1;
+                self.vanish(&instance, Loss::Displaced);
+                true
+            }
+            Verdict::Full => {
+                self.refused += 1;
+                false
+            }
+        }
+    }
+}
+
+/// Returns host and port of the first endpoint of a server.
+pub(super) fn place_of(asked: &Asked) -> String {
+    let first = asked.discovery_urls.first();
+    first.map(|url| place(url)).unwrap_or_default()
+}

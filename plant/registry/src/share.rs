@@ -1,0 +1,184 @@
+//! Which entry of a full table gives way to a new one.
+//!
+//! Anyone on the network can announce names, and any program of the host can register them. A table therefore has a share
+//! for each endpoint and for each sender, and an entry that nothing verifies gives way first.
+
+use std::collections::HashMap;
+use std::time::{Duration, Instant};
+
+/// An entry of a table, as far as it matters who gives way.
+#[derive(Debug)]
+pub(crate) struct Entry<'e> {
+    /// The name of the entry.
+    pub(crate) key: &'e str,
+    /// Host and port of its endpoint.
+    pub(crate) place: &'e str,
+    /// The address that counts as its sender.
+    pub(crate) sender: &'e str,
+    /// The order of arrival, and its time.
+    pub(crate) arrival: (u64, Instant),
+    /// Whether it is registered by a certificate.
+    pub(crate) is_certified: bool,
+    /// Whether its endpoint has answered.
+    pub(crate) is_live: bool,
+}
+
+/// A new entry.
+#[derive(Debug)]
+pub(crate) struct Newcomer<'e> {
+    pub(crate) place: &'e str,
+    pub(crate) sender: &'e str,
+}
+
+/// Whether a new entry is accepted.
+#[derive(Debug, PartialEq, Eq)]
+pub(crate) enum Verdict {
+    /// There is room.
+    Room,
+    /// In the place of this entry.
+    InsteadOf(String),
+    /// The new entry is refused.
+    Full,
+}
+
+/// Decides on a new entry of a table of at most `most`.
+pub(crate) fn admit(
+    entries: &[Entry<'_>],
+    newcomer: &Newcomer<'_>,
+    most: usize,
+    now: Instant,
+) -> Verdict {
+    let at_place = entries
+        .iter()
+        .filter(|entry| entry.place == newcomer.place && !entry.is_certified)
+        .count();
+    let is_nearly_full = entries.len() >= most - most / 4;
+    if at_place < PLACE_SHARE && !is_nearly_full {
+        return Verdict::Room;
+    }
+    // The first entry of a live endpoint is verified; the others there are further names of it.
+    let mut firsts: HashMap<&str, u64> = HashMap::new();
+    let mut senders: HashMap<&str, usize> = HashMap::new();
+    for entry in entries {
+        let first = firsts.entry(entry.place).or_insert(entry.arrival.0);
+        *first = entry.arrival.0.min(*first);
+        *senders.entry(entry.sender).or_default() += 1;
+    }
+    let is_kept = |entry: &&Entry<'_>| {
+        let is_first = firsts.get(entry.place) == Some(&entry.arrival.0);
+        entry.is_certified || (entry.is_live && is_first)
+    };
+    let oldest = |wanted: &dyn Fn(&Entry<'_>) -> bool| {
+        let unverified = entries.iter().filter(|entry| !is_kept(entry));
+        let oldest = unverified
+            .filter(|entry| wanted(entry))
+            .min_by_key(|entry| entry.arrival.0);
+        oldest.map(|entry| (entry.key.to_owned(), entry.arrival.1))
+    };
+    let instead = |found: Option<(String, Instant)>| {
+        found.map_or(Verdict::Full, |(key, _)| Verdict::InsteadOf(key))
+    };
+    if at_place >= PLACE_SHARE {
+        // A flood of names for one endpoint exchanges them slowly.
+        let found = oldest(&|entry| entry.place == newcomer.place);
+        return instead(found.filter(|(_, since)| now.duration_since(*since) >= EXCHANGE_AFTER));
+    }
+    let own = senders.get(newcomer.sender).copied().unwrap_or_default();
+    if entries.len() < most {
+        return match own >= most / 2 {
+            true => instead(oldest(&|entry| entry.sender == newcomer.sender)),
+            false => Verdict::Room,
+        };
+    }
+    // The sender with the largest share gives way.
+    let largest = entries
+        .iter()
+        .filter(|entry| !is_kept(entry))
+        .map(|entry| senders.get(entry.sender).copied().unwrap_or_default())
+        .max();
+    instead(oldest(&|entry| {
+        senders.get(entry.sender).copied() == largest
+    }))
+}
+
+/// Entries without a certificate for one endpoint.
+const PLACE_SHARE: usize = 16;
+/// How long an entry of an endpoint stays at least.
+const EXCHANGE_AFTER: Duration = Duration::from_secs(2);
+
+#[cfg(test)]
+mod tests {
+    #![expect(
+        clippy::disallowed_methods,
+        reason = "a test needs some instant to count from"
+    )]
+    use super::*;
+
+    fn entry(key: &str, place: &str, number: u64, since: Instant) -> Entry<'static> {
+        let leak = |text: &str| -> &'static str { Box::leak(text.to_owned().into_boxed_str()) };
+        Entry {
+            key: leak(key),
+            place: leak(place),
+            sender: leak(place.split(':').next().unwrap()),
+            arrival: (number, since),
+            is_certified: false,
+            is_live: false,
+        }
+    }
+
+    fn new(place: &str) -> Newcomer<'_> {
+        Newcomer {
+            place,
+            sender: place.split(':').next().unwrap(),
+        }
+    }
+
+    #[test]
+    fn the_oldest_unverified_entry_of_the_largest_sender_gives_way() {
+        let now = Instant::now();
+        let mut all = vec![
+            entry("live", "a:0", 1, now),
+            entry("certified", "a:1", 2, now),
+            entry("other", "b:1", 3, now),
+        ];
+        all[0].is_live = true;
+        all[1].is_certified = true;
+        for number in 4..=8 {
+            all.push(entry(
+                &format!("forged {number}"),
+                &format!("a:{number}"),
+                number,
+                now,
+            ));
+        }
+        let verdict = admit(&all, &new("c:1"), 8, now);
+        assert_eq!(verdict, Verdict::InsteadOf("forged 4".to_owned()));
+        all.truncate(2);
+        assert_eq!(admit(&all, &new("c:1"), 2, now), Verdict::Full);
+    }
+
+    #[test]
+    fn one_sender_leaves_a_quarter_of_the_table_to_others() {
+        let now = Instant::now();
+        let mut all: Vec<Entry<'_>> = (0..12)
+            .map(|number| entry(&number.to_string(), &format!("a:{number}"), number, now))
+            .collect();
+        all.iter_mut().for_each(|one| one.is_live = true);
+        assert_eq!(admit(&all, &new("a:99"), 16, now), Verdict::Full);
+        assert_eq!(admit(&all, &new("b:1"), 16, now), Verdict::Room);
+    }
+
+    #[test]
+    fn names_of_one_endpoint_exchange_slowly_and_never_the_first() {
+        let now = Instant::now();
+        let mut all: Vec<Entry<'_>> = (0..16)
+            .map(|number| entry(&number.to_string(), "a:1", number, now))
+            .collect();
+        all[0].is_live = true;
+        assert_eq!(admit(&all, &new("a:1"), 1024, now), Verdict::Full);
+        let later = now + EXCHANGE_AFTER;
+        let verdict = admit(&all, &new("a:1"), 1024, later);
+        assert_eq!(verdict, Verdict::InsteadOf("1".to_owned()));
+        assert_eq!(admit(&all, &new("a:2"), 1024, now), Verdict::Room);
+    }
+}
