@@ -1,6 +1,7 @@
 //! A registry of servers: registrations, announcements, tries and passing time as a list of operations.
 
 use std::collections::BTreeSet;
+use std::net::{IpAddr, Ipv4Addr};
 use std::time::{Duration, Instant};
 
 use registry::{
@@ -71,6 +72,7 @@ impl Played {
                 let channel = Channel {
                     is_secured: how & 1 != 0,
                     certificate_uri: (how & 2 != 0).then(|| uri(which)),
+                    peer: (how & 16 != 0).then_some(IpAddr::V4(Ipv4Addr::LOCALHOST)),
                 };
                 let there = (how & 4 != 0).then_some(how & 8 != 0);
                 let asked = asked(which, how, input);
@@ -103,7 +105,7 @@ impl Played {
     fn renamed(&mut self, from: &str, to: &str) {
         let is_free = !self.ours.contains(to) && !self.seen.contains(to);
         if is_free && self.ours.remove(from) {
-            self.registry.renamed(from, to);
+            self.registry.renamed(from, to, self.now);
             self.ours.insert(to.to_owned());
         }
     }
