@@ -4,8 +4,10 @@ use std::collections::BTreeMap;
 use std::num::NonZeroU16;
 use std::time::{Duration, Instant};
 
+use log_limit::LogLimit;
 use registry::{Announcement, Event, Loss, Outcome, Registry, Settings};
 use tokio::time::sleep_until;
+use tracing::info;
 
 use crate::clock::now;
 use crate::liveness::{Liveness, Told, Try};
@@ -33,6 +35,8 @@ pub(crate) struct Keeper {
     new_starts: Vec<(String, i64)>,
     /// The numbers in the space of those that tell.
     numbers: BTreeMap<String, NonZeroU16>,
+    /// Servers in the log that cannot be probed.
+    untried_log: LogLimit,
     most: usize,
 }
 
@@ -76,6 +80,7 @@ impl Keeper {
             started: BTreeMap::new(),
             new_starts: Vec::new(),
             numbers: BTreeMap::new(),
+            untried_log: LogLimit::every(LOG_EVERY),
             most: settings.most,
         }
     }
@@ -288,6 +293,15 @@ impl Keeper {
 
     fn probed(&mut self, url: &str, outcome: Outcome) {
         let at = now();
+        if outcome == Outcome::Untried
+            && let Some(suppressed) = self.untried_log.admit(url, at)
+        {
+            info!(
+                url,
+                suppressed,
+                "cannot probe a server: its host name is not resolved here, or its URL is of another kind; it stays listed"
+            );
+        }
         if let Outcome::Alive { start_time } = outcome {
             keep(&mut self.answered, self.most, url, at);
             if let Some(at) = start_time {
@@ -325,6 +339,8 @@ const LATE: Duration = Duration::from_millis(500);
 /// How much later than its server a program may say that it started, in 100 ns. Another run starts later than that.
 const SAME_RUN: i64 = 20_000_000;
 const TIDY_EVERY: Duration = Duration::from_secs(1);
+/// A server that cannot be probed is logged once in this time.
+const LOG_EVERY: Duration = Duration::from_secs(600);
 const TRY_ASLEEP: Duration = Duration::from_secs(1);
 /// The longest pause between tries of an endpoint that answered before it was lost.
 const LONGEST_PAUSE_KNOWN: Duration = Duration::from_secs(8);
