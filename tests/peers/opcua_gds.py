@@ -70,9 +70,9 @@ def record(uri=URI, name="Robot", number=None, capabilities=("DA",)):
     return told
 
 
-def signing_request(uri=URI, key=None):
+def signing_request(uri=URI, key=None, hosts=("robot.cell",)):
     key = key or rsa.generate_private_key(public_exponent=65537, key_size=2048)
-    names = [x509.UniformResourceIdentifier(uri), x509.DNSName("robot.cell")]
+    names = [x509.UniformResourceIdentifier(uri), *(x509.DNSName(host) for host in hosts)]
     builder = (
         x509.CertificateSigningRequestBuilder()
         .subject_name(x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "Robot")]))
@@ -159,7 +159,8 @@ async def certificates(gds, said, folder):
     said["forged"] = await outcome(gds.call(157, number, groups[0], null, wanted[:-1] + bytes([wanted[-1] ^ 1])))
     request = await gds.call(157, number, groups[0], null, wanted)
     issued, private, issuers = await gds.call(163, number, request)
-    said["twice"] = await outcome(gds.call(163, number, request))
+    again, _, _ = await gds.call(163, number, request)
+    said["twice"] = again == issued
     certificate, authority = x509.load_der_x509_certificate(issued), x509.load_der_x509_certificate(issuers[0])
     names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     said["issued"] = {
@@ -221,6 +222,8 @@ async def itself(gds, said):
     issued, _, _ = await gds.call(163, number, request)
     said["renewed"] = x509.load_der_x509_certificate(issued).not_valid_after_utc.isoformat()
     said["other"] = await outcome(gds.call(146, record("urn:other")))
+    elsewhere = signing_request(hosts=["robot.cell", "other.cell"])[1]
+    said["other_host"] = await outcome(gds.call(157, number, ua.NodeId(), ua.NodeId(), elsewhere))
     trusted = await gds.read_list(await gds.call(204, number, ua.NodeId()))
     said["trusted"] = len(trusted.TrustedCertificates)
 

@@ -343,7 +343,7 @@ const TIDY_EVERY: Duration = Duration::from_secs(1);
 const LOG_EVERY: Duration = Duration::from_secs(600);
 const TRY_ASLEEP: Duration = Duration::from_secs(1);
 /// The longest pause between tries of an endpoint that answered before it was lost.
-const LONGEST_PAUSE_KNOWN: Duration = Duration::from_secs(8);
+const LONGEST_PAUSE_KNOWN: Duration = Duration::from_secs(2);
 /// The longest pause between tries of an endpoint that never answered.
 const LONGEST_PAUSE: Duration = Duration::from_secs(64);
 /// By then mDNS has forgotten them too, and tells of them when they come back.

@@ -82,6 +82,8 @@ struct Watched {
     answered: Instant,
     /// Whether it ever did; before, `answered` is when it was heard of.
     has_answered: bool,
+    /// Whether an announcement named its start time: the program was running then.
+    has_announced: bool,
     try_at: Instant,
     start_time: Option<i64>,
     /// Whether the server answers while it executes methods.
@@ -97,6 +99,7 @@ impl Watch {
             url: url.to_owned(),
             answered: now,
             has_answered: false,
+            has_announced: false,
             try_at: first_try,
             start_time: None,
             answers_during_calls: false,
@@ -214,6 +217,7 @@ impl Watch {
         let Some(watched) = self.endpoints.get_mut(&place(url)) else {
             return Sign::Nothing;
         };
+        watched.has_announced = true;
         match watched.start_time.replace(start_time) {
             Some(before) if before != start_time => {
                 watched.try_at = watched.answered;
@@ -267,7 +271,8 @@ impl Watch {
                 )
             }
             Outcome::Hanging => {
-                let (most, again) = match (watched.answers_during_calls, watched.has_answered) {
+                let is_running = watched.has_answered || watched.has_announced;
+                let (most, again) = match (watched.answers_during_calls, is_running) {
                     (true, true) => (patience.hanging, patience.every / 10),
                     // Who has never answered may be starting: it listens, and serves a while later.
                     (true, false) => (patience.hanging * STARTING, patience.every / 10),
@@ -358,8 +363,8 @@ const UNTRIED: u32 = 10;
 const STARTING: u32 = 10;
 /// The longest pause, as a power of two of the time between probes: 64 s.
 const LONGEST_PAUSE: u32 = 6;
-/// The longest pause of an endpoint that has answered before: 8 s.
-const LONGEST_PAUSE_KNOWN: u32 = 3;
+/// The longest pause of an endpoint that has answered before: 2 s.
+const LONGEST_PAUSE_KNOWN: u32 = 1;
 /// Pauses that are remembered; the one that ends first gives way.
 const MOST_PAUSES: usize = 4096;
 /// An endpoint that is left alone for that long after its pause starts anew.
