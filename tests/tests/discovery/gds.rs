@@ -153,7 +153,10 @@ fn a_certificate_is_issued_used_renewed_by_its_owner_and_revoked() {
     assert_eq!(said["due_before"], true, "{said}");
     assert_eq!(said["foreign_uri"], "BadInvalidArgument");
     assert_eq!(said["forged"], "BadInvalidArgument");
-    assert_eq!(said["twice"], true, "an answer that was lost is given again");
+    assert_eq!(
+        said["twice"], true,
+        "an answer that was lost is given again"
+    );
     assert_eq!(
         said["issued"],
         json!({
