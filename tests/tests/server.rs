@@ -12,6 +12,7 @@ mod malformed;
 mod nodesets;
 mod pubsub;
 mod quality;
+mod strangers;
 
 use std::{
     fs,

@@ -83,7 +83,7 @@ enum Reached {
 }
 
 /// Who says what no client says. The same seed says the same.
-struct Stranger {
+pub(super) struct Stranger {
     hello: Vec<u8>,
     open: Vec<u8>,
     create: Vec<u8>,
@@ -93,7 +93,7 @@ struct Stranger {
 }
 
 /// A channel, as the server has opened it.
-struct Channel {
+pub(super) struct Channel {
     id: [u8; 4],
     token: [u8; 4],
     sequence: u32,
@@ -102,7 +102,7 @@ struct Channel {
 }
 
 impl Stranger {
-    fn new(seed: u64) -> Self {
+    pub(super) fn new(seed: u64) -> Self {
         let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../fuzz/corpus/opcua");
         let mut paths: Vec<_> = fs::read_dir(&folder)
             .unwrap()
@@ -162,16 +162,11 @@ impl Stranger {
             self.set_size(&mut frame);
             return stream.write_all(&frame);
         }
-        stream.write_all(&self.open)?;
-        let mut channel = Channel::opened(&answer(stream)?);
+        let mut channel = self.open_channel(stream)?;
         *reached = Reached::Channel;
         if kind > 4 {
-            let create = channel.addressed(&self.create);
-            stream.write_all(&create)?;
-            channel.session = Some(token(&answer(stream)?)?);
-            let activate = channel.addressed(&self.activate);
-            stream.write_all(&activate)?;
-            answer(stream)?;
+            self.create_session(stream, &mut channel)?;
+            self.activate_session(stream, &mut channel)?;
             *reached = Reached::Session;
         }
         for _ in 0..REQUESTS {
@@ -188,6 +183,46 @@ impl Stranger {
             stream.write_all(&frame)?;
         }
         Ok(())
+    }
+
+    /// Opens a channel, after a HELLO.
+    fn open_channel(&self, stream: &mut TcpStream) -> io::Result<Channel> {
+        stream.write_all(&self.open)?;
+        Ok(Channel::opened(&answer(stream)?))
+    }
+
+    /// Connects, and opens a channel without security.
+    pub(super) fn connected(&self) -> io::Result<(TcpStream, Channel)> {
+        let mut stream = TcpStream::connect(SERVER_ENDPOINT.trim_start_matches("opc.tcp://"))?;
+        stream.set_read_timeout(Some(SOON))?;
+        stream.set_write_timeout(Some(SOON))?;
+        stream.write_all(&self.hello)?;
+        answer(&mut stream)?;
+        let channel = self.open_channel(&mut stream)?;
+        Ok((stream, channel))
+    }
+
+    /// Creates a session on a channel.
+    pub(super) fn create_session(
+        &self,
+        stream: &mut TcpStream,
+        channel: &mut Channel,
+    ) -> io::Result<()> {
+        let create = channel.addressed(&self.create);
+        stream.write_all(&create)?;
+        channel.session = Some(token(&answer(stream)?)?);
+        Ok(())
+    }
+
+    /// Activates the session of a channel. Returns the response.
+    pub(super) fn activate_session(
+        &self,
+        stream: &mut TcpStream,
+        channel: &mut Channel,
+    ) -> io::Result<Vec<u8>> {
+        let activate = channel.addressed(&self.activate);
+        stream.write_all(&activate)?;
+        answer(stream)
     }
 
     /// Another frame from a place on.
@@ -307,7 +342,7 @@ impl Channel {
     }
 
     /// A recorded request as the next of this channel and its session.
-    fn addressed(&mut self, frame: &[u8]) -> Vec<u8> {
+    pub(super) fn addressed(&mut self, frame: &[u8]) -> Vec<u8> {
         self.sequence += 1;
         let mut frame = frame.to_vec();
         frame[8..12].copy_from_slice(&self.id);
@@ -337,7 +372,7 @@ fn token(answer: &[u8]) -> io::Result<Vec<u8>> {
 }
 
 /// The next frame that the server says.
-fn answer(stream: &mut TcpStream) -> io::Result<Vec<u8>> {
+pub(super) fn answer(stream: &mut TcpStream) -> io::Result<Vec<u8>> {
     let mut frame = vec![0; 8];
     stream.read_exact(&mut frame)?;
     let size = u32::from_le_bytes(frame[4..8].try_into().unwrap());
@@ -348,7 +383,7 @@ fn answer(stream: &mut TcpStream) -> io::Result<Vec<u8>> {
 }
 
 /// Where the body of a chunk begins that is not secured.
-const BODY: usize = 24;
+pub(super) const BODY: usize = 24;
 /// How a token of this server begins: an opaque NodeId of namespace 0 with 32 bytes.
 const TOKEN: &[u8] = &[5, 0, 0, 32, 0, 0, 0];
 /// Of one connection, if it is not closed before.
