@@ -362,7 +362,7 @@ impl Writer {
             self.again = None;
             return;
         };
-        let again = self.again.get_or_insert_with(|| Again {
+        let again = self.again.get_or_insert(Again {
             message: None,
             since: now,
             times: 0,

@@ -1,6 +1,4 @@
 //! Messages move between ROS bytes and fields without an allocation, once the buffers were used.
-#![expect(clippy::unwrap_used, reason = "test code")]
-
 use std::sync::Arc;
 use std::time::Instant;
 

@@ -1,13 +1,5 @@
 //! Which applications there are in the group: what programs tell who asks, and what they keep of it.
 
-#![expect(
-    clippy::unwrap_used,
-    clippy::panic,
-    clippy::indexing_slicing,
-    clippy::wildcard_enum_match_arm,
-    reason = "test code"
-)]
-
 use crate::cell;
 
 use std::net::SocketAddr;

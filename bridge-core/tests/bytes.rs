@@ -1,11 +1,5 @@
 //! Messages that cross as they are, between spaces of one ROS and of both.
 
-#![expect(
-    clippy::unwrap_used,
-    clippy::wildcard_enum_match_arm,
-    reason = "test code"
-)]
-
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Instant;

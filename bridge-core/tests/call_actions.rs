@@ -1,12 +1,4 @@
 //! The calls and values of an action between Routers, where both sides have types of their own.
-#![expect(
-    clippy::unwrap_used,
-    clippy::panic,
-    clippy::indexing_slicing,
-    clippy::wildcard_enum_match_arm,
-    reason = "test code"
-)]
-
 use crate::cell;
 
 use std::num::NonZeroU16;

@@ -2,14 +2,6 @@
 //! started anew: a request is executed at most once in all lives of a program, where its name says and never at home, who asked
 //! is told what is so, and then there is silence. Bridges of ROS 1 and
 //! ROS 2, which offer and ask with the type of a service, and programs that speak in fields are mixed.
-#![expect(
-    clippy::unwrap_used,
-    clippy::panic,
-    clippy::indexing_slicing,
-    clippy::wildcard_enum_match_arm,
-    reason = "test code"
-)]
-
 use crate::cell;
 
 use std::collections::BTreeMap;

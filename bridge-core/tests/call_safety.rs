@@ -1,12 +1,4 @@
 //! What calls do on a network that loses, and to peers that lie or die.
-#![expect(
-    clippy::unwrap_used,
-    clippy::panic,
-    clippy::indexing_slicing,
-    clippy::wildcard_enum_match_arm,
-    reason = "test code"
-)]
-
 use crate::cell;
 
 use std::cell::Cell as Shared;

@@ -1,12 +1,4 @@
 //! Calls between Routers: asked for in one space, executed in another, answered to who asked.
-#![expect(
-    clippy::unwrap_used,
-    clippy::panic,
-    clippy::indexing_slicing,
-    clippy::wildcard_enum_match_arm,
-    reason = "test code"
-)]
-
 use crate::cell;
 
 use std::sync::Arc;

@@ -130,7 +130,7 @@ impl Dice {
             .0
             .wrapping_mul(6_364_136_223_846_793_005)
             .wrapping_add(1);
-        (self.0 >> 33) % 5 == 0
+        (self.0 >> 33).is_multiple_of(5)
     }
 }
 

@@ -1,6 +1,4 @@
 //! Every type of the bundle crosses UADP as the fields its leaves say, and returns.
-#![expect(clippy::unwrap_used, reason = "test code")]
-
 use crate::inventor;
 
 use bridge_core::{decode_fields, encode_fields};

@@ -1,12 +1,5 @@
 //! What writers of other makers send, as the local side gets it: datagrams of open62541 and asyncua, and what they may do next.
 
-#![expect(
-    clippy::unwrap_used,
-    clippy::indexing_slicing,
-    clippy::wildcard_enum_match_arm,
-    reason = "test code"
-)]
-
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;

@@ -1,12 +1,5 @@
 //! Messages too big for a datagram: cut, paced, put together, and what a bad network may do to them.
 
-#![expect(
-    clippy::unwrap_used,
-    clippy::wildcard_enum_match_arm,
-    clippy::cast_possible_truncation,
-    reason = "test code"
-)]
-
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};

@@ -1,13 +1,6 @@
 //! Any set of bridges around one group: a value enters every other space once, never comes home, and then there is
 //! silence.
 
-#![expect(
-    clippy::unwrap_used,
-    clippy::panic,
-    clippy::wildcard_enum_match_arm,
-    reason = "test code"
-)]
-
 use std::collections::{BTreeMap, VecDeque};
 use std::net::SocketAddr;
 use std::sync::Arc;

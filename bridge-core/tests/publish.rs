@@ -1,11 +1,4 @@
 //! Values that are held back: on change, within a deadband, faster than a rate.
-#![expect(
-    clippy::unwrap_used,
-    clippy::panic,
-    clippy::wildcard_enum_match_arm,
-    reason = "test code"
-)]
-
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 

@@ -1,11 +1,5 @@
 //! Another mapping for a Router that runs.
 
-#![expect(
-    clippy::unwrap_used,
-    clippy::wildcard_enum_match_arm,
-    reason = "test code"
-)]
-
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 

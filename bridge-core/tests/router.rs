@@ -1,12 +1,5 @@
 //! What a bridge does with samples, datagrams and time, seen from outside.
 
-#![expect(
-    clippy::unwrap_used,
-    clippy::panic,
-    clippy::wildcard_enum_match_arm,
-    reason = "test code"
-)]
-
 use std::net::SocketAddr;
 use std::num::NonZeroU16;
 use std::sync::Arc;

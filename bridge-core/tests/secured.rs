@@ -1,12 +1,4 @@
 //! Secured groups between Routers: who has the keys is heard, and nobody else.
-#![expect(
-    clippy::unwrap_used,
-    clippy::panic,
-    clippy::indexing_slicing,
-    clippy::wildcard_enum_match_arm,
-    reason = "test code"
-)]
-
 use crate::cell;
 
 use std::sync::Arc;

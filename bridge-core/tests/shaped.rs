@@ -1,10 +1,4 @@
 //! Parts of arrays and converted values, from a mapping through the bridges of two spaces.
-#![expect(
-    clippy::unwrap_used,
-    clippy::wildcard_enum_match_arm,
-    reason = "test code"
-)]
-
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Instant;

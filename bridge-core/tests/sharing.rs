@@ -1,11 +1,4 @@
 //! Samples that share a datagram, where the mapping lets them.
-#![expect(
-    clippy::unwrap_used,
-    clippy::panic,
-    clippy::wildcard_enum_match_arm,
-    reason = "test code"
-)]
-
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 

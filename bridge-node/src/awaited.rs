@@ -91,12 +91,14 @@ impl PeerWatch {
     pub(crate) fn update(&mut self, missing: AwaitedPeers, now: Instant) -> PeerChanges {
         let AwaitedPeers { reasons, omitted } = missing;
         self.omitted = omitted;
-        let arrived = self
-            .peers
-            .extract_if(.., |peer, _| !reasons.contains_key(peer));
-        let arrived: Vec<String> = arrived
-            .filter_map(|(peer, missing)| missing.reported.map(|_| peer))
-            .collect();
+        let mut arrived = Vec::new();
+        self.peers.retain(|peer, missing| {
+            let is_missing = reasons.contains_key(peer);
+            if !is_missing && missing.reported.is_some() {
+                arrived.push(peer.clone());
+            }
+            is_missing
+        });
         for (peer, reason) in reasons {
             let known = self.peers.entry(peer).or_insert_with(|| MissingPeer {
                 reason: String::new(),

@@ -113,15 +113,23 @@ impl<P: Port> Shell<P> {
             let limit = tokio::time::sleep(PENDING_AT_END);
             ended = self.carry(limit, Phase::Closing).await;
         }
+        self.log_unknown_outcomes();
+        self.log_end();
+        self.port.shutdown().await;
+        ended
+    }
+
+    fn log_unknown_outcomes(&self) {
         for pending in self.port.pending() {
             warn!("ending, and the outcome is unknown: {pending}");
         }
+    }
+
+    fn log_end(&self) {
         let status = self.status();
         let [topics, sent, delivered, dropped] = status.summary();
         info!(topics, sent, delivered, dropped, "ending");
         debug!(status = %status.json(), "the last status");
-        self.port.shutdown().await;
-        ended
     }
 
     /// All branches of the `select!` are cancel-safe: a socket and bounded channels that hold what was not taken.

@@ -310,14 +310,20 @@ impl Told for Status {
             link.figures(&own, &mut line);
         }
         for (hop, delays) in &self.hops {
-            let labels = format!("{own},hop=\"{hop}\"");
-            line("hop_count", &labels, &delays.count);
-            line("hop_negative_total", &labels, &delays.negative);
-            line("hop_p50_microseconds", &labels, &delays.p50_us);
-            line("hop_p99_microseconds", &labels, &delays.p99_us);
-            line("hop_max_microseconds", &labels, &delays.max_us);
+            delays.figures(&format!("{own},hop=\"{hop}\""), &mut line);
         }
         text
+    }
+}
+
+impl HopStatus {
+    /// Passes the name, the labels and the value of each figure to `line`.
+    fn figures(&self, labels: &str, line: &mut impl FnMut(&str, &str, &dyn std::fmt::Display)) {
+        line("hop_count", labels, &self.count);
+        line("hop_negative_total", labels, &self.negative);
+        line("hop_p50_microseconds", labels, &self.p50_us);
+        line("hop_p99_microseconds", labels, &self.p99_us);
+        line("hop_max_microseconds", labels, &self.max_us);
     }
 }
 

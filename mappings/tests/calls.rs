@@ -1,6 +1,4 @@
 //! Calls: services, actions, and Methods of other servers.
-#![expect(clippy::unwrap_used, clippy::panic, reason = "test code")]
-
 use std::path::PathBuf;
 use std::time::Duration;
 

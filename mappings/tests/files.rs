@@ -1,6 +1,4 @@
 //! Documents of several files, with variables of the environment and with what YAML shares within a text.
-#![expect(clippy::unwrap_used, reason = "test code")]
-
 use std::collections::BTreeMap;
 
 use mappings::{Checked, Code, Mapping, Readers, Surroundings};

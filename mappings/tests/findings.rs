@@ -1,6 +1,4 @@
 //! One faulty document per code in tests/bad/, and beside it what people are told about it.
-#![expect(clippy::unwrap_used, reason = "test code")]
-
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 

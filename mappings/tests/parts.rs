@@ -1,6 +1,4 @@
 //! One mapping on several hosts, each with the definitions of its own robots.
-#![expect(clippy::unwrap_used, reason = "test code")]
-
 use mappings::{Checked, Code, Mapping, Severity, SpaceId};
 
 /// No definition of `their_msgs` is here.

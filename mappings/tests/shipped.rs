@@ -1,6 +1,4 @@
 //! What is shipped beside the code: the documents, and the schema editors use on them.
-#![expect(clippy::unwrap_used, clippy::panic, reason = "test code")]
-
 use std::path::{Path, PathBuf};
 
 use mappings::{Code, Mapping, Overflow, SpaceId, TopicId};

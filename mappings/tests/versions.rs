@@ -1,6 +1,4 @@
 //! The ROS 1 and the ROS 2 version of each type both bundles have, bound to one variable.
-#![expect(clippy::unwrap_used, reason = "test code")]
-
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
 

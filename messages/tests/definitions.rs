@@ -1,6 +1,4 @@
 //! What becomes of definitions: flattened, incomplete, hostile, or a peer's.
-#![expect(clippy::unwrap_used, reason = "test code")]
-
 use std::collections::BTreeMap;
 use std::sync::Arc;
 

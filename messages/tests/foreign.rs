@@ -1,13 +1,6 @@
 //! Messages there and back between this crate and other serializers, live: what `data/judge.py` says.
 //!
 //! `UA_JUDGE_MESSAGES` sets how many messages of each type go each way, `UA_JUDGE_SEED` which.
-#![expect(
-    clippy::unwrap_used,
-    clippy::panic,
-    clippy::print_stderr,
-    reason = "test code"
-)]
-
 use crate::inventor;
 use crate::support;
 

@@ -1,6 +1,4 @@
 //! What other implementations say: md5 sums, field lists, and messages they wrote. See `data/make.py`.
-#![expect(clippy::unwrap_used, clippy::panic, reason = "test code")]
-
 use crate::support;
 
 use std::collections::HashMap;

@@ -1,11 +1,4 @@
 //! Random values there and back, and bytes that are no message.
-#![expect(
-    clippy::unwrap_used,
-    clippy::panic,
-    clippy::cast_possible_truncation,
-    reason = "test code"
-)]
-
 use crate::inventor;
 use crate::support;
 

@@ -1,6 +1,4 @@
 //! Parts of arrays and converted values, on both wires.
-#![expect(clippy::unwrap_used, reason = "test code")]
-
 use crate::support;
 
 use messages::{

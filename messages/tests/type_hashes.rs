@@ -1,6 +1,4 @@
 //! Type hashes beside those of rosbags (`data/make.py hashes`), and beside published ones of services and actions.
-#![expect(clippy::unwrap_used, reason = "test code")]
-
 use std::collections::BTreeSet;
 
 use messages::{Dialect, Registry, TextKind, TypeName};

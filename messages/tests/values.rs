@@ -1,6 +1,4 @@
 //! Bytes that are read as documented, and values and bytes that do not fit.
-#![expect(clippy::unwrap_used, reason = "test code")]
-
 use crate::support;
 
 use std::collections::BTreeMap;

@@ -1,12 +1,6 @@
 //! What is too big for one datagram goes through in chunks, and nothing a network may do to them costs more than
 //! the limits.
 
-#![expect(
-    clippy::unwrap_used,
-    clippy::cast_possible_truncation,
-    reason = "test code"
-)]
-
 use std::path::PathBuf;
 use std::time::Duration;
 

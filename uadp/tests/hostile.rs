@@ -1,12 +1,6 @@
 //! Datagrams of 64 KiB made to cost as much as they can. Reading them through every accessor allocates nothing, and
 //! what is well formed in them is found.
 
-#![expect(
-    clippy::unwrap_used,
-    clippy::cast_possible_truncation,
-    reason = "test code"
-)]
-
 use crate::everything;
 
 use allocation_counter::measure;

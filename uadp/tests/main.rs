@@ -1,4 +1,12 @@
 //! The tests of the codec and its states, one program so that they are linked once.
+#![expect(
+    clippy::cast_possible_truncation,
+    clippy::indexing_slicing,
+    clippy::panic,
+    clippy::unwrap_used,
+    clippy::wildcard_enum_match_arm,
+    reason = "test code"
+)]
 
 #[path = "common/everything.rs"]
 mod everything;

@@ -1,14 +1,6 @@
 //! What holds for every message: it comes back as it was written, no part of it passes for the whole, and no bytes
 //! whatsoever make the reader panic.
 
-#![expect(
-    clippy::unwrap_used,
-    clippy::indexing_slicing,
-    clippy::cast_possible_truncation,
-    clippy::wildcard_enum_match_arm,
-    reason = "test code"
-)]
-
 use crate::everything;
 use crate::model;
 use crate::rewrite;

@@ -3,14 +3,6 @@
 //! The standard has no example of a RawData payload. What is expected of `RawDialect::Standard` is laid out by hand
 //! from OPC 10000-14, 7.2.4.5.11; the structures in it are the examples of OPC 10000-6, 5.2.7 and 5.2.8.
 
-#![expect(
-    clippy::unwrap_used,
-    clippy::panic,
-    clippy::indexing_slicing,
-    clippy::wildcard_enum_match_arm,
-    reason = "test code"
-)]
-
 use std::path::PathBuf;
 
 use allocation_counter::measure;

@@ -1,8 +1,6 @@
 //! What holds for every layout and every payload of RawData. The payloads are laid out here a second time, straight
 //! from OPC 10000-14, 7.2.4.5.11 and OPC 10000-6, 5.2.5 to 5.2.8, so that the crate is not its own judge.
 
-#![expect(clippy::unwrap_used, clippy::indexing_slicing, reason = "test code")]
-
 use proptest::collection::vec;
 use proptest::prelude::*;
 use uadp::{

@@ -1,11 +1,5 @@
 //! What a receiver meets on a network, datagram by datagram.
 
-#![expect(
-    clippy::unwrap_used,
-    clippy::wildcard_enum_match_arm,
-    reason = "test code"
-)]
-
 use uadp::{
     Array, BuiltinType, Chunk, DataSetMessage, DataValue, DateTime, DecodeError, DiagnosticInfo,
     Encoded, ExpandedNodeId, FieldEncoding, FieldValue, Fields, LocalizedText, Matrix, MessageKind,

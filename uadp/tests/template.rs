@@ -1,7 +1,5 @@
 //! A message encoded once and patched: it is what encoding it anew would give, and what does not fit is refused.
 
-#![expect(clippy::unwrap_used, reason = "test code")]
-
 use allocation_counter::measure;
 use uadp::{
     BuiltinType, DataSetHeader, DateTime, DecodeError, Extras, GroupHeader, Guid, MessageTemplate,

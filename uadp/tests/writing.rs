@@ -1,7 +1,5 @@
 //! What a writer may ask for, and what it is refused.
 
-#![expect(clippy::wildcard_enum_match_arm, reason = "test code")]
-
 use uadp::{
     BuiltinType, DataSetHeader, DataValue, DateTime, DecodeError, EncodeError, Encoded,
     ExtensionBody, Extras, FieldEncoder, Fields, NetworkHeader, NetworkMessage,

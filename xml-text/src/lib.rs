@@ -143,7 +143,6 @@ const WINDOWS: [char; 32] = [
 const LONGEST_DECLARATION: usize = 200;
 
 #[cfg(test)]
-#[expect(clippy::unwrap_used, reason = "a test may")]
 mod tests {
     use super::*;
 

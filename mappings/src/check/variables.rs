@@ -318,6 +318,19 @@ fn unique(drafts: &[Draft<'_>], findings: &mut Findings) {
     }
 }
 
+/// Returns what the queue of a variable does when it is full, and for how long a value counts. Commands are events.
+fn queue(entry: &VariableEntry, is_command: bool) -> Option<(Overflow, Lasting)> {
+    let given = match given(&entry.queue) {
+        Some((Queue::DropOldest(size), _)) => Overflow::DropOldest(NonZeroU16::new(*size)?),
+        Some((Queue::KeepLatest, _)) => Overflow::KeepLatest,
+        None if is_command => {
+            return Some((Overflow::DropOldest(NonZeroU16::MIN), Lasting::Event));
+        }
+        None => return Some((Overflow::KeepLatest, Lasting::AsSource)),
+    };
+    Some((given, Lasting::from(given)))
+}
+
 fn variable(
     draft: &Draft<'_>,
     servers: &Servers,
@@ -343,11 +356,6 @@ fn variable(
         [one] => Some(declared.unwrap_or_else(|| types::value_type(one))),
         _ => declared,
     };
-    let queue = match given(&entry.queue) {
-        Some((Queue::DropOldest(size), _)) => Some(Overflow::DropOldest(NonZeroU16::new(*size)?)),
-        Some((Queue::KeepLatest, _)) => Some(Overflow::KeepLatest),
-        None => None,
-    };
     let publish = publish(entry, (value_type, &fields), findings);
     let several = fields.len() > 1;
     let meaning = meaning::check(entry, (value_type, several), findings);
@@ -360,11 +368,7 @@ fn variable(
         .as_ref()
         .is_some_and(|service| matches!(service.role, ServiceRole::Call { .. }));
     let is_command = calls || draft.origin == Some(SpaceId::UA);
-    let (overflow, lasting) = match queue {
-        Some(queue) => (queue, Lasting::from(queue)),
-        None if is_command => (Overflow::DropOldest(NonZeroU16::MIN), Lasting::Event),
-        None => (Overflow::KeepLatest, Lasting::AsSource),
-    };
+    let (overflow, lasting) = queue(entry, is_command)?;
     let ua_field = ua_field(
         draft,
         &bound.bindings,

@@ -1,13 +1,4 @@
 //! A source that makes up whatever is asked for.
-#![expect(
-    clippy::unwrap_used,
-    clippy::panic,
-    clippy::indexing_slicing,
-    clippy::cast_possible_truncation,
-    clippy::wildcard_enum_match_arm,
-    reason = "test code"
-)]
-
 use std::collections::HashMap;
 use std::sync::OnceLock;
 

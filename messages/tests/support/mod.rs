@@ -1,12 +1,4 @@
 //! A sink that records, and a source that plays back what was recorded.
-#![expect(
-    clippy::unwrap_used,
-    clippy::panic,
-    clippy::indexing_slicing,
-    clippy::wildcard_enum_match_arm,
-    reason = "test code"
-)]
-
 use std::fmt;
 
 use messages::{Sink, Source, SourceError, TypeName};

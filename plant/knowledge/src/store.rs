@@ -420,7 +420,6 @@ const MAX_SOURCES: usize = 2000;
 const MAX_DERIVED: usize = 500_000;
 
 #[cfg(test)]
-#[expect(clippy::unwrap_used, reason = "a test may")]
 mod tests {
     use super::*;
 

@@ -1,5 +1,6 @@
 //! The ZIP containers of manifests: `.mtp` (VDI/VDE/NAMUR 2658) and `.amlx` (AutomationML container, IEC 62714-1).
 
+use miniz_oxide::inflate::TINFLStatus;
 use quick_xml::XmlVersion;
 use quick_xml::events::Event;
 use quick_xml::reader::Reader;
@@ -94,9 +95,13 @@ fn unpack(file: &[u8], member: &Member) -> Result<Vec<u8>, ManifestError> {
         CompressionMethod::STORE => packed.to_vec(),
         CompressionMethod::DEFLATE => {
             let inflated = miniz_oxide::inflate::decompress_to_vec_with_limit(packed, MAX_FILE);
-            inflated.map_err(|error| match error.status {
-                miniz_oxide::inflate::TINFLStatus::HasMoreOutput => too_large(),
-                _ => damaged(&error),
+            inflated.map_err(|error| {
+                let is_too_large = error.status == TINFLStatus::HasMoreOutput;
+                if is_too_large {
+                    too_large()
+                } else {
+                    damaged(&error)
+                }
             })?
         }
         other => {
@@ -126,20 +131,21 @@ fn root_document(file: &[u8], members: &[Member]) -> Result<Option<String>, Mani
     let text = xml_text::decode(&relations).map_err(|error| wrong(&error))?;
     let mut reader = Reader::from_str(&text);
     loop {
-        match reader.read_event().map_err(|error| wrong(&error))? {
-            Event::Start(element) | Event::Empty(element) => {
-                let value = |name: &str| {
-                    let attribute = element.try_get_attribute(name).ok().flatten()?;
-                    let value = attribute.normalized_value(XmlVersion::Implicit1_0).ok()?;
-                    Some(value.into_owned())
-                };
-                if value("Type").is_some_and(|kind| kind.ends_with("/RootDocument")) {
-                    let target = value("Target").unwrap_or_default();
-                    return Ok(Some(target.trim_start_matches('/').to_owned()));
-                }
-            }
-            Event::Eof => return Ok(None),
-            _ => {}
+        let event = reader.read_event().map_err(|error| wrong(&error))?;
+        if matches!(event, Event::Eof) {
+            return Ok(None);
+        }
+        let (Event::Start(element) | Event::Empty(element)) = event else {
+            continue;
+        };
+        let value = |name: &str| {
+            let attribute = element.try_get_attribute(name).ok().flatten()?;
+            let value = attribute.normalized_value(XmlVersion::Implicit1_0).ok()?;
+            Some(value.into_owned())
+        };
+        if value("Type").is_some_and(|kind| kind.ends_with("/RootDocument")) {
+            let target = value("Target").unwrap_or_default();
+            return Ok(Some(target.trim_start_matches('/').to_owned()));
         }
     }
 }
@@ -152,7 +158,6 @@ fn fault(what: impl Into<String>) -> ManifestError {
 const MAX_MEMBERS: usize = 10_000;
 
 #[cfg(test)]
-#[expect(clippy::unwrap_used, reason = "a test may")]
 mod tests {
     use std::io::Write as _;
 

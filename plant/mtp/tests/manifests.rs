@@ -1,5 +1,5 @@
 //! Manifests of our own and of six makers, and what is wrong with some.
-#![expect(clippy::unwrap_used, clippy::panic, reason = "a test may")]
+#![expect(clippy::unwrap_used, reason = "a test may")]
 
 use mtp::{Bound, Identifier, ManifestError, Module, Procedure, Role, Service, ValueKind};
 use test_data::{read_foreign, read_own};

@@ -125,60 +125,85 @@ impl Pki {
         let data = certificate_data(application_uri, hosts, name, now);
         match files {
             PairFiles::Both => {
-                match is_made_too_early(&certificate, now) {
-                    true => {
-                        let key =
-                            CertificateStore::read_pkey(&key).map_err(PkiError::Unreadable)?;
-                        self.make_own(&data, Some(key))?;
-                        warn!(
-                            certificate = %certificate.display(),
-                            "made the application's own certificate anew: it was made before the clock was set, and has expired. \
-                             Whoever trusted it has to trust the new one"
-                        );
-                    }
-                    false => {}
+                if is_made_too_early(&certificate, now) {
+                    self.replace_expired(&data, &certificate, &key)?;
                 }
                 check_own(&certificate, &key, application_uri)
             }
-            PairFiles::Certificate => {
-                // Earlier versions wrote the certificate first, and no key belongs to one that was interrupted then.
-                if !is_self_made(&certificate) {
-                    return Err(PkiError::Half {
-                        present: certificate,
-                        missing: key,
-                    });
-                }
-                let aside = certificate.with_extension("without-key");
-                fs::rename(&certificate, &aside).map_err(|source| PkiError::Directory {
-                    path: certificate.clone(),
-                    source,
-                })?;
-                self.make_own(&data, None)?;
-                warn!(
-                    certificate = %certificate.display(), aside = %aside.display(),
-                    "made the application's own pair anew: there was a certificate without its key"
-                );
-                Ok(())
-            }
-            PairFiles::Key => {
-                let known = CertificateStore::read_pkey(&key);
-                let known = known.map_err(|_unreadable| PkiError::Half {
-                    present: key.clone(),
-                    missing: certificate.clone(),
-                })?;
-                self.make_own(&data, Some(known))?;
-                warn!(
-                    certificate = %certificate.display(),
-                    "made the application's own certificate anew: there was a key without its certificate"
-                );
-                Ok(())
-            }
+            PairFiles::Certificate => self.replace_without_key(&data, certificate, key),
+            PairFiles::Key => self.certify_key(&data, certificate, key),
             PairFiles::Neither => {
                 self.make_own(&data, None)?;
                 info!(certificate = %certificate.display(), application_uri, "made the application's own certificate");
                 Ok(())
             }
         }
+    }
+
+    /// Makes a new certificate for the key of one that expired because the clock was not set when it was made.
+    fn replace_expired(
+        &self,
+        data: &X509Data,
+        certificate: &Path,
+        key: &Path,
+    ) -> Result<(), PkiError> {
+        let key = CertificateStore::read_pkey(key).map_err(PkiError::Unreadable)?;
+        self.make_own(data, Some(key))?;
+        warn!(
+            certificate = %certificate.display(),
+            "replaced the own certificate: it was made before the clock was set, and has expired. \
+             Applications that trust the old certificate have to trust the new one"
+        );
+        Ok(())
+    }
+
+    /// Makes a new pair in place of a self-made certificate without key.
+    ///
+    /// Earlier versions wrote the certificate first, so an interrupted start left no key.
+    fn replace_without_key(
+        &self,
+        data: &X509Data,
+        certificate: PathBuf,
+        key: PathBuf,
+    ) -> Result<(), PkiError> {
+        if !is_self_made(&certificate) {
+            return Err(PkiError::Half {
+                present: certificate,
+                missing: key,
+            });
+        }
+        let aside = certificate.with_extension("without-key");
+        fs::rename(&certificate, &aside).map_err(|source| PkiError::Directory {
+            path: certificate.clone(),
+            source,
+        })?;
+        self.make_own(data, None)?;
+        warn!(
+            certificate = %certificate.display(), aside = %aside.display(),
+            "made a new own certificate and key: the key of the old certificate was missing"
+        );
+        Ok(())
+    }
+
+    /// Makes the certificate of a key whose certificate is missing.
+    fn certify_key(
+        &self,
+        data: &X509Data,
+        certificate: PathBuf,
+        key: PathBuf,
+    ) -> Result<(), PkiError> {
+        let Ok(known) = CertificateStore::read_pkey(&key) else {
+            return Err(PkiError::Half {
+                present: key,
+                missing: certificate,
+            });
+        };
+        self.make_own(data, Some(known))?;
+        warn!(
+            certificate = %certificate.display(),
+            "made a new own certificate: the certificate of the key was missing"
+        );
+        Ok(())
     }
 
     /// Makes the pair, or a certificate for a key that is there.

@@ -84,11 +84,9 @@ fn forged_names_of_many_hosts_keep_no_live_server_off_the_list() {
     for live in ["robot", "plc"] {
         assert!(all.contains(&live.to_owned()), "{live}");
     }
-    let lost = |event: &Event| match event {
-        Event::Vanished { record, loss } => {
-            *loss != Loss::Displaced || record.announcement.instance == "robot"
-        }
-        _ => false,
+    let lost = |event: &Event| {
+        matches!(event, Event::Vanished { record, loss }
+            if *loss != Loss::Displaced || record.announcement.instance == "robot")
     };
     let wrong: Vec<Event> = std::iter::from_fn(|| registry.poll_event())
         .filter(lost)

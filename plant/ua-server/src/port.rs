@@ -131,12 +131,8 @@ impl ServerPort {
         let (layout, (sets, nodesets)) = laid_out(mapping, &mut types)?;
         let described = mapping.server();
         setup.sks.follow(mapping)?;
-        let (listener, address) = listen(&setup.pki, &setup.url, described)?;
+        let (listener, (address, security)) = listen(&setup.pki, &setup.url, described)?;
         let port = address.port();
-        let security = endpoint::security(described, address);
-        if !address.ip().is_loopback() {
-            tell_open(&setup.url, described, &security);
-        }
         let access = users(&setup.pki, address)?;
         access.set_rules(access::rules(mapping, &layout));
 
@@ -166,10 +162,7 @@ impl ServerPort {
             .build()
             .map_err(configuration)?;
         let manager = manager(&handle, &layout).map_err(configuration)?;
-        limit(manager.inner(), mapping);
-        pubsub.stand(places(&handle, &manager));
-        pubsub.show(mapping, &layout);
-
+        show_limits(mapping, &layout, (&handle, &manager), &pubsub);
         let (runtime, listener) = endpoint::threads(listener)?;
         let serving = runtime.spawn(server.run_with(listener));
         endpoint::stand(&runtime, door)?;
@@ -535,7 +528,7 @@ fn listen(
     pki: &Pki,
     url: &EndpointUrl,
     described: &Server,
-) -> Result<(TcpListener, SocketAddr), Failure> {
+) -> Result<(TcpListener, (SocketAddr, Vec<Security>)), Failure> {
     let io = |error: String| Failure::new(FailureKind::Io, error);
     pki.ensure_own_at(&described.application_uri, &url.hosts())
         .map_err(|error| io(error.to_string()))?;
@@ -543,7 +536,12 @@ fn listen(
         .bind()
         .map_err(|error| Failure::new(FailureKind::Unavailable, format!("{error} (--endpoint)")))?;
     let address = listener.local_addr();
-    Ok((listener, address.map_err(|error| io(error.to_string()))?))
+    let address = address.map_err(|error| io(error.to_string()))?;
+    let security = endpoint::security(described, address);
+    if !address.ip().is_loopback() {
+        tell_open(url, described, &security);
+    }
+    Ok((listener, (address, security)))
 }
 
 /// Says what a server that other hosts reach leaves open to them: what it asks of other programs comes from its own address.
@@ -594,6 +592,18 @@ fn prepared(core: &mut AddressSpace) {
 }
 
 /// Where the nodes of the PubSub configuration are to stand.
+/// Shows the limits of the server and the PubSub configuration in the address space.
+fn show_limits(
+    mapping: &Mapping,
+    layout: &Layout,
+    (handle, manager): (&ServerHandle, &Arc<SpaceManager>),
+    pubsub: &PubSub,
+) {
+    limit(manager.inner(), mapping);
+    pubsub.stand(places(handle, manager));
+    pubsub.show(mapping, layout);
+}
+
 fn places(handle: &ServerHandle, manager: &Arc<SpaceManager>) -> Places {
     Places {
         core: core_of(handle),

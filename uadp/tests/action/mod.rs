@@ -1,12 +1,5 @@
 //! Actions: bytes by the tables, what is written comes back, and who asks and who answers understand each other.
 
-#![expect(
-    clippy::unwrap_used,
-    clippy::indexing_slicing,
-    clippy::panic,
-    reason = "test code"
-)]
-
 mod codec;
 mod link;
 mod peers;

@@ -1,8 +1,6 @@
 //! Discovery messages: read as their makers meant them, written back byte for byte, and refused without cost when they
 //! are malformed.
 
-#![expect(clippy::unwrap_used, clippy::indexing_slicing, reason = "test code")]
-
 mod asyncua;
 mod cost;
 mod kinds;

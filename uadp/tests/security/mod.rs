@@ -1,12 +1,5 @@
 //! Secured messages: what is opened, what is refused and why, and what is sent.
 
-#![expect(
-    clippy::unwrap_used,
-    clippy::indexing_slicing,
-    clippy::cast_possible_truncation,
-    reason = "test code"
-)]
-
 mod allocation;
 mod foreign;
 mod refusing;

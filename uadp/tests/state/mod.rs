@@ -1,7 +1,5 @@
 //! What a reader takes and what it drops, when a writer sends, and the states both are in.
 
-#![expect(clippy::unwrap_used, clippy::panic, reason = "test code")]
-
 mod machine;
 mod properties;
 mod reader;

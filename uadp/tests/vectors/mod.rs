@@ -1,15 +1,6 @@
 //! Every datagram under `tests/vectors`: read as its JSON says and written back byte for byte. Of those in [`NOT_READ`]
 //! and [`RAW_DATA`] only what stands in clear and needs no metadata.
 
-#![expect(
-    clippy::unwrap_used,
-    clippy::panic,
-    clippy::indexing_slicing,
-    clippy::cast_possible_truncation,
-    clippy::wildcard_enum_match_arm,
-    reason = "test code"
-)]
-
 mod found;
 mod not_read;
 use crate::rewrite;

@@ -190,7 +190,6 @@ impl<'q, Q, A> Parts<'_, 'q, Q, A> {
 }
 
 #[cfg(test)]
-#[expect(clippy::unwrap_used, reason = "a test may")]
 mod tests {
     use super::*;
 

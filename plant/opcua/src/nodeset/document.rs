@@ -41,20 +41,20 @@ impl Parsed {
                 (file, text)
             }
         };
-        let document = load_nodeset2_file(&text.0).map_err(|error| match error.error {
-            XmlErrorInner::Xml(reason) => not_a_document(&file, reason.to_string()),
-            reason => {
-                let (line, node) = text.place_at(error.span.start);
-                let reason = reason.to_string();
-                match node {
-                    Some(node) => NodeSetError::Node {
-                        file: file.clone(),
-                        line,
-                        node,
-                        reason,
-                    },
-                    None => not_a_document(&file, format!("line {line}: {reason}")),
-                }
+        let document = load_nodeset2_file(&text.0).map_err(|error| {
+            if let XmlErrorInner::Xml(reason) = &error.error {
+                return not_a_document(&file, reason.to_string());
+            }
+            let (line, node) = text.place_at(error.span.start);
+            let reason = error.error.to_string();
+            match node {
+                Some(node) => NodeSetError::Node {
+                    file: file.clone(),
+                    line,
+                    node,
+                    reason,
+                },
+                None => not_a_document(&file, format!("line {line}: {reason}")),
             }
         })?;
         let mut set = document

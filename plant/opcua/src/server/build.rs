@@ -271,21 +271,14 @@ impl ServerBuilder {
                 sets,
                 namespaces: self.namespaces,
             });
-        // Without certificates the library complains of them though nobody can ask for any.
-        let (server, handle) = if secured {
-            builder.build()
-        } else {
-            tracing::subscriber::with_default(tracing::subscriber::NoSubscriber::new(), || {
-                builder.build()
-            })
-        }
-        .map_err(ServerError::Configuration)?;
+        let (server, handle) = built(builder, secured)?;
         if let Some(error) = made.error.lock().take() {
             return Err(error.into());
         }
         let (Some(manager), Some(spaces)) = (made.own.get(), calls.spaces.get()) else {
-            let reason = "it has no address space".to_owned();
-            return Err(ServerError::Configuration(reason));
+            return Err(ServerError::Configuration(
+                "it has no address space".to_owned(),
+            ));
         };
         Ok(Server {
             inner: Arc::new(Inner {
@@ -308,6 +301,19 @@ impl ServerBuilder {
             }),
         })
     }
+}
+
+/// Builds the server of the library. Without security its complaints about missing certificates are not logged.
+fn built(
+    builder: opcua::server::ServerBuilder,
+    secured: bool,
+) -> Result<(opcua::server::Server, opcua::server::ServerHandle), ServerError> {
+    if secured {
+        return builder.build().map_err(ServerError::Configuration);
+    }
+    let silent = tracing::subscriber::NoSubscriber::new();
+    tracing::subscriber::with_default(silent, || builder.build())
+        .map_err(ServerError::Configuration)
 }
 
 fn described(config: &ServerConfig, port: u16) -> opcua::server::ServerBuilder {

@@ -154,10 +154,8 @@ impl Asking<'_> {
                 let mut goal = waiting(waits);
                 self.cancel_goal(&mut goal)?;
                 let end = self.follow_goal(goal).await?;
-                return match failure {
-                    Failure::Unavailable(_) => end,
-                    failure => Err(failure),
-                };
+                let is_lost = matches!(failure, Failure::Unavailable(_));
+                return if is_lost { end } else { Err(failure) };
             }
             answer => answer?,
         };
