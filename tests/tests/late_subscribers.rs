@@ -77,7 +77,9 @@ fn a_value_of_ros_1_that_is_not_latched_reaches_no_late_subscriber_of_ros_2_in_e
         let _ros1 = cell.bridge_ros1(&[]);
         let ros2 = (!bridge_is_late).then(|| cell.bridge_ros2(&[]));
         let name = topic.trim_start_matches('/');
-        let mut sends = cell.rospy("ros1_pub.py", &[topic, TYPE, "--value", "7"]);
+        // ROS 1 hands the value to those that are connected by then.
+        let value = ["--value", "7", "--wait-subscribers", "1"];
+        let mut sends = cell.rospy("ros1_pub.py", &[&[topic, TYPE][..], &value].concat());
         eventually("the bridge has sent the value", SOON, || {
             let status: Value = metrics(METRICS_ROS1)?;
             (status["topics"][name]["repeated"].as_u64()? > 3).then_some(())

@@ -42,19 +42,23 @@ struct Line {
 }
 
 fn start(cell: &Cell) -> Line {
+    start_with(cell, MAPPING)
+}
+
+fn start_with(cell: &Cell, mapping: &str) -> Line {
     let master = cell.roscore();
     let side = UaSide::join();
     let robot = cell.rospy("niryo.py", &[&definitions().unwrap()]);
     Line {
         side,
         robot,
-        bridge: bridge(cell),
+        bridge: bridge(cell, mapping),
         _master: master,
     }
 }
 
-fn bridge(cell: &Cell) -> Child {
-    cell.bridge_ros1_started(&[MAPPING])
+fn bridge(cell: &Cell, mapping: &str) -> Child {
+    cell.bridge_ros1_started(&[mapping])
         .env("ROS_PACKAGE_PATH", definitions().unwrap())
         .start()
 }
@@ -185,7 +189,13 @@ fn digital_outputs_learning_mode_and_stop_are_called_with_what_the_mapping_says(
 #[test]
 fn a_state_waits_for_its_service_and_an_event_does_not() {
     let Some(cell) = cell() else { return };
-    let mut line = start(&cell);
+    // A value that calls a service is an event, unless its mapping says otherwise.
+    let output = "name: DigitalOutput1\n    type: Boolean\n";
+    let text = std::fs::read_to_string(MAPPING).unwrap();
+    assert_eq!(text.matches(output).count(), 1);
+    let text = text.replace(output, &format!("{output}    queue: keep_latest\n"));
+    let file = cell.file("cell.yaml", &text);
+    let mut line = start_with(&cell, file.to_str().unwrap());
     line.side.hear((1, 2, 11), "joints", |_| Some(()));
     let killed = line.robot.id();
     line.robot.signal(nix::sys::signal::Signal::SIGKILL);
@@ -344,7 +354,7 @@ fn a_restarted_bridge_calls_for_the_value_the_space_repeats() {
     line.side.write((0, 2, 45), Scalar::Boolean(true));
     called(&line.robot, output, 0);
     line.bridge.end();
-    line.bridge = bridge(&cell);
+    line.bridge = bridge(&cell, MAPPING);
     let again = eventually("the repeated value is called for", SOON, || {
         line.side.write((0, 2, 45), Scalar::Boolean(true));
         calls(&line.robot, output).get(1).cloned()

@@ -58,7 +58,8 @@ fn about(key: &str) -> Value {
     metrics(METRICS_ROS1).map_or(Value::Null, |status| status["mapping"][key].clone())
 }
 
-/// What was heard of the routes: of each, the sequence numbers with the number that was said.
+/// What was heard of the routes: of each, the sequence numbers with the number that was said. Events that were sent again
+/// stand there once.
 type Heard = BTreeMap<u16, Vec<(u16, u16)>>;
 
 /// Hears the group in a thread of its own until `ended`.
@@ -88,7 +89,11 @@ fn listen(heard: &Arc<Mutex<Heard>>, ended: &Arc<AtomicBool>) -> std::thread::Jo
                 };
                 let said = number.parse().unwrap();
                 let mut heard = heard.lock().unwrap();
-                heard.entry(route).or_default().push((sequence, said));
+                let all = heard.entry(route).or_default();
+                // An event is sent again under its number, unless a newer one followed.
+                if all.last() != Some(&(sequence, said)) {
+                    all.push((sequence, said));
+                }
             }
         }
     })
