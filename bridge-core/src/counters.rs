@@ -35,7 +35,7 @@ pub enum Reason {
     TooBig,
     /// A large message of which chunks never came.
     Incomplete,
-    /// A large message given up since others took up the room for unfinished ones.
+    /// A large message given up since others took up the room for those that are unfinished or wait for their type.
     NoRoom,
     /// More topics than are tracked.
     TooManyTopics,

@@ -157,8 +157,21 @@ pub(crate) struct Held {
     pub(crate) source: Option<Timestamp>,
     pub(crate) instance: Option<Timestamp>,
     pub(crate) status: u16,
-    pub(crate) arrived: Timestamp,
     pub(crate) lasting: bool,
+    /// When an event is too old to be handed on, and a large sample is removed.
+    pub(crate) until: Instant,
+}
+
+impl Held {
+    /// Whether it counts against the bytes that large samples share.
+    pub(crate) const fn is_large(&self) -> bool {
+        self.fields.len() > MAX_SMALL
+    }
+
+    /// When the sample is removed, if it is large.
+    pub(crate) fn expires(&self) -> Option<Instant> {
+        self.is_large().then_some(self.until)
+    }
 }
 
 impl Reader {
@@ -604,6 +617,9 @@ impl Reader {
     }
 }
 
+/// The size up to which a sample of each topic may wait for its local type: whoever sends to the group can invent topics, and
+/// all of them together must not hold more than some megabytes.
+const MAX_SMALL: usize = 4_096;
 /// Samples whose repetitions are known: as many as a writer keeps.
 const MAX_KNOWN: usize = MAX_KEPT;
 /// How long the second other word on what a topic is has to wait for, and how often that is doubled.

@@ -10,6 +10,7 @@ mod content;
 mod discovery;
 mod follow;
 mod guarded;
+mod held;
 mod own;
 mod receive;
 mod reload;
@@ -24,7 +25,7 @@ use std::time::{Duration, Instant};
 
 use mappings::{Lasting, Mapping, SpaceId, TopicId};
 use messages::{Dialect, MessageType, PlanError, Selection, Wire};
-use uadp::{Fields, Timestamp};
+use uadp::Timestamp;
 
 use crate::counters::{Cause, Counters, Reason, Verdict};
 use crate::fields;
@@ -37,7 +38,6 @@ use crate::network::{check_size, data_set_header, encode, keep_alive};
 use crate::output::{Delivery, Heard, Kept, Output, PublisherKey};
 use crate::pace::Pace;
 use crate::plans::Plans;
-use crate::reader::Held;
 use crate::room::Room;
 use crate::settings::{Local, Now, Settings};
 use crate::topic::{Item, Role, Topic};
@@ -48,7 +48,6 @@ use calls::Calls;
 use chunks::Chunks;
 use discovery::Discovery;
 use own::Claims;
-use receive::Sample;
 use told::About;
 
 /// Decides what crosses between one space and UADP. See the crate's page for how it is driven.
@@ -91,6 +90,8 @@ pub struct Router {
     timers: BinaryHeap<Reverse<(Instant, TopicId)>>,
     /// Bytes of the key frames kept for delta frames.
     base_bytes: usize,
+    /// Topics of which a large sample may wait for its local type.
+    large_held: Vec<TopicId>,
     /// Buffers given back by [`recycle`](Self::recycle).
     spare: Vec<Vec<u8>>,
     /// Datagrams and messages that belong to no topic, and topics that are no longer followed.
@@ -126,6 +127,7 @@ impl Router {
             value_first: false,
             timers: BinaryHeap::new(),
             base_bytes: 0,
+            large_held: Vec::new(),
             spare: Vec::new(),
             others: Counters::default(),
             hops: Hops::new(),
@@ -201,32 +203,6 @@ impl Router {
         }
         let loss = Loss::new(&self.mapping, topic, of, wire)?;
         Ok((loss, trigger(&self.mapping, topic, of.0, wire)?))
-    }
-
-    /// Delivers a sample that waited for its local type; an event only while it is young.
-    fn deliver_held(&mut self, topic: TopicId, held: &Held, now: Now) {
-        let age = now.utc.unix_nanos() - held.arrived.unix_nanos();
-        if !held.lasting && age >= MAX_WAIT {
-            self.forget(topic, held.instance);
-            self.count(About::topic(topic), Reason::NotPublished, 1, || {
-                "its local type was known too late for an event".to_owned()
-            });
-            return;
-        }
-        let Ok(fields) = Fields::parse(&held.fields) else {
-            return;
-        };
-        let sample = Sample {
-            fields,
-            source: held.source,
-            instance: held.instance,
-            kept: Kept::Alone,
-            lasting: held.lasting,
-            status: held.status,
-            // The wait is no delay of this program.
-            arrived: now.utc,
-        };
-        self.deliver(topic, &sample, now);
     }
 
     /// A sample was heard on the local side.
@@ -544,6 +520,7 @@ impl Router {
     }
 
     fn handle_due(&mut self, topic: TopicId, now: Now) {
+        self.expire_held(topic, now);
         let (key_frames, keep_alives, silence) = self.periods();
         let Some(entry) = self.topics.get_mut(&topic) else {
             return;
@@ -677,7 +654,9 @@ impl Router {
             }
             Role::Theirs(reader) => {
                 let hold = entry.loss.as_ref().and_then(|loss| loss.due());
-                reader.due(silence).into_iter().chain(hold).min()
+                let held = reader.held.as_ref().and_then(|held| held.expires());
+                let due = reader.due(silence).into_iter().chain(hold);
+                due.chain(held).min()
             }
         };
         // An earlier entry stays: it finds nothing due and asks again, which spares the list an entry per sample.
@@ -766,8 +745,6 @@ impl Router {
     }
 }
 
-/// How many nanoseconds an event may wait for its local type.
-const MAX_WAIT: i128 = 1_000_000_000;
 /// The upper half of the StatusCode Good.
 const GOOD: u16 = 0;
 /// Buffers kept for reuse, and how large each may have grown.

@@ -525,3 +525,55 @@ fn a_service_is_called_when_the_commander_of_an_arm_is_lost() {
         .collect();
     assert_eq!(came, [(topic("ua_0_2_13"), &[1][..])]);
 }
+
+/// A bridge of ROS 2 that knows no type, which has heard an event of `size` characters of ROS 1, and that event.
+fn heard_before_its_type(of: TopicId, size: usize, now: Now) -> (Router, Vec<u8>) {
+    let mut producer = router(1, Local::Ros1);
+    let text = Registry::bundle(Dialect::Ros1).get(&"std_msgs/String".parse().unwrap());
+    producer
+        .bind(of, &text.unwrap(), &Selection::Whole, now)
+        .unwrap();
+    let characters = vec![b'a'; size];
+    let mut message = u32::try_from(size).unwrap().to_le_bytes().to_vec();
+    message.extend_from_slice(&characters);
+    say(&mut producer, of, &message, false, now);
+    let mut consumer = router(2, Local::Cdr);
+    let mut at = now;
+    for _ in 0..20 {
+        let datagrams = sent(&mut producer, at);
+        assert_eq!(taken(&mut consumer, &datagrams, 1, at), []);
+        at = later(at, STEP / 10);
+    }
+    (consumer, characters)
+}
+
+/// What the bridge publishes once it knows that the topic is a std_msgs/String.
+fn typed(router: &mut Router, of: TopicId, now: Now) -> Vec<Delivery> {
+    let text = Registry::bundle(Dialect::Ros2).get(&"std_msgs/String".parse().unwrap());
+    router
+        .bind(of, &text.unwrap(), &Selection::Whole, now)
+        .unwrap();
+    taken(router, &[], 1, now)
+}
+
+#[test]
+fn an_event_of_any_size_waits_a_second_for_its_type_and_is_lost_after_it() {
+    let of = topic("ua_1_5_10");
+    for size in [10, 5_000, 60_000, 1_000_000] {
+        let now = start();
+        let (mut consumer, characters) = heard_before_its_type(of, size, now);
+        let published = typed(&mut consumer, of, later(now, SECOND / 2));
+        assert_eq!(published.len(), 1, "{size} bytes");
+        let has_all = published[0]
+            .payload
+            .windows(size)
+            .any(|of| of == characters);
+        assert!(has_all && !published[0].lasting, "{size} bytes");
+
+        let (mut consumer, _) = heard_before_its_type(of, size, now);
+        let late = later(now, SECOND * 3 / 2);
+        assert_eq!(taken(&mut consumer, &[], 1, late), []);
+        assert_eq!(typed(&mut consumer, of, late), [], "{size} bytes");
+        assert_eq!(dropped(&consumer, Reason::NotPublished), 1, "{size} bytes");
+    }
+}

@@ -17,7 +17,7 @@ use crate::hops::Hop;
 use crate::loop_rule::{Owned, Side, What, may_cross};
 use crate::output::{Delivery, Kept, Output};
 use crate::place::Place;
-use crate::reader::{Admitted, Handling, Held};
+use crate::reader::{Admitted, Handling};
 use crate::settings::{Local, Now};
 use crate::topic::{Item, Role, Topic};
 
@@ -371,16 +371,7 @@ impl Router {
         if asks {
             reader.asked = Some(now.monotonic);
         }
-        let fields = sample.fields.bytes();
-        let held = || Held {
-            fields: fields.to_vec(),
-            source: sample.source,
-            instance: sample.instance,
-            status: sample.status,
-            arrived: sample.arrived,
-            lasting: sample.lasting,
-        };
-        reader.held = (fields.len() <= MAX_HELD).then(|| Box::new(held()));
+        self.hold(topic, sample, now);
         if asks {
             self.tell_unbound(topic);
         }
@@ -581,9 +572,6 @@ const fn reason_of(error: &DecodeError) -> Reason {
     }
 }
 
-/// A sample that waits for its type is kept up to this size: whoever sends to the group can invent topics, and all of
-/// them together must not hold more than some megabytes. A larger value comes with its next repetition.
-const MAX_HELD: usize = 4_096;
 /// A value that lives beside others is held to be gone when it was not repeated for so many key frame periods: two
 /// lost datagrams are ridden out.
 const MISSED_ROUNDS: u32 = 3;

@@ -1,0 +1,122 @@
+//! Samples that wait for their local type: the newest of each topic.
+
+use std::time::Duration;
+
+use mappings::TopicId;
+use uadp::Fields;
+
+use super::receive::Sample;
+use super::{About, Router};
+use crate::counters::Reason;
+use crate::output::Kept;
+use crate::reader::Held;
+use crate::settings::Now;
+use crate::topic::{Role, Topic};
+
+impl Router {
+    /// Keeps a sample until its local type is known, in place of the one before.
+    pub(super) fn hold(&mut self, topic: TopicId, sample: &Sample<'_>, now: Now) {
+        let held = Box::new(Held {
+            fields: sample.fields.bytes().to_vec(),
+            source: sample.source,
+            instance: sample.instance,
+            status: sample.status,
+            lasting: sample.lasting,
+            until: now.monotonic + MAX_WAIT,
+        });
+        let large = held.is_large();
+        let size = held.fields.len();
+        if let Some(reader_held) = self.held_of(topic) {
+            *reader_held = Some(held);
+        }
+        if !large {
+            return;
+        }
+        if self.has_room(topic, size) {
+            self.schedule(topic);
+            return;
+        }
+        if let Some(reader_held) = self.held_of(topic) {
+            *reader_held = None;
+        }
+        let cause = (Reason::NoRoom, "before its local type");
+        self.count(About::topic(topic), cause, 1, || {
+            "other large samples that wait for their local types take up the room".to_owned()
+        });
+    }
+
+    /// Takes a place for a large sample among those that wait, if there is one.
+    fn has_room(&mut self, topic: TopicId, size: usize) -> bool {
+        let mut large = std::mem::take(&mut self.large_held);
+        let mut bytes = size;
+        large.retain(|other| {
+            let held = match self.held_of(*other) {
+                Some(Some(held)) if *other != topic && held.is_large() => held,
+                _ => return false,
+            };
+            bytes = bytes.saturating_add(held.fields.len());
+            true
+        });
+        let most = self.mapping.pubsub().max_message;
+        let fits = usize::try_from(most).is_ok_and(|most| bytes <= most);
+        let has_room = fits && large.len() < MAX_LARGE;
+        if has_room {
+            large.push(topic);
+        }
+        self.large_held = large;
+        has_room
+    }
+
+    fn held_of(&mut self, topic: TopicId) -> Option<&mut Option<Box<Held>>> {
+        match self.topics.get_mut(&topic) {
+            Some(Topic {
+                role: Role::Theirs(reader),
+                ..
+            }) => Some(&mut reader.held),
+            _ => None,
+        }
+    }
+
+    /// Removes a large sample whose type was not known in time. A state comes with its next repetition.
+    pub(super) fn expire_held(&mut self, topic: TopicId, now: Now) {
+        let over = |held: &mut Box<Held>| held.expires().is_some_and(|at| at <= now.monotonic);
+        let expired = self.held_of(topic).and_then(|held| held.take_if(over));
+        if let Some(held) = expired.filter(|held| !held.lasting) {
+            self.came_too_early(topic, &held);
+        }
+    }
+
+    /// Delivers a sample that waited for its local type; an event only while it is young.
+    pub(super) fn deliver_held(&mut self, topic: TopicId, held: &Held, now: Now) {
+        if !held.lasting && held.until <= now.monotonic {
+            self.came_too_early(topic, held);
+            return;
+        }
+        let Ok(fields) = Fields::parse(&held.fields) else {
+            return;
+        };
+        let sample = Sample {
+            fields,
+            source: held.source,
+            instance: held.instance,
+            kept: Kept::Alone,
+            lasting: held.lasting,
+            status: held.status,
+            // The wait is no delay of this program.
+            arrived: now.utc,
+        };
+        self.deliver(topic, &sample, now);
+    }
+
+    fn came_too_early(&mut self, topic: TopicId, held: &Held) {
+        self.forget(topic, held.instance);
+        self.count(About::topic(topic), Reason::NotPublished, 1, || {
+            "its local type was known too late for an event".to_owned()
+        });
+    }
+}
+
+/// How long an event may wait for its local type.
+const MAX_WAIT: Duration = Duration::from_secs(1);
+/// How many topics may have a large sample waiting. All of them together have no more bytes than the largest message.
+const MAX_LARGE: usize = 64;
