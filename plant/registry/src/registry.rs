@@ -501,8 +501,9 @@ impl Registry {
                 continue;
             };
             if server.asked.discovery_urls.iter().all(is_there) {
-                // What was never verified is not kept for its return.
-                self.leave(&uri, loss, ended || !(had_answered || certified));
+                // What was never verified is not kept for its return. A program that hangs accepts connections, so it exists.
+                let is_verified = had_answered || certified || loss == Loss::Hanging;
+                self.leave(&uri, loss, ended || !is_verified);
                 continue;
             }
             server.asked.discovery_urls.retain(|known| !is_there(known));

@@ -289,7 +289,7 @@ impl Watch {
         }
     }
 
-    /// Doubles the pause of a host and port with each failure, and ends it with an answer.
+    /// Doubles the pause of a host and port with each failure after the first ones, and ends it with an answer.
     fn pause(&mut self, place: &str, is_alive: bool, every: Duration, now: Instant) {
         let before = self.pauses.get(place).copied();
         if before.is_none() && self.pauses.len() >= MOST_PAUSES {
@@ -308,9 +308,9 @@ impl Watch {
             true => LONGEST_PAUSE_KNOWN,
             false => LONGEST_PAUSE,
         };
-        let until = match failures {
-            0 => now,
-            failures => now + every * (1 << (failures - 1).min(longest)),
+        let until = match failures.checked_sub(FAILURES_WITHOUT_PAUSE + 1) {
+            None => now,
+            Some(doubled) => now + every * (1 << doubled.min(longest)),
         };
         let pause = Pause {
             failures,
@@ -361,6 +361,9 @@ const LEAST_APART: Duration = Duration::from_millis(2);
 const BURST: Duration = Duration::from_millis(20);
 const UNTRIED: u32 = 10;
 const STARTING: u32 = 10;
+/// Failures in a row that cause no pause. The probes of a server that fails before it has answered are made in time to
+/// miss it as soon as one that has: silent after two, hanging after three of them.
+const FAILURES_WITHOUT_PAUSE: u32 = 2;
 /// The longest pause, as a power of two of the time between probes: 64 s.
 const LONGEST_PAUSE: u32 = 6;
 /// The longest pause of an endpoint that has answered before: 2 s.

@@ -253,3 +253,62 @@ fn a_url_that_no_server_is_at_cannot_be_registered() {
         assert!(registered.is_ok(), "{url}: {registered:?}");
     }
 }
+
+/// Lets the probes of an endpoint fail, each after a second, until an event of its loss. Returns that event and its time.
+fn lost(registry: &mut Registry, from: Instant, outcome: Outcome) -> (Event, Instant) {
+    let mut now = from;
+    while now < from + SECOND * 10 {
+        if let Some(probe) = registry.poll_probe(now) {
+            now += SECOND;
+            registry.probed(&probe.url, outcome, now);
+        }
+        let is_loss = |event: &Event| matches!(event, Event::Vanished { .. } | Event::Gone { .. });
+        if let Some(event) = std::iter::from_fn(|| registry.poll_event()).find(is_loss) {
+            return (event, now);
+        }
+        now += SECOND / 100;
+    }
+    panic!("no loss within 10 s");
+}
+
+#[test]
+fn a_server_that_fails_before_its_first_answer_is_missed_as_soon_as_any_other() {
+    for port in 4840..4940 {
+        let url = format!("opc.tcp://10.9.0.2:{port}/");
+        for (outcome, loss, most) in [
+            (Outcome::Silent, Loss::Unreachable, SECOND * 3),
+            (Outcome::Hanging, Loss::Hanging, SECOND * 4),
+        ] {
+            let (mut registry, now) = (Registry::new(SETTINGS()), Instant::now());
+            registry.announced(announcement("gripper", &url), now);
+            registry.answers_during_calls(&url);
+            registry.announced_start("gripper", 17);
+            let (event, at) = lost(&mut registry, now, outcome);
+            assert!(
+                matches!(&event, Event::Vanished { loss: told, .. } if *told == loss),
+                "{event:?}"
+            );
+            assert!(at - now < most, "{url}: {loss:?} after {:?}", at - now);
+        }
+    }
+}
+
+#[test]
+fn a_program_that_hangs_before_its_first_answer_is_registered_again_when_it_goes_on() {
+    let url = "opc.tcp://127.0.0.1:4841/";
+    for (outcome, is_kept) in [(Outcome::Hanging, true), (Outcome::Silent, false)] {
+        let (mut registry, now) = (Registry::new(SETTINGS()), Instant::now());
+        let gripper = Asked {
+            product_uri: "urn:ua-bridge:gripper".to_owned(),
+            ..asked("urn:gripper", url)
+        };
+        let registered = registry.register(gripper, &channel(None), None, now);
+        assert_eq!(registered, Ok(Registered::New));
+        registry.announced(announcement("gripper", url), now);
+        registry.announced_start("gripper", 17);
+        let (_, at) = lost(&mut registry, now, outcome);
+        assert_eq!(registry.find_servers(&[]).count(), 0);
+        registry.probed(url, ALIVE, at + SECOND);
+        assert_eq!(registry.find_servers(&[]).count(), usize::from(is_kept));
+    }
+}
