@@ -19,6 +19,7 @@ import opcua_session
 DATA = 0xF1
 DISCOVERY = 0x91
 ANNOUNCEMENT = 2 << 2
+DATA_SET_META_DATA = 2
 
 
 def plain(value):
@@ -35,7 +36,9 @@ def announcement(datagram):
     publisher, flags, token, nonce = struct.unpack_from("<HBIB", datagram, 3)
     assert (flags, token, nonce) == (0, 0, 0)
     kind, sequence, writer = struct.unpack_from("<BHH", datagram, 11)
-    assert kind == 2
+    if kind != DATA_SET_META_DATA:
+        # Programs announce their application, too.
+        return
     rest = Buffer(datagram[16:])
     meta = struct_from_binary(ua.DataSetMetaDataType, rest)
     status = struct.unpack("<I", rest.read(4))[0]
