@@ -349,7 +349,7 @@ impl Reader {
         let moved = self.from.is_some_and(|from| from != place.from);
         let again = place.stamp.is_some() && place.stamp == self.stamp;
         let restarted = moved
-            || (self.over && !again)
+            || (self.over && !again && !self.came_before(&place, handling))
             || matches!((place.stamp, self.stamp), (Some(new), Some(last)) if new > last);
         let first = self.sequence.is_none() || moved || self.over;
         let mut next = false;
@@ -434,6 +434,14 @@ impl Reader {
             self.withdrawn = Some(stamp);
         }
         Reason::Repeat
+    }
+
+    /// Whether a sample was handed on, as its stamp says. After the end of a writer that tells a datagram which the network
+    /// held back from the first one of a writer that starts over. A stored value of the latter is no event.
+    fn came_before(&self, place: &Place, handling: Handling) -> bool {
+        let is_known = |stamp| self.known.iter().any(|known| known.stamp == stamp);
+        let stored = place.is_stored() && handling != Handling::Event;
+        !stored && place.instance().is_some_and(is_known)
     }
 
     /// The value that the local side is to store no longer.
@@ -706,6 +714,26 @@ mod tests {
             Ok((0, Kept::Alone)),
             "another address tells of a restart"
         );
+    }
+
+    #[test]
+    fn a_datagram_that_comes_after_the_end_of_its_writer_is_handed_on_once() {
+        for handling in [Handling::Event, Handling::AsSource, Handling::Shown] {
+            let (mut reader, now) = reader();
+            let admit = |reader: &mut Reader, place: Place| {
+                let admitted = reader.admit(place, None, handling, now)?;
+                reader.delivered(place.instance(), (admitted.kept, admitted.lasting), now);
+                Ok(admitted.kept)
+            };
+            assert_eq!(admit(&mut reader, place(7, 1000)), Ok(Kept::Alone));
+            assert_eq!(admit(&mut reader, place(8, 2000)), Ok(Kept::Alone));
+            assert!(reader.leave());
+            // The network held both back.
+            assert_eq!(admit(&mut reader, place(7, 1000)), Err(Reason::Stale));
+            assert_eq!(admit(&mut reader, place(8, 2000)), Err(Reason::Repeat));
+            // The next writer starts over, with a clock that was set back.
+            assert_eq!(admit(&mut reader, place(0, 500)).err(), None);
+        }
     }
 
     #[test]

@@ -125,12 +125,52 @@ fn dropped(router: &Router, reason: Reason) -> u64 {
 struct Dice(u64);
 
 impl Dice {
-    fn loses_a_fifth(&mut self) -> bool {
+    fn below(&mut self, end: u64) -> u64 {
         self.0 = self
             .0
             .wrapping_mul(6_364_136_223_846_793_005)
             .wrapping_add(1);
-        (self.0 >> 33).is_multiple_of(5)
+        (self.0 >> 33) % end
+    }
+
+    fn loses_a_fifth(&mut self) -> bool {
+        self.below(5) == 0
+    }
+}
+
+/// A network that holds each datagram back for up to 150 ms, so that they overtake one another, and brings a fifth twice.
+struct Network {
+    dice: Dice,
+    under_way: Vec<(Instant, Vec<u8>)>,
+}
+
+impl Network {
+    const fn new(seed: u64) -> Self {
+        Self {
+            dice: Dice(seed),
+            under_way: Vec::new(),
+        }
+    }
+
+    /// Puts what was sent under way, with a delay for each datagram.
+    fn send(&mut self, datagrams: Vec<Vec<u8>>, now: Now) {
+        for datagram in datagrams {
+            for _ in 0..1 + u64::from(self.dice.loses_a_fifth()) {
+                let delay = Duration::from_millis(self.dice.below(150));
+                self.under_way
+                    .push((now.monotonic + delay, datagram.clone()));
+            }
+        }
+    }
+
+    /// Returns the datagrams whose delay is over, in the order of their arrival.
+    fn arrived(&mut self, now: Now) -> Vec<Vec<u8>> {
+        let (mut arrived, rest): (Vec<_>, Vec<_>) = std::mem::take(&mut self.under_way)
+            .into_iter()
+            .partition(|(at, _)| *at <= now.monotonic);
+        self.under_way = rest;
+        arrived.sort_by_key(|(at, _)| *at);
+        arrived.into_iter().map(|(_, datagram)| datagram).collect()
     }
 }
 
@@ -159,6 +199,59 @@ fn of_1000_stops_on_a_network_that_loses_a_fifth_at_most_18_are_lost_and_none_co
     assert_eq!(once, came, "none comes twice");
     assert!(came.is_sorted(), "none comes late");
     assert!((982..1000).contains(&came.len()), "{} came", came.len());
+}
+
+#[test]
+fn on_a_network_that_delays_and_reorders_no_event_and_no_command_comes_twice_or_after_a_newer_one()
+{
+    for (of, local) in [("ua_1_2_10", Local::Ros1), ("ua_0_2_10", Local::Fields)] {
+        let of = topic(of);
+        let mut now = start();
+        let (mut sender, mut reader) = match local {
+            Local::Fields => (router(0, local), bridge(1, of, now)),
+            Local::Ros1 | Local::Cdr => (bridge(1, of, now), bridge(2, of, now)),
+        };
+        let mut network = Network::new(34);
+        let mut dice = Dice(7);
+        let mut came = Vec::new();
+        let (bursts, each) = (100_u32, 20_u32);
+        for burst in 0..bursts {
+            // From 1 kHz to the rate at which each is sent three times.
+            let gap = [1, 5, 20, 35, 60, 120][usize::try_from(burst).unwrap() % 6];
+            for value in 0..each {
+                let value = burst * each + value;
+                let payload = match local {
+                    Local::Fields => field(value),
+                    Local::Ros1 | Local::Cdr => value.to_le_bytes().to_vec(),
+                };
+                say(&mut sender, of, &payload, false, now);
+                for _ in 0..gap {
+                    network.send(sent(&mut sender, now), now);
+                    came.extend(taken(&mut reader, &network.arrived(now), 1, now));
+                    now = later(now, Duration::from_millis(1));
+                }
+            }
+            // At times the last one is repeated for readers that show it, too, and at times the producer ends.
+            let ends = burst % 3 == 0;
+            if ends {
+                sender.set_live(of, false, now);
+            }
+            for _ in 0..200 + dice.below(2000) {
+                network.send(sent(&mut sender, now), now);
+                came.extend(taken(&mut reader, &network.arrived(now), 1, now));
+                now = later(now, Duration::from_millis(1));
+            }
+            if ends {
+                sender.set_live(of, true, now);
+            }
+        }
+        assert!(came.iter().all(|one| !one.lasting), "{of}");
+        let came: Vec<_> = came.iter().map(number).collect();
+        assert!(came.is_sorted_by(|a, b| a < b), "{of}: {came:?}");
+        let last: Vec<_> = (1..=bursts).map(|burst| burst * each - 1).collect();
+        let missing = last.iter().filter(|last| !came.contains(last)).count();
+        assert_eq!(missing, 0, "{of}: the last one of each burst arrives");
+    }
 }
 
 #[test]
