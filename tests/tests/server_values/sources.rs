@@ -199,7 +199,7 @@ fn a_server_of_node_opcua_is_heard_and_told_before_and_after_it_was_killed() {
         return;
     };
     let more = format!(
-        "  - {{node: ns=2;i=6, name: wish, type: Double, origin: 0, to: {{server: plc, node: 'nsu={URI};s=Line.Setpoint'}}}}\n"
+        "  - {{node: ns=2;i=6, name: wish, type: Double, origin: 0, queue: keep_latest, to: {{server: plc, node: 'nsu={URI};s=Line.Setpoint'}}}}\n"
     );
     let file = cell.file("plc.yaml", &mapping(&more));
     let mut plc = node_opcua_plc(&cell);
@@ -222,7 +222,7 @@ fn a_server_of_node_opcua_is_heard_and_told_before_and_after_it_was_killed() {
     becomes(&watch, speed, "BadNoCommunication", before);
     drop(plc);
     let mut plc = node_opcua_plc(&cell);
-    // The state of the cell is told anew.
+    // The mapping says that it is a state, which is written again.
     written(&mut plc, 21.5);
     plc.ask(r#"{"set": 2.5}"#, SOON);
     shows(&mut watch, speed, "Good", &json!(2.5));
