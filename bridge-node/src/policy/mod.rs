@@ -91,15 +91,8 @@ impl Policy {
         let mut gone = Vec::new();
         if self.room.wants_look(now) {
             let mut there = 0_usize;
-            let mut silent: Vec<(Instant, TopicId)> = strays(self)
-                .into_iter()
-                .inspect(|_| there += 1)
-                .filter_map(|(since, topic)| since.map(|since| (since, topic)))
-                .collect();
-            silent.sort_unstable();
-            silent.truncate(MOST_LET_GO);
-            self.room.looked(there - silent.len(), now);
-            gone = silent.into_iter().map(|(_, topic)| topic).collect();
+            gone = longest_silent(strays(self).into_iter().inspect(|_| there += 1));
+            self.room.looked(there - gone.len(), now);
         }
         Admission {
             admitted: self.room.take(),
@@ -124,6 +117,19 @@ impl Policy {
         }
         Some((name.clone(), selection?))
     }
+}
+
+/// Returns the strays that give way, longest silent first, at most [`MOST_LET_GO`]. A stray whose writer is heard does not.
+#[must_use]
+pub fn longest_silent(
+    strays: impl IntoIterator<Item = (Option<Instant>, TopicId)>,
+) -> Vec<TopicId> {
+    let silent = strays.into_iter();
+    let silent = silent.filter_map(|(since, topic)| since.map(|since| (since, topic)));
+    let mut silent: Vec<(Instant, TopicId)> = silent.collect();
+    silent.sort_unstable();
+    silent.truncate(MOST_LET_GO);
+    silent.into_iter().map(|(_, topic)| topic).collect()
 }
 
 /// Whether the type of a topic is another than the Router knows by now: what it wrote is still in the old one.

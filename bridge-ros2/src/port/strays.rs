@@ -1,8 +1,9 @@
 //! Values of other spaces that neither the mapping names nor a subscriber wants: they are written while there is room.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeSet, HashMap};
+use std::time::Instant;
 
-use bridge_node::policy::{Admission, Policy};
+use bridge_node::policy::{Admission, Policy, longest_silent};
 use bridge_node::{PortEvent, Reason, now};
 use mappings::TopicId;
 
@@ -20,6 +21,11 @@ impl Ros2Port {
         let sink = Sink::new(self.policy.destination(topic));
         let subscribed = is_subscribed(&sink, &self.graph);
         let is_stray = self.policy.is_stray(topic, subscribed);
+        if is_stray && !self.has_descriptors() {
+            let (sinks, graph) = (&self.sinks, &self.graph);
+            let silent = longest_silent(strays(&self.policy, sinks, graph));
+            self.let_go(silent);
+        }
         if is_stray && !self.has_descriptors() {
             self.tell_scarce();
             self.events.push_back(PortEvent::Dropped {
@@ -50,15 +56,15 @@ impl Ros2Port {
 
     fn take_place(&mut self) -> bool {
         let (sinks, graph) = (&self.sinks, &self.graph);
-        let strays = |policy: &Policy| {
-            let strays = sinks
-                .iter()
-                .filter(|(topic, sink)| policy.is_stray(**topic, is_subscribed(sink, graph)));
-            let strays = strays.map(|(topic, sink)| (sink.silent, *topic));
-            strays.collect::<Vec<_>>()
-        };
+        let strays = |policy: &Policy| strays(policy, sinks, graph);
         let now = now().monotonic;
         let Admission { admitted, gone } = self.policy.admit_stray(now, strays);
+        self.let_go(gone);
+        admitted
+    }
+
+    /// Ends the writers of strays that give way to others.
+    fn let_go(&mut self, gone: Vec<TopicId>) {
         let mut names = BTreeSet::new();
         for topic in gone {
             if let Some(sink) = self.sinks.remove(&topic) {
@@ -71,8 +77,22 @@ impl Ros2Port {
         }
         // Should they return, what is peculiar is told anew.
         self.policy.told.forget(&names);
-        admitted
     }
+}
+
+/// Returns the values that neither the mapping names nor a reader subscribes to, each with since when its writer is silent.
+fn strays(
+    policy: &Policy,
+    sinks: &HashMap<TopicId, Box<Sink>>,
+    graph: &Graph,
+) -> Vec<(Option<Instant>, TopicId)> {
+    let strays = sinks.iter();
+    let strays = strays.filter(|(topic, sink)| {
+        let subscribed = is_subscribed(sink, graph);
+        policy.is_stray(**topic, subscribed)
+    });
+    let strays = strays.map(|(topic, sink)| (sink.silent, *topic));
+    strays.collect()
 }
 
 fn is_subscribed(sink: &Sink, graph: &Graph) -> bool {

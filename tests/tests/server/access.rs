@@ -429,7 +429,7 @@ fn what_other_hosts_reach_is_secured_unless_the_mapping_says_otherwise() {
     let cable = cell.cable();
     cable.lay(HERE);
     let endpoint = format!("opc.tcp://{HERE}:4840");
-    for (text, policies) in [("", 3), ("server: {security: [None, Basic256Sha256]}", 2)] {
+    for (text, policies) in [("{}", 3), ("server: {security: [None, Basic256Sha256]}", 2)] {
         let file = cell.file("open.yaml", text);
         let mut server = cell.ua_server(&[path(&file), "--endpoint", &endpoint]);
         let offered = eventually("the endpoints are told", SOON, || {

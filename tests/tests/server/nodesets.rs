@@ -173,7 +173,7 @@ variables:
     // Of one that is none by its definition it is told, and it has no value.
     let told = server.wait_for_line("M170", SOON);
     assert!(
-        told.contains("the values of 1 nodes") && told.contains("ns=1;i=6002"),
+        told.contains("the value cannot be read") && told.contains("ns=1;i=6002"),
         "{told}"
     );
     assert_eq!(read(&cell, "ns=3;i=6002")["status"], "BadDecodingError");
