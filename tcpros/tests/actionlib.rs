@@ -243,7 +243,9 @@ async fn a_goal_with_an_id_of_the_caller_is_stamped_by_its_server() {
     let (mut server, client) = (serve(&robot), client(&cell, ActionClientOptions::default()));
     ready(&client).await;
     let mut ahead = client.send_goal(b"1").goal_id().stamp;
-    goal(&mut server).await.succeed(b"", "").unwrap();
+    let mut first = goal(&mut server).await;
+    first.accept("").unwrap();
+    first.succeed(b"", "").unwrap();
     ahead.secs += 1000;
     assert_eq!(client.cancel_before(ahead), 1);
     // Any stamp of this host is earlier than the last one the server has: the goal would be recalled.

@@ -53,9 +53,8 @@ struct Place {
 /// What the names of a place are of.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Names {
-    Components,
     Skills,
-    /// Both.
+    /// Of components and skills.
     Either,
     Calls,
     Topics,
@@ -137,7 +136,6 @@ impl Place {
         }
         let names = self.positional()?.get_value_names()?;
         match names.first()?.as_str() {
-            "COMPONENT" => Some(Names::Components),
             "SKILL" => Some(Names::Skills),
             "COMPONENT|SKILL" => Some(Names::Either),
             "TOPIC|NAME" if self.command.get_name() == "start" => Some(Names::Skills),
@@ -161,7 +159,6 @@ impl Names {
             topics,
         } = heard;
         match self {
-            Self::Components => components,
             Self::Skills => skills,
             Self::Either => {
                 skills.extend(components);
@@ -253,7 +250,7 @@ mod tests {
     #[test]
     fn names_are_of_what_the_word_is_to_be() {
         for (line, names) in [
-            (&["skills"][..], Some(Names::Components)),
+            (&["skills"][..], Some(Names::Either)),
             (&["skills", "info"], Some(Names::Skills)),
             (
                 &["skills", "--interface", "lo", "start"],

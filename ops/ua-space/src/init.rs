@@ -289,7 +289,7 @@ fn written(file: &str, places: &[String], plan: &mut Plan) -> Result<String, Fai
 const CALLS: [&str; 5] = [
     "",
     "# What one space executes and the others ask for: there each has its name in the space, as /ua_1_2_61, or the one that a",
-    "# binding of that space says, as `ros: [{service: /a, type: std_srvs/SetBool}, {space: 2, service: /b, type: std_srvs/SetBool}]`.",
+    "# binding of that space says, as `ros: [{service: /NAME, type: std_srvs/SetBool}, {space: 2, service: /OTHER, type: std_srvs/SetBool}]`.",
     "# An action takes five numbers. Requests of other hosts are executed with `open: true`.",
     "calls:",
 ];
@@ -421,7 +421,10 @@ fn settled(
         let Checked {
             mapping, findings, ..
         } = Mapping::from_text(&rendered.text, file, &Disk);
-        let here = findings.iter().filter(|finding| *finding.at.file == *file);
+        // An entry without an end of its movement runs, and has a comment that says how to end it.
+        let here = findings
+            .iter()
+            .filter(|finding| *finding.at.file == *file && finding.code != Code::EndlessMotion);
         let marked = here.filter(|finding| rendered.mark(finding, plan)).count();
         if marked > 0 {
             // The file has the comment already.

@@ -37,8 +37,8 @@ fn all_faults_of_all_files_are_told_and_end_with_78() {
     for wanted in [
         "error[M003]",
         "did you mean `origin`?",
-        "error[M006]",
         "error[M031]",
+        "2 errors",
         &format!("--> {faulty}:6:5"),
         &format!("{faulty} cannot run"),
         "minimal.yaml can run",
