@@ -243,7 +243,7 @@ async fn a_goal_with_an_id_of_the_caller_is_stamped_by_its_server() {
     let (mut server, client) = (serve(&robot), client(&cell, ActionClientOptions::default()));
     ready(&client).await;
     let mut ahead = client.send_goal(b"1").goal_id().stamp;
-    let mut first = goal(&mut server).await;
+    let first = goal(&mut server).await;
     first.accept("").unwrap();
     first.succeed(b"", "").unwrap();
     ahead.secs += 1000;
