@@ -7,7 +7,7 @@ use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::time::{Duration, Instant};
 
-/// The peers that are missing at one moment, each with the reason. Holds at most [`MOST_PEERS`]; further peers are
+/// The peers that are missing at one moment, each with the reason. Holds at most `MOST_PEERS`; further peers are
 /// counted.
 #[derive(Debug, Default)]
 pub struct AwaitedPeers {
