@@ -45,7 +45,7 @@ impl Router {
         });
     }
 
-    /// Takes a place for a large sample among those that wait, if there is one.
+    /// Reserves room for a large sample that waits for its type. Returns whether there was room.
     fn has_room(&mut self, topic: TopicId, size: usize) -> bool {
         let mut large = std::mem::take(&mut self.large_held);
         let mut bytes = size;

@@ -1,5 +1,5 @@
-//! The number of log lines that one place in a program writes. What peers send causes most messages of a program, so that a
-//! peer in a loop could fill a disk. A place that knows its cause limits by it with `LogLimit`; this is the bound for all.
+//! Limits the log lines that one callsite writes. Messages of peers cause most log lines, so a peer in a loop could
+//! fill a disk. A place that knows its cause limits by it with `LogLimit`; this is the bound for all.
 
 use std::cell::Cell;
 use std::collections::HashMap;

@@ -46,7 +46,7 @@ impl Supervision {
         }
         let supervisor = self.0.read();
         let is_supervisor = supervisor.as_ref().is_some_and(|supervisor| {
-            // Over channels without security nobody can prove who it is, neither here nor at the registration.
+            // Channels without security prove no identity, neither here nor at the registration.
             let may_claim = !supervisor.proven && !caller.encrypted;
             caller.application_uri == supervisor.application_uri && (caller.proven || may_claim)
         });

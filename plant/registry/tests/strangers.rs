@@ -111,7 +111,7 @@ fn forged_names_at_the_endpoint_of_a_live_server_displace_neither_it_nor_a_new_o
     for name in ["robot", "gripper", "further name"] {
         assert!(all.contains(&name.to_owned()), "{name} of {all:?}");
     }
-    // One endpoint is probed once, whatever its names, and its loss is seen as soon as before.
+    // An endpoint with many names is probed once, and its loss is reported in the same time.
     let probed = pass(&mut registry, (later, later + SECOND * 4), |_| ALIVE);
     let robot = probed.iter().filter(|url| *url == ROBOT).count();
     assert!((3..=6).contains(&robot), "{robot}");
