@@ -178,7 +178,7 @@ impl Cell {
 }
 
 impl Asking {
-    /// As the guide calls it.
+    /// Returns the name of the caller in the tables of `docs/calls.md`.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {

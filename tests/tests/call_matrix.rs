@@ -1,13 +1,13 @@
 //! Every kind of executor asked by every kind of asker, with requests and responses of every kind.
 //!
-//! The tables of the guide are those that these tests see.
+//! The tables of `docs/calls.md` hold the results of these tests.
 
 mod actions;
 
 use serde_json::{Value, json};
 use system_tests::{Asker, Asking, Cell, Child, Distribution, Peer, Started, program};
 
-/// A letter of the guide for each case, and its name there.
+/// The letter of each case in the table of the page, and its name.
 const CASES: [(char, &str); 5] = [
     ('B', "bundled"),
     ('F', "files"),
@@ -219,7 +219,7 @@ fn asked(askers: &mut [(Asking, Asker)], executing: &Executing, call: &Call) -> 
     told.collect()
 }
 
-/// The row of the guide for what was seen, a word for each who asks.
+/// Returns the row of the table for the observed results, with a word for each caller.
 fn row(askers: &mut [(Asking, Asker)], executing: &Executing) -> Vec<String> {
     let mut cells = vec![executing.name.to_owned()];
     cells.extend(askers.iter().map(|_| String::new()));
@@ -246,18 +246,18 @@ fn row(askers: &mut [(Asking, Asker)], executing: &Executing) -> Vec<String> {
     cells
 }
 
-/// The rows of the guide below those words.
-fn in_the_guide(head: &[String]) -> Vec<Vec<String>> {
+/// Returns the rows of the table of `docs/calls.md` with the given head.
+fn rows_of_page(head: &[String]) -> Vec<Vec<String>> {
     let cells = |line: &str| -> Vec<String> {
         let cells = line.trim().trim_matches('|').split('|');
         cells.map(|cell| cell.trim().to_owned()).collect()
     };
-    let guide = concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/guide.md");
-    let guide = std::fs::read_to_string(guide).unwrap();
-    let mut lines = guide.lines();
+    let page = concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/calls.md");
+    let page = std::fs::read_to_string(page).unwrap();
+    let mut lines = page.lines();
     lines
         .find(|line| line.starts_with('|') && cells(line) == head)
-        .unwrap_or_else(|| panic!("the guide has no table of {head:?}"));
+        .unwrap_or_else(|| panic!("docs/calls.md has no table with the head {head:?}"));
     let rows = lines.skip(1).take_while(|line| line.starts_with('|'));
     rows.map(cells).collect()
 }
@@ -320,7 +320,7 @@ fn all_who_execute_are_asked_by_all_who_ask() {
         .collect();
     assert_eq!(
         seen,
-        in_the_guide(&head),
+        rows_of_page(&head),
         "seen:\n| {} |\n{table}",
         head.join(" | ")
     );

@@ -328,7 +328,7 @@ async fn large_samples_of_others_survive_a_wire_that_loses() {
         loss: 0.01,
         delay: Duration::from_millis(20),
     });
-    // Else Linux keeps what it has of each datagram for 30 s, and soon has no room for new ones (docs/guide.md).
+    // Else Linux keeps what it has of each datagram for 30 s, and soon has no room for new ones (docs/ros2.md).
     std::fs::write("/proc/sys/net/ipv4/ipfrag_time", "3").unwrap();
     let domain = join(HERE);
     for fast in [true, false] {

@@ -5,7 +5,7 @@ use std::time::Duration;
 use serde_json::{Value, json};
 use system_tests::{Cell, Child, Distribution, Peer};
 
-use crate::call_matrix::{in_the_guide, mapping};
+use crate::call_matrix::{mapping, rows_of_page};
 
 /// rospy and rclpy need seconds to start on a busy machine.
 const SOON: Duration = Duration::from_secs(60);
@@ -189,7 +189,7 @@ fn servers(cell: &Cell) -> Vec<Serving> {
     ready.collect()
 }
 
-/// The row of the guide for what was seen.
+/// Returns the row of the table for the observed results.
 fn row(cell: &Cell, serving: &Serving) -> Vec<String> {
     let driven = SENDING.map(|sending| {
         let direct = serving.of_ros1 && !matches!(sending, Sending::Rclpy(_));
@@ -222,7 +222,7 @@ fn all_who_serve_actions_are_driven_by_all_who_send_goals() {
     let table: String = lines.collect();
     assert_eq!(
         seen,
-        in_the_guide(&head),
+        rows_of_page(&head),
         "seen:\n| {} |\n{table}",
         head.join(" | ")
     );

@@ -1,4 +1,4 @@
-//! The examples of the guide, run as they are printed there.
+//! Runs the examples of `docs/calls.md` as they are printed there.
 
 use std::time::Duration;
 
@@ -8,7 +8,7 @@ use system_tests::{Cell, Child, Distribution, Peer, Started, eventually, program
 const SOON: Duration = Duration::from_secs(60);
 const SECTION: &str = "### Three to paste\n";
 
-/// One example of the guide.
+/// An example of the page.
 #[derive(Default)]
 struct Example {
     /// Files by name.
@@ -64,10 +64,10 @@ impl Command {
 
 /// The example with that mapping.
 fn example(mapping: &str) -> Example {
-    let guide = concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/guide.md");
-    let guide = std::fs::read_to_string(guide).unwrap();
-    let (_, section) = guide.split_once(SECTION).expect("the section is there");
-    let (section, _) = section.split_once("\n## ").unwrap();
+    let page = concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/calls.md");
+    let page = std::fs::read_to_string(page).unwrap();
+    let (_, section) = page.split_once(SECTION).expect("the page has the section");
+    let (section, _) = section.split_once("\n## ").unwrap_or((section, ""));
     let mut example = Example::default();
     // Of what is between fences every second one is a block.
     for block in section.split("```").skip(1).step_by(2) {
@@ -88,7 +88,7 @@ fn example(mapping: &str) -> Example {
             }
         }
     }
-    panic!("the guide has no example with {mapping}");
+    panic!("docs/calls.md has no example with {mapping}");
 }
 
 /// Runs one with `others` in place of what the reader has, and with a roscore where it says so.
@@ -126,17 +126,17 @@ fn runs(example: &Example, others: impl FnOnce(&Cell) -> Option<Child>) {
 }
 
 #[test]
-fn a_client_of_ros_2_calls_a_service_of_ros_1_as_the_guide_prints_it() {
+fn a_client_of_ros_2_calls_a_service_of_ros_1_as_the_page_prints_it() {
     runs(&example("belt.yaml"), |_| None);
 }
 
 #[test]
-fn an_opc_ua_client_calls_a_service_of_ros_2_as_the_guide_prints_it() {
+fn an_opc_ua_client_calls_a_service_of_ros_2_as_the_page_prints_it() {
     runs(&example("lamp.yaml"), |_| None);
 }
 
 #[test]
-fn a_client_of_ros_1_drives_a_base_of_ros_2_as_the_guide_prints_it() {
+fn a_client_of_ros_1_drives_a_base_of_ros_2_as_the_page_prints_it() {
     runs(&example("base.yaml"), |cell| {
         Some(cell.cyclone("calls/ros2_navigate.py", &["/navigate_to_pose"]))
     });
