@@ -6,7 +6,7 @@ use system_tests::{Cell, Child, Distribution, Peer, Started, eventually, program
 
 /// rospy and rclpy need seconds to start on a busy machine.
 const SOON: Duration = Duration::from_secs(60);
-const SECTION: &str = "### Three to paste\n";
+const SECTION: &str = "### Three examples to paste\n";
 
 /// An example of the page.
 #[derive(Default)]
