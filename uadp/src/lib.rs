@@ -9,7 +9,6 @@
 //! | fields as Variants or DataValues, in key frames, delta frames and events | [`DataSetMessage::fields`], [`DataSetMessage::values`] |
 //! | fields as RawData, by their metadata | [`RawLayout`] |
 //! | writing into a buffer of the caller | [`NetworkMessageEncoder`] |
-//! | a message of fixed layout, patched in place | [`MessageTemplate`] |
 //! | chunks | [`Chunks`], [`Reassembler`] |
 //! | message security: PubSub-Aes128-CTR and PubSub-Aes256-CTR | [`Opener`], [`Sealer`] |
 //! | probes and announcements, DataSetMetaData | [`discovery`] |
@@ -93,7 +92,6 @@ mod security;
 mod sequence;
 mod state;
 mod structure;
-mod template;
 mod time;
 mod variant;
 mod writer;
@@ -135,7 +133,6 @@ pub use security::{
 pub use sequence::{SequenceCounter, SequenceOrder};
 pub use state::{PubSubState, StateEvent, StateMachine, StateRefused};
 pub use structure::StructureReader;
-pub use template::{Fixed, MessagePatch, MessageTemplate, PatchError};
 pub use time::{DateTime, Timestamp};
 pub use variant::{Array, Elements, Matrix, Variant};
 pub use writer_state::{DataSetWriterState, WriterSettings, WriterSettingsError};

@@ -157,45 +157,6 @@ impl<'a> Scalar<'a> {
         })
     }
 
-    /// The encoding of a value of fixed size, in the first so many bytes; `None` where the size varies.
-    #[inline]
-    pub(crate) fn fixed_bytes(&self) -> Option<([u8; 16], usize)> {
-        let wide = |value: u64, size| {
-            let mut bytes = [0; 16];
-            if let Some(place) = bytes.first_chunk_mut() {
-                *place = value.to_le_bytes();
-            }
-            Some((bytes, size))
-        };
-        match *self {
-            Self::Boolean(v) => wide(u64::from(v), 1),
-            Self::SByte(v) => wide(u64::from(v.cast_unsigned()), 1),
-            Self::Byte(v) => wide(u64::from(v), 1),
-            Self::Int16(v) => wide(u64::from(v.cast_unsigned()), 2),
-            Self::UInt16(v) => wide(u64::from(v), 2),
-            Self::Int32(v) => wide(u64::from(v.cast_unsigned()), 4),
-            Self::UInt32(v) => wide(u64::from(v), 4),
-            Self::Float(v) => wide(u64::from(v.to_bits()), 4),
-            Self::StatusCode(v) => wide(u64::from(v.0), 4),
-            Self::Int64(v) => wide(v.cast_unsigned(), 8),
-            Self::UInt64(v) => wide(v, 8),
-            Self::Double(v) => wide(v.to_bits(), 8),
-            Self::DateTime(v) => wide(v.0.cast_unsigned(), 8),
-            Self::Guid(v) => Some((v.0, 16)),
-            Self::String(_)
-            | Self::ByteString(_)
-            | Self::XmlElement(_)
-            | Self::NodeId(_)
-            | Self::ExpandedNodeId(_)
-            | Self::QualifiedName(_)
-            | Self::LocalizedText(_)
-            | Self::ExtensionObject(_)
-            | Self::DataValue(_)
-            | Self::Variant(_)
-            | Self::DiagnosticInfo(_) => None,
-        }
-    }
-
     /// Moves behind `count` values and checks them on the way.
     pub(crate) fn skip(
         builtin: BuiltinType,

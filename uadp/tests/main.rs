@@ -26,6 +26,5 @@ mod raw_properties;
 mod reading;
 mod security;
 mod state;
-mod template;
 mod vectors;
 mod writing;

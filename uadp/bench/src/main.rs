@@ -74,15 +74,6 @@ fn cases() -> Vec<Case> {
                 black_box(ours::decode(black_box(&datagram)));
             }
         }));
-        if payload != Payload::Bytes {
-            let mut template = ours::template(payload);
-            cases.push(case("patch", name, move |messages| {
-                for number in 0..messages {
-                    ours::patch(payload, number as u16, &mut template);
-                    black_box(template.bytes());
-                }
-            }));
-        }
     }
     cases
 }

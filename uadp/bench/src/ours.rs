@@ -3,8 +3,8 @@
 use std::hint::black_box;
 
 use uadp::{
-    DataSetHeader, DateTime, GroupHeader, MessageTemplate, NetworkHeader, NetworkMessage,
-    NetworkMessageEncoder, PublisherId, Scalar, Variant,
+    DataSetHeader, DateTime, GroupHeader, NetworkHeader, NetworkMessage, NetworkMessageEncoder,
+    PublisherId, Scalar, Variant,
 };
 
 /// What a message holds.
@@ -112,30 +112,4 @@ pub(crate) fn decode(datagram: &[u8]) -> u64 {
         }
     }
     seen
-}
-
-/// A template of the payload, for [`patch`].
-pub(crate) fn template(payload: Payload) -> MessageTemplate {
-    let mut datagram = Vec::new();
-    encode(payload, 0, &Config::new(), &mut datagram);
-    MessageTemplate::new(datagram).unwrap()
-}
-
-/// Replaces the sequence number, the time and all fields.
-#[inline(never)]
-pub(crate) fn patch(payload: Payload, number: u16, template: &mut MessageTemplate) {
-    let mut message = template.message(0).unwrap();
-    message.sequence_number(number).unwrap();
-    message
-        .timestamp(DateTime(134_234_948_967_890_123))
-        .unwrap();
-    match payload {
-        Payload::Double => message.field(0, Scalar::Double(f64::from(number))).unwrap(),
-        Payload::Ints => {
-            let base = i32::from(number);
-            let values: [i32; 20] = std::array::from_fn(|index| base + index as i32);
-            message.fields(0, &values).unwrap();
-        }
-        Payload::Bytes => {}
-    }
 }
