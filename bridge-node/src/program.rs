@@ -1,6 +1,7 @@
 //! From the command line to the run loop and back: what every program's `main` does.
 
 use std::collections::BTreeMap;
+use std::ffi::OsString;
 use std::fs::File;
 use std::io::Read;
 use std::net::SocketAddr;
@@ -133,10 +134,11 @@ pub struct Context {
     pub own: SpaceId,
 }
 
-/// Runs a program from its command line to its end.
+/// Runs a program from its command line to its end. `arguments` begin with the name of the program, as those of
+/// [`std::env::args_os`] do.
 #[must_use]
-pub fn run<P: Program>() -> ExitCode {
-    let program: P = match service::parse() {
+pub fn run<P: Program>(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
+    let program: P = match service::parse(arguments) {
         Ok(program) => program,
         Err(code) => return code,
     };

@@ -1,5 +1,6 @@
 //! A program of the plant that carries no space: from its command line to its end, without a mapping and a run loop.
 
+use std::ffi::OsString;
 use std::process::ExitCode;
 
 use clap::Parser;
@@ -28,10 +29,11 @@ pub trait Service: Parser {
     ) -> impl Future<Output = Result<(), Failure>>;
 }
 
-/// Runs a program from its command line to its end, on one thread.
+/// Runs a program from its command line to its end, on one thread. `arguments` begin with the name of the program, as
+/// those of [`std::env::args_os`] do.
 #[must_use]
-pub fn run_service<S: Service>() -> ExitCode {
-    let service: S = match parse() {
+pub fn run_service<S: Service>(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
+    let service: S = match parse(arguments) {
         Ok(service) => service,
         Err(code) => return code,
     };
@@ -57,8 +59,10 @@ fn serve<S: Service>(service: S) -> Result<(), Failure> {
 }
 
 /// The command line; or how to end where it asks for help or cannot be read.
-pub(crate) fn parse<P: Parser>() -> Result<P, ExitCode> {
-    P::try_parse().map_err(|usage| {
+pub(crate) fn parse<P: Parser>(
+    arguments: impl IntoIterator<Item = OsString>,
+) -> Result<P, ExitCode> {
+    P::try_parse_from(arguments).map_err(|usage| {
         // Nobody is left to tell when stdout or stderr is closed.
         let _printed = usage.print();
         let asked = [ErrorKind::DisplayHelp, ErrorKind::DisplayVersion];

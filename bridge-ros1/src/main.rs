@@ -1,5 +1,6 @@
 //! `bridge-ros1`: carries topics between a ROS 1 graph and the space.
 
+use std::ffi::OsString;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -15,7 +16,7 @@ use tcpros::{ArgumentError, NodeError, NodeOptions};
 use tracing::warn;
 
 fn main() -> ExitCode {
-    bridge_node::run::<BridgeRos1>()
+    bridge_node::run::<BridgeRos1>(std::env::args_os())
 }
 
 /// The command line: what clap reads, and the words that ROS gives a meaning to.
@@ -42,16 +43,24 @@ struct Flags {
 }
 
 impl Parser for BridgeRos1 {
-    fn try_parse() -> Result<Self, clap::Error> {
-        Self::of(std::env::args().collect())
+    fn try_parse_from<I, T>(arguments: I) -> Result<Self, clap::Error>
+    where
+        I: IntoIterator<Item = T>,
+        T: Into<OsString> + Clone,
+    {
+        Self::of(arguments.into_iter().map(Into::into))
     }
 }
 
 impl BridgeRos1 {
-    fn of(arguments: Vec<String>) -> Result<Self, clap::Error> {
-        let (words, rest): (Vec<_>, Vec<_>) = arguments
-            .into_iter()
-            .partition(|argument| argument.contains(":="));
+    fn of(arguments: impl Iterator<Item = OsString>) -> Result<Self, clap::Error> {
+        let (mut words, mut rest) = (Vec::new(), Vec::new());
+        for argument in arguments {
+            match argument.to_str().filter(|text| text.contains(":=")) {
+                Some(word) => words.push(word.to_owned()),
+                None => rest.push(argument),
+            }
+        }
         Ok(Self {
             flags: Flags::try_parse_from(rest)?,
             words,
@@ -153,7 +162,7 @@ mod tests {
 
     fn parsed(arguments: &[&str]) -> BridgeRos1 {
         let all = std::iter::once(&"bridge-ros1").chain(arguments);
-        BridgeRos1::of(all.map(|word| (*word).to_owned()).collect()).unwrap()
+        BridgeRos1::of(all.map(OsString::from)).unwrap()
     }
 
     #[test]

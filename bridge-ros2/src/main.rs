@@ -22,7 +22,7 @@ use tracing::{info, warn};
 use transport::{Interface, InterfaceError};
 
 fn main() -> ExitCode {
-    bridge_node::run::<BridgeRos2>()
+    bridge_node::run::<BridgeRos2>(std::env::args_os())
 }
 
 /// Carries topics between a ROS 2 domain and the space of OPC UA PubSub.

@@ -1,7 +1,7 @@
 //! The programs under test, found and started as users start them.
 
 use std::{
-    env,
+    env, fs,
     path::{Path, PathBuf},
     time::Duration,
 };
@@ -144,7 +144,7 @@ pub fn drops(status: &Value) -> u64 {
 /// The path of a program of this workspace.
 ///
 /// # Panics
-/// When it has not been built.
+/// When the program has not been built, or a program with the name of a link to `ua-bridge` is left from another build.
 #[must_use]
 pub fn program(name: &str) -> PathBuf {
     let given = env::var_os("UA_BIN_DIR").map(PathBuf::from);
@@ -152,13 +152,20 @@ pub fn program(name: &str) -> PathBuf {
         .ok()
         .and_then(|test| Some(test.parent()?.parent()?.to_path_buf()));
     let folders: Vec<PathBuf> = given.into_iter().chain(beside).collect();
-    folders
+    let path = folders
         .iter()
         .map(|folder| folder.join(name))
         .find(|path| Path::is_file(path))
         .unwrap_or_else(|| {
             panic!("{name} has not been built (looked in {folders:?}): run `cargo xtask test`, which builds it first")
-        })
+        });
+    let is_link = fs::read_link(&path).is_ok_and(|target| target == Path::new("ua-bridge"));
+    assert!(
+        is_link || !name.starts_with("ua-"),
+        "{} is no link to ua-bridge: run `cargo xtask build`, which makes the links",
+        path.display()
+    );
+    path
 }
 
 #[cfg(test)]

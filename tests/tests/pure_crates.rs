@@ -279,9 +279,28 @@ fn the_check_sees_what_a_shell_reaches() {
     assert!(forbidden(&tree("bridge-node"), IMPURE).contains(&"tokio".to_owned()));
 }
 
+/// The programs that `ua-bridge` acts as, and the programs each of them may use.
+const NAMES_OF_UA_BRIDGE: [(&str, &[&str]); 6] = [
+    ("ua-component", &[]),
+    ("ua-gds", &[]),
+    ("ua-mes", &["ua-component"]),
+    ("ua-server", &["ua-component"]),
+    ("ua-space", &[]),
+    ("ua-station", &[]),
+];
+
 #[test]
-fn nobody_depends_on_the_tools_of_ops() {
-    for program in ["bridge-ros1", "bridge-ros2", "ua-server"] {
-        does_not_reach(program, &["ua-space"]);
+fn only_ua_bridge_depends_on_the_programs_that_it_acts_as() {
+    let all = NAMES_OF_UA_BRIDGE.map(|(name, _)| name);
+    for package in ["bridge-ros1", "bridge-ros2", "demo"] {
+        does_not_reach(package, &all);
+        does_not_reach(package, &["ua-bridge"]);
     }
+    for (package, used) in NAMES_OF_UA_BRIDGE {
+        let is_banned = |name: &&str| *name != package && !used.contains(name);
+        let banned: Vec<&str> = all.into_iter().filter(is_banned).collect();
+        does_not_reach(package, &banned);
+    }
+    let found = forbidden(&tree("ua-bridge"), &all);
+    assert_eq!(found, all, "ua-bridge links them all");
 }

@@ -9,7 +9,7 @@ use std::{
 use anyhow::{Context as _, ensure};
 
 use crate::{
-    instructions,
+    instructions, links,
     namespace::{Namespaces, REFUSED},
     patches::Patched,
     peers,
@@ -31,7 +31,7 @@ pub(crate) fn ros1(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<
 
 /// Measures relays of DDS samples beside a UDP echo, and both bridges between ROS 1 and ROS 2, all in one run.
 pub(crate) fn ros2(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
-    let packages = ["bridge-ros1", "bridge-ros2", "ua-space", "system-tests"];
+    let packages = ["bridge-ros1", "bridge-ros2", links::TARGET, "system-tests"];
     measured(workspace, "bench-ros2", &packages, arguments)
 }
 
@@ -40,7 +40,7 @@ pub(crate) fn opcua(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result
     measured(
         workspace,
         "bench-opcua",
-        &["ua-server", "system-tests"],
+        &[links::TARGET, "system-tests"],
         arguments,
     )
 }
@@ -50,7 +50,7 @@ pub(crate) fn skills(workspace: &Workspace, arguments: &[&str]) -> anyhow::Resul
     measured(
         workspace,
         "bench-skills",
-        &["discovery", "ua-component", "ua-station", "system-tests"],
+        &[links::TARGET, "system-tests"],
         arguments,
     )
 }
@@ -113,6 +113,9 @@ fn measured(
     }
     must(&mut build)?;
     let programs = workspace.target.join(SHIPPED);
+    if packages.contains(&links::TARGET) {
+        links::make(&programs)?;
+    }
     let program = programs.join(bench);
     ensure!(
         program.is_file(),

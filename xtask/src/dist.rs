@@ -5,33 +5,25 @@ use std::fs;
 use anyhow::Context as _;
 
 use crate::{
+    links,
     patches::Patched,
     shell::{Ended, run as must, step},
     workspace::{SHIPPED, Workspace},
 };
 
-/// Packages, and the program of each that is handed out.
-const PROGRAMS: [(&str, &str); 9] = [
-    ("bridge-ros1", "bridge-ros1"),
-    ("bridge-ros2", "bridge-ros2"),
-    ("discovery", "ua-lds"),
-    ("ua-component", "ua-component"),
-    ("ua-gds", "ua-gds"),
-    ("ua-mes", "ua-mes"),
-    ("ua-server", "ua-server"),
-    ("ua-space", "ua-space"),
-    ("ua-station", "ua-station"),
-];
+/// The programs that are handed out, which are called as their packages. All others are links to the last.
+const PROGRAMS: [&str; 3] = ["bridge-ros1", "bridge-ros2", links::TARGET];
 
 /// Builds the programs without optimisation into `target/debug`.
 pub(crate) fn build(workspace: &Workspace) -> anyhow::Result<Ended> {
     let patched = Patched::prepare(workspace)?;
     step("building the programs (some minutes the first time)");
     let mut build = patched.cargo(workspace, &["build", "--locked", "--bins"]);
-    for (package, _) in PROGRAMS {
+    for package in PROGRAMS {
         build.args(["--package", package]);
     }
     must(&mut build)?;
+    links::make(&workspace.target.join("debug"))?;
     Ok(Ended::WELL)
 }
 
@@ -43,17 +35,21 @@ pub(crate) fn run(workspace: &Workspace) -> anyhow::Result<Ended> {
         workspace,
         &["build", "--profile", SHIPPED, "--locked", "--bins"],
     );
-    for (package, _) in PROGRAMS {
+    for package in PROGRAMS {
         build.args(["--package", package]);
     }
     must(&mut build)?;
     let folder = workspace.target.join("dist");
     fs::create_dir_all(&folder).with_context(|| folder.display().to_string())?;
-    for (_, program) in PROGRAMS {
+    for program in PROGRAMS {
         let target = folder.join(program);
         fs::copy(workspace.target.join(SHIPPED).join(program), &target)
             .with_context(|| target.display().to_string())?;
         println!("{}", target.display());
+    }
+    links::make(&folder)?;
+    for link in links::paths(&folder) {
+        println!("{} -> {}", link.display(), links::TARGET);
     }
     Ok(Ended::WELL)
 }

@@ -9,6 +9,7 @@ mod bench;
 mod demo;
 mod dist;
 mod instructions;
+mod links;
 mod lint;
 mod namespace;
 mod patches;
@@ -29,8 +30,8 @@ cargo xtask <verb>
   peers [--build]                only install the peers; of those only what the programs are built with
   lint [--dependencies]          formatting, clippy, documentation; or licences, sources and advisories of dependencies, and the
                                  workspace with all crates as published
-  build                          build the programs without optimisation into target/debug
-  dist                           build the programs that are handed out, with optimisation, into target/dist
+  build                          build the programs without optimisation into target/debug, with the links of ua-bridge
+  dist                           build the programs that are handed out, with optimisation, into target/dist, with the links
   patches [--test]               only patch the crates of patches/, which all verbs build with, and print the flags to do so by hand;
                                  or run the tests that the patches add, which `test` leaves out
   bench hop [ARGS]               measure one hop beside the floor and roscpp's relay

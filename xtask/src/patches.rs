@@ -29,8 +29,8 @@ pub(crate) struct Patched {
 }
 
 impl Patched {
-    /// Brings the patched sources up to date. One is written only when a patch or the version changed: cargo looks at the
-    /// times of its files.
+    /// Brings the patched sources up to date. A file is written only when its contents change: cargo looks at the times of
+    /// files.
     ///
     /// # Errors
     /// When there are patches for what is not locked, one of them does not apply, or a folder cannot be written.
@@ -120,10 +120,13 @@ impl Source {
             source.name,
             folder.display()
         ));
+        let new = patched.join(format!("{}.new", source.name));
         remove(&stamp)?;
-        remove(folder)?;
-        copy(&published.folder, folder)?;
-        patches.apply(folder)?;
+        remove(&new)?;
+        copy(&published.folder, &new)?;
+        patches.apply(&new)?;
+        renew(&new, folder)?;
+        remove(&new)?;
         fs::write(&stamp, made_of).with_context(|| stamp.display().to_string())?;
         Ok(source)
     }
@@ -356,9 +359,69 @@ fn copy(from: &Path, to: &Path) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// Gives `old` the contents of `new`. Files that are the same keep their times.
+fn renew(new: &Path, old: &Path) -> anyhow::Result<()> {
+    fs::create_dir_all(old).with_context(|| old.display().to_string())?;
+    for entry in fs::read_dir(old).with_context(|| old.display().to_string())? {
+        let entry = entry?;
+        let same = fs::symlink_metadata(new.join(entry.file_name()));
+        if !same.is_ok_and(|same| same.is_dir() == entry.path().is_dir()) {
+            remove(&entry.path())?;
+        }
+    }
+    for entry in fs::read_dir(new).with_context(|| new.display().to_string())? {
+        let (new, old) = {
+            let entry = entry?;
+            (entry.path(), old.join(entry.file_name()))
+        };
+        if new.is_dir() {
+            renew(&new, &old)?;
+            continue;
+        }
+        let contents = fs::read(&new).with_context(|| new.display().to_string())?;
+        if !fs::read(&old).is_ok_and(|known| known == contents) {
+            fs::write(&old, contents).with_context(|| old.display().to_string())?;
+        }
+    }
+    Ok(())
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn files_with_the_same_contents_keep_their_times() {
+        let folder = env::temp_dir().join(format!("xtask-patches-{}", std::process::id()));
+        let (new, old) = (folder.join("new"), folder.join("old"));
+        for (file, text) in [
+            ("new/src/same.rs", "same"),
+            ("new/src/other.rs", "new"),
+            ("new/src/added.rs", "added"),
+            ("old/src/same.rs", "same"),
+            ("old/src/other.rs", "old"),
+            ("old/src/gone.rs", "gone"),
+            ("old/gone/file.rs", "gone"),
+        ] {
+            let file = folder.join(file);
+            fs::create_dir_all(file.parent().unwrap()).unwrap();
+            fs::write(file, text).unwrap();
+        }
+        let same = old.join("src/same.rs");
+        let before = std::time::SystemTime::UNIX_EPOCH;
+        let file = fs::File::options().write(true).open(&same).unwrap();
+        file.set_modified(before).unwrap();
+        renew(&new, &old).unwrap();
+        let modified = fs::metadata(&same).unwrap().modified().unwrap();
+        assert_eq!(modified, before);
+        let text = |name: &str| fs::read_to_string(old.join("src").join(name)).unwrap();
+        assert_eq!(
+            (text("other.rs"), text("added.rs")),
+            ("new".to_owned(), "added".to_owned())
+        );
+        assert!(!old.join("src/gone.rs").exists() && !old.join("gone").exists());
+        fs::remove_dir_all(&folder).unwrap();
+    }
 
     #[test]
     fn the_tests_that_patches_add_are_found() {

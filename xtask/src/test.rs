@@ -18,6 +18,7 @@ use std::{
 use anyhow::Context as _;
 
 use crate::{
+    links,
     namespace::{Namespaces, REFUSED},
     patches::{Patched, Source},
     peers,
@@ -56,6 +57,7 @@ pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<E
     let built = ["--bins", "--tests", "--examples"];
     let build = patched.cargo(workspace, &[&["build"][..], TARGETS, &built].concat());
     let programs = programs::build(build)?;
+    links::make(&workspace.target.join("debug"))?;
 
     let skipped = workspace.target.join("skipped-tests.txt");
     remove(&skipped)?;

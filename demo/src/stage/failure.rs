@@ -10,8 +10,8 @@ use thiserror::Error;
 #[derive(Debug, Error)]
 pub(crate) enum Failure {
     #[error(
-        "these programs are missing beside the demo: {}; `cargo build --workspace --bins` makes \
-         them", list(.0)
+        "these programs are missing beside the demo: {}; `cargo xtask demo` builds them and runs \
+         the demo", list(.0)
     )]
     Missing(Vec<PathBuf>),
     #[error(

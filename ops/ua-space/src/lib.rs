@@ -38,6 +38,7 @@ mod structures;
 mod survey;
 mod values;
 
+use std::ffi::OsString;
 use std::process::ExitCode;
 
 use clap::Parser as _;
@@ -46,8 +47,10 @@ use clap::error::ErrorKind;
 use arguments::{Arguments, Verb};
 use exit::Failure;
 
-fn main() -> ExitCode {
-    let arguments = match Arguments::try_parse() {
+/// Runs `ua-space` from its command line to its end. `arguments` begin with the name of the program.
+#[must_use]
+pub fn run(arguments: Vec<OsString>) -> ExitCode {
+    let arguments = match Arguments::try_parse_from(arguments) {
         Ok(arguments) => arguments,
         Err(usage) => {
             // Nobody is left to tell when stdout or stderr is closed.

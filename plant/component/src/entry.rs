@@ -1,7 +1,6 @@
-//! A component of the cell, by its own YAML.
+//! The program `ua-component`: a component of the cell, by its own YAML.
 
-mod simulate;
-
+use std::ffi::OsString;
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -12,7 +11,8 @@ use bridge_node::{
 };
 use mappings::{Mapping, SpaceId};
 use skills::{Component, Lds, Security};
-use ua_component::{ComponentPort, Options, made};
+
+use crate::{ComponentPort, Options, made, simulate};
 
 /// A component of the cell: an OPC UA server with skills, which are values and calls of the space too.
 #[derive(Debug, clap::Parser)]
@@ -71,15 +71,13 @@ struct Read {
     text: String,
 }
 
-fn main() -> ExitCode {
-    let mut arguments = std::env::args_os().skip(1).peekable();
-    if arguments
-        .peek()
-        .is_some_and(|first| first == simulate::VERB)
-    {
-        return simulate::run(arguments);
+/// Runs `ua-component` from its command line to its end. `arguments` begin with the name of the program.
+#[must_use]
+pub fn run(arguments: Vec<OsString>) -> ExitCode {
+    match arguments.get(1) {
+        Some(first) if first == simulate::VERB => simulate::run(arguments.into_iter().skip(1)),
+        _ => bridge_node::run::<UaComponent>(arguments),
     }
-    bridge_node::run::<UaComponent>()
 }
 
 impl UaComponent {
@@ -100,7 +98,7 @@ impl UaComponent {
         let mut component =
             Component::from_yaml_with(&text, folder, &devices::Kinds).map_err(|findings| {
                 let count = findings.len();
-                ua_component::print(&findings.render(&file, &text));
+                crate::print(&findings.render(&file, &text));
                 Failure::new(
                     FailureKind::Configuration,
                     format!("{file}: {count} errors"),
@@ -163,7 +161,7 @@ impl Program for UaComponent {
         }
         let read = self.read()?;
         if self.check {
-            ua_component::check(&read.component, &self.options(read))?;
+            crate::check(&read.component, &self.options(read))?;
             return Ok(Some(Made::Checked));
         }
         Ok(Some(Made::Run(made(&read.component))))

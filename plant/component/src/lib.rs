@@ -7,12 +7,16 @@
 
 mod asking;
 pub mod definition;
+#[cfg(feature = "devices")]
+pub mod entry;
 mod executor;
 mod fields;
 mod goals;
 mod mirrors;
 mod partners;
 mod port;
+#[cfg(feature = "devices")]
+mod simulate;
 mod space;
 mod work;
 

@@ -135,7 +135,7 @@ pub(crate) fn run(arguments: impl Iterator<Item = std::ffi::OsString>) -> ExitCo
     match runtime.and_then(|runtime| runtime.block_on(simulated(simulate.device))) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            ua_component::print(&format!("error: {error}\n"));
+            crate::print(&format!("error: {error}\n"));
             ExitCode::from(UNAVAILABLE)
         }
     }

@@ -105,7 +105,7 @@ impl Presence {
 }
 
 fn main() -> ExitCode {
-    run_service::<Who>()
+    run_service::<Who>(std::env::args_os())
 }
 
 impl Service for Who {

@@ -29,6 +29,7 @@ mod presence;
 pub mod scan;
 mod security;
 mod services;
+pub mod ua_lds;
 mod url;
 mod watch;
 mod wire;

@@ -1,14 +1,16 @@
-//! The Local Discovery Server of a host: the program around [`discovery::lds`].
+//! The Local Discovery Server of a host: the program `ua-lds` around [`lds`](crate::lds).
 
+use std::ffi::OsString;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Duration;
 
 use bridge_node::{Failure, LogFormat, Service, run_service, serve_pages};
-use discovery::lds::{self, LdsSettings};
-use discovery::scan::Range;
-use discovery::{DEFAULT_LDS, Interface};
+
+use crate::lds::{self, LdsSettings};
+use crate::scan::Range;
+use crate::{DEFAULT_LDS, Interface};
 
 /// Tells who is there: a Local Discovery Server with multicast extension.
 ///
@@ -64,8 +66,10 @@ struct UaLds {
     log: LogFormat,
 }
 
-fn main() -> ExitCode {
-    run_service::<UaLds>()
+/// Runs `ua-lds` from its command line to its end. `arguments` begin with the name of the program.
+#[must_use]
+pub fn run(arguments: Vec<OsString>) -> ExitCode {
+    run_service::<UaLds>(arguments)
 }
 
 impl Service for UaLds {

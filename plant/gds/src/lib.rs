@@ -12,6 +12,7 @@ mod serve;
 mod service;
 mod store;
 
+use std::ffi::OsString;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Duration;
@@ -93,8 +94,10 @@ impl Folders {
     }
 }
 
-fn main() -> ExitCode {
-    run_service::<UaGds>()
+/// Runs `ua-gds` from its command line to its end. `arguments` begin with the name of the program.
+#[must_use]
+pub fn run(arguments: Vec<OsString>) -> ExitCode {
+    run_service::<UaGds>(arguments)
 }
 
 impl Service for UaGds {

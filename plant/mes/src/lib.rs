@@ -15,6 +15,7 @@ mod process;
 mod record;
 mod settings;
 
+use std::ffi::OsString;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -102,8 +103,10 @@ impl std::fmt::Debug for Ready {
     }
 }
 
-fn main() -> ExitCode {
-    bridge_node::run::<UaMes>()
+/// Runs `ua-mes` from its command line to its end. `arguments` begin with the name of the program.
+#[must_use]
+pub fn run(arguments: Vec<OsString>) -> ExitCode {
+    bridge_node::run::<UaMes>(arguments)
 }
 
 impl UaMes {
@@ -291,7 +294,7 @@ impl Program for UaMes {
         self.serve(ready).await?;
         let port = ComponentPort::start(&ready.component, &ready.options)?;
         if let (Some(iri), Some(skill)) = (&self.run, port.skills().first()) {
-            drop(tokio::spawn(run(skill.clone(), iri.clone())));
+            drop(tokio::spawn(run_process(skill.clone(), iri.clone())));
         }
         Ok(port)
     }
@@ -339,8 +342,8 @@ fn page(cell: &Arc<Cell>) -> knowledge::Page {
     })
 }
 
-/// Starts a process by the skill, as anybody would.
-async fn run(skill: Skill, iri: String) {
+/// Runs a process by the skill, as any caller does.
+async fn run_process(skill: Skill, iri: String) {
     let run = LocalRun {
         skill,
         by: Owner::Local("the command line"),

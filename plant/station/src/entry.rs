@@ -1,5 +1,6 @@
-//! One level of a plant: the program around [`ua_station`].
+//! The program `ua-station` around [`crate::run`].
 
+use std::ffi::OsString;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -12,7 +13,8 @@ use plant_opcua::client::HostNames;
 use plant_opcua::server::EndpointUrl;
 use plant_opcua::users::{Role, Roles};
 use registry::hierarchy::{Choice, Place};
-use ua_station::{StationSettings, Upper, run};
+
+use crate::{StationSettings, Upper};
 
 /// One level of a plant: the discovery server of a workstation and its devices, or of a whole cell.
 ///
@@ -97,8 +99,10 @@ struct UaStation {
     log: LogFormat,
 }
 
-fn main() -> ExitCode {
-    run_service::<UaStation>()
+/// Runs `ua-station` from its command line to its end. `arguments` begin with the name of the program.
+#[must_use]
+pub fn run(arguments: Vec<OsString>) -> ExitCode {
+    run_service::<UaStation>(arguments)
 }
 
 impl Service for UaStation {
@@ -144,6 +148,6 @@ impl Service for UaStation {
             devices_endpoint: self.devices_endpoint,
             upper,
         };
-        run(settings, pages, stop).await
+        crate::run(settings, pages, stop).await
     }
 }

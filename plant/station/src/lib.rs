@@ -13,6 +13,7 @@
 mod board;
 mod callers;
 mod configure;
+pub mod entry;
 mod face;
 mod marks;
 mod mirror;

@@ -53,6 +53,7 @@ mod values;
 mod verbs;
 mod wear;
 
+use std::ffi::OsString;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::{Arc, OnceLock};
@@ -103,10 +104,12 @@ struct UaServer {
     sks: OnceLock<Arc<Sks>>,
 }
 
-fn main() -> ExitCode {
-    match verbs::asked() {
+/// Runs `ua-server` from its command line to its end. `arguments` begin with the name of the program.
+#[must_use]
+pub fn run(arguments: Vec<OsString>) -> ExitCode {
+    match verbs::asked(&arguments) {
         Some(ended) => ended,
-        None => restart::again(bridge_node::run::<UaServer>()),
+        None => restart::again(bridge_node::run::<UaServer>(arguments)),
     }
 }
 

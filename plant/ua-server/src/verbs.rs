@@ -2,6 +2,7 @@
 //!
 //! A server that runs takes notice by itself: certificates are looked for at each connection, and users within a second.
 
+use std::ffi::OsString;
 use std::io::{self, BufRead as _, IsTerminal as _, Write as _};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -134,12 +135,12 @@ enum VerbFault {
 }
 
 /// Does what the command line asks about certificates and users; `None` where it asks for the server.
-pub(crate) fn asked() -> Option<ExitCode> {
-    let first = std::env::args().nth(1)?;
-    if !VERBS.contains(&&first[..]) {
+pub(crate) fn asked(arguments: &[OsString]) -> Option<ExitCode> {
+    let first = arguments.get(1)?;
+    if !VERBS.iter().any(|verb| first == verb) {
         return None;
     }
-    let verbs = match Verbs::try_parse() {
+    let verbs = match Verbs::try_parse_from(arguments) {
         Ok(verbs) => verbs,
         Err(usage) => {
             // Nobody is left to tell when stdout or stderr is closed.

@@ -1,4 +1,4 @@
-//! `ua-space` as its users run it.
+//! `ua-bridge` as its users run it: the names of the program, and `ua-space`.
 
 #![expect(clippy::unwrap_used, clippy::indexing_slicing, reason = "test code")]
 
@@ -8,6 +8,7 @@ mod check;
 mod init;
 mod live;
 mod malformed;
+mod names;
 mod normal;
 mod program;
 mod secured;

@@ -2,6 +2,7 @@
 
 use std::fs;
 use std::io::Write as _;
+use std::os::unix::process::CommandExt as _;
 use std::path::PathBuf;
 use std::process::{Command, Stdio};
 
@@ -15,6 +16,13 @@ pub(crate) struct Ended {
     pub(crate) stderr: String,
 }
 
+/// A command of the program under one of its names, as a link with that name starts it.
+pub(crate) fn named(name: &str) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_ua-bridge"));
+    command.arg0(name);
+    command
+}
+
 /// Runs `ua-space` with nothing on stdin.
 pub(crate) fn run(words: &[&str]) -> Ended {
     run_on(words, b"")
@@ -22,7 +30,7 @@ pub(crate) fn run(words: &[&str]) -> Ended {
 
 /// Runs `ua-space` with `stdin`.
 pub(crate) fn run_on(words: &[&str], stdin: &[u8]) -> Ended {
-    let mut child = Command::new(env!("CARGO_BIN_EXE_ua-space"))
+    let mut child = named("ua-space")
         .args(words)
         .stdin(Stdio::piped())
         .stdout(Stdio::piped())

@@ -2,7 +2,7 @@
 
 use serde_json::{Value, json};
 
-use crate::program::{file, run, run_on};
+use crate::program::{file, named, run, run_on};
 use crate::vectors::Vector;
 
 #[test]
@@ -53,7 +53,7 @@ fn an_output_that_takes_nothing_is_told_with_74() {
         .open("/dev/full")
         .unwrap();
     let datagram = file("full.hex", Vector::load("pubid_byte").hex);
-    let output = std::process::Command::new(env!("CARGO_BIN_EXE_ua-space"))
+    let output = named("ua-space")
         .args(["decode", &datagram])
         .stdout(full)
         .output()
@@ -122,7 +122,7 @@ fn several_datagrams_are_written_a_line_each_and_read_so() {
         assert_eq!(run_on(&["encode", "-"], json.as_bytes()).quiet(), wanted);
         let raw = file("several.json", &json);
         let bytes: Vec<_> = vectors.iter().flat_map(Vector::bytes).collect();
-        let output = std::process::Command::new(env!("CARGO_BIN_EXE_ua-space"))
+        let output = named("ua-space")
             .args(["encode", "--raw", &raw])
             .output()
             .unwrap();

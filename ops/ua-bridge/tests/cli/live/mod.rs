@@ -10,7 +10,7 @@ use std::time::Duration;
 use component::Component;
 use serde_json::{Value, json};
 
-use crate::program::{Ended, run, run_on};
+use crate::program::{Ended, named, run, run_on};
 
 fn object(text: &str) -> Value {
     serde_json::from_str(text).unwrap()
@@ -286,7 +286,7 @@ fn what_is_wrong_with_parameters_is_said_before_anything_moves() {
 #[test]
 fn ctrl_c_halts_the_run_and_says_how_it_ended() {
     let component = Component::start();
-    let mut child = Command::new(env!("CARGO_BIN_EXE_ua-space"))
+    let mut child = named("ua-space")
         .args(component.words(&["call", "gripper.Grasp", "Force=0"]))
         .stdout(Stdio::piped())
         .stderr(Stdio::piped())
@@ -327,7 +327,7 @@ fn ctrl_c_halts_the_run_and_says_how_it_ended() {
 fn of_who_falls_silent_in_a_call_it_is_said_that_nobody_knows() {
     let component = Component::start();
     let words = component.words(&["call", "gripper.Grasp", "Force=0", "--json"]);
-    let mut child = Command::new(env!("CARGO_BIN_EXE_ua-space"))
+    let mut child = named("ua-space")
         .args(&words)
         .stdout(Stdio::piped())
         .stderr(Stdio::piped())
