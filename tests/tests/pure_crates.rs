@@ -152,6 +152,23 @@ fn what_the_plant_thinks_with_reaches_no_io_and_knows_no_space() {
 }
 
 #[test]
+fn mdns_knows_no_space_and_no_opc_ua_library() {
+    does_not_reach(
+        "mdns",
+        &[
+            "uadp",
+            "mappings",
+            "bridge-*",
+            "tcpros",
+            "rustdds",
+            "discovery",
+            "plant-opcua",
+            "async-opcua*",
+        ],
+    );
+}
+
+#[test]
 fn who_fetches_keys_knows_neither_ros_nor_skills() {
     does_not_reach(
         "plant-keys",

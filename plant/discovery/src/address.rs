@@ -7,9 +7,9 @@ use tokio::net::{TcpStream, UdpSocket, lookup_host};
 use tokio::time::timeout;
 
 use crate::announce::Server;
-use crate::interface::Interface;
-use crate::mdns::is_own;
-use crate::url::Url;
+use mdns::Interface;
+use mdns::Url;
+use mdns::is_own;
 
 /// Returns the server with a URL that others can use. A server that listens on all addresses is known by the name of its host,
 /// which few networks resolve: it is registered with the address of the interface over which the discovery server is reached.
@@ -78,7 +78,7 @@ mod tests {
     use tokio::net::TcpListener;
 
     use super::*;
-    use crate::host_name;
+    use mdns::host_name;
 
     #[tokio::test]
     async fn a_server_on_all_addresses_is_registered_with_the_one_towards_the_discovery_server() {

@@ -18,10 +18,10 @@ use crate::chosen::find_lds;
 use crate::client::{self, AskFault};
 use crate::clock;
 use crate::embedded::{Embedded, Embedding, lost};
-use crate::host_name;
-use crate::interface::Interface;
-use crate::mdns::{Aside, Heard, Mdns, MdnsFault, Ours, same_place};
-use crate::url::Url;
+use mdns::Interface;
+use mdns::Url;
+use mdns::host_name;
+use mdns::{Aside, Heard, Mdns, MdnsFault, Ours, same_place};
 
 /// A server to tell of.
 #[derive(Debug, Clone, PartialEq, Eq)]

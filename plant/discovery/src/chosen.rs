@@ -10,9 +10,9 @@ use tokio::sync::watch;
 use tokio::time::{MissedTickBehavior, interval};
 use tracing::{info, warn};
 
-use crate::interface::Interface;
-use crate::mdns::MdnsFault;
 use crate::watch::{Found, Known, WatchSettings, Watcher};
+use mdns::Interface;
+use mdns::MdnsFault;
 
 /// Looks into the address space of a discovery server, which takes a session.
 #[async_trait]

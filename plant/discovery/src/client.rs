@@ -29,8 +29,8 @@ use plant_opcua::supervision::Registrar;
 
 use crate::announce::Server;
 use crate::security::Security;
-use crate::url::Url;
 use crate::wire::{Conversation, Kind, MOST_CHUNK, MOST_CHUNKS, MOST_HEARD, WireFault};
+use mdns::Url;
 
 /// Why there is no answer.
 #[derive(Debug, thiserror::Error)]

@@ -15,11 +15,11 @@ use tracing::{debug, info};
 use crate::announce::Server;
 use crate::client::AskFault;
 use crate::connection::Asking;
-use crate::interface::Interface;
 use crate::lds::{EmbeddedIn, Lds, LdsSettings, listen};
 use crate::line::{Line, Reached};
 use crate::services::{Answer, Question};
-use crate::url::Url;
+use mdns::Interface;
+use mdns::Url;
 
 /// What it takes to embed one.
 #[derive(Debug)]

@@ -10,9 +10,11 @@ use registry::{Announcement, Registry, Settings};
 use tokio::sync::mpsc;
 
 use crate::connection::{Asking, Shared, serve};
-use crate::interface::Subnets;
 use crate::services::{Answer, Own, Question};
-use crate::{clock, mdns, url::Url};
+use mdns::Url;
+
+use crate::clock;
+use mdns::Subnets;
 
 /// What a discovery server that knows nobody answers a client that says these bytes and no more, with how many are
 /// registered afterwards. Needs a tokio runtime.
@@ -80,7 +82,7 @@ fn answer(
 /// The instances that a packet of mDNS takes back.
 #[must_use]
 pub fn goodbyes(packet: &[u8]) -> Vec<String> {
-    crate::goodbye::goodbyes(packet)
+    mdns::goodbyes(packet)
 }
 
 /// What is heard of a server by the instance name, the port, and the texts of its TXT record.

@@ -11,7 +11,7 @@ use tracing::info;
 
 use crate::clock::now;
 use crate::liveness::{Liveness, Told, Try};
-use crate::mdns::{Aside, Heard, Mdns, Ours, same_place};
+use mdns::{Aside, Heard, Mdns, Ours, same_place};
 
 /// See the module's page. Drive it by [`step`](Self::step), then take every [`event`](Self::event).
 pub(crate) struct Keeper {

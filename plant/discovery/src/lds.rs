@@ -23,13 +23,13 @@ use crate::client;
 use crate::clock;
 use crate::connection::{Asking, Counters, Shared};
 use crate::endpoint;
-use crate::host_name;
-use crate::interface::Interface;
 use crate::keeper::Keeper;
-use crate::mdns::{Aside, Mdns, Ours};
 use crate::security::{Security, TOLD_EVERY};
 use crate::services::{Answer, Own, Question, semaphore};
-use crate::url::Url;
+use mdns::Interface;
+use mdns::Url;
+use mdns::host_name;
+use mdns::{Aside, Mdns, Ours};
 
 /// How a discovery server runs.
 #[derive(Debug, Clone, PartialEq, Eq)]

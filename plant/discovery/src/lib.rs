@@ -9,7 +9,6 @@
 
 mod address;
 mod announce;
-mod bridges;
 mod chosen;
 pub mod client;
 mod clock;
@@ -18,29 +17,21 @@ mod embedded;
 mod endpoint;
 #[doc(hidden)]
 pub mod fuzz;
-mod goodbye;
-mod interface;
 mod keeper;
 pub mod lds;
 mod line;
 mod liveness;
-mod mdns;
 mod presence;
 pub mod scan;
 mod security;
 mod services;
 pub mod ua_lds;
-mod url;
 mod watch;
 mod wire;
 
 pub use announce::{AnnounceSettings, AnnounceState, Announced, Server, announce};
-pub use bridges::{
-    Bridge, HeardBridge, Telling, TellingArguments, ToldBridge, heard_bridges, tell_bridge,
-};
 pub use chosen::{Marks, find_lds};
-pub use interface::Interface;
-pub use mdns::MdnsFault;
+pub use mdns::{Interface, MdnsFault, host_name};
 pub use presence::be_there;
 /// How it is known that a server is gone.
 pub use registry::Loss;
@@ -48,14 +39,3 @@ pub use watch::{Found, Known, WatchSettings, Watcher, watch};
 
 /// Where the Local Discovery Server of a host is (OPC 10000-12, 4.2.2).
 pub const DEFAULT_LDS: &str = "opc.tcp://127.0.0.1:4840";
-
-/// The name of this host, without a domain.
-#[must_use]
-pub fn host_name() -> String {
-    let name = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
-    let name = name.trim();
-    match name.split('.').next() {
-        Some(first) if !first.is_empty() => first.to_owned(),
-        _ => "localhost".to_owned(),
-    }
-}

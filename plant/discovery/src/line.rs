@@ -17,8 +17,8 @@ use opcua::types::{
 use tokio::net::{TcpStream, lookup_host};
 use tokio::time::{Instant, timeout, timeout_at};
 
-use crate::url::Url;
 use crate::wire::{Conversation, Kind, MOST_CHUNK, MOST_CHUNKS, MOST_HEARD, WireFault};
+use mdns::Url;
 
 /// An open channel.
 pub(crate) struct Line {

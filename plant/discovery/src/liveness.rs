@@ -12,7 +12,7 @@ use tokio::time::{sleep, timeout};
 
 use crate::client;
 use crate::line::{Line, Reached};
-use crate::url::Url;
+use mdns::Url;
 
 /// What is told of an endpoint.
 #[derive(Debug, Clone, PartialEq, Eq)]

@@ -10,10 +10,10 @@ use tokio::task::JoinSet;
 
 use crate::client;
 use crate::clock;
-use crate::interface::Interface;
 use crate::keeper::Keeper;
-use crate::mdns::{Mdns, MdnsFault, same_place};
-use crate::url::Url;
+use mdns::Interface;
+use mdns::Url;
+use mdns::{Mdns, MdnsFault, same_place};
 
 /// How servers are watched.
 #[derive(Debug, Clone, PartialEq, Eq)]

@@ -5,9 +5,8 @@ use std::time::Duration;
 
 use discovery::client::{Application, describe, find_servers, find_servers_on_network};
 use discovery::scan::{Outcome, Pace, scan};
-use discovery::{
-    DEFAULT_LDS, Found, HeardBridge, Interface, Known, WatchSettings, heard_bridges, watch,
-};
+use discovery::{DEFAULT_LDS, Found, Interface, Known, WatchSettings, watch};
+use mdns::{HeardBridge, heard_bridges};
 use tokio::signal::ctrl_c;
 use tokio::task::JoinSet;
 use tokio::time::timeout;

@@ -7,7 +7,7 @@ use mdns_sd::{IfKind, IfPredicate};
 use tokio::net::lookup_host;
 use tokio::time::timeout;
 
-use crate::scan::Range;
+use crate::range::Range;
 use crate::url::Url;
 
 /// One network interface, by name or by an address it has. One level of a plant is one network: what is announced on one
@@ -86,7 +86,7 @@ impl Interface {
     }
 
     /// Whether only this host is on it.
-    pub(crate) fn is_loopback(&self) -> bool {
+    pub fn is_loopback(&self) -> bool {
         match &self.which {
             Which::Address(address) => address.is_loopback(),
             Which::Name(_) => self.addresses().iter().all(Ipv4Addr::is_loopback),
@@ -113,7 +113,7 @@ impl Interface {
     }
 
     /// Returns the networks from which announcements are accepted.
-    pub(crate) fn subnets(&self) -> Subnets {
+    pub fn subnets(&self) -> Subnets {
         let all = if_addrs::get_if_addrs().unwrap_or_default();
         let own = all.iter().filter(|interface| self.is(interface));
         let networks = own.filter_map(|interface| match &interface.addr {
@@ -128,7 +128,7 @@ impl Interface {
     }
 
     /// For the mDNS daemon.
-    pub(crate) fn kind(&self) -> IfKind {
+    pub fn kind(&self) -> IfKind {
         let this = self.clone();
         let is =
             move |interface: &if_addrs::Interface| interface.ip().is_ipv4() && this.is(interface);
@@ -138,7 +138,7 @@ impl Interface {
 
 /// The networks from which announcements are accepted: the subnets of an interface, and those that the operator adds.
 #[derive(Debug, Clone)]
-pub(crate) struct Subnets {
+pub struct Subnets {
     is_loopback: bool,
     /// Addresses of the interface, with their masks.
     networks: Vec<(Ipv4Addr, Ipv4Addr)>,
@@ -147,7 +147,7 @@ pub(crate) struct Subnets {
 
 impl Subnets {
     /// Returns the subnets of an interface with a single address.
-    pub(crate) fn of(address: Ipv4Addr, mask: Ipv4Addr) -> Self {
+    pub fn of(address: Ipv4Addr, mask: Ipv4Addr) -> Self {
         Self {
             is_loopback: address.is_loopback(),
             networks: vec![(address, mask)],
@@ -156,12 +156,12 @@ impl Subnets {
     }
 
     /// Returns whether only this host is on the network.
-    pub(crate) const fn is_loopback(&self) -> bool {
+    pub const fn is_loopback(&self) -> bool {
         self.is_loopback
     }
 
     /// Returns whether a server at that address may be connected to.
-    pub(crate) fn contains(&self, ip: Ipv4Addr) -> bool {
+    pub fn contains(&self, ip: Ipv4Addr) -> bool {
         let mut networks = self.networks.iter();
         let is_near =
             networks.any(|(own, mask)| (own.to_bits() ^ ip.to_bits()) & mask.to_bits() == 0);

@@ -4,17 +4,18 @@ use std::net::IpAddr;
 
 /// The parts of a URL of OPC UA over TCP.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Url {
+pub struct Url {
     /// A name or an address, that of IPv6 without brackets.
-    pub(crate) host: String,
-    pub(crate) port: u16,
+    pub host: String,
+    /// The TCP port, 4840 where the text has none.
+    pub port: u16,
     /// With its slash, or empty.
-    pub(crate) path: String,
+    pub path: String,
 }
 
 impl Url {
     /// `None` for any other kind of URL.
-    pub(crate) fn parse(url: &str) -> Option<Self> {
+    pub fn parse(url: &str) -> Option<Self> {
         let rest = url.strip_prefix("opc.tcp://")?;
         let (authority, path) = match rest.find('/') {
             Some(at) => rest.split_at(at),
@@ -50,7 +51,7 @@ impl Url {
     }
 
     /// Of an address.
-    pub(crate) fn of(ip: IpAddr, port: u16, path: &str) -> Self {
+    pub fn of(ip: IpAddr, port: u16, path: &str) -> Self {
         Self {
             host: ip.to_string(),
             port,
@@ -59,7 +60,7 @@ impl Url {
     }
 
     /// The address, where the host is one.
-    pub(crate) fn ip(&self) -> Option<IpAddr> {
+    pub fn ip(&self) -> Option<IpAddr> {
         self.host.parse().ok()
     }
 }

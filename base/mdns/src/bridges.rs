@@ -19,7 +19,7 @@ use tracing::{debug, info, warn};
 
 use crate::host_name;
 use crate::interface::Interface;
-use crate::mdns::MdnsFault;
+use crate::servers::MdnsFault;
 
 /// Where a bridge tells of itself, on the command line.
 #[derive(Debug, Clone, PartialEq, Eq, clap::Args)]

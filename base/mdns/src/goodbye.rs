@@ -10,7 +10,7 @@ use tokio::net::UdpSocket;
 use crate::interface::Interface;
 
 /// Hears what is said to the group of mDNS on one interface.
-pub(crate) fn listen(interface: &Interface) -> std::io::Result<UdpSocket> {
+pub fn listen(interface: &Interface) -> std::io::Result<UdpSocket> {
     let socket = Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP))?;
     socket.set_reuse_address(true)?;
     socket.set_reuse_port(true)?;
@@ -26,7 +26,7 @@ pub(crate) fn listen(interface: &Interface) -> std::io::Result<UdpSocket> {
 }
 
 /// The instances of our service that a packet takes back.
-pub(crate) fn goodbyes(packet: &[u8]) -> Vec<String> {
+pub fn goodbyes(packet: &[u8]) -> Vec<String> {
     taken_back(packet).unwrap_or_default()
 }
 

@@ -18,7 +18,6 @@ use tokio::net::UdpSocket;
 use tokio::time::{Instant, sleep_until};
 use tracing::{debug, info, warn};
 
-use crate::clock;
 use crate::goodbye::{goodbyes, listen};
 use crate::host_name;
 use crate::interface::{Interface, Subnets};
@@ -44,38 +43,49 @@ impl MdnsFault {
 
 /// What is heard on the network.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) enum Heard {
+pub enum Heard {
     /// Of a server, for the first time or with something new.
     Announced {
+        /// What the server announces.
         announcement: Announcement,
         /// What programs of this project tell beside it.
         aside: Aside,
     },
     /// Of the end of a server: a goodbye, or what was heard has run out.
-    Withdrawn { instance: String },
+    Withdrawn {
+        /// The instance name of the server.
+        instance: String,
+    },
     /// That somebody else has the name of what we announce, which is called so from now on.
-    Renamed { from: String, to: String },
+    Renamed {
+        /// The instance name until now.
+        from: String,
+        /// The instance name from now on.
+        to: String,
+    },
 }
 
 /// What is announced.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Ours {
-    pub(crate) announcement: Announcement,
-    pub(crate) aside: Aside,
+pub struct Ours {
+    /// What every reader of mDNS understands.
+    pub announcement: Announcement,
+    /// The keys that programs of this project add.
+    pub aside: Aside,
 }
 
 /// What programs of this project tell in keys of their own, which others pass over.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub(crate) struct Aside {
+pub struct Aside {
     /// When the program started, in 100 ns since 1601.
-    pub(crate) start_time: Option<i64>,
+    pub start_time: Option<i64>,
     /// Its number in the space: the namespace of what it produces there.
-    pub(crate) number: Option<NonZeroU16>,
+    pub number: Option<NonZeroU16>,
 }
 
 impl Aside {
     /// That of a program without a number.
-    pub(crate) const fn of_start(start_time: i64) -> Self {
+    pub const fn of_start(start_time: i64) -> Self {
         Self {
             start_time: Some(start_time),
             number: None,
@@ -84,7 +94,7 @@ impl Aside {
 }
 
 /// One interface, with a thread of its own that answers and asks.
-pub(crate) struct Mdns {
+pub struct Mdns {
     interface: Interface,
     daemon: ServiceDaemon,
     events: Receiver<ServiceEvent>,
@@ -123,7 +133,7 @@ struct Announced {
 
 impl Mdns {
     /// Starts to hear at once.
-    pub(crate) fn open(interface: &Interface) -> Result<Self, MdnsFault> {
+    pub fn open(interface: &Interface) -> Result<Self, MdnsFault> {
         Self::open_at(interface, MDNS_PORT)
     }
 
@@ -154,7 +164,7 @@ impl Mdns {
     }
 
     /// Announces a server at once, in the place of what was announced under its name.
-    pub(crate) fn put(&mut self, ours: Ours) {
+    pub fn put(&mut self, ours: Ours) {
         let Some(info) = self.info(&ours) else {
             warn!(
                 name = ours.announcement.instance,
@@ -182,10 +192,7 @@ impl Mdns {
     }
 
     /// Takes back what is announced under a name. The goodbye has been sent when the answer comes.
-    pub(crate) fn take_back(
-        &mut self,
-        instance: &str,
-    ) -> Option<impl Future<Output = ()> + Send + use<>> {
+    pub fn take_back(&mut self, instance: &str) -> Option<impl Future<Output = ()> + Send + use<>> {
         let announced = self.ours.remove(instance)?;
         let told = self.daemon.unregister(&announced.fullname).ok()?;
         Some(async move {
@@ -195,12 +202,12 @@ impl Mdns {
     }
 
     /// How much was heard that is no announcement of a server.
-    pub(crate) fn ignored(&self) -> u64 {
+    pub fn ignored(&self) -> u64 {
         self.ignored
     }
 
     /// What is heard next. Whoever drops it before loses nothing.
-    pub(crate) async fn next(&mut self) -> Heard {
+    pub async fn next(&mut self) -> Heard {
         loop {
             while let Some(instance) = self.left.pop() {
                 if self.outdated.remove(&instance).is_some() {
@@ -427,7 +434,7 @@ impl Mdns {
             true => "address",
             false => "form",
         };
-        let Some(suppressed) = self.ignored_log.admit(cause, clock::now()) else {
+        let Some(suppressed) = self.ignored_log.admit(cause, Instant::now().into_std()) else {
             return;
         };
         let name: String = service.fullname.chars().take(MOST_NAME).collect();
@@ -537,7 +544,7 @@ fn hear_goodbyes(interface: &Interface) -> Option<UdpSocket> {
 }
 
 /// Whether a name is that of this host, with or without a domain.
-pub(crate) fn is_own(name: &str) -> bool {
+pub fn is_own(name: &str) -> bool {
     let first = |name: &str| {
         name.split('.')
             .next()
@@ -549,12 +556,12 @@ pub(crate) fn is_own(name: &str) -> bool {
 }
 
 /// Whether two URLs are of one endpoint.
-pub(crate) fn same_place(one: &str, other: &str) -> bool {
+pub fn same_place(one: &str, other: &str) -> bool {
     one.trim_end_matches('/') == other.trim_end_matches('/')
 }
 
 /// An announcement as the registry takes it.
-pub(crate) fn heard(service: &ResolvedService, subnets: &Subnets) -> Option<(Announcement, Aside)> {
+pub fn heard(service: &ResolvedService, subnets: &Subnets) -> Option<(Announcement, Aside)> {
     let instance = instance(&service.fullname)?;
     let text = |key| service.get_property_val(key).flatten();
     let path = match text("path").map(std::str::from_utf8) {
@@ -619,7 +626,8 @@ fn instance(fullname: &str) -> Option<String> {
     (label(&name) == name).then_some(name)
 }
 
-pub(crate) const SERVICE: &str = "_opcua-tcp._tcp.local.";
+/// The service of OPC UA servers over TCP (OPC 10000-12, Annex C).
+pub const SERVICE: &str = "_opcua-tcp._tcp.local.";
 /// The key of the TXT record that tells one run of a program from the next. Ours alone; others pass over it.
 const START: &str = "start";
 /// The key of the number in the space. Likewise.
