@@ -12,7 +12,7 @@ use anyhow::Context as _;
 /// The program behind the links.
 pub(crate) const TARGET: &str = "ua-bridge";
 /// The names that the program acts by.
-const NAMES: [&str; 7] = [
+pub(crate) const NAMES: [&str; 7] = [
     "ua-component",
     "ua-gds",
     "ua-lds",

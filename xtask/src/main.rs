@@ -8,6 +8,7 @@
 mod bench;
 mod demo;
 mod dist;
+mod docs;
 mod instructions;
 mod links;
 mod lint;
@@ -32,6 +33,7 @@ cargo xtask <verb>
                                  workspace with all crates as published
   build                          build the programs without optimisation into target/debug, with the links of ua-bridge
   dist                           build the programs that are handed out, with optimisation, into target/dist, with the links
+  docs [--check] [--no-build]    build the programs and write docs/reference from them; or only check that its pages are current
   patches [--test]               only patch the crates of patches/, which all verbs build with, and print the flags to do so by hand;
                                  or run the tests that the patches add, which `test` leaves out
   bench hop [ARGS]               measure one hop beside the floor and roscpp's relay
@@ -67,6 +69,7 @@ fn run(arguments: &[&str]) -> anyhow::Result<Ended> {
         ["peers", "--build"] => peers::for_building(),
         ["build"] => dist::build(&Workspace::find()?),
         ["dist"] => dist::run(&Workspace::find()?),
+        ["docs", rest @ ..] => docs::run(&Workspace::find()?, rest),
         ["patches"] => patches::run(&Workspace::find()?),
         ["patches", "--test"] => test::of_all_patches(&Workspace::find()?),
         ["lint"] => lint::run(&Workspace::find()?),
