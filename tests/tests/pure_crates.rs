@@ -321,3 +321,10 @@ fn only_ua_bridge_depends_on_the_programs_that_it_acts_as() {
     let found = forbidden(&tree("ua-bridge"), &all);
     assert_eq!(found, all, "ua-bridge links them all");
 }
+
+#[test]
+fn bridges_fetch_keys_without_the_library_of_opc_ua_servers() {
+    for bridge in ["bridge-ros1", "bridge-ros2", "plant-keys"] {
+        does_not_reach(bridge, &["async-opcua-server", "discovery"]);
+    }
+}

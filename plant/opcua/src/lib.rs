@@ -5,24 +5,35 @@
 //! in), `nodeset` (types from files), `users`, `supervision`, `audit` and `changes`, `server` and `client`, `file`, `trust_file`, `directory` and
 //! `configuration` (a server's certificates as clients manage them, and as it renews them itself).
 
+#[cfg(feature = "server")]
 pub mod audit;
 pub mod certificates;
+#[cfg(feature = "server")]
 pub mod changes;
 pub mod client;
+#[cfg(feature = "server")]
 pub mod configuration;
+#[cfg(feature = "server")]
 pub mod directory;
+#[cfg(feature = "server")]
 pub mod door;
 pub mod endpoint;
+#[cfg(feature = "server")]
 pub mod file;
 pub mod judge;
 pub mod known;
 pub mod limits;
+#[cfg(feature = "server")]
 pub mod nodeset;
 mod pair;
 pub mod pki;
+#[cfg(feature = "server")]
 pub mod server;
+#[cfg(feature = "server")]
 pub mod supervision;
+#[cfg(feature = "server")]
 pub mod trust_file;
+#[cfg(feature = "server")]
 pub mod users;
 
 pub use opcua::types;

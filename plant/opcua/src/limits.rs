@@ -2,6 +2,7 @@
 
 use std::time::Duration;
 
+#[cfg(feature = "server")]
 use opcua::server::{Limits, OperationalLimits, SubscriptionLimits};
 
 /// Bytes of the largest string, byte string or message.
@@ -72,6 +73,7 @@ impl ClientLimits {
 
     /// Sets these limits in those of the library. The published library has the number of sessions only, and ignores
     /// the others.
+    #[cfg(feature = "server")]
     #[must_use]
     pub fn bound(self, mut limits: Limits) -> Limits {
         limits.max_sessions = self.sessions;
@@ -97,6 +99,7 @@ impl Default for ClientLimits {
 }
 
 /// Returns the limits of a server.
+#[cfg(feature = "server")]
 #[must_use]
 pub fn server(clients: ClientLimits) -> Limits {
     clients.bound(Limits {
@@ -121,7 +124,7 @@ pub fn server(clients: ClientLimits) -> Limits {
     })
 }
 
-#[cfg(test)]
+#[cfg(all(test, feature = "server"))]
 mod tests {
     use super::*;
 

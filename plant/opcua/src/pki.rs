@@ -424,6 +424,8 @@ fn owner_only(_path: &Path) -> io::Result<()> {
 pub const OWN_CERTIFICATE: &str = certificates::OWN;
 /// Its private key, below the root.
 pub const OWN_KEY: &str = "private/private.pem";
+/// The folder of certificates of a peer without certificates: no folder can be made there.
+pub(crate) const NO_PKI: &str = "/dev/null/pki";
 /// Held while the pair is looked for and made.
 const LOCK: &str = "private/lock";
 /// Five years, as other stacks make them: clients trust this very file, so a new one is work for people.

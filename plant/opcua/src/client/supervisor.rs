@@ -32,7 +32,7 @@ use super::{
 };
 use crate::limits;
 use crate::pki::{OWN_CERTIFICATE, OWN_KEY, Pki};
-use crate::server::NO_PKI;
+use crate::pki::NO_PKI;
 
 /// What the handles and the supervisor have in common.
 pub(crate) struct Shared {

@@ -25,7 +25,7 @@ use crate::door::Door;
 use crate::endpoint::{BindError, EndpointUrl};
 use crate::limits::{self, ClientLimits};
 use crate::nodeset::{self, NodeSet, NodeSetError, Source};
-use crate::pki::{OWN_CERTIFICATE, OWN_KEY, Pki, PkiError};
+use crate::pki::{NO_PKI, OWN_CERTIFICATE, OWN_KEY, Pki, PkiError};
 use crate::users::Access;
 
 /// A security policy that clients may choose.
@@ -446,6 +446,3 @@ impl NodeManagerBuilder for Own {
         Arc::new(Routed { inner, front, last })
     }
 }
-
-/// No directory can be made there.
-pub(crate) const NO_PKI: &str = "/dev/null/pki";

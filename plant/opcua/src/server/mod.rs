@@ -30,7 +30,6 @@ use tokio::net::TcpListener;
 use tokio::task::JoinHandle;
 use tracing::{error, warn};
 
-pub(crate) use self::build::NO_PKI;
 pub use self::build::{Security, ServerBuilder, ServerConfig, ServerError};
 pub use self::calls::{MethodHandler, MethodRequest, Refusal, method};
 pub use self::events::{StateRef, TransitionEvent};
