@@ -14,8 +14,8 @@ use std::path::PathBuf;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use mappings::{Code, SpaceId};
 
-/// Looks into the space: topics, values, skills and calls of one that runs, mappings and what is wrong with them,
-/// datagrams of OPC UA PubSub as JSON and back.
+/// Shows a running space (topics, values, skills and calls), proposes and checks mappings, and
+/// converts datagrams of OPC UA PubSub to JSON and back.
 #[derive(Debug, Parser)]
 #[command(name = "ua-space", version)]
 pub(crate) struct Arguments {
@@ -25,125 +25,135 @@ pub(crate) struct Arguments {
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum Verb {
-    /// Tell everything that is wrong with a mapping
+    /// Check a mapping and print all findings
     ///
-    /// Each finding has a code, its place with the line it is about, and what to do; `ua-space explain CODE` says more of
-    /// a code. Definitions of messages are those of its type_paths, of ROS_PACKAGE_PATH and AMENT_PREFIX_PATH, and those
-    /// built in. Nothing is asked of the network without --environment.
+    /// Each finding has a code, its location with the line, and a remedy; `ua-space explain CODE`
+    /// explains the code. Definitions of messages are those of type_paths, of ROS_PACKAGE_PATH and
+    /// AMENT_PREFIX_PATH, and the built-in ones. The network is used only with --environment.
     ///
-    /// Exit codes: 0 all can run (with --for: there), with or without warnings, 64 usage, 69 somebody of the environment is not there, 74 a
-    /// file that cannot be read or an output that cannot be written, 78 one of them cannot run.
+    /// Exit codes: 0 all can run (with --for: there), with or without warnings, 64 usage, 69 a part
+    /// of the environment is not available, 74 a file cannot be read or the output cannot be
+    /// written, 78 a mapping cannot run.
     Check(Check),
-    /// Write a mapping of what is there
+    /// Propose a mapping of running robots and servers
     ///
-    /// Looks at live ROS graphs, running OPC UA servers and NodeSets, or at whoever is found, and writes a commented mapping that runs. Topics and
-    /// nodes of several are tied where name and type are the same, and marked as guesses. What runs ROS itself (logs,
-    /// actions, transforms) is left out, with a comment.
+    /// Inspects ROS graphs, running OPC UA servers and NodeSets, or all discovered sources, and
+    /// writes a commented mapping that runs. Topics and nodes of several sources with the same name
+    /// and type are joined, and marked as guesses. Topics of ROS itself (logs, actions, transforms)
+    /// are left out, with a comment.
     ///
-    /// A file that is there keeps every byte: with --merge what is new is put behind it, and topics or nodes that its
-    /// comments name are not proposed again, unless this command made them a comment because a definition was missing.
+    /// An existing file keeps every byte: with --merge new entries are appended. Topics or nodes
+    /// that its comments name are not proposed again, unless this command commented them out
+    /// because a definition was missing.
     ///
-    /// Exit codes: 0 done, 64 usage, 65 a NodeSet is malformed, 69 a master, domain or server is not there, 74 a file that
-    /// cannot be read or written, or is there and --merge was not said, 78 the file that is there cannot run.
+    /// Exit codes: 0 done, 64 usage, 65 a NodeSet is malformed, 69 a master, domain or server is
+    /// not available, 74 a file cannot be read or written, or exists and --merge is missing, 78 the
+    /// existing file cannot run.
     Init(Init),
-    /// Say what the code of a finding means, with an example
+    /// Explain the code of a finding, with an example
     ///
-    /// Without a code: all of them, a line each.
+    /// Without a code: all codes, a line each.
     ///
-    /// Exit codes: 0 done, 64 a code that there is not, 74 an output that cannot be written.
+    /// Exit codes: 0 done, 64 an unknown code, 74 the output cannot be written.
     Explain(Explain),
     /// Print the JSON Schema of mappings, for editors
     ///
-    /// With `# yaml-language-server: $schema=PATH` as a mapping's first line, editors that know YAML schemas complete its
-    /// keys and show what they mean.
+    /// With `# yaml-language-server: $schema=PATH` as the first line of a mapping, editors that
+    /// know YAML schemas complete its keys and show their meaning.
     Schema,
-    /// Make a file with keys for a secured group, or change the one there is
+    /// Create a file with keys for a secured group, or change an existing file
     ///
-    /// Only its owner can read it. Bring it to each host of the cell; `keys: {file: FILE}` under `security` in the mapping
-    /// names it. To change keys while everything runs: --next, bring it to all, --drop, bring it to all.
+    /// Only its owner can read the file. Copy it to each host of the cell; `keys: {file: FILE}`
+    /// under `security` in the mapping names it. To rotate keys while all programs run: --next,
+    /// copy it to all hosts, --drop, copy it again.
     ///
-    /// Exit codes: 0 done, 64 usage, 65 a file that holds no keys, 74 a file that cannot be read or written, or is there.
+    /// Exit codes: 0 done, 64 usage, 65 the file has no keys, 74 the file cannot be read or
+    /// written, or exists.
     Keys(MakeKeys),
-    /// Show what a datagram, or each datagram of a capture, holds
+    /// Show the contents of a datagram, or of each datagram of a capture
     ///
-    /// Reads a datagram as hexadecimal text or as its bytes, or the UDP datagrams of a pcap or pcapng file. One datagram
-    /// is shown as a JSON object, those of a capture as one object a line. What is wrong with a datagram is told on
-    /// stderr, with the offset of the byte.
+    /// Reads a datagram as hexadecimal text or as its bytes, or the UDP datagrams of a pcap or
+    /// pcapng file. A datagram is shown as a JSON object, the datagrams of a capture as an object
+    /// per line. Faults are reported on stderr, with the offset of the byte.
     ///
-    /// Exit codes: 0 done, 64 usage, 65 something is malformed or not to be opened, 74 a file that cannot be read or
-    /// an output that cannot be written.
+    /// Exit codes: 0 done, 64 usage, 65 a datagram is malformed or cannot be decrypted, 74 a file
+    /// cannot be read or the output cannot be written.
     Decode(Decode),
-    /// Make datagrams of what `decode` shows
+    /// Create datagrams from the output of `decode`
     ///
-    /// Writes the datagrams of a JSON object, of several one after the other or of an array, as hexadecimal text, a line
-    /// each. Flags and sizes follow from what is there.
+    /// Writes the datagrams of a JSON object, of several objects or of an array, as hexadecimal
+    /// text, a line each. Flags and sizes follow from the contents.
     ///
-    /// Exit codes: 0 done, 64 usage, 65 JSON that is no datagram, 74 a file that cannot be read or an output that cannot
-    /// be written.
+    /// Exit codes: 0 done, 64 usage, 65 the JSON is not a datagram, 74 a file cannot be read or the
+    /// output cannot be written.
     Encode(Encode),
-    /// Tell who is there: discovery servers, servers, components, bridges
+    /// List programs and servers: discovery servers, servers, components, bridges
     ///
-    /// Hears announcements (mDNS) on the interface, or on all of this host, asks the discovery servers and listens in the group;
-    /// needs no mapping. Each server is asked who it is. Nothing is tried that was not announced, but for the addresses of --scan.
+    /// Listens for announcements (mDNS) on the interface, or on all interfaces of this host, asks
+    /// the discovery servers and listens in the group. Each server is asked for its description.
+    /// Only announced addresses are contacted, and those of --scan.
     ///
-    /// Exit codes: 0 done, 64 usage, 74 an output that cannot be written, 130 interrupted.
+    /// Exit codes: 0 done, 64 usage, 74 the output cannot be written, 130 interrupted.
     Discover(Discover),
-    /// List the topics and calls of a running space
+    /// List the programs, topics and calls of a running space
     ///
-    /// What was heard in the group or announced there: name, origin, rate and what it consists of. Needs no mapping.
+    /// Shows name, origin, rate and type of all topics that are received or announced in the group.
+    /// Needs no mapping.
     ///
-    /// Exit codes: 0 done, 64 usage, 69 an interface or group that cannot be had, 74 an output that cannot be written.
-    List(List),
-    /// Tell all that is known of a topic or call
-    ///
-    /// Exit codes: 0 done, 64 usage, 69 nothing came of it, or an interface or group cannot be had, 74 an output that
+    /// Exit codes: 0 done, 64 usage, 69 an interface or group is not available, 74 the output
     /// cannot be written.
+    List(List),
+    /// Show all details of a topic or call
+    ///
+    /// Exit codes: 0 done, 64 usage, 69 nothing was received, or an interface or group is not
+    /// available, 74 the output cannot be written.
     Info(Info),
     /// Show the values of a topic
     ///
-    /// Field by field, by the names its writer announces; as YAML, or with --json a JSON object a value.
+    /// Shows each field by its announced name, as YAML, or with --json as a JSON object per value.
     ///
-    /// Exit codes: 0 done, 64 usage, 65 nothing that came can be read, 69 nothing came, or an interface or group cannot be
-    /// had, 74 an output that cannot be written.
+    /// Exit codes: 0 done, 64 usage, 65 no received value can be read, 69 nothing was received, or
+    /// an interface or group is not available, 74 the output cannot be written.
     Echo(Echo),
-    /// Tell how often the values of a topic come
+    /// Measure the rate of a topic
     ///
-    /// Exit codes: 0 done, 64 usage, 69 nothing came, or an interface or group cannot be had, 74 an output that cannot be
-    /// written.
+    /// Exit codes: 0 done, 64 usage, 69 nothing was received, or an interface or group is not
+    /// available, 74 the output cannot be written.
     Hz(Hz),
-    /// List the skills of all components, with their states and how to start them; tell of one, run one, watch them
+    /// List the skills of all components with their states; show, start or watch skills
     ///
-    /// Exit codes: 0 done, and the run succeeded, 1 refused, or the run did not succeed, 64 usage, or a parameter that is
-    /// missing or wrong, 69 no such skill, or an interface or group that cannot be had, 74 an output that cannot be written,
-    /// 130 interrupted.
+    /// Exit codes: 0 done, and the run succeeded, 1 refused, or the run did not succeed, 64 usage,
+    /// or a parameter is missing or wrong, 69 no such skill, or an interface or group is not
+    /// available, 74 the output cannot be written, 130 interrupted.
     Skills(Skills),
-    /// Ask for a call: a skill of a component, a service of a robot, a method
+    /// Call a skill of a component, a service or action of a robot, or a Method
     ///
-    /// Values are typed by what the call is announced to take. A skill that is started is followed to the end of its run,
-    /// with its states, progress and result; Ctrl-C halts it, and once more leaves at once.
+    /// Values are parsed by the announced types. A started skill is followed to the end of its run,
+    /// with its states, progress and result; Ctrl-C halts it, and a second Ctrl-C leaves at once.
     ///
-    /// Exit codes: 0 answered, and the run succeeded, 1 refused, or the run did not succeed, 64 usage, or a parameter that is
-    /// missing or wrong, 69 nobody offers the call, or how it ended is not known, 74 an output that cannot be written, 130
-    /// interrupted.
+    /// Exit codes: 0 answered, and the run succeeded, 1 refused, or the run did not succeed, 64
+    /// usage, or a parameter is missing or wrong, 69 the call has no executor, or its outcome is
+    /// unknown, 74 the output cannot be written, 130 interrupted.
     Call(Call),
-    /// Tell how long values take, hop by hop
+    /// Show the delays of values, hop by hop
     ///
-    /// The delays that programs measured (--metrics, as they were started with), and those of each topic on its way to
-    /// here, read off the times in its messages.
+    /// Shows the delays that programs measured (at the address of their --metrics), and those of
+    /// each topic on its way to this program, from the timestamps in its messages.
     ///
-    /// Exit codes: 0 done, 64 usage, 69 a program that does not answer, or an interface or group that cannot be had, 74 an
-    /// output that cannot be written.
+    /// Exit codes: 0 done, 64 usage, 69 a program does not answer, or an interface or group is not
+    /// available, 74 the output cannot be written.
     Trace(Trace),
-    /// Ask what is known of the plant: which skills can do what, who is there, what ran
+    /// Query the knowledge of the plant: skills, components, runs
     ///
-    /// Exit codes: 0 done, 64 usage, or a question there is not, 65 a query that is wrong, 69 nobody answers, or not in time,
-    /// 74 a file that cannot be read or an output that cannot be written.
+    /// Exit codes: 0 done, 64 usage, or an unknown question, 65 the query is wrong, 69 no answer in
+    /// time, 74 a file cannot be read or the output cannot be written.
     Ask(Ask),
-    /// Print what makes a shell complete the words of ua-space, with the names of skills and topics that are heard
+    /// Print the completion script of a shell, which also completes names of skills and topics
     ///
-    /// For bash: `source <(ua-space completion bash)`; for zsh likewise; for fish: `ua-space completion fish | source`.
+    /// For bash: `source <(ua-space completion bash)`; for zsh likewise; for fish: `ua-space
+    /// completion fish | source`.
     Completion(Completion),
-    /// What a shell may put in place of the last word
+    /// Candidates for the last word
     #[command(hide = true)]
     Complete(Complete),
 }
@@ -168,7 +178,7 @@ pub(crate) enum Shell {
 
 #[derive(Debug, Args)]
 pub(crate) struct Complete {
-    /// Those of the line after `ua-space`, the last of which may be empty
+    /// The words of the line after `ua-space`; the last may be empty
     #[arg(
         value_name = "WORD",
         trailing_var_arg = true,
@@ -182,15 +192,16 @@ pub(crate) struct Check {
     /// The mappings, or - for stdin
     #[arg(value_name = "FILE", required = true)]
     pub(crate) files: Vec<String>,
-    /// One JSON object a file, with its findings
+    /// Prints a JSON object per file, with its findings
     #[arg(long)]
     pub(crate) json: bool,
-    /// For the host whose program serves this space, or these as 2,3; 0 is ua-server. What is wrong with types or NodeSets that only
-    /// others need is a warning, as it is for that program. Without it all of a mapping counts
+    /// For the host whose program serves this space, or these as 2,3; 0 is ua-server. Faults of
+    /// types or NodeSets that only other spaces need are warnings, as for that program. Without it
+    /// the whole mapping counts
     #[arg(long = "for", value_name = "SPACE", value_delimiter = ',', value_parser = space)]
     pub(crate) spaces: Vec<SpaceId>,
-    /// Ask whether the topics, services, types, namespaces and nodes are there: the ROS 1 master (ROS_MASTER_URI), the DDS
-    /// domains of the spaces and the OPC UA server, or some of them
+    /// Ask whether topics, services, types, namespaces and nodes exist: the ROS 1 master
+    /// (ROS_MASTER_URI), the DDS domains of the spaces and the OPC UA server, or some of them
     #[arg(
         long,
         value_name = "WHOM",
@@ -201,7 +212,7 @@ pub(crate) struct Check {
         default_missing_value = "ros1,ros2,opcua"
     )]
     pub(crate) environment: Vec<Part>,
-    /// How many seconds to listen in a DDS domain at most
+    /// Longest time to listen in a DDS domain, in seconds
     #[arg(long, value_name = "SECONDS", default_value_t = 5, value_parser = clap::value_parser!(u16).range(1..=600))]
     pub(crate) wait: u16,
 }
@@ -232,33 +243,34 @@ pub(crate) struct Init {
     /// A DDS domain, 0 to 232; without a number that of ROS_DOMAIN_ID. May be repeated
     #[arg(long, value_name = "DOMAIN", num_args = 0..=1, default_missing_value = "", value_parser = domain)]
     pub(crate) ros2: Vec<Option<u16>>,
-    /// A NodeSet, as modelling tools export it. May be repeated
+    /// A NodeSet file of a modelling tool. May be repeated
     #[arg(long, value_name = "FILE")]
     pub(crate) nodeset: Vec<String>,
-    /// An OPC UA server that runs, as opc.tcp://127.0.0.1:4840. May be repeated
+    /// A running OPC UA server, as opc.tcp://127.0.0.1:4840. May be repeated
     #[arg(long, value_name = "URL")]
     pub(crate) opcua: Vec<String>,
-    /// Whoever is found: the OPC UA servers that `ua-space discover` finds, the ROS 1 master and the DDS domain of the environment
+    /// All discovered sources: the OPC UA servers that `ua-space discover` finds, the ROS 1 master
+    /// and the DDS domain of the environment
     #[arg(long)]
     pub(crate) discover: bool,
     #[command(flatten)]
     pub(crate) look: Look,
-    /// Where to write; without it stdout
+    /// The output file; without it stdout
     #[arg(short, long, value_name = "FILE")]
     pub(crate) output: Option<String>,
-    /// Add what is new to the file where it is there already
+    /// Append new entries to an existing file
     #[arg(long, requires = "output")]
     pub(crate) merge: bool,
-    /// The namespace URI of values that have no node yet
+    /// The namespace URI of values without a node
     #[arg(long, value_name = "URI", default_value = "urn:ua-bridge:cell")]
     pub(crate) namespace: String,
-    /// Take in /tf and /tf_static
+    /// Include /tf and /tf_static
     #[arg(long)]
     pub(crate) tf: bool,
-    /// How many seconds to listen in a DDS domain at most
+    /// Longest time to listen in a DDS domain, in seconds
     #[arg(long, value_name = "SECONDS", default_value_t = 5, value_parser = clap::value_parser!(u16).range(1..=600))]
     pub(crate) wait: u16,
-    /// Tell what was written as a JSON object
+    /// Print the summary as a JSON object
     #[arg(long, requires = "output")]
     pub(crate) json: bool,
 }
@@ -284,13 +296,13 @@ pub(crate) struct MakeKeys {
     /// The file
     #[arg(value_name = "FILE")]
     pub(crate) file: PathBuf,
-    /// How long the keys for encryption are
+    /// The length of the keys for encryption
     #[arg(long, value_name = "POLICY", value_enum, default_value_t = KeyPolicy::Aes256)]
     pub(crate) policy: KeyPolicy,
-    /// Put a new key behind those of the file
+    /// Append a new key to the file
     #[arg(long, conflicts_with_all = ["drop", "policy"])]
     pub(crate) next: bool,
-    /// Take the first key out of the file, so that the second is used
+    /// Remove the first key of the file, so that the second is used
     #[arg(long, conflicts_with = "policy")]
     pub(crate) drop: bool,
 }
@@ -316,7 +328,7 @@ pub(crate) struct Decode {
     /// Every line of hexadecimal text is a datagram
     #[arg(long)]
     pub(crate) lines: bool,
-    /// One JSON array instead of one object a line
+    /// Print a JSON array instead of an object per line
     #[arg(long)]
     pub(crate) array: bool,
     #[command(flatten)]
@@ -328,7 +340,7 @@ pub(crate) struct Encode {
     /// The file, or - for stdin
     #[arg(value_name = "FILE")]
     pub(crate) file: String,
-    /// The bytes themselves, back to back
+    /// Write the bytes themselves, one datagram after another
     #[arg(long)]
     pub(crate) raw: bool,
     #[command(flatten)]
@@ -346,7 +358,7 @@ pub(crate) struct Known {
     /// each, or an array of objects with such a metaData and publisherId, writerGroupId or dataSetWriterId
     #[arg(long, value_name = "FILE")]
     pub(crate) metadata: Option<PathBuf>,
-    /// How RawData of padded texts and arrays is laid out
+    /// The layout of padded texts and arrays in RawData
     #[arg(long, value_name = "READING", value_enum, default_value_t = RawReading::Standard)]
     pub(crate) raw_reading: RawReading,
 }
@@ -355,7 +367,7 @@ pub(crate) struct Known {
 pub(crate) enum RawReading {
     /// By OPC 10000-14
     Standard,
-    /// As open62541 1.5 does it
+    /// As in open62541 1.5
     Open62541,
 }
 

@@ -16,11 +16,11 @@ pub(crate) struct Group {
     /// The PubSub group, as opc.udp://239.192.0.40:4840
     #[arg(long, value_name = "URL", env = "UA_ADDRESS")]
     pub(crate) address: Option<String>,
-    /// The keys of a secured group, as `ua-space keys` makes them and `decode` takes them: messages are opened with them, and
-    /// what is sent is sealed with the first
+    /// The keys of a secured group, in the format of `ua-space keys` and `decode`: messages are
+    /// decrypted with them, and requests are secured with the first
     #[arg(long, value_name = "FILE", env = "UA_KEYS")]
     pub(crate) keys: Option<PathBuf>,
-    /// What is sent is signed alone, as of a group of `mode: sign`
+    /// Only sign requests, for a group with `mode: sign`
     #[arg(long, requires = "keys")]
     pub(crate) sign: bool,
 }
@@ -30,13 +30,13 @@ pub(crate) struct List {
     /// Only topics of this origin: 0 the OPC UA side, 1 ROS 1, 2 to 232 a ROS 2 space
     #[arg(long, value_name = "SPACE", value_parser = super::space)]
     pub(crate) space: Option<SpaceId>,
-    /// How long to listen
+    /// Time to listen
     #[arg(long, value_name = "SECONDS", default_value = "3", value_parser = seconds)]
     pub(crate) seconds: f64,
-    /// Only topics and calls: look for no programs
+    /// List topics and calls only, without programs
     #[arg(long)]
     pub(crate) topics: bool,
-    /// One JSON object
+    /// Print a JSON object
     #[arg(long)]
     pub(crate) json: bool,
     #[command(flatten)]
@@ -45,13 +45,13 @@ pub(crate) struct List {
 
 #[derive(Debug, Args)]
 pub(crate) struct Info {
-    /// Such as ua_1_2_10
+    /// The topic, as ua_1_2_10
     #[arg(value_name = "TOPIC", value_parser = topic)]
     pub(crate) topic: TopicId,
-    /// How long to listen
+    /// Time to listen
     #[arg(long, value_name = "SECONDS", default_value = "3", value_parser = seconds)]
     pub(crate) seconds: f64,
-    /// One JSON object
+    /// Print a JSON object
     #[arg(long)]
     pub(crate) json: bool,
     #[command(flatten)]
@@ -60,16 +60,16 @@ pub(crate) struct Info {
 
 #[derive(Debug, Args)]
 pub(crate) struct Echo {
-    /// Such as ua_1_2_10
+    /// The topic, as ua_1_2_10
     #[arg(value_name = "TOPIC", value_parser = topic)]
     pub(crate) topic: TopicId,
-    /// End after so many values
+    /// End after this number of values
     #[arg(short = 'n', long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     pub(crate) count: Option<u64>,
-    /// End after so long. Without it and -n: at Ctrl-C
+    /// End after this time. Without it and -n: at Ctrl-C
     #[arg(long, value_name = "SECONDS", value_parser = seconds)]
     pub(crate) seconds: Option<f64>,
-    /// One JSON object a value
+    /// Print a JSON object per value
     #[arg(long)]
     pub(crate) json: bool,
     #[command(flatten)]
@@ -78,16 +78,16 @@ pub(crate) struct Echo {
 
 #[derive(Debug, Args)]
 pub(crate) struct Hz {
-    /// Such as ua_1_2_10
+    /// The topic, as ua_1_2_10
     #[arg(value_name = "TOPIC", value_parser = topic)]
     pub(crate) topic: TopicId,
-    /// Of how many values at most the figures are
+    /// Largest number of values in a measurement
     #[arg(long, value_name = "N", default_value_t = 10_000, value_parser = window)]
     pub(crate) window: usize,
-    /// End after so long. Without it: at Ctrl-C
+    /// End after this time. Without it: at Ctrl-C
     #[arg(long, value_name = "SECONDS", value_parser = seconds)]
     pub(crate) seconds: Option<f64>,
-    /// One JSON object a second
+    /// Print a JSON object per second
     #[arg(long)]
     pub(crate) json: bool,
     #[command(flatten)]
@@ -105,25 +105,25 @@ pub(crate) struct Skills {
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum SkillsVerb {
-    /// List the skills, which is also done without this word
+    /// List the skills, as without this verb
     List(ListSkills),
-    /// Tell all that is known of one skill: what it takes, how it is, how its last run ended
+    /// Show a skill: its parameters, its state, the end of its last run
     Info(InfoSkill),
-    /// Run one skill, which is made ready first where it is Halted, and follow it to its end; Ctrl-C halts it
+    /// Start a skill, after a Reset if it is Halted, and follow it to its end; Ctrl-C halts it
     Start(Call),
-    /// Tell what happens to the skills of all components, or to some of them
+    /// Watch transitions, progress and results of skills
     Watch(WatchSkills),
 }
 
 #[derive(Debug, Args)]
 pub(crate) struct InfoSkill {
-    /// Such as parallel-gripper.Grasp
+    /// The skill, as parallel-gripper.Grasp
     #[arg(value_name = "SKILL")]
     pub(crate) skill: String,
-    /// How long to listen
+    /// Time to listen
     #[arg(long, value_name = "SECONDS", default_value = "3", value_parser = seconds)]
     pub(crate) seconds: f64,
-    /// One JSON object
+    /// Print a JSON object
     #[arg(long)]
     pub(crate) json: bool,
     #[command(flatten)]
@@ -135,10 +135,10 @@ pub(crate) struct WatchSkills {
     /// Only this component, as parallel-gripper, or only this skill, as parallel-gripper.Grasp
     #[arg(value_name = "COMPONENT|SKILL")]
     pub(crate) what: Option<String>,
-    /// End after so long. Without it: at Ctrl-C
+    /// End after this time. Without it: at Ctrl-C
     #[arg(long, value_name = "SECONDS", value_parser = seconds)]
     pub(crate) seconds: Option<f64>,
-    /// One JSON object for each thing that happens
+    /// Print a JSON object per event
     #[arg(long)]
     pub(crate) json: bool,
     #[command(flatten)]
@@ -150,10 +150,10 @@ pub(crate) struct ListSkills {
     /// Only the skills of this component, as parallel-gripper, or only this skill, as parallel-gripper.Grasp
     #[arg(value_name = "COMPONENT|SKILL")]
     pub(crate) what: Option<String>,
-    /// How long to listen
+    /// Time to listen
     #[arg(long, value_name = "SECONDS", default_value = "3", value_parser = seconds)]
     pub(crate) seconds: f64,
-    /// One JSON array
+    /// Print a JSON array
     #[arg(long)]
     pub(crate) json: bool,
     #[command(flatten)]
@@ -165,22 +165,23 @@ pub(crate) struct Call {
     /// A topic as ua_0_7_105, or a name as gripper.Grasp.Halt; gripper.Grasp is gripper.Grasp.Start
     #[arg(value_name = "TOPIC|NAME")]
     pub(crate) target: Target,
-    /// What the call takes, as Force=12.5 TargetPosition=0.4,0,0.2,0,0,0; a goal also as YAML, '{order: 5}'
+    /// Parameters, as Force=12.5 TargetPosition=0.4,0,0.2,0,0,0; a goal also as YAML, '{order: 5}'
     #[arg(value_name = "NAME=VALUE")]
     pub(crate) parameters: Vec<String>,
-    /// How long to wait for the call to be announced
+    /// Time to wait for the announcement of the call
     #[arg(long, value_name = "SECONDS", default_value = "5", value_parser = seconds)]
     pub(crate) wait: f64,
-    /// How long to wait for an answer, which the one that executes the call is told
+    /// Time to wait for the response, which is sent to the executor as a deadline
     #[arg(long, value_name = "SECONDS", default_value = "10", value_parser = seconds)]
     pub(crate) timeout: f64,
     /// Call Halt when the run of a skill takes longer, or cancel the goal of an action. Without it: at Ctrl-C
     #[arg(long, value_name = "SECONDS", value_parser = seconds)]
     pub(crate) run_timeout: Option<f64>,
-    /// End with the answer, and leave the run of a skill or the goal alone
+    /// End with the response; the run of a skill or the goal continues
     #[arg(long)]
     pub(crate) no_wait: bool,
-    /// One JSON object for the answer and each step of the run, or each feedback and the result of the goal
+    /// Print a JSON object for the response and each step of the run, or each feedback and the result
+    /// of the goal
     #[arg(long)]
     pub(crate) json: bool,
     #[command(flatten)]
@@ -189,13 +190,13 @@ pub(crate) struct Call {
 
 #[derive(Debug, Args)]
 pub(crate) struct Trace {
-    /// Ask this program, by the address it was given with --metrics. May be repeated
+    /// Ask the program with this address of --metrics. May be repeated
     #[arg(long, value_name = "URL")]
     pub(crate) metrics: Vec<String>,
-    /// How long to listen in the group; 0 asks the programs alone
+    /// Time to listen in the group; 0 asks the programs only
     #[arg(long, value_name = "SECONDS", default_value = "3", value_parser = seconds_or_none)]
     pub(crate) seconds: f64,
-    /// One JSON object
+    /// Print a JSON object
     #[arg(long)]
     pub(crate) json: bool,
     #[command(flatten)]
@@ -204,16 +205,16 @@ pub(crate) struct Trace {
 
 #[derive(Debug, Args)]
 pub(crate) struct Ask {
-    /// Such as what-can-run. Without it all questions are listed
+    /// The question, as what-can-run. Without it all questions are listed
     #[arg(value_name = "QUESTION", conflicts_with = "sparql")]
     pub(crate) question: Option<String>,
-    /// What the question takes, as capability=urn:example:grasp, or values in its order
+    /// Parameters of the question, as capability=urn:example:grasp, or values in its order
     #[arg(value_name = "NAME=VALUE", requires = "question")]
     pub(crate) arguments: Vec<String>,
-    /// Ask this query of SPARQL 1.1 in a file, or - for stdin
+    /// Run this query of SPARQL 1.1 in a file, or - for stdin
     #[arg(long, value_name = "FILE")]
     pub(crate) sparql: Option<String>,
-    /// Whom to ask
+    /// The URL of ua-mes
     #[arg(
         long,
         value_name = "URL",
@@ -221,7 +222,7 @@ pub(crate) struct Ask {
         default_value = "http://127.0.0.1:8087"
     )]
     pub(crate) url: String,
-    /// The answer as it came
+    /// Print the response unchanged
     #[arg(long)]
     pub(crate) json: bool,
 }
