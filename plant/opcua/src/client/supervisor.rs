@@ -31,8 +31,8 @@ use super::{
     ClientConfig, ClientError, ClientUser, Link, OperationLimits, SecurityChoice, Service,
 };
 use crate::limits;
-use crate::pki::{OWN_CERTIFICATE, OWN_KEY, Pki};
 use crate::pki::NO_PKI;
+use crate::pki::{OWN_CERTIFICATE, OWN_KEY, Pki};
 
 /// What the handles and the supervisor have in common.
 pub(crate) struct Shared {
