@@ -6,7 +6,7 @@ use anyhow::{Context as _, ensure};
 use serde_json::{Map, Value};
 
 use crate::{
-    dist, links,
+    dist, links, markdown,
     shell::{Ended, line, step},
     workspace::Workspace,
 };
@@ -30,8 +30,8 @@ const METRICS: [(&str, &str, &str); 3] = [
 ];
 
 /// Builds the programs and writes the reference pages. `--check` compares the pages instead, and
-/// checks that the page of metrics names each metric of the sources. `--no-build` takes the
-/// programs as they are.
+/// checks that the page of metrics names each metric of the sources, and that the links of all pages
+/// have targets. `--no-build` takes the programs as they are.
 ///
 /// # Errors
 /// Returns an error if a program cannot be built or run, or a page cannot be written.
@@ -80,6 +80,9 @@ pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<E
             faults
                 .extend(missing.map(|name| format!("{FOLDER}/metrics.md lacks {name} of {file}")));
         }
+    }
+    if check {
+        faults.extend(markdown::broken_links(&workspace.root)?);
     }
     for fault in &faults {
         eprintln!("xtask: {fault}");

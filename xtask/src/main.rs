@@ -12,6 +12,7 @@ mod docs;
 mod instructions;
 mod links;
 mod lint;
+mod markdown;
 mod namespace;
 mod patches;
 mod peers;
