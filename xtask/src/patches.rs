@@ -294,7 +294,7 @@ impl Patches {
         for (path, _) in &self.0 {
             let mut git = Command::new("git");
             git.current_dir(folder)
-                .args(["apply", "--unidiff-zero", "--whitespace=nowarn"])
+                .args(["apply", "--whitespace=nowarn"])
                 .arg(path)
                 // In a repository git would take the paths to be those of the repository, and skip them as foreign to it.
                 .env_remove("GIT_DIR")
