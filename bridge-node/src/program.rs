@@ -50,6 +50,12 @@ pub trait Program: Parser {
     /// How it reads the NodeSet2 files that a mapping names, where it does.
     const NODESETS: Option<NodeSetReader> = None;
 
+    /// The library of its local side, with its version and patches, for the status.
+    #[must_use]
+    fn library() -> Option<&'static str> {
+        None
+    }
+
     /// The arguments all programs have.
     fn arguments(&self) -> &Arguments;
 
@@ -269,6 +275,7 @@ async fn prepare<P: Program>(
     router.introduce(application, now());
     Ok(Shell {
         program: P::NAME,
+        library: P::library(),
         own,
         router,
         held: port.addresses().and_then(Held::start),

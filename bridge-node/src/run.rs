@@ -32,6 +32,8 @@ use crate::status::{Interfaces, Readiness, Status};
 /// A bridge in the middle: router, port and socket, and who asks for the status.
 pub(crate) struct Shell<P> {
     pub(crate) program: &'static str,
+    /// The library of the port, for the status.
+    pub(crate) library: Option<&'static str>,
     pub(crate) own: SpaceId,
     pub(crate) router: Router,
     pub(crate) port: P,
@@ -260,6 +262,7 @@ impl<P: Port> Shell<P> {
                 interfaces,
             },
         )
+        .with_library(self.library)
         .with_links(self.port.links())
         .with_pending(self.port.pending())
     }

@@ -15,6 +15,8 @@ use crate::port::LinkState;
 #[derive(Debug, Clone, Serialize)]
 pub(crate) struct Status {
     program: &'static str,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    library: Option<&'static str>,
     space: u8,
     #[serde(flatten)]
     readiness: Readiness,
@@ -158,6 +160,7 @@ impl Status {
             .collect();
         Self {
             program,
+            library: None,
             space: space.get(),
             readiness,
             mapping: MappingStatus {
@@ -173,6 +176,11 @@ impl Status {
             others: router.others().into(),
             hops,
         }
+    }
+
+    pub(crate) const fn with_library(mut self, library: Option<&'static str>) -> Self {
+        self.library = library;
+        self
     }
 
     pub(crate) fn with_links(mut self, links: Vec<LinkState>) -> Self {

@@ -213,6 +213,10 @@ impl Program for BridgeRos2 {
     const QUIET: &'static str = plant_keys::QUIET;
     const LOCAL: Local = Local::Cdr;
 
+    fn library() -> Option<&'static str> {
+        Some(limits::RUSTDDS)
+    }
+
     fn arguments(&self) -> &Arguments {
         &self.arguments
     }

@@ -18,7 +18,7 @@ use crate::{ComponentPort, Options, made, simulate};
 #[derive(Debug, clap::Parser)]
 #[command(
     name = "ua-component",
-    version,
+    version = plant_opcua::patches::version(),
     after_help = "`ua-component simulate --help`: devices behind their protocols, to try drivers with"
 )]
 struct UaComponent {
@@ -147,6 +147,10 @@ impl Program for UaComponent {
     const LOCAL: bridge_core::Local = bridge_core::Local::Fields;
     const QUIET: &'static str = plant_opcua::QUIET;
     const CLAIMS: bool = true;
+
+    fn library() -> Option<&'static str> {
+        Some(plant_opcua::patches::library())
+    }
 
     fn arguments(&self) -> &Arguments {
         &self.arguments.0

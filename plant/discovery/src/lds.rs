@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, VecDeque};
 use std::io::ErrorKind;
-use std::net::IpAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -11,6 +11,7 @@ use std::time::{Duration, SystemTime};
 use bridge_node::{Failure, FailureKind, Requests};
 use log_limit::LogLimit;
 use opcua::types::ApplicationType;
+use plant_opcua::patches::OtherHosts;
 use registry::{Announcement, Asked, Event, Loss, Settings, instance_name};
 use serde::Serialize;
 use tokio::net::TcpListener;
@@ -183,6 +184,7 @@ pub enum OnLevel {
 #[derive(Debug, Clone, Serialize)]
 pub struct LdsStatus {
     program: &'static str,
+    library: &'static str,
     application_uri: String,
     endpoint: String,
     interface: String,
@@ -596,6 +598,7 @@ impl Lds {
         let why = format!("the interface {} has no IPv4 address", self.interface);
         LdsStatus {
             program: "ua-lds",
+            library: plant_opcua::patches::library(),
             application_uri: self.shared.own.application_uri.clone(),
             endpoint: self.shared.own.url.clone(),
             interface: self.interface.to_string(),
@@ -666,6 +669,8 @@ pub(crate) enum ListenFault {
     Url,
     /// The system does not let it.
     Io(std::io::Error),
+    /// Other hosts reach the address, and the OPC UA libraries are as published.
+    AsPublished(OtherHosts),
 }
 
 impl ListenFault {
@@ -681,6 +686,9 @@ impl ListenFault {
                 let message =
                     format!("--endpoint {endpoint}: for example opc.tcp://127.0.0.1:4840");
                 return Failure::new(FailureKind::Usage, message);
+            }
+            Self::AsPublished(error) => {
+                return Failure::new(FailureKind::Configuration, error.to_string());
             }
             Self::Io(error) => error,
         };
@@ -709,6 +717,7 @@ impl std::fmt::Display for ListenFault {
         match self {
             Self::Url => f.write_str("that is no URL as opc.tcp://host:port"),
             Self::Io(error) => error.fmt(f),
+            Self::AsPublished(error) => error.fmt(f),
         }
     }
 }
@@ -726,7 +735,10 @@ fn own_host(host: &str, interface: &Interface) -> String {
 /// Listens at a URL.
 pub(crate) async fn listen(endpoint: &str) -> Result<(TcpListener, Url), ListenFault> {
     let place = Url::parse(endpoint).ok_or(ListenFault::Url)?;
-    let listener = TcpListener::bind((place.host.as_str(), place.port)).await;
+    let addresses = tokio::net::lookup_host((place.host.as_str(), place.port)).await;
+    let addresses: Vec<SocketAddr> = addresses.map_err(ListenFault::Io)?.collect();
+    plant_opcua::patches::check(&addresses).map_err(ListenFault::AsPublished)?;
+    let listener = TcpListener::bind(addresses.as_slice()).await;
     Ok((listener.map_err(ListenFault::Io)?, place))
 }
 

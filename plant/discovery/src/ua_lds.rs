@@ -18,7 +18,7 @@ use crate::{DEFAULT_LDS, Interface};
 /// (FindServers, FindServersOnNetwork, GetEndpoints). There are no sessions. Who does not answer any more is forgotten
 /// within two seconds.
 #[derive(Debug, clap::Parser)]
-#[command(name = "ua-lds", version)]
+#[command(name = "ua-lds", version = plant_opcua::patches::version())]
 struct UaLds {
     /// Where servers and clients connect
     #[arg(long, value_name = "URL", env = "UA_LDS_ENDPOINT", default_value = DEFAULT_LDS)]

@@ -31,7 +31,7 @@ use crate::serve::{Settings, serve};
 /// by a certificate that is trusted here, and comes over an encrypted channel. Everybody may ask who is registered. Users and
 /// trusted certificates are those of the certificate store (`ua-server user` and `ua-server trust` with its --pki).
 #[derive(Debug, clap::Parser)]
-#[command(name = "ua-gds", version, args_conflicts_with_subcommands = true)]
+#[command(name = "ua-gds", version = plant_opcua::patches::version(), args_conflicts_with_subcommands = true)]
 struct UaGds {
     #[command(subcommand)]
     verb: Option<Verb>,

@@ -42,7 +42,7 @@ use crate::settings::Settings;
 
 /// The semantic MES: knows the components of the plant, answers questions about them, and runs processes with them.
 #[derive(Debug, clap::Parser)]
-#[command(name = "ua-mes", version)]
+#[command(name = "ua-mes", version = plant_opcua::patches::version())]
 struct UaMes {
     /// The YAML of the MES
     #[arg(value_name = "MES", env = "UA_MES")]
@@ -257,6 +257,10 @@ impl Program for UaMes {
     const LOCAL: bridge_core::Local = bridge_core::Local::Fields;
     const QUIET: &'static str = plant_opcua::QUIET;
     const CLAIMS: bool = true;
+
+    fn library() -> Option<&'static str> {
+        Some(plant_opcua::patches::library())
+    }
 
     fn arguments(&self) -> &Arguments {
         &self.arguments.0

@@ -5,6 +5,9 @@ use std::io;
 use std::net::{IpAddr, SocketAddr, TcpListener, ToSocketAddrs as _};
 use std::str::FromStr;
 
+#[cfg(feature = "server")]
+use crate::patches::OtherHosts;
+
 /// The endpoint URL of the server: `opc.tcp://host:port/path` (OPC 10000-6, 7.1.2.2).
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct EndpointUrl {
@@ -72,7 +75,8 @@ impl EndpointUrl {
     /// Opens the listening socket, with no delay for small packets on the connections it accepts.
     ///
     /// # Errors
-    /// The host has no address, or none of its addresses can be listened on.
+    /// The host has no address, or none of its addresses can be listened on; or other hosts reach one, and the libraries are
+    /// as published ([`crate::patches`]).
     pub fn bind(&self) -> Result<TcpListener, BindError> {
         let failed = |address: String| {
             move |source: io::Error| {
@@ -97,6 +101,8 @@ impl EndpointUrl {
                 source,
             })?
             .collect();
+        #[cfg(feature = "server")]
+        crate::patches::check(&addresses)?;
         let shown = addresses.first().map_or_else(|| name, ToString::to_string);
         let listener = TcpListener::bind(addresses.as_slice()).map_err(failed(shown.clone()))?;
         listener
@@ -186,6 +192,10 @@ pub enum BindError {
         #[source]
         source: io::Error,
     },
+    /// Other hosts reach the address, and the libraries are as published.
+    #[cfg(feature = "server")]
+    #[error(transparent)]
+    AsPublished(#[from] OtherHosts),
     /// Anything else.
     #[error("cannot listen on {address}: {source}")]
     Other {

@@ -26,6 +26,8 @@ pub mod limits;
 #[cfg(feature = "server")]
 pub mod nodeset;
 mod pair;
+#[cfg(feature = "server")]
+pub mod patches;
 pub mod pki;
 #[cfg(feature = "server")]
 pub mod server;

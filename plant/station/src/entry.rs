@@ -23,7 +23,7 @@ use crate::{StationSettings, Upper};
 /// To the devices it shows the methods of its neighbours above, below Neighbours. Without --upper-interface it is the top
 /// level, and shows nothing to anybody.
 #[derive(Debug, clap::Parser)]
-#[command(name = "ua-station", version)]
+#[command(name = "ua-station", version = plant_opcua::patches::version())]
 struct UaStation {
     /// What it is called on the level above
     #[arg(long, value_name = "NAME", env = "UA_STATION")]

@@ -73,7 +73,7 @@ use crate::structures::Types;
 
 /// The OPC UA server of the cell: every value of the space as a variable, and a way in for those of origin 0.
 #[derive(Debug, clap::Parser)]
-#[command(name = "ua-server", version, after_help = verbs::HELP)]
+#[command(name = "ua-server", version = plant_opcua::patches::version(), after_help = verbs::HELP)]
 struct UaServer {
     #[command(flatten)]
     arguments: Arguments,
@@ -161,6 +161,10 @@ impl Program for UaServer {
         opcua_crypto=warn,opcua_core=warn,opcua_nodes=warn,opcua_types=off";
 
     const NODESETS: Option<NodeSetReader> = Some(plant_nodesets::read);
+
+    fn library() -> Option<&'static str> {
+        Some(plant_opcua::patches::library())
+    }
 
     fn arguments(&self) -> &Arguments {
         &self.arguments
