@@ -2,6 +2,7 @@
 
 #![expect(clippy::unwrap_used, clippy::panic, reason = "test code")]
 
+use std::collections::VecDeque;
 use std::future::Future;
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -17,6 +18,7 @@ use tcpros::{
 };
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
+use tokio::task::JoinSet;
 use tokio::time::{Instant, timeout};
 
 const MD5: &str = "09fb03525b03e7ea1fd3992bafd87e16";
@@ -410,6 +412,49 @@ async fn a_server_that_does_not_grant_persistence_is_connected_to_for_every_call
         }
     };
     within("the calls", async { tokio::join!(serve, call) }).await;
+}
+
+/// The kernel holds five connections that a rospy server has not accepted yet, and drops the
+/// packets of others.
+#[tokio::test]
+async fn calls_at_once_connect_a_few_at_a_time_and_all_are_answered() {
+    const CALLS: usize = 20;
+    const QUIET: Duration = Duration::from_millis(300);
+    let core = core();
+    let cell = node("cell", &core);
+    let listener = server_by_hand(&core, "/grip").await;
+    let client = client(&cell, "/grip");
+    let mut calls = JoinSet::new();
+    for _ in 0..CALLS {
+        let client = client.clone();
+        calls.spawn(async move { client.call(Bytes::from_static(b"on")).await });
+    }
+    let mut opening = VecDeque::new();
+    while let Ok(accepted) = timeout(QUIET, listener.accept()).await {
+        opening.push_back(accepted.unwrap().0);
+    }
+    assert!((1..=4).contains(&opening.len()), "{}", opening.len());
+    let mut open = Vec::new();
+    while let Some(mut stream) = opening.pop_front() {
+        read_header(&mut stream).await;
+        let reply = ConnectionHeader::default().with("md5sum", MD5);
+        stream.write_all(&reply.encode().unwrap()).await.unwrap();
+        open.push(stream);
+        if open.len() + opening.len() < CALLS {
+            let accepted = within("the next connection", listener.accept()).await;
+            opening.push_back(accepted.unwrap().0);
+        }
+    }
+    // A call that is executed holds up no other.
+    for stream in &mut open {
+        assert_eq!(take_request(stream).await, b"on");
+    }
+    for stream in &mut open {
+        stream.write_all(b"\x01\x02\0\0\0on").await.unwrap();
+    }
+    while let Some(answer) = calls.join_next().await {
+        assert_eq!(answer.unwrap().unwrap(), "on");
+    }
 }
 
 #[tokio::test]

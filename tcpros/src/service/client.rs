@@ -11,7 +11,7 @@ use socket2::SockRef;
 use thiserror::Error;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
-use tokio::sync::Mutex;
+use tokio::sync::{Mutex, Semaphore};
 use tokio::time::{Instant, timeout, timeout_at};
 
 use super::DEFAULT_MAX_BODY;
@@ -65,6 +65,8 @@ struct Shared {
     master: Master,
     /// Of a persistent client between two calls. Who calls takes it out, so that a call given up takes it along.
     kept: Mutex<Option<Connection>>,
+    /// Permits to look the service up, connect and exchange headers, see [`MOST_OPENING`].
+    opening: Semaphore,
 }
 
 impl ServiceClient {
@@ -81,6 +83,7 @@ impl ServiceClient {
                 caller_id: caller_id.to_owned(),
                 master,
                 kept: Mutex::default(),
+                opening: Semaphore::new(MOST_OPENING),
             }),
         }
     }
@@ -178,12 +181,15 @@ impl Shared {
         answer
     }
 
-    /// Finds the server, connects, and has it accept us.
+    /// Looks the service up, connects, and exchanges headers. The server has accepted the
+    /// connection then.
     async fn connect(
         &self,
         deadline: Instant,
         purpose: Purpose,
     ) -> Result<(Connection, ConnectionHeader), ServiceError> {
+        let waiting = self.opening.acquire();
+        let _permit = self.within(CallPhase::Queue, deadline, waiting).await?;
         let looking = self.master.lookup_service(&self.service);
         let found = self.within(CallPhase::Lookup, deadline, looking).await?;
         let uri = found
@@ -425,7 +431,7 @@ enum AnswerError {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum CallPhase {
-    /// Waiting for earlier calls on the same persistent connection.
+    /// Waiting for earlier calls: for the persistent connection, or for a turn to connect.
     Queue,
     /// Asking the master where the service is.
     Lookup,
@@ -442,7 +448,7 @@ pub enum CallPhase {
 impl fmt::Display for CallPhase {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
-            Self::Queue => "waiting for earlier calls on its connection",
+            Self::Queue => "waiting for earlier calls to the same service",
             Self::Lookup => "asking the master for it",
             Self::Connect => {
                 "connecting to it (if its node is gone, `rosnode cleanup` removes it from the master)"
@@ -599,5 +605,9 @@ impl ServiceError {
     }
 }
 
+/// Connections of one client that are opened at the same time. The accept queues of a rospy node
+/// and of rosmaster hold five connections. The kernel drops the packets of further connections, and
+/// repeats them with growing pauses.
+const MOST_OPENING: usize = 4;
 /// How quickly a server that closes after its answer is expected to have closed.
 const CLOSING_TIME: Duration = Duration::from_millis(50);
