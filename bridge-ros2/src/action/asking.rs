@@ -9,6 +9,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use rustdds::GUID;
+use tokio::sync::{Notify, mpsc};
 use tokio::task::AbortHandle;
 use tokio::time::{Instant, sleep, sleep_until, timeout};
 use tracing::{debug, info};
@@ -74,7 +75,18 @@ pub(super) struct Shared {
     participant: GUID,
     peers: ServicePeers,
     asked: Asked,
+    /// Goals that end once feedback is taken that was received before their results.
+    ends: mpsc::Sender<GoalEnd>,
     state: Mutex<State>,
+}
+
+/// How a goal has ended.
+#[derive(Debug)]
+pub(super) struct GoalEnd {
+    id: GoalId,
+    outcome: Outcome,
+    /// Distinguishes the goal from a later goal with the same id.
+    changed: Arc<Notify>,
 }
 
 #[derive(Debug)]
@@ -91,7 +103,7 @@ impl Shared {
         (domain, peers): (&Domain, &ServicePeers),
         action: &Action,
         options: ActionClientOptions,
-        asked: Asked,
+        (asked, ends): (Asked, mpsc::Sender<GoalEnd>),
     ) -> Self {
         Self {
             action: action.clone(),
@@ -99,6 +111,7 @@ impl Shared {
             participant: domain.guid(),
             peers: peers.clone(),
             asked,
+            ends,
             state: Mutex::new(State {
                 goals: ClientGoals::new(Limits {
                     goals: options.max_goals,
@@ -234,12 +247,36 @@ impl Shared {
 
     /// Sees a goal through to its end.
     pub(super) async fn drive(self: Arc<Self>, id: GoalId, request: Bytes) {
+        let changed = self.lock().goals.changed(id);
         // Both are cancel-safe: a request to cancel is noted as sent before it is.
         let outcome = tokio::select! {
             outcome = self.outcome(id, request) => outcome,
             never = self.cancel_withdrawn(id) => match never {},
         };
+        if let Outcome::Done { .. } = &outcome {
+            // Feedback that was sent before may be on another socket, which is read later.
+            sleep(FEEDBACK_GRACE).await;
+        }
+        let end = GoalEnd {
+            id,
+            outcome,
+            changed,
+        };
+        // It is closed with the client, whose goals have ended then.
+        let _is_open = self.ends.send(end).await;
+    }
+
+    /// Ends a goal, unless nobody holds it any more.
+    pub(super) fn end(&self, end: GoalEnd) {
+        let GoalEnd {
+            id,
+            outcome,
+            changed,
+        } = end;
         let mut state = self.lock();
+        if !Arc::ptr_eq(&changed, &state.goals.changed(id)) {
+            return;
+        }
         let age = state.goals.withdrawal(id).map(|of| of.age(Instant::now()));
         if state.goals.end(id, outcome.clone()) {
             let action = self.action.name();
@@ -434,5 +471,7 @@ async fn after(limit: Option<Duration>) -> Duration {
     }
 }
 
+/// How long feedback may come behind a result that was sent after it.
+const FEEDBACK_GRACE: Duration = Duration::from_millis(10);
 /// How long the answer to a goal may come behind the status that says that the goal is accepted.
 const ANSWER_AFTER_STATUS: Duration = Duration::from_secs(1);

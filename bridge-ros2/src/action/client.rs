@@ -3,12 +3,12 @@
 use std::sync::{Arc, MutexGuard};
 use std::time::Duration;
 
-use tokio::sync::Notify;
+use tokio::sync::{Notify, mpsc};
 use tokio::task::AbortHandle;
 use tokio::time::Instant;
 use tracing::warn;
 
-use super::asking::{ActionClientOptions, Asked, Shared, State};
+use super::asking::{ActionClientOptions, Asked, GoalEnd, Shared, State};
 use super::client_goals::{ClientCounters, Outcome};
 use super::error::{ActionError, IdInUse, LostReason, NoServer};
 use super::goal::GoalHandle;
@@ -57,17 +57,16 @@ impl ActionClient {
         let cancel = open(action.cancel_goal(), Some(options.cancel_timeout))?;
         // The decision about a goal is awaited until the server has left, since a withdrawn goal is cancelled then.
         let send = open(action.send_goal(), None)?;
-        let shared = Arc::new(Shared::new(
-            (domain, peers),
-            action,
-            options,
-            Asked {
-                send,
-                cancel,
-                result,
-            },
-        ));
-        let task = tokio::spawn(listen(Arc::clone(&shared), status, feedback)).abort_handle();
+        let (ends, ended) = mpsc::channel(MOST_ENDS);
+        let asked = Asked {
+            send,
+            cancel,
+            result,
+        };
+        let shared = Shared::new((domain, peers), action, options, (asked, ends));
+        let shared = Arc::new(shared);
+        let listening = listen(Arc::clone(&shared), (status, feedback), ended);
+        let task = tokio::spawn(listening).abort_handle();
         Ok(Self { shared, task })
     }
 
@@ -163,13 +162,34 @@ impl Drop for ActionClient {
     }
 }
 
-/// Hears what the server says until aborted.
-async fn listen(shared: Arc<Shared>, status: Reader, feedback: Reader) {
+/// Receives statuses and feedback until aborted. A goal ends here, once what was received before
+/// its result is taken.
+async fn listen(
+    shared: Arc<Shared>,
+    (status, feedback): (Reader, Reader),
+    mut ended: mpsc::Receiver<GoalEnd>,
+) {
     loop {
-        // Both are cancel-safe.
+        // All are cancel-safe.
         tokio::select! {
             sample = next(&status) => shared.hear_status(sample),
             sample = next(&feedback) => shared.hear_feedback(sample),
+            Some(end) = ended.recv() => {
+                for _ in 0..MOST_OVERTAKEN {
+                    tokio::select! {
+                        biased;
+                        sample = next(&status) => shared.hear_status(sample),
+                        sample = next(&feedback) => shared.hear_feedback(sample),
+                        () = std::future::ready(()) => break,
+                    }
+                }
+                shared.end(end);
+            }
         }
     }
 }
+
+/// Goals that may wait for their end here; others wait in their tasks.
+const MOST_ENDS: usize = 64;
+/// Samples that are taken before a goal ends. A server that keeps sending does not hold up the end.
+const MOST_OVERTAKEN: usize = 10_000;

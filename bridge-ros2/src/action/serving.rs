@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use tokio::sync::{Notify, oneshot, watch};
-use tokio::time::{Instant, sleep_until, timeout_at};
+use tokio::time::{Instant, sleep, sleep_until, timeout, timeout_at};
 use tracing::debug;
 
 use super::feedback::FeedbackWriter;
@@ -373,7 +373,7 @@ impl Shared {
         let id = wire::read_result_request(&request.bytes).map_err(|Malformed| self.malformed())?;
         let (who, result) = oneshot::channel();
         let asked = self.lock().goals.ask(id, || who);
-        match asked {
+        let result = match asked {
             Asked::Ended(result) => Ok(result),
             Asked::Unknown => wire::with_status(&self.options.empty_result, Status::Unknown)
                 .ok_or_else(|| "the empty result of the options is no CDR".to_owned()),
@@ -382,7 +382,25 @@ impl Shared {
                 let why = "too many wait for the result of one goal, or the server has gone";
                 result.await.map_err(|_| why.to_owned())
             }
-        }
+        };
+        self.feedback_first().await;
+        result
+    }
+
+    /// Waits until queued feedback is sent: a client reports none after the result. A reader that
+    /// takes nothing holds up a result for half a second.
+    async fn feedback_first(&self) {
+        let is_waiting = || {
+            let state = self.lock();
+            let outputs = state.outputs.as_ref();
+            outputs.is_some_and(|outputs| outputs.feedback.is_waiting())
+        };
+        let sent = async {
+            while is_waiting() {
+                sleep(BUSY).await;
+            }
+        };
+        let _is_sent = timeout(FEEDBACK_FIRST, sent).await.is_ok();
     }
 
     fn malformed(&self) -> String {
@@ -471,5 +489,7 @@ pub(super) async fn run(shared: Arc<Shared>) {
 
 /// Requests that are answered at once, beside those that wait.
 const AT_ONCE: usize = 64;
+/// How long a result waits for feedback that is yet to be sent.
+const FEEDBACK_FIRST: Duration = Duration::from_millis(500);
 /// Stands for a time limit too long for the clock.
 const LONGEST: Duration = Duration::from_secs(86_400 * 365);
