@@ -24,7 +24,9 @@ use system_tests::{
 
 const LDS: &str = "opc.tcp://127.0.0.1:4840";
 const STATUS: &str = "127.0.0.1:9104";
-const SOON: Duration = Duration::from_secs(10);
+/// For what has no promised time: each look of a peer in Python starts an interpreter, which takes
+/// seconds on a loaded machine.
+const SOON: Duration = Duration::from_secs(30);
 const MDNS: SocketAddrV4 = SocketAddrV4::new(Ipv4Addr::new(224, 0, 0, 251), 5353);
 
 fn lds(args: &[&str]) -> Child {

@@ -646,9 +646,9 @@ impl Lds {
         ])
     }
 
-    /// Lets nobody in any more, and says goodbye.
+    /// Says goodbye, and closes the listener and the connections. Goodbye comes first: a client
+    /// whose connection ends before takes the discovery server for killed.
     async fn leave(&mut self) {
-        self.accepting.shutdown().await;
         let goodbye = self
             .keeper
             .mdns
@@ -658,6 +658,7 @@ impl Lds {
             // Late: others find out by themselves.
             drop(timeout(LEAVE_LIMIT, goodbye).await);
         }
+        self.accepting.shutdown().await;
         self.keeper.mdns = None;
     }
 }
