@@ -18,8 +18,9 @@ use serde_json::Value;
 
 use crate::{Cable, Host, Site};
 
-/// How long a process has between the signal that asks it to end and the one that makes it.
-const GRACE: Duration = Duration::from_secs(5);
+/// How long a process has between the signal that asks it to end and the one that makes it. A bridge
+/// waits 5 s for pending cancellations; the rest is for a loaded machine.
+const GRACE: Duration = Duration::from_secs(10);
 /// Lines kept per process. What comes after them is read and counted, so that the process never blocks on its pipe.
 const KEPT: usize = 200_000;
 /// Lines shown when a test fails.
@@ -324,7 +325,7 @@ impl Child {
     /// Asks it to end as a user would and waits for that.
     ///
     /// # Panics
-    /// When it has not ended in five seconds.
+    /// When it has not ended in ten seconds.
     pub fn end(&mut self) -> ExitStatus {
         self.signal(self.ends_on);
         self.wait_for_end(GRACE)

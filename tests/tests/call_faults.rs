@@ -397,10 +397,21 @@ fn slow_calls_do_not_delay_values_at_1_khz() {
         return;
     };
     let _core = cell.roscore();
-    let service = format!("empty={SERVICE}");
-    // They go on until they are told to end.
-    let mut executor = cell.rospy_executor(&[&service, "--delay", "1000"]);
-    let plant = concat!(env!("CARGO_MANIFEST_DIR"), "/cells/plant.yaml");
+    // They go on until they are told to end, which takes its time on a loaded machine.
+    let mut executor = cell.rospy_executor(&["empty=/slow", "--delay", "1000"]);
+    let plant = include_str!("../cells/plant.yaml");
+    let slow = "
+calls:
+  - node: ns=2;i=61
+    name: Slow
+    origin: 1
+    timeout: 80s
+    ros:
+      - {service: /slow, type: std_srvs/Trigger}
+      - {space: 2, service: /slow, type: std_srvs/Trigger}
+";
+    let plant = cell.file("plant.yaml", &[plant, slow].concat());
+    let plant = plant.to_str().unwrap();
     let _bridges = (cell.bridge_ros1(&[plant]), cell.bridge_ros2(&[plant]));
     let mut asker = cell.rclpy_asker(Distribution::Jazzy);
     let mut judge = cell.judge(Distribution::Jazzy, &["judge"]);
@@ -418,7 +429,10 @@ fn slow_calls_do_not_delay_values_at_1_khz() {
     ];
     let mut sends = cell.rospy_started("ros1_pub.py", &args).told().start();
     judge.hears(topic, |value| (value["data"] == "warm-up").then_some(()));
-    asker.begin(order("empty", 0, 200, 200));
+    let mut calls = order("empty", 0, 200, 200);
+    calls["service"] = json!("/slow");
+    calls["patience"] = json!(85);
+    asker.begin(calls);
     running(&mut executor, AT_ONCE);
     sends.tell("go");
     sends.wait_for_line("\"sent\"", SOON);

@@ -13,7 +13,7 @@ use uadp::Scalar;
 const ELSEWHERE: &str = "10.77.0.3";
 const START: Duration = Duration::from_secs(20);
 /// A look each second and a repetition each second, and a loaded machine.
-const SOON: Duration = Duration::from_secs(5);
+const SOON: Duration = Duration::from_secs(20);
 const OUT: (Triple, &str) = ((1, 2, 10), "/ua_1_2_10");
 const IN: (Triple, &str) = ((2, 2, 20), "ua_2_2_20");
 

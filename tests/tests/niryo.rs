@@ -346,7 +346,7 @@ fn move_goal(path: &str, value: &str) -> (TopicType, Vec<u8>) {
 }
 
 #[test]
-fn a_restarted_bridge_calls_for_the_value_the_space_repeats() {
+fn a_restarted_bridge_calls_for_the_next_value_that_is_written() {
     let Some(cell) = cell() else { return };
     let mut line = start(&cell);
     line.side.hear((1, 2, 11), "joints", |_| Some(()));
@@ -355,7 +355,7 @@ fn a_restarted_bridge_calls_for_the_value_the_space_repeats() {
     called(&line.robot, output, 0);
     line.bridge.end();
     line.bridge = bridge(&cell, MAPPING);
-    let again = eventually("the repeated value is called for", SOON, || {
+    let again = eventually("the next value is called for", SOON, || {
         line.side.write((0, 2, 45), Scalar::Boolean(true));
         calls(&line.robot, output).get(1).cloned()
     });

@@ -14,7 +14,7 @@ use system_tests::{
 };
 use uadp::Scalar;
 
-const SOON: Duration = Duration::from_secs(10);
+const SOON: Duration = Duration::from_secs(30);
 /// What domain 2 announces participants to (RTPS 2.5, 9.6.2.3), and what the first participant listens at.
 const GROUP: SocketAddrV4 = SocketAddrV4::new(Ipv4Addr::new(239, 255, 0, 1), 7900);
 const PORTS: [u16; 2] = [7910, 7911];
