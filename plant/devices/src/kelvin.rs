@@ -13,8 +13,8 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use skills::{
-    ClientOptions, Device, Driver, DriverFault, Parameters, Results, Runs, SkillClient, SkillFault,
-    TypeName, Value, Work,
+    COMPOSITE_HALT_TIMEOUT, ClientOptions, Device, Driver, DriverFault, Parameters, PartEnd,
+    Results, Runs, SkillClient, SkillFault, TypeName, Value, Work, run_part,
 };
 use tokio::time::{Instant, sleep};
 
@@ -175,6 +175,11 @@ impl Tool {
 
 #[async_trait]
 impl Driver for Change {
+    /// Halt waits for the moves of the robot.
+    fn halt_timeout(&self) -> Option<Duration> {
+        Some(COMPOSITE_HALT_TIMEOUT)
+    }
+
     fn check(&self, parameters: &Parameters) -> Result<(), String> {
         match self.what {
             What::Detach => Ok(()),
@@ -407,12 +412,12 @@ impl Connected {
             work.step(*step).await;
             let skill = if *straight { &self.linear } else { &self.ptp };
             let parameters = vec![("TargetPosition".to_owned(), Value::from(*to))];
-            let outcome = tokio::select! {
-                outcome = skill.run(parameters, within) => outcome,
-                why = skill.lost() => return Err(format!("{step}: the robot is lost: {why}")),
-                () = work.stopped() => {
-                    let halted = skill.halt().await;
-                    let why = halted.err().map(|fault| format!(", and the robot cannot be halted: {fault}"));
+            let outcome = match run_part(&**skill, parameters, within, work, work.stopped()).await {
+                PartEnd::Ended(outcome) => outcome,
+                PartEnd::Interrupted { halted, .. } => {
+                    let halted = halted.err();
+                    let why =
+                        halted.map(|fault| format!(", and the robot cannot be halted: {fault}"));
                     return Err(format!("stopped at {step}{}", why.unwrap_or_default()));
                 }
             };

@@ -1,10 +1,11 @@
 //! A process from its plan to its end: planned with what the plant offers, run, and planned anew when a component is lost.
 
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use async_trait::async_trait;
-use skills::{Outcome, PickAndPlace, Runs, SkillFault, Teller, Value};
+use skills::{Outcome, PartEnd, PickAndPlace, Runs, SkillFault, Teller, Value, run_part};
 use tokio::sync::watch;
 use tracing::{info, warn};
 
@@ -265,6 +266,7 @@ impl Execution<'_> {
                     offer: offer.clone(),
                     log: Arc::clone(self.log),
                     process: self.process.clone(),
+                    is_halted: AtomicBool::new(false),
                 };
                 Arc::new(watched) as Arc<dyn Runs>
             });
@@ -342,16 +344,21 @@ impl Execution<'_> {
                 Ok(values) => values,
                 Err(why) => return Ended::Over(format!("{}: {why}", step.name)),
             };
-            let outcome = tokio::select! {
-                outcome = skill.run(values, self.process.within) => outcome,
-                why = skill.lost() => Err(SkillFault::Lost(why)),
-                () = self.teller.stopped() => {
-                    return match skill.halt().await {
-                        Ok(()) => Ended::Over("stopped".to_owned()),
-                        Err(fault) => Ended::Over(format!("stopped, but {} may go on: {fault}", skill.name())),
-                    };
+            let within = self.process.within;
+            let part = run_part(&**skill, values, within, self, self.teller.stopped());
+            let outcome = match part.await {
+                PartEnd::Ended(outcome) => outcome,
+                PartEnd::Interrupted { halted: Ok(()), .. } => {
+                    return Ended::Over("stopped".to_owned());
+                }
+                PartEnd::Interrupted {
+                    halted: Err(fault), ..
+                } => {
+                    let name = skill.name();
+                    return Ended::Over(format!("stopped, but {name} may go on: {fault}"));
                 }
             };
+            let goes_on = matches!(outcome, Err(SkillFault::NotHalted(_)));
             let why = match outcome {
                 Ok(outcome) if outcome.succeeded => continue,
                 Ok(outcome) => outcome.message,
@@ -360,7 +367,7 @@ impl Execution<'_> {
             // What was done before would be done twice by another plan.
             let why = format!("{}: {} {why}", step.name, skill.name());
             let is_first = self.process.steps.first() == Some(step);
-            return if is_first {
+            return if is_first && !goes_on {
                 Ended::Broken(why)
             } else {
                 Ended::Over(why)
@@ -376,6 +383,14 @@ impl Teller for Execution<'_> {
     async fn step(&self, step: &'static str) {
         self.log.step(step);
         self.teller.step(step).await;
+    }
+
+    async fn pending(&self, why: &str) {
+        self.teller.pending(why).await;
+    }
+
+    async fn unknown(&self, why: &str) {
+        self.teller.unknown(why).await;
     }
 
     async fn stopped(&self) {
@@ -451,6 +466,8 @@ struct Watched {
     offer: Offer,
     process: Process,
     log: Arc<Log>,
+    /// Whether the run was halted because of another skill, which says nothing against this one.
+    is_halted: AtomicBool,
 }
 
 impl Watched {
@@ -515,10 +532,12 @@ impl Runs for Watched {
         parameters: Vec<(String, Value)>,
         within: Duration,
     ) -> Result<Outcome, SkillFault> {
+        self.is_halted.store(false, Ordering::Relaxed);
         self.begins();
         let outcome = self.inner.run(parameters, within).await;
         match &outcome {
             Ok(outcome) if outcome.succeeded => self.ends(How::Done, None),
+            Ok(_) if self.is_halted.load(Ordering::Relaxed) => self.ends(How::Stopped, None),
             Ok(outcome) => {
                 self.fell(false, &outcome.message);
                 self.ends(How::Failed, Some(outcome.message.clone()));
@@ -533,6 +552,7 @@ impl Runs for Watched {
     }
 
     async fn halt(&self) -> Result<(), SkillFault> {
+        self.is_halted.store(true, Ordering::Relaxed);
         self.inner.halt().await
     }
 

@@ -96,6 +96,14 @@ impl Teller for Telling<'_> {
         self.0.step(step).await;
     }
 
+    async fn pending(&self, why: &str) {
+        self.0.pending(why).await;
+    }
+
+    async fn unknown(&self, why: &str) {
+        self.0.unknown(why).await;
+    }
+
     async fn stopped(&self) {
         self.0.stopped().await;
     }

@@ -305,9 +305,10 @@ mod tests {
         mine.call(Method::Reset).await.unwrap();
         let status = |fault: SkillFault| match &fault {
             SkillFault::Refused { status, .. } => status.clone(),
-            SkillFault::Lost(_) | SkillFault::TimedOut(_) | SkillFault::Unexpected(_) => {
-                panic!("{fault}")
-            }
+            SkillFault::Lost(_)
+            | SkillFault::TimedOut(_)
+            | SkillFault::NotHalted(_)
+            | SkillFault::Unexpected(_) => panic!("{fault}"),
         };
         assert_eq!(
             status(theirs.call(Method::Start).await.unwrap_err()),
@@ -519,9 +520,10 @@ mod tests {
         let (mine, theirs) = (first.handle(&found[0]), second.handle(&found[0]));
         let code = |fault: SkillFault| match &fault {
             SkillFault::Refused { status, .. } => status.clone(),
-            SkillFault::Lost(_) | SkillFault::TimedOut(_) | SkillFault::Unexpected(_) => {
-                panic!("{fault}")
-            }
+            SkillFault::Lost(_)
+            | SkillFault::TimedOut(_)
+            | SkillFault::NotHalted(_)
+            | SkillFault::Unexpected(_) => panic!("{fault}"),
         };
         // What is refused leaves a Halted skill Halted.
         let force = |force: f64| vec![("Force".to_owned(), Value::from(force))];

@@ -1,5 +1,6 @@
 //! Pick and place: one skill made of those of a robot and a gripper.
 
+use std::future::Future;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -8,6 +9,7 @@ use tracing::{debug, warn};
 
 use crate::driver::{Driver, Results, Work};
 use crate::parameters::Parameters;
+use crate::part::{PartEnd, run_part};
 use crate::runs::{COMPOSITE_HALT_TIMEOUT, Runs, SkillFault};
 use crate::value::Value;
 
@@ -63,6 +65,16 @@ pub trait Teller: Send + Sync {
         debug!("{what}");
     }
 
+    /// Reports why the work has not ended although it was told to stop.
+    async fn pending(&self, why: &str) {
+        debug!("{why}");
+    }
+
+    /// Reports that the end of a part is unknown: the skill is not started again before a Reset.
+    async fn unknown(&self, why: &str) {
+        warn!("{why}");
+    }
+
     /// Ready when nothing more is to be done.
     async fn stopped(&self) {
         std::future::pending().await
@@ -77,6 +89,14 @@ impl Teller for Work {
 
     async fn did(&self, what: &str) {
         self.note(what).await;
+    }
+
+    async fn pending(&self, why: &str) {
+        Self::pending(self, why).await;
+    }
+
+    async fn unknown(&self, why: &str) {
+        Self::unknown(self, why).await;
     }
 
     async fn stopped(&self) {
@@ -105,10 +125,22 @@ type Step<'s> = (
 /// How a step went wrong.
 enum Fault {
     /// Halt: everything stands still where it is.
-    Stopped,
-    /// There is no robot any more that could retreat.
+    Stopped(String),
+    /// There is no robot any more that could retreat, or whether it moves is unknown.
     RobotLost(String),
     Other(String),
+}
+
+impl Fault {
+    /// The fault after a part that could not be halted.
+    fn goes_on(self, part: &str, is_robot: bool) -> Self {
+        match self {
+            Self::RobotLost(why) => Self::RobotLost(format!("{why}; {part}")),
+            Self::Stopped(why) => Self::Stopped(format!("{why}; {part}")),
+            Self::Other(why) if is_robot => Self::RobotLost(format!("{why}; {part}")),
+            Self::Other(why) => Self::Other(format!("{why}; {part}")),
+        }
+    }
 }
 
 impl PickAndPlace {
@@ -165,10 +197,7 @@ impl PickAndPlace {
                 Err(fault) => fault,
             };
             let (why, retreated) = match fault {
-                Fault::Stopped => (
-                    "stopped".to_owned(),
-                    Err("it was halted, and stands still".to_owned()),
-                ),
+                Fault::Stopped(why) => (why, Err(HALTED.to_owned())),
                 Fault::RobotLost(why) => (why.clone(), Err(why)),
                 Fault::Other(why) => (why, self.retreat(retreat, teller).await),
             };
@@ -189,27 +218,25 @@ impl PickAndPlace {
         target: Option<[f64; 6]>,
         teller: &dyn Teller,
     ) -> Result<(), Fault> {
-        let fault = tokio::select! {
-            fault = run(&**skill, target, self.within, teller) => match fault {
-                Ok(()) => return Ok(()),
-                Err(Ran::Lost(why)) if target.is_some() => return Err(Fault::RobotLost(why)),
-                Err(Ran::Lost(why) | Ran::Failed(why)) => return Err(Fault::Other(why)),
-            },
-            why = self.ptp.lost() => return Err(Fault::RobotLost(lost(&*self.ptp, &why))),
-            why = self.linear.lost() => return Err(Fault::RobotLost(lost(&*self.linear, &why))),
-            why = self.grasp.lost() => Fault::Other(lost(&*self.grasp, &why)),
-            why = self.release.lost() => Fault::Other(lost(&*self.release, &why)),
-            () = teller.stopped() => Fault::Stopped,
+        let interrupted = async {
+            tokio::select! {
+                biased;
+                () = teller.stopped() => Fault::Stopped("stopped".to_owned()),
+                why = self.ptp.lost() => Fault::RobotLost(lost(&*self.ptp, &why)),
+                why = self.linear.lost() => Fault::RobotLost(lost(&*self.linear, &why)),
+                why = self.grasp.lost() => Fault::Other(lost(&*self.grasp, &why)),
+                why = self.release.lost() => Fault::Other(lost(&*self.release, &why)),
+            }
         };
-        if target.is_some()
-            && let Err(fault) = skill.halt().await
-        {
-            return Err(Fault::RobotLost(format!(
-                "{} cannot be halted: {fault}",
-                skill.name()
-            )));
+        let is_robot = target.is_some();
+        let ran = run(&**skill, target, self.within, teller, interrupted);
+        match ran.await {
+            Ok(()) => Ok(()),
+            Err(Ran::Lost(why) | Ran::NotHalted(why)) if is_robot => Err(Fault::RobotLost(why)),
+            Err(Ran::Lost(why) | Ran::NotHalted(why) | Ran::Failed(why)) => Err(Fault::Other(why)),
+            Err(Ran::Interrupted(fault, Ok(()))) => Err(fault),
+            Err(Ran::Interrupted(fault, Err(why))) => Err(fault.goes_on(&why, is_robot)),
         }
-        Err(fault)
     }
 
     async fn retreat(
@@ -218,34 +245,41 @@ impl PickAndPlace {
         teller: &dyn Teller,
     ) -> Result<(), String> {
         teller.step(step).await;
-        tokio::select! {
-            retreated = run(&**skill, Some(to), self.within, teller) => retreated.map_err(|fault| match fault {
-                Ran::Lost(why) | Ran::Failed(why) => why,
-            }),
-            () = teller.stopped() => {
-                // It is to stand still, and there is nothing left that could be done if it does not.
-                let halted = skill.halt().await;
-                Err(halted.err().map_or_else(|| "halted".to_owned(), |fault| fault.to_string()))
-            }
-        }
+        let ran = run(&**skill, Some(to), self.within, teller, teller.stopped());
+        ran.await.map_err(|fault| match fault {
+            Ran::Lost(why) | Ran::NotHalted(why) | Ran::Failed(why) => why,
+            Ran::Interrupted((), Ok(())) => HALTED.to_owned(),
+            Ran::Interrupted((), Err(why)) => why,
+        })
     }
 }
 
 /// How the run of one skill did not end well.
-enum Ran {
+enum Ran<T> {
     Lost(String),
+    NotHalted(String),
     Failed(String),
+    /// With an error if the skill could not be halted.
+    Interrupted(T, Result<(), String>),
 }
 
-async fn run(
+async fn run<T>(
     skill: &dyn Runs,
     target: Option<[f64; 6]>,
     within: Duration,
     teller: &dyn Teller,
-) -> Result<(), Ran> {
+    interrupted: impl Future<Output = T> + Send,
+) -> Result<(), Ran<T>> {
     let parameters = target.map(|target| ("TargetPosition".to_owned(), Value::from(target)));
+    let parameters = parameters.into_iter().collect();
     let name = skill.name();
-    let ran = skill.run(parameters.into_iter().collect(), within).await;
+    let ran = match run_part(skill, parameters, within, teller, interrupted).await {
+        PartEnd::Ended(ran) => ran,
+        PartEnd::Interrupted { by, halted } => {
+            let halted = halted.map_err(|fault| format!("{name} cannot be halted: {fault}"));
+            return Err(Ran::Interrupted(by, halted));
+        }
+    };
     let what = match &ran {
         Ok(outcome) if outcome.succeeded => format!("{name} run {} is done", outcome.run),
         Ok(outcome) => format!("{name} run {} failed: {}", outcome.run, outcome.message),
@@ -256,9 +290,13 @@ async fn run(
         Ok(outcome) if outcome.succeeded => Ok(()),
         Ok(outcome) => Err(Ran::Failed(format!("{name} failed: {}", outcome.message))),
         Err(SkillFault::Lost(why)) => Err(Ran::Lost(lost(skill, &why))),
+        Err(SkillFault::NotHalted(why)) => Err(Ran::NotHalted(why)),
         Err(fault) => Err(Ran::Failed(format!("{name}: {fault}"))),
     }
 }
+
+/// Why a robot that was told to stop has not retreated.
+const HALTED: &str = "it was halted, and stands still";
 
 fn lost(skill: &dyn Runs, why: &str) -> String {
     format!("{} is lost: {why}", skill.name())

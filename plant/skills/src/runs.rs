@@ -59,6 +59,9 @@ pub enum SkillFault {
     /// The run did not end in time, and was told to halt.
     #[error("it did not end within {0:?} and was halted")]
     TimedOut(Duration),
+    /// It was told to halt, and its end was not confirmed: whether its machine moves is unknown.
+    #[error("{0}")]
+    NotHalted(String),
     /// It is not what it should be.
     #[error("{0}")]
     Unexpected(String),
@@ -145,7 +148,7 @@ impl Runs for LocalRun {
 
 /// Why a skill that was told to halt may not have come to a stand.
 pub(crate) fn goes_on(name: &str) -> SkillFault {
-    SkillFault::Unexpected(format!(
+    SkillFault::NotHalted(format!(
         "{name} was told to halt, and its run has not ended within {HALTS_WITHIN:?}: whether it moves is unknown"
     ))
 }

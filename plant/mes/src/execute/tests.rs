@@ -14,6 +14,9 @@ struct Fakes {
     /// A skill whose component is lost when it is run, and one that fails.
     dies_at: Mutex<Option<&'static str>>,
     fails_at: Option<&'static str>,
+    /// A skill that runs until it is halted, because the gripper is lost meanwhile.
+    halted_at: Mutex<Option<&'static str>>,
+    halts: watch::Sender<u32>,
     unreachable: Option<&'static str>,
     journal: Mutex<Vec<String>>,
     kept: Mutex<Vec<Run>>,
@@ -133,6 +136,32 @@ impl Runs for FakeSkill {
                 .send_modify(|lost| lost.push(self.offer.component.clone()));
             std::future::pending::<()>().await;
         }
+        let is_halted = self
+            .plant
+            .halted_at
+            .lock()
+            .unwrap()
+            .take_if(|at| *at == name)
+            .is_some();
+        if is_halted {
+            self.plant
+                .offers
+                .lock()
+                .unwrap()
+                .retain(|offer| offer.component != GRIPPER);
+            self.plant
+                .lost
+                .send_modify(|lost| lost.push(GRIPPER.to_owned()));
+            let mut halts = self.plant.halts.subscribe();
+            halts.wait_for(|halts| *halts > 0).await.unwrap();
+            return Ok(Outcome {
+                run: 1,
+                succeeded: false,
+                message: "halted by session 3".into(),
+                results: vec![],
+                trace: vec![],
+            });
+        }
         if self.plant.fails_at == Some(&*name) {
             return Ok(Outcome {
                 run: 1,
@@ -152,6 +181,7 @@ impl Runs for FakeSkill {
     }
 
     async fn halt(&self) -> Result<(), SkillFault> {
+        self.plant.halts.send_modify(|halts| *halts += 1);
         Ok(())
     }
 
@@ -199,6 +229,9 @@ fn gripper(name: &str) -> Vec<Offer> {
     ]
 }
 
+/// The component of the skills of `gripper("gripper")`.
+const GRIPPER: &str = "urn:example:gripper";
+
 fn plant(offers: Vec<Offer>) -> Fakes {
     let robot = [
         offer("robot", "Ptp", "PtpMoveSkillType"),
@@ -210,6 +243,8 @@ fn plant(offers: Vec<Offer>) -> Fakes {
         lost: watch::channel(vec![]).0,
         dies_at: Mutex::new(None),
         fails_at: None,
+        halted_at: Mutex::new(None),
+        halts: watch::channel(0).0,
         unreachable: None,
         journal: Mutex::default(),
         kept: Mutex::default(),
@@ -342,6 +377,24 @@ async fn a_gripper_lost_in_the_middle_is_replaced_by_one_that_comes() {
         "{waited}"
     );
     assert_eq!(run.waits_for, None);
+}
+
+#[tokio::test]
+async fn a_robot_that_is_halted_because_the_gripper_is_lost_goes_on_with_the_next_gripper() {
+    let fakes = plant(gripper("gripper"));
+    *fakes.halted_at.lock().unwrap() = Some("robot.Lin");
+    *fakes.spare.lock().unwrap() = gripper("vacuum");
+    let (run, ..) = executed(fakes, &process()).await;
+    assert_eq!((run.outcome, run.plans.len()), (How::Done, 2), "{run:?}");
+    let ended = run.plans[0].ran.iter().map(|ran| (&*ran.step, ran.outcome));
+    assert_eq!(
+        ended.collect::<Vec<_>>(),
+        [
+            ("MovePickApproachBefore", How::Done),
+            ("MovePick", How::Stopped),
+            ("MovePickApproachError", How::Done)
+        ]
+    );
 }
 
 #[tokio::test]

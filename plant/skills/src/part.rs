@@ -1,0 +1,266 @@
+//! A skill of another component as a part of the work of a composite skill.
+
+use std::future::Future;
+use std::pin::{Pin, pin};
+use std::time::Duration;
+
+use tokio::time::timeout;
+
+use crate::composite::Teller;
+use crate::runs::{Runs, SkillFault, goes_on};
+use crate::shown::Outcome;
+use crate::value::Value;
+
+/// The end of a part.
+#[derive(Debug)]
+pub enum PartEnd<T> {
+    /// The run has ended by itself, or its component is lost.
+    Ended(Result<Outcome, SkillFault>),
+    /// The run was halted because of `by`.
+    Interrupted {
+        /// The output of the future that interrupted the part.
+        by: T,
+        /// An error if the end of the run is unknown.
+        halted: Result<(), SkillFault>,
+    },
+}
+
+/// Runs one skill to its end, or until `interrupted` is ready. An interrupted run is halted, and the function returns when the
+/// run has ended. Until then the teller shows that the cancellation is pending. If the end is unknown, the teller is told so,
+/// and the composite needs a Reset.
+pub async fn run_part<T>(
+    skill: &dyn Runs,
+    parameters: Vec<(String, Value)>,
+    within: Duration,
+    teller: &dyn Teller,
+    interrupted: impl Future<Output = T>,
+) -> PartEnd<T> {
+    let mut run = pin!(skill.run(parameters, within));
+    let mut has_begun = false;
+    let by = tokio::select! {
+        // A run is never started after the interruption.
+        biased;
+        why = skill.lost() => return PartEnd::Ended(Err(SkillFault::Lost(why))),
+        by = interrupted => by,
+        ended = async {
+            has_begun = true;
+            run.as_mut().await
+        } => {
+            if let Err(fault @ SkillFault::NotHalted(_)) = &ended {
+                teller.unknown(&fault.to_string()).await;
+            }
+            return PartEnd::Ended(ended);
+        }
+    };
+    let halted = match has_begun {
+        true => halt(skill, run, teller).await,
+        false => Ok(()),
+    };
+    if let Err(fault) = &halted {
+        teller.unknown(&fault.to_string()).await;
+    }
+    PartEnd::Interrupted { by, halted }
+}
+
+/// Halts a skill and waits for the end of its run.
+async fn halt(
+    skill: &dyn Runs,
+    mut run: Pin<&mut (impl Future<Output = Result<Outcome, SkillFault>> + ?Sized)>,
+    teller: &dyn Teller,
+) -> Result<(), SkillFault> {
+    // A Halt can overtake the request that starts the run, so it is repeated.
+    for _ in 0..HALTS {
+        if let Err(fault) = skill.halt().await {
+            let why = format!("{} is not halted: {fault}", skill.name());
+            teller.pending(&why).await;
+        }
+        if let Ok(ended) = timeout(HALT_AGAIN, run.as_mut()).await {
+            return confirmed(ended);
+        }
+    }
+    teller.pending(&goes_on(&skill.name()).to_string()).await;
+    tokio::select! {
+        ended = run => confirmed(ended),
+        why = skill.lost() => Err(SkillFault::Lost(why)),
+    }
+}
+
+/// An error if the run may go on.
+fn confirmed(ended: Result<Outcome, SkillFault>) -> Result<(), SkillFault> {
+    match ended {
+        Err(fault @ (SkillFault::Lost(_) | SkillFault::NotHalted(_))) => Err(fault),
+        Ok(_)
+        | Err(SkillFault::Refused { .. } | SkillFault::TimedOut(_) | SkillFault::Unexpected(_)) => {
+            Ok(())
+        }
+    }
+}
+
+/// Number of times that a run is told to halt.
+const HALTS: u32 = 3;
+/// Pause before a run that goes on is told to halt again.
+const HALT_AGAIN: Duration = Duration::from_secs(2);
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+    use std::sync::atomic::{AtomicU32, Ordering};
+
+    use async_trait::async_trait;
+    use program::{Method, State};
+    use tokio::sync::watch;
+
+    use super::*;
+    use crate::authority::{Authority, Owner};
+    use crate::composite::PickAndPlace;
+    use crate::model;
+    use crate::parameters::TypeName;
+    use crate::shown::Shown;
+    use crate::skill::{Facts, Skill};
+
+    const BY: Owner = Owner::Local("the test");
+
+    /// The way of a run to its end.
+    #[derive(Clone, Copy, PartialEq)]
+    enum Way {
+        /// The run is done at once.
+        Done,
+        /// The run takes a Halt, and ends when the test lets it.
+        Halts,
+        /// The run refuses a Halt.
+        Refuses,
+    }
+
+    struct Scripted {
+        way: Way,
+        runs: AtomicU32,
+        halts: AtomicU32,
+        may_end: watch::Sender<bool>,
+    }
+
+    impl Scripted {
+        fn new(way: Way) -> Arc<Self> {
+            Arc::new(Self {
+                way,
+                runs: AtomicU32::new(0),
+                halts: AtomicU32::new(0),
+                may_end: watch::channel(way == Way::Done).0,
+            })
+        }
+    }
+
+    #[async_trait]
+    impl Runs for Scripted {
+        fn name(&self) -> String {
+            "gripper.Grasp".to_owned()
+        }
+
+        async fn run(
+            &self,
+            _parameters: Vec<(String, Value)>,
+            _within: Duration,
+        ) -> Result<Outcome, SkillFault> {
+            let run = self.runs.fetch_add(1, Ordering::Relaxed) + 1;
+            let mut may_end = self.may_end.subscribe();
+            may_end.wait_for(|may_end| *may_end).await.unwrap();
+            if self.way == Way::Refuses {
+                return Err(goes_on("gripper.Grasp"));
+            }
+            Ok(Outcome {
+                run,
+                succeeded: self.way == Way::Done,
+                message: String::new(),
+                results: Vec::new(),
+                trace: Vec::new(),
+            })
+        }
+
+        async fn halt(&self) -> Result<(), SkillFault> {
+            self.halts.fetch_add(1, Ordering::Relaxed);
+            match self.way {
+                Way::Done | Way::Halts => Ok(()),
+                Way::Refuses => Err(goes_on("gripper.Grasp")),
+            }
+        }
+    }
+
+    /// A started composite whose Grasp ends as given.
+    async fn at_grasp(way: Way) -> (Skill, Arc<Scripted>) {
+        let grasp = Scripted::new(way);
+        let composite = PickAndPlace {
+            ptp: Scripted::new(Way::Done),
+            linear: Scripted::new(Way::Done),
+            grasp: Arc::clone(&grasp) as Arc<dyn Runs>,
+            release: Scripted::new(Way::Done),
+            within: Duration::from_secs(60),
+        };
+        let of = model::find("PickAndPlaceSkillType").unwrap();
+        let facts = Facts {
+            name: "PickAndPlace".to_owned(),
+            types: vec![TypeName::own(of.name)],
+            parameters: of.parameters(),
+            results: of.results(),
+            capabilities: Vec::new(),
+            timeout: None,
+            rests_in: of.rests_in,
+        };
+        let skill = Skill::spawn(facts, Arc::new(composite), Authority::new(), Vec::new());
+        skill.call(BY, Method::Reset).await.unwrap();
+        let six = |name: &str| (name.to_owned(), Value::from([0.0; 6]));
+        let parameters = vec![six("PickPosition"), six("PlacePosition")];
+        skill.start_with(BY, parameters).await.unwrap();
+        until(&skill, |shown| shown.step == "Grasp").await;
+        (skill, grasp)
+    }
+
+    async fn until(skill: &Skill, is: impl FnMut(&Arc<Shown>) -> bool) -> Arc<Shown> {
+        let mut watch = skill.watch();
+        let shown = timeout(Duration::from_secs(60), watch.wait_for(is)).await;
+        Arc::clone(&shown.unwrap().unwrap())
+    }
+
+    #[tokio::test]
+    async fn a_halted_composite_halts_the_running_grasp_and_is_halted_when_the_grasp_has_ended() {
+        let (skill, grasp) = at_grasp(Way::Halts).await;
+        skill.call(BY, Method::Halt).await.unwrap();
+        assert_eq!(skill.shown().state, State::Running);
+        assert_ne!(grasp.halts.load(Ordering::Relaxed), 0);
+        grasp.may_end.send_replace(true);
+        let shown = until(&skill, |shown| shown.state == State::Halted).await;
+        assert!(!shown.needs_reset);
+    }
+
+    #[tokio::test]
+    async fn a_composite_with_a_part_that_does_not_halt_says_so_and_needs_a_reset() {
+        let (skill, grasp) = at_grasp(Way::Refuses).await;
+        skill.call(BY, Method::Halt).await.unwrap();
+        let shown = skill.shown();
+        let pending = shown.pending.clone().unwrap_or_default();
+        assert_eq!(shown.state, State::Running);
+        assert!(pending.contains("gripper.Grasp is not halted"), "{pending}");
+        grasp.may_end.send_replace(true);
+        let shown = until(&skill, |shown| shown.state == State::Halted).await;
+        assert!(shown.needs_reset);
+        let message = shown.outcome.as_ref().unwrap().message.clone();
+        assert!(message.contains("whether it moves is unknown"), "{message}");
+        skill.call(BY, Method::Reset).await.unwrap();
+        assert!(!skill.shown().needs_reset);
+    }
+
+    #[tokio::test]
+    async fn a_part_is_never_started_after_the_interruption() {
+        let skill = Scripted::new(Way::Done);
+        let teller = |_step: &'static str| {};
+        let within = Duration::from_secs(1);
+        let interrupted = std::future::ready(7);
+        let part = run_part(&*skill, Vec::new(), within, &teller, interrupted).await;
+        assert!(matches!(
+            part,
+            PartEnd::Interrupted {
+                by: 7,
+                halted: Ok(())
+            }
+        ));
+        assert_eq!(skill.runs.load(Ordering::Relaxed), 0);
+    }
+}
