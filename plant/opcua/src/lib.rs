@@ -33,6 +33,7 @@ pub mod pki;
 pub mod server;
 #[cfg(feature = "server")]
 pub mod supervision;
+pub mod synced;
 #[cfg(feature = "server")]
 pub mod trust_file;
 #[cfg(feature = "server")]

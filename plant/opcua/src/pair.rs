@@ -1,14 +1,15 @@
 //! The files of an application's own certificate and private key. They are written so that a program that is killed, or a
 //! disk that is full, leaves a pair that the next start can use: beside, synced, and renamed with the key first.
 
-use std::fs::{self, File};
-use std::io::{self, Write as _};
+use std::fs;
+use std::io;
 use std::path::Path;
 
 use trust::Certificate;
 use x509_cert::der::pem::{self, LineEnding};
 
 use crate::pki::{OWN_CERTIFICATE, OWN_KEY};
+use crate::synced::{rename_synced, write_synced, write_synced_for_owner};
 
 /// The state of the files of a pair.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -102,51 +103,6 @@ fn content(path: &Path) -> io::Result<Option<Vec<u8>>> {
         Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
         Err(error) => Err(error),
     }
-}
-
-fn write_synced(path: &Path, content: &[u8]) -> io::Result<()> {
-    let mut file = File::create(path)?;
-    file.write_all(content)?;
-    file.sync_all()
-}
-
-/// Writes a file that its owner alone reads, from the first byte on.
-fn write_synced_for_owner(path: &Path, content: &[u8]) -> io::Result<()> {
-    match fs::remove_file(path) {
-        Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
-        Ok(()) | Err(_) => {}
-    }
-    let mut file = owners_file(path)?;
-    file.write_all(content)?;
-    file.sync_all()
-}
-
-/// Renames a file, and has the folder know it after a loss of power.
-fn rename_synced(from: &Path, to: &Path) -> io::Result<()> {
-    fs::rename(from, to)?;
-    match to.parent() {
-        // Some file systems cannot sync a folder; the file itself is written.
-        Some(folder) => {
-            drop(File::open(folder).and_then(|folder| folder.sync_all()));
-            Ok(())
-        }
-        None => Ok(()),
-    }
-}
-
-#[cfg(unix)]
-fn owners_file(path: &Path) -> io::Result<File> {
-    use std::os::unix::fs::OpenOptionsExt as _;
-    fs::OpenOptions::new()
-        .write(true)
-        .create_new(true)
-        .mode(0o600)
-        .open(path)
-}
-
-#[cfg(not(unix))]
-fn owners_file(path: &Path) -> io::Result<File> {
-    File::create_new(path)
 }
 
 /// Takes a key away from other users. Of a key that belongs to another user nothing is changed.

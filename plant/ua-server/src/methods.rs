@@ -4,6 +4,7 @@
 //! call does.
 
 use std::collections::{HashMap, VecDeque};
+use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -67,6 +68,7 @@ impl Methods {
         (manager, subscriptions): (Arc<SpaceManager>, Arc<SubscriptionCache>),
         mapping: &Arc<Mapping>,
         (heard, structures): (Heard, &[Structure]),
+        root: &Path,
     ) -> Self {
         let mut types = ArgumentTypes::default();
         types.set_variables(structures);
@@ -77,7 +79,7 @@ impl Methods {
             &mut manager.address_space().write(),
         );
         Self {
-            programs: Programs::new(Arc::clone(&manager), subscriptions),
+            programs: Programs::new(Arc::clone(&manager), subscriptions, root),
             manager,
             mapping: Arc::clone(mapping),
             heard,
@@ -181,6 +183,11 @@ impl Methods {
     /// What an action reports of one of its goals.
     pub(crate) fn reported(&self, topic: TopicId, block: &[u8]) {
         self.programs.reported(topic, block);
+    }
+
+    /// See [`Programs::end`].
+    pub(crate) fn end(&self) {
+        self.programs.end();
     }
 
     /// See [`Programs::pending`].

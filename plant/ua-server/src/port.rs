@@ -172,7 +172,7 @@ impl ServerPort {
         look_at_created(&runtime, nodes.clone(), created_items);
         tell_serving(&layout, &setup.pki, (&setup.url, port));
         let others = Others::new(mapping, setup.announce.as_ref(), setup.pki.root());
-        let methods = Methods::new(nodes.clone(), mapping, (asked, &layout.structures));
+        let methods = shown_calls(&nodes, mapping, (asked, &layout), &setup.pki);
         let (server, application) = told_of(described, setup.url.advertised(port), &security);
         endpoint::keep_young(&runtime, setup.gds, &certificates, &server);
         let (told, components) = tell(server, setup.announce, nodes)?;
@@ -431,6 +431,7 @@ impl Port for ServerPort {
     }
 
     async fn shutdown(mut self) {
+        self.methods.end();
         if let Some(told) = self.told.take() {
             // Late: others find out by themselves.
             let _late = tokio::time::timeout(GOODBYE, told.leave()).await;
@@ -499,6 +500,17 @@ impl Drop for ServerPort {
             runtime.shutdown_background();
         }
     }
+}
+
+/// Shows the calls of other spaces.
+fn shown_calls(
+    nodes: &(Arc<SpaceManager>, Arc<SubscriptionCache>),
+    mapping: &Arc<Mapping>,
+    (asked, layout): (Heard, &Layout),
+    pki: &Pki,
+) -> Methods {
+    let asked = (asked, &layout.structures[..]);
+    Methods::new(nodes.clone(), mapping, asked, pki.root())
 }
 
 /// Who the server lets in.

@@ -7,8 +7,10 @@
 
 mod nodes;
 mod run;
+mod unknown;
 
-use std::collections::{HashMap, HashSet};
+use std::collections::HashMap;
+use std::path::Path;
 use std::sync::Arc;
 
 use bridge_node::{ActionFamily, CallDescription, CallRole};
@@ -19,6 +21,7 @@ use tracing::{info, warn};
 
 use self::nodes::Nodes;
 use self::run::Run;
+use self::unknown::UnknownOutcomes;
 use crate::address;
 use crate::argument_types::ArgumentTypes;
 use crate::asking::Callable;
@@ -34,8 +37,8 @@ pub(crate) struct Programs {
     shown: HashMap<TopicId, Shown>,
     /// Whose feedback each value is.
     feedback: HashMap<TopicId, TopicId>,
-    /// The calls that send the goals of Programs that went while they were at one: its outcome is unknown.
-    unknown: HashSet<TopicId>,
+    /// The Programs that need a Reset.
+    unknown: Arc<UnknownOutcomes>,
     told_full: bool,
 }
 
@@ -47,7 +50,12 @@ struct Shown {
 }
 
 impl Programs {
-    pub(crate) fn new(manager: Arc<SpaceManager>, subscriptions: Arc<SubscriptionCache>) -> Self {
+    /// Keeps the Programs that need a Reset in a file below `root`.
+    pub(crate) fn new(
+        manager: Arc<SpaceManager>,
+        subscriptions: Arc<SubscriptionCache>,
+        root: &Path,
+    ) -> Self {
         address::add_folder(
             &address::programs_folder(),
             "Programs",
@@ -60,7 +68,7 @@ impl Programs {
             parts: HashMap::new(),
             shown: HashMap::new(),
             feedback: HashMap::new(),
-            unknown: HashSet::new(),
+            unknown: Arc::new(UnknownOutcomes::open(root.join(UNKNOWN))),
             told_full: false,
         }
     }
@@ -115,8 +123,8 @@ impl Programs {
         let node = nodes.program();
         let feedback = beside(goal, family.feedback);
         let methods = nodes.methods();
-        let needs_reset = self.unknown.remove(&goal);
-        let run = Run::new(name, nodes, [send, cancel, result], needs_reset);
+        let calls = [send, cancel, result];
+        let run = Run::new((name, goal), nodes, calls, &self.unknown);
         let inner = self.manager.inner();
         let sends = goal_node(goal, inner);
         let drive = |method| run.drive(method, inner.questions(), sends.clone());
@@ -148,9 +156,7 @@ impl Programs {
         if let Some(feedback) = shown.feedback {
             self.feedback.remove(&feedback);
         }
-        if shown.run.leave() && self.unknown.len() < MOST_PARTS {
-            self.unknown.insert(goal);
-        }
+        shown.run.leave(run::GONE);
         let nodes = shown.run.nodes();
         let mut programs = self.manager.inner().programs().lock();
         for (method, _) in nodes.methods() {
@@ -169,6 +175,13 @@ impl Programs {
     pub(crate) fn pending(&self) -> Vec<String> {
         let all = self.shown.values();
         all.filter_map(|shown| shown.run.pending()).collect()
+    }
+
+    /// Ends all Programs with the server.
+    pub(crate) fn end(&self) {
+        for shown in self.shown.values() {
+            shown.run.leave(run::ENDS);
+        }
     }
 
     /// Shows what an action reports of a goal, if that is a Program's.
@@ -203,5 +216,7 @@ fn beside(topic: TopicId, id: u16) -> Option<TopicId> {
     TopicId::new(space, namespace, id)
 }
 
+/// The file of the Programs that need a Reset.
+const UNKNOWN: &str = "programs-to-reset";
 /// Calls that are parts of actions: anybody in the space can announce some.
 const MOST_PARTS: usize = 3 * 256;

@@ -6,7 +6,7 @@
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};
-use std::io::{self, Read as _, Write as _};
+use std::io::{self, Read as _};
 use std::path::{Path, PathBuf};
 
 use argon2::Argon2;
@@ -15,6 +15,7 @@ use argon2::password_hash::phc::PasswordHash;
 use opcua::crypto::{CertificateStore, X509};
 
 use super::{Roles, UnknownRole};
+use crate::synced::replace;
 
 /// A user.
 #[derive(Clone, PartialEq, Eq)]
@@ -355,16 +356,6 @@ fn is_name(text: &str) -> bool {
         && !text.eq_ignore_ascii_case("anonymous")
 }
 
-/// Writes a file beside, and puts it in the place of what is there: who reads sees the one or the other.
-fn replace(path: &Path, content: &[u8]) -> io::Result<()> {
-    let beside = path.with_extension("new");
-    drop(fs::remove_file(&beside));
-    let mut file = owners_file(&beside)?;
-    file.write_all(content)?;
-    file.sync_all()?;
-    fs::rename(&beside, path)
-}
-
 #[cfg(unix)]
 fn make_folder(folder: &Path) -> io::Result<()> {
     use std::os::unix::fs::PermissionsExt as _;
@@ -375,18 +366,6 @@ fn make_folder(folder: &Path) -> io::Result<()> {
 #[cfg(not(unix))]
 fn make_folder(folder: &Path) -> io::Result<()> {
     fs::create_dir_all(folder)
-}
-
-#[cfg(unix)]
-fn owners_file(path: &Path) -> io::Result<File> {
-    use std::os::unix::fs::OpenOptionsExt as _;
-    let mut options = fs::OpenOptions::new();
-    options.write(true).create_new(true).mode(0o600).open(path)
-}
-
-#[cfg(not(unix))]
-fn owners_file(path: &Path) -> io::Result<File> {
-    File::create(path)
 }
 
 #[cfg(unix)]

@@ -4,6 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use bridge_node::AskErrorKind;
+use mappings::TopicId;
 use opcua::sync::Mutex;
 use opcua::types::{ByteString, DateTime, NodeId, StatusCode, Variant};
 use program::{Ending, Method, Nature, Program, Rest, RunId, State};
@@ -13,6 +14,7 @@ use tracing::{info, warn};
 use uadp::Fields;
 
 use super::nodes::{Nodes, Outcome};
+use super::unknown::UnknownOutcomes;
 use crate::asking::{Callable, Drive, Questions, Refused};
 use crate::value;
 
@@ -23,6 +25,10 @@ pub(crate) struct Run {
     send: Callable,
     cancel: Callable,
     result: Callable,
+    /// The call that sends the goals.
+    goal: TopicId,
+    /// The Programs that need a Reset.
+    unknown: Arc<UnknownOutcomes>,
     inner: Mutex<Inner>,
     /// The state, for who waits for another; closed never.
     state: watch::Sender<State>,
@@ -63,11 +69,12 @@ impl Inner {
 impl Run {
     /// Makes a Program in Ready, or in Halted after a goal with an unknown outcome.
     pub(super) fn new(
-        name: String,
+        (name, goal): (String, TopicId),
         nodes: Nodes,
         [send, cancel, result]: [Callable; 3],
-        needs_reset: bool,
+        unknown: &Arc<UnknownOutcomes>,
     ) -> Arc<Self> {
+        let needs_reset = unknown.has(goal);
         let mut program = Program::new(Nature {
             can_suspend: false,
             rests_in: Rest::Ready,
@@ -87,6 +94,8 @@ impl Run {
             send,
             cancel,
             result,
+            goal,
+            unknown: Arc::clone(unknown),
             inner: Mutex::new(Inner {
                 program,
                 goal: None,
@@ -404,6 +413,7 @@ impl Run {
         let message = format!("the outcome is unknown, the goal may go on: {why}");
         warn!(program = self.name, "{message}");
         inner.goal = None;
+        self.unknown.insert(self.goal);
         self.nodes.show_outcome(&Outcome::lost(message));
         self.called(inner, Method::Halt)
     }
@@ -421,7 +431,9 @@ impl Run {
         if inner.left || inner.starting {
             return Err(Refused::Status(StatusCode::BadInvalidState));
         }
-        self.called(&mut inner, Method::Reset)
+        let reset = self.called(&mut inner, Method::Reset)?;
+        self.unknown.remove(self.goal);
+        Ok(reset)
     }
 
     fn called(&self, inner: &mut Inner, method: Method) -> Result<Vec<Variant>, Refused> {
@@ -432,26 +444,24 @@ impl Run {
         Ok(Vec::new())
     }
 
-    /// The action is gone, and what it was at is nobody's any more.
-    ///
-    /// Returns true if it was at a goal, whose outcome is unknown then.
-    pub(super) fn leave(&self) -> bool {
+    /// Ends the Program because of `why`. The outcome of an open goal is unknown.
+    pub(super) fn leave(&self, why: &str) {
         let mut inner = self.inner.lock();
         inner.left = true;
         let is_open = inner.goal.take().is_some();
         if is_open {
-            warn!(program = self.name, "{GONE}");
+            warn!(program = self.name, "{why}");
+            self.unknown.insert(self.goal);
         }
         inner.halting = None;
         let run = inner.program.run();
         let ended = run.and_then(|run| inner.program.ended(run, Ending::Failure).ok());
         if let Some(transition) = ended {
-            let outcome = Outcome::lost(GONE.to_owned());
+            let outcome = Outcome::lost(why.to_owned());
             self.nodes.show_outcome(&outcome);
-            self.nodes.show_transition(transition, GONE);
+            self.nodes.show_transition(transition, why);
         }
         self.state.send_replace(State::Halted);
-        is_open
     }
 
     /// Shows feedback, if it is of the goal that is at work.
@@ -505,7 +515,9 @@ pub(super) fn whole(value: &Variant) -> Option<i64> {
 
 const NOT_NOW_AND_NEVER: Refused = Refused::Status(StatusCode::BadNotSupported);
 const PENDING: &str = "cancellation pending: the goal has not ended";
-const GONE: &str = "the executor of the action is lost: the outcome is unknown, the goal may go on";
+pub(super) const GONE: &str =
+    "the executor of the action is lost: the outcome is unknown, the goal may go on";
+pub(super) const ENDS: &str = "the server ends: the outcome is unknown, the goal may go on";
 /// Of `action_msgs/GoalStatus`, and of goals that never ran.
 pub(super) const SUCCEEDED: i64 = 4;
 pub(super) const NEVER_RAN: i64 = -1;

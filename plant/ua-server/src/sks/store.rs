@@ -1,13 +1,14 @@
 //! The file with the keys of the groups this server makes keys for.
 
 use std::collections::{BTreeMap, VecDeque};
-use std::fs::{self, File, OpenOptions};
-use std::io::{self, Read as _, Write as _};
-use std::os::unix::fs::{OpenOptionsExt as _, PermissionsExt as _};
+use std::fs::File;
+use std::io::{self, Read as _};
+use std::os::unix::fs::PermissionsExt as _;
 use std::path::PathBuf;
 use std::time::Duration;
 
 use bridge_core::Now;
+use plant_opcua::synced::replace;
 use serde::{Deserialize, Serialize};
 use uadp::SecurityPolicy;
 
@@ -101,23 +102,9 @@ impl Store {
     }
 
     fn write(&self, kept: &BTreeMap<&str, Kept>) -> io::Result<()> {
-        let mut beside = self.file.clone().into_os_string();
-        beside.push(".new");
-        let beside = PathBuf::from(beside);
-        match fs::remove_file(&beside) {
-            Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
-            Ok(()) | Err(_) => {}
-        }
-        let mut file = OpenOptions::new()
-            .write(true)
-            .create_new(true)
-            .mode(0o600)
-            .open(&beside)?;
-        let text = serde_json::to_string_pretty(kept).map_err(io::Error::other)?;
-        file.write_all(text.as_bytes())?;
-        file.write_all(b"\n")?;
-        file.sync_all()?;
-        fs::rename(&beside, &self.file)
+        let mut text = serde_json::to_string_pretty(kept).map_err(io::Error::other)?;
+        text.push('\n');
+        replace(&self.file, text.as_bytes())
     }
 }
 
@@ -190,6 +177,8 @@ const MOST_BYTES: u64 = 1 << 20;
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use bridge_node::now;
 
     use super::*;

@@ -1,0 +1,62 @@
+//! Files that are written so that a program that is killed, or a disk that is full, leaves the old or the new content.
+
+use std::fs::{self, File};
+use std::io::{self, Write as _};
+use std::path::{Path, PathBuf};
+
+/// Replaces the content of a file that its owner alone reads. A reader sees the old or the new content.
+///
+/// # Errors
+/// A file that cannot be written. The old content is left as it was then.
+pub fn replace(path: &Path, content: &[u8]) -> io::Result<()> {
+    let mut beside = path.as_os_str().to_owned();
+    beside.push(".new");
+    let beside = PathBuf::from(beside);
+    write_synced_for_owner(&beside, content)?;
+    rename_synced(&beside, path)
+}
+
+pub(crate) fn write_synced(path: &Path, content: &[u8]) -> io::Result<()> {
+    let mut file = File::create(path)?;
+    file.write_all(content)?;
+    file.sync_all()
+}
+
+/// Writes a file that its owner alone reads, from the first byte on.
+pub(crate) fn write_synced_for_owner(path: &Path, content: &[u8]) -> io::Result<()> {
+    match fs::remove_file(path) {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
+        Ok(()) | Err(_) => {}
+    }
+    let mut file = owners_file(path)?;
+    file.write_all(content)?;
+    file.sync_all()
+}
+
+/// Renames a file, and has the folder know it after a loss of power.
+pub(crate) fn rename_synced(from: &Path, to: &Path) -> io::Result<()> {
+    fs::rename(from, to)?;
+    match to.parent() {
+        // Some file systems cannot sync a folder; the file itself is written.
+        Some(folder) => {
+            drop(File::open(folder).and_then(|folder| folder.sync_all()));
+            Ok(())
+        }
+        None => Ok(()),
+    }
+}
+
+#[cfg(unix)]
+fn owners_file(path: &Path) -> io::Result<File> {
+    use std::os::unix::fs::OpenOptionsExt as _;
+    fs::OpenOptions::new()
+        .write(true)
+        .create_new(true)
+        .mode(0o600)
+        .open(path)
+}
+
+#[cfg(not(unix))]
+fn owners_file(path: &Path) -> io::Result<File> {
+    File::create_new(path)
+}
