@@ -25,6 +25,8 @@ pub const MOST_PER_REQUEST: usize = 500;
 pub const MOST_SESSIONS: usize = 50;
 /// Bytes of the notifications that wait for all clients of a server.
 pub const QUEUED_NOTIFICATIONS: usize = 64 << 20;
+/// Requests of one connection that a server processes at a time, Publish requests apart.
+pub const REQUESTS_IN_FLIGHT: usize = 1_000;
 /// How long a method or a write may take until its client is told `BadTimeout`.
 pub const LONGEST_REQUEST: Duration = Duration::from_secs(10);
 /// Bytes of the largest NodeSet file.
@@ -60,6 +62,20 @@ impl ClientLimits {
         }
     }
 
+    /// Returns the limits that a file sets: sessions, sessions per address, connections, and connections per address. `None`
+    /// is the usual limit.
+    #[must_use]
+    pub fn given([sessions, per_address, connections, per_peer]: [Option<u16>; 4]) -> Self {
+        let set = |given: Option<u16>, usual| given.map_or(usual, usize::from);
+        let usual = Self::of(set(sessions, MOST_SESSIONS));
+        Self {
+            sessions: usual.sessions,
+            sessions_per_address: set(per_address, usual.sessions_per_address),
+            connections: set(connections, usual.connections),
+            connections_per_address: set(per_peer, usual.connections_per_address),
+        }
+    }
+
     /// Returns the limits of a server behind a [`crate::door::Door`]. All its connections come from one address, and the
     /// door has bounded those of each client.
     #[must_use]
@@ -85,6 +101,7 @@ impl ClientLimits {
             ("max_connections", self.connections),
             ("max_connections_per_address", self.connections_per_address),
             ("max_queued_bytes", QUEUED_NOTIFICATIONS),
+            ("max_requests_in_flight", REQUESTS_IN_FLIGHT),
         ] {
             all.insert(name.to_owned(), limit.into());
         }

@@ -84,15 +84,12 @@ pub(crate) fn within(told: ServerLimits) -> Limits {
 
 /// Returns the number of clients that the mapping allows.
 pub(crate) fn clients(told: ServerLimits) -> ClientLimits {
-    let sessions = told.sessions.map_or(limits::MOST_SESSIONS, usize::from);
-    let usual = ClientLimits::of(sessions);
-    let set = |told: Option<u16>, usual| told.map_or(usual, usize::from);
-    ClientLimits {
-        sessions,
-        sessions_per_address: set(told.sessions_per_address, usual.sessions_per_address),
-        connections: set(told.connections, usual.connections),
-        connections_per_address: set(told.connections_per_address, usual.connections_per_address),
-    }
+    ClientLimits::given([
+        told.sessions,
+        told.sessions_per_address,
+        told.connections,
+        told.connections_per_address,
+    ])
 }
 
 /// The server's own threads, and the listener as they take it.
