@@ -316,6 +316,7 @@ fn component(settings: &Settings, driver: ExecuteProcess) -> Component {
         lds: settings.lds.clone(),
         open: settings.open,
         lease: skills::LEASE,
+        limits: plant_opcua::limits::ClientLimits::default(),
         device: None,
         robot: None,
         skills: vec![SkillSetup {

@@ -10,6 +10,8 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
+use plant_opcua::limits::ClientLimits;
+
 pub use device::{Device, DeviceKinds, NoDevices};
 pub use drivers::{DriverFault, Drivers};
 pub use space::{Asked, Form, Part, Source, SpaceWork};
@@ -39,6 +41,8 @@ pub struct Component {
     pub open: bool,
     /// After this time the lease of a session that has nothing done is free for others.
     pub lease: Duration,
+    /// The number of clients that its server serves.
+    pub limits: ClientLimits,
     /// What does the work of the skills whose driver is [`DriverSetup::Device`].
     pub device: Option<Arc<dyn Device>>,
     /// The robot that it is to clients of OPC 40010-1.

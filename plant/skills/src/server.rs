@@ -227,6 +227,7 @@ fn server_of(
         security: policies.collect(),
         pki: settings.pki.clone(),
         trust_unknown_clients: settings.trust_any_client,
+        clients: component.limits,
         ..ServerConfig::new(&component.application_uri, &component.name, endpoint)
     };
     let mut builder = ServerBuilder::new(config)

@@ -3,6 +3,8 @@
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use plant_opcua::limits::ClientLimits;
+
 use super::{
     Asked, Component, DeviceKinds, DriverSetup, LEASE, Lds, MOST_SKILLS, NoDevices, Partner,
     Partners, Robot, Security, Simulation, SkillSetup,
@@ -59,6 +61,7 @@ fn component(
         "lds",
         "open",
         "lease",
+        "limits",
         "device",
         "robot",
         "skills",
@@ -73,6 +76,7 @@ fn component(
         lds,
         open,
         lease,
+        limits,
         device,
         robot,
         skills,
@@ -86,7 +90,7 @@ fn component(
         .and_then(|node| read_uri(node, Code::Uri, reader));
     let namespace = reader
         .needed(namespace, "namespace", root.place)
-        .and_then(|node| read_namespace(node, reader));
+        .and_then(|node| read_positive(node, Code::Namespace, reader));
     let endpoint = match endpoint {
         Some(node) => read_endpoint(node, reader),
         None => Some(DEFAULT_ENDPOINT.to_owned()),
@@ -95,19 +99,11 @@ fn component(
         Some(node) => read_security(node, reader),
         None => vec![Security::None],
     };
-    let nodesets: Vec<PathBuf> = nodesets
-        .map(|node| reader.list(node))
-        .unwrap_or_default()
-        .iter()
-        .filter_map(|node| {
-            reader
-                .text(node, "the path of a file")
-                .map(|path| folder.join(path))
-        })
-        .collect();
+    let nodesets = read_nodesets(nodesets, folder, reader);
     let lds = lds.map_or(Some(Lds::Local), |node| read_lds(node, reader));
     let open = open.map_or(Some(false), |node| reader.boolean(node));
     let lease = lease.map_or(Some(LEASE), |node| reader.duration(node));
+    let limits = read_limits(limits, reader);
     let device = device.map(|node| kinds.read(node, reader));
     let robot = robot.map(|node| read_robot(node, reader));
     let skills = reader
@@ -123,6 +119,7 @@ fn component(
         lds: lds?,
         open: open?,
         lease: lease?,
+        limits: limits?,
         device: whole(device)?,
         robot: whole(robot)?,
         skills: skills?,
@@ -135,6 +132,34 @@ fn whole<T>(read: Option<Option<T>>) -> Option<Option<T>> {
         Some(read) => read.map(Some),
         None => Some(None),
     }
+}
+
+fn read_nodesets(node: Option<&Node>, folder: &Path, reader: &mut Reader<'_>) -> Vec<PathBuf> {
+    let nodes = node.map(|node| reader.list(node)).unwrap_or_default();
+    let paths = nodes
+        .iter()
+        .filter_map(|node| reader.text(node, "the path of a file"));
+    paths.map(|path| folder.join(path)).collect()
+}
+
+/// The keys of `server.limits` of a mapping that bound clients.
+fn read_limits(node: Option<&Node>, reader: &mut Reader<'_>) -> Option<ClientLimits> {
+    let Some(node) = node else {
+        return Some(ClientLimits::default());
+    };
+    let keys = [
+        "sessions",
+        "sessions_per_address",
+        "connections",
+        "connections_per_address",
+    ];
+    let mut is_whole = true;
+    let given = reader.map(node, keys)?.map(|node| {
+        let number = read_positive(node?, Code::WrongValue, reader);
+        is_whole &= number.is_some();
+        number
+    });
+    is_whole.then(|| ClientLimits::given(given))
 }
 
 fn read_robot(node: &Node, reader: &mut Reader<'_>) -> Option<Robot> {
@@ -243,7 +268,7 @@ fn is_of_scheme(b: u8) -> bool {
     b.is_ascii_alphanumeric() || matches!(b, b'+' | b'-' | b'.')
 }
 
-fn read_namespace(node: &Node, reader: &mut Reader<'_>) -> Option<u16> {
+fn read_positive(node: &Node, code: Code, reader: &mut Reader<'_>) -> Option<u16> {
     let text = reader.text(node, "a number")?;
     let number = text.parse().ok().filter(|number| *number > 0);
     number.or_else(|| {
@@ -251,7 +276,7 @@ fn read_namespace(node: &Node, reader: &mut Reader<'_>) -> Option<u16> {
             "expected a number from 1 to 65535, found `{}`",
             shortened(text)
         );
-        reader.refuse(node, Code::Namespace, message)
+        reader.refuse(node, code, message)
     })
 }
 
@@ -472,6 +497,28 @@ mod tests {
         assert!(
             matches!(&component.skills[0].driver, DriverSetup::Simulated(how) if how.duration == Some(Duration::from_millis(400)))
         );
+    }
+
+    #[test]
+    fn the_limits_of_clients_are_those_of_a_mapping() {
+        let read = |limits: &str| {
+            let text = format!("{GRIPPER}limits: {limits}\n");
+            Component::from_yaml(&text, Path::new("examples/plant"))
+                .map(|component| component.limits)
+                .map_err(|findings| findings.render("x.yaml", &text))
+        };
+        let limits = read("{sessions: 8, connections: 20}").unwrap();
+        let usual = ClientLimits::of(8);
+        assert_eq!((limits.sessions, limits.connections), (8, 20));
+        assert_eq!(limits.sessions_per_address, usual.sessions_per_address);
+        assert_eq!(
+            limits.connections_per_address,
+            usual.connections_per_address
+        );
+        let told = read("{sessions: 0, connection: 5}").unwrap_err();
+        for expected in ["from 1 to 65535, found `0`", "`connection`", "connections"] {
+            assert!(told.contains(expected), "{expected}: {told}");
+        }
     }
 
     #[test]
