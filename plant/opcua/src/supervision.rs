@@ -3,10 +3,39 @@
 use std::sync::Arc;
 
 use opcua::sync::RwLock;
-use opcua::types::StatusCode;
+use opcua::types::{Argument, DataTypeId, LocalizedText, StatusCode};
 
 use crate::server::Caller;
 use crate::users::{Role, Roles};
+
+/// The BrowseName of the method by which a supervisor configures a program, in any namespace.
+pub const CONFIGURE: &str = "Configure";
+
+/// The arguments of [`CONFIGURE`], in this order, all Strings.
+pub const CONFIGURED: [(&str, &str); 3] = [
+    (
+        "Place",
+        "Where the component is, as cell-1/station-a/gripper",
+    ),
+    ("SupervisorUri", "The ApplicationUri of whoever says so"),
+    (
+        "DiscoveryUrl",
+        "The discovery server of the component's level",
+    ),
+];
+
+/// Returns the InputArguments of [`CONFIGURE`].
+#[must_use]
+pub fn configure_takes() -> Vec<Argument> {
+    let argument = |(name, description): (&str, &str)| Argument {
+        name: name.into(),
+        data_type: DataTypeId::String.into(),
+        value_rank: -1,
+        array_dimensions: None,
+        description: LocalizedText::new("en", description),
+    };
+    CONFIGURED.map(argument).to_vec()
+}
 
 /// The discovery server that a program registered with, which supervises its level.
 #[derive(Debug, Clone, PartialEq, Eq)]

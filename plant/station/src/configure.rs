@@ -1,10 +1,8 @@
 //! The method by which a component is told its place: `Configure(Place, SupervisorUri, DiscoveryUrl)`, three Strings, nothing
 //! back, on an object below Objects.
 
-use plant_opcua::types::{Argument, DataTypeId, LocalizedText, NodeId, Variant};
-
-/// The BrowseName of the method, in any namespace.
-pub(crate) const CONFIGURE: &str = "Configure";
+use plant_opcua::supervision::CONFIGURE;
+use plant_opcua::types::{Argument, DataTypeId, NodeId, Variant};
 
 /// What a component is told.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -42,34 +40,6 @@ impl Told {
             supervisor_uri: texts.next()??,
             discovery_url: texts.next()??,
         })
-    }
-}
-
-/// What the method takes.
-pub(crate) fn takes() -> Vec<Argument> {
-    let about = [
-        (
-            "Place",
-            "Where the component is, as cell-1/station-a/gripper",
-        ),
-        ("SupervisorUri", "The ApplicationUri of whoever says so"),
-        (
-            "DiscoveryUrl",
-            "The discovery server of the component's level",
-        ),
-    ];
-    about
-        .map(|(name, description)| argument(name, description))
-        .to_vec()
-}
-
-fn argument(name: &str, description: &str) -> Argument {
-    Argument {
-        name: name.into(),
-        data_type: DataTypeId::String.into(),
-        value_rank: -1,
-        array_dimensions: None,
-        description: LocalizedText::new("en", description),
     }
 }
 

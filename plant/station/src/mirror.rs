@@ -3,9 +3,9 @@
 use std::collections::{BTreeSet, VecDeque};
 
 use plant_opcua::client::{Browse, Client, ClientError};
+use plant_opcua::server::arguments_in;
 use plant_opcua::types::{
-    Argument, DataTypeId, DataValue, NodeClass, NodeClassMask, NodeId, ObjectId, ReferenceTypeId,
-    Variant,
+    Argument, DataTypeId, NodeClass, NodeClassMask, NodeId, ObjectId, ReferenceTypeId,
 };
 use tracing::debug;
 
@@ -122,7 +122,7 @@ async fn signature(
         let read = client
             .read(std::slice::from_ref(&property.node_id.node_id))
             .await?;
-        let Some(all) = arguments(read.into_iter().next()) else {
+        let Some(all) = arguments_in(read.into_iter().next()) else {
             return Ok(None);
         };
         if all.len() > MOST_ARGUMENTS {
@@ -167,19 +167,6 @@ async fn passed(client: &Client, argument: Argument) -> Result<Option<Argument>,
         data_type,
         ..argument
     }))
-}
-
-fn arguments(read: Option<DataValue>) -> Option<Vec<Argument>> {
-    let Variant::Array(array) = read?.value? else {
-        return None;
-    };
-    let each = array.values.into_iter().map(|value| {
-        let Variant::ExtensionObject(object) = value else {
-            return None;
-        };
-        object.into_inner_as::<Argument>().map(|one| *one)
-    });
-    each.collect()
 }
 
 const DEEPEST: usize = 12;

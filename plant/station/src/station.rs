@@ -14,7 +14,7 @@ use discovery::{
 use plant_opcua::client::{ClientConfig, HostNames, SecurityChoice};
 use plant_opcua::pki::Pki;
 use plant_opcua::server::{EndpointUrl, MethodRequest, MethodSpec, Refusal, ServerError, method};
-use plant_opcua::supervision::Supervision;
+use plant_opcua::supervision::{CONFIGURE, Supervision, configure_takes};
 use plant_opcua::types::{ObjectId, QualifiedName, StatusCode};
 use plant_opcua::users::{Access, Roles};
 use registry::hierarchy::{Change, Choice, Place, Roster};
@@ -24,7 +24,7 @@ use tracing::{info, warn};
 
 use crate::board::{Board, Level};
 use crate::callers::Admission;
-use crate::configure::{self, Told};
+use crate::configure::Told;
 use crate::face::{Face, FaceSettings, id};
 use crate::marks::Sessions;
 use crate::tend::Tending;
@@ -371,13 +371,13 @@ fn configurable(
         place.send_replace(Some(new));
         Ok(Vec::new())
     });
-    let path = format!("{STATION}/{}", configure::CONFIGURE);
+    let path = format!("{STATION}/{}", CONFIGURE);
     let spec = MethodSpec {
         node_id: id(&path),
-        browse_name: QualifiedName::new(1, configure::CONFIGURE),
+        browse_name: QualifiedName::new(1, CONFIGURE),
         object: id(STATION),
         arguments: (id(&format!("{path}.in")), id(&format!("{path}.out"))),
-        takes: configure::takes(),
+        takes: configure_takes(),
         gives: Vec::new(),
     };
     face.server.add_method(spec, handler).map_err(failed)

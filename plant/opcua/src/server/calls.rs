@@ -10,8 +10,8 @@ use opcua::nodes::{NodeType, TypeTree};
 use opcua::server::node_manager::{MethodCall, RequestContext};
 use opcua::sync::RwLock;
 use opcua::types::{
-    Argument, DataEncoding, DataTypeId, NodeId, NumericRange, StatusCode, TimestampsToReturn,
-    Variant,
+    Argument, DataEncoding, DataTypeId, DataValue, NodeId, NumericRange, StatusCode,
+    TimestampsToReturn, Variant,
 };
 use tokio::time::{Instant, timeout_at};
 
@@ -329,18 +329,23 @@ pub(crate) fn fits(value: &Variant, data_type: &NodeId, rank: i32, types: &dyn T
         || types.is_subtype_of(data_type, &given)
 }
 
-/// The arguments in the value of an InputArguments property.
+/// Returns the arguments of an InputArguments property.
 pub(crate) fn arguments(property: &NodeType) -> Option<Vec<Argument>> {
     let NodeType::Variable(variable) = property else {
         return None;
     };
-    let value = variable.value(
+    arguments_in(Some(variable.value(
         TimestampsToReturn::Neither,
         &NumericRange::None,
         &DataEncoding::Binary,
         0.0,
-    );
-    let Some(Variant::Array(array)) = value.value else {
+    )))
+}
+
+/// Returns the arguments that an InputArguments or OutputArguments property has for its value.
+#[must_use]
+pub fn arguments_in(value: Option<DataValue>) -> Option<Vec<Argument>> {
+    let Variant::Array(array) = value?.value? else {
         return None;
     };
     let each = array.values.into_iter().map(|value| {

@@ -49,6 +49,32 @@ pub struct TransitionEvent {
 }
 
 impl TransitionEvent {
+    /// Makes an event of a state machine that stays in its state, as a BaseEventType.
+    #[must_use]
+    pub fn without_transition(
+        (source, source_name): (NodeId, &str),
+        state: StateRef,
+        (message, severity): (&str, u16),
+    ) -> Self {
+        Self {
+            source,
+            source_name: source_name.to_owned(),
+            event_type: ObjectTypeId::BaseEventType.into(),
+            message: message.to_owned(),
+            severity,
+            from_state: state.clone(),
+            to_state: state,
+            transition: StateRef {
+                name: String::new(),
+                id: NodeId::null(),
+                number: 0,
+            },
+            intermediate_result: Variant::Empty,
+            fields: Vec::new(),
+            time: DateTime::now(),
+        }
+    }
+
     /// Raises it on its source and on the Server object, as a ProgramTransitionEventType that has no subtype. A server that is
     /// [`Server`](super::Server) raises events of types of its own, too.
     pub fn raise(&self, subscriptions: &SubscriptionCache) {

@@ -31,7 +31,7 @@ use tokio::task::JoinHandle;
 use tracing::{error, warn};
 
 pub use self::build::{Security, ServerBuilder, ServerConfig, ServerError};
-pub use self::calls::{MethodHandler, MethodRequest, Refusal, method};
+pub use self::calls::{MethodHandler, MethodRequest, Refusal, arguments_in, method};
 pub use self::events::{StateRef, TransitionEvent};
 pub use self::instances::{
     IdRange, Instance, InstanceError, InstanceSpec, ObjectSpec, VariableSpec,

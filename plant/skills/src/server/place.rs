@@ -5,26 +5,13 @@ use std::sync::Arc;
 use plant_opcua::server::{
     IdRange, InstanceError, MethodRequest, MethodSpec, Refusal, Server, VariableSpec, method,
 };
-use plant_opcua::supervision::Supervision;
+use plant_opcua::supervision::{CONFIGURE, CONFIGURED, Supervision, configure_takes};
 use plant_opcua::types::{
-    Argument, DataTypeId, DataValue, LocalizedText, NodeId, QualifiedName, ReferenceTypeId,
-    StatusCode, VariableTypeId, Variant,
+    DataTypeId, DataValue, LocalizedText, NodeId, QualifiedName, ReferenceTypeId, StatusCode,
+    VariableTypeId, Variant,
 };
 use plant_opcua::users::Access;
 use tracing::warn;
-
-/// What a component is told, in this order; it shows each as a property of its object.
-const TOLD: [(&str, &str); 3] = [
-    (
-        "Place",
-        "Where the component is, as cell-1/station-a/gripper",
-    ),
-    ("SupervisorUri", "The ApplicationUri of whoever says so"),
-    (
-        "DiscoveryUrl",
-        "The discovery server of the component's level",
-    ),
-];
 
 /// Adds the method `Configure` and the last arguments of it to the object of a component. Only the supervisor of the component
 /// and users with the role ConfigureAdmin may call it.
@@ -35,7 +22,7 @@ pub(super) fn configurable(
     (supervision, users): (Supervision, Arc<Access>),
 ) -> Result<(), InstanceError> {
     let mut shown = Vec::new();
-    for (name, _) in TOLD {
+    for (name, _) in CONFIGURED {
         let node_id = ids.next();
         server.add_variable(&VariableSpec {
             node_id: node_id.clone(),
@@ -53,10 +40,10 @@ pub(super) fn configurable(
     }
     let spec = MethodSpec {
         node_id: ids.next(),
-        browse_name: QualifiedName::new(object.namespace, "Configure"),
+        browse_name: QualifiedName::new(object.namespace, CONFIGURE),
         object: object.clone(),
         arguments: (ids.next(), ids.next()),
-        takes: TOLD.map(|(name, about)| argument(name, about)).to_vec(),
+        takes: configure_takes(),
         gives: Vec::new(),
     };
     let shower = server.clone();
@@ -93,16 +80,6 @@ pub(super) fn configurable(
         Ok(Vec::new())
     });
     server.add_method(spec, handler)
-}
-
-fn argument(name: &str, about: &str) -> Argument {
-    Argument {
-        name: name.into(),
-        data_type: DataTypeId::String.into(),
-        value_rank: -1,
-        array_dimensions: None,
-        description: LocalizedText::new("en", about),
-    }
 }
 
 const LONGEST: usize = 1024;

@@ -6,8 +6,8 @@ use std::time::SystemTime;
 
 use plant_opcua::server::{Instance, Server, StateRef, TransitionEvent};
 use plant_opcua::types::{
-    DataValue, DateTime, ExtensionObject, LocalizedText, NodeId, ObjectTypeId,
-    ProgramDiagnostic2DataType, QualifiedName, StatusCode, UAString, Variant,
+    DataValue, DateTime, ExtensionObject, LocalizedText, NodeId, ProgramDiagnostic2DataType,
+    QualifiedName, StatusCode, UAString, Variant,
 };
 use program::{Method, State, Transition};
 
@@ -180,26 +180,15 @@ impl Nodes {
     /// Shows why a run has not ended that is being cancelled, and raises an event without a transition.
     fn show_pending(&self, server: &Server, why: &str, shown: &Shown) {
         self.show_progress(server, shown);
+        let source = (self.skill().clone(), &*self.name);
         let state = state_ref(shown.state);
         server.raise(&TransitionEvent {
-            source: self.skill().clone(),
-            source_name: self.name.clone(),
-            event_type: ObjectTypeId::BaseEventType.into(),
-            message: why.to_owned(),
-            severity: FAILED,
-            from_state: state.clone(),
-            to_state: state,
-            transition: StateRef {
-                name: String::new(),
-                id: NodeId::null(),
-                number: 0,
-            },
             intermediate_result: Variant::from(shown.step.as_str()),
             fields: vec![(
                 QualifiedName::new(self.types, "RunId"),
                 Variant::from(shown.run),
             )],
-            time: DateTime::now(),
+            ..TransitionEvent::without_transition(source, state, (why, FAILED))
         });
     }
 

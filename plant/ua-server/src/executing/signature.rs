@@ -7,6 +7,7 @@ use opcua::types::{
     Argument, AttributeId, DataTypeId, DataValue, Identifier, NodeId, ReferenceTypeId, Variant,
 };
 use plant_opcua::client::{Browse, Client, ClientError};
+use plant_opcua::server::arguments_in;
 use uadp::BuiltinType;
 
 use super::Wanted;
@@ -69,7 +70,7 @@ pub(super) async fn read(client: &Client, target: &MethodTarget) -> Result<Signa
             Some(property) => {
                 let values = client.read(std::slice::from_ref(&property.node_id.node_id));
                 let value = values.await.map_err(told)?.into_iter().next();
-                arguments(value).ok_or_else(|| format!("its {which} are none"))?
+                arguments_in(value).ok_or_else(|| format!("its {which} are none"))?
             }
         };
         both.push(fields(client, which, arguments).await?);
@@ -111,19 +112,6 @@ fn there(read: &DataValue, text: &ExpandedNodeIdText) -> Result<(), String> {
 
 fn told(error: ClientError) -> String {
     error.to_string()
-}
-
-fn arguments(value: Option<DataValue>) -> Option<Vec<Argument>> {
-    let Variant::Array(array) = value?.value? else {
-        return None;
-    };
-    let each = array.values.into_iter().map(|value| {
-        let Variant::ExtensionObject(object) = value else {
-            return None;
-        };
-        object.into_inner_as::<Argument>().map(|one| *one)
-    });
-    each.collect()
 }
 
 async fn fields(

@@ -214,23 +214,8 @@ impl Nodes {
             id: NodeId::new(0, now.node_id()),
             number: now.number(),
         };
-        let event = TransitionEvent {
-            source: self.program(),
-            source_name: self.name.clone(),
-            event_type: ObjectTypeId::BaseEventType.into(),
-            message: why.to_owned(),
-            severity: FAILED,
-            from_state: state.clone(),
-            to_state: state,
-            transition: StateRef {
-                name: String::new(),
-                id: NodeId::null(),
-                number: 0,
-            },
-            intermediate_result: Variant::Empty,
-            fields: Vec::new(),
-            time: DateTime::now(),
-        };
+        let source = (self.program(), &*self.name);
+        let event = TransitionEvent::without_transition(source, state, (why, FAILED));
         event.raise(&self.subscriptions);
     }
 
