@@ -49,6 +49,8 @@ pub enum Reason {
     MetaData,
     /// The local side did not take it.
     NotPublished,
+    /// An event, and no subscriber is present on the local side.
+    NoSubscriber,
     /// The socket did not take it.
     NotSent,
     /// A service did not take the value, or did not answer.
@@ -83,7 +85,7 @@ pub enum Reason {
 
 impl Reason {
     /// All of them, in the order of their counters.
-    pub const ALL: [Self; 36] = [
+    pub const ALL: [Self; 37] = [
         Self::Looped,
         Self::SpaceTaken,
         Self::NotInSpace,
@@ -106,6 +108,7 @@ impl Reason {
         Self::Undescribed,
         Self::MetaData,
         Self::NotPublished,
+        Self::NoSubscriber,
         Self::NotSent,
         Self::CallFailed,
         Self::IncompatibleQos,
@@ -148,6 +151,7 @@ impl Reason {
             Self::Undescribed => "undescribed",
             Self::MetaData => "metadata",
             Self::NotPublished => "not_published",
+            Self::NoSubscriber => "no_subscriber",
             Self::NotSent => "not_sent",
             Self::CallFailed => "call_failed",
             Self::IncompatibleQos => "incompatible_qos",
@@ -192,6 +196,7 @@ impl Reason {
             Self::Looped
                 | Self::Repeat
                 | Self::NotInSpace
+                | Self::NoSubscriber
                 | Self::IncompatibleQos
                 | Self::Unchanged
                 | Self::Outpaced

@@ -26,6 +26,7 @@ use crate::exit::{Failure, FailureKind};
 use crate::keys::{self, KeyRing, NewKeys};
 use crate::mapping_file::Running;
 use crate::metrics::{Requests, Told as _};
+use crate::policy::NO_SUBSCRIBER;
 use crate::port::{Delivery, Port, PortEvent};
 use crate::status::{Interfaces, Readiness, Status};
 
@@ -530,6 +531,11 @@ impl<P: Port> Shell<P> {
         };
         match self.port.publish(sample) {
             Ok(()) => self.router.published(topic, arrived, now()),
+            Err(NO_SUBSCRIBER) => {
+                self.router.published(topic, arrived, now());
+                let cause = (Reason::NoSubscriber, NO_SUBSCRIBER);
+                self.router.lost(Some(topic), 1, cause);
+            }
             Err(why) => self.router.not_published(topic, instance, why),
         }
     }

@@ -6,6 +6,7 @@ mod actions;
 mod awaited;
 mod calls;
 mod found;
+mod opening;
 mod reload;
 mod strays;
 
@@ -15,7 +16,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::SystemTime;
 
-use bridge_node::policy::{Policy, Step, TYPE_CHANGES, Word, is_bad, type_changes};
+use bridge_node::policy::{NO_SUBSCRIBER, Policy, Step, TYPE_CHANGES, Word, is_bad, type_changes};
 use bridge_node::{
     Actions, Answered, AskId, AwaitedPeers, CallDescription, Calls, Delivery, Described, Executed,
     Executing, Execution, ExecutionId, Kept, Port, PortEvent, Reason, Services, TypePaths,
@@ -33,10 +34,11 @@ use uadp::{BuiltinType, Timestamp};
 
 use self::calls::Kinds;
 use self::found::Refused;
+use self::opening::{FLUSH, until};
 use crate::definitions::Definitions;
 use crate::ends::Ends;
 use crate::services::{Executor, Ros1Graph};
-use crate::sink::{Open, Sink};
+use crate::sink::{Open, Opening, Sink};
 use crate::source::{MAX_LATCHED, Met, Source};
 use crate::watcher::{Seen, Watcher};
 
@@ -94,6 +96,8 @@ pub struct Ros1Port {
     has_master: bool,
     /// Topics of the graph that there was no room for, and when that was told last.
     refused: Refused,
+    /// When to look at events that wait for subscribers to connect.
+    flush_at: Option<tokio::time::Instant>,
 }
 
 impl Ros1Port {
@@ -145,6 +149,7 @@ impl Ros1Port {
             master,
             has_master: false,
             refused: Refused::default(),
+            flush_at: None,
         };
         port.take_bindings()?;
         let wanted = port.calls.ask_for_mapped(&port.policy);
@@ -501,6 +506,11 @@ impl Ros1Port {
                     publisher,
                     reported: 0,
                     stamps: sink.choice.stamps(&message_type),
+                    opening: Opening::of(
+                        self.graph.subscribers.get(&ros_topic),
+                        self.node.name(),
+                        bridge_node::now().monotonic,
+                    ),
                 };
                 sink.open = Some(open);
                 let selection = sink.choice.selection(message_type.name());
@@ -573,8 +583,10 @@ impl Port for Ros1Port {
                 return event;
             }
             // All are cancel-safe. The graph first, so that a flood of samples does not keep new topics out.
+            let flush_at = self.flush_at;
             tokio::select! {
                 biased;
+                () = until(flush_at) => self.flush(),
                 seen = self.watcher.recv() => match seen {
                     Seen::Graph(graph) => self.look(graph),
                     Seen::Ended(reason) => {
@@ -623,12 +635,17 @@ impl Port for Ros1Port {
         }
         let Some(Sink {
             open: Some(open), ..
-        }) = self.sinks.get(&sample.topic)
+        }) = self.sinks.get_mut(&sample.topic)
         else {
             return Err("no publisher yet");
         };
         let payload = open.stamped(sample.payload, self.node.now());
         let key = sample.instance.map_or(0, latch_key);
+        let mut lost = match sample.lasting {
+            // Before the topic is latched: late subscribers get no events.
+            true => open.end_opening(),
+            false => 0,
+        };
         open.publisher.set_latching(sample.lasting);
         let latched = match sample.kept {
             Kept::Alone => Latched::Alone(key),
@@ -639,8 +656,22 @@ impl Port for Ros1Port {
             }
         };
         // What slow subscribers lose by it is reported with the next look at the graph.
-        let _published = open.publisher.publish_latched(payload, latched);
-        Ok(())
+        if sample.lasting {
+            let _published = open.publisher.publish_latched(payload, latched);
+        } else {
+            lost += open.publish_once((payload, latched), bridge_node::now().monotonic);
+        }
+        let is_waiting = open.opening.as_ref().is_some_and(|of| !of.is_empty());
+        if is_waiting && self.flush_at.is_none() {
+            self.flush_at = Some(tokio::time::Instant::now() + FLUSH);
+        }
+        if lost > 1 {
+            self.unheard(sample.topic, lost - 1);
+        }
+        match lost {
+            0 => Ok(()),
+            _ => Err(NO_SUBSCRIBER),
+        }
     }
 
     fn wanted(

@@ -1,13 +1,14 @@
 //! A topic of the graph that we write values of other spaces to.
 
+use std::collections::VecDeque;
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use bridge_node::policy::{Choice, Destination};
 use bytes::{Bytes, BytesMut};
 use mappings::Lasting;
 use messages::{MessageType, TypeName};
-use tcpros::{Publisher, PublisherOptions, RosTime};
+use tcpros::{Latched, Publisher, PublisherOptions, RosTime};
 
 /// Where the values of one topic of another space go.
 #[derive(Debug)]
@@ -31,9 +32,92 @@ pub(crate) struct Open {
     pub(crate) reported: u64,
     /// Whether its header's stamp is ours to set: only one field of the message is the value, and not the stamp.
     pub(crate) stamps: bool,
+    /// Events that wait for subscribers to connect.
+    pub(crate) opening: Option<Opening>,
+}
+
+/// Events of a topic that was advertised a moment ago. The master knew subscribers of the topic by
+/// then, which have yet to connect.
+#[derive(Debug)]
+pub(crate) struct Opening {
+    subscribers: Vec<String>,
+    until: Instant,
+    waiting: VecDeque<(Bytes, Latched)>,
+}
+
+impl Opening {
+    /// Returns `None` where the topic has no subscriber but the node `own`.
+    pub(crate) fn of(subscribers: Option<&Vec<String>>, own: &str, now: Instant) -> Option<Self> {
+        let others = subscribers
+            .into_iter()
+            .flatten()
+            .filter(|node| *node != own);
+        let subscribers: Vec<String> = others.cloned().collect();
+        (!subscribers.is_empty()).then(|| Self {
+            subscribers,
+            until: now + CONNECTED_WITHIN,
+            waiting: VecDeque::new(),
+        })
+    }
+
+    /// Queues an event. Returns the event if there is no room.
+    pub(crate) fn queue(&mut self, event: (Bytes, Latched)) -> Result<(), (Bytes, Latched)> {
+        if self.waiting.len() >= MOST_WAITING {
+            return Err(event);
+        }
+        self.waiting.push_back(event);
+        Ok(())
+    }
+
+    /// Whether all subscribers are connected, or have had the time to.
+    pub(crate) fn is_over(&self, is_connected: impl Fn(&str) -> bool, now: Instant) -> bool {
+        now >= self.until || self.subscribers.iter().all(|node| is_connected(node))
+    }
+
+    pub(crate) fn is_empty(&self) -> bool {
+        self.waiting.is_empty()
+    }
 }
 
 impl Open {
+    /// Publishes an event, or queues it while subscribers connect. Returns the number of events
+    /// that had no subscriber.
+    pub(crate) fn publish_once(&mut self, event: (Bytes, Latched), now: Instant) -> u64 {
+        let lost = self.look_at_opening(now);
+        let unqueued = match &mut self.opening {
+            None => Err(event),
+            Some(opening) => opening.queue(event),
+        };
+        match unqueued {
+            Ok(()) => lost,
+            // Behind those that wait.
+            Err(event) => lost + self.end_opening() + self.send(event),
+        }
+    }
+
+    /// Publishes the events that wait, once they need not. Returns the number of events that had no
+    /// subscriber.
+    pub(crate) fn look_at_opening(&mut self, now: Instant) -> u64 {
+        let publisher = &self.publisher;
+        let is_over = self
+            .opening
+            .as_ref()
+            .is_some_and(|opening| opening.is_over(|node| publisher.is_subscribed_by(node), now));
+        if is_over { self.end_opening() } else { 0 }
+    }
+
+    /// Publishes the events that wait. Returns the number of events that had no subscriber.
+    pub(crate) fn end_opening(&mut self) -> u64 {
+        let opening = self.opening.take();
+        let waiting = opening.map(|opening| opening.waiting).unwrap_or_default();
+        waiting.into_iter().map(|event| self.send(event)).sum()
+    }
+
+    fn send(&self, (message, latched): (Bytes, Latched)) -> u64 {
+        let published = self.publisher.publish_latched(message, latched);
+        u64::from(published.sent_to == 0)
+    }
+
     /// The message with the time in its header, if that is not part of the value.
     pub(crate) fn stamped(&self, message: Bytes, now: RosTime) -> Bytes {
         if !self.stamps {
@@ -104,6 +188,12 @@ impl Sink {
     }
 }
 
+/// How long the events of a topic that was advertised wait for subscribers that the master knows.
+/// One that was killed stays known, and never connects.
+const CONNECTED_WITHIN: Duration = Duration::from_secs(1);
+/// Events that may wait for them.
+const MOST_WAITING: usize = 512;
+
 #[cfg(test)]
 mod tests {
     use bridge_node::policy::{Step, Word};
@@ -144,5 +234,24 @@ mod tests {
             lasting: Lasting::Event,
         });
         assert!(!sink.options().latch);
+    }
+
+    #[test]
+    fn events_wait_until_the_subscribers_that_the_master_knows_are_connected() {
+        let now = bridge_node::now().monotonic;
+        let nodes = |names: &[&str]| names.iter().map(|name| (*name).to_owned()).collect();
+        assert!(Opening::of(None, "/bridge", now).is_none());
+        assert!(Opening::of(Some(&nodes(&["/bridge"])), "/bridge", now).is_none());
+        let known = nodes(&["/arm", "/bridge", "/gripper"]);
+        let mut opening = Opening::of(Some(&known), "/bridge", now).unwrap();
+        assert!(!opening.is_over(|_| false, now));
+        assert!(!opening.is_over(|node| node == "/arm", now));
+        assert!(opening.is_over(|node| node != "/bridge", now));
+        assert!(opening.is_over(|_| false, now + CONNECTED_WITHIN));
+        let event = || (Bytes::from_static(b"stop"), Latched::Alone(0));
+        for _ in 0..MOST_WAITING {
+            opening.queue(event()).unwrap();
+        }
+        assert!(opening.queue(event()).is_err());
     }
 }

@@ -10,6 +10,7 @@ use std::collections::VecDeque;
 use std::time::Duration;
 
 use bridge_node::Reason;
+use bridge_node::policy::NO_SUBSCRIBER;
 use rustdds::dds::WriteError;
 use rustdds::{DataWriterStatus, GUID, StatusEvented, Timestamp};
 use tokio::time::Instant;
@@ -86,6 +87,8 @@ pub enum Refusal {
     Overflow,
     /// Larger than this many bytes, which is what readers of this topic receive for certain ([`limits`]). Not written.
     TooLarge(usize),
+    /// An event, and no reader is present.
+    NoReader,
     /// RustDDS failed; it does so only when one of its threads has died.
     Failed,
 }
@@ -96,6 +99,7 @@ impl Refusal {
     pub fn cause(self) -> (Reason, &'static str) {
         let reason = match self {
             Self::Overflow => Reason::Overflow,
+            Self::NoReader => Reason::NoSubscriber,
             Self::TooLarge(_) | Self::Failed => Reason::NotPublished,
         };
         (reason, self.label())
@@ -107,6 +111,7 @@ impl Refusal {
         match self {
             Self::Overflow => "subscriber too slow",
             Self::TooLarge(_) => "too large for DDS",
+            Self::NoReader => NO_SUBSCRIBER,
             Self::Failed => "DDS writer failed",
         }
     }
@@ -251,7 +256,8 @@ impl Outlet {
     /// As [`offer`](Self::offer), of an event: for the readers that are present.
     ///
     /// # Errors
-    /// [`Refusal`]: one sample was lost, this or an older one.
+    /// [`Refusal`]: one sample was lost, this or an older one; [`Refusal::NoReader`] without a
+    /// present reader.
     pub fn offer_once(
         &mut self,
         payload: Payload,
@@ -265,7 +271,11 @@ impl Outlet {
                 lasting: false,
             },
             now,
-        )
+        )?;
+        match self.audience {
+            Audience::Nobody { .. } => Err(Refusal::NoReader),
+            Audience::Present { .. } => Ok(()),
+        }
     }
 
     fn offer_sample(&mut self, sample: Sample, now: Instant) -> Result<(), Refusal> {

@@ -4,7 +4,8 @@ use std::time::Duration;
 
 use serde_json::{Value, json};
 use system_tests::{
-    Cell, Child, METRICS_ROS1, METRICS_ROS2, Peer, UaSide, UadpSocket, eventually, metrics,
+    Cell, Child, Distribution, METRICS_ROS1, METRICS_ROS2, Peer, UaSide, UadpSocket, eventually,
+    metrics,
 };
 use uadp::{NetworkMessage, NetworkMessageType, Scalar};
 
@@ -63,6 +64,57 @@ fn a_command_of_opc_ua_reaches_present_subscribers_once_and_late_ones_never() {
             numbers(subscriber).contains(&9).then_some(())
         });
         assert!(!numbers(subscriber).contains(&7));
+    }
+}
+
+/// The bridges advertise each topic with its first value, and subscribers that they know have yet
+/// to connect then.
+#[test]
+fn the_first_event_of_a_topic_reaches_subscribers_that_are_present() {
+    let Some(cell) = Cell::with(&[Peer::Ros1, Peer::Ros2]) else {
+        return;
+    };
+    let _master = cell.roscore();
+    let mut rospy = [11, 12, 10].map(|number| {
+        let (topic, node) = (format!("/ua_0_5_{number}"), format!("sub_{number}"));
+        cell.rospy("ros1_sub.py", &[&topic, TYPE, "--node", &node])
+    });
+    let _bridges = (cell.bridge_ros1(&[]), cell.bridge_ros2(&[]));
+    let mut judge = cell.judge(Distribution::Jazzy, &["judge"]);
+    for number in (11..=20).chain([10_usize]) {
+        let reliability = ["RELIABLE", "BEST_EFFORT"][number % 2];
+        let topic = format!("/ua_0_5_{number}");
+        let qos = json!({"reliability": reliability});
+        judge.ask(json!({"subscribe": topic, "type": "std_msgs/msg/UInt32", "qos": qos}));
+    }
+    let mut side = UaSide::join();
+    // The last topic is for waiting until all subscribers are known.
+    eventually("the subscribers are known", SOON, || {
+        side.write((0, 5, 10), Scalar::UInt32(1));
+        let heard = judge.child().json_lines();
+        let is_heard = heard.iter().any(|line| line["heard"] == "/ua_0_5_10");
+        (is_heard && !numbers(&rospy[2]).is_empty()).then_some(())
+    });
+    for number in 11..=20 {
+        side.write((0, 5, number), Scalar::UInt32(u32::from(number)));
+    }
+    for number in 11..=20 {
+        let data = |value: &Value| (value["data"] == number).then_some(());
+        judge.hears(&format!("/ua_0_5_{number}"), data);
+    }
+    for (subscriber, number) in rospy.iter_mut().zip([11, 12]) {
+        eventually("rospy receives the event", SOON, || {
+            numbers(subscriber).contains(&number).then_some(())
+        });
+    }
+    // A topic without subscribers.
+    side.write((0, 5, 21), Scalar::UInt32(21));
+    for bridge in [METRICS_ROS1, METRICS_ROS2] {
+        eventually("the event is counted", SOON, || {
+            let status: Value = metrics(bridge)?;
+            let dropped = &status["topics"]["ua_0_5_21"]["dropped"];
+            (dropped["no_subscriber"] == 1).then_some(())
+        });
     }
 }
 

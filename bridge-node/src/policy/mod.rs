@@ -152,6 +152,8 @@ pub const fn is_bad(status: u16) -> bool {
 
 /// Why a value is not written while its topic goes over to another type.
 pub const TYPE_CHANGES: &str = "type changes";
+/// Why an event is not written. It is counted, and is no fault.
+pub const NO_SUBSCRIBER: &str = "no subscriber is present";
 /// Topics of the space that the mapping does not name and that are read: anybody in a graph can invent names. Likewise
 /// those that are written, of values nobody here knows.
 pub const MAX_TOPICS: usize = 4096;

@@ -446,7 +446,7 @@ impl Shared {
     fn note(&self, sent: Result<(), Refusal>) {
         match sent {
             // One status waits, which is the newest.
-            Ok(()) | Err(Refusal::Overflow) => {}
+            Ok(()) | Err(Refusal::Overflow | Refusal::NoReader) => {}
             Err(refusal @ (Refusal::TooLarge(_) | Refusal::Failed)) => {
                 let (action, why) = (self.action.name(), refusal.label());
                 debug!(action, why, "the status of its goals is not published");

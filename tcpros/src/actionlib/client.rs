@@ -223,15 +223,15 @@ impl ActionClient {
         })
     }
 
-    /// The node that serves the action: its status has come, it sends feedback and results, and it takes goals and
-    /// requests to cancel.
+    /// The node that serves the action: it sends feedback and results, its status has come after it
+    /// was connected for both, and it takes goals and requests to cancel.
     pub fn server(&self) -> Result<String, NoServer> {
         let state = lock(&self.shared.state);
         let missing = |reason| NoServer {
             action: self.shared.name.clone(),
             reason,
         };
-        let server = state.goals.ready_server().map_err(missing)?;
+        let server = state.goals.ready_server(clock::now()).map_err(missing)?;
         let takes = |topic: fn(&Outputs) -> &Publisher| {
             let outputs = state.outputs.as_ref();
             outputs.is_some_and(|outputs| topic(outputs).is_subscribed_by(server))

@@ -194,8 +194,22 @@ struct Server {
     feedback: usize,
     result: usize,
     last_status: Option<Instant>,
+    /// Since when it has a connection for each of the three topics.
+    complete: Option<Instant>,
     /// Since when it has no connection for its status.
     gone: Option<Instant>,
+}
+
+impl Server {
+    /// Whether the server is known to use its connections. rospy answers the header of a connection
+    /// before it adds the connection to its publisher, and what is published in between is lost to
+    /// it.
+    fn is_settled(&self, now: Instant) -> bool {
+        self.complete.is_some_and(|since| {
+            let heard = self.last_status >= Some(clock::after(since, STATUS_AFTER));
+            heard || now >= clock::after(since, SETTLES_WITHIN)
+        })
+    }
 }
 
 impl ClientGoals {
@@ -337,11 +351,13 @@ impl ClientGoals {
             count.saturating_sub(1)
         };
         server.gone = (server.status == 0).then(|| server.gone.unwrap_or(now));
+        let is_complete = server.status > 0 && server.feedback > 0 && server.result > 0;
+        server.complete = is_complete.then(|| server.complete.unwrap_or(now));
         self.forget_servers();
     }
 
     /// The connected server heard of last, or what there is not.
-    pub(super) fn ready_server(&self) -> Result<&str, &'static str> {
+    pub(super) fn ready_server(&self, now: Instant) -> Result<&str, &'static str> {
         let latest = self
             .servers
             .iter()
@@ -352,6 +368,9 @@ impl ClientGoals {
             None => Err("no status of a server has come"),
             Some((_, _, server)) if server.feedback == 0 => Err("the server publishes no feedback"),
             Some((_, _, server)) if server.result == 0 => Err("the server publishes no result"),
+            Some((_, _, server)) if !server.is_settled(now) => {
+                Err("the server has sent no status after it was connected")
+            }
             Some((_, node, _)) => Ok(node),
         }
     }
@@ -627,6 +646,12 @@ const fn path(state: CommState, status: Status) -> Option<&'static [CommState]> 
         | (C::Preempting, S::Preempted | S::Succeeded | S::Aborted) => &[C::WaitingForResult],
     })
 }
+
+/// How much later than the last of the connections a status shows that the server uses all of them.
+const STATUS_AFTER: Duration = Duration::from_millis(50);
+/// How long such a status is waited for. Servers send five a second, unless they are told
+/// otherwise.
+const SETTLES_WITHIN: Duration = Duration::from_secs(1);
 
 #[cfg(test)]
 mod tests {
@@ -909,14 +934,35 @@ mod tests {
         let now = clock::now();
         let mut goals = ClientGoals::new(LIMITS);
         goals.connection("/server", Source::Status, true, now);
-        assert!(goals.ready_server().unwrap_err().contains("status"));
+        assert!(goals.ready_server(now).unwrap_err().contains("status"));
         goals.status("/server", &[], now);
-        assert!(goals.ready_server().unwrap_err().contains("feedback"));
+        assert!(goals.ready_server(now).unwrap_err().contains("feedback"));
         goals.connection("/server", Source::Feedback, true, now);
         goals.connection("/other", Source::Result, true, now);
-        assert!(goals.ready_server().unwrap_err().contains("result"));
+        assert!(goals.ready_server(now).unwrap_err().contains("result"));
         goals.connection("/server", Source::Result, true, now);
-        assert_eq!(goals.ready_server(), Ok("/server"));
+        goals.status("/server", &[], now + STATUS_AFTER);
+        assert_eq!(goals.ready_server(now + STATUS_AFTER), Ok("/server"));
+    }
+
+    #[test]
+    fn a_server_is_not_ready_before_it_uses_its_connections() {
+        let now = clock::now();
+        let mut goals = ClientGoals::new(LIMITS);
+        for topic in [Source::Status, Source::Feedback, Source::Result] {
+            goals.connection("/server", topic, true, now);
+        }
+        // The latched status, which may have been sent before the other connections were made.
+        goals.status("/server", &[], now);
+        let soon = now + STATUS_AFTER;
+        assert!(goals.ready_server(soon).unwrap_err().contains("status"));
+        goals.status("/server", &[], soon);
+        assert_eq!(goals.ready_server(soon), Ok("/server"));
+        goals.connection("/server", Source::Result, false, soon);
+        goals.connection("/server", Source::Result, true, soon);
+        assert!(goals.ready_server(soon).unwrap_err().contains("status"));
+        // A server that sends its status on change only.
+        assert_eq!(goals.ready_server(soon + SETTLES_WITHIN), Ok("/server"));
     }
 
     /// What can come in, for a goal of ours or another.

@@ -1,0 +1,53 @@
+//! Events of topics that were advertised a moment ago: they wait for subscribers to connect.
+
+use std::time::Duration;
+
+use bridge_node::policy::NO_SUBSCRIBER;
+use bridge_node::{PortEvent, Reason};
+use mappings::TopicId;
+use tokio::time::{Instant, sleep_until};
+
+use super::Ros1Port;
+
+impl Ros1Port {
+    /// Publishes events that need not wait for subscribers any longer.
+    pub(super) fn flush(&mut self) {
+        let now = bridge_node::now().monotonic;
+        let mut unheard = Vec::new();
+        let mut is_waiting = false;
+        for (topic, sink) in &mut self.sinks {
+            let Some(open) = sink.open.as_mut().filter(|open| open.opening.is_some()) else {
+                continue;
+            };
+            unheard.push((*topic, open.look_at_opening(now)));
+            is_waiting |= open.opening.as_ref().is_some_and(|of| !of.is_empty());
+        }
+        for (topic, count) in unheard {
+            self.unheard(topic, count);
+        }
+        self.flush_at = is_waiting.then(|| Instant::now() + FLUSH);
+    }
+
+    /// Reports events that no subscriber was there for.
+    pub(super) fn unheard(&mut self, topic: TopicId, count: u64) {
+        if count > 0 {
+            self.events.push_back(PortEvent::Lost {
+                topic: Some(topic),
+                reason: Reason::NoSubscriber,
+                why: NO_SUBSCRIBER,
+                count,
+            });
+        }
+    }
+}
+
+/// Returns at that time, or never.
+pub(super) async fn until(at: Option<Instant>) {
+    match at {
+        Some(at) => sleep_until(at).await,
+        None => std::future::pending().await,
+    }
+}
+
+/// How often events look for the subscribers that they wait for.
+pub(super) const FLUSH: Duration = Duration::from_millis(10);
