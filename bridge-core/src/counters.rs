@@ -69,6 +69,8 @@ pub enum Reason {
     NotAsked,
     /// A response of somebody who does not execute the call.
     Forged,
+    /// An event that a bridge it is for has not confirmed in time: whether it has arrived is unknown.
+    Unconfirmed,
     /// In clear, where the group is secured.
     Unsecured,
     /// Signed alone, where the group encrypts; or encrypted and not signed.
@@ -85,7 +87,7 @@ pub enum Reason {
 
 impl Reason {
     /// All of them, in the order of their counters.
-    pub const ALL: [Self; 37] = [
+    pub const ALL: [Self; 38] = [
         Self::Looped,
         Self::SpaceTaken,
         Self::NotInSpace,
@@ -117,6 +119,7 @@ impl Reason {
         Self::CallRefused,
         Self::NotAsked,
         Self::Forged,
+        Self::Unconfirmed,
         Self::Unsecured,
         Self::Downgraded,
         Self::Signature,
@@ -160,6 +163,7 @@ impl Reason {
             Self::CallRefused => "call_refused",
             Self::NotAsked => "not_asked",
             Self::Forged => "forged",
+            Self::Unconfirmed => "unconfirmed",
             Self::Unsecured => "unsecured",
             Self::Downgraded => "downgraded",
             Self::Signature => "signature",

@@ -15,6 +15,7 @@ mod block;
 mod call;
 mod call_announcement;
 mod call_plan;
+mod confirm;
 mod constant;
 mod counters;
 mod description;
@@ -47,6 +48,7 @@ pub use call::{
     CallField, CallMap, CallRole, CallStructure, Executed, Execution, Offered, OfferedType,
     ValueDescription, ValueNote, split_name,
 };
+pub use confirm::{Arrival, Handover};
 pub use counters::{Counters, Reason, Verdict};
 pub use description::Described;
 pub use fields::{decode_fields, encode_fields};

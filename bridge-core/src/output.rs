@@ -8,6 +8,7 @@ use uadp::action::ExecutionId;
 use uadp::{BuiltinType, Timestamp};
 
 use crate::call::{Answered, AskId, CallDescription, Execution};
+use crate::confirm::Arrival;
 use crate::counters::Reason;
 use crate::description::Described;
 
@@ -104,6 +105,21 @@ pub enum Output {
         execution: ExecutionId,
         /// Of which call.
         topic: TopicId,
+    },
+    /// The outcome of the newest event of a topic of ours that bridges [confirm](mappings::Variable::confirmed_within).
+    Settled {
+        /// Which value.
+        topic: TopicId,
+        /// The outcome.
+        arrival: Arrival,
+    },
+    /// A value that the local side accepted is to be confirmed: report its handover with
+    /// [`Router::handed`](crate::Router::handed).
+    HandoverWanted {
+        /// Which value.
+        topic: TopicId,
+        /// [`Delivery::instance`] of the value.
+        instance: Timestamp,
     },
     /// Somebody else writes a namespace of ours: nothing of ours is sent in it as long as that is so.
     Taken {

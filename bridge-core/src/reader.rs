@@ -8,6 +8,7 @@ use mappings::Lasting;
 use uadp::{BuiltinType, DataSetMessage, SequenceOrder, Timestamp};
 
 use crate::base::Base;
+use crate::confirm::Receipt;
 use crate::counters::Reason;
 use crate::output::Kept;
 use crate::place::Place;
@@ -52,6 +53,8 @@ pub(crate) struct Reader {
     withdrawn: Option<Timestamp>,
     /// A sample that waits for its local type.
     pub(crate) held: Option<Box<Held>>,
+    /// The newest event, where this space confirms it.
+    pub(crate) receipt: Option<Receipt>,
     /// The state that delta frames change.
     pub(crate) base: Option<Box<Base>>,
     /// Whether the writer has sent a delta frame.
@@ -193,6 +196,7 @@ impl Reader {
             over: false,
             withdrawn: None,
             held: None,
+            receipt: None,
             base: None,
             deltas: false,
             owed: true,
@@ -309,6 +313,7 @@ impl Reader {
             // Who comes back may send something else.
             self.shape = None;
             self.over = true;
+            self.receipt = None;
         }
         fell
     }
@@ -317,6 +322,7 @@ impl Reader {
     pub(crate) fn leave(&mut self) -> bool {
         self.shape = None;
         self.over = true;
+        self.receipt = None;
         !std::mem::replace(&mut self.silent, true)
     }
 
@@ -622,6 +628,7 @@ impl Reader {
         self.owed = true;
         self.known.clear();
         self.several = None;
+        self.receipt = None;
     }
 }
 

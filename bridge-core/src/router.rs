@@ -6,6 +6,7 @@ mod batch;
 mod by_name;
 mod calls;
 mod chunks;
+mod confirm;
 mod content;
 mod discovery;
 mod follow;
@@ -19,7 +20,7 @@ mod send;
 mod told;
 
 use std::cmp::Reverse;
-use std::collections::{BinaryHeap, HashMap, VecDeque};
+use std::collections::{BTreeMap, BinaryHeap, HashMap, VecDeque};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -27,6 +28,7 @@ use mappings::{Lasting, Mapping, SpaceId, TopicId};
 use messages::{Dialect, MessageType, PlanError, Selection, Wire};
 use uadp::Timestamp;
 
+use crate::confirm::{Confirmer, Handover};
 use crate::counters::{Cause, Counters, Reason, Verdict};
 use crate::fields;
 use crate::gate::{Passage, Waiting};
@@ -79,6 +81,10 @@ pub struct Router {
     guard: Option<Box<Guard>>,
     /// Whether what is handled came in clear.
     in_clear: bool,
+    /// Who confirms for each other space.
+    confirmers: BTreeMap<SpaceId, Confirmer>,
+    /// Topics of ours of which it is known what became of the newest event.
+    settled: VecDeque<TopicId>,
     /// What is told besides samples.
     told: VecDeque<Output>,
     /// Topics of other spaces of which the port is to be told something, each once.
@@ -121,6 +127,8 @@ impl Router {
             claims: None,
             guard,
             in_clear: true,
+            confirmers: BTreeMap::new(),
+            settled: VecDeque::new(),
             told: VecDeque::new(),
             news: VecDeque::new(),
             news_first: false,
@@ -213,6 +221,13 @@ impl Router {
     /// As [`handle_local`](Self::handle_local), of a side that knows the quality of its samples: the upper 16 bits of a
     /// StatusCode, which go out as the Status of the DataSetMessage (OPC 10000-14, 7.2.4.5.4).
     pub fn handle_local_as(&mut self, heard: Heard<'_>, status: u16, now: Now) -> Verdict {
+        let topic = heard.topic;
+        let verdict = self.take_local(heard, status, now);
+        self.settle_verdict(topic, verdict);
+        verdict
+    }
+
+    fn take_local(&mut self, heard: Heard<'_>, status: u16, now: Now) -> Verdict {
         let Heard {
             topic,
             payload,
@@ -271,6 +286,13 @@ impl Router {
                 self.refuse(topic, Reason::Unchanged, String::new())
             }
             Passage::TooEarly => {
+                if let Some(Topic {
+                    role: Role::Ours(writer),
+                    ..
+                }) = self.topics.get_mut(&topic)
+                {
+                    writer.supersede();
+                }
                 let outpaced = self
                     .topics
                     .get_mut(&topic)
@@ -304,6 +326,7 @@ impl Router {
         let Some(Topic {
             role: Role::Ours(writer),
             lasting,
+            confirming,
             ..
         }) = self.topics.get_mut(&topic)
         else {
@@ -324,7 +347,16 @@ impl Router {
         };
         let is_kept = *lasting != Lasting::Event;
         let gave_way = is_kept && writer.keep((latched_by, is_state), &message);
-        writer.send_again(&message, (is_state, is_kept), now.monotonic);
+        let is_confirmed = confirming.is_some();
+        writer.send_again(
+            &message,
+            (is_state, is_kept),
+            confirming.as_deref(),
+            now.monotonic,
+        );
+        if is_confirmed {
+            self.look_for_confirmers(topic, now);
+        }
         if gave_way {
             self.count(About::topic(topic), Reason::TooManyPublishers, 1, || {
                 format!(
@@ -386,6 +418,7 @@ impl Router {
                 // No local type will say what it is.
                 self.describe(topic, None, now);
             }
+            self.settle_arrival(topic);
             self.schedule(topic);
         }
     }
@@ -407,6 +440,7 @@ impl Router {
             entry.timer = None;
             self.announce_again(topic, now);
             self.handle_due(topic, now);
+            self.settle_arrival(topic);
             self.schedule(topic);
         }
         self.look_at_claims(now);
@@ -453,6 +487,7 @@ impl Router {
         why: &'static str,
     ) {
         self.forget(topic, instance);
+        self.handed(topic, instance, Handover::Nobody);
         self.count(About::topic(topic), (Reason::NotPublished, why), 1, || {
             why.to_owned()
         });

@@ -7,6 +7,7 @@ use mappings::{Lasting, Overflow};
 use messages::{MessageType, Plan, Selection};
 
 use crate::call::ValueDescription;
+use crate::confirm::Confirming;
 use crate::counters::Counters;
 use crate::description::Description;
 use crate::gate::Gate;
@@ -46,6 +47,8 @@ pub(crate) struct Topic {
     pub(crate) loss: Option<Box<Loss>>,
     /// The value that calls the service of the topic, where that is the reaction to the loss of a commander.
     pub(crate) trigger: Option<Box<Stop>>,
+    /// The spaces that confirm its events.
+    pub(crate) confirming: Option<Box<Confirming>>,
     /// What holds samples of our own space back.
     pub(crate) gate: Option<Box<Gate>>,
     /// What is announced of it, if it is of our own space and its type is known.
@@ -112,6 +115,7 @@ impl Topic {
             held_back: Duration::ZERO,
             loss: None,
             trigger: None,
+            confirming: None,
             gate: None,
             description: None,
             said: None,

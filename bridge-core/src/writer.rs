@@ -3,8 +3,10 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use uadp::Timestamp;
+use mappings::SpaceId;
+use uadp::{DateTime, Timestamp};
 
+use crate::confirm::{Arrival, Awaited, Confirming, Mark};
 use crate::output::PublisherKey;
 use crate::pace::Pace;
 
@@ -30,13 +32,22 @@ pub(crate) struct Writer {
     started: bool,
     /// The newest event, while it is sent again in case it is lost.
     again: Option<Again>,
+    /// The outcome of the newest event, if others confirm it.
+    arrival: Option<Arrival>,
+    /// Whether the outcome was not reported yet.
+    is_news: bool,
 }
 
-/// An event of one datagram that is sent again under its sequence number.
+/// An event that is sent again under its sequence number: twice if it is one datagram, and until it is confirmed where that is
+/// awaited.
 #[derive(Debug)]
 struct Again {
     /// The message, unless it is kept as the last value, too.
     message: Option<Encoded>,
+    /// The message, if it is large.
+    large: Option<Arc<Encoded>>,
+    /// The confirmations that are missing.
+    awaited: Option<Awaited>,
     /// When it was sent first.
     since: Instant,
     /// How often it was sent again.
@@ -92,6 +103,13 @@ impl Message {
         }
     }
 
+    fn encoded(&self) -> &Encoded {
+        match self {
+            Self::Datagram(encoded) => encoded,
+            Self::Large(encoded) => encoded,
+        }
+    }
+
     /// How long sending it takes, if that is worth a thought.
     fn time(&self) -> Duration {
         match self {
@@ -127,6 +145,20 @@ impl Encoded {
             .map_or(0, |number| u16::from_le_bytes(*number))
     }
 
+    /// Returns the identity of the DataSetMessage among all of its writer. Its sequence number is followed by Timestamp and
+    /// PicoSeconds in all that is sent here.
+    fn mark(&self) -> Option<Mark> {
+        let stamp = self.bytes.get(self.sequence_at.checked_add(2)?..)?;
+        let (ticks, rest) = stamp.split_first_chunk()?;
+        Some(Mark {
+            sequence: self.sequence(),
+            stamp: Timestamp {
+                time: DateTime(i64::from_le_bytes(*ticks)),
+                picoseconds: u16::from_le_bytes(*rest.first_chunk()?),
+            },
+        })
+    }
+
     pub(crate) fn number(&mut self, sequence: u16) {
         patch(&mut self.bytes, self.sequence_at, &sequence.to_le_bytes());
     }
@@ -144,6 +176,8 @@ impl Writer {
             next: usize::MAX,
             started: false,
             again: None,
+            arrival: None,
+            is_news: false,
         }
     }
 
@@ -235,7 +269,7 @@ impl Writer {
     /// No longer repeats anything.
     pub(crate) fn keep_nothing(&mut self) {
         self.kept.clear();
-        self.again = None;
+        self.end_again();
         self.next = usize::MAX;
     }
 
@@ -326,6 +360,14 @@ impl Writer {
     fn event_again(&mut self, buffer: impl FnOnce() -> Vec<u8>) -> Option<Message> {
         let again = self.again.as_mut()?;
         again.is_due = false;
+        if let Some(large) = &again.large {
+            let kept = self.kept.iter().filter(
+                |kept| matches!(&kept.message, Message::Large(kept) if Arc::ptr_eq(kept, large)),
+            );
+            // One that is still on its way needs no repetition.
+            let is_sent = Arc::strong_count(large) == 1 + kept.count();
+            return is_sent.then(|| Message::Large(Arc::clone(large)));
+        }
         let mut kept = self.kept.iter();
         let message = match &again.message {
             Some(message) => Some(message),
@@ -339,7 +381,7 @@ impl Writer {
             bytes.clone_from(&message.bytes);
             Message::Datagram(Encoded { bytes, ..*message })
         });
-        if again.times >= AGAIN.len() {
+        if again.awaited.is_none() && again.times >= AGAIN.len() {
             self.again = None;
         }
         message
@@ -350,25 +392,41 @@ impl Writer {
         self.again.as_ref().is_some_and(|again| again.is_due)
     }
 
-    /// Plans to send a sample again if it is an event of one datagram. It takes the place of the event before, which is not
-    /// sent any more.
+    /// Plans to send a sample again if it is an event of one datagram, or `confirmed`. It replaces the event before, which is not
+    /// sent again.
     pub(crate) fn send_again(
         &mut self,
         message: &Message,
         (is_state, is_kept): (bool, bool),
+        confirmed: Option<&Confirming>,
         now: Instant,
     ) {
-        let (Message::Datagram(message), false) = (message, is_state) else {
+        self.supersede_arrival();
+        let confirmed = confirmed.filter(|_| !is_state);
+        let mark = message.encoded().mark();
+        let awaited = confirmed.and_then(|confirmed| Some(confirmed.await_event(mark?, now)));
+        let large = match message {
+            Message::Large(large) => Some(Arc::clone(large)),
+            Message::Datagram(_) => None,
+        };
+        if is_state || (large.is_some() && awaited.is_none()) {
             self.again = None;
             return;
-        };
+        }
         let again = self.again.get_or_insert(Again {
             message: None,
+            large: None,
+            awaited: None,
             since: now,
             times: 0,
             is_due: false,
         });
         (again.since, again.times, again.is_due) = (now, 0, false);
+        (again.large, again.awaited) = (large, awaited);
+        let Message::Datagram(message) = message else {
+            again.message = None;
+            return;
+        };
         if is_kept {
             again.message = None;
             return;
@@ -383,7 +441,17 @@ impl Writer {
     /// When the newest event is sent again next.
     pub(crate) fn again_at(&self) -> Option<Instant> {
         let again = self.again.as_ref()?;
-        Some(again.since + *AGAIN.get(again.times)?)
+        let Some(awaited) = &again.awaited else {
+            return Some(again.since + *AGAIN.get(again.times)?);
+        };
+        let period = match again.large {
+            Some(_) => LARGE_AWAITED,
+            None => AWAITED,
+        };
+        let early = AGAIN.get(again.times).filter(|_| again.large.is_none());
+        let times = u32::try_from(again.times).unwrap_or(u32::MAX);
+        let at = early.map_or_else(|| period.saturating_mul(times.saturating_add(1)), |at| *at);
+        Some((again.since + at).min(awaited.until))
     }
 
     /// Returns whether the newest event is to be sent again now. An overdue event is given up, because it would come late.
@@ -394,19 +462,91 @@ impl Writer {
         let Some(again) = &mut self.again else {
             return false;
         };
-        if now.saturating_duration_since(again.since) > AGAIN_WITHIN {
-            self.again = None;
+        let is_over = match &again.awaited {
+            Some(awaited) => now >= awaited.until,
+            None => now.saturating_duration_since(again.since) > AGAIN_WITHIN,
+        };
+        if is_over {
+            self.end_again();
             return false;
         }
         again.times += 1;
         again.is_due = true;
+        if again.awaited.is_some() {
+            // Times that were missed are not made up for.
+            while self.again_at().is_some_and(|at| at <= now) {
+                if let Some(again) = &mut self.again {
+                    again.times += 1;
+                }
+            }
+        }
         true
     }
 
-    pub(crate) const fn set_live(&mut self, live: bool) {
+    /// Stops to repeat the newest event. The outcome is unknown for spaces that have not confirmed it.
+    fn end_again(&mut self) {
+        let awaited = self.again.take().and_then(|again| again.awaited);
+        if let Some(awaited) = awaited {
+            self.arrival = Some(Arrival::Unknown(awaited.spaces));
+            self.is_news = true;
+        }
+    }
+
+    /// A newer sample than the newest event waits for its time: the event is not sent again.
+    pub(crate) fn supersede(&mut self) {
+        self.supersede_arrival();
+        self.again = None;
+    }
+
+    fn supersede_arrival(&mut self) {
+        (self.arrival, self.is_news) = (None, false);
+    }
+
+    /// Returns whether the confirmation of that event by that space is missing.
+    pub(crate) fn is_awaited(&self, mark: Mark, space: SpaceId) -> bool {
+        let again = self.again.as_ref();
+        let awaited = again.and_then(|again| again.awaited.as_ref());
+        awaited.is_some_and(|awaited| awaited.is_awaited(mark, space))
+    }
+
+    /// Notes that a space has confirmed the newest event.
+    pub(crate) fn confirm(&mut self, space: SpaceId) {
+        let Some(again) = &mut self.again else { return };
+        if !again
+            .awaited
+            .as_mut()
+            .is_some_and(|awaited| awaited.confirm(space))
+        {
+            return;
+        }
+        again.awaited = None;
+        let is_over = again.large.is_some() || again.times >= AGAIN.len();
+        if is_over {
+            self.again = None;
+        }
+        self.arrival = Some(Arrival::Confirmed);
+        self.is_news = true;
+    }
+
+    /// Returns the outcome of the newest event, if others confirm it and it is known.
+    pub(crate) const fn arrival(&self) -> Option<&Arrival> {
+        self.arrival.as_ref()
+    }
+
+    /// Returns whether the outcome has become known since the last call.
+    pub(crate) const fn take_news(&mut self) -> bool {
+        std::mem::replace(&mut self.is_news, false)
+    }
+
+    pub(crate) fn set_live(&mut self, live: bool) {
         self.live = live;
         if !live {
             self.next = usize::MAX;
+            let is_awaited = |again: &Again| again.awaited.is_some();
+            if self.again.as_ref().is_some_and(is_awaited) {
+                // A command does not outlive its commander.
+                self.end_again();
+            }
         }
     }
 
@@ -446,7 +586,10 @@ impl Writer {
 
 /// When an event is sent again after it was sent first.
 const AGAIN: [Duration; 2] = [Duration::from_millis(30), Duration::from_millis(80)];
-/// From then on it is not sent again.
+/// How often after that while it is not confirmed, and how often if it is large.
+const AWAITED: Duration = Duration::from_millis(50);
+const LARGE_AWAITED: Duration = Duration::from_millis(250);
+/// From then on it is not sent again unless it is to be confirmed.
 const AGAIN_WITHIN: Duration = Duration::from_millis(150);
 /// Samples kept per topic: more latched publishers of one topic are not known of any graph.
 pub(crate) const MAX_KEPT: usize = 32;
@@ -635,7 +778,7 @@ mod tests {
     fn the_send_time_is_written_where_the_header_has_it() {
         let mut encoded = sample();
         encoded.stamp(Timestamp {
-            time: uadp::DateTime(0x0102),
+            time: DateTime(0x0102),
             picoseconds: 0x0304,
         });
         assert_eq!(encoded.bytes[2..12], [2, 1, 0, 0, 0, 0, 0, 0, 4, 3]);

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use bridge_core::{
     Delivery, Heard, Kept, Local, Now, Output, PublisherKey, Reason, Router, Settings,
 };
-use mappings::{Mapping, SpaceId, TopicId};
+use mappings::{Mapping, ServiceRole, SpaceId, TopicId};
 use messages::{Dialect, Registry, Selection};
 use uadp::{
     BuiltinType, DataSetHeader, DateTime, GroupHeader, NetworkHeader, NetworkMessageEncoder,
@@ -482,6 +482,7 @@ variables:
   - {node: ns=2;i=11, name: Held, origin: 0, on_loss: {twist.linear.x: 0.5}, hold: 500ms, ros: {space: 1, topic: /held, type: geometry_msgs/TwistStamped}}
   - {node: ns=2;i=12, name: Arm, origin: 0, type: UInt32, on_loss: {call: ns=2;i=13}, ros: {space: 1, topic: /arm, type: std_msgs/UInt32, field: data}}
   - {node: ns=2;i=13, name: Stop, origin: 0, type: Boolean, ros: {space: 1, call: /stop, type: std_srvs/Trigger, when: true}}
+  - {node: ns=2;i=14, name: Motor, origin: 0, type: Boolean, on_loss: false, ros: {space: 1, call: /motor, type: std_srvs/SetBool, field: data}}
 ";
 
 /// A bridge of space 1 with that mapping, the topic bound to this type.
@@ -617,6 +618,36 @@ fn a_service_is_called_when_the_commander_of_an_arm_is_lost() {
         .map(|one| (one.topic, &one.payload[..]))
         .collect();
     assert_eq!(came, [(topic("ua_0_2_13"), &[1][..])]);
+}
+
+#[test]
+fn a_service_is_called_once_more_when_the_commander_of_a_value_that_calls_it_is_lost() {
+    let of = topic("ua_0_2_14");
+    let mut now = start();
+    let checked = Mapping::from_yaml(COMMANDS, "cell.yaml").mapping.unwrap();
+    let variable = checked.variable(of).unwrap();
+    let service = variable.service.as_ref().unwrap();
+    let ServiceRole::Call { request, .. } = &service.role else {
+        panic!("{service:?}")
+    };
+    let mut robot = commanded(topic("ua_0_2_13"), "std_msgs/Bool", &Selection::Whole, now);
+    let set_bool = Registry::bundle(Dialect::Ros1).service(&"std_srvs/SetBool".parse().unwrap());
+    let set_bool = set_bool.unwrap();
+    robot.bind(of, set_bool.request(), request, now).unwrap();
+    let mut server = router(0, Local::Fields);
+    let mut came = Vec::new();
+    let on = [1, 0, BuiltinType::Boolean.id(), 1];
+    say(&mut server, of, &on, false, now);
+    came.extend(taken(&mut robot, &sent(&mut server, now), 1, now));
+    for _ in 0..100 {
+        now = later(now, SECOND / 10);
+        came.extend(taken(&mut robot, &[], 1, now));
+    }
+    let came: Vec<_> = came
+        .iter()
+        .map(|one| (one.topic, &one.payload[..]))
+        .collect();
+    assert_eq!(came, [(of, &[1][..]), (of, &[0][..])]);
 }
 
 /// A bridge of ROS 2 that knows no type, which has heard an event of `size` characters of ROS 1, and that event.

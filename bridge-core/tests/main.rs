@@ -23,6 +23,7 @@ mod call_actions;
 mod call_freedom;
 mod call_safety;
 mod calls;
+mod confirm;
 mod events;
 mod fields;
 mod foreign;

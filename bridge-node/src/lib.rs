@@ -32,9 +32,10 @@ pub use actions::{ActionGraph, Actions};
 pub use arguments::{Arguments, Flags, WithoutMapping};
 pub use awaited::{AwaitedPeers, near};
 pub use bridge_core::{
-    ActionFamily, Answered, Application, AskError, AskErrorKind, AskId, CallDescription, CallField,
-    CallMap, CallRole, CallStructure, Counters, Described, Executed, ExecutionId, Kept, Offered,
-    OfferedType, Owned, PublisherKey, Reason, Refusal, Room, Router, ValueDescription, ValueNote,
+    ActionFamily, Answered, Application, Arrival, AskError, AskErrorKind, AskId, CallDescription,
+    CallField, CallMap, CallRole, CallStructure, Counters, Described, Executed, ExecutionId,
+    Handover, Kept, Offered, OfferedType, Owned, PublisherKey, Reason, Refusal, Room, Router,
+    ValueDescription, ValueNote,
 };
 pub use busy_poll::BusyPoll;
 pub use calls::{Asker, CallGraph, Calls};

@@ -18,6 +18,7 @@ use tokio::sync::watch;
 use tokio::time::{Instant as TokioInstant, MissedTickBehavior, Sleep, interval};
 use tracing::{debug, info, warn};
 use transport::{Change, Finding, Held, SendError, Udp};
+use uadp::Timestamp;
 
 use crate::awaited::PeerWatch;
 use crate::busy_poll::BusyPoll;
@@ -480,6 +481,10 @@ impl<P: Port> Shell<P> {
                     dropped,
                 } => self.silent(topic, silent, dropped),
                 Output::Retired { topic, instance } => self.port.retired(topic, instance),
+                Output::Settled { topic, arrival } => self.port.settled(topic, &arrival),
+                Output::HandoverWanted { topic, instance } => {
+                    self.handed(topic, Some(instance));
+                }
                 Output::CommanderLost { topic } => {
                     warn!(%topic, "commander lost, `on_loss` is published");
                 }
@@ -530,13 +535,25 @@ impl<P: Port> Shell<P> {
             lasting,
         };
         match self.port.publish(sample) {
-            Ok(()) => self.router.published(topic, arrived, now()),
+            Ok(()) => {
+                self.router.published(topic, arrived, now());
+                self.handed(topic, instance);
+            }
             Err(NO_SUBSCRIBER) => {
                 self.router.published(topic, arrived, now());
                 let cause = (Reason::NoSubscriber, NO_SUBSCRIBER);
                 self.router.lost(Some(topic), 1, cause);
+                self.handed(topic, instance);
             }
             Err(why) => self.router.not_published(topic, instance, why),
+        }
+    }
+
+    /// Reports the handover of a delivery, if it is to be confirmed.
+    fn handed(&mut self, topic: TopicId, instance: Option<Timestamp>) {
+        if self.router.is_to_confirm(topic, instance) {
+            let handover = self.port.handover(topic);
+            self.router.handed(topic, instance, handover);
         }
     }
 }

@@ -12,6 +12,7 @@ use std::sync::Arc;
 use std::task::{Context, Poll};
 use std::time::Duration;
 
+use bridge_core::Handover;
 use bytes::Bytes;
 use mappings::{Mapping, Overflow, ServiceRole, SpaceId, TopicId, Trigger, Variable};
 use messages::{Literal, MessageType, NoFields, Plan, Selection, ServiceType, TypeName, Wire};
@@ -418,6 +419,13 @@ impl Services {
     #[must_use]
     pub fn takes(&self, topic: TopicId) -> bool {
         self.callers.contains_key(&topic)
+    }
+
+    /// Returns the handover of the newest value of a topic that calls a service; `None` for other topics.
+    #[must_use]
+    pub fn handover(&self, topic: TopicId) -> Option<Handover> {
+        let callee = self.callers.get(&topic)?;
+        Some(callee.pending.handover())
     }
 
     /// Hands a value to the service of its topic; `None` when it has none. Else says how many older values gave way.

@@ -19,8 +19,8 @@ use std::time::SystemTime;
 use bridge_node::policy::{NO_SUBSCRIBER, Policy, Step, TYPE_CHANGES, Word, is_bad, type_changes};
 use bridge_node::{
     Actions, Answered, AskId, AwaitedPeers, CallDescription, Calls, Delivery, Described, Executed,
-    Executing, Execution, ExecutionId, Kept, Port, PortEvent, Reason, Services, TypePaths,
-    timestamp,
+    Executing, Execution, ExecutionId, Handover, Kept, Port, PortEvent, Reason, Services,
+    TypePaths, timestamp,
 };
 use bytes::Bytes;
 use mappings::{Mapping, SpaceId, TopicId, Variable};
@@ -505,6 +505,7 @@ impl Ros1Port {
                     message_type: Arc::clone(&message_type),
                     publisher,
                     reported: 0,
+                    reached: false,
                     stamps: sink.choice.stamps(&message_type),
                     opening: Opening::of(
                         self.graph.subscribers.get(&ros_topic),
@@ -633,6 +634,8 @@ impl Port for Ros1Port {
             }
             return Ok(());
         }
+        let variable = self.policy.mapping().variable(sample.topic);
+        let is_confirmed = variable.is_some_and(|variable| variable.confirmed_within.is_some());
         let Some(Sink {
             open: Some(open), ..
         }) = self.sinks.get_mut(&sample.topic)
@@ -656,10 +659,16 @@ impl Port for Ros1Port {
             }
         };
         // What slow subscribers lose by it is reported with the next look at the graph.
-        if sample.lasting {
-            let _published = open.publisher.publish_latched(payload, latched);
+        let event = (payload, latched);
+        if sample.lasting || is_confirmed {
+            // The router hands a command over again until a subscriber has it.
+            lost += open.end_opening();
+            let (payload, latched) = event;
+            let published = open.publisher.publish_latched(payload, latched);
+            open.reached = published.sent_to > 0;
         } else {
-            lost += open.publish_once((payload, latched), bridge_node::now().monotonic);
+            lost += open.publish_once(event, bridge_node::now().monotonic);
+            open.reached = lost == 0 && open.opening.is_none();
         }
         let is_waiting = open.opening.as_ref().is_some_and(|of| !of.is_empty());
         if is_waiting && self.flush_at.is_none() {
@@ -672,6 +681,15 @@ impl Port for Ros1Port {
             0 => Ok(()),
             _ => Err(NO_SUBSCRIBER),
         }
+    }
+
+    fn handover(&self, topic: TopicId) -> Handover {
+        let sink = self.sinks.get(&topic).and_then(|sink| sink.open.as_ref());
+        let reached = || match sink {
+            Some(open) if open.reached => Handover::Done,
+            Some(_) | None => Handover::Nobody,
+        };
+        self.services.handover(topic).unwrap_or_else(reached)
     }
 
     fn wanted(

@@ -1,6 +1,7 @@
 //! Services of the ROS 1 graph, as values of the space call them, and calls of the space as services.
 
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use bridge_node::{Asker, CallFault, CallGraph, ExecutorGraph, Ran, ServiceCall, ServiceGraph};
@@ -65,7 +66,7 @@ impl ServiceGraph for Ros1Graph<'_> {
             ..ServiceClientOptions::default()
         };
         let client = self.node.service_client(service, options);
-        client.map(Client).map_err(|error| error.to_string())
+        client.map(Client::from).map_err(|error| error.to_string())
     }
 }
 
@@ -116,7 +117,7 @@ impl ExecutorGraph for Ros1Graph<'_> {
                 ..ServiceClientOptions::default()
             };
             let client = self.node.service_client(service, options);
-            client.map(Client).map_err(|error| error.to_string())
+            client.map(Client::from).map_err(|error| error.to_string())
         };
         Ok(Executor {
             kept: client(true)?,
@@ -150,15 +151,34 @@ impl ServiceCall for Executor {
 
 /// Calls one service.
 #[derive(Debug)]
-pub(crate) struct Client(ServiceClient);
+pub(crate) struct Client {
+    client: ServiceClient,
+    /// The requests that had been sent when the last call began.
+    sent_before: AtomicU64,
+}
+
+impl From<ServiceClient> for Client {
+    fn from(client: ServiceClient) -> Self {
+        Self {
+            client,
+            sent_before: AtomicU64::new(0),
+        }
+    }
+}
 
 impl ServiceCall for Client {
     fn service(&self) -> &str {
-        self.0.service()
+        self.client.service()
+    }
+
+    fn has_request(&self) -> bool {
+        self.client.requests_sent() > self.sent_before.load(Ordering::Relaxed)
     }
 
     async fn call(&self, request: Bytes) -> Result<Bytes, CallFault> {
-        self.0.call(request).await.map_err(|error| CallFault {
+        let before = self.client.requests_sent();
+        self.sent_before.store(before, Ordering::Relaxed);
+        self.client.call(request).await.map_err(|error| CallFault {
             text: error.to_string(),
             may_pass: may_pass(&error),
             ran: if matches!(error, ServiceError::Failed { .. }) {

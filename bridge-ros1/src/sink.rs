@@ -30,6 +30,8 @@ pub(crate) struct Open {
     pub(crate) publisher: Publisher,
     /// Losses of slow subscribers that were reported.
     pub(crate) reported: u64,
+    /// Whether any subscriber was there for the last value.
+    pub(crate) reached: bool,
     /// Whether its header's stamp is ours to set: only one field of the message is the value, and not the stamp.
     pub(crate) stamps: bool,
     /// Events that wait for subscribers to connect.

@@ -9,8 +9,8 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use bridge_node::Reason;
 use bridge_node::policy::NO_SUBSCRIBER;
+use bridge_node::{Handover, Reason};
 use rustdds::dds::WriteError;
 use rustdds::{DataWriterStatus, GUID, StatusEvented, Timestamp};
 use tokio::time::Instant;
@@ -28,6 +28,8 @@ pub struct Outlet {
     audience: Audience,
     /// Samples for which the send window had no room, oldest first.
     waiting: VecDeque<Sample>,
+    /// Whether a sample was dropped that would have come late, and that was not told.
+    has_late: bool,
     /// Since when the send window has no room.
     full_since: Option<Instant>,
     /// Bytes written since every reader had acknowledged everything.
@@ -52,6 +54,8 @@ struct Sample {
     source: Option<Timestamp>,
     /// Whether readers that come late get it.
     lasting: bool,
+    /// When it would come late.
+    until: Option<Instant>,
 }
 
 /// Who listens.
@@ -89,6 +93,8 @@ pub enum Refusal {
     TooLarge(usize),
     /// An event, and no reader is present.
     NoReader,
+    /// It waited for its readers until it would have come late.
+    Late,
     /// RustDDS failed; it does so only when one of its threads has died.
     Failed,
 }
@@ -100,7 +106,7 @@ impl Refusal {
         let reason = match self {
             Self::Overflow => Reason::Overflow,
             Self::NoReader => Reason::NoSubscriber,
-            Self::TooLarge(_) | Self::Failed => Reason::NotPublished,
+            Self::TooLarge(_) | Self::Late | Self::Failed => Reason::NotPublished,
         };
         (reason, self.label())
     }
@@ -112,6 +118,7 @@ impl Refusal {
             Self::Overflow => "subscriber too slow",
             Self::TooLarge(_) => "too large for DDS",
             Self::NoReader => NO_SUBSCRIBER,
+            Self::Late => "subscriber not ready in time",
             Self::Failed => "DDS writer failed",
         }
     }
@@ -128,6 +135,7 @@ impl Outlet {
             joined,
             audience: Audience::Nobody { held: None },
             waiting: VecDeque::new(),
+            has_late: false,
             full_since: None,
             in_flight: 0,
             last: None,
@@ -248,6 +256,7 @@ impl Outlet {
                 payload,
                 source,
                 lasting,
+                until: None,
             },
             now,
         )
@@ -269,12 +278,50 @@ impl Outlet {
                 payload,
                 source,
                 lasting: false,
+                until: None,
             },
             now,
         )?;
         match self.audience {
             Audience::Nobody { .. } => Err(Refusal::NoReader),
             Audience::Present { .. } => Ok(()),
+        }
+    }
+
+    /// As [`offer_once`](Self::offer_once), of a command: without readers it is not written, and after `within` it is dropped.
+    ///
+    /// # Errors
+    /// [`Refusal`]: one sample was lost, this or an older one.
+    pub fn offer_in_time(
+        &mut self,
+        payload: Payload,
+        source: Option<Timestamp>,
+        (now, within): (Instant, Duration),
+    ) -> Result<(), Refusal> {
+        if matches!(self.audience, Audience::Nobody { .. }) {
+            self.notice_matches(now);
+        }
+        if matches!(self.audience, Audience::Nobody { .. }) {
+            return Ok(());
+        }
+        self.offer_sample(
+            Sample {
+                payload,
+                source,
+                lasting: false,
+                until: Some(now + within),
+            },
+            now,
+        )
+    }
+
+    /// Returns the handover of the sample that was offered last.
+    #[must_use]
+    pub fn handover(&self) -> Handover {
+        match self.audience {
+            Audience::Nobody { .. } => Handover::Nobody,
+            Audience::Present { .. } if self.waiting.is_empty() => Handover::Done,
+            Audience::Present { .. } => Handover::Waiting,
         }
     }
 
@@ -301,7 +348,7 @@ impl Outlet {
             // Readers that have answered must not lose samples for one that says nothing.
             self.settle();
         }
-        self.flush(now)?;
+        self.flush_waiting(now)?;
         if !self.waiting.is_empty() {
             return self.queue(sample, self.offered.waiting_room());
         }
@@ -316,7 +363,19 @@ impl Outlet {
     /// # Errors
     /// [`Refusal::Failed`], with the sample lost.
     pub fn flush(&mut self, now: Instant) -> Result<(), Refusal> {
+        self.flush_waiting(now)?;
+        match std::mem::take(&mut self.has_late) {
+            true => Err(Refusal::Late),
+            false => Ok(()),
+        }
+    }
+
+    fn flush_waiting(&mut self, now: Instant) -> Result<(), Refusal> {
         self.look_back(now);
+        let before = self.waiting.len();
+        let is_late = |sample: &Sample| sample.until.is_some_and(|until| until <= now);
+        self.waiting.retain(|sample| !is_late(sample));
+        self.has_late |= self.waiting.len() < before;
         if self.waiting.is_empty() || !self.is_settled(now) {
             return Ok(());
         }
@@ -491,6 +550,7 @@ impl Outlet {
             payload,
             source,
             lasting,
+            until,
         } = sample;
         let size = payload.len();
         if !self.has_room(size) {
@@ -499,6 +559,7 @@ impl Outlet {
                 payload,
                 source,
                 lasting,
+                until,
             }));
         }
         let is_state = self.offered == Offered::KeepLatest;
@@ -506,6 +567,7 @@ impl Outlet {
             payload: payload.clone(),
             source,
             lasting,
+            until,
         });
         let mut written = self.writer.write(payload, source);
         if let Err(WriteError::WouldBlock { data }) = written {
@@ -530,6 +592,7 @@ impl Outlet {
                     payload: data,
                     source,
                     lasting,
+                    until,
                 }))
             }
             Err(

@@ -31,7 +31,8 @@ use std::task::{Context, Poll};
 use bridge_node::policy::{Policy, Read, Step, TYPE_CHANGES, Word, is_bad, type_changes};
 use bridge_node::{
     Actions, Answered, AskId, AwaitedPeers, CallDescription, Calls, Delivery, Described, Executed,
-    Executing, Execution, ExecutionId, Kept, Port, PortEvent, Reason, Services, TypePaths, now,
+    Executing, Execution, ExecutionId, Handover, Kept, Port, PortEvent, Reason, Services,
+    TypePaths, now,
 };
 use bytes::Bytes;
 use futures_util::StreamExt;
@@ -514,11 +515,23 @@ impl Port for Ros2Port {
         let payload = Payload::to_write(payload).map_err(|error| error.label())?;
         let size = payload.len();
         let (source, now) = (source.map(dds_time), Instant::now());
-        let offered = match lasting {
-            true => open.outlet.offer(payload, source, now),
-            false => open.outlet.offer_once(payload, source, now),
+        let variable = self.policy.mapping().variable(topic);
+        let confirmed = variable.and_then(|variable| variable.confirmed_within);
+        let offered = match (lasting, confirmed) {
+            (true, _) => open.outlet.offer(payload, source, now),
+            (false, None) => open.outlet.offer_once(payload, source, now),
+            (false, Some(within)) => open.outlet.offer_in_time(payload, source, (now, within)),
         };
         self.schedule.waiting |= open.outlet.is_waiting();
+        let offered = match offered {
+            // An older sample was lost: the new one must not be handed over again.
+            Err(Refusal::Overflow) if confirmed.is_some() => {
+                let cause = Refusal::Overflow.cause();
+                self.events.push_back(lost(topic, cause, 1));
+                Ok(())
+            }
+            offered => offered,
+        };
         if let Err(Refusal::TooLarge(limit)) = offered {
             let dds_topic = dds_topic.clone();
             self.policy.told.once(&dds_topic, "too large", || {
@@ -530,6 +543,12 @@ impl Port for Ros2Port {
             });
         }
         offered.map_err(Refusal::label)
+    }
+
+    fn handover(&self, topic: TopicId) -> Handover {
+        let sink = self.sinks.get(&topic).and_then(|sink| sink.open.as_ref());
+        let outlet = || sink.map_or(Handover::Nobody, |open| open.outlet.handover());
+        self.services.handover(topic).unwrap_or_else(outlet)
     }
 
     fn wanted(

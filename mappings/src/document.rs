@@ -219,9 +219,9 @@ document! {
         /// origin 0 and values that call a service; others are what their ROS publisher is, a state where it is latched or
         /// transient-local and an event otherwise.
         queue: Queue,
-        /// What is published once into ROS when the commander of the value has ended or timed out, if a value of it was published
-        /// since: `zero`, the value of the bound `field`, fields of the message as {linear.x: 0.1}, or {call: ns=2;i=48} for
-        /// the service that the values of that variable call.
+        /// What is published once into ROS, or requested of the service that the value calls, when the commander of the value has
+        /// ended or timed out, if a value of it was published since: `zero`, the value of the bound `field`, fields of the
+        /// message or request as {linear.x: 0.1}, or {call: ns=2;i=48} for the service that the values of that variable call.
         on_loss: OnLossEntry,
         /// With `on_loss`: a value that is not renewed for this long is lost, too, as 500ms.
         #[schemars(regex(pattern = DURATION))]
@@ -236,8 +236,12 @@ document! {
         at_most: String,
         /// When the server no longer shows the value as good, because no newer one comes.
         quality: QualityEntry,
-        /// With `origin: 0`: a client's write has succeeded when the robot answers, and not when the value has been sent.
-        confirm: ConfirmEntry,
+        /// What says that a value has arrived. `bridge`, the default for events of origin 0 and for values that call a service:
+        /// each bridge that the mapping ties the value to, when a present subscriber or the service has it; the value is sent
+        /// again until then, 1 s at most, and a client's write is answered accordingly. `none`: a write is answered when the
+        /// value has been sent. {within: 2s} for another time; {by: ns=2;i=31} with `origin: 0` for a value that the robot
+        /// answers with.
+        confirm: ConfirmedEntry,
         /// How many past values the server keeps, 0 to 65535. Left out: as many as `server.history` says.
         history: u16,
         /// Which roles may do what with the node.
@@ -263,14 +267,14 @@ document! {
         call: String,
     }
 
-    /// What says that a value a client wrote has arrived. Without it in time the write is BadTimeout, the variable shows what it
-    /// showed before, and the value is not repeated to who comes later.
+    /// What says that a value has arrived. With `by`, a write without an answer in time is BadTimeout, the variable shows what
+    /// it showed before, and the value is not repeated to who comes later.
     struct ConfirmEntry {
         /// Node of the variable that answers, as ns=2;i=31: one of another space, or one that comes `from` a server. The
-        /// answer is sent anew for each write.
-        #[schemars(required, regex(pattern = r"^(ns=[0-9]+;)?[isgb]="))]
+        /// answer is sent anew for each write. Left out: the bridges confirm.
+        #[schemars(regex(pattern = r"^(ns=[0-9]+;)?[isgb]="))]
         by: String,
-        /// How long the answer may take; default 2s.
+        /// How long the answer may take; default 2s, and 1s for that of the bridges.
         #[schemars(regex(pattern = DURATION))]
         within: String,
         /// Which answer counts: `same` (the default) one that equals what was written, `any` each that comes after it.
@@ -731,6 +735,54 @@ impl JsonSchema for OnLossEntry {
         let call = generator.subschema_for::<StopCallEntry>();
         schemars::json_schema!({
             "anyOf": [{ "const": "zero" }, { "type": ["number", "boolean", "string"] }, call, { "type": "object" }]
+        })
+    }
+}
+
+/// What says that a value has arrived.
+#[derive(Clone, Debug)]
+pub(crate) enum ConfirmedEntry {
+    /// Nothing.
+    None,
+    /// The bridges that the value is for.
+    Bridge,
+    /// The bridges or a value, as the map says.
+    Map(Box<ConfirmEntry>),
+}
+
+impl Read for ConfirmedEntry {
+    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
+        match &node.kind {
+            Kind::Scalar(text) if text == "bridge" => Some(Self::Bridge),
+            Kind::Scalar(text) if text == "none" => Some(Self::None),
+            Kind::Map(_) => {
+                let read = ConfirmEntry::read(node, reader);
+                read.map(|read| Self::Map(Box::new(read)))
+            }
+            Kind::Scalar(_) | Kind::Null | Kind::List(_) => {
+                reader.wrong(
+                    node,
+                    "`bridge`, `none`, {within: 2s}, or {by: ns=2;i=31, within: 2s}",
+                );
+                None
+            }
+        }
+    }
+}
+
+impl JsonSchema for ConfirmedEntry {
+    fn inline_schema() -> bool {
+        true
+    }
+
+    fn schema_name() -> std::borrow::Cow<'static, str> {
+        "Confirmed".into()
+    }
+
+    fn json_schema(generator: &mut schemars::SchemaGenerator) -> schemars::Schema {
+        let map = generator.subschema_for::<ConfirmEntry>();
+        schemars::json_schema!({
+            "anyOf": [{ "const": "bridge" }, { "const": "none" }, map]
         })
     }
 }

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use messages::{Literal, Selection, TypeName};
+use messages::{Literal, Selected, Selection, TypeName};
 
 use crate::topic::TopicId;
 
@@ -28,10 +28,13 @@ pub enum LossAction {
 }
 
 impl LossAction {
-    /// The message for a topic of which the value is `selection`; `None` for a call, and for one value where the topic is bound
-    /// to several.
+    /// The message for a topic of which the value is `selection`, or the request of a service that is made of the value by it;
+    /// `None` for a call, for one value where several are bound, and for a request that has no value in it.
     #[must_use]
     pub fn template(&self, selection: &Selection) -> Option<Selection> {
+        if let Selection::Template { fields, rest } = selection {
+            return self.request(fields, rest);
+        }
         let rest = match self {
             Self::Message(rest) => rest.clone(),
             Self::Field(literal) => {
@@ -47,6 +50,20 @@ impl LossAction {
             }
             Self::Call(_) => return None,
         };
+        let fields = Vec::new();
+        Some(Selection::Template { fields, rest })
+    }
+
+    /// A request of which only `fields` are made of the value.
+    fn request(&self, fields: &[Selected], rest: &BTreeMap<String, Literal>) -> Option<Selection> {
+        let mut rest = rest.clone();
+        match (self, fields) {
+            (Self::Message(message), [_, ..]) => rest.extend(message.clone()),
+            (Self::Field(literal), [one]) => {
+                rest.insert(one.field.clone(), literal.clone());
+            }
+            (Self::Message(_), []) | (Self::Field(_) | Self::Call(_), _) => return None,
+        }
         let fields = Vec::new();
         Some(Selection::Template { fields, rest })
     }

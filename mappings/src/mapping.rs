@@ -575,8 +575,11 @@ pub struct Variable {
     pub history: Option<u16>,
     /// What is published when its commander is lost.
     pub loss: Option<Box<Loss>>,
-    /// What says that a written value has arrived.
+    /// The value that says that a written value has arrived.
     pub confirm: Option<Box<Confirm>>,
+    /// How long a value is sent again until each bridge that it is [for](Self::destinations) has confirmed it; `None` where none
+    /// does.
+    pub confirmed_within: Option<Duration>,
     /// The node of another OPC UA server it comes from; its origin is the OPC UA side then.
     pub from: Option<Box<NodeSource>>,
     /// The node of another OPC UA server it is written to.
@@ -663,6 +666,15 @@ impl Variable {
     #[must_use]
     pub fn binding(&self, space: SpaceId) -> Option<&Binding> {
         self.bindings.iter().find(|binding| binding.space == space)
+    }
+
+    /// The other spaces whose topics or services get its values.
+    pub fn destinations(&self) -> impl Iterator<Item = SpaceId> {
+        let called = self.service.as_ref();
+        let called = called.filter(|of| matches!(of.role, ServiceRole::Call { .. }));
+        let topics = self.bindings.iter().map(|binding| binding.space);
+        let all = topics.chain(called.map(|of| of.space));
+        all.filter(|space| *space != self.topic.space)
     }
 }
 

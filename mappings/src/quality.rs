@@ -24,7 +24,7 @@ impl Ages {
     }
 }
 
-/// What says that a value a client wrote has arrived.
+/// The value of the robot that says that a value which a client wrote has arrived.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Confirm {
     /// The value that answers.

@@ -254,7 +254,8 @@ fn a_cell_without_ros_1_crosses_between_ros_2_and_the_server() {
     let write = [SERVER_ENDPOINT, "ns=2;i=30", "Boolean", "true"];
     assert_eq!(
         cell.asyncua_once("opcua_write.py", &write)[0]["status"],
-        "Good"
+        "BadTimeout",
+        "the bridge of space 1 confirms it, and is not there"
     );
     assert_eq!(
         switch.wait_for_json("the switch in ROS 2", SOON, value),

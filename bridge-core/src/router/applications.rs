@@ -36,13 +36,8 @@ impl Router {
     /// Takes the description of this program: it is announced once, and to everyone who asks for applications or for its
     /// Endpoints, and the other applications are asked for once. A program without values is known to others by it.
     pub fn introduce(&mut self, own: Application, now: Now) {
-        let random = u32::try_from(now.utc.unix_nanos() & 0xFFFF_FFFF).unwrap_or_default();
         let discovery = self.discovery(now);
         let since = discovery.since_start(now);
-        let limits = ProbeLimits {
-            max_period: Duration::from_secs(1),
-            attempts: 1,
-        };
         discovery.applications.own = Some(own);
         let subject = Subject::ApplicationInformation;
         // An announcement that is planned already says it all.
@@ -50,6 +45,18 @@ impl Router {
             .announcer
             .announce(subject, Included::default(), since)
             .is_ok();
+        self.ask_applications(now);
+    }
+
+    /// Asks once which applications there are, unless they are just being asked.
+    pub(super) fn ask_applications(&mut self, now: Now) {
+        let random = u32::try_from(now.utc.unix_nanos() & 0xFFFF_FFFF).unwrap_or_default();
+        let discovery = self.discovery(now);
+        let since = discovery.since_start(now);
+        let limits = ProbeLimits {
+            max_period: Duration::from_secs(1),
+            attempts: 1,
+        };
         discovery
             .applications
             .asking

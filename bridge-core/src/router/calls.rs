@@ -431,6 +431,8 @@ impl Router {
                 (Some(topic), ActionKind::Request) => {
                     self.handle_request(topic, &action, from, now);
                 }
+                (Some(_), ActionKind::Response)
+                    if self.is_confirmation(&action, (space, from), now) => {}
                 (Some(topic), ActionKind::Response) => {
                     self.handle_response(topic, &action, from, now);
                 }

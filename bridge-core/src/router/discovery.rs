@@ -292,7 +292,10 @@ impl Router {
             self.handle_chunk(message, (space, 0), from, now);
         } else {
             match Announcement::decode(message) {
-                Ok(announcement) => self.learn(&announcement, (space, from), now),
+                Ok(announcement) => {
+                    self.meet_confirmer(space, from);
+                    self.learn(&announcement, (space, from), now);
+                }
                 Err(error) => self.drop_undecoded(None, from, &error),
             }
         }

@@ -7,6 +7,7 @@ use std::time::Instant;
 use mappings::{Lasting, Overflow, SpaceId, TopicId};
 
 use super::{About, Router};
+use crate::confirm::Confirming;
 use crate::counters::Reason;
 use crate::gate::Gate;
 use crate::reader::Reader;
@@ -60,6 +61,7 @@ impl Router {
             };
             let mut entry = Topic::new(role, rules);
             entry.takes = Takes::of(variable);
+            entry.confirming = Confirming::of(variable);
             entry.held_back = variable
                 .map(|found| found.publish.period)
                 .unwrap_or_default();

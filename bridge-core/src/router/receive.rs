@@ -199,6 +199,7 @@ impl Router {
             counters,
             lasting,
             held_back,
+            confirming,
             ..
         }) = self.entry(topic, from, now)
         else {
@@ -209,7 +210,7 @@ impl Router {
         // A keep-alive says nothing of the content.
         let changed = message.kind != MessageKind::KeepAlive
             && reader.is_changed(message.header().major_version);
-        let admitted = match message.kind {
+        let mut admitted = match message.kind {
             // It says that the writer lives, and that is all.
             MessageKind::KeepAlive => None,
             MessageKind::KeyFrame | MessageKind::DeltaFrame | MessageKind::Event => {
@@ -217,6 +218,7 @@ impl Router {
                 Some(reader.admit(place, Some(message), handling, now.monotonic))
             }
         };
+        let is_confirmed = confirming.is_some();
         if let Some(Ok(admitted)) = &admitted {
             counters.missing += u64::from(admitted.missing);
         }
@@ -241,6 +243,9 @@ impl Router {
         }
         if let Some(instance) = withdrawn {
             self.tell(Output::Retired { topic, instance });
+        }
+        if is_confirmed {
+            admitted = admitted.map(|admitted| self.receive(topic, &place, admitted, now));
         }
         match admitted {
             None => {}

@@ -6,6 +6,7 @@ use mappings::{Lasting, Mapping, Overflow, PubSub, TopicId};
 use messages::Wire;
 
 use super::{About, Router};
+use crate::confirm::Confirming;
 use crate::counters::Reason;
 use crate::gate::Gate;
 use crate::queue::Queue;
@@ -58,6 +59,7 @@ impl Router {
                 && was != is
             {
                 entry.takes = Takes::of(is);
+                entry.confirming = Confirming::of(is);
                 entry.held_back = is.map(|is| is.publish.period).unwrap_or_default();
                 if let Role::Theirs(reader) = &mut entry.role {
                     // Another field may be the value now.
@@ -99,6 +101,7 @@ impl Router {
             Role::Ours(writer) => {
                 writer.keep_nothing();
                 writer.set_live(false);
+                self.settle_arrival(topic);
             }
             Role::Theirs(reader) => {
                 reader.held = None;
@@ -170,6 +173,7 @@ impl Router {
         {
             writer.keep_nothing();
         }
+        self.settle_arrival(topic);
         let waiting: Vec<Item> = std::iter::from_fn(|| before.pop()).collect();
         for item in waiting {
             // Whether another gave way for it is counted there.

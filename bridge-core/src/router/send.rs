@@ -29,6 +29,9 @@ impl Router {
         if let Some(told) = self.told.pop_front() {
             return Some(told);
         }
+        if let Some(settled) = self.next_arrival() {
+            return Some(settled);
+        }
         if self.calls.is_none() {
             return self.next_value(now);
         }

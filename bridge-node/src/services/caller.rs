@@ -1,5 +1,6 @@
 //! The task that calls one service.
 
+use std::pin::pin;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -21,6 +22,11 @@ pub trait ServiceCall: Send + 'static {
     /// # Errors
     /// [`CallFault`]; a call ends in bounded time.
     fn call(&self, request: Bytes) -> impl Future<Output = Result<Bytes, CallFault>> + Send;
+
+    /// Whether the service has the request of the call that is under way, as far as that is known before its answer.
+    fn has_request(&self) -> bool {
+        false
+    }
 }
 
 /// Why a call brought no answer.
@@ -89,8 +95,8 @@ impl<C: ServiceCall> Caller<C> {
         loop {
             let mut request = pending.take().await;
             let mut wait = FIRST_WAIT;
-            while let Some(asked) = request.clone()
-                && self.call(asked, insist).await == Next::Again
+            while let (number, Some(asked)) = request.clone()
+                && self.call_for((&pending, number), asked, insist).await == Next::Again
             {
                 tokio::select! {
                     newer = pending.take() => (request, wait) = (newer, FIRST_WAIT),
@@ -107,12 +113,40 @@ impl<C: ServiceCall> Caller<C> {
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
             ticks.tick().await;
-            self.call(request.clone(), false).await;
+            let answer = self.client.call(request.clone()).await;
+            self.report(answer, false).await;
         }
     }
 
-    async fn call(&mut self, request: Bytes, insist: bool) -> Next {
-        let answer = self.client.call(request).await;
+    /// Calls with a request, and notes whether the service has it.
+    async fn call_for(
+        &mut self,
+        (pending, number): (&Pending, u64),
+        request: Bytes,
+        insist: bool,
+    ) -> Next {
+        let answer = {
+            let mut call = pin!(self.client.call(request));
+            let mut looks = interval(LOOK);
+            loop {
+                tokio::select! {
+                    answer = &mut call => break answer,
+                    _ = looks.tick() => {
+                        if self.client.has_request() {
+                            pending.took(number);
+                        }
+                    }
+                }
+            }
+        };
+        match &answer {
+            Err(CallFault { ran: Ran::No, .. }) => pending.refused(number),
+            Ok(_) | Err(_) => pending.took(number),
+        }
+        self.report(answer, insist).await
+    }
+
+    async fn report(&mut self, answer: Result<Bytes, CallFault>, insist: bool) -> Next {
         let mut next = Next::Done;
         let result = answer.map_err(|CallFault { text, may_pass, .. }| {
             self.failing = true;
@@ -141,6 +175,8 @@ enum Next {
     Again,
 }
 
+/// How often it is looked whether a service has the request.
+const LOOK: Duration = Duration::from_millis(20);
 /// The first wait before a state is handed to its service again, doubling to the last.
 const FIRST_WAIT: Duration = Duration::from_millis(250);
 const LAST_WAIT: Duration = Duration::from_secs(5);

@@ -1,8 +1,10 @@
 //! Requests that wait for a service.
 
 use std::collections::VecDeque;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
+use bridge_core::Handover;
 use bytes::Bytes;
 use mappings::Overflow;
 use tokio::sync::Notify;
@@ -15,8 +17,20 @@ use tokio::sync::Notify;
 pub(super) struct Pending {
     depth: usize,
     is_state: bool,
-    waiting: Mutex<VecDeque<Option<Bytes>>>,
+    waiting: Mutex<Waiting>,
     changed: Notify,
+    /// The number of the newest request that the service has.
+    taken: AtomicU64,
+    /// The number of the newest request that no service has taken.
+    refused: AtomicU64,
+}
+
+/// Requests with their numbers, which count from 1.
+#[derive(Debug, Default)]
+struct Waiting {
+    requests: VecDeque<(u64, Option<Bytes>)>,
+    /// The number of the newest one.
+    last: u64,
 }
 
 impl Pending {
@@ -30,30 +44,57 @@ impl Pending {
             is_state: overflow == Overflow::KeepLatest,
             waiting: Mutex::default(),
             changed: Notify::new(),
+            taken: AtomicU64::new(0),
+            refused: AtomicU64::new(0),
         }
     }
 
     /// Queues a request and says how many requests had to go for it.
     pub(super) fn push(&self, request: Option<Bytes>) -> u64 {
+        let mut waiting = self.lock();
+        waiting.last += 1;
+        let number = waiting.last;
         if request.is_none() && !self.is_state {
+            self.took(number);
             return 0;
         }
-        let mut waiting = self.lock();
-        let oldest = if waiting.len() >= self.depth {
-            waiting.pop_front().flatten()
+        let oldest = if waiting.requests.len() >= self.depth {
+            waiting.requests.pop_front().and_then(|(_, oldest)| oldest)
         } else {
             None
         };
-        waiting.push_back(request);
+        waiting.requests.push_back((number, request));
         drop(waiting);
         self.changed.notify_one();
         u64::from(oldest.is_some())
     }
 
-    /// The oldest, when there is one. Cancel-safe: it is taken only when it is returned.
-    pub(super) async fn take(&self) -> Option<Bytes> {
+    /// The service has the request of that number.
+    pub(super) fn took(&self, number: u64) {
+        self.taken.fetch_max(number, Ordering::AcqRel);
+    }
+
+    /// No service has taken the request of that number.
+    pub(super) fn refused(&self, number: u64) {
+        self.refused.fetch_max(number, Ordering::AcqRel);
+    }
+
+    /// Returns the handover of the newest request.
+    pub(super) fn handover(&self) -> Handover {
+        let last = self.lock().last;
+        if self.taken.load(Ordering::Acquire) >= last {
+            Handover::Done
+        } else if self.refused.load(Ordering::Acquire) >= last {
+            Handover::Nobody
+        } else {
+            Handover::Waiting
+        }
+    }
+
+    /// The oldest with its number, when there is one. Cancel-safe: it is taken only when it is returned.
+    pub(super) async fn take(&self) -> (u64, Option<Bytes>) {
         loop {
-            let next = self.lock().pop_front();
+            let next = self.lock().requests.pop_front();
             if let Some(request) = next {
                 return request;
             }
@@ -61,7 +102,7 @@ impl Pending {
         }
     }
 
-    fn lock(&self) -> MutexGuard<'_, VecDeque<Option<Bytes>>> {
+    fn lock(&self) -> MutexGuard<'_, Waiting> {
         // The queue is whole between statements.
         self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -87,7 +128,28 @@ mod tests {
             if overflow != Overflow::KeepLatest {
                 assert_eq!(pending.push(None), 0, "what calls nothing takes no place");
             }
-            assert_eq!(pending.take().await.as_ref(), Some(&requests[first]));
+            let (_, oldest) = pending.take().await;
+            assert_eq!(oldest.as_ref(), Some(&requests[first]));
         }
+    }
+    #[tokio::test]
+    async fn the_newest_request_has_arrived_when_its_service_has_it() {
+        let pending = Pending::new(Overflow::DropOldest(2.try_into().unwrap()));
+        let request = || Some(Bytes::from_static(b"x"));
+        pending.push(request());
+        assert_eq!(pending.handover(), Handover::Waiting);
+        let (first, _) = pending.take().await;
+        pending.push(request());
+        pending.took(first);
+        assert_eq!(pending.handover(), Handover::Waiting, "a newer one waits");
+        let (second, _) = pending.take().await;
+        pending.refused(second);
+        assert_eq!(pending.handover(), Handover::Nobody);
+        pending.push(request());
+        let (third, _) = pending.take().await;
+        pending.took(third);
+        assert_eq!(pending.handover(), Handover::Done);
+        pending.push(None);
+        assert_eq!(pending.handover(), Handover::Done, "it calls nothing");
     }
 }

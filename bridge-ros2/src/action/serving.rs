@@ -447,7 +447,7 @@ impl Shared {
         match sent {
             // One status waits, which is the newest.
             Ok(()) | Err(Refusal::Overflow | Refusal::NoReader) => {}
-            Err(refusal @ (Refusal::TooLarge(_) | Refusal::Failed)) => {
+            Err(refusal @ (Refusal::TooLarge(_) | Refusal::Late | Refusal::Failed)) => {
                 let (action, why) = (self.action.name(), refusal.label());
                 debug!(action, why, "the status of its goals is not published");
             }

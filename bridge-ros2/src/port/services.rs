@@ -1,6 +1,6 @@
 //! Services of the domain, as values of the space call them, and calls of the space as services.
 
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use bridge_node::{Asker, CallFault, CallGraph, ExecutorGraph, Ran, ServiceCall, ServiceGraph};
@@ -13,8 +13,8 @@ use crate::definitions::Definitions;
 use crate::domain::Domain;
 use crate::parameters::{Parameter, ParameterValue};
 use crate::service::{
-    Service, ServiceClient, ServiceClientOptions, ServiceError, ServiceOptions, ServicePeers,
-    ServiceRequest, ServiceServer,
+    Recall, Service, ServiceClient, ServiceClientOptions, ServiceError, ServiceOptions,
+    ServicePeers, ServiceRequest, ServiceServer,
 };
 
 /// A domain and what is known of types.
@@ -69,7 +69,7 @@ impl ServiceGraph for Ros2Graph<'_> {
             ..ServiceClientOptions::default()
         };
         ServiceClient::open(self.domain, self.peers, &service, options)
-            .map(Client)
+            .map(Client::from)
             .map_err(|error| error.to_string())
     }
 }
@@ -148,15 +148,44 @@ pub(super) fn parameters(own: SpaceId, domain: u16, sim_time: bool) -> Vec<Param
 
 /// Calls one service.
 #[derive(Debug)]
-pub(super) struct Client(ServiceClient);
+pub(super) struct Client {
+    client: ServiceClient,
+    /// The call that began last.
+    under_way: Mutex<Recall>,
+}
+
+impl From<ServiceClient> for Client {
+    fn from(client: ServiceClient) -> Self {
+        Self {
+            client,
+            under_way: Mutex::default(),
+        }
+    }
+}
+
+impl Client {
+    fn under_way(&self) -> MutexGuard<'_, Recall> {
+        // The handle is whole between statements.
+        let lock = self.under_way.lock();
+        lock.unwrap_or_else(PoisonError::into_inner)
+    }
+}
 
 impl ServiceCall for Client {
     fn service(&self) -> &str {
-        self.0.service()
+        self.client.service()
+    }
+
+    fn has_request(&self) -> bool {
+        self.under_way().is_sent()
     }
 
     async fn call(&self, request: Bytes) -> Result<Bytes, CallFault> {
-        self.0.call(request).await.map_err(|error| CallFault {
+        let under_way = Recall::default();
+        *self.under_way() = under_way.clone();
+        let call = self.client.call_recallable(request, None, &under_way);
+        let replied = call.await.map(|replied| replied.reply);
+        replied.map_err(|error| CallFault {
             text: error.to_string(),
             // A server of another type may give way to the right one as well as none.
             may_pass: matches!(

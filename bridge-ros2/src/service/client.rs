@@ -228,7 +228,7 @@ impl ServiceClient {
 }
 
 /// Takes a request back that is not sent yet.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub(crate) struct Recall(Arc<AtomicU8>);
 
 impl Default for Recall {
@@ -238,6 +238,11 @@ impl Default for Recall {
 }
 
 impl Recall {
+    /// Whether the request was sent.
+    pub(crate) fn is_sent(&self) -> bool {
+        self.0.load(Ordering::Acquire) == u8::from(CallPhase::Answer)
+    }
+
     /// Keeps the request from being sent. Returns false if it was sent, or is being sent.
     pub(crate) fn recall(&self) -> bool {
         let before = |phase: u8| (phase < CallPhase::Request.into()).then_some(RECALLED);

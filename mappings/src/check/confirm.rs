@@ -1,4 +1,4 @@
-//! What says that a written value has arrived.
+//! The confirmation that a value has arrived.
 
 use std::collections::HashMap;
 use std::time::Duration;
@@ -7,21 +7,24 @@ use uadp::BuiltinType;
 
 use super::{network, required, types};
 use crate::code::Code;
-use crate::document::{ConfirmEntry, ConfirmWhenEntry, VariableEntry};
+use crate::document::{ConfirmEntry, ConfirmWhenEntry, ConfirmedEntry, VariableEntry};
 use crate::findings::Findings;
-use crate::mapping::Variable;
+use crate::mapping::{Lasting, ServiceRole, Variable};
 use crate::node_id::NodeIdText;
 use crate::quality::{Answer, Confirm};
 use crate::read::{given, short};
 use crate::topic::{SpaceId, TopicId};
 use crate::tree::Place;
 
-/// Ties variables to those that answer for them. What is faulty is noted.
+/// Sets the confirmation of each variable. Faults are noted.
 pub(super) fn check<'d>(
     entries: impl Iterator<Item = (TopicId, &'d VariableEntry)>,
     variables: &mut [Variable],
     findings: &mut Findings,
 ) {
+    for variable in &mut *variables {
+        variable.confirmed_within = is_command(variable).then_some(CONFIRMED_WITHIN);
+    }
     let mut confirms = Vec::new();
     let entries = entries.filter_map(|(topic, entry)| Some((topic, entry.confirm.as_ref()?)));
     let mut entries = entries.peekable();
@@ -42,14 +45,95 @@ pub(super) fn check<'d>(
         let Some(written) = variables.get(*index) else {
             continue;
         };
-        let confirm = confirm((entry, at.place), written, &by_node, findings);
-        confirms.extend(confirm.map(|confirm| (*index, confirm)));
+        let confirmed = match entry {
+            ConfirmedEntry::None => Some((None, None)),
+            ConfirmedEntry::Bridge => {
+                let within = by_bridges(None, at.place, written, findings);
+                within.map(|within| (Some(within), None))
+            }
+            ConfirmedEntry::Map(entry) if entry.by.is_none() => {
+                let within = by_bridges(Some(entry.as_ref()), at.place, written, findings);
+                within.map(|within| (Some(within), None))
+            }
+            ConfirmedEntry::Map(entry) => {
+                let confirm = confirm((entry.as_ref(), at.place), written, &by_node, findings);
+                confirm.map(|confirm| {
+                    let repeated = is_command(written).then_some(confirm.within);
+                    (repeated, Some(confirm))
+                })
+            }
+        };
+        confirms.extend(confirmed.map(|confirmed| (*index, confirmed)));
     }
-    for (index, confirm) in confirms {
+    for (index, (within, confirm)) in confirms {
         if let Some(variable) = variables.get_mut(index) {
-            variable.confirm = Some(Box::new(confirm));
+            variable.confirmed_within = within;
+            variable.confirm = confirm.map(Box::new);
         }
     }
+}
+
+/// Whether the values are events of the OPC UA side, or call a service, in another space.
+fn is_command(variable: &Variable) -> bool {
+    let called = variable.service.as_ref();
+    let calls = called.is_some_and(|of| matches!(of.role, ServiceRole::Call { .. }));
+    let is_commanded = calls || variable.topic.space == SpaceId::UA;
+    is_commanded && variable.lasting == Lasting::Event && variable.destinations().next().is_some()
+}
+
+/// How long the bridges may take to confirm; `None` when something is faulty, which is noted.
+fn by_bridges(
+    entry: Option<&ConfirmEntry>,
+    place: Place,
+    written: &Variable,
+    findings: &mut Findings,
+) -> Option<Duration> {
+    let answers = entry.and_then(|entry| {
+        let when = entry.when.as_ref().map(|when| when.place);
+        when.or_else(|| entry.equals.as_ref().map(|equals| equals.place))
+    });
+    if let Some(place) = answers {
+        findings
+            .error(
+                Code::Confirm,
+                place,
+                "`when` and `equals` stand without the variable that answers",
+            )
+            .help("add `by` with its node, as {by: ns=2;i=31}");
+        return None;
+    }
+    if written.destinations().next().is_none() {
+        findings
+            .error(Code::Confirm, place, "the value goes to no other space")
+            .help("`confirm: bridge` goes with a topic or a service in another space than the `origin`");
+        return None;
+    }
+    if written.lasting == Lasting::State {
+        findings
+            .error(
+                Code::Confirm,
+                place,
+                "the value is a state, which is repeated for as long as its producer lives",
+            )
+            .help("leave `queue: keep_latest` out, so that it is an event");
+        return None;
+    }
+    let Some(entry) = entry.filter(|entry| entry.within.is_some()) else {
+        return Some(CONFIRMED_WITHIN);
+    };
+    let place = entry.within.as_ref().map_or(place, |within| within.place);
+    let within = network::duration(&entry.within, findings)?;
+    if within > LONGEST {
+        findings
+            .error(
+                Code::Confirm,
+                place,
+                "a value is sent again for a minute at most",
+            )
+            .help("a command that comes later than that does harm");
+        return None;
+    }
+    Some(within)
 }
 
 /// `None` when something is faulty, which is noted.
@@ -62,7 +146,7 @@ fn confirm(
     if !is_written(written) {
         findings
             .error(Code::Confirm, place, "no client writes this variable")
-            .help("`confirm` goes with `origin: 0`, and not with `from`");
+            .help("`confirm` with `by` goes with `origin: 0`, and not with `from`");
         return None;
     }
     let within = network::duration(&entry.within, findings);
@@ -190,3 +274,7 @@ fn is_value(text: &str, value_type: Option<types::ValueType>) -> bool {
 
 /// How long an answer may take where nothing is said.
 const WITHIN: Duration = Duration::from_secs(2);
+/// Likewise the confirmation of a bridge.
+const CONFIRMED_WITHIN: Duration = Duration::from_secs(1);
+/// How long a value is sent again at most.
+const LONGEST: Duration = Duration::from_secs(60);

@@ -1,8 +1,9 @@
 //! What is published when the commander of a value is lost.
 
 use std::collections::{BTreeMap, HashMap};
+use std::sync::Arc;
 
-use messages::{Plan, Selection, Wire};
+use messages::{MessageType, Plan, Selection, TypeName, Wire};
 
 use super::types::{Types, dialect};
 use super::{network, required};
@@ -62,14 +63,15 @@ fn loss(
         return None;
     }
     let written: Vec<&Binding> = commanded(variable).collect();
-    if written.is_empty() {
+    let called = called(variable);
+    if written.is_empty() && called.is_none() {
         findings
             .error(
                 Code::OnLoss,
                 at.place,
-                "the value is published to no ROS topic",
+                "the value is published to no ROS topic and calls no service",
             )
-            .help("`on_loss` goes with a topic in another space than the `origin`");
+            .help("`on_loss` goes with a topic or a `call` in another space than the `origin`");
         return None;
     }
     let action = match said {
@@ -85,6 +87,9 @@ fn loss(
     if !matches!(action, LossAction::Call(_)) {
         for binding in written {
             fits(binding, &action, (at.place, types), findings)?;
+        }
+        if let Some(called) = called {
+            fits_request(called, &action, (at.place, types), findings)?;
         }
     }
     Some(Loss { action, hold })
@@ -140,19 +145,67 @@ fn fits(
     let Ok(message) = types.get((dialect, place), &binding.message_type, findings) else {
         return Some(());
     };
-    let wire = match binding.space {
+    can_be_made(&message, &template, (binding.space, place), findings)
+}
+
+/// As [`fits`], for the request of a service.
+fn fits_request(
+    (space, service_type, request): (SpaceId, &TypeName, &Selection),
+    action: &LossAction,
+    (place, types): (Place, &mut Types),
+    findings: &mut Findings,
+) -> Option<()> {
+    let Some(template) = action.template(request) else {
+        findings
+            .error(
+                Code::OnLoss,
+                place,
+                "the request of the service has not one field that is the value",
+            )
+            .help(
+                "fields of the request, as {data: false}, or {call: ns=2;i=48} for another service",
+            );
+        return None;
+    };
+    let Some(service) = types.service((dialect(space), place), service_type, findings) else {
+        return Some(());
+    };
+    can_be_made(service.request(), &template, (space, place), findings)
+}
+
+fn can_be_made(
+    message: &Arc<MessageType>,
+    template: &Selection,
+    (space, place): (SpaceId, Place),
+    findings: &mut Findings,
+) -> Option<()> {
+    let wire = match space {
         SpaceId::ROS1 => Wire::Ros1,
         _ => Wire::Cdr,
     };
-    match Plan::compile(&message, &template, wire) {
+    match Plan::compile(message, template, wire) {
         Ok(_) => Some(()),
         Err(error) => {
-            findings.of_part([binding.space]);
+            findings.of_part([space]);
             findings.error(Code::OnLoss, place, error.to_string());
             findings.of_part(None);
             None
         }
     }
+}
+
+/// The service in another space that the values of a variable call: its space and type, and the request.
+fn called(variable: &Variable) -> Option<(SpaceId, &TypeName, &Selection)> {
+    let service = variable.service.as_ref()?;
+    let ServiceRole::Call {
+        service_type,
+        request,
+        ..
+    } = &service.role
+    else {
+        return None;
+    };
+    (service.space != variable.topic.space).then_some((service.space, service_type, request))
 }
 
 /// The topics that the values of a variable command.

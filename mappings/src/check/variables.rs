@@ -407,6 +407,7 @@ fn variable(
         history: given(&entry.history).map(|(count, _)| *count),
         loss: None,
         confirm: None,
+        confirmed_within: None,
         from,
         to,
     })

@@ -12,6 +12,7 @@ use opcua::sync::{Mutex, RwLock};
 use opcua::types::{StatusCode, Variant};
 use tokio::sync::{Notify, oneshot};
 
+use crate::arrivals::Arrivals;
 use crate::value;
 use crate::values::Shown;
 
@@ -23,6 +24,8 @@ pub(crate) struct Confirms {
     /// Topics whose last value was not confirmed, until the run loop has seen to it.
     taken_back: Mutex<BTreeSet<TopicId>>,
     called: Notify,
+    /// The writes that bridges confirm.
+    pub(crate) arrivals: Arrivals,
 }
 
 /// What confirms the writes of one topic.
@@ -60,6 +63,7 @@ struct Pending<'c> {
 impl Confirms {
     /// Takes over the rules of a mapping. Those that are the same keep their turns.
     pub(crate) fn follow(&self, mapping: &Mapping) {
+        self.arrivals.follow(mapping);
         let mut rules = self.rules.write();
         let variables = mapping.variables().iter();
         let wanted = variables.filter_map(|variable| {

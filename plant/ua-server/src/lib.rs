@@ -11,13 +11,14 @@
 //! clients ask for both), `nodesets` (nodes from files), `folders` (those of dotted names), `executing` (Methods of other servers as calls), `sources` (their nodes as values), `clients` (the
 //! sessions for both), `finding` (those with skills that discovery finds), `others` (all of these), `port` (the shell's side),
 //! `endpoint` (how clients get in), `changes` (what is told of a reload), `identity` (what the server says of itself), `confirm`
-//! (what says that a write has arrived), `access` (what each may do), `auditing` (what is told of it), `sks` (keys of secured
+//! and `arrivals` (what says that a write has arrived), `access` (what each may do), `auditing` (what is told of it), `sks` (keys of secured
 //! groups), `pubsub` (the PubSub configuration as nodes), `value` (between the two codecs), `verbs` (certificates and users by
 //! hand), `restart` (in its own place, for another certificate).
 
 mod access;
 mod address;
 mod argument_types;
+mod arrivals;
 mod asking;
 mod auditing;
 mod browse;

@@ -34,6 +34,7 @@ use uadp::Timestamp;
 
 use crate::access::{self, Genuine};
 use crate::address;
+use crate::arrivals::Awaited;
 use crate::asking::{Drive, Drives, Questions, Refused, Table};
 use crate::budget::{Answers, LARGEST, SMALL, Watched};
 use crate::commanders::Commander;
@@ -93,7 +94,7 @@ pub(crate) struct Exits {
     pub(crate) access: Arc<Access>,
     /// The PubSub configuration, which clients can disable parts of.
     pub(crate) pubsub: Arc<PubSub>,
-    /// What says that a write has arrived.
+    /// The confirmations of writes.
     pub(crate) confirms: Arc<Confirms>,
 }
 
@@ -112,6 +113,8 @@ pub(crate) struct ClientWrite {
     pub(crate) gone_out: oneshot::Sender<()>,
     /// Takes the result of the server that the value is written to. Dropped if there is no such server.
     pub(crate) answer: oneshot::Sender<StatusCode>,
+    /// Takes what the bridges confirm.
+    pub(crate) awaited: Option<Awaited>,
 }
 
 /// What becomes of a value that is on its way.
@@ -119,6 +122,9 @@ struct OnItsWay {
     gone_out: oneshot::Receiver<()>,
     answered: oneshot::Receiver<StatusCode>,
 }
+
+/// What is done with the fields of a write before it is sent, and the confirmation that it waits for.
+type Registration<'r> = (&'r dyn Fn(&[Variant]), Option<Awaited>);
 
 impl OnItsWay {
     /// Waits until the value has left.
@@ -532,10 +538,12 @@ impl SpaceNodes {
             let _shown = self.show(&context.subscriptions, &topic, arrived);
             return Ok(StatusCode::Good);
         }
+        let arrivals = &self.exits.confirms.arrivals;
+        let (awaited, awaiting) = arrivals.await_write(topic.topic, field).unzip();
         if topic.targeted {
             let (sent, on_its_way) = {
                 let _alone = self.writing.lock();
-                self.send_alone(context, place, write, &|_| {})?
+                self.send_alone(context, place, write, (&|_| {}, awaited))?
             };
             let answered = on_its_way.left().await?;
             let status = match tokio::time::timeout(LONGEST_WAY_OUT, answered).await {
@@ -548,10 +556,17 @@ impl SpaceNodes {
                 return Err(status);
             }
             let _shown = self.show(&context.subscriptions, &topic, sent);
+            if let Some(awaiting) = awaiting {
+                awaiting.arrived().await?;
+            }
             return Ok(status);
         }
-        let on_its_way = self.write_and_show(context, place, write)?;
-        on_its_way.left().await.map(|_| StatusCode::Good)
+        let on_its_way = self.write_and_show(context, place, (write, awaited))?;
+        on_its_way.left().await?;
+        if let Some(awaiting) = awaiting {
+            awaiting.arrived().await?;
+        }
+        Ok(StatusCode::Good)
     }
 
     /// Has a value sent and shows it.
@@ -559,11 +574,11 @@ impl SpaceNodes {
         &self,
         context: &RequestContext,
         place: (&TopicNode, Option<usize>),
-        write: &ParsedWriteValue,
+        (write, awaited): (&ParsedWriteValue, Option<Awaited>),
     ) -> Result<OnItsWay, StatusCode> {
         // Until it is shown nobody else may write: what is not written stays as it is.
         let _alone = self.writing.lock();
-        let (sent, on_its_way) = self.send_alone(context, place, write, &|_| {})?;
+        let (sent, on_its_way) = self.send_alone(context, place, write, (&|_| {}, awaited))?;
         let _shown = self.show(&context.subscriptions, place.0, sent);
         Ok(on_its_way)
     }
@@ -577,7 +592,7 @@ impl SpaceNodes {
         register: &dyn Fn(&[Variant]),
     ) -> Result<Shown, StatusCode> {
         let _alone = self.writing.lock();
-        let (sent, _on_its_way) = self.send_alone(context, place, write, register)?;
+        let (sent, _on_its_way) = self.send_alone(context, place, write, (register, None))?;
         Ok(sent)
     }
 
@@ -588,7 +603,7 @@ impl SpaceNodes {
         context: &RequestContext,
         (topic, field): (&TopicNode, Option<usize>),
         write: &ParsedWriteValue,
-        register: &dyn Fn(&[Variant]),
+        (register, awaited): Registration<'_>,
     ) -> Result<(Shown, OnItsWay), StatusCode> {
         if self.exits.pubsub.is_off(topic.topic) {
             // Its writer is disabled, so it would not go out.
@@ -616,7 +631,8 @@ impl SpaceNodes {
         register(&fields);
         drop(fields);
         let source = source_of(&write.value);
-        let on_its_way = self.send(topic, (block.clone(), source), Commander::of(context))?;
+        let value = (block.clone(), source);
+        let on_its_way = self.send(topic, value, (Commander::of(context), awaited))?;
         let stamp = Stamp {
             status: StatusCode::Good,
             source: Some(source),
@@ -631,7 +647,7 @@ impl SpaceNodes {
         &self,
         topic: &TopicNode,
         (block, source): (Bytes, Timestamp),
-        commander: Commander,
+        (commander, awaited): (Commander, Option<Awaited>),
     ) -> Result<OnItsWay, StatusCode> {
         if block.len() > self.largest_write.load(Ordering::Relaxed) {
             return Err(StatusCode::BadRequestTooLarge);
@@ -650,6 +666,7 @@ impl SpaceNodes {
             room,
             gone_out: left,
             answer,
+            awaited,
         };
         self.exits.writes.try_send(write).map_err(|_| full)?;
         Ok(OnItsWay { gone_out, answered })

@@ -6,8 +6,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use bridge_node::{
-    Answered, Application, AskId, CallDescription, Delivery, Described, Execution, ExecutionId,
-    Failure, FailureKind, Kept, LinkState, Port, PortEvent, Reason, Router, TypePaths,
+    Answered, Application, Arrival, AskId, CallDescription, Delivery, Described, Execution,
+    ExecutionId, Failure, FailureKind, Kept, LinkState, Port, PortEvent, Reason, Router, TypePaths,
 };
 use bytes::Bytes;
 use discovery::{AnnounceSettings, Announced, MdnsFault, WatchSettings, announce, watch};
@@ -245,11 +245,12 @@ impl Port for ServerPort {
             }
             tokio::select! {
                 Some(write) = self.writes.recv() => {
-                    let ClientWrite { topic, block, source, commander, room, gone_out, answer } = write;
+                    let ClientWrite { topic, block, source, commander, room, gone_out, answer, awaited } = write;
                     self.commanders.wrote(topic, commander);
                     drop(room);
                     self.leaving = Some(gone_out);
                     self.confirms.supersede(topic);
+                    self.confirms.arrivals.sent(topic, awaited);
                     self.others.sources.write(topic, &block, answer);
                     return PortEvent::Sample { topic, payload: block, received: source, latched_by: None };
                 }
@@ -321,6 +322,10 @@ impl Port for ServerPort {
         _described: Option<&Described>,
     ) {
         // Values of every type have a node.
+    }
+
+    fn settled(&mut self, topic: TopicId, arrival: &Arrival) {
+        self.confirms.arrivals.settled(topic, arrival);
     }
 
     fn silent(&mut self, topic: TopicId, silent: bool) {

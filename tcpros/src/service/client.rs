@@ -4,6 +4,7 @@ use std::fmt;
 use std::io;
 use std::mem::MaybeUninit;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use bytes::{Buf, Bytes};
@@ -67,6 +68,8 @@ struct Shared {
     kept: Mutex<Option<Connection>>,
     /// Permits to look the service up, connect and exchange headers, see [`MOST_OPENING`].
     opening: Semaphore,
+    /// How many requests were sent as a whole.
+    sent: AtomicU64,
 }
 
 impl ServiceClient {
@@ -84,6 +87,7 @@ impl ServiceClient {
                 master,
                 kept: Mutex::default(),
                 opening: Semaphore::new(MOST_OPENING),
+                sent: AtomicU64::new(0),
             }),
         }
     }
@@ -101,6 +105,11 @@ impl ServiceClient {
     ) -> Result<Self, MasterError> {
         let master = Master::at(uri, caller_id)?;
         Ok(Self::new(service.to_owned(), options, caller_id, master))
+    }
+
+    /// Returns how many requests were sent as a whole, answered or not.
+    pub fn requests_sent(&self) -> u64 {
+        self.shared.sent.load(Ordering::Relaxed)
     }
 
     /// The service's resolved name.
@@ -305,6 +314,7 @@ impl Shared {
         self.within(CallPhase::Request, deadline, writing)
             .await?
             .map_err(|source| self.lost(CallPhase::Request, source))?;
+        self.sent.fetch_add(1, Ordering::Relaxed);
         let reading = connection.answer(self.options.max_response);
         let phase = CallPhase::Answer;
         let read = self.within(phase, deadline, reading).await?;

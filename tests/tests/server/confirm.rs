@@ -1,4 +1,4 @@
-//! Writes that have succeeded when the robot answers, and not when they have been sent.
+//! Writes that have succeeded when a bridge confirms them or the robot answers, and not when they have been sent.
 
 use system_tests::Distribution;
 
@@ -104,6 +104,69 @@ fn a_write_has_succeeded_when_a_robot_of_rclpy_answers_and_has_not_happened_when
     let _bridge = cell.bridge_ros2(&[&mapping]);
     let robot = cell.rclpy(Distribution::Jazzy, "ros2_arm.py", &TOPICS);
     confirms(&cell, robot);
+}
+
+/// A bridge that confirms: without a robot, with one that is there, and one that is gone.
+fn is_confirmed_by_the_bridge(cell: &Cell, bridge: Child, start: impl FnOnce() -> Child) {
+    let set = |value: &str| write(cell, SETPOINT, "Double", value);
+    assert_eq!(set("1.0"), "BadTimeout", "there is no subscriber");
+    let mut robot = start();
+    // The bridge and the robot may still be about to find each other.
+    let mut value = 10.0;
+    eventually("a write is confirmed", SOON * 2, || {
+        value += 1.0;
+        (set(&format!("{value:.1}")) == "Good").then_some(())
+    });
+    got(&mut robot, value);
+    for value in ["50.0", "51.0", "52.0"] {
+        assert_eq!(set(value), "Good");
+        got(&mut robot, value.parse().unwrap());
+    }
+    let came = robot.json_lines();
+    let came = came
+        .iter()
+        .filter_map(|line| line.get("setpoint")?.as_f64());
+    let came: Vec<f64> = came.collect();
+    assert!(
+        came.is_sorted_by(|one, next| one < next),
+        "none comes twice or late: {came:?}"
+    );
+    bridge.signal(nix::sys::signal::Signal::SIGKILL);
+    drop(bridge);
+    assert_eq!(set("60.0"), "BadTimeout", "there is no bridge");
+}
+
+fn confirmed_by_the_bridge(space: &str) -> String {
+    let by_bridge = MAPPING.replace("    confirm: {by: ns=2;i=10, within: 3s}\n", "");
+    assert_ne!(by_bridge, MAPPING);
+    by_bridge.replace("SPACE", space)
+}
+
+#[test]
+fn a_write_is_good_when_a_subscriber_of_rospy_has_it_and_else_unknown() {
+    let Some(cell) = Cell::with(&[Peer::Python, Peer::Ros1]) else {
+        return;
+    };
+    let _master = cell.roscore();
+    let mapping = confirmed_by_the_bridge("1");
+    let _server = serving(&cell, &mapping);
+    let mapping = cell.file("bridge.yaml", &mapping);
+    let bridge = cell.bridge_ros1(&[mapping.to_str().unwrap()]);
+    is_confirmed_by_the_bridge(&cell, bridge, || cell.rospy("ros1_arm.py", &TOPICS));
+}
+
+#[test]
+fn a_write_is_good_when_a_subscriber_of_rclpy_has_it_and_else_unknown() {
+    let Some(cell) = Cell::with(&[Peer::Python, Peer::Ros2]) else {
+        return;
+    };
+    let mapping = confirmed_by_the_bridge("2");
+    let _server = serving(&cell, &mapping);
+    let mapping = cell.file("bridge.yaml", &mapping);
+    let bridge = cell.bridge_ros2(&[mapping.to_str().unwrap()]);
+    is_confirmed_by_the_bridge(&cell, bridge, || {
+        cell.rclpy(Distribution::Jazzy, "ros2_arm.py", &TOPICS)
+    });
 }
 
 #[test]

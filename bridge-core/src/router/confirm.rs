@@ -1,0 +1,246 @@
+//! Confirmations of events: sent for events of other spaces, and awaited for events of this program.
+
+use std::net::SocketAddr;
+
+use mappings::{SpaceId, TopicId};
+use uadp::Timestamp;
+use uadp::action::ActionMessage;
+
+use super::{About, Router};
+use crate::confirm::{self, Arrival, Confirmer, Handover, Mark, Receipt, Reply};
+use crate::counters::{Reason, Verdict};
+use crate::output::{Kept, Output};
+use crate::place::Place;
+use crate::reader::Admitted;
+use crate::settings::Now;
+use crate::topic::{Role, Topic};
+
+impl Router {
+    /// Returns whether a delivery is to be confirmed. The caller then reports its [`Handover`] with
+    /// [`handed`](Self::handed).
+    #[must_use]
+    pub fn is_to_confirm(&self, topic: TopicId, instance: Option<Timestamp>) -> bool {
+        self.receipt(topic)
+            .is_some_and(|receipt| Some(receipt.mark.stamp) == instance)
+    }
+
+    /// Takes the handover of a delivery that is [to be confirmed](Self::is_to_confirm). A delivery that has arrived is confirmed. A
+    /// delivery without a subscriber is handed over again when its writer repeats it in time.
+    pub fn handed(&mut self, topic: TopicId, instance: Option<Timestamp>, handover: Handover) {
+        let Some(Topic {
+            role: Role::Theirs(reader),
+            ..
+        }) = self.topics.get_mut(&topic)
+        else {
+            return;
+        };
+        let receipt = reader.receipt.as_mut();
+        let Some(receipt) = receipt.filter(|receipt| Some(receipt.mark.stamp) == instance) else {
+            return;
+        };
+        receipt.handed(handover);
+        let mark = receipt.mark;
+        match handover {
+            Handover::Done => self.send_confirmation(topic, mark),
+            Handover::Waiting => {}
+            Handover::Nobody => reader.forget(instance),
+        }
+    }
+
+    fn receipt(&self, topic: TopicId) -> Option<&Receipt> {
+        match &self.topics.get(&topic)?.role {
+            Role::Theirs(reader) => reader.receipt.as_ref(),
+            Role::Ours(_) => None,
+        }
+    }
+
+    /// Follows the newest event of a topic that is confirmed here, and answers its repetitions. The repetition of an event
+    /// without a subscriber is admitted.
+    pub(super) fn receive(
+        &mut self,
+        topic: TopicId,
+        place: &Place,
+        admitted: Result<Admitted, Reason>,
+        now: Now,
+    ) -> Result<Admitted, Reason> {
+        let own = self.settings.own;
+        let Some(Topic {
+            role: Role::Theirs(reader),
+            confirming: Some(confirming),
+            ..
+        }) = self.topics.get_mut(&topic)
+        else {
+            return admitted;
+        };
+        let (Some(sequence), Some(stamp)) = (place.sequence, place.instance()) else {
+            return admitted;
+        };
+        if !confirming.spaces.contains(&own) {
+            return admitted;
+        }
+        let mark = Mark { sequence, stamp };
+        let reason = match admitted {
+            Ok(admitted) => {
+                reader.receipt = Some(Receipt::new(mark, now.monotonic));
+                return Ok(admitted);
+            }
+            Err(reason) => reason,
+        };
+        let receipt = reader.receipt.as_mut();
+        let Some(receipt) = receipt.filter(|receipt| receipt.mark == mark) else {
+            return Err(reason);
+        };
+        match receipt.repeated(confirming.within, now.monotonic) {
+            Reply::Nothing => {}
+            Reply::Confirm => self.send_confirmation(topic, mark),
+            Reply::Ask => self.tell(Output::HandoverWanted {
+                topic,
+                instance: stamp,
+            }),
+            Reply::HandOver => {
+                return Ok(Admitted {
+                    missing: 0,
+                    kept: Kept::Alone,
+                    lasting: false,
+                });
+            }
+        }
+        Err(reason)
+    }
+
+    fn send_confirmation(&mut self, topic: TopicId, mark: Mark) {
+        let mut bytes = self.buffer();
+        match confirm::encode(self.settings.own, (topic, mark), &mut bytes) {
+            Ok(()) => self.tell(Output::Action { topic, bytes }),
+            Err(error) => {
+                self.recycle(bytes);
+                self.count(About::topic(topic), Reason::TooBig, 1, || error.to_string());
+            }
+        }
+    }
+
+    /// Notes a sender that announces a space.
+    pub(super) fn meet_confirmer(&mut self, space: SpaceId, from: SocketAddr) {
+        self.confirmers
+            .entry(space)
+            .or_insert_with(|| Confirmer::new(from))
+            .announced(from);
+    }
+
+    /// Handles a confirmation of the space. Returns false for a response to a request.
+    pub(super) fn is_confirmation(
+        &mut self,
+        response: &ActionMessage<'_>,
+        (space, from): (SpaceId, SocketAddr),
+        now: Now,
+    ) -> bool {
+        let Some((topic, mark)) = confirm::decode(response) else {
+            return false;
+        };
+        // Confirmations go to the whole group.
+        let is_own = self.settings.source.is_some() && self.is_source(from);
+        if !self.is_home(topic) || is_own {
+            return true;
+        }
+        let Some(Topic {
+            role: Role::Ours(writer),
+            ..
+        }) = self.topics.get_mut(&topic)
+        else {
+            return true;
+        };
+        let about = About {
+            topic: Some(topic),
+            from: Some(from),
+        };
+        if !writer.is_awaited(mark, space) {
+            let cause = (Reason::NotAsked, "confirmation");
+            self.count_only(about, cause, 1, String::new);
+            return true;
+        }
+        let confirmer = self.confirmers.get_mut(&space);
+        if !confirmer.is_some_and(|of| of.counts(from, now.monotonic)) {
+            // The announcement of the bridge may have been lost.
+            self.ask_applications(now);
+            let cause = (Reason::Forged, "confirmation");
+            self.count_only(about, cause, 1, || {
+                format!("{from} confirms for space {space}, which it did not announce or another sender did first")
+            });
+            return true;
+        }
+        if let Some(Topic {
+            role: Role::Ours(writer),
+            ..
+        }) = self.topics.get_mut(&topic)
+        {
+            writer.confirm(space);
+        }
+        self.settle_arrival(topic);
+        true
+    }
+
+    /// Probes for applications if a bridge that is to confirm the newest event is unknown.
+    pub(super) fn look_for_confirmers(&mut self, topic: TopicId, now: Now) {
+        let confirming = self.topics.get(&topic);
+        let confirming = confirming.and_then(|of| of.confirming.as_deref());
+        let is_known = |space: &SpaceId| self.confirmers.contains_key(space);
+        if confirming.is_some_and(|of| !of.spaces.iter().all(is_known)) {
+            self.ask_applications(now);
+        }
+    }
+
+    /// Queues the arrival of the newest event of a topic for the port, once it is known.
+    pub(super) fn settle_arrival(&mut self, topic: TopicId) {
+        let Some(Topic {
+            role: Role::Ours(writer),
+            counters,
+            ..
+        }) = self.topics.get_mut(&topic)
+        else {
+            return;
+        };
+        if writer.take_news() {
+            if let Some(Arrival::Unknown(_)) = writer.arrival() {
+                // The port logs it.
+                counters.add(Reason::Unconfirmed, 1);
+            }
+            self.settled.push_back(topic);
+        }
+    }
+
+    /// Returns the next arrival for the port.
+    pub(super) fn next_arrival(&mut self) -> Option<Output> {
+        while let Some(topic) = self.settled.pop_front() {
+            // A newer event is not settled by the arrival of the event before.
+            if let Some(Topic {
+                role: Role::Ours(writer),
+                ..
+            }) = self.topics.get(&topic)
+                && let Some(arrival) = writer.arrival().cloned()
+            {
+                return Some(Output::Settled { topic, arrival });
+            }
+        }
+        None
+    }
+
+    /// Reports a sample of the local side that is not sent.
+    pub(super) fn settle_verdict(&mut self, topic: TopicId, verdict: Verdict) {
+        let Verdict::Drop(reason) = verdict else {
+            return;
+        };
+        let entry = self.topics.get(&topic);
+        if entry.is_none_or(|entry| entry.confirming.is_none()) {
+            return;
+        }
+        if reason == Reason::Unchanged {
+            // The arrival of the sample before holds for this one.
+            self.settled.push_back(topic);
+        } else {
+            self.tell(Output::Settled {
+                topic,
+                arrival: Arrival::NotSent,
+            });
+        }
+    }
+}

@@ -1,0 +1,203 @@
+//! Writes that are answered when the bridges confirm them (`confirm: bridge` in the mapping).
+//!
+//! Each write goes out at once. It ends those of its topic that wait, because nobody sends their values again.
+
+use std::collections::HashMap;
+use std::time::Duration;
+
+use bridge_node::Arrival;
+use mappings::{Mapping, TopicId};
+use opcua::sync::{Mutex, RwLock};
+use opcua::types::StatusCode;
+use tokio::sync::oneshot;
+use tracing::warn;
+
+/// The topics of the mapping that bridges confirm, and the writes that wait.
+#[derive(Default)]
+pub(crate) struct Arrivals {
+    within: RwLock<HashMap<TopicId, Duration>>,
+    waiting: Mutex<HashMap<TopicId, Vec<Awaited>>>,
+}
+
+/// A write that waits.
+#[derive(Debug)]
+pub(crate) struct Awaited {
+    /// The field of the topic that it writes; `None` for all of them.
+    field: Option<usize>,
+    answer: oneshot::Sender<StatusCode>,
+}
+
+/// The answer to a write.
+#[derive(Debug)]
+pub(crate) struct Awaiting {
+    answer: oneshot::Receiver<StatusCode>,
+    within: Duration,
+}
+
+impl Awaiting {
+    /// Waits for the answer.
+    ///
+    /// # Errors
+    /// `BadTimeout` if it is unknown whether the value has arrived, and `BadRequestCancelledByRequest` if a newer one took its
+    /// place before.
+    pub(crate) async fn arrived(self) -> Result<(), StatusCode> {
+        match tokio::time::timeout(self.within + GRACE, self.answer).await {
+            Ok(Ok(StatusCode::Good)) => Ok(()),
+            Ok(Ok(status)) => Err(status),
+            // A reload of the mapping, or the end of the server.
+            Ok(Err(_)) | Err(_) => Err(StatusCode::BadTimeout),
+        }
+    }
+}
+
+impl Arrivals {
+    /// Takes over the topics of a mapping.
+    pub(crate) fn follow(&self, mapping: &Mapping) {
+        let variables = mapping.variables().iter();
+        let wanted = variables.filter_map(|variable| {
+            let by_bridges = variable.confirm.is_none();
+            let within = variable.confirmed_within.filter(|_| by_bridges)?;
+            Some((variable.topic, within))
+        });
+        *self.within.write() = wanted.collect();
+    }
+
+    /// A write of a field, or of all of them, that is to be answered when it is confirmed; `None` where bridges confirm nothing.
+    pub(crate) fn await_write(
+        &self,
+        topic: TopicId,
+        field: Option<usize>,
+    ) -> Option<(Awaited, Awaiting)> {
+        let within = self.within.read().get(&topic).copied()?;
+        let (told, answer) = oneshot::channel();
+        let awaited = Awaited {
+            field,
+            answer: told,
+        };
+        Some((awaited, Awaiting { answer, within }))
+    }
+
+    /// A write is sent. Earlier writes are answered as superseded, except writes of other fields, whose values it contains.
+    pub(crate) fn sent(&self, topic: TopicId, write: Option<Awaited>) {
+        let mut waiting = self.waiting.lock();
+        let field = write.as_ref().and_then(|write| write.field);
+        let writes = waiting.entry(topic).or_default();
+        let superseded = writes.extract_if(.., |before| {
+            field.is_none() || before.field.is_none() || before.field == field
+        });
+        for before in superseded {
+            // The client may be lost.
+            let _gone = before.answer.send(SUPERSEDED);
+        }
+        writes.extend(write);
+        if writes.is_empty() {
+            waiting.remove(&topic);
+        }
+    }
+
+    /// Answers the writes that wait for the newest value of a topic.
+    pub(crate) fn settled(&self, topic: TopicId, arrival: &Arrival) {
+        let Some(writes) = self.waiting.lock().remove(&topic) else {
+            return;
+        };
+        let status = match arrival {
+            Arrival::Confirmed => StatusCode::Good,
+            Arrival::NotSent => StatusCode::BadCommunicationError,
+            Arrival::Unknown(spaces) => {
+                let spaces: Vec<String> = spaces.iter().map(ToString::to_string).collect();
+                warn!(
+                    %topic,
+                    spaces = spaces.join(", "),
+                    "a write is not confirmed, and it is unknown whether it has arrived: the bridge of the space, or a \
+                     subscriber there, is missing"
+                );
+                StatusCode::BadTimeout
+            }
+        };
+        for write in writes {
+            // Likewise.
+            let _gone = write.answer.send(status);
+        }
+    }
+}
+
+/// The answer to a write after which a newer one of the same value came.
+const SUPERSEDED: StatusCode = StatusCode::BadRequestCancelledByRequest;
+/// How much longer than the mapping says an answer is waited for: the value waits for its turn to leave, too.
+const GRACE: Duration = Duration::from_secs(5);
+
+#[cfg(test)]
+mod tests {
+    use mappings::SpaceId;
+
+    use super::*;
+
+    const MAPPING: &str = "
+spaces: [{id: 1}]
+namespaces: {2: urn:cell}
+variables:
+  - {node: ns=2;i=30, name: drive, origin: 0, ros: {space: 1, topic: /cmd_vel, type: geometry_msgs/Twist}}
+  - {node: ns=2;i=31, name: other, type: Double, origin: 0}
+  - {node: ns=2;i=32, name: sent, type: Double, origin: 0, confirm: none, ros: {space: 1, topic: /sent, type: std_msgs/Float64}}
+";
+
+    fn topic(identifier: u16) -> TopicId {
+        TopicId::new(0, 2, identifier).unwrap()
+    }
+
+    fn arrivals() -> Arrivals {
+        let arrivals = Arrivals::default();
+        let checked = Mapping::from_yaml(MAPPING, "cell.yaml");
+        arrivals.follow(&checked.mapping.unwrap());
+        arrivals
+    }
+
+    fn write(arrivals: &Arrivals, field: Option<usize>) -> Awaiting {
+        let (awaited, awaiting) = arrivals.await_write(topic(30), field).unwrap();
+        arrivals.sent(topic(30), Some(awaited));
+        awaiting
+    }
+
+    #[test]
+    fn values_that_go_to_no_other_space_or_are_said_to_need_none_are_not_awaited() {
+        let arrivals = arrivals();
+        for (identifier, wanted) in [(30, true), (31, false), (32, false), (33, false)] {
+            let awaited = arrivals.await_write(topic(identifier), None);
+            assert_eq!(awaited.is_some(), wanted, "{identifier}");
+        }
+    }
+
+    #[tokio::test]
+    async fn a_write_is_answered_by_what_became_of_its_value() {
+        let arrivals = arrivals();
+        let unknown = Arrival::Unknown(vec![SpaceId::ROS1]);
+        for (arrival, wanted) in [
+            (Arrival::Confirmed, Ok(())),
+            (unknown, Err(StatusCode::BadTimeout)),
+            (Arrival::NotSent, Err(StatusCode::BadCommunicationError)),
+        ] {
+            let awaiting = write(&arrivals, None);
+            arrivals.settled(topic(31), &Arrival::Confirmed);
+            arrivals.settled(topic(30), &arrival);
+            assert_eq!(awaiting.arrived().await, wanted);
+            assert!(arrivals.waiting.lock().is_empty());
+        }
+    }
+
+    #[tokio::test]
+    async fn a_newer_write_ends_the_one_before_unless_it_has_its_value() {
+        for (first, second, wanted) in [
+            (None, None, Err(SUPERSEDED)),
+            (Some(0), Some(0), Err(SUPERSEDED)),
+            (Some(0), None, Err(SUPERSEDED)),
+            (Some(0), Some(5), Ok(())),
+        ] {
+            let arrivals = arrivals();
+            let before = write(&arrivals, first);
+            let after = write(&arrivals, second);
+            arrivals.settled(topic(30), &Arrival::Confirmed);
+            assert_eq!(before.arrived().await, wanted);
+            assert_eq!(after.arrived().await, Ok(()));
+        }
+    }
+}
