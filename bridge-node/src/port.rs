@@ -128,6 +128,11 @@ pub trait Port: Send + 'static {
         Vec::new()
     }
 
+    /// Describes the OPC UA certificate of this side, for `/status`.
+    fn certificate(&self) -> Option<serde_json::Value> {
+        None
+    }
+
     /// The program is to end: what this side works on elsewhere is to be cancelled as far as it ends with the program. The
     /// shell goes on until nothing is [pending](Self::pending), 5 s at most. Never waits.
     fn closing(&mut self) {}

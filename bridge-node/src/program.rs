@@ -30,6 +30,7 @@ use crate::logging;
 use crate::mapping_file::{MappingFile, NodeSetReader, Running};
 use crate::metrics::{self, Requests};
 use crate::port::Port;
+use crate::restart;
 use crate::run::{Fixed, Shell};
 use crate::service;
 use crate::signals;
@@ -164,13 +165,13 @@ pub fn run<P: Program>(arguments: impl IntoIterator<Item = OsString>) -> ExitCod
         Ok(None) => Ok(()),
         Err(failure) => Err(failure),
     };
-    match ended {
+    restart::executed_again(match ended {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => {
             error!("{failure}");
             failure.kind().into()
         }
-    }
+    })
 }
 
 fn serve<P: Program>(program: P, file: MappingFile) -> Result<(), Failure> {

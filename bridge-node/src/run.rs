@@ -266,6 +266,7 @@ impl<P: Port> Shell<P> {
         )
         .with_library(self.library)
         .with_links(self.port.links())
+        .with_certificate(self.port.certificate())
         .with_pending(self.port.pending())
     }
 

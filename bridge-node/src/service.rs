@@ -9,7 +9,7 @@ use tracing::error;
 
 use crate::exit::{Failure, FailureKind};
 use crate::logging::{self, LogFormat};
-use crate::{descriptors, signals};
+use crate::{descriptors, restart, signals};
 
 /// What one program is, for [`run_service`].
 pub trait Service: Parser {
@@ -39,13 +39,13 @@ pub fn run_service<S: Service>(arguments: impl IntoIterator<Item = OsString>) ->
     };
     logging::start(service.log(), S::QUIET);
     descriptors::raise();
-    match serve(service) {
+    restart::executed_again(match serve(service) {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => {
             error!("{failure}");
             failure.kind().into()
         }
-    }
+    })
 }
 
 fn serve<S: Service>(service: S) -> Result<(), Failure> {

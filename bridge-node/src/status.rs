@@ -29,6 +29,9 @@ pub(crate) struct Status {
     /// Other servers that the program is a client of.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     servers: Vec<LinkState>,
+    /// The application's own OPC UA certificate.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    certificate: Option<serde_json::Value>,
     /// Goals and runs that are being cancelled, as long as their end is not known.
     cancellations_pending: Vec<String>,
     /// Other applications of the group, as they say of themselves.
@@ -171,6 +174,7 @@ impl Status {
             topics,
             calls,
             servers: Vec::new(),
+            certificate: None,
             cancellations_pending: Vec::new(),
             applications: applications(router),
             others: router.others().into(),
@@ -185,6 +189,11 @@ impl Status {
 
     pub(crate) fn with_links(mut self, links: Vec<LinkState>) -> Self {
         self.servers = links;
+        self
+    }
+
+    pub(crate) fn with_certificate(mut self, certificate: Option<serde_json::Value>) -> Self {
+        self.certificate = certificate;
         self
     }
 

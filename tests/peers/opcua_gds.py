@@ -14,7 +14,7 @@ from asyncua.common.utils import Buffer
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import rsa, padding
-from cryptography.x509.oid import NameOID
+from cryptography.x509.oid import AttributeOID, NameOID
 
 import lifetime
 import opcua_access
@@ -70,7 +70,7 @@ def record(uri=URI, name="Robot", number=None, capabilities=("DA",)):
     return told
 
 
-def signing_request(uri=URI, key=None, hosts=("robot.cell",)):
+def signing_request(uri=URI, key=None, hosts=("robot.cell",), token=None):
     key = key or rsa.generate_private_key(public_exponent=65537, key_size=2048)
     names = [x509.UniformResourceIdentifier(uri), *(x509.DNSName(host) for host in hosts)]
     builder = (
@@ -78,6 +78,8 @@ def signing_request(uri=URI, key=None, hosts=("robot.cell",)):
         .subject_name(x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "Robot")]))
         .add_extension(x509.SubjectAlternativeName(names), critical=False)
     )
+    if token:
+        builder = builder.add_attribute(AttributeOID.CHALLENGE_PASSWORD, token.encode())
     return key, builder.sign(key, hashes.SHA256()).public_bytes(serialization.Encoding.DER)
 
 
@@ -239,9 +241,41 @@ async def stranger(gds, said):
     said["open"] = await outcome(handle)
 
 
+async def applies(gds, said, args, folder):
+    """An application that nobody trusts requests its first certificate, with a token or without."""
+    uri = args.application_uri
+    null = ua.NodeId()
+    number = await outcome(gds.call(146, record(uri)))
+    key = serialization.load_pem_private_key((folder / f"{args.client}_key.pem").read_bytes(), None)
+    wanted = signing_request(uri, key, token=args.token)[1]
+    other = signing_request(uri)[1]
+    said["other_key"] = await outcome(gds.call(157, number, null, null, other))
+    request = await outcome(gds.call(157, number, null, null, wanted))
+    if isinstance(request, str):
+        said["started"] = request
+        return
+    said["started"] = "Good"
+    answer = await outcome(gds.call(163, number, request))
+    if isinstance(answer, str):
+        said["finished"] = answer
+        handle = gds.node(TRUST_LIST).call_method(ua.NodeId(622, gds.index), ua.Variant(1, ua.VariantType.Byte))
+        said["open"] = await outcome(handle)
+        return
+    issued, _, issuers = answer
+    again, _, _ = await gds.call(163, number, request)
+    certificate = x509.load_der_x509_certificate(issued)
+    said["finished"] = "Good"
+    said["twice"] = again == issued
+    said["own_key"] = certificate.public_key().public_numbers() == key.public_key().public_numbers()
+    said["signed"] = signed_by(certificate, x509.load_der_x509_certificate(issuers[0]))
+    registered = (await gds.call(143, uri))[0].ApplicationId
+    trusted = await gds.read_list(await gds.call(204, registered, null))
+    said["trusted"] = [one == issuers[0] for one in trusted.TrustedCertificates]
+
+
 async def main():
     parser = argparse.ArgumentParser()
-    parser.add_argument("verb", choices=["make", "directory", "certificates", "itself", "stranger"])
+    parser.add_argument("verb", choices=["make", "directory", "certificates", "itself", "stranger", "applies"])
     parser.add_argument("endpoint")
     parser.add_argument("folder")
     parser.add_argument("--client", default="client")
@@ -249,11 +283,12 @@ async def main():
     parser.add_argument("--way", default="Basic256Sha256/SignAndEncrypt")
     parser.add_argument("--user")
     parser.add_argument("--password")
+    parser.add_argument("--token")
     args = parser.parse_args()
     lifetime.bound(120.0)
     folder = pathlib.Path(args.folder)
     if args.verb == "make":
-        opcua_access.make(folder, "client", opcua_session.APPLICATION_URI, -1, 365)
+        opcua_access.make(folder, args.client, args.application_uri, -1, 365)
         lifetime.say(made=True)
         return
     said = {}
@@ -270,6 +305,8 @@ async def main():
             await directory(gds, said)
         elif args.verb == "certificates":
             await certificates(gds, said, folder)
+        elif args.verb == "applies":
+            await applies(gds, said, args, folder)
         elif args.verb == "itself":
             await itself(gds, said)
         else:

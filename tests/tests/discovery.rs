@@ -2,6 +2,7 @@
 
 mod clock;
 mod embedded;
+mod enrolment;
 mod faults;
 mod gds;
 mod levels;

@@ -15,10 +15,11 @@ const FOLDER: &str = "docs/reference";
 const NOTE: &str =
     "<!-- Written by `cargo xtask docs`. Change the program or the schema instead. -->";
 /// Verbs that the help of their program lists outside of its commands.
-const FURTHER: [&[&str]; 5] = [
+const FURTHER: [&[&str]; 6] = [
     &["ua-component", "simulate"],
     &["ua-server", "certificates"],
     &["ua-server", "reject"],
+    &["ua-server", "renew"],
     &["ua-server", "trust"],
     &["ua-server", "user"],
 ];

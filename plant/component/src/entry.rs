@@ -10,6 +10,7 @@ use bridge_node::{
     Arguments, Context, Failure, FailureKind, KeyService, Made, Owned, Program, WithoutMapping,
 };
 use mappings::{Mapping, SpaceId};
+use plant_opcua::enrolment::GdsArguments;
 use skills::{Component, Lds, Security};
 
 use crate::{ComponentPort, Options, made, simulate};
@@ -46,6 +47,8 @@ struct UaComponent {
     /// The certificate store: own, private, trusted and rejected under one directory
     #[arg(long, value_name = "DIR", env = "UA_PKI")]
     pki: Option<PathBuf>,
+    #[command(flatten)]
+    gds: GdsArguments,
     /// Trust every client certificate, and keep it as trusted. For tests and demonstrations only
     #[arg(long)]
     trust_any_client_certificate: bool,
@@ -121,9 +124,10 @@ impl UaComponent {
     }
 
     fn options(&self, read: &Read) -> Options {
-        let secured = read.component.security.contains(&Security::Basic256Sha256);
+        let is_secured =
+            self.gds.gds.is_some() || read.component.security.contains(&Security::Basic256Sha256);
         let usual = || self.pki_root(read);
-        let pki = self.pki.clone().or_else(|| secured.then(usual));
+        let pki = self.pki.clone().or_else(|| is_secured.then(usual));
         let interface = self.arguments.0.flags.interface.as_deref();
         let mdns = match interface {
             None => discovery::Interface::LOOPBACK,
@@ -135,6 +139,7 @@ impl UaComponent {
             trust_any_client: self.trust_any_client_certificate,
             mdns: Some(mdns),
             capabilities: vec!["DA".to_owned()],
+            gds: None,
             source: Some((read.text.clone(), self.file().display().to_string())),
         }
     }
@@ -191,6 +196,12 @@ impl Program for UaComponent {
 
     async fn start(&self, _context: Context) -> Result<ComponentPort, Failure> {
         let read = self.read()?;
-        ComponentPort::start(&read.component, &self.options(read))
+        let gds = self.gds.invitation();
+        let gds = gds.map_err(|fault| Failure::new(FailureKind::Usage, fault.to_string()))?;
+        let options = Options {
+            gds,
+            ..self.options(read)
+        };
+        ComponentPort::start(&read.component, &options)
     }
 }

@@ -14,6 +14,9 @@ use bridge_node::{
 use bytes::Bytes;
 use discovery::{AnnounceSettings, Announced, Interface};
 use mappings::{Mapping, PubSub, TopicId};
+use plant_opcua::endpoint::EndpointUrl;
+use plant_opcua::enrolment::{Enrolment, Invitation};
+use plant_opcua::own;
 use plant_opcua::supervision::Supervision;
 use program::{Method, State};
 use skills::server::{ComponentServer, ServeFault, ServeSettings};
@@ -42,6 +45,8 @@ pub struct Options {
     pub mdns: Option<Interface>,
     /// Codes of OPC 10000-12, annex D, that it is announced with.
     pub capabilities: Vec<String>,
+    /// The Global Discovery Server that issues its certificate. Needs `pki`.
+    pub gds: Option<Invitation>,
     /// The text of its YAML and the name of that file, for findings.
     pub source: Option<(String, String)>,
 }
@@ -72,6 +77,8 @@ pub struct ComponentPort {
     application: Application,
     /// The skills that are being halted for the end of the component.
     closing: Arc<Mutex<BTreeSet<String>>>,
+    /// The certificate store.
+    pki: Option<PathBuf>,
 }
 
 impl ComponentPort {
@@ -87,7 +94,7 @@ impl ComponentPort {
         };
         let outbox = Outbox::default();
         let mut first = VecDeque::new();
-        let (detector, looks) = partners::look(component, options.mdns.as_ref());
+        let (detector, mut looks) = partners::look(component, options.mdns.as_ref());
         let settings = ServeSettings {
             detector,
             pki: options.pki.clone(),
@@ -121,6 +128,7 @@ impl ComponentPort {
         server.start();
         let told = told_of(component, server.url(), options);
         let application = application(&told, &component.security);
+        enrol(&mut looks, (component, &told), options, server.skills());
         let announced = announce(told, component, options, settings.supervision);
         if server.skills().len() > MOST_IN_SPACE {
             warn!(
@@ -147,6 +155,7 @@ impl ComponentPort {
             asking,
             application,
             closing: Arc::default(),
+            pki: options.pki.clone(),
         })
     }
 
@@ -184,6 +193,10 @@ impl Port for ComponentPort {
             event = self.actions.recv() => event,
             event = self.outbox.next() => event,
         }
+    }
+
+    fn certificate(&self) -> Option<serde_json::Value> {
+        own::status(self.pki.as_deref()?)
     }
 
     fn application(&self) -> Option<Application> {
@@ -390,6 +403,41 @@ fn told_of(component: &Component, url: &str, options: &Options) -> discovery::Se
     }
 }
 
+/// Keeps the certificate of the component current at the Global Discovery Server.
+fn enrol(
+    tasks: &mut JoinSet<()>,
+    (component, announced): (&Component, &discovery::Server),
+    options: &Options,
+    skills: &[Skill],
+) {
+    let (Some(root), Some(gds)) = (&options.pki, &options.gds) else {
+        return;
+    };
+    let endpoint = component.endpoint.parse::<EndpointUrl>().ok();
+    let port = announced.url.parse::<EndpointUrl>().map(|url| url.port());
+    let urls = endpoint.zip(port.ok()).map(|(url, port)| url.urls(port));
+    let applicant = announced.applicant(urls.unwrap_or_default());
+    let enrolment = Enrolment::new(root, applicant, gds.clone());
+    let skills = skills.to_vec();
+    tasks.spawn(async move {
+        enrolment
+            .keep(|| drop(tokio::spawn(restart_when_idle(skills.clone()))))
+            .await;
+    });
+}
+
+/// Restarts the program as soon as no skill runs: a restart for a certificate stops no machine.
+async fn restart_when_idle(skills: Vec<Skill>) {
+    let runs = |skill: &Skill| matches!(skill.shown().state, State::Running | State::Suspended);
+    if skills.iter().any(runs) {
+        info!("the program restarts with its new certificate when no skill runs");
+    }
+    while skills.iter().any(runs) {
+        tokio::time::sleep(IDLE_LOOK).await;
+    }
+    bridge_node::restart();
+}
+
 /// The same for the group.
 fn application(server: &discovery::Server, security: &[Security]) -> Application {
     let ways = security.iter().flat_map(|security| match security {
@@ -432,6 +480,8 @@ fn announce(
     }
 }
 
+/// How often skills are looked at before a restart.
+const IDLE_LOOK: Duration = Duration::from_millis(500);
 /// Within the 2 s a port has to end.
 const SHUTDOWN: Duration = Duration::from_millis(1_900);
 /// So many calls may be executed at once; more are refused.

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use std::pin::Pin;
 use std::time::{Duration, SystemTime};
 
+use plant_opcua::enrolment::Applicant;
 use plant_opcua::supervision::{Registrar, Supervision};
 use registry::hierarchy::Choice;
 use registry::{Announcement, instance_name};
@@ -38,6 +39,26 @@ pub struct Server {
     pub capabilities: Vec<String>,
     /// Its number in the space, the namespace of what it produces there; `None` where it produces nothing.
     pub number: Option<NonZeroU16>,
+}
+
+impl Server {
+    /// Describes the server to a Global Discovery Server, with these DiscoveryUrls beside its own.
+    #[must_use]
+    pub fn applicant(&self, urls: impl IntoIterator<Item = String>) -> Applicant {
+        let mut all = vec![self.url.clone()];
+        for url in urls {
+            if !all.contains(&url) {
+                all.push(url);
+            }
+        }
+        Applicant {
+            application_uri: self.application_uri.clone(),
+            name: self.name.clone(),
+            product_uri: self.product_uri.clone(),
+            urls: all,
+            capabilities: self.capabilities.clone(),
+        }
+    }
 }
 
 /// To whom a server is told of.

@@ -11,6 +11,8 @@ use std::time::{Duration, SystemTime};
 use bridge_node::{Failure, FailureKind, Requests};
 use log_limit::LogLimit;
 use opcua::types::ApplicationType;
+use plant_opcua::enrolment::{Applicant, Enrolment, Invitation};
+use plant_opcua::own;
 use plant_opcua::patches::OtherHosts;
 use registry::{Announcement, Asked, Event, Loss, Settings, instance_name};
 use serde::Serialize;
@@ -49,6 +51,8 @@ pub struct LdsSettings {
     pub register_every: Duration,
     /// The certificate store for secured channels; without it there are none.
     pub pki: Option<PathBuf>,
+    /// The Global Discovery Server that issues its certificate. Needs `pki`.
+    pub gds: Option<Invitation>,
     /// Whether any client certificate will do. For tests only.
     pub trust_any: bool,
     /// The program it runs in, where that is another than `ua-lds`.
@@ -76,6 +80,7 @@ impl LdsSettings {
             secured_only: false,
             register_every: REGISTER_EVERY,
             pki: None,
+            gds: None,
             trust_any: false,
             embedded: None,
         }
@@ -196,6 +201,9 @@ pub struct LdsStatus {
     counters: BTreeMap<&'static str, u64>,
     #[serde(skip_serializing_if = "Option::is_none")]
     level: Option<serde_json::Value>,
+    /// Its own certificate.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    certificate: Option<serde_json::Value>,
 }
 
 /// A registered server.
@@ -308,6 +316,8 @@ pub(crate) struct Lds {
     refused: LogLimit,
     /// Lets clients in while it is kept.
     accepting: JoinSet<()>,
+    /// The certificate store.
+    pki: Option<PathBuf>,
 }
 
 impl Lds {
@@ -357,6 +367,17 @@ impl Lds {
         let shared = Arc::new(Shared::new(own, security, ask).secured_only(settings.secured_only));
         let mut accepting = JoinSet::new();
         accepting.spawn(endpoint::accept(listener, Arc::clone(&shared)));
+        if let (Some(root), Some(gds)) = (&settings.pki, &settings.gds) {
+            let applicant = Applicant {
+                application_uri: shared.own.application_uri.clone(),
+                name: shared.own.name.clone(),
+                product_uri: "urn:ua-bridge:lds".to_owned(),
+                urls: vec![url.clone()],
+                capabilities: vec!["LDS".to_owned()],
+            };
+            let enrolment = Enrolment::new(root, applicant, gds.clone());
+            accepting.spawn(enrolment.keep(bridge_node::restart));
+        }
         info!(url, interface = %settings.interface, "ua-lds listens");
         let registry = Settings {
             allow_unsecured: settings.allow_unsecured,
@@ -377,6 +398,7 @@ impl Lds {
             register_every: settings.register_every,
             refused: LogLimit::every(TOLD_EVERY),
             accepting,
+            pki: settings.pki.clone(),
         };
         lds.announce();
         Ok((lds, questions))
@@ -612,6 +634,7 @@ impl Lds {
                 .around
                 .as_ref()
                 .and_then(|around| around.added.borrow().status.clone()),
+            certificate: self.pki.as_deref().and_then(own::status),
         }
     }
 

@@ -6,7 +6,9 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use bridge_node::{Failure, LogFormat, Service, run_service, serve_pages};
+use bridge_node::{Failure, FailureKind, LogFormat, Service, run_service, serve_pages};
+use plant_opcua::enrolment::GdsArguments;
+use plant_opcua::pki::default_named;
 
 use crate::lds::{self, LdsSettings};
 use crate::scan::Range;
@@ -49,6 +51,8 @@ struct UaLds {
     /// it no channel is secured
     #[arg(long, value_name = "DIR", env = "UA_LDS_PKI")]
     pki: Option<PathBuf>,
+    #[command(flatten)]
+    gds: GdsArguments,
     /// Trust every client certificate. For tests and demonstrations only
     #[arg(long, requires = "pki")]
     trust_any_client_certificate: bool,
@@ -83,6 +87,10 @@ impl Service for UaLds {
     async fn serve(self, stop: impl Future<Output = ()> + Send + 'static) -> Result<(), Failure> {
         let pages = serve_pages(self.metrics).await?;
         let interface = self.interface.as_deref().map(Interface::parse);
+        let gds = self.gds.invitation();
+        let gds = gds.map_err(|fault| Failure::new(FailureKind::Usage, fault.to_string()))?;
+        // A certificate of the plant needs a store.
+        let usual = || gds.as_ref().map(|_| default_named("pki-ua-lds"));
         let settings = LdsSettings {
             interface: interface
                 .unwrap_or(Interface::LOOPBACK)
@@ -90,7 +98,8 @@ impl Service for UaLds {
             allow_unsecured: self.allow_unsecured,
             secured_only: self.secured_only,
             register_every: Duration::from_secs(self.register_period.into()),
-            pki: self.pki,
+            pki: self.pki.or_else(usual),
+            gds,
             trust_any: self.trust_any_client_certificate,
             ..LdsSettings::at(self.endpoint)
         };

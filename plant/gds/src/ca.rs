@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use bridge_node::{Failure, FailureKind};
+use plant_opcua::own::day;
 use trust::{Certificate, Request, Serial};
 
 use crate::Folders;
@@ -144,7 +145,7 @@ pub(crate) fn run(verb: CaVerb) -> Result<(), Failure> {
     }
 }
 
-fn open(folders: &Folders) -> Result<Store, Failure> {
+pub(crate) fn open(folders: &Folders) -> Result<Store, Failure> {
     Store::open(&folders.authority()).map_err(|fault| of_store(&fault))
 }
 
@@ -242,23 +243,15 @@ fn as_json(one: &Issued) -> String {
     bridge_node::harmless_json(&json.to_string())
 }
 
-/// A day, as 2031-11-25.
-fn day(at: Duration) -> String {
-    let seconds = i64::try_from(at.as_secs()).unwrap_or_default();
-    let ticks = seconds * 10_000_000 + 116_444_736_000_000_000;
-    let time = opcua::types::DateTime::from(ticks).as_chrono();
-    time.format("%Y-%m-%d").to_string()
-}
-
 fn of_days(days: u32) -> Duration {
     Duration::from_secs(u64::from(days) * 86_400)
 }
 
-fn io_fault(file: &Path, error: &io::Error) -> Failure {
+pub(crate) fn io_fault(file: &Path, error: &io::Error) -> Failure {
     Failure::new(FailureKind::Io, format!("{}: {error}", file.display()))
 }
 
-fn say(text: &str) -> Result<(), Failure> {
+pub(crate) fn say(text: &str) -> Result<(), Failure> {
     writeln!(io::stdout(), "{text}")
         .map_err(|error| Failure::new(FailureKind::Io, error.to_string()))
 }

@@ -4,8 +4,8 @@ use opcua::types::{ExtensionObject, StatusCode, UAString, Variant};
 use plant_opcua::server::MethodRequest;
 use tracing::info;
 
-use crate::records::{Query, Record};
-use crate::service::{Answer, Gds, id, number, refused, texts, time, unregistered};
+use crate::records::{Query, Record, check};
+use crate::service::{Answer, Gds, Standing, id, number, refused, texts, time, unregistered};
 use plant_opcua::directory::ApplicationRecord;
 
 /// FindApplications: those of an ApplicationUri.
@@ -22,8 +22,17 @@ pub(crate) fn find(gds: &Gds, request: &MethodRequest) -> Answer {
 /// RegisterApplication: answers with the ApplicationId.
 pub(crate) fn register(gds: &Gds, request: &MethodRequest) -> Answer {
     let (told, caller) = (record(request)?, &request.caller);
-    gds.may(caller, told.application_uri.as_ref())?;
+    let standing = gds.standing(caller, told.application_uri.as_ref())?;
     let record = Record::of(told, 0);
+    match standing {
+        Standing::Administrator | Standing::Itself => {}
+        Standing::Applicant(key) => {
+            check(&record).map_err(|fault| unregistered(&fault, caller))?;
+            let id = gds.applicants.lock().put(record, key);
+            return Ok(vec![Variant::from(id)]);
+        }
+        Standing::Stranger => return Err(StatusCode::BadUserAccessDenied.into()),
+    }
     let (uri, urls) = (record.uri.clone(), record.urls.clone());
     let registered = gds.records.lock().register(record);
     let number = registered.map_err(|fault| unregistered(&fault, caller))?;

@@ -1,13 +1,19 @@
 //! The Global Discovery Server of a plant (OPC 10000-12, 6 and 7): a register of its applications over all subnets, and a small
 //! authority that issues their certificates.
 //!
-//! Reading order: `record` (an application on the wire), `records` (all of them in a file), `store` (the authority in its folder),
-//! `service` (who may do what), `directory` and `manager` (the methods), `serve` (the server), `ca` (the same for people).
+//! Reading order: `records` (the applications in a file), `store` (the authority in its folder), `kept` (lists that the server and
+//! the command line share), `invitations` and `requests`, `applicants`, `service` (who may do what), `directory` and `manager`
+//! (the methods), `serve` (the server), `ca` and `people` (the same for people).
 
+mod applicants;
 mod ca;
 mod directory;
+mod invitations;
+mod kept;
 mod manager;
+mod people;
 mod records;
+mod requests;
 mod serve;
 mod service;
 mod store;
@@ -23,12 +29,14 @@ use plant_opcua::pki::default_root;
 use plant_opcua::server::EndpointUrl;
 
 use crate::ca::CaVerb;
+use crate::people::PeopleVerb;
 use crate::serve::{Settings, serve};
 
 /// The Global Discovery Server of a plant: registers its applications, and issues and revokes their certificates.
 ///
-/// Whoever registers an application or asks for its certificate is a user with the role security_admin, or the application itself
-/// by a certificate that is trusted here, and comes over an encrypted channel. Everybody may ask who is registered. Users and
+/// A program gets its first certificate with an invitation (`ua-gds invite`), or once an administrator has approved its request
+/// (`ua-gds requests`, `ua-gds approve`). Otherwise a user with the role security_admin registers an application or requests its
+/// certificate, or the application itself by a certificate that is trusted here, over an encrypted channel. Everybody may ask who is registered. Users and
 /// trusted certificates are those of the certificate store (`ua-server user` and `ua-server trust` with its --pki).
 #[derive(Debug, clap::Parser)]
 #[command(name = "ua-gds", version = plant_opcua::patches::version(), args_conflicts_with_subcommands = true)]
@@ -70,6 +78,9 @@ enum Verb {
     /// The authority for people: make it, issue, revoke and list certificates
     #[command(subcommand)]
     Ca(CaVerb),
+    /// Invite a program into the plant, and list, approve and reject requests for certificates
+    #[command(flatten)]
+    People(PeopleVerb),
 }
 
 #[derive(Debug, clap::Args)]
@@ -108,8 +119,12 @@ impl Service for UaGds {
     }
 
     async fn serve(self, stop: impl Future<Output = ()> + Send + 'static) -> Result<(), Failure> {
-        if let Some(Verb::Ca(verb)) = self.verb {
-            let done = tokio::task::spawn_blocking(|| ca::run(verb)).await;
+        if let Some(verb) = self.verb {
+            let done = tokio::task::spawn_blocking(|| match verb {
+                Verb::Ca(verb) => ca::run(verb),
+                Verb::People(verb) => people::run(verb),
+            });
+            let done = done.await;
             return done
                 .unwrap_or_else(|error| Err(Failure::new(FailureKind::Io, error.to_string())));
         }

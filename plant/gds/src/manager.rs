@@ -1,71 +1,24 @@
-//! The certificates of applications (OPC 10000-12, 7.9): asked for, finished, revoked.
+//! The certificates of applications (OPC 10000-12, 7.9): requested, finished, revoked.
 
-use std::collections::VecDeque;
+use std::io;
 use std::net::IpAddr;
 use std::sync::Arc;
-use std::time::Duration;
 
 use async_trait::async_trait;
-use opcua::types::{ByteString, NodeId, ObjectTypeId, StatusCode, UAString, Variant};
+use opcua::types::{ByteString, Identifier, NodeId, ObjectTypeId, StatusCode, UAString, Variant};
 use plant_opcua::server::{Caller, MethodHandler, MethodRequest, Refusal};
-use tracing::info;
-use trust::{Certificate, Fault, Known, Renewal, Request, Step};
+use tokio::time::Instant;
+use tracing::{info, warn};
+use trust::{Certificate, Fault, Fingerprint, Known, Renewal, Request, Step};
 
+use crate::invitations::{self, Invitations, Shows};
+use crate::kept;
 use crate::records::Record;
-use crate::service::{Answer, Gds, OWN, now, refused, texts, time};
+use crate::requests::{self, Asked, Requests, State, Wanted};
+use crate::service::{Answer, Gds, OWN, Standing, now, number, refused, texts, time};
 use crate::store::{new_key, pem_of};
 
-/// What is asked for and not fetched yet.
-#[derive(Debug, Default)]
-pub(crate) struct Requests {
-    last: u32,
-    waiting: VecDeque<Waiting>,
-}
-
-#[derive(Debug)]
-struct Waiting {
-    number: u32,
-    application: u32,
-    since: Duration,
-    request: Request,
-    /// In PEM, where the authority was to make it.
-    key: Option<String>,
-    /// What was issued. It is kept for a client that did not get the answer.
-    issued: Option<Certificate>,
-}
-
-impl Requests {
-    /// Keeps a request. Of those that nobody fetches the oldest give way.
-    fn put(&mut self, application: u32, request: Request, key: Option<String>) -> NodeId {
-        let since = now();
-        self.waiting
-            .retain(|one| since.saturating_sub(one.since) < LONGEST_WAIT);
-        if self.waiting.len() >= MOST_WAITING {
-            self.waiting.pop_front();
-        }
-        self.last = self.last.wrapping_add(1);
-        self.waiting.push_back(Waiting {
-            number: self.last,
-            application,
-            since,
-            request,
-            key,
-            issued: None,
-        });
-        NodeId::new(OWN, format!("request-{}", self.last))
-    }
-
-    fn find(&mut self, application: u32, id: &NodeId) -> Option<&mut Waiting> {
-        let now = now();
-        self.waiting.iter_mut().find(|one| {
-            one.application == application
-                && now.saturating_sub(one.since) < LONGEST_WAIT
-                && *id == NodeId::new(OWN, format!("request-{}", one.number))
-        })
-    }
-}
-
-/// StartSigningRequest: keeps what is asked for, and answers with the RequestId.
+/// StartSigningRequest: keeps the request, and answers with the RequestId.
 pub(crate) fn start_signing(gds: &Gds, request: &MethodRequest) -> Answer {
     let [
         Variant::NodeId(application),
@@ -76,19 +29,29 @@ pub(crate) fn start_signing(gds: &Gds, request: &MethodRequest) -> Answer {
     else {
         return Err(StatusCode::BadInvalidArgument.into());
     };
-    let record = gds.own(&request.caller, application)?;
+    let caller = &request.caller;
+    let (record, standing) = gds.asking(caller, application)?;
     is_ours(gds, group, kind)?;
     let wanted = wanted.value.as_deref().unwrap_or_default();
     let wanted = Request::read(wanted).map_err(|why| unfit(&record, &why.to_string()))?;
     if wanted.application_uri() != record.uri {
         return Err(unfit(&record, "it is for another ApplicationUri"));
     }
-    gds.may_have_hosts(&request.caller, &record, wanted.hosts())?;
-    Ok(vec![Variant::from(gds.requests.lock().put(
-        record.number,
-        wanted,
-        None,
-    ))])
+    let number = match standing {
+        Standing::Applicant(key) => gds.apply(&record, wanted, key)?,
+        Standing::Administrator | Standing::Itself | Standing::Stranger => {
+            gds.may_have_hosts(caller, &record, wanted.hosts())?;
+            if wanted.challenge().is_some() {
+                return Err(unfit(
+                    &record,
+                    "a challengePassword is for the first certificate of an application",
+                ));
+            }
+            let by = format!("{} {}", caller.user, caller.application_uri);
+            gds.keep_request(wanted, (None, Some(by)))?
+        }
+    };
+    Ok(vec![Variant::from(request_id(number))])
 }
 
 /// StartNewKeyPairRequest: makes a key, too.
@@ -124,42 +87,47 @@ impl MethodHandler for StartNewKeyPair {
         let wanted = Request::make(&key, &record.uri, (&name, &organization), &hosts);
         let wanted = wanted.map_err(|why| unfit(&record, &why.to_string()))?;
         let key = pem_of(&key).map_err(|fault| refused(&fault))?;
-        let mut requests = gds.requests.lock();
-        Ok(vec![Variant::from(requests.put(
-            record.number,
-            wanted,
-            Some(key),
-        ))])
+        let by = format!("{} {}", request.caller.user, request.caller.application_uri);
+        let number = gds.keep_request(wanted, (None, Some(by)))?;
+        let mut keys = gds.keys.lock();
+        while keys.len() >= MOST_KEYS {
+            keys.pop_first();
+        }
+        keys.insert(number, key);
+        Ok(vec![Variant::from(request_id(number))])
     }
 }
 
-/// FinishRequest: issues the certificate, and answers with it, the key where that was asked for, and the authority.
+/// FinishRequest: issues the certificate, and answers with it, its key if that was made here, and the authority.
 pub(crate) fn finish(gds: &Gds, request: &MethodRequest) -> Answer {
     let [Variant::NodeId(application), Variant::NodeId(id)] = request.arguments.as_slice() else {
         return Err(StatusCode::BadInvalidArgument.into());
     };
     let caller = &request.caller;
-    let record = gds.own(caller, application)?;
-    let mut requests = gds.requests.lock();
-    let waiting = requests.find(record.number, id);
-    let waiting = waiting.ok_or(StatusCode::BadNotFound)?;
-    let store = gds.store.lock();
-    let authority = ByteString::from(store.certificate().der().to_vec());
-    let issued = match &waiting.issued {
-        Some(issued) => issued.clone(),
-        None => {
-            let issued = store.issue(&waiting.request, now(), gds.life);
-            let issued = issued.map_err(|fault| refused(&fault))?;
-            info!(
-                application = ?record.uri, name = ?issued.name(), hosts = ?issued.hosts(), serial = %issued.serial(), by = ?caller.user,
-                "a certificate is issued"
-            );
-            waiting.issued.insert(issued).clone()
-        }
+    let (record, standing) = gds.asking(caller, application)?;
+    let number = number_of_request(id).ok_or(StatusCode::BadNotFound)?;
+    let requests: Requests =
+        kept::read(&gds.folder.join(requests::FILE)).map_err(|error| unkept(&error))?;
+    let asked = requests.get(number, now());
+    let asked = asked.filter(|one| one.uri == record.uri);
+    let asked = asked.ok_or(StatusCode::BadNotFound)?;
+    let key = gds.keys.lock().get(&number).cloned();
+    if let Standing::Applicant(key) = standing
+        && !asked.is_of_key(key)
+    {
+        return Err(StatusCode::BadUserAccessDenied.into());
+    }
+    let issued = match (&asked.state, standing) {
+        (State::Issued { .. }, _) => asked.certificate().ok_or(StatusCode::BadNotFound)?,
+        (State::Approved { by }, _) => gds.issue(asked, by)?,
+        // An administrator approves a request by fetching the certificate, and by trusting the application.
+        (State::Waiting | State::Refused, Standing::Administrator)
+        | (State::Waiting, Standing::Itself) => gds.issue(asked, &caller.user)?,
+        (State::Waiting, _) => return Err(StatusCode::BadRequestNotComplete.into()),
+        (State::Refused, _) => return Err(StatusCode::BadUserAccessDenied.into()),
     };
-    let key = waiting.key.as_ref().map_or_else(ByteString::null, |key| {
-        ByteString::from(key.clone().into_bytes())
-    });
+    let authority = ByteString::from(gds.store.lock().certificate().der().to_vec());
+    let key = key.map_or_else(ByteString::null, |key| ByteString::from(key.into_bytes()));
     Ok(vec![
         Variant::ByteString(ByteString::from(issued.der().to_vec())),
         Variant::ByteString(key),
@@ -272,6 +240,139 @@ pub(crate) fn check(gds: &Gds, request: &MethodRequest) -> Answer {
 }
 
 impl Gds {
+    /// Returns the application that a caller requests a certificate for: registered, or waiting for its first certificate.
+    fn asking(&self, caller: &Caller, id: &NodeId) -> Result<(Record, Standing), StatusCode> {
+        self.is_unread(caller)?;
+        let known = number(id).and_then(|number| self.records.lock().get(number).cloned());
+        let record = match known {
+            Some(record) => record,
+            None => {
+                let applies = self.applicants.lock().get(id).cloned();
+                applies.ok_or(StatusCode::BadNotFound)?
+            }
+        };
+        match self.standing(caller, &record.uri)? {
+            Standing::Stranger => Err(StatusCode::BadUserAccessDenied),
+            standing => Ok((record, standing)),
+        }
+    }
+
+    /// Keeps the request of an application that is not known by its certificate: with the token of an invitation it is
+    /// approved, otherwise it waits for an administrator.
+    fn apply(&self, record: &Record, wanted: Request, key: Fingerprint) -> Result<u32, Refusal> {
+        if wanted.key_fingerprint() != key {
+            return Err(unfit(record, "it is for another key than the channel's"));
+        }
+        let Some(token) = wanted.challenge().map(str::to_owned) else {
+            let number = self.keep_request(wanted, (Some(record.clone()), None))?;
+            if let Some(suppressed) = self.another(&format!("waits {number}")) {
+                info!(
+                    application = ?record.uri, number, %key, suppressed,
+                    "a request for a certificate waits: `ua-gds approve {number}` or `ua-gds reject {number}`"
+                );
+            }
+            return Ok(number);
+        };
+        self.may_name_hosts(record, wanted.hosts())?;
+        let shows = Shows {
+            uri: &record.uri,
+            names: &record.names,
+            key,
+        };
+        let path = self.folder.join(invitations::FILE);
+        let redeemed = kept::change(&path, |all: &mut Invitations| {
+            all.redeem(&token, shows, now())
+        });
+        match redeemed.map_err(|error| unkept(&error))? {
+            Ok(invitation) => {
+                info!(application = ?record.uri, %key, invitation, "an application has used an invitation");
+                // The token is a secret that is used up; the request is stored without it.
+                let by = format!("invitation {invitation}");
+                let issued = self.register_and_issue(Some(record), &wanted, &by)?;
+                let path = self.folder.join(requests::FILE);
+                let kept = kept::change(&path, |all: &mut Requests| {
+                    all.put_issued((&wanted, &issued), now())
+                });
+                Ok(kept.map_err(|error| unkept(&error))?)
+            }
+            Err(why) => {
+                if let Some(suppressed) = self.another(&format!("token {why}")) {
+                    warn!(application = ?record.uri, suppressed, "refused the token of an application: {why}");
+                }
+                Err(StatusCode::BadUserAccessDenied.into())
+            }
+        }
+    }
+
+    /// Keeps a request in the file, and returns its number.
+    fn keep_request(
+        &self,
+        request: Request,
+        (record, approved): (Option<Record>, Option<String>),
+    ) -> Result<u32, Refusal> {
+        let wanted = Wanted {
+            request,
+            record,
+            approved,
+        };
+        let path = self.folder.join(requests::FILE);
+        let kept = kept::change(&path, |all: &mut Requests| all.put(wanted, now()));
+        kept.map_err(|error| unkept(&error))?.map_err(|full| {
+            if let Some(suppressed) = self.another("full") {
+                warn!(suppressed, "refused a request for a certificate: {full}");
+            }
+            StatusCode::BadTooManyOperations.into()
+        })
+    }
+
+    /// Issues the certificate of a request that was approved.
+    fn issue(&self, asked: &Asked, by: &str) -> Result<Certificate, Refusal> {
+        let request = asked.request().ok_or(StatusCode::BadNotFound)?;
+        let issued = self.register_and_issue(asked.record.as_ref(), &request, by)?;
+        let path = self.folder.join(requests::FILE);
+        let kept = kept::change(&path, |all: &mut Requests| {
+            all.issued(asked.number, &issued, now());
+        });
+        kept.map_err(|error| unkept(&error))?;
+        Ok(issued)
+    }
+
+    /// Registers an application that was approved, and issues its certificate.
+    fn register_and_issue(
+        &self,
+        record: Option<&Record>,
+        request: &Request,
+        by: &str,
+    ) -> Result<Certificate, Refusal> {
+        if let Some(record) = record {
+            let mut records = self.records.lock();
+            let known = records.of_uri(&record.uri).next().map(|one| one.number);
+            let registered = match known {
+                Some(number) => records.update(Record {
+                    number,
+                    ..record.clone()
+                }),
+                None => records.register(record.clone()).map(drop),
+            };
+            registered.map_err(|fault| {
+                warn!(application = ?record.uri, "cannot register an application: {fault}");
+                StatusCode::BadInvalidArgument
+            })?;
+        }
+        let issued = self.store.lock().issue(request, now(), self.life);
+        let issued = issued.map_err(|fault| refused(&fault))?;
+        info!(
+            application = ?request.application_uri(), name = ?issued.name(), hosts = ?issued.hosts(), serial = %issued.serial(), by = ?by,
+            "a certificate is issued"
+        );
+        Ok(issued)
+    }
+
+    /// Returns the number of messages that were suppressed, if this one should be logged now.
+    pub(crate) fn another(&self, message: &str) -> Option<u64> {
+        self.logged.lock().admit(message, Instant::now())
+    }
+
     /// Checks the hosts that a certificate is to name: those of the DiscoveryUrls of the application and of the certificate that
     /// it has, and the computer itself. A security administrator may ask for others.
     fn may_have_hosts(
@@ -280,9 +381,14 @@ impl Gds {
         record: &Record,
         hosts: &[String],
     ) -> Result<(), Refusal> {
-        if self.is_administrator(caller) {
-            return Ok(());
+        match self.is_administrator(caller) {
+            true => Ok(()),
+            false => self.may_name_hosts(record, hosts),
         }
+    }
+
+    /// The same of an application without an administrator.
+    fn may_name_hosts(&self, record: &Record, hosts: &[String]) -> Result<(), Refusal> {
         let current = self.store.lock().of_application(&record.uri);
         let current = current.map_err(|fault| refused(&fault))?;
         let current = current.first().map(Certificate::hosts).unwrap_or_default();
@@ -313,13 +419,14 @@ impl Gds {
     /// What the caller is told.
     pub(crate) fn may_read_list(&self, caller: &Caller) -> Result<(), StatusCode> {
         self.is_unread(caller)?;
-        let registered = {
-            let records = self.records.lock();
-            records.of_uri(&caller.application_uri).next().is_some()
-        };
-        match caller.proven && registered {
-            true => Ok(()),
-            false => self.may(caller, ""),
+        let uri = &caller.application_uri;
+        let registered = self.records.lock().of_uri(uri).next().is_some();
+        match self.standing(caller, uri)? {
+            Standing::Administrator => Ok(()),
+            Standing::Itself if registered => Ok(()),
+            Standing::Itself | Standing::Applicant(_) | Standing::Stranger => {
+                Err(StatusCode::BadUserAccessDenied)
+            }
         }
     }
 }
@@ -352,6 +459,24 @@ fn unfit(record: &Record, why: &str) -> Refusal {
     StatusCode::BadInvalidArgument.into()
 }
 
+/// Logs that a list cannot be read or written, and returns the status for the caller.
+fn unkept(error: &io::Error) -> StatusCode {
+    warn!(%error, "the requests or invitations cannot be read or written");
+    StatusCode::BadResourceUnavailable
+}
+
+/// The RequestId of a number.
+fn request_id(number: u32) -> NodeId {
+    NodeId::new(OWN, format!("request-{number}"))
+}
+
+fn number_of_request(id: &NodeId) -> Option<u32> {
+    match (id.namespace, &id.identifier) {
+        (OWN, Identifier::String(text)) => text.as_ref().strip_prefix("request-")?.parse().ok(),
+        _ => None,
+    }
+}
+
 fn certificate(bytes: &ByteString) -> Option<Certificate> {
     let bytes = bytes.value.as_deref()?;
     Certificate::read(bytes).ok()
@@ -376,5 +501,5 @@ const GROUP: u32 = 615;
 /// Its trust list.
 pub(crate) const TRUST_LIST: u32 = 616;
 const KEY_BITS: u32 = 2048;
-const MOST_WAITING: usize = 100;
-const LONGEST_WAIT: Duration = Duration::from_secs(3600);
+/// Private keys that wait to be fetched.
+const MOST_KEYS: usize = 100;

@@ -313,7 +313,7 @@ fn host(url: &str) -> Option<String> {
 }
 
 /// Whether what a client tells of an application can be kept.
-fn check(record: &Record) -> Result<(), RecordFault> {
+pub(crate) fn check(record: &Record) -> Result<(), RecordFault> {
     let fits = |ok: bool, why: &'static str| ok.then_some(()).ok_or(RecordFault::Unfit(why));
     let short = |text: &String| text.len() <= LONGEST_TEXT;
     fits(!record.uri.is_empty(), "it has no ApplicationUri")?;

@@ -1,15 +1,21 @@
 //! The server of the Directory.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
 use bridge_node::{Failure, FailureKind};
 use discovery::{AnnounceSettings, Announced, Interface, announce};
+use log_limit::LogLimit;
 use opcua::sync::Mutex;
 use opcua::types::{NodeId, Variant};
 use plant_opcua::certificates;
+use plant_opcua::door::UnknownClients;
+use plant_opcua::enrolment::own_key;
 use plant_opcua::file::FileMethod;
+use plant_opcua::judge::Judge;
+use plant_opcua::own::{self, Cause};
+use plant_opcua::pki::Pki;
 use plant_opcua::server::{
     EndpointUrl, MethodHandler, MethodRequest, Security, Server, ServerBuilder, ServerConfig,
     method,
@@ -18,7 +24,9 @@ use plant_opcua::trust_file::TrustFile;
 use plant_opcua::users::{self, Access, Permissions, Roles, Rules};
 use tokio::time::{MissedTickBehavior, interval};
 use tracing::{info, warn};
+use trust::{Renewal, Request, Step};
 
+use crate::kept;
 use crate::manager::{self, StartNewKeyPair, TRUST_LIST};
 use crate::records::Records;
 use crate::service::{Answer, Gds, GroupList, now};
@@ -48,6 +56,7 @@ pub(crate) async fn serve(
     let told = server.tell(&settings)?;
     let mut look = interval(LOOK);
     look.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let mut warned = None;
     tokio::pin!(stop);
     loop {
         tokio::select! {
@@ -56,6 +65,7 @@ pub(crate) async fn serve(
                 if let Err(fault) = server.gds.know(now()) {
                     warn!("{fault}; whoever has the last revocation list goes on with that");
                 }
+                server.look_at_certificates(&settings, &mut warned);
             }
         }
     }
@@ -77,17 +87,17 @@ impl Serving {
         let io = failed(FailureKind::Io);
         // Those whom the authority issued certificates are let in. The door of the server stands where an authority is trusted.
         let authority = store.certificate_path();
-        let trusted = plant_opcua::pki::Pki::open(settings.pki.clone())
+        let trusted = Pki::open(settings.pki.clone())
             .map_err(|error| io(error.to_string()))
             .and_then(|pki| {
                 let given = authority.display().to_string();
                 certificates::trust(pki.root(), &given).map_err(|error| io(error.to_string()))
             });
         trusted?;
+        let uri = own_uri();
+        ensure_own(&store, &settings.pki, &settings.endpoint, now())?;
         let access = Access::new(Some(settings.pki.join(users::FOLDER)), false);
         let access = Arc::new(access.map_err(|error| io(error.to_string()))?);
-        let host = discovery::host_name();
-        let uri = format!("urn:{host}:ua-gds");
         let config = ServerConfig {
             product_uri: "urn:ua-bridge:gds".to_owned(),
             security: vec![
@@ -97,6 +107,8 @@ impl Serving {
                 Security::Aes256Sha256RsaPss,
             ],
             pki: Some(settings.pki.clone()),
+            // An application without a certificate of the plant requests one here.
+            unknown_clients: UnknownClients::Admit,
             ..ServerConfig::new(&uri, NAME, settings.endpoint.clone())
         };
         let server = ServerBuilder::new(config)
@@ -117,7 +129,11 @@ impl Serving {
         let gds = Arc::new(Gds {
             store: Mutex::new(store),
             records: Mutex::new(records),
-            requests: Mutex::default(),
+            applicants: Mutex::default(),
+            keys: Mutex::default(),
+            folder: settings.authority.clone(),
+            judge: Judge::of(&settings.pki, false),
+            logged: Mutex::new(LogLimit::every(LOGGED_EVERY)),
             known: Mutex::default(),
             access: Arc::clone(&access),
             pki: settings.pki.clone(),
@@ -130,6 +146,35 @@ impl Serving {
         serving.show();
         serving.server.start();
         Ok(serving)
+    }
+
+    /// Renews the server's own certificate, for which the program restarts, and warns once a day before the authority ends.
+    fn look_at_certificates(&self, settings: &Settings, warned: &mut Option<Duration>) {
+        let now = now();
+        let store = self.gds.store.lock();
+        match renew_own(&store, &settings.pki, &settings.endpoint, now) {
+            Ok(true) => bridge_node::restart(),
+            Ok(false) => {}
+            Err(fault) => {
+                if let Some(suppressed) = self.gds.another("own certificate") {
+                    warn!(
+                        suppressed,
+                        "cannot renew the server's own certificate: {fault}"
+                    );
+                }
+            }
+        }
+        let due = warned.is_none_or(|at| now.saturating_sub(at) >= DAY);
+        if due && trust::is_near_end(store.certificate(), now) {
+            *warned = Some(now);
+            let until = store.certificate().validity().1;
+            warn!(
+                until = own::day(until),
+                days_left = until.saturating_sub(now).as_secs() / DAY.as_secs(),
+                "the certificate of the authority ends, and no certificate that it issues lasts longer: make a new authority \
+                 (`ua-gds ca init` with another --authority) and have all programs trust it"
+            );
+        }
     }
 
     /// Has each method carried out, and says that everybody may call them: each looks itself at who calls.
@@ -213,6 +258,78 @@ impl Serving {
     }
 }
 
+/// The ApplicationUri of the server.
+pub(crate) fn own_uri() -> String {
+    format!("urn:{}:ua-gds", discovery::host_name())
+}
+
+/// Makes the pair of the server at its first start. Its own authority issues the certificate, so that all programs that trust
+/// the authority trust the server. An existing certificate stays until its renewal.
+pub(crate) fn ensure_own(
+    store: &Store,
+    pki: &Path,
+    endpoint: &EndpointUrl,
+    now: Duration,
+) -> Result<(), Failure> {
+    let io = |error: String| Failure::new(FailureKind::Io, error);
+    // The server and `ua-gds invite` may start at once: an invitation names the certificate that stays.
+    let alone = kept::lock(&store.folder().join(OWN_LOCK));
+    let _alone = alone.map_err(|error| io(error.to_string()))?;
+    let is_new = own::read(pki).is_none();
+    let opened = Pki::open(pki.to_owned()).map_err(|error| io(error.to_string()))?;
+    let made = opened.ensure_own_at(&own_uri(), &endpoint.hosts());
+    made.map_err(|error| io(error.to_string()))?;
+    match is_new {
+        true => issue_own(store, pki, endpoint, now).map_err(|fault| of_store(&fault)),
+        false => Ok(()),
+    }
+}
+
+/// Renews the certificate of the server at four fifths of its life; a self-made one, which clients may trust by its file, near
+/// its end. Returns whether there is a new one.
+fn renew_own(
+    store: &Store,
+    pki: &Path,
+    endpoint: &EndpointUrl,
+    now: Duration,
+) -> Result<bool, StoreFault> {
+    let Some(certificate) = own::read(pki) else {
+        return Ok(false);
+    };
+    let is_due = match certificate.is_self_signed() {
+        true => trust::is_near_end(&certificate, now),
+        false => !matches!(Renewal::of(&certificate).step(now), Step::Wait { .. }),
+    };
+    // A certificate of an authority that ends is not renewed without end.
+    let (_, last) = store.certificate().validity();
+    if !is_due || certificate.validity().1 >= last {
+        return Ok(false);
+    }
+    issue_own(store, pki, endpoint, now).map(|()| true)
+}
+
+fn issue_own(
+    store: &Store,
+    pki: &Path,
+    endpoint: &EndpointUrl,
+    now: Duration,
+) -> Result<(), StoreFault> {
+    let key = own_key(pki).map_err(StoreFault::Key)?;
+    let mut hosts = endpoint.hosts();
+    for host in ["localhost", "127.0.0.1", "::1"] {
+        if !hosts.iter().any(|one| one == host) {
+            hosts.push(host.to_owned());
+        }
+    }
+    let request = Request::make(&key, &own_uri(), (NAME, ""), &hosts);
+    let request = request.map_err(StoreFault::Request)?;
+    let issued = store.issue(&request, now, OWN_LIFE)?;
+    own::replace(pki, &issued, &Cause::Authority).map_err(|source| StoreFault::Io {
+        path: pki.to_owned(),
+        source,
+    })
+}
+
 /// As a failure of the program.
 pub(crate) fn of_store(fault: &StoreFault) -> Failure {
     let kind = match fault {
@@ -268,5 +385,46 @@ const USER_WRITABLE: u32 = 619;
 const OPEN_COUNT: u32 = 620;
 const LAST_UPDATE: u32 = 637;
 const CERTIFICATE_TYPES: u32 = 648;
+const DAY: Duration = Duration::from_secs(86_400);
+/// Held while the server's own certificate is made.
+const OWN_LOCK: &str = "own.lock";
+/// The life of the server's own certificate.
+const OWN_LIFE: Duration = Duration::from_secs(365 * 86_400);
+/// The same cause is logged once in this time.
+const LOGGED_EVERY: Duration = Duration::from_secs(60);
 /// How often it is looked whether the revocation list is another, or is to be signed anew.
 const LOOK: Duration = Duration::from_secs(2);
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use super::*;
+
+    #[test]
+    fn a_server_and_an_invitation_that_start_at_once_have_one_certificate() {
+        let folder = std::env::temp_dir().join(format!("ua-gds-own-{}", std::process::id()));
+        drop(fs::remove_dir_all(&folder));
+        let (authority, pki) = (folder.join("authority"), folder.join("pki"));
+        let life = OWN_LIFE * 10;
+        Store::init(&authority, ("Plant authority", ""), now(), life).unwrap();
+        let endpoint: EndpointUrl = "opc.tcp://127.0.0.1:4841".parse().unwrap();
+        let start = std::sync::Barrier::new(2);
+        let made = || {
+            let store = Store::open(&authority).unwrap();
+            start.wait();
+            ensure_own(&store, &pki, &endpoint, now()).unwrap();
+            own::read(&pki).unwrap()
+        };
+        let [first, second] = std::thread::scope(|scope| {
+            [scope.spawn(made), scope.spawn(made)].map(|one| one.join().unwrap())
+        });
+        assert_eq!(first, second);
+        assert_eq!(first.issuer_name(), "Plant authority");
+        let store = Store::open(&authority).unwrap();
+        let renewed = |later| renew_own(&store, &pki, &endpoint, now() + later).unwrap();
+        assert!(!renewed(OWN_LIFE / 5 * 3) && renewed(OWN_LIFE / 5 * 4));
+        assert_ne!(own::read(&pki).unwrap(), first);
+        fs::remove_dir_all(folder).unwrap();
+    }
+}

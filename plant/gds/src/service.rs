@@ -1,22 +1,25 @@
 //! What the methods share: who may do what, and what is registered and issued.
 
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
+use log_limit::LogLimit;
 use opcua::server::ANONYMOUS_USER_TOKEN_ID;
 use opcua::server::authenticator::UserToken;
 use opcua::sync::Mutex;
 use opcua::types::{
     ByteString, DateTime, Identifier, NodeId, StatusCode, TrustListDataType, Variant,
 };
+use plant_opcua::judge::Judge;
 use plant_opcua::server::{Caller, Refusal};
 use plant_opcua::trust_file::{TrustList, masks};
 use plant_opcua::users::{Access, Role};
 use tracing::{info, warn};
-use trust::Certificate;
+use trust::{Certificate, Fingerprint};
 
-use crate::manager::Requests;
+use crate::applicants::Applicants;
 use crate::records::{Record, RecordFault, Records};
 use crate::store::{Store, StoreFault};
 
@@ -27,7 +30,16 @@ pub(crate) type Answer = Result<Vec<Variant>, Refusal>;
 pub(crate) struct Gds {
     pub(crate) store: Mutex<Store>,
     pub(crate) records: Mutex<Records>,
-    pub(crate) requests: Mutex<Requests>,
+    /// Applications that wait for their first certificate, and are not registered.
+    pub(crate) applicants: Mutex<Applicants>,
+    /// The private keys that were made for requests, in PEM, by the numbers of the requests. They are never stored.
+    pub(crate) keys: Mutex<BTreeMap<u32, String>>,
+    /// The folder of the authority, with the lists that the command line shares.
+    pub(crate) folder: PathBuf,
+    /// Judges the certificates of callers by the store of the server.
+    pub(crate) judge: Judge,
+    /// Limits what strangers can have logged.
+    pub(crate) logged: Mutex<LogLimit>,
     /// The revocation list that the server itself has.
     pub(crate) known: Mutex<Vec<u8>>,
     pub(crate) access: Arc<Access>,
@@ -46,12 +58,46 @@ impl Gds {
     /// # Errors
     /// What the caller is told.
     pub(crate) fn may(&self, caller: &Caller, uri: &str) -> Result<(), StatusCode> {
-        self.is_unread(caller)?;
-        let is_itself = caller.proven && caller.application_uri == uri;
-        match is_itself || self.is_administrator(caller) {
-            true => Ok(()),
-            false => Err(StatusCode::BadUserAccessDenied),
+        match self.standing(caller, uri)? {
+            Standing::Administrator | Standing::Itself => Ok(()),
+            Standing::Applicant(_) | Standing::Stranger => Err(StatusCode::BadUserAccessDenied),
         }
+    }
+
+    /// Returns who a caller is for the application of a URI.
+    ///
+    /// # Errors
+    /// Others could read or change what is said.
+    pub(crate) fn standing(&self, caller: &Caller, uri: &str) -> Result<Standing, StatusCode> {
+        self.is_unread(caller)?;
+        if self.is_administrator(caller) {
+            return Ok(Standing::Administrator);
+        }
+        let shown = caller.certificate.as_deref();
+        let certificate = shown.and_then(|der| Certificate::read(der).ok());
+        let Some(certificate) = certificate.filter(|_| caller.proven) else {
+            return Ok(Standing::Stranger);
+        };
+        if caller.application_uri != uri {
+            return Ok(Standing::Stranger);
+        }
+        let checked = trust::check(&certificate, &[], &self.judge.known(), now());
+        let key = certificate.key_fingerprint();
+        match checked.is_ok() || self.has_issued(uri, key) {
+            true => Ok(Standing::Itself),
+            false => Ok(Standing::Applicant(key)),
+        }
+    }
+
+    /// Returns whether the authority has issued a certificate to an application with that key, and revoked none of the key.
+    fn has_issued(&self, uri: &str, key: Fingerprint) -> bool {
+        let all = self.store.lock().list().unwrap_or_default();
+        let mut own = all.iter().filter(|one| {
+            one.certificate.key_fingerprint() == key
+                && one.certificate.application_uri().as_deref() == Some(uri)
+        });
+        let first = own.next();
+        first.is_some_and(|one| one.revoked.is_none()) && own.all(|one| one.revoked.is_none())
     }
 
     /// # Errors
@@ -112,6 +158,19 @@ impl Gds {
         }
         Ok(())
     }
+}
+
+/// Who a caller is for an application.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Standing {
+    /// A user with the role SecurityAdmin.
+    Administrator,
+    /// The application, by a trusted certificate or a key that the authority has issued one for.
+    Itself,
+    /// A client whose untrusted certificate names the application, with the SHA-256 of its key.
+    Applicant(Fingerprint),
+    /// Anybody else.
+    Stranger,
 }
 
 /// The authority and its list, as those that trust it are to have them.

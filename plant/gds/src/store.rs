@@ -50,7 +50,7 @@ pub(crate) enum StoreFault {
     Open(PathBuf),
     #[error("no certificate that was issued here has the number {0} (`ua-gds ca list`)")]
     Unknown(String),
-    #[error("no key can be made: {0}")]
+    #[error("no key can be made or read: {0}")]
     Key(String),
     #[error("what is asked for cannot be issued: {0}")]
     Request(Unfit),
@@ -132,6 +132,11 @@ impl Store {
 
     pub(crate) const fn certificate(&self) -> &Certificate {
         self.authority.certificate()
+    }
+
+    /// The folder of the authority.
+    pub(crate) fn folder(&self) -> &Path {
+        &self.folder
     }
 
     /// Issues what is asked for, from now on and for that long.

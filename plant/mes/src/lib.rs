@@ -28,6 +28,7 @@ use bridge_node::{
 };
 use knowledge::{Endpoint, Knowledge, Limits};
 use mappings::{Mapping, SpaceId};
+use plant_opcua::enrolment::GdsArguments;
 use skills::yaml::Place;
 use skills::{
     ClientOptions, Component, DriverSetup, Lds, LocalRun, Owner, Runs as _, Security, Skill,
@@ -66,6 +67,8 @@ struct UaMes {
     /// The certificate store: own, private, trusted and rejected under one directory
     #[arg(long, value_name = "DIR", env = "UA_PKI")]
     pki: Option<PathBuf>,
+    #[command(flatten)]
+    gds: GdsArguments,
     /// Trust every client certificate, and keep it as trusted. For tests and demonstrations only
     #[arg(long)]
     trust_any_client_certificate: bool,
@@ -121,7 +124,8 @@ impl UaMes {
         let knowledge = Arc::new(knowledge);
         let options = self.options(&settings);
         let client = ClientOptions {
-            application_uri: format!("{}:client", settings.application_uri),
+            // The ApplicationUri of the certificate: servers refuse a session with another one.
+            application_uri: settings.application_uri.clone(),
             application_name: format!("{} client", settings.name),
             pki: options.pki.clone(),
             within: WITHIN,
@@ -189,13 +193,15 @@ impl UaMes {
     }
 
     fn options(&self, settings: &Settings) -> Options {
-        let secured = settings.security.contains(&Security::Basic256Sha256);
+        let is_secured =
+            self.gds.gds.is_some() || settings.security.contains(&Security::Basic256Sha256);
         let usual = || self.pki_root(settings);
         Options {
-            pki: self.pki.clone().or_else(|| secured.then(usual)),
+            pki: self.pki.clone().or_else(|| is_secured.then(usual)),
             trust_any_client: self.trust_any_client_certificate,
             mdns: Some(self.interface()),
             capabilities: vec!["DA".to_owned()],
+            gds: None,
             source: None,
         }
     }
@@ -296,7 +302,13 @@ impl Program for UaMes {
     async fn start(&self, _context: Context) -> Result<ComponentPort, Failure> {
         let ready = self.ready()?;
         self.serve(ready).await?;
-        let port = ComponentPort::start(&ready.component, &ready.options)?;
+        let gds = self.gds.invitation();
+        let gds = gds.map_err(|fault| Failure::new(FailureKind::Usage, fault.to_string()))?;
+        let options = Options {
+            gds,
+            ..ready.options.clone()
+        };
+        let port = ComponentPort::start(&ready.component, &options)?;
         if let (Some(iri), Some(skill)) = (&self.run, port.skills().first()) {
             drop(tokio::spawn(run_process(skill.clone(), iri.clone())));
         }

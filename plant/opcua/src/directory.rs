@@ -47,6 +47,22 @@ pub struct ApplicationRecord {
     pub server_capabilities: Option<Vec<UAString>>,
 }
 
+impl ApplicationRecord {
+    /// Compares all but the ApplicationId and the locales of the names.
+    fn says_the_same(&self, other: &Self) -> bool {
+        let names = |one: &Self| -> Vec<UAString> {
+            let names = one.application_names.iter().flatten();
+            names.map(|name| name.text.clone()).collect()
+        };
+        self.application_uri == other.application_uri
+            && self.application_type == other.application_type
+            && names(self) == names(other)
+            && self.product_uri.as_ref() == other.product_uri.as_ref()
+            && self.discovery_urls == other.discovery_urls
+            && self.server_capabilities == other.server_capabilities
+    }
+}
+
 impl ExpandedMessageInfo for ApplicationRecord {
     fn full_type_id(&self) -> ExpandedNodeId {
         ExpandedNodeId::new_with_namespace(NAMESPACE, BINARY)
@@ -136,11 +152,11 @@ impl Directory {
         called.map_err(|error| DirectoryError::Call { method, error })
     }
 
-    /// The ApplicationId of an application: it is registered where it is not yet.
+    /// Returns the ApplicationId of an application. It is registered if it is not, and updated if its record differs.
     ///
     /// # Errors
     /// The server does not say.
-    pub async fn registered(&self, record: ApplicationRecord) -> Result<NodeId, DirectoryError> {
+    pub async fn registered(&self, record: &ApplicationRecord) -> Result<NodeId, DirectoryError> {
         let uri = Variant::String(record.application_uri.clone());
         let found = self.call(FIND_APPLICATIONS, vec![uri]).await?;
         let Some(Variant::Array(found)) = found.into_iter().next() else {
@@ -153,9 +169,20 @@ impl Directory {
             object.into_inner_as::<ApplicationRecord>()
         });
         if let Some(known) = known {
-            return Ok(known.application_id);
+            let wanted = ApplicationRecord {
+                application_id: known.application_id.clone(),
+                ..record.clone()
+            };
+            if known.says_the_same(&wanted) {
+                return Ok(wanted.application_id);
+            }
+            let updated = Variant::from(ExtensionObject::from_message(wanted));
+            // An application that is not known here by its certificate yet registers as a new one.
+            if self.call(UPDATE_APPLICATION, vec![updated]).await.is_ok() {
+                return Ok(known.application_id.clone());
+            }
         }
-        let record = Variant::from(ExtensionObject::from_message(record));
+        let record = Variant::from(ExtensionObject::from_message(record.clone()));
         let registered = self.call(REGISTER_APPLICATION, vec![record]).await?;
         match registered.into_iter().next() {
             Some(Variant::NodeId(id)) => Ok(*id),
@@ -163,47 +190,58 @@ impl Directory {
         }
     }
 
-    /// The certificate that an authority issues for a signing request, and the certificates of those above it.
+    /// Requests a certificate, and returns the number of the request.
     ///
     /// # Errors
-    /// None is issued.
-    pub async fn issued(
+    /// The server refuses the request.
+    pub async fn requested(
         &self,
         application: &NodeId,
         request: &Request,
-    ) -> Result<(Certificate, Vec<Certificate>), DirectoryError> {
-        let (application, any) = (Variant::from(application.clone()), NodeId::null());
+    ) -> Result<NodeId, DirectoryError> {
+        let any = NodeId::null();
         let request = Variant::ByteString(ByteString::from(request.der().to_vec()));
         let arguments = vec![
-            application.clone(),
+            Variant::from(application.clone()),
             Variant::from(any.clone()),
             Variant::from(any),
             request,
         ];
         let number = self.call(START_SIGNING_REQUEST, arguments).await?;
-        let number = number.into_iter().next();
-        let number = number.ok_or(DirectoryError::Answer("StartSigningRequest"))?;
-        let finished = self.call(FINISH_REQUEST, vec![application, number]).await?;
-        let read = |bytes: &Variant| {
-            let Variant::ByteString(bytes) = bytes else {
-                return None;
-            };
-            Certificate::read(bytes.value.as_deref()?).ok()
-        };
+        match number.into_iter().next() {
+            Some(Variant::NodeId(number)) => Ok(*number),
+            _ => Err(DirectoryError::Answer("StartSigningRequest")),
+        }
+    }
+
+    /// Returns the certificate that an authority issued for a request, and the certificates of the authorities above it.
+    ///
+    /// # Errors
+    /// None is issued; BadRequestNotComplete while the server has not decided.
+    pub async fn finished(
+        &self,
+        application: &NodeId,
+        number: &NodeId,
+    ) -> Result<(Certificate, Vec<Certificate>), DirectoryError> {
+        let arguments = vec![
+            Variant::from(application.clone()),
+            Variant::from(number.clone()),
+        ];
+        let finished = self.call(FINISH_REQUEST, arguments).await?;
         let odd = || DirectoryError::Answer("FinishRequest");
-        let certificate = finished.first().and_then(read).ok_or_else(odd)?;
+        let certificate = finished.first().and_then(certificate).ok_or_else(odd)?;
         let above = match finished.get(2) {
-            Some(Variant::Array(all)) => all.values.iter().filter_map(read).collect(),
+            Some(Variant::Array(all)) => all.values.iter().filter_map(self::certificate).collect(),
             _ => Vec::new(),
         };
         Ok((certificate, above))
     }
 
-    /// The revocation lists in the trust list of an application.
+    /// Returns the trust list of an application.
     ///
     /// # Errors
     /// The list cannot be read.
-    pub async fn revocation_lists(&self, application: &NodeId) -> Result<Vec<Crl>, DirectoryError> {
+    pub async fn trust_lists(&self, application: &NodeId) -> Result<TrustLists, DirectoryError> {
         let arguments = vec![
             Variant::from(application.clone()),
             Variant::from(NodeId::null()),
@@ -216,9 +254,18 @@ impl Directory {
         let context = ContextOwned::default();
         let read = TrustListDataType::decode(&mut bytes.as_slice(), &context.context());
         let read = read.map_err(|_| DirectoryError::Answer("the trust list"))?;
+        let certificates = |all: Option<Vec<ByteString>>| {
+            let each = all.into_iter().flatten().filter_map(|bytes| bytes.value);
+            each.filter_map(|bytes| Certificate::read(&bytes).ok())
+                .collect()
+        };
         let lists = read.trusted_crls.into_iter().chain(read.issuer_crls);
         let each = lists.flatten().filter_map(|bytes| bytes.value);
-        Ok(each.filter_map(|bytes| Crl::read(&bytes).ok()).collect())
+        Ok(TrustLists {
+            trusted: certificates(read.trusted_certificates),
+            issuers: certificates(read.issuer_certificates),
+            revocation_lists: each.filter_map(|bytes| Crl::read(&bytes).ok()).collect(),
+        })
     }
 
     /// The content of a file object, which is closed afterwards (OPC 10000-20, 4.2).
@@ -267,10 +314,29 @@ impl Directory {
     }
 }
 
+/// The trust list of an application (OPC 10000-12, 7.8.2.7).
+#[derive(Debug, Clone, Default)]
+pub struct TrustLists {
+    /// Certificates that are trusted: of applications, and of authorities with all that they have issued.
+    pub trusted: Vec<Certificate>,
+    /// Authorities between.
+    pub issuers: Vec<Certificate>,
+    /// Revocation lists of both.
+    pub revocation_lists: Vec<Crl>,
+}
+
+fn certificate(bytes: &Variant) -> Option<Certificate> {
+    let Variant::ByteString(bytes) = bytes else {
+        return None;
+    };
+    Certificate::read(bytes.value.as_deref()?).ok()
+}
+
 /// Nodes of the Directory object of every Global Discovery Server.
 const DIRECTORY: u32 = 141;
 const FIND_APPLICATIONS: (u32, &str) = (143, "FindApplications");
 const REGISTER_APPLICATION: (u32, &str) = (146, "RegisterApplication");
+const UPDATE_APPLICATION: (u32, &str) = (200, "UpdateApplication");
 const START_SIGNING_REQUEST: (u32, &str) = (157, "StartSigningRequest");
 const FINISH_REQUEST: (u32, &str) = (163, "FinishRequest");
 const GET_TRUST_LIST: (u32, &str) = (204, "GetTrustList");

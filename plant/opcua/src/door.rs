@@ -44,6 +44,18 @@ pub struct Door {
     shared: Arc<Shared>,
 }
 
+/// The rule for clients whose sound certificate is not trusted, nor its authority.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum UnknownClients {
+    /// The channel is refused, and the certificate is kept in `rejected`.
+    #[default]
+    Refuse,
+    /// The channel is opened. The server itself decides what such clients may do, by [`Caller::certificate`].
+    ///
+    /// [`Caller::certificate`]: crate::server::Caller::certificate
+    Admit,
+}
+
 /// Where the library finds what it needs behind a door.
 #[derive(Debug, Clone)]
 pub struct Behind {
@@ -78,6 +90,7 @@ impl Behind {
 struct Shared {
     root: PathBuf,
     behind: Behind,
+    unknown: UnknownClients,
     /// Where the server listens.
     inner: SocketAddr,
     known: RwLock<Arc<Known>>,
@@ -99,6 +112,7 @@ impl Door {
     pub fn of(
         root: &Path,
         clients: ClientLimits,
+        unknown: UnknownClients,
     ) -> io::Result<Option<(Self, std::net::TcpListener)>> {
         if !known::trusts_authorities(root) {
             return Ok(None);
@@ -129,6 +143,7 @@ impl Door {
             known: RwLock::new(Arc::new(known::read(&root))),
             root,
             behind,
+            unknown,
             inner: listener.local_addr()?,
             admitted: Mutex::default(),
             changes: watch::Sender::new(0),
@@ -282,7 +297,15 @@ impl Shared {
 
     fn judge(&self, (certificate, sent): &Shown) -> Result<(), Fault> {
         let known = Arc::clone(&self.known.read());
-        trust::check(certificate, sent, &known, known::now())
+        let checked = trust::check(certificate, sent, &known, known::now());
+        match (checked, self.unknown) {
+            (Err(Fault::Untrusted | Fault::Incomplete), UnknownClients::Admit) => {
+                let mut known = known;
+                Arc::make_mut(&mut known).trusted.push(certificate.clone());
+                trust::check(certificate, sent, &known, known::now())
+            }
+            (checked, _) => checked,
+        }
     }
 
     /// Has the library trust a certificate, if it is to be trusted.

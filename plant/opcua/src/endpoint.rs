@@ -48,6 +48,19 @@ impl EndpointUrl {
         hosts
     }
 
+    /// Returns a URL for each of the [hosts](Self::hosts), with the port that is listened on.
+    #[must_use]
+    pub fn urls(&self, port: u16) -> Vec<String> {
+        let url = |host: &String| {
+            let host = match host.contains(':') {
+                true => format!("[{host}]"),
+                false => host.clone(),
+            };
+            format!("opc.tcp://{host}:{port}{}", self.path)
+        };
+        self.hosts().iter().map(url).collect()
+    }
+
     /// The path of the URL, `/` at least.
     #[must_use]
     pub fn path(&self) -> &str {
@@ -58,6 +71,12 @@ impl EndpointUrl {
     #[must_use]
     pub fn host(&self) -> &str {
         self.host.trim_matches(['[', ']'])
+    }
+
+    /// The port as it is written; 0 is any free one.
+    #[must_use]
+    pub const fn port(&self) -> u16 {
+        self.port
     }
 
     /// Host and port, as they are connected to.

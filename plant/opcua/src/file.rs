@@ -250,6 +250,7 @@ pub(crate) mod tests {
                 application_uri: String::new(),
                 proven: false,
                 encrypted: true,
+                certificate: None,
             },
             presence: Presence::while_(lasts),
             object: NodeId::null(),

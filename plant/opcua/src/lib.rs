@@ -1,9 +1,9 @@
 //! OPC UA for the programs of the plant: servers whose address space is made of NodeSets and of instances of their
 //! types, and clients that come back by themselves. It knows no skills, no discovery, no space and no ROS.
 //!
-//! Reading order: `limits` (the bounds of both sides), `endpoint`, `pair` and `pki`, `certificates`, `known`, `judge` and `door` (who gets
+//! Reading order: `limits` (the bounds of both sides), `endpoint`, `pair`, `own` and `pki`, `certificates`, `known`, `judge` and `door` (who gets
 //! in), `nodeset` (types from files), `users`, `supervision`, `audit` and `changes`, `server` and `client`, `file`, `trust_file`, `directory` and
-//! `configuration` (a server's certificates as clients manage them, and as it renews them itself).
+//! `configuration` (a server's certificates as clients manage them), `enrolment` (as a Global Discovery Server issues them).
 
 #[cfg(feature = "server")]
 pub mod audit;
@@ -19,12 +19,15 @@ pub mod directory;
 pub mod door;
 pub mod endpoint;
 #[cfg(feature = "server")]
+pub mod enrolment;
+#[cfg(feature = "server")]
 pub mod file;
 pub mod judge;
 pub mod known;
 pub mod limits;
 #[cfg(feature = "server")]
 pub mod nodeset;
+pub mod own;
 mod pair;
 #[cfg(feature = "server")]
 pub mod patches;

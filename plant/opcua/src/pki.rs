@@ -4,14 +4,13 @@ use std::collections::BTreeSet;
 use std::fs::{self, File};
 use std::io;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
 
 use opcua::crypto::{CertificateStore, PrivateKey, X509, X509Data};
-use tracing::{info, warn};
-use trust::Certificate;
+use tracing::warn;
 
 use crate::certificates::{self, REJECTED_KEPT, Standing};
 use crate::known;
+use crate::own::{self, Cause, Owner};
 use crate::pair::{self, PairFiles};
 
 /// The directories of an OPC UA certificate store: `own`, `private`, `trusted` and `rejected` under one root.
@@ -49,6 +48,15 @@ pub enum PkiError {
     /// A new pair cannot be made or written.
     #[error("no certificate could be made: {0}")]
     Make(String),
+    /// There is no certificate that could be made anew.
+    #[error("there is no certificate in {0}: the program of the store makes it when it starts")]
+    None(PathBuf),
+    /// The certificate is one of an authority.
+    #[error(
+        "the certificate was issued by {0:?}, which other applications trust: have it renewed there (--gds), or give --self-made \
+         to replace it by a self-made one"
+    )]
+    Issued(String),
 }
 
 impl Pki {
@@ -87,16 +95,19 @@ impl Pki {
     }
 
     /// Makes the application instance certificate and its key when neither is there, naming the application and
-    /// the hosts it is reached under (OPC 10000-6, 6.2.2), and warns when those there do not fit any more. Of several
-    /// servers that start at once in one store the first makes the pair, and the others take it.
+    /// the hosts it is reached under (OPC 10000-6, 6.2.2), and makes a self-made certificate anew that has expired. Warns if
+    /// the certificate does not fit otherwise. Of several servers that start at once in one store the first makes the pair,
+    /// and the others take it. For a client, which may share the store of a server.
     ///
     /// # Errors
     /// Files that cannot be read or written, or half a pair.
     pub fn ensure_own(&self, application_uri: &str, host: &str) -> Result<(), PkiError> {
-        self.ensure_own_at(application_uri, &[host.to_owned()])
+        let hosts = [host.to_owned()];
+        self.ensure((application_uri, Owner::Client), &hosts, NAME)
     }
 
-    /// The same, for an application that is reached under several hosts.
+    /// The same for a server that is reached under several hosts. A self-made certificate of another ApplicationUri is made
+    /// anew too.
     ///
     /// # Errors
     /// Files that cannot be read or written, or half a pair.
@@ -104,13 +115,22 @@ impl Pki {
         self.ensure_own_named(application_uri, hosts, NAME)
     }
 
-    /// The same, for an application of that name.
+    /// The same, for a server of that name.
     ///
     /// # Errors
     /// Files that cannot be read or written, or half a pair.
     pub fn ensure_own_named(
         &self,
         application_uri: &str,
+        hosts: &[String],
+        name: &str,
+    ) -> Result<(), PkiError> {
+        self.ensure((application_uri, Owner::Server), hosts, name)
+    }
+
+    fn ensure(
+        &self,
+        application: (&str, Owner),
         hosts: &[String],
         name: &str,
     ) -> Result<(), PkiError> {
@@ -122,38 +142,54 @@ impl Pki {
             source,
         })?;
         let now = known::now();
-        let data = certificate_data(application_uri, hosts, name, now);
+        let data = own::described(application.0, hosts, name, now);
         match files {
             PairFiles::Both => {
-                if is_made_too_early(&certificate, now) {
-                    self.replace_expired(&data, &certificate, &key)?;
+                let known = own::read(&self.root);
+                match known.and_then(|known| own::outdated(&known, application, now)) {
+                    Some(cause) => self.make_anew(&data, &cause),
+                    None => check_own(&certificate, &key, application.0),
                 }
-                check_own(&certificate, &key, application_uri)
             }
             PairFiles::Certificate => self.replace_without_key(&data, certificate, key),
             PairFiles::Key => self.certify_key(&data, certificate, key),
-            PairFiles::Neither => {
-                self.make_own(&data, None)?;
-                info!(certificate = %certificate.display(), application_uri, "made the application's own certificate");
-                Ok(())
-            }
+            PairFiles::Neither => self.make_own(&data, None, &Cause::Missing),
         }
     }
 
-    /// Makes a new certificate for the key of one that expired because the clock was not set when it was made.
-    fn replace_expired(
-        &self,
-        data: &X509Data,
-        certificate: &Path,
-        key: &Path,
-    ) -> Result<(), PkiError> {
-        let key = CertificateStore::read_pkey(key).map_err(PkiError::Unreadable)?;
-        self.make_own(data, Some(key))?;
-        warn!(
-            certificate = %certificate.display(),
-            "replaced the own certificate: it was made before the clock was set, and has expired. \
-             Applications that trust the old certificate have to trust the new one"
-        );
+    /// Makes the self-made certificate anew by command, for the same key, ApplicationUri and hosts. With `even_issued` a
+    /// certificate of an authority is replaced too.
+    ///
+    /// # Errors
+    /// There is none, it is one of an authority, or files cannot be read or written.
+    pub fn renew(&self, even_issued: bool) -> Result<(), PkiError> {
+        let _alone = self.lock()?;
+        let Some(known) = own::read(&self.root) else {
+            return Err(PkiError::None(self.root.clone()));
+        };
+        if !known.is_self_signed() && !even_issued {
+            return Err(PkiError::Issued(known.issuer_name()));
+        }
+        let (uri, name) = (known.application_uri().unwrap_or_default(), known.name());
+        let name = if own::is_self_made(&known) {
+            &name
+        } else {
+            NAME
+        };
+        let computer = opcua::crypto::hostname().unwrap_or_default();
+        let mut hosts = known.hosts();
+        // A certificate for the computer itself has these names anyway.
+        hosts.retain(|host| *host != computer && host != "localhost");
+        let data = own::described(&uri, &hosts, name, known::now());
+        self.make_anew(&data, &Cause::Command)
+    }
+
+    /// Makes a new certificate for the key that is there.
+    fn make_anew(&self, data: &X509Data, cause: &Cause) -> Result<(), PkiError> {
+        let key = CertificateStore::read_pkey(&self.root.join(OWN_KEY));
+        let key = key.map_err(PkiError::Unreadable)?;
+        self.make_own(data, Some(key), cause)?;
+        warn!("applications that trust the previous certificate have to trust the new one");
         Ok(())
     }
 
@@ -166,7 +202,7 @@ impl Pki {
         certificate: PathBuf,
         key: PathBuf,
     ) -> Result<(), PkiError> {
-        if !is_self_made(&certificate) {
+        if !own::read(&self.root).is_some_and(|one| own::is_self_made(&one)) {
             return Err(PkiError::Half {
                 present: certificate,
                 missing: key,
@@ -177,12 +213,8 @@ impl Pki {
             path: certificate.clone(),
             source,
         })?;
-        self.make_own(data, None)?;
-        warn!(
-            certificate = %certificate.display(), aside = %aside.display(),
-            "made a new own certificate and key: the key of the old certificate was missing"
-        );
-        Ok(())
+        warn!(aside = %aside.display(), "the previous certificate has no key, and is kept aside");
+        self.make_own(data, None, &Cause::KeyMissing)
     }
 
     /// Makes the certificate of a key whose certificate is missing.
@@ -198,16 +230,16 @@ impl Pki {
                 missing: certificate,
             });
         };
-        self.make_own(data, Some(known))?;
-        warn!(
-            certificate = %certificate.display(),
-            "made a new own certificate: the certificate of the key was missing"
-        );
-        Ok(())
+        self.make_own(data, Some(known), &Cause::CertificateMissing)
     }
 
     /// Makes the pair, or a certificate for a key that is there.
-    fn make_own(&self, data: &X509Data, key: Option<PrivateKey>) -> Result<(), PkiError> {
+    fn make_own(
+        &self,
+        data: &X509Data,
+        key: Option<PrivateKey>,
+        cause: &Cause,
+    ) -> Result<(), PkiError> {
         let made = |error: &dyn std::fmt::Display| PkiError::Make(error.to_string());
         let (certificate, new_key) = match key {
             Some(key) => (X509::from_pkey(&key, data).map_err(PkiError::Make)?, None),
@@ -220,7 +252,9 @@ impl Pki {
         let key = new_key.map(|key| key.to_der()).transpose();
         let key = key.map_err(|error| made(&error))?;
         let key = key.as_ref().map(|key| key.as_bytes());
-        pair::write(&self.root, &der, key).map_err(|error| made(&error))
+        pair::write(&self.root, &der, key).map_err(|error| made(&error))?;
+        own::report(&self.root, cause);
+        Ok(())
     }
 
     /// Waits until no other server is making its certificate here, and keeps others from it until the file is dropped.
@@ -296,6 +330,12 @@ pub fn default_root(variable: impl Fn(&str) -> Option<String>) -> PathBuf {
     state.join("ua-bridge/pki")
 }
 
+/// Returns the store of that name beside the usual one, for a program that shares its host with others.
+#[must_use]
+pub fn default_named(name: &str) -> PathBuf {
+    default_root(|variable| std::env::var(variable).ok()).with_file_name(name)
+}
+
 /// Lets certificates in `trusted` of the store at `root` be trusted that people put there, whatever they called the file: the
 /// library looks them up by a name of its own, and holds those in `rejected` for refused even so.
 pub fn know_trusted(root: &Path) {
@@ -329,66 +369,6 @@ fn remove(refused: &Path) {
     }
 }
 
-/// Returns whether a certificate is one that this project makes for itself, which no authority has issued.
-fn is_self_made(certificate: &Path) -> bool {
-    let read = fs::read(certificate).ok();
-    let read = read.and_then(|bytes| Certificate::read(&bytes).ok());
-    read.is_some_and(|certificate| {
-        certificate.is_self_signed() && certificate.name().contains(ORGANIZATION)
-    })
-}
-
-/// Returns whether a self-made certificate has expired that was made while the clock was not set.
-fn is_made_too_early(certificate: &Path, now: Duration) -> bool {
-    let read = fs::read(certificate).ok();
-    let Some(read) = read.and_then(|bytes| Certificate::read(&bytes).ok()) else {
-        return false;
-    };
-    is_too_early(read.validity(), now) && is_self_made(certificate)
-}
-
-fn is_too_early((from, until): (Duration, Duration), now: Duration) -> bool {
-    from < PLAUSIBLE && until <= now
-}
-
-/// The number of days for which a certificate is valid that is made now. One that is made while the clock is not set is valid
-/// from then on, and for the usual time from the first plausible day.
-fn days_from(now: Duration) -> u32 {
-    let early = PLAUSIBLE.saturating_sub(now).as_secs() / 86_400;
-    CERTIFICATE_DAYS.saturating_add(u32::try_from(early).unwrap_or_default())
-}
-
-fn certificate_data(
-    application_uri: &str,
-    hosts: &[String],
-    name: &str,
-    now: Duration,
-) -> X509Data {
-    let mut addresses: Vec<String> = Vec::new();
-    for host in hosts.iter().map(String::as_str).chain(["127.0.0.1", "::1"]) {
-        if !addresses.iter().any(|one| one == host) {
-            addresses.push(host.to_owned());
-        }
-    }
-    X509Data {
-        key_size: 2048,
-        common_name: name.to_owned(),
-        organization: ORGANIZATION.to_owned(),
-        organizational_unit: ORGANIZATION.to_owned(),
-        country: "XX".to_owned(),
-        state: "-".to_owned(),
-        // Without the addresses of the computer's name: they are asked of a name service, which may not answer.
-        alt_host_names: X509Data::alt_host_names(
-            application_uri,
-            Some(addresses),
-            true,
-            true,
-            false,
-        ),
-        certificate_duration_days: days_from(now),
-    }
-}
-
 fn check_own(certificate: &Path, key: &Path, application_uri: &str) -> Result<(), PkiError> {
     let own = CertificateStore::read_cert(certificate).map_err(PkiError::Unreadable)?;
     CertificateStore::read_pkey(key).map_err(PkiError::Unreadable)?;
@@ -396,7 +376,8 @@ fn check_own(certificate: &Path, key: &Path, application_uri: &str) -> Result<()
         warn!(
             certificate = %certificate.display(),
             application_uri,
-            "the certificate names another application: clients will refuse it; remove it and its key for a new pair",
+            "the certificate names another application: peers will refuse it; have one issued for this application (--gds), or \
+             `ua-server renew --self-made` and restart",
         );
     }
     let now = opcua::types::DateTime::now().as_chrono();
@@ -428,17 +409,13 @@ pub const OWN_KEY: &str = "private/private.pem";
 pub(crate) const NO_PKI: &str = "/dev/null/pki";
 /// Held while the pair is looked for and made.
 const LOCK: &str = "private/lock";
-/// Five years, as other stacks make them: clients trust this very file, so a new one is work for people.
-const CERTIFICATE_DAYS: u32 = 1826;
 /// The common name of an application without a name of its own.
 const NAME: &str = "UA bridge";
-const ORGANIZATION: &str = "UA bridge";
-/// The first day that a clock can show: 2026-01-01, before this version was made.
-const PLAUSIBLE: Duration = Duration::from_secs(1_767_225_600);
 
 #[cfg(test)]
 mod tests {
     use opcua::crypto::SecurityPolicy;
+    use trust::Certificate;
 
     use super::*;
 
@@ -607,32 +584,29 @@ mod tests {
     }
 
     #[test]
-    fn a_certificate_made_in_1970_is_valid_once_the_clock_is_set() {
-        let day = Duration::from_secs(86_400);
-        let until = |now: Duration| now + day * days_from(now);
-        assert_eq!(days_from(PLAUSIBLE + day), CERTIFICATE_DAYS);
-        assert!(until(day) >= PLAUSIBLE + day * (CERTIFICATE_DAYS - 1));
-    }
-
-    #[test]
-    fn a_certificate_of_1970_that_has_expired_is_to_be_made_anew() {
-        let year = Duration::from_secs(365 * 86_400);
-        let now = PLAUSIBLE + year;
-        assert!(is_too_early((Duration::ZERO, year * 5), now));
-        assert!(!is_too_early((Duration::ZERO, now + year), now));
-        assert!(!is_too_early((PLAUSIBLE, PLAUSIBLE + year / 2), now));
-        let root = scratch("self-made");
+    fn a_certificate_of_another_application_is_made_anew_for_a_server_and_by_command() {
+        let root = scratch("anew");
         let pki = Pki::open(root.clone()).unwrap();
+        let read = || own::read(&root).unwrap();
         pki.ensure_own("urn:a", "localhost").unwrap();
-        let path = root.join(OWN_CERTIFICATE);
-        assert!(is_self_made(&path));
-        let before = Certificate::read(&fs::read(&path).unwrap()).unwrap();
-        let key = CertificateStore::read_pkey(&root.join(OWN_KEY)).unwrap();
-        let data = certificate_data("urn:a", &["other".to_owned()], NAME, known::now());
-        pki.make_own(&data, Some(key)).unwrap();
-        let after = Certificate::read(&fs::read(&path).unwrap()).unwrap();
-        assert_ne!(before.der(), after.der());
-        pki.ensure_own("urn:a", "localhost").unwrap();
+        let first = read();
+        pki.ensure_own("urn:b", "localhost").unwrap();
+        assert_eq!(read(), first, "a client of the store replaces nothing");
+        let hosts = ["other".to_owned()];
+        pki.ensure_own_at("urn:b", &hosts).unwrap();
+        let second = read();
+        assert_eq!(second.application_uri().as_deref(), Some("urn:b"));
+        assert_eq!(second.key_fingerprint(), first.key_fingerprint());
+        pki.ensure_own_at("urn:b", &hosts).unwrap();
+        assert_eq!(read(), second);
+        pki.renew(false).unwrap();
+        // Within the same second the certificate has the same bytes.
+        let third = read();
+        assert_eq!(third.application_uri().as_deref(), Some("urn:b"));
+        assert!(third.is_for_host("other"));
+        assert_eq!(third.hosts().len(), second.hosts().len());
+        let said = own::status(&root).unwrap();
+        assert_eq!(said["reason"], Cause::Command.to_string());
         fs::remove_dir_all(root).unwrap();
     }
 

@@ -97,6 +97,7 @@ mod tests {
             application_uri: uri.to_owned(),
             proven,
             encrypted,
+            certificate: None,
         }
     }
 

@@ -142,6 +142,7 @@ mod tests {
             application_uri: "urn:b".to_owned(),
             proven,
             encrypted: true,
+            certificate: None,
         };
         let denied = Err(StatusCode::BadUserAccessDenied);
         assert_eq!(

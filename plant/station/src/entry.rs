@@ -6,10 +6,12 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use bridge_node::{Failure, LogFormat, Service, run_service, serve_pages};
+use bridge_node::{Failure, FailureKind, LogFormat, Service, run_service, serve_pages};
 use discovery::lds::LdsSettings;
 use discovery::{DEFAULT_LDS, Interface};
 use plant_opcua::client::HostNames;
+use plant_opcua::enrolment::GdsArguments;
+use plant_opcua::pki::default_named;
 use plant_opcua::server::EndpointUrl;
 use plant_opcua::users::{Role, Roles};
 use registry::hierarchy::{Choice, Place};
@@ -74,6 +76,8 @@ struct UaStation {
     /// The certificate store, for secured channels (Basic256Sha256): own, private, trusted and rejected under one directory
     #[arg(long, value_name = "DIR", env = "UA_PKI")]
     pki: Option<PathBuf>,
+    #[command(flatten)]
+    gds: GdsArguments,
     /// Trust every certificate. For tests and demonstrations only
     #[arg(long, requires = "pki")]
     trust_any_certificate: bool,
@@ -116,13 +120,20 @@ impl Service for UaStation {
     async fn serve(self, stop: impl Future<Output = ()> + Send + 'static) -> Result<(), Failure> {
         let pages = serve_pages(self.metrics).await?;
         let interface = self.interface.as_deref().map(Interface::parse);
+        let gds = self.gds.invitation();
+        let gds = gds.map_err(|fault| Failure::new(FailureKind::Usage, fault.to_string()))?;
+        // A certificate of the plant needs a store.
+        let usual = || {
+            gds.as_ref()
+                .map(|_| default_named(&format!("pki-ua-station-{}", self.name)))
+        };
         let lds = LdsSettings {
             interface: interface
                 .unwrap_or(Interface::LOOPBACK)
                 .with_networks(self.networks.iter().copied()),
             allow_unsecured: self.allow_unsecured,
             register_every: Duration::from_secs(self.register_period.into()),
-            pki: self.pki,
+            pki: self.pki.or_else(usual),
             trust_any: self.trust_any_certificate,
             ..LdsSettings::at(self.endpoint)
         };
@@ -142,6 +153,7 @@ impl Service for UaStation {
                 true => HostNames::Refuse,
                 false => HostNames::Warn,
             },
+            gds,
             name: self.name,
             place: self.place,
             lds,

@@ -12,6 +12,7 @@ use discovery::{
     announce, find_lds, watch as watch_level,
 };
 use plant_opcua::client::{ClientConfig, HostNames, SecurityChoice};
+use plant_opcua::enrolment::{Applicant, Enrolment, Invitation};
 use plant_opcua::pki::Pki;
 use plant_opcua::server::{EndpointUrl, MethodRequest, MethodSpec, Refusal, ServerError, method};
 use plant_opcua::supervision::{CONFIGURE, Supervision, configure_takes};
@@ -46,6 +47,8 @@ pub struct StationSettings {
     pub anonymous: Roles,
     /// The rule for servers at hosts that their trusted certificates do not name.
     pub host_names: HostNames,
+    /// The Global Discovery Server that issues its certificate. Needs the store of `lds`.
+    pub gds: Option<Invitation>,
 }
 
 /// The level above.
@@ -94,6 +97,7 @@ pub async fn run(
         Some(upper) => Some(common.open(upper, &place, &mut levels)?),
         None => None,
     };
+    levels.enrolled = enrol(&settings, &uri, faces.as_ref());
     let (tell, events) = mpsc::channel(MOST_EVENTS);
     let tending = Tending {
         level: Level::Below,
@@ -227,6 +231,8 @@ impl Drop for Abort {
 /// What runs beside the discovery server.
 #[derive(Default)]
 struct Levels {
+    /// Keeps the certificate current.
+    enrolled: Option<Abort>,
     above: Option<Abort>,
     below: Option<Abort>,
     announced: Vec<Announced>,
@@ -236,7 +242,7 @@ struct Levels {
 
 impl Levels {
     async fn leave(self) {
-        drop((self.above, self.below));
+        drop((self.above, self.below, self.enrolled));
         if let Some((stop, task)) = self.registered {
             drop(stop);
             drop(tokio::time::timeout(LEAVE_LIMIT, task).await);
@@ -263,6 +269,33 @@ fn certificates(settings: &StationSettings, uri: &str) -> Result<Option<PathBuf>
     let pki = Pki::open(root.clone()).map_err(failed)?;
     pki.ensure_own_at(uri, &hosts).map_err(failed)?;
     Ok(Some(root.clone()))
+}
+
+/// Keeps the certificate of the station current at the Global Discovery Server, for the addresses of all its interfaces.
+fn enrol(settings: &StationSettings, uri: &str, faces: Option<&Faces>) -> Option<Abort> {
+    let (root, gds) = (settings.lds.pki.as_ref()?, settings.gds.clone()?);
+    let faces = faces
+        .into_iter()
+        .flat_map(|faces| [&faces.above, &faces.below]);
+    let mut urls: Vec<String> = faces.map(|face| face.server.url().to_owned()).collect();
+    if let Ok(lds) = settings.lds.endpoint.parse::<EndpointUrl>() {
+        let port = lds.port();
+        urls.extend(lds.urls(port));
+        let addresses = settings.lds.interface.addresses().into_iter();
+        urls.extend(addresses.map(|address| format!("opc.tcp://{address}:{port}")));
+    }
+    urls.sort();
+    urls.dedup();
+    let applicant = Applicant {
+        application_uri: uri.to_owned(),
+        name: settings.name.clone(),
+        product_uri: "urn:ua-bridge:station".to_owned(),
+        urls,
+        capabilities: vec!["LDS".to_owned()],
+    };
+    let enrolment = Enrolment::new(root, applicant, gds);
+    let kept = tokio::spawn(enrolment.keep(bridge_node::restart));
+    Some(Abort(kept.abort_handle()))
 }
 
 fn open_below(

@@ -17,7 +17,7 @@ use x509_cert::ext::pkix::{BasicConstraints, ExtendedKeyUsage, KeyUsage, Subject
 use x509_cert::name::{Name, RelativeDistinguishedName};
 use x509_cert::spki::AlgorithmIdentifierOwned;
 
-use crate::Unfit;
+use crate::{Fingerprint, Unfit};
 
 /// The number that an authority has given a certificate: unlike those of all others of that authority.
 #[derive(Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -132,6 +132,18 @@ impl Certificate {
     #[must_use]
     pub fn der(&self) -> &[u8] {
         &self.der
+    }
+
+    /// Returns the SHA-256 of the DER.
+    #[must_use]
+    pub fn fingerprint(&self) -> Fingerprint {
+        Fingerprint::of(&self.der)
+    }
+
+    /// Returns the SHA-256 of the public key.
+    #[must_use]
+    pub fn key_fingerprint(&self) -> Fingerprint {
+        Fingerprint::of_key(&self.inner.tbs_certificate.subject_public_key_info)
     }
 
     /// Its PEM.

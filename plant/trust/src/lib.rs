@@ -11,6 +11,7 @@ mod authority;
 mod certificate;
 mod chain;
 mod crl;
+mod fingerprint;
 mod renewal;
 mod request;
 
@@ -18,7 +19,8 @@ pub use authority::{Authority, Issue};
 pub use certificate::{Certificate, Serial};
 pub use chain::{Fault, Known, Names, check, check_named};
 pub use crl::{Crl, Revoked};
-pub use renewal::{Renewal, Step};
+pub use fingerprint::{Fingerprint, NoFingerprint};
+pub use renewal::{Renewal, Step, is_near_end};
 pub use request::Request;
 
 /// What is no certificate, request, list or key of the kinds that are understood.

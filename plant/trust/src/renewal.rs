@@ -19,7 +19,8 @@ pub enum Step {
 }
 
 /// The plan for the renewal of a certificate: when four fifths of its life are over, or at once if the application has made it
-/// itself. A failed renewal is repeated with growing pauses.
+/// itself. A failed renewal is repeated with growing pauses: from half a minute to an hour, and of a self-made certificate, which
+/// peers do not trust yet, from 2 s to a minute.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Renewal {
     from: Duration,
@@ -68,7 +69,7 @@ impl Renewal {
     /// What is to be done.
     #[must_use]
     pub fn step(&self, now: Duration) -> Step {
-        let again = self.failed.map(|(at, times)| at + pause(times));
+        let again = self.failed.map(|(at, times)| at + self.pause(times));
         let next = again.map_or_else(|| self.due(), |again| again.max(self.due()));
         if now < next {
             return Step::Wait { until: next };
@@ -79,6 +80,18 @@ impl Renewal {
         }
     }
 
+    /// Returns the pause after so many failures: twice as long each time.
+    fn pause(&self, times: u32) -> Duration {
+        let (first, longest) = match self.is_self_made {
+            true => SELF_MADE_PAUSES,
+            false => PAUSES,
+        };
+        let factor = 1_u32.checked_shl(times.saturating_sub(1));
+        first
+            .saturating_mul(factor.unwrap_or(u32::MAX))
+            .min(longest)
+    }
+
     /// It was asked for, in vain.
     pub fn failed(&mut self, now: Duration) {
         let times = self.failed.map_or(0, |(_, times)| times);
@@ -86,15 +99,21 @@ impl Renewal {
     }
 }
 
-/// From half a minute on twice as long each time, up to an hour.
-fn pause(times: u32) -> Duration {
-    let doubled = FIRST_PAUSE.saturating_mul(
-        1_u32
-            .checked_shl(times.saturating_sub(1))
-            .unwrap_or(u32::MAX),
-    );
-    doubled.min(LONGEST_PAUSE)
+/// Returns whether people should replace a certificate that no program renews, such as the certificate of an authority: less
+/// than a fifth of its life is left, or less than a year of a life of more than two years.
+#[must_use]
+pub fn is_near_end(certificate: &Certificate, now: Duration) -> bool {
+    let (from, until) = certificate.validity();
+    let life = until.saturating_sub(from);
+    let early = match life > YEAR * 2 {
+        true => YEAR.max(life / 5),
+        false => life / 5,
+    };
+    now + early >= until
 }
 
-const FIRST_PAUSE: Duration = Duration::from_secs(30);
-const LONGEST_PAUSE: Duration = Duration::from_secs(3600);
+/// The first and the longest pause after a failure.
+const PAUSES: (Duration, Duration) = (Duration::from_secs(30), Duration::from_secs(3600));
+/// The same for a certificate that the application has made itself.
+const SELF_MADE_PAUSES: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs(60));
+const YEAR: Duration = Duration::from_secs(365 * 86_400);

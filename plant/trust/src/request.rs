@@ -1,5 +1,6 @@
 //! A request for a certificate (PKCS #10), made by who has the key.
 
+use std::fmt;
 use std::net::IpAddr;
 
 use rsa::RsaPrivateKey;
@@ -8,25 +9,37 @@ use rsa::pkcs8::DecodePrivateKey as _;
 use rsa::sha2::Sha256;
 use rsa::traits::PublicKeyParts as _;
 use x509_cert::builder::{Builder as _, RequestBuilder};
-use x509_cert::der::asn1::{Ia5String, OctetString};
+use x509_cert::der::asn1::{Ia5String, OctetString, PrintableStringRef, Utf8StringRef};
 use x509_cert::der::{Decode as _, DecodePem as _, Encode as _};
 use x509_cert::ext::pkix::SubjectAltName;
-use x509_cert::ext::pkix::name::GeneralName;
+use x509_cert::ext::pkix::name::{DirectoryString, GeneralName};
 use x509_cert::name::Name;
+use x509_cert::request::attributes::ChallengePassword;
 use x509_cert::request::{CertReq, ExtensionReq};
 use x509_cert::spki::SubjectPublicKeyInfoOwned;
 
 use crate::certificate::{COMMON_NAME, ORGANIZATION, alternative, common_name, name_of, verify};
-use crate::{KEY_BITS, Unfit};
+use crate::{Fingerprint, KEY_BITS, Unfit};
 
 /// A request whose signature is that of the key it is for.
-#[derive(Debug, Clone)]
+#[derive(Clone)]
 pub struct Request {
     pub(crate) subject: Name,
     pub(crate) key: SubjectPublicKeyInfoOwned,
     application_uri: String,
     hosts: Vec<String>,
+    challenge: Option<String>,
     der: Vec<u8>,
+}
+
+/// Without the challengePassword, which is a secret.
+impl fmt::Debug for Request {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Request")
+            .field("application_uri", &self.application_uri)
+            .field("hosts", &self.hosts)
+            .finish_non_exhaustive()
+    }
 }
 
 impl Request {
@@ -38,8 +51,21 @@ impl Request {
     pub fn make(
         key: &[u8],
         application_uri: &str,
-        (name, organization): (&str, &str),
+        names: (&str, &str),
         hosts: &[String],
+    ) -> Result<Self, Unfit> {
+        Self::make_with(key, (application_uri, hosts), names, None)
+    }
+
+    /// The same with a challengePassword (RFC 2985, 5.4.1), such as the one-time token of an invitation.
+    ///
+    /// # Errors
+    /// A key that is none, or a name or URI that a certificate cannot have.
+    pub fn make_with(
+        key: &[u8],
+        (application_uri, hosts): (&str, &[String]),
+        (name, organization): (&str, &str),
+        challenge: Option<&str>,
     ) -> Result<Self, Unfit> {
         let key = RsaPrivateKey::from_pkcs8_der(key).map_err(|_| Unfit::Key)?;
         let signer = SigningKey::<Sha256>::new(key);
@@ -47,6 +73,11 @@ impl Request {
         let mut builder = RequestBuilder::new(subject, &signer).map_err(|_| Unfit::Name)?;
         let names = alternatives(application_uri, hosts)?;
         builder.add_extension(&names).map_err(|_| Unfit::Name)?;
+        if let Some(challenge) = challenge {
+            let challenge = DirectoryString::Utf8String(challenge.to_owned());
+            let added = builder.add_attribute(&ChallengePassword(challenge));
+            added.map_err(|_| Unfit::Name)?;
+        }
         let made = builder.build::<Signature>().map_err(|_| Unfit::Signature)?;
         Self::of(made)
     }
@@ -81,6 +112,7 @@ impl Request {
         Ok(Self {
             application_uri: uri.ok_or(Unfit::NoUri)?,
             hosts,
+            challenge: challenge(&read),
             subject: read.info.subject,
             key: read.info.public_key,
             der,
@@ -110,6 +142,30 @@ impl Request {
     pub fn hosts(&self) -> &[String] {
         &self.hosts
     }
+
+    /// The challengePassword.
+    #[must_use]
+    pub fn challenge(&self) -> Option<&str> {
+        self.challenge.as_deref()
+    }
+
+    /// Returns the SHA-256 of the public key, as of [`Certificate::key_fingerprint`](crate::Certificate::key_fingerprint).
+    #[must_use]
+    pub fn key_fingerprint(&self) -> Fingerprint {
+        Fingerprint::of_key(&self.key)
+    }
+}
+
+fn challenge(read: &CertReq) -> Option<String> {
+    let mut wanted = read.info.attributes.iter();
+    let value = wanted.find(|one| one.oid == CHALLENGE)?.values.get(0)?;
+    let text = value.decode_as::<Utf8StringRef<'_>>();
+    let text = text.map(|text| text.as_str().to_owned());
+    let printable = || {
+        let text = value.decode_as::<PrintableStringRef<'_>>();
+        text.map(|text| text.as_str().to_owned())
+    };
+    text.or_else(|_| printable()).ok()
 }
 
 fn names(read: &CertReq) -> Option<SubjectAltName> {
@@ -150,5 +206,8 @@ pub(crate) fn alternatives(
 /// extensionRequest of PKCS #9.
 const EXTENSIONS: x509_cert::der::asn1::ObjectIdentifier =
     x509_cert::der::asn1::ObjectIdentifier::new_unwrap("1.2.840.113549.1.9.14");
+/// challengePassword of PKCS #9.
+const CHALLENGE: x509_cert::der::asn1::ObjectIdentifier =
+    x509_cert::der::asn1::ObjectIdentifier::new_unwrap("1.2.840.113549.1.9.7");
 const ALTERNATIVE_NAMES: x509_cert::der::asn1::ObjectIdentifier =
     x509_cert::der::asn1::ObjectIdentifier::new_unwrap("2.5.29.17");

@@ -355,9 +355,19 @@ fn a_certificate_is_asked_for_at_four_fifths_of_its_life_and_again_while_that_fa
 fn a_certificate_that_an_application_made_itself_is_replaced_at_once() {
     let Cell { authority, .. } = cell();
     let mut plan = Renewal::of(authority.certificate());
-    assert_eq!(plan.step(NOW), Step::Ask);
-    plan.failed(NOW);
-    assert!(matches!(plan.step(NOW), Step::Wait { .. }));
+    let mut at = NOW;
+    let mut pauses = Vec::new();
+    for _ in 0..40 {
+        assert_eq!(plan.step(at), Step::Ask);
+        plan.failed(at);
+        let Step::Wait { until } = plan.step(at) else {
+            panic!("it was requested just now")
+        };
+        pauses.push((until - at).as_secs());
+        at = until;
+    }
+    assert_eq!(&pauses[..7], [2, 4, 8, 16, 32, 60, 60]);
+    assert!(pauses.iter().skip(6).all(|pause| *pause == 60));
 }
 
 proptest::proptest! {
@@ -368,4 +378,36 @@ proptest::proptest! {
         drop(Crl::read(&bytes));
         drop(Request::read(&bytes));
     }
+}
+
+#[test]
+fn a_request_carries_a_challenge_that_debug_output_leaves_out() {
+    let hosts = ["cell-1".to_owned()];
+    let names = ("Robot", "Plant");
+    let with = |challenge| {
+        let made = Request::make_with(&key(DEVICE), ("urn:cell:robot", &hosts), names, challenge);
+        Request::read(made.unwrap().der()).unwrap()
+    };
+    let invited = with(Some("3f9a-secret"));
+    assert_eq!(invited.challenge(), Some("3f9a-secret"));
+    assert!(!format!("{invited:?}").contains("secret"));
+    assert_eq!(with(None).challenge(), None);
+    let cell = cell();
+    assert_eq!(invited.key_fingerprint(), cell.device.key_fingerprint());
+    assert_ne!(
+        invited.key_fingerprint(),
+        cell.authority.certificate().key_fingerprint()
+    );
+}
+
+#[test]
+fn people_are_warned_of_the_end_of_an_authority_while_they_can_replace_it() {
+    let ends = |days: u32, left: u32| {
+        let life = issue(1, NOW - DAY * (days - left), NOW + DAY * left);
+        let made = Authority::make(&key(AUTHORITY), ("Plant authority", ""), &life).unwrap();
+        trust::is_near_end(made.certificate(), NOW)
+    };
+    assert!(!ends(3650, 731) && ends(3650, 729));
+    assert!(!ends(1000, 366) && ends(1000, 364));
+    assert!(!ends(100, 21) && ends(100, 19));
 }

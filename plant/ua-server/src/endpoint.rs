@@ -6,11 +6,10 @@ use std::sync::Arc;
 use bridge_node::{Failure, FailureKind};
 use mappings::{SecurityPolicy, Server, ServerLimits};
 use opcua::server::{Limits, ServerBuilder};
-use opcua::types::ApplicationType;
-use plant_opcua::configuration::{Configuration, Plant};
-use plant_opcua::directory::ApplicationRecord;
-use plant_opcua::door::Door;
+use plant_opcua::configuration::Configuration;
+use plant_opcua::door::{Door, UnknownClients};
 use plant_opcua::endpoint::EndpointUrl;
+use plant_opcua::enrolment::{Applicant, Enrolment, Invitation};
 use plant_opcua::limits::{self, ClientLimits};
 use plant_opcua::pki::{OWN_CERTIFICATE, OWN_KEY, Pki};
 use plant_opcua::server::Security;
@@ -127,7 +126,7 @@ pub(crate) fn door(
         warn!("every client certificate is trusted, and kept as trusted: for tests only");
         None
     } else {
-        Door::of(pki.root(), clients).map_err(io_fault)?
+        Door::of(pki.root(), clients, UnknownClients::Refuse).map_err(io_fault)?
     };
     Ok(match wanted {
         Some((door, behind)) => {
@@ -147,27 +146,18 @@ pub(crate) fn stand(runtime: &Runtime, door: Standing) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Has the Global Discovery Server at `gds` keep the certificate of the server young, for as long as the server runs.
-pub(crate) fn keep_young(
+/// Keeps the certificate of the server current at the Global Discovery Server, for as long as the server runs.
+pub(crate) fn enrol(
     runtime: &Runtime,
-    gds: Option<String>,
-    certificates: &Arc<Configuration>,
-    told: &discovery::Server,
+    gds: Option<Invitation>,
+    (pki, certificates): (&Pki, &Arc<Configuration>),
+    applicant: Applicant,
 ) {
-    let Some(url) = gds else { return };
-    let texts = |all: &[String]| Some(all.iter().map(|one| one.as_str().into()).collect());
-    let record = ApplicationRecord {
-        application_uri: told.application_uri.as_str().into(),
-        application_type: ApplicationType::Server,
-        application_names: Some(vec![told.name.as_str().into()]),
-        product_uri: told.product_uri.as_str().into(),
-        discovery_urls: texts(std::slice::from_ref(&told.url)),
-        server_capabilities: texts(&told.capabilities),
-        ..ApplicationRecord::default()
-    };
+    let Some(gds) = gds else { return };
+    let enrolment = Enrolment::new(pki.root(), applicant, gds);
     let certificates = Arc::clone(certificates);
-    let plant = Plant { url, record };
-    drop(runtime.spawn(async move { certificates.keep_young(plant).await }));
+    let kept = async move { enrolment.keep(|| certificates.restart()).await };
+    drop(runtime.spawn(kept));
 }
 
 fn io_fault(error: std::io::Error) -> Failure {

@@ -13,7 +13,7 @@
 //! `endpoint` (how clients get in), `changes` (what is told of a reload), `identity` (what the server says of itself), `confirm`
 //! and `arrivals` (what says that a write has arrived), `access` (what each may do), `auditing` (what is told of it), `sks` (keys of secured
 //! groups), `pubsub` (the PubSub configuration as nodes), `value` (between the two codecs), `verbs` (certificates and users by
-//! hand), `restart` (in its own place, for another certificate).
+//! hand).
 
 mod access;
 mod address;
@@ -44,7 +44,6 @@ mod presence;
 mod programs;
 mod properties;
 mod pubsub;
-mod restart;
 mod sks;
 mod sources;
 mod space;
@@ -66,6 +65,7 @@ use discovery::scan::Range;
 use discovery::{AnnounceSettings, Interface};
 use mappings::{FindSkills, Mapping, SpaceId};
 use plant_opcua::endpoint::EndpointUrl;
+use plant_opcua::enrolment::GdsArguments;
 use plant_opcua::pki::{self, Pki};
 
 use crate::port::{ServerPort, Setup};
@@ -96,10 +96,8 @@ struct UaServer {
     /// an interface, to this host and of this host
     #[arg(long)]
     announce: bool,
-    /// Register with this Global Discovery Server, as opc.tcp://10.80.0.1:4841, have it renew the server's certificate before
-    /// that is over, and fetch its revocation lists
-    #[arg(long, value_name = "URL", env = "UA_GDS")]
-    gds: Option<EndpointUrl>,
+    #[command(flatten)]
+    gds: GdsArguments,
     /// Made when it is first wanted.
     #[arg(skip)]
     sks: OnceLock<Arc<Sks>>,
@@ -110,7 +108,7 @@ struct UaServer {
 pub fn run(arguments: Vec<OsString>) -> ExitCode {
     match verbs::asked(&arguments) {
         Some(ended) => ended,
-        None => restart::again(bridge_node::run::<UaServer>(arguments)),
+        None => bridge_node::run::<UaServer>(arguments),
     }
 }
 
@@ -210,6 +208,8 @@ impl Program for UaServer {
         };
         let pki = Pki::open(self.pki_root())
             .map_err(|error| Failure::new(FailureKind::Io, format!("{error} (--pki)")))?;
+        let gds = self.gds.invitation();
+        let gds = gds.map_err(|fault| Failure::new(FailureKind::Usage, fault.to_string()))?;
         let setup = Setup {
             url,
             pki,
@@ -217,7 +217,7 @@ impl Program for UaServer {
             trust_any_client: self.trust_any_client_certificate,
             types: Types::new(&context.types),
             mapped_url: self.endpoint.is_none(),
-            gds: self.gds.as_ref().map(ToString::to_string),
+            gds,
             announce: self.announcement(&context.mapping),
         };
         ServerPort::start(&context.mapping, setup)

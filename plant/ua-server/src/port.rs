@@ -21,7 +21,9 @@ use opcua::server::{MonitoredItemHandle, ServerHandle, SubscriptionCache};
 use opcua::types::{NodeId, NumericRange, StatusCode, VariableId, Variant};
 use plant_opcua::configuration::Configuration;
 use plant_opcua::endpoint::EndpointUrl;
+use plant_opcua::enrolment::Invitation;
 use plant_opcua::nodeset::NodeSets;
+use plant_opcua::own;
 use plant_opcua::pki::Pki;
 use plant_opcua::server::{Security, core_of, core_with};
 use plant_opcua::users::{self, Access, UserFault};
@@ -48,7 +50,6 @@ use crate::nodes::{ClientWrite, Exits, SpaceManager, SpaceNodes, look_again};
 use crate::nodesets;
 use crate::others::Others;
 use crate::pubsub::{Places, PubSub, Readers, State};
-use crate::restart;
 use crate::sks::Sks;
 use crate::sources::{self, Sourced};
 use crate::space::Space;
@@ -67,7 +68,7 @@ pub(crate) struct Setup {
     /// To whom the server is told of.
     pub(crate) announce: Option<AnnounceSettings>,
     /// The Global Discovery Server that keeps its certificate young.
-    pub(crate) gds: Option<String>,
+    pub(crate) gds: Option<Invitation>,
 }
 
 /// The OPC UA side of the space.
@@ -174,7 +175,8 @@ impl ServerPort {
         let others = Others::new(mapping, setup.announce.as_ref(), setup.pki.root());
         let methods = shown_calls(&nodes, mapping, (asked, &layout), &setup.pki);
         let (server, application) = told_of(described, setup.url.advertised(port), &security);
-        endpoint::keep_young(&runtime, setup.gds, &certificates, &server);
+        let applicant = server.applicant(setup.url.urls(port));
+        endpoint::enrol(&runtime, setup.gds, (&setup.pki, &certificates), applicant);
         let (told, components) = tell(server, setup.announce, nodes)?;
         Ok(Self {
             unbound: VecDeque::new(),
@@ -279,7 +281,7 @@ impl Port for ServerPort {
                     self.live.extend(taken_back.map(|topic| (topic, false)));
                 }
                 () = at(self.space.due()) => self.space.grow_old(),
-                () = self.certificates.applied() => restart::ask(),
+                () = self.certificates.applied() => bridge_node::restart(),
                 _ = self.look.tick() => {
                     self.pki.report_rejected();
                     self.access.look();
@@ -429,6 +431,10 @@ impl Port for ServerPort {
 
     fn links(&self) -> Vec<LinkState> {
         self.others.links()
+    }
+
+    fn certificate(&self) -> Option<serde_json::Value> {
+        own::status(self.pki.root())
     }
 
     fn application(&self) -> Option<Application> {

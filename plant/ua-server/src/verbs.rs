@@ -10,9 +10,9 @@ use std::process::ExitCode;
 use bridge_node::FailureKind;
 use clap::Parser as _;
 use clap::error::ErrorKind;
-use plant_opcua::certificates::{self, StoreFault, Stored};
+use plant_opcua::certificates::{self, Standing, StoreFault, Stored};
 use plant_opcua::known;
-use plant_opcua::pki;
+use plant_opcua::pki::{self, Pki, PkiError};
 use plant_opcua::users::{self, Credential, Roles, User, UserFault, Users};
 
 /// Certificates and users of the OPC UA server of the cell.
@@ -50,6 +50,15 @@ enum Verb {
         /// A JSON line for each
         #[arg(long)]
         json: bool,
+        #[command(flatten)]
+        store: Store,
+    },
+    /// Make a self-made certificate anew, for the same key, ApplicationUri and hosts. Works on the store of any program of
+    /// the plant (--pki), which shows it when it is started again
+    Renew {
+        /// Put a self-made certificate in the place of one of an authority
+        #[arg(long)]
+        self_made: bool,
         #[command(flatten)]
         store: Store,
     },
@@ -125,6 +134,8 @@ enum VerbFault {
     #[error(transparent)]
     Store(#[from] StoreFault),
     #[error(transparent)]
+    Pki(#[from] PkiError),
+    #[error(transparent)]
     User(#[from] UserFault),
     #[error("the password cannot be read: {0}")]
     Password(io::Error),
@@ -165,13 +176,20 @@ pub(crate) fn asked(arguments: &[OsString]) -> Option<ExitCode> {
 fn kind(fault: &VerbFault) -> FailureKind {
     match fault {
         VerbFault::Store(StoreFault::Io { .. })
+        | VerbFault::Pki(PkiError::Directory { .. } | PkiError::Make(_))
         | VerbFault::User(UserFault::Io { .. })
         | VerbFault::Password(_)
         | VerbFault::Output(_) => FailureKind::Io,
         VerbFault::User(UserFault::Open(_) | UserFault::Line { .. } | UserFault::TooMany(_)) => {
             FailureKind::Configuration
         }
-        VerbFault::Store(
+        VerbFault::Pki(
+            PkiError::Half { .. }
+            | PkiError::Unreadable(_)
+            | PkiError::None(_)
+            | PkiError::Issued(_),
+        )
+        | VerbFault::Store(
             StoreFault::Certificate { .. } | StoreFault::Unknown { .. } | StoreFault::Several(_),
         )
         | VerbFault::User(
@@ -203,6 +221,7 @@ fn run(verb: Verb) -> Result<(), VerbFault> {
             }
             Ok(())
         }
+        Verb::Renew { self_made, store } => renew(&store.root(), self_made),
         Verb::User(verb) => user(verb),
     }
 }
@@ -231,6 +250,17 @@ fn trust(root: &Path, which: &str, issuer: bool) -> Result<(), VerbFault> {
         }
     }
     Ok(())
+}
+
+fn renew(root: &Path, self_made: bool) -> Result<(), VerbFault> {
+    Pki::open(root.to_owned())?.renew(self_made)?;
+    let all = certificates::list(root)?;
+    for own in all.iter().filter(|one| one.standing == Standing::Own) {
+        say(&format!("made anew: {}", line(own)))?;
+    }
+    say(
+        "restart the program; applications that trust the previous certificate have to trust this one",
+    )
 }
 
 fn user(verb: UserVerb) -> Result<(), VerbFault> {
@@ -386,10 +416,11 @@ fn say(text: &str) -> Result<(), VerbFault> {
 }
 
 /// The verbs; all else is a mapping or a flag of the server.
-const VERBS: [&str; 4] = ["trust", "reject", "certificates", "user"];
+const VERBS: [&str; 5] = ["trust", "reject", "certificates", "renew", "user"];
 /// What the help of the server says of them.
 pub(crate) const HELP: &str = "Certificates and users (each with --help):
   ua-server trust THUMBPRINT|FILE        let a client in that was refused, or all that an authority has issued
   ua-server reject THUMBPRINT            let it in no longer
   ua-server certificates                 list its own, trusted and refused certificates
+  ua-server renew                        make the self-made certificate anew
   ua-server user add|password|role|remove|list";

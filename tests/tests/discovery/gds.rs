@@ -19,7 +19,7 @@ const URI: &str = "urn:ua-bridge:system-tests:robot";
 
 struct Site {
     cell: Cell,
-    _gds: Child,
+    gds: Child,
 }
 
 /// A server with an authority, a user `sara` who says who may do what, and a client that it trusts.
@@ -50,7 +50,7 @@ fn site() -> Option<Site> {
     eventually("the server answers clients", SOON, || {
         cell.asyncua_try("opcua_read.py", &[GDS, "ns=0;i=2258"])
     });
-    Some(Site { cell, _gds: gds })
+    Some(Site { cell, gds })
 }
 
 fn pairs(cell: &Cell) -> std::path::PathBuf {
@@ -182,7 +182,8 @@ fn a_certificate_is_issued_used_renewed_by_its_owner_and_revoked() {
     assert!(itself["renewed"].is_string());
     // People see what was issued, and revoke.
     let listed = told(&site.cell, &["ca", "list"]);
-    assert_eq!(listed.lines().count(), 3, "{listed}");
+    // Beside the three of the robot that of the server itself.
+    assert_eq!(listed.lines().count(), 4, "{listed}");
     assert_eq!(listed.matches("REVOKED").count(), 1, "{listed}");
     let certificate = pairs(&site.cell).join("robot_certificate.der");
     told(&site.cell, &["ca", "revoke", path(&certificate)]);
@@ -286,7 +287,7 @@ fn a_server_has_its_certificate_renewed_before_it_is_over_and_hears_what_is_revo
     let mapping = cell.file("cell.yaml", &format!("server: {{endpoint: '{server}'}}\n"));
     let mut child = cell.ua_server(&[path(&mapping), "--gds", GDS]);
     // Whom nobody knows is not given anything.
-    child.wait_for_line("certificates are not kept young", LATER);
+    child.wait_for_line("waits for an administrator", LATER);
     let issuers = || {
         let said = cell.asyncua_try("opcua_access.py", &["endpoints", server])?;
         Some(said[0]["issuers"].clone())
@@ -329,4 +330,54 @@ fn a_server_has_its_certificate_renewed_before_it_is_over_and_hears_what_is_revo
         .collect();
     assert_eq!(lists.len(), 1);
     assert_ne!(lists[0], list, "what was revoked since is known");
+}
+
+#[test]
+fn a_stranger_is_issued_nothing_until_an_administrator_approves_or_it_shows_its_token() {
+    let Some(site) = site() else { return };
+    let [first, second] = ["first", "second"].map(|name| format!("{URI}:{name}"));
+    let asked = |verb: &str, name: &str, uri: &str, token: Option<&str>| {
+        let named = ["--client", name, "--application-uri", uri];
+        let token: Vec<&str> = token.into_iter().flat_map(|one| ["--token", one]).collect();
+        site.asked(verb, &[&named[..], &token].concat())
+    };
+    for (name, uri) in [("first", &first), ("second", &second), ("thief", &second)] {
+        asked("make", name, uri, None);
+    }
+    let applies = |name: &str, uri: &str, token| asked("applies", name, uri, token);
+    let said = applies("first", &first, None);
+    assert_eq!(said["other_key"], "BadInvalidArgument", "{said}");
+    assert_eq!(said["finished"], "BadRequestNotComplete", "{said}");
+    assert_eq!(said["open"], "BadUserAccessDenied", "{said}");
+    let line = told(&site.cell, &["requests", "--json"]);
+    let waits: Value = serde_json::from_str(line.trim()).unwrap();
+    assert_eq!(waits["state"], "waits");
+    assert_eq!(waits["application_uri"], first);
+    assert_eq!(waits["hosts"], json!(["robot.cell"]));
+    told(&site.cell, &["reject", &waits["request"].to_string()]);
+    let said = applies("first", &first, None);
+    assert_eq!(said["finished"], "BadUserAccessDenied", "{said}");
+    told(&site.cell, &["approve", &waits["request"].to_string()]);
+    let good = |said: &Value| {
+        assert_eq!(said["finished"], "Good", "{said}");
+        for key in ["twice", "own_key", "signed"] {
+            assert_eq!(said[key], true, "{key}: {said}");
+        }
+        assert_eq!(said["trusted"], json!([true]), "{said}");
+    };
+    good(&applies("first", &first, None));
+
+    let invitation = told(&site.cell, &["invite", &second]);
+    let token = invitation.trim().rsplit_once(",token=").unwrap().1;
+    let denied = |said: Value| assert_eq!(said["started"], "BadUserAccessDenied", "{said}");
+    let wrong = format!("{token}0");
+    denied(applies("second", &second, Some(&wrong)));
+    good(&applies("second", &second, Some(token)));
+    denied(applies("thief", &second, Some(token)));
+    let stored = site.cell.folder().join("gds/authority/invitations.json");
+    let stored = fs::read_to_string(stored).unwrap();
+    let (number, secret) = token.split_once('-').unwrap();
+    assert!(stored.contains(number) && !stored.contains(secret));
+    let said: String = site.gds.lines().join("\n");
+    assert!(said.contains(number) && !said.contains(secret), "{said}");
 }

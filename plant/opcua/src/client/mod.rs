@@ -19,6 +19,7 @@ use std::time::Duration;
 
 use opcua::types::{NamespaceMap, StatusCode, TypeLoader};
 use tokio::sync::watch;
+use trust::Fingerprint;
 
 pub use self::parts::{OperationLimits, PartFault, Parts, Service};
 pub use self::services::{Browse, CallError, CallOptions, CallResult, MOST_REFERENCES};
@@ -39,6 +40,10 @@ pub struct ClientConfig {
     pub pki: Option<PathBuf>,
     /// Trusts the certificate of any server that is sound otherwise. For tests and demonstrations only.
     pub accept_untrusted: bool,
+    /// The SHA-256 of a certificate that is trusted beside the certificates of the store.
+    pub pinned: Option<Fingerprint>,
+    /// Accepts a server of a trusted authority without a current revocation list: the server that hands out that list.
+    pub allow_outdated_lists: bool,
     /// The rule for servers at hosts that their trusted certificates do not name.
     pub host_names: HostNames,
     /// What it wants of what servers offer.
@@ -66,6 +71,8 @@ impl ClientConfig {
             application_name: application_name.to_owned(),
             pki: None,
             accept_untrusted: false,
+            pinned: None,
+            allow_outdated_lists: false,
             host_names: HostNames::Warn,
             security: SecurityChoice::Best,
             user: None,

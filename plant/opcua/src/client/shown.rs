@@ -36,7 +36,10 @@ impl Servers {
     pub(super) fn of(config: &ClientConfig) -> Option<Self> {
         let root = config.pki.as_ref()?;
         Some(Self {
-            judge: Judge::of(root, config.accept_untrusted).host_names(config.host_names),
+            judge: Judge::of(root, config.accept_untrusted)
+                .host_names(config.host_names)
+                .pinned(config.pinned)
+                .outdated_lists(config.allow_outdated_lists),
         })
     }
 

@@ -4,9 +4,8 @@
 //! issued (UpdateCertificate), and says whom it is to trust (the trust list, a file). What counts after ApplyChanges only, because
 //! the library reads its pair once, is told to the program around it, which starts the server anew.
 //!
-//! Reading order: `store` (the trust list in the files of the store), then here, `renewing` (without an administrator).
+//! Reading order: `store` (the trust list in the files of the store), then here.
 
-mod renewing;
 mod store;
 
 use std::fs;
@@ -24,11 +23,11 @@ use tokio::sync::Notify;
 use tracing::{info, warn};
 use trust::{Certificate, Request};
 
-pub use self::renewing::Plant;
+pub(crate) use self::store::StoreList;
 
-use self::store::StoreList;
 use crate::file::{FileMethod, LARGEST, LONGEST_UNUSED};
 use crate::known;
+use crate::own::{self, Cause};
 use crate::pair;
 use crate::pki::{OWN_CERTIFICATE, OWN_KEY};
 use crate::server::{CoreMethod, MethodHandler, MethodRequest, Refusal, method};
@@ -87,6 +86,11 @@ impl Configuration {
     /// Ready once changes are to be applied for which the server has to be started anew, with time for the client to be answered.
     pub async fn applied(&self) {
         self.applied.notified().await;
+    }
+
+    /// Has [`applied`](Self::applied) return: the server has another certificate.
+    pub fn restart(&self) {
+        self.applied.notify_one();
     }
 
     /// Each method, for the node manager of the core namespace.
@@ -306,6 +310,7 @@ impl Configuration {
                 self.state.lock().waiting = Some((certificate, key));
                 return Err(StatusCode::BadResourceUnavailable.into());
             }
+            own::report(&self.root, &Cause::Administrator);
             self.state.lock().next_key = None;
         }
         if is_new || self.wants_door() {

@@ -18,12 +18,12 @@ use crate::trust_file::{TrustList, masks};
 
 /// The list of the store at a root.
 #[derive(Debug, Clone)]
-pub(super) struct StoreList {
+pub(crate) struct StoreList {
     root: PathBuf,
 }
 
 impl StoreList {
-    pub(super) fn new(root: &Path) -> Self {
+    pub(crate) fn new(root: &Path) -> Self {
         Self {
             root: root.to_owned(),
         }
@@ -31,7 +31,7 @@ impl StoreList {
 
     /// AddCertificate: of an application or an authority that is trusted. Others are of a list that is written as a whole
     /// (OPC 10000-12, 7.8.2.6).
-    pub(super) fn add(&self, request: &MethodRequest) -> Answer {
+    pub(crate) fn add(&self, request: &MethodRequest) -> Answer {
         let [Variant::ByteString(bytes), Variant::Boolean(true)] = request.arguments.as_slice()
         else {
             return Err(StatusCode::BadInvalidArgument.into());
@@ -44,7 +44,7 @@ impl StoreList {
     }
 
     /// RemoveCertificate: by its thumbprint.
-    pub(super) fn remove(&self, request: &MethodRequest) -> Answer {
+    pub(crate) fn remove(&self, request: &MethodRequest) -> Answer {
         let [Variant::String(thumbprint), Variant::Boolean(is_trusted)] =
             request.arguments.as_slice()
         else {
@@ -75,7 +75,7 @@ impl StoreList {
 
     /// Looks at a new certificate of the server, with the certificates of authorities that come along: the signature of each is
     /// to be of the one above it. Whom the server trusts says nothing of by whom it is to be known (OPC 10000-12, 7.10.5).
-    pub(super) fn judge(
+    pub(crate) fn judge(
         &self,
         certificate: &Certificate,
         issuers: &Variant,
@@ -84,7 +84,7 @@ impl StoreList {
     }
 
     /// The same with the certificates of authorities read.
-    pub(super) fn judge_among(
+    pub(crate) fn judge_among(
         &self,
         certificate: &Certificate,
         issuers: &[Certificate],
@@ -107,15 +107,27 @@ impl StoreList {
     }
 
     /// Keeps the certificates of authorities above one, which clients may want to know.
-    pub(super) fn keep_issuers(&self, issuers: &Variant) -> Result<(), StatusCode> {
+    pub(crate) fn keep_issuers(&self, issuers: &Variant) -> Result<(), StatusCode> {
         self.keep_all(&given(issuers)?)
     }
 
     /// The same with the certificates read.
-    pub(super) fn keep_all(&self, issuers: &[Certificate]) -> Result<(), StatusCode> {
+    pub(crate) fn keep_all(&self, issuers: &[Certificate]) -> Result<(), StatusCode> {
         for certificate in issuers.iter().filter(|one| one.is_authority()) {
             self.keep(certificate, Standing::Issuer)
                 .map_err(|error| told(&error))?;
+        }
+        Ok(())
+    }
+
+    /// Trusts certificates of a trust list, beside those that are trusted already.
+    pub(crate) fn trust_all(&self, all: &[Certificate]) -> io::Result<()> {
+        for certificate in all {
+            let known = known::read(&self.root);
+            if !known.trusted.contains(certificate) {
+                self.keep(certificate, Standing::Trusted)?;
+                info!(name = ?certificate.name(), "a certificate of the trust list of the plant is trusted");
+            }
         }
         Ok(())
     }

@@ -21,7 +21,7 @@ use super::calls::Calls;
 use super::nodes::{Nodes, Spaces};
 use super::routed::{Front, Routed};
 use super::{Inner, Server, Waiting};
-use crate::door::Door;
+use crate::door::{Door, UnknownClients};
 use crate::endpoint::{BindError, EndpointUrl};
 use crate::limits::{self, ClientLimits};
 use crate::nodeset::{self, NodeSet, NodeSetError, Source};
@@ -101,6 +101,8 @@ pub struct ServerConfig {
     pub pki: Option<PathBuf>,
     /// Trusts every client's certificate, and keeps it as trusted. For tests and demonstrations only.
     pub trust_unknown_clients: bool,
+    /// The rule for clients without a trusted certificate, of a server that trusts an authority.
+    pub unknown_clients: UnknownClients,
     /// How long a session may be silent at most.
     pub session_timeout: Duration,
     /// The number of clients.
@@ -120,6 +122,7 @@ impl ServerConfig {
             security: vec![Security::None],
             pki: None,
             trust_unknown_clients: false,
+            unknown_clients: UnknownClients::Refuse,
             session_timeout: Duration::from_secs(60),
             clients: ClientLimits::default(),
         }
@@ -244,7 +247,7 @@ impl ServerBuilder {
         let port = listener.local_addr()?.port();
         let mut listener = tokio::net::TcpListener::from_std(listener)?;
         let root = pki.as_ref().filter(|_| !config.trust_unknown_clients);
-        let door = root.map(|pki| Door::of(pki.root(), config.clients));
+        let door = root.map(|pki| Door::of(pki.root(), config.clients, config.unknown_clients));
         let door = door.transpose()?.flatten();
         let door = match door {
             Some((door, behind)) => {

@@ -23,6 +23,8 @@ pub struct Caller {
     pub proven: bool,
     /// Whether nobody else can read what is said: signed and encrypted.
     pub encrypted: bool,
+    /// The DER of the client's certificate, whose key it has; `None` without security.
+    pub certificate: Option<Arc<[u8]>>,
 }
 
 impl Caller {
@@ -41,7 +43,9 @@ impl Caller {
             session: context.session_id,
             user,
             proven: certificate
+                .as_ref()
                 .is_some_and(|one| one.is_application_uri_valid(&application_uri).is_ok()),
+            certificate: certificate.and_then(|one| one.to_der().ok()).map(Arc::from),
             encrypted: session.message_security_mode() == MessageSecurityMode::SignAndEncrypt,
             application_uri,
         }

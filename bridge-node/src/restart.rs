@@ -1,0 +1,40 @@
+//! Restarts the program as the same process, with the same arguments: libraries read the certificate of a server once.
+//!
+//! The program ends as after SIGTERM, with goodbyes to the space and to clients, and executes its own file again. The process
+//! id stays.
+
+use std::env;
+use std::os::unix::process::CommandExt as _;
+use std::process::{Command, ExitCode};
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use rustix::process::{Signal, getpid, kill_process};
+use tracing::{error, warn};
+
+use crate::exit::FailureKind;
+
+static REQUESTED: AtomicBool = AtomicBool::new(false);
+
+/// Ends the program in order, and starts it again in the same process.
+pub fn restart() {
+    if REQUESTED.swap(true, Ordering::Relaxed) {
+        return;
+    }
+    if let Err(error) = kill_process(getpid(), Signal::TERM) {
+        REQUESTED.store(false, Ordering::Relaxed);
+        warn!(%error, "the program cannot restart itself: restart it for its new certificate");
+    }
+}
+
+/// Executes the program again after [`restart`]; otherwise returns the code of its end.
+pub(crate) fn executed_again(ended: ExitCode) -> ExitCode {
+    if !REQUESTED.load(Ordering::Relaxed) {
+        return ended;
+    }
+    let mut arguments = env::args_os();
+    let name = arguments.next().unwrap_or_default();
+    let program = env::current_exe().unwrap_or_else(|_| name.clone().into());
+    let error = Command::new(&program).arg0(name).args(arguments).exec();
+    error!(%error, program = %program.display(), "the program cannot execute itself again");
+    FailureKind::Io.into()
+}

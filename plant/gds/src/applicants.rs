@@ -1,0 +1,38 @@
+//! Applications without a trusted certificate that want to be registered. They are registered when their certificate is issued.
+
+use std::collections::VecDeque;
+
+use opcua::types::NodeId;
+use trust::Fingerprint;
+
+use crate::records::Record;
+use crate::service::OWN;
+
+/// The applicants, oldest first. The oldest give way: they register again.
+#[derive(Debug, Default)]
+pub(crate) struct Applicants {
+    all: VecDeque<(NodeId, Record)>,
+}
+
+impl Applicants {
+    /// Keeps an application and returns its provisional ApplicationId, which depends on its key: an applicant cannot change
+    /// the record of another.
+    pub(crate) fn put(&mut self, record: Record, key: Fingerprint) -> NodeId {
+        let of = Fingerprint::of(format!("{key} {}", record.uri).as_bytes());
+        let id = NodeId::new(OWN, format!("applicant-{of}"));
+        self.all.retain(|(known, _)| *known != id);
+        if self.all.len() >= MOST {
+            self.all.pop_front();
+        }
+        self.all.push_back((id.clone(), record));
+        id
+    }
+
+    /// Returns the application of a provisional ApplicationId.
+    pub(crate) fn get(&self, id: &NodeId) -> Option<&Record> {
+        let found = self.all.iter().find(|(known, _)| known == id);
+        found.map(|(_, record)| record)
+    }
+}
+
+const MOST: usize = 200;

@@ -1,0 +1,472 @@
+//! Requests and renews the certificate and the trust list of an application at the Global Discovery Server of its plant
+//! (OPC 10000-12, 7.9). One implementation for all programs with an OPC UA certificate.
+//!
+//! The first request goes out at once while the application has made its certificate itself, later ones when four fifths of the
+//! life of the certificate are over. With the one-time token of an [`Invitation`] the first certificate is issued at once;
+//! without it the request waits until an administrator has approved it, and is asked for again until then. The authority in
+//! the trust list is trusted from then on, so that the programs of a plant trust one another.
+//!
+//! Reading order: `invitation` (the option of a program), then here.
+
+mod invitation;
+
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use opcua::types::{ApplicationType, NodeId, StatusCode};
+use tokio::time::{Instant, sleep, timeout};
+use tracing::{debug, info, warn};
+use trust::{Certificate, Renewal, Request, Step};
+
+pub use self::invitation::{GdsArguments, GdsOption, Invitation, InvitationFault, Token};
+
+use crate::client::{CallError, Client, ClientConfig, ClientError, Link, SecurityChoice};
+use crate::configuration::StoreList;
+use crate::directory::{ApplicationRecord, Directory, DirectoryError, TrustLists};
+use crate::endpoint::EndpointUrl;
+use crate::known;
+use crate::own::{self, Cause};
+use crate::pair;
+use crate::pki::OWN_KEY;
+
+/// An application that wants a certificate.
+#[derive(Debug, Clone)]
+pub struct Applicant {
+    /// Its ApplicationUri.
+    pub application_uri: String,
+    /// Its name for people.
+    pub name: String,
+    /// Its ProductUri.
+    pub product_uri: String,
+    /// Its DiscoveryUrls. The authority issues certificates for their hosts only.
+    pub urls: Vec<String>,
+    /// Its capabilities, such as `DA`.
+    pub capabilities: Vec<String>,
+}
+
+impl Applicant {
+    fn record(&self) -> ApplicationRecord {
+        let texts = |all: &[String]| Some(all.iter().map(|one| one.as_str().into()).collect());
+        let capabilities = match self.capabilities.as_slice() {
+            [] => vec!["NA".to_owned()],
+            all => all.to_vec(),
+        };
+        ApplicationRecord {
+            application_uri: self.application_uri.as_str().into(),
+            application_type: ApplicationType::Server,
+            application_names: Some(vec![self.name.as_str().into()]),
+            product_uri: self.product_uri.as_str().into(),
+            discovery_urls: texts(&self.urls),
+            server_capabilities: texts(&capabilities),
+            ..ApplicationRecord::default()
+        }
+    }
+
+    /// Returns the hosts for which a certificate is requested: the hosts of the DiscoveryUrls, and of the current certificate
+    /// all hosts if an authority issued it, otherwise the names of the computer itself.
+    fn hosts(&self, old: &Certificate) -> Vec<String> {
+        let urls = self.urls.iter().filter_map(|url| url.parse().ok());
+        let registered = urls.flat_map(|url: EndpointUrl| url.hosts());
+        let is_issued = !old.is_self_signed();
+        let own = old.hosts().into_iter();
+        let own = own.filter(|host| is_issued || LOOPBACK.contains(&host.as_str()));
+        let mut hosts: Vec<String> = Vec::new();
+        for host in registered.chain(own) {
+            if !hosts.iter().any(|one| one.eq_ignore_ascii_case(&host)) {
+                hosts.push(host);
+            }
+        }
+        hosts
+    }
+}
+
+/// Keeps the certificate and the trust list of an application current.
+#[derive(Debug)]
+pub struct Enrolment {
+    root: PathBuf,
+    applicant: Applicant,
+    gds: Invitation,
+    /// The request that the server has not decided on.
+    pending: Option<Pending>,
+    /// Whether the token was refused: it has expired, or was used by another application.
+    is_token_refused: bool,
+}
+
+#[derive(Debug)]
+struct Pending {
+    application: NodeId,
+    number: NodeId,
+}
+
+/// The outcome of a visit.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Visit {
+    /// There is a new certificate, or the first authority is trusted: the program has to restart.
+    Changed,
+    /// The certificate stays.
+    Current,
+    /// The request waits for an administrator.
+    Waiting,
+}
+
+/// Why a visit failed, for people.
+type Why = String;
+
+impl Enrolment {
+    /// The enrolment of the application whose certificate store is at `root` and has its pair.
+    #[must_use]
+    pub fn new(root: &Path, applicant: Applicant, gds: Invitation) -> Self {
+        Self {
+            root: root.to_owned(),
+            applicant,
+            gds,
+            pending: None,
+            is_token_refused: false,
+        }
+    }
+
+    /// Keeps the certificate and the trust list current, for as long as it is polled. Calls `changed` when the program has to
+    /// restart for a new certificate.
+    pub async fn keep(mut self, changed: impl Fn()) {
+        let mut plan: Option<(Certificate, Renewal)> = None;
+        let mut lists_at = Instant::now();
+        let mut reported: Option<String> = None;
+        loop {
+            let own = own::read(&self.root);
+            // An administrator may have replaced it.
+            let is_same = |(of, _): &(Certificate, Renewal)| Some(of) == own.as_ref();
+            plan = plan
+                .filter(is_same)
+                .or_else(|| own.map(|own| (own.clone(), Renewal::of(&own))));
+            let Some((certificate, renewal)) = &mut plan else {
+                sleep(LOOK).await;
+                continue;
+            };
+            let wants = match renewal.step(known::now()) {
+                Step::Ask | Step::Late => Some(certificate.clone()),
+                Step::Wait { .. } => None,
+            };
+            let is_for_lists = !certificate.is_self_signed() && Instant::now() >= lists_at;
+            if wants.is_some() || is_for_lists {
+                let visited = self.visit(wants.as_ref()).await;
+                let again = match &visited {
+                    Ok(_) => LISTS_EVERY,
+                    Err(_) => LISTS_AGAIN,
+                };
+                lists_at = Instant::now() + again;
+                if wants.is_some() && visited != Ok(Visit::Changed) {
+                    renewal.failed(known::now());
+                }
+                let days_left = renewal.left(known::now()).as_secs() / 86_400;
+                self.report(&visited, days_left, &mut reported);
+                if visited == Ok(Visit::Changed) {
+                    plan = None;
+                    changed();
+                }
+            }
+            sleep(LOOK).await;
+        }
+    }
+
+    /// Logs an outcome once, until it is another.
+    fn report(&self, visited: &Result<Visit, Why>, days_left: u64, reported: &mut Option<String>) {
+        let message = match visited {
+            Ok(Visit::Changed | Visit::Current) => None,
+            Ok(Visit::Waiting) => Some(WAITING.to_owned()),
+            Err(why) => Some(why.clone()),
+        };
+        if *reported == message {
+            return;
+        }
+        match (visited, &message) {
+            (Ok(Visit::Waiting), _) => {
+                let key = own::read(&self.root).map(|own| own.key_fingerprint().to_string());
+                warn!(
+                    gds = self.gds.url,
+                    application_uri = self.applicant.application_uri,
+                    key = key.unwrap_or_default(),
+                    "{WAITING}"
+                );
+            }
+            (_, Some(why)) => warn!(
+                gds = self.gds.url,
+                days_left, "cannot renew the certificate or its trust list: {why}"
+            ),
+            (_, None) => debug!(
+                gds = self.gds.url,
+                "the certificate and its trust list are current"
+            ),
+        }
+        *reported = message;
+    }
+
+    /// Connects to the Global Discovery Server, requests a certificate in place of `old`, and fetches the trust list.
+    async fn visit(&mut self, old: Option<&Certificate>) -> Result<Visit, Why> {
+        let client = Client::open(
+            ClientConfig {
+                pki: Some(self.root.clone()),
+                pinned: self.gds.fingerprint,
+                allow_outdated_lists: true,
+                security: SecurityChoice::Best,
+                timeout: ANSWERS_WITHIN,
+                ..ClientConfig::new(&self.applicant.application_uri, &self.applicant.name)
+            },
+            &self.gds.url,
+        );
+        let visited = timeout(LONGEST_VISIT, self.ask(&client, old)).await;
+        client.close().await;
+        visited.unwrap_or_else(|_| {
+            Err(format!(
+                "the server has not answered within {LONGEST_VISIT:?}"
+            ))
+        })
+    }
+
+    async fn ask(&mut self, client: &Client, old: Option<&Certificate>) -> Result<Visit, Why> {
+        let text = |error: DirectoryError| error.to_string();
+        let up = client.up(ANSWERS_WITHIN).await;
+        up.map_err(|error| error.to_string())?;
+        // Any server could issue a certificate to a client that does not check the server's own.
+        if !matches!(&*client.link().borrow(), Link::Up { secured: true, .. }) {
+            return Err("the server offers no secured channel".to_owned());
+        }
+        let directory = Directory::of(client).map_err(text)?;
+        let issued = match old {
+            Some(old) => match self.issued(&directory, old).await? {
+                Some(issued) => Some(issued),
+                None => return Ok(Visit::Waiting),
+            },
+            None => None,
+        };
+        let application = directory.registered(&self.applicant.record()).await;
+        let application = application.map_err(text)?;
+        let lists = directory.trust_lists(&application).await.map_err(text)?;
+        let is_first = !known::trusts_authorities(&self.root);
+        // Before the certificate: it is of no use while its authority is not trusted here.
+        self.trust(&lists)?;
+        if let Some((certificate, above)) = &issued {
+            self.take_up(certificate, above)?;
+        }
+        match issued.is_some() || is_first && known::trusts_authorities(&self.root) {
+            true => Ok(Visit::Changed),
+            false => Ok(Visit::Current),
+        }
+    }
+
+    /// Returns the certificate that the authority issued, with those of the authorities above; `None` while the request waits.
+    async fn issued(
+        &mut self,
+        directory: &Directory,
+        old: &Certificate,
+    ) -> Result<Option<(Certificate, Vec<Certificate>)>, Why> {
+        let text = |error: DirectoryError| error.to_string();
+        let pending = match self.pending.take() {
+            Some(pending) => pending,
+            None => {
+                let application = directory.registered(&self.applicant.record()).await;
+                let application = application.map_err(text)?;
+                self.requested(directory, application, old).await?
+            }
+        };
+        match directory
+            .finished(&pending.application, &pending.number)
+            .await
+        {
+            Ok(issued) => Ok(Some(issued)),
+            Err(error) => match status_of(&error) {
+                Some(StatusCode::BadRequestNotComplete) => {
+                    self.pending = Some(pending);
+                    Ok(None)
+                }
+                // The server does not know the request any more: the next visit makes another one.
+                Some(_) => Err(text(error)),
+                // The answer was lost, and is fetched again.
+                None => {
+                    self.pending = Some(pending);
+                    Err(text(error))
+                }
+            },
+        }
+    }
+
+    /// Requests a certificate: with the token, unless the server has refused it.
+    async fn requested(
+        &mut self,
+        directory: &Directory,
+        application: NodeId,
+        old: &Certificate,
+    ) -> Result<Pending, Why> {
+        let token = self.gds.token.clone();
+        let token = token.filter(|_| !self.is_token_refused && old.is_self_signed());
+        let has_token = token.is_some();
+        let request = self.request(old, token).await?;
+        match directory.requested(&application, &request).await {
+            Ok(number) => Ok(Pending {
+                application,
+                number,
+            }),
+            Err(error)
+                if has_token && status_of(&error) == Some(StatusCode::BadUserAccessDenied) =>
+            {
+                warn!(
+                    gds = self.gds.url,
+                    "the token of --gds is refused: it has expired, was used, or is for another application; the request waits \
+                     for an administrator, or for another invitation (`ua-gds invite`)"
+                );
+                self.is_token_refused = true;
+                let request = self.request(old, None).await?;
+                let number = directory.requested(&application, &request).await;
+                let number = number.map_err(|error| error.to_string())?;
+                Ok(Pending {
+                    application,
+                    number,
+                })
+            }
+            Err(error) => Err(error.to_string()),
+        }
+    }
+
+    /// Signs a request with the own key, which takes a while.
+    async fn request(&self, old: &Certificate, token: Option<Token>) -> Result<Request, Why> {
+        let key = own_key(&self.root)?;
+        let (uri, hosts) = (
+            self.applicant.application_uri.clone(),
+            self.applicant.hosts(old),
+        );
+        let name: String = self.applicant.name.chars().take(LONGEST_NAME).collect();
+        let signing = tokio::task::spawn_blocking(move || {
+            let token = token.as_ref().map(Token::secret);
+            Request::make_with(&key, (&uri, &hosts), (&name, ""), token)
+        });
+        let signed = signing.await.map_err(|error| error.to_string())?;
+        signed.map_err(|why| format!("no certificate can be requested: {why}"))
+    }
+
+    /// Trusts the certificates of a trust list, and keeps its revocation lists.
+    fn trust(&self, lists: &TrustLists) -> Result<(), Why> {
+        let store = StoreList::new(&self.root);
+        let failed = |error: std::io::Error| format!("the trust list cannot be kept: {error}");
+        store.trust_all(&lists.trusted).map_err(failed)?;
+        let kept = store.keep_all(&lists.issuers);
+        kept.map_err(|status| format!("the trust list cannot be kept: {status}"))?;
+        for list in &lists.revocation_lists {
+            match known::put_crl(&self.root, list) {
+                Ok(Some(path)) => debug!(file = %path.display(), "kept a revocation list"),
+                Ok(None) => debug!(
+                    issuer = ?list.issuer_name(),
+                    "ignored a revocation list of an unknown authority"
+                ),
+                Err(error) => return Err(error.to_string()),
+            }
+        }
+        Ok(())
+    }
+
+    /// Checks an issued certificate by the same rules as UpdateCertificate, and replaces the own certificate by it.
+    fn take_up(&self, certificate: &Certificate, above: &[Certificate]) -> Result<(), Why> {
+        if certificate.application_uri().as_deref() != Some(&self.applicant.application_uri) {
+            return Err("the issued certificate is for another ApplicationUri".to_owned());
+        }
+        if !certificate.is_valid_at(known::now()) {
+            return Err(
+                "the issued certificate is not valid now: one of the clocks is wrong".to_owned(),
+            );
+        }
+        if !matches!(
+            Renewal::of(certificate).step(known::now()),
+            Step::Wait { .. }
+        ) {
+            // The program would restart without end.
+            return Err("the issued certificate is to be renewed at once".to_owned());
+        }
+        let key = own_key(&self.root)?;
+        if !certificate.is_of_private_key(&key) {
+            return Err("the issued certificate is for another key".to_owned());
+        }
+        let refused = |status| format!("the issued certificate is refused: {status}");
+        let store = StoreList::new(&self.root);
+        store.judge_among(certificate, above).map_err(refused)?;
+        store.keep_all(above).map_err(refused)?;
+        own::replace(&self.root, certificate, &Cause::Enrolment)
+            .map_err(|error| format!("the certificate cannot be written: {error}"))?;
+        info!(
+            gds = self.gds.url,
+            "the program restarts with the certificate of the plant"
+        );
+        Ok(())
+    }
+}
+
+/// Returns the status that the server answered with; `None` where there was no answer.
+fn status_of(error: &DirectoryError) -> Option<StatusCode> {
+    match error {
+        DirectoryError::Call { error, .. } => match error {
+            CallError::Client(ClientError::Status(status)) => Some(*status),
+            CallError::Client(_) => None,
+            CallError::Refused { status, .. } => Some(*status),
+        },
+        DirectoryError::Client(_) | DirectoryError::None | DirectoryError::Answer(_) => None,
+    }
+}
+
+/// Reads the DER of the own private key.
+///
+/// # Errors
+/// The file cannot be read, or holds no key.
+pub fn own_key(root: &Path) -> Result<Vec<u8>, String> {
+    let path = root.join(OWN_KEY);
+    let read = std::fs::read(&path).map_err(|error| format!("{}: {error}", path.display()))?;
+    pair::from_pem(&read).ok_or_else(|| format!("{} holds no private key", path.display()))
+}
+
+/// The names of the computer itself, which every certificate may have.
+const LOOPBACK: [&str; 3] = ["localhost", "127.0.0.1", "::1"];
+const WAITING: &str = "the certificate is requested and waits for an administrator: `ua-gds requests` lists it, `ua-gds \
+    approve NUMBER` has it issued";
+/// How often the store is read: an administrator may have replaced the certificate, and the clock may have been set.
+const LOOK: Duration = Duration::from_secs(2);
+/// How often the trust list is fetched; an authority signs a new list when half of the time of the last is over.
+const LISTS_EVERY: Duration = Duration::from_secs(3600);
+/// The same after a failure.
+const LISTS_AGAIN: Duration = Duration::from_secs(30);
+/// The time of a visit, with all its answers.
+const LONGEST_VISIT: Duration = Duration::from_secs(60);
+/// The time of one answer of the Global Discovery Server.
+const ANSWERS_WITHIN: Duration = Duration::from_secs(10);
+/// Characters of a common name.
+const LONGEST_NAME: usize = 64;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_hosts_that_the_authority_can_check_are_requested() {
+        let applicant = Applicant {
+            application_uri: "urn:a".to_owned(),
+            name: "A".to_owned(),
+            product_uri: String::new(),
+            urls: [4840, 4841]
+                .map(|port| format!("opc.tcp://192.0.2.7:{port}"))
+                .to_vec(),
+            capabilities: Vec::new(),
+        };
+        let data = own::described(
+            "urn:a",
+            &["192.0.2.6".to_owned()],
+            "UA bridge",
+            known::now(),
+        );
+        let key = opcua::crypto::PrivateKey::new(2048).unwrap();
+        let made = opcua::crypto::X509::from_pkey(&key, &data).unwrap();
+        let old = Certificate::read(&made.to_der().unwrap()).unwrap();
+        assert!(old.hosts().contains(&"192.0.2.6".to_owned()));
+        let hosts = applicant.hosts(&old);
+        assert_eq!(hosts.first().map(String::as_str), Some("192.0.2.7"));
+        assert_eq!(hosts.iter().filter(|one| *one == "192.0.2.7").count(), 1);
+        let others: Vec<&str> = hosts.iter().skip(1).map(String::as_str).collect();
+        assert!(others.iter().all(|one| LOOPBACK.contains(one)), "{hosts:?}");
+        let record = applicant.record();
+        assert_eq!(record.server_capabilities, Some(vec!["NA".into()]));
+    }
+}
