@@ -179,25 +179,24 @@ impl Enrolment {
             return;
         }
         match (visited, &message) {
-            (Ok(Visit::Waiting), _) => {
-                let key = own::read(&self.root).map(|own| own.key_fingerprint().to_string());
-                warn!(
-                    gds = self.gds.url,
-                    application_uri = self.applicant.application_uri,
-                    key = key.unwrap_or_default(),
-                    "{WAITING}"
-                );
-            }
+            (Ok(Visit::Waiting), _) => self.report_waiting(),
             (_, Some(why)) => warn!(
                 gds = self.gds.url,
                 days_left, "cannot renew the certificate or its trust list: {why}"
             ),
-            (_, None) => debug!(
-                gds = self.gds.url,
-                "the certificate and its trust list are current"
-            ),
+            (_, None) => {}
         }
         *reported = message;
+    }
+
+    fn report_waiting(&self) {
+        let key = own::read(&self.root).map(|own| own.key_fingerprint().to_string());
+        warn!(
+            gds = self.gds.url,
+            application_uri = self.applicant.application_uri,
+            key = key.unwrap_or_default(),
+            "{WAITING}"
+        );
     }
 
     /// Connects to the Global Discovery Server, requests a certificate in place of `old`, and fetches the trust list.
