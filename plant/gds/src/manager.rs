@@ -253,7 +253,9 @@ impl Gds {
         };
         match self.standing(caller, &record.uri)? {
             Standing::Stranger => Err(StatusCode::BadUserAccessDenied),
-            standing => Ok((record, standing)),
+            standing @ (Standing::Administrator | Standing::Itself | Standing::Applicant(_)) => {
+                Ok((record, standing))
+            }
         }
     }
 
@@ -263,16 +265,31 @@ impl Gds {
         if wanted.key_fingerprint() != key {
             return Err(unfit(record, "it is for another key than the channel's"));
         }
-        let Some(token) = wanted.challenge().map(str::to_owned) else {
-            let number = self.keep_request(wanted, (Some(record.clone()), None))?;
-            if let Some(suppressed) = self.another(&format!("waits {number}")) {
-                info!(
-                    application = ?record.uri, number, %key, suppressed,
-                    "a request for a certificate waits: `ua-gds approve {number}` or `ua-gds reject {number}`"
-                );
-            }
-            return Ok(number);
-        };
+        match wanted.challenge().map(str::to_owned) {
+            Some(token) => self.redeem(record, &wanted, (&token, key)),
+            None => self.wait(record, wanted, key),
+        }
+    }
+
+    /// Keeps a request until an administrator decides.
+    fn wait(&self, record: &Record, wanted: Request, key: Fingerprint) -> Result<u32, Refusal> {
+        let number = self.keep_request(wanted, (Some(record.clone()), None))?;
+        if let Some(suppressed) = self.another(&format!("waits {number}")) {
+            info!(
+                application = ?record.uri, number, %key, suppressed,
+                "a request for a certificate waits: `ua-gds approve {number}` or `ua-gds reject {number}`"
+            );
+        }
+        Ok(number)
+    }
+
+    /// Issues a certificate for the token of an invitation.
+    fn redeem(
+        &self,
+        record: &Record,
+        wanted: &Request,
+        (token, key): (&str, Fingerprint),
+    ) -> Result<u32, Refusal> {
         self.may_name_hosts(record, wanted.hosts())?;
         let shows = Shows {
             uri: &record.uri,
@@ -281,27 +298,23 @@ impl Gds {
         };
         let path = self.folder.join(invitations::FILE);
         let redeemed = kept::change(&path, |all: &mut Invitations| {
-            all.redeem(&token, shows, now())
+            all.redeem(token, shows, now())
         });
-        match redeemed.map_err(|error| unkept(&error))? {
-            Ok(invitation) => {
-                info!(application = ?record.uri, %key, invitation, "an application has used an invitation");
-                // The token is a secret that is used up; the request is stored without it.
-                let by = format!("invitation {invitation}");
-                let issued = self.register_and_issue(Some(record), &wanted, &by)?;
-                let path = self.folder.join(requests::FILE);
-                let kept = kept::change(&path, |all: &mut Requests| {
-                    all.put_issued((&wanted, &issued), now())
-                });
-                Ok(kept.map_err(|error| unkept(&error))?)
+        let invitation = redeemed.map_err(|error| unkept(&error))?.map_err(|why| {
+            if let Some(suppressed) = self.another(&format!("token {why}")) {
+                warn!(application = ?record.uri, suppressed, "refused the token of an application: {why}");
             }
-            Err(why) => {
-                if let Some(suppressed) = self.another(&format!("token {why}")) {
-                    warn!(application = ?record.uri, suppressed, "refused the token of an application: {why}");
-                }
-                Err(StatusCode::BadUserAccessDenied.into())
-            }
-        }
+            StatusCode::BadUserAccessDenied
+        })?;
+        info!(application = ?record.uri, %key, invitation, "an application has used an invitation");
+        let issued =
+            self.register_and_issue(Some(record), wanted, &format!("invitation {invitation}"))?;
+        let path = self.folder.join(requests::FILE);
+        // The token is a secret: the request is not stored.
+        let kept = kept::change(&path, |all: &mut Requests| {
+            all.put_issued((wanted, &issued), now())
+        });
+        Ok(kept.map_err(|error| unkept(&error))?)
     }
 
     /// Keeps a request in the file, and returns its number.

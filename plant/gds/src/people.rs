@@ -143,7 +143,7 @@ fn list(folders: &Folders, json: bool) -> Result<(), Failure> {
             false => format!(
                 "invitation {} {} for {:?} until {until}",
                 one.number,
-                used.map_or("open".to_owned(), |used| format!("used by {used:?}")),
+                used.map_or_else(|| "open".to_owned(), |used| format!("used by {used:?}")),
                 application.unwrap_or("any application"),
             ),
         };

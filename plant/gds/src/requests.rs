@@ -90,7 +90,7 @@ impl Requests {
             if let Some(by) = wanted.approved {
                 same.state = State::Approved { by };
             }
-            same.record = wanted.record.or(same.record.take());
+            same.record = wanted.record.or_else(|| same.record.take());
             return Ok(same.number);
         }
         let is_approved = wanted.approved.is_some();

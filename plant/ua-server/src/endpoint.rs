@@ -149,9 +149,8 @@ pub(crate) fn stand(runtime: &Runtime, door: Standing) -> Result<(), Failure> {
 /// Keeps the certificate of the server current at the Global Discovery Server, for as long as the server runs.
 pub(crate) fn enrol(
     runtime: &Runtime,
-    gds: Option<Invitation>,
+    (applicant, gds): (Applicant, Option<Invitation>),
     (pki, certificates): (&Pki, &Arc<Configuration>),
-    applicant: Applicant,
 ) {
     let Some(gds) = gds else { return };
     let enrolment = Enrolment::new(pki.root(), applicant, gds);

@@ -127,7 +127,6 @@ impl ServerPort {
     /// used.
     pub(crate) fn start(mapping: &Arc<Mapping>, setup: Setup) -> Result<Self, Failure> {
         let configuration = |error: String| Failure::new(FailureKind::Configuration, error);
-
         let mut types = setup.types;
         let (layout, (sets, nodesets)) = laid_out(mapping, &mut types)?;
         let described = mapping.server();
@@ -136,7 +135,6 @@ impl ServerPort {
         let port = address.port();
         let access = users(&setup.pki, address)?;
         access.set_rules(access::rules(mapping, &layout));
-
         let pubsub = Arc::new(PubSub::new());
         let (exits, (writes, created_items, asked)) = exits(mapping, &access, &pubsub);
         let (confirms, layout) = (Arc::clone(&exits.confirms), Arc::new(layout));
@@ -146,14 +144,13 @@ impl ServerPort {
             exits,
         };
         let certificates = Configuration::new(setup.pki.root(), &described.application_uri);
-        let mdns = setup.announce.as_ref().is_some_and(|to| to.mdns.is_some());
+        let mdns = matches!(&setup.announce, Some(to) if to.mdns.is_some());
         let core = core(&setup.sks, &pubsub, (&certificates, mdns), described);
         let builder = endpoint::server(described, (&setup.url, port), &security);
-        let clients = endpoint::clients(described.limits);
         let (door, listener, builder) = endpoint::door(
             &setup.pki,
             setup.trust_any_client,
-            clients,
+            endpoint::clients(described.limits),
             (listener, builder),
         )?;
         let (server, handle) = builder
@@ -175,8 +172,8 @@ impl ServerPort {
         let others = Others::new(mapping, setup.announce.as_ref(), setup.pki.root());
         let methods = shown_calls(&nodes, mapping, (asked, &layout), &setup.pki);
         let (server, application) = told_of(described, setup.url.advertised(port), &security);
-        let applicant = server.applicant(setup.url.urls(port));
-        endpoint::enrol(&runtime, setup.gds, (&setup.pki, &certificates), applicant);
+        let own = server.applicant(setup.url.urls(port));
+        endpoint::enrol(&runtime, (own, setup.gds), (&setup.pki, &certificates));
         let (told, components) = tell(server, setup.announce, nodes)?;
         Ok(Self {
             unbound: VecDeque::new(),
