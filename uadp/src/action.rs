@@ -1,33 +1,40 @@
-//! Actions: a Requestor asks, a Responder executes and answers (OPC 10000-14, 5.4.3 and 6.2.11.2).
+//! Actions: a Requestor sends requests, a Responder executes them and sends responses (OPC
+//! 10000-14, 5.4.3 and 6.2.11.2).
 //!
-//! Requests and responses are DataSetMessages under an ActionHeader. Both carry the PublisherId, WriterGroupId and
-//! DataSetWriterId of the Responder: what is asked for is an address, whoever asks. Reading borrows from the datagram
-//! and allocates nothing, as everywhere in this crate; [`ActionEncoder`] writes into a buffer of the caller. The
-//! ActionHeader belongs to the payload: it is encrypted with it, and signed in any case.
+//! Requests and responses are DataSetMessages behind an ActionHeader. Both carry the PublisherId,
+//! WriterGroupId and DataSetWriterId of the Responder, so these ids address the Action and do not
+//! identify the sender. Decoding borrows from the datagram and allocates nothing; [`ActionEncoder`]
+//! writes into a buffer of the caller. The ActionHeader is part of the payload: it is always
+//! signed, and encrypted if the payload is.
 //!
-//! There are two readings of the standard, an [`ActionDialect`] each. Nothing on the wire tells them apart.
+//! Each of the two readings of the standard is an [`ActionDialect`]. The messages do not show which
+//! dialect they use.
 //!
-//! [`Requestor`] and [`Responder`] are what makes calls of messages that may get lost: the one repeats, acknowledges and
-//! gives up, the other executes once and remembers what it answered. Both take times and messages in and give messages
-//! out, and have no socket, clock or randomness of their own. How a Responder's states change follows here from the table
-//! of the Requestor's (OPC 10000-14, 6.2.11.2.2); the table of its own was not at hand.
+//! [`Requestor`] and [`Responder`] make calls over a network that loses messages. The Requestor
+//! repeats, acknowledges and gives up requests; the Responder executes each request once and
+//! remembers its response. Both take times and messages as input and return messages; they have no
+//! socket, clock or randomness. The state transitions of the Responder are derived from the state
+//! table of the Requestor (OPC 10000-14, 6.2.11.2.2), because the Responder's own table was not
+//! available.
 //!
 //! # Chunks
-//! A request or response has to fit in one NetworkMessage. One in chunks is not read, since the requests of all
-//! Requestors carry the PublisherId of the Responder: only the ActionHeader tells whose piece it is, which a
-//! [`Reassembler`](crate::Reassembler) does not look at. A whole NetworkMessage cut up, as UA-.NETStandard does it,
-//! passes through [`Chunks`](crate::Chunks) and [`Reassembler`](crate::Reassembler) as it is: a
-//! [`Whole`](crate::Whole) without DataSetWriter, whose bytes are read with
+//! A request or response has to fit in one NetworkMessage. Chunked requests and responses are not
+//! decoded: the requests of all Requestors carry the PublisherId of the Responder, so only the
+//! ActionHeader identifies the message of a chunk, and a [`Reassembler`](crate::Reassembler) does
+//! not read it. UA-.NETStandard splits the encoded NetworkMessage instead. Such messages pass
+//! through [`Chunks`](crate::Chunks) and [`Reassembler`](crate::Reassembler) unchanged, as a
+//! [`Whole`](crate::Whole) without DataSetWriter, whose bytes are decoded with
 //! [`NetworkMessage::decode`](crate::NetworkMessage::decode).
 //!
 //! # Announcing
-//! What an Action takes and gives, and what it can be called on, is an
-//! [`ActionMetaData`](crate::discovery::ActionMetaData) announcement, and which connections answer Actions is another
-//! ([`Announced::ActionResponder`](crate::discovery::Announced)). The standard has no probe for either: a Responder sends
-//! the first unasked when it changes (OPC 10000-14, 7.2.4.6.11). What an [`Announcer`](crate::discovery::Announcer)
-//! answers beyond that stands at [`set_actions`](crate::discovery::Announcer::set_actions).
+//! An [`ActionMetaData`](crate::discovery::ActionMetaData) announcement describes the arguments,
+//! results and targets of an Action. A second announcement lists the connections with Action
+//! Responders ([`Announced::ActionResponder`](crate::discovery::Announced)). The standard has no
+//! probe for either: a Responder sends the first unprompted when it changes (OPC 10000-14,
+//! 7.2.4.6.11). [`set_actions`](crate::discovery::Announcer::set_actions) lists the further probes
+//! that an [`Announcer`](crate::discovery::Announcer) responds to.
 //!
-//! # Asking
+//! # Encoding and decoding a request
 //! ```
 //! use uadp::action::{
 //!     ActionCall, ActionDialect, ActionEncoder, ActionHeader, ActionKind, ActionStart, ActionState,

@@ -1,14 +1,14 @@
-//! UADP, the binary message mapping of OPC UA PubSub: NetworkMessages to and from bytes.
+//! UADP, the binary message mapping of OPC UA PubSub: encodes and decodes NetworkMessages.
 //!
-//! Everything in OPC 10000-14, 7.2.4, in the versions 1.04 and 1.05, with the readings of the standard that peers differ
-//! in:
+//! The crate covers OPC 10000-14, 7.2.4, in the versions 1.04 and 1.05. Where implementations read
+//! the standard differently, it supports each reading:
 //!
-//! | what | where |
+//! | feature | items |
 //! |---|---|
-//! | headers, read when asked for | [`NetworkMessage`], [`DataSetMessage`] |
+//! | headers, decoded on demand | [`NetworkMessage`], [`DataSetMessage`] |
 //! | fields as Variants or DataValues, in key frames, delta frames and events | [`DataSetMessage::fields`], [`DataSetMessage::values`] |
-//! | fields as RawData, by their metadata | [`RawLayout`] |
-//! | writing into a buffer of the caller | [`NetworkMessageEncoder`] |
+//! | fields as RawData, decoded with their DataSetMetaData | [`RawLayout`] |
+//! | encoding into a buffer of the caller | [`NetworkMessageEncoder`] |
 //! | chunks | [`Chunks`], [`Reassembler`] |
 //! | message security: PubSub-Aes128-CTR and PubSub-Aes256-CTR | [`Opener`], [`Sealer`] |
 //! | probes and announcements, DataSetMetaData | [`discovery`] |
@@ -16,12 +16,13 @@
 //! | calls over a network that loses messages | [`action::Requestor`], [`action::Responder`] |
 //! | sequence numbers, timeouts and states | [`DataSetReaderState`], [`ReaderTable`], [`DataSetWriterState`] |
 //!
-//! Variants of the builtin types 26 to 31, which are not assigned yet, and chunks with an ActionHeader are
+//! Variants of the unassigned builtin types 26 to 31, and chunks with an ActionHeader, are
 //! [`DecodeError::Unsupported`].
 //!
-//! No sockets, no clock, no thread, no randomness: bytes, times and random numbers are parameters. Reading borrows from
-//! the datagram and allocates nothing; decrypting and reassembling use buffers that stay. Counts and lengths are held
-//! against the bytes that follow, nesting ends at [`MAX_NESTING`], and no datagram makes anything here panic.
+//! The crate has no sockets, clock, threads or randomness: bytes, times and random numbers are
+//! parameters. Decoding borrows from the datagram and allocates nothing; decryption and reassembly
+//! reuse their buffers. Counts and lengths are checked against the bytes that follow, nesting ends
+//! at [`MAX_NESTING`], and no datagram causes a panic.
 //!
 //! # Reading
 //! ```

@@ -1,14 +1,15 @@
-//! Writing requests and responses.
+//! Encodes requests and responses.
 
 use super::{ActionDialect, ActionEncoding, ActionFields, ActionHeader, ActionState};
 use crate::encoder::{self, NetworkMessageEncoder};
 use crate::field_encoder::FieldEncoder;
 use crate::{DataSetHeader, EncodeError, Extras, NetworkHeader, Seal, data_set_message as message};
 
-/// Appends one NetworkMessage of requests or responses to a buffer (OPC 10000-14, 7.2.4.5.9 and 7.2.4.5.10).
+/// Appends one NetworkMessage of requests or responses to a buffer (OPC 10000-14, 7.2.4.5.9 and
+/// 7.2.4.5.10).
 ///
-/// As with [`NetworkMessageEncoder`] the flags follow from what the headers hold, and after an error the buffer holds
-/// an unfinished message.
+/// As with [`NetworkMessageEncoder`], the flags follow from the fields that are set in the headers.
+/// After an error the buffer holds an incomplete message.
 #[derive(Debug)]
 #[must_use = "a message is complete with `finish`"]
 pub struct ActionEncoder<'b> {
@@ -18,37 +19,40 @@ pub struct ActionEncoder<'b> {
     kind: u8,
 }
 
-/// How a NetworkMessage of Actions begins.
+/// Headers of a NetworkMessage of requests or responses.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ActionStart<'a> {
-    /// The PublisherId in it is the Responder's.
+    /// NetworkMessage header, with the PublisherId of the Responder.
     pub network: NetworkHeader<'a>,
-    /// What belongs to all messages.
+    /// ActionHeader, shared by all messages.
     pub action: ActionHeader<'a>,
-    /// How they are laid out.
+    /// Layout of the messages.
     pub dialect: ActionDialect,
-    /// The headers few messages have, the SecurityHeader among them.
+    /// Rarely used headers, such as the SecurityHeader.
     pub extras: Extras<'a>,
 }
 
-/// What a request or response says of itself.
+/// Target, id and state of a request or response.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct ActionCall {
-    /// What the Action is called on.
+    /// Target that the Action is called on.
     pub target_id: u16,
-    /// Tells the requests of one RequestorId and CorrelationData apart.
+    /// Distinguishes requests with the same RequestorId and CorrelationData.
     pub request_id: u16,
-    /// The state wanted, or the one there is.
+    /// Requested state in a request, current state in a response.
     pub state: ActionState,
 }
 
 impl<'b> ActionEncoder<'b> {
-    /// Appends the headers to `buf`. `writer_ids` are the Responder's DataSetWriters, one message each.
+    /// Appends the headers to `buf`. `writer_ids` are the Responder's DataSetWriters, one per
+    /// message.
     ///
     /// # Errors
-    /// [`EncodeError::MessageCount`] when `writer_ids` is empty, or more than one where the dialect has but one;
-    /// [`EncodeError::Misplaced`] without a PublisherId; [`EncodeError::TooBig`] as
-    /// [`NetworkMessageEncoder::with`] and for what is longer than its length in the ActionHeader can say.
+    /// - [`EncodeError::MessageCount`] if `writer_ids` is empty, or has several ids in a dialect
+    ///   with one message per NetworkMessage.
+    /// - [`EncodeError::Misplaced`] without a PublisherId.
+    /// - [`EncodeError::TooBig`] as for [`NetworkMessageEncoder::with`], and for ActionHeader
+    ///   fields that exceed their length field.
     pub fn new(
         buf: &'b mut Vec<u8>,
         start: &ActionStart<'_>,
@@ -85,12 +89,13 @@ impl<'b> ActionEncoder<'b> {
         })
     }
 
-    /// Opens a request or response of Variants. One left without [`FieldEncoder::finish`] is taken back by the next
-    /// call.
+    /// Starts a request or response of Variants. A message without [`FieldEncoder::finish`] is
+    /// removed by the next call.
     ///
     /// # Errors
-    /// [`EncodeError::MessageCount`] when all announced messages are written, [`EncodeError::Misplaced`] where the
-    /// dialect has RawData, and for header fields where it has no DataSetMessage header.
+    /// - [`EncodeError::MessageCount`] if all announced messages are written.
+    /// - [`EncodeError::Misplaced`] if the dialect uses RawData, or if header fields are set and
+    ///   the dialect has no DataSetMessage header.
     pub fn variants(
         &mut self,
         header: &DataSetHeader,
@@ -102,11 +107,11 @@ impl<'b> ActionEncoder<'b> {
         Ok(FieldEncoder::new(buf, progress, offsets))
     }
 
-    /// Appends a request or response of RawData: `count` fields, which `write` appends, for instance with
-    /// [`RawLayout::write`](crate::RawLayout::write).
+    /// Appends a request or response of RawData with `count` fields. `write` appends the fields,
+    /// for example with [`RawLayout::write`](crate::RawLayout::write).
     ///
     /// # Errors
-    /// As for [`variants`](Self::variants) the other way round, and what `write` gives.
+    /// As for [`variants`](Self::variants) with the encodings swapped, and the errors of `write`.
     pub fn raw_data(
         &mut self,
         header: &DataSetHeader,
@@ -123,11 +128,12 @@ impl<'b> ActionEncoder<'b> {
         progress.message_finished(buf)
     }
 
-    /// Appends a request or response whose fields were encoded before.
+    /// Appends a request or response with encoded fields.
     ///
     /// # Errors
-    /// As for [`variants`](Self::variants) and [`raw_data`](Self::raw_data); [`EncodeError::Misplaced`] also for RawData
-    /// without the FieldCount that the dialect has, and for Variants shorter than theirs.
+    /// As for [`variants`](Self::variants) and [`raw_data`](Self::raw_data). Also
+    /// [`EncodeError::Misplaced`] for RawData without the FieldCount that the dialect requires, and
+    /// for Variants shorter than their FieldCount.
     pub fn fields(
         &mut self,
         header: &DataSetHeader,
@@ -152,18 +158,18 @@ impl<'b> ActionEncoder<'b> {
         }
     }
 
-    /// As [`NetworkMessageEncoder::configured_size`].
+    /// Sets the configured size, as [`NetworkMessageEncoder::configured_size`].
     pub fn configured_size(&mut self, size: u16) {
         self.message.configured_size(size);
     }
 
-    /// Position in the buffer of the payload, which starts with the ActionHeader.
+    /// Returns the position of the payload in the buffer. The payload starts with the ActionHeader.
     #[must_use]
     pub const fn payload_offset(&self) -> usize {
         self.message.payload_offset()
     }
 
-    /// Ends the NetworkMessage.
+    /// Finishes the NetworkMessage.
     ///
     /// # Errors
     /// As [`NetworkMessageEncoder::finish`].
@@ -171,7 +177,7 @@ impl<'b> ActionEncoder<'b> {
         self.message.finish()
     }
 
-    /// Ends the NetworkMessage with a SecurityFooter.
+    /// Finishes the NetworkMessage with a SecurityFooter.
     ///
     /// # Errors
     /// As [`NetworkMessageEncoder::finish_with_footer`].
@@ -179,8 +185,8 @@ impl<'b> ActionEncoder<'b> {
         self.message.finish_with_footer(footer)
     }
 
-    /// Ends a NetworkMessage that was begun with the [`header`](Seal::header) of this seal: encrypts it from the
-    /// ActionHeader on and appends the signature.
+    /// Finishes a NetworkMessage that was started with the [`header`](Seal::header) of this seal:
+    /// encrypts it from the ActionHeader on and appends the signature.
     ///
     /// # Errors
     /// As [`NetworkMessageEncoder::finish_sealed`].
@@ -188,7 +194,7 @@ impl<'b> ActionEncoder<'b> {
         self.message.finish_sealed(seal)
     }
 
-    /// Appends what stands in front of the fields, FieldCount excluded.
+    /// Appends the bytes before the fields, without the FieldCount.
     fn begin(
         &mut self,
         header: &DataSetHeader,

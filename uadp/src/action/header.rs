@@ -1,4 +1,4 @@
-//! The ActionHeader: what belongs to all requests or responses of a NetworkMessage.
+//! The ActionHeader, shared by all requests or responses of a NetworkMessage.
 
 use std::time::Duration;
 
@@ -6,7 +6,7 @@ use crate::reader::Reader;
 use crate::writer::{self, flag};
 use crate::{DecodeError, EncodeError, PublisherId, Scalar, Variant};
 
-/// Whether a message asks or answers.
+/// Direction of an Action message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum ActionKind {
     /// From a Requestor (OPC 10000-14, 7.2.4.5.9).
@@ -15,29 +15,33 @@ pub enum ActionKind {
     Response,
 }
 
-/// What stands in front of the requests or responses of a NetworkMessage (OPC 10000-14, 7.2.4.4.2). What is `None` is
-/// not on the wire.
+/// ActionHeader of a NetworkMessage (OPC 10000-14, 7.2.4.4.2). Fields that are `None` are not
+/// encoded.
 ///
-/// It follows the SecurityHeader and is encrypted with the payload. The numbering of the ActionFlags is that of
-/// UA-.NETStandard 2.0, the only implementation there was to compare with: bit 0 request, 1 ResponseAddress,
-/// 2 CorrelationData, 3 RequestorId, 4 TimeoutHint.
+/// The header follows the SecurityHeader and is encrypted with the payload. The bits of the
+/// ActionFlags are numbered as in UA-.NETStandard 2.0, the only implementation available for
+/// comparison: bit 0 request, 1 ResponseAddress, 2 CorrelationData, 3 RequestorId, 4 TimeoutHint.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ActionHeader<'a> {
-    /// What the NetworkMessage holds.
+    /// Requests or responses.
     pub kind: ActionKind,
-    /// Where the answer is wanted, such as `opc.udp://239.0.0.1:4840`; without one, where the request came from
-    /// (OPC 10000-14, 7.3.2.3). Anybody can write anything here: to answer there is to attack whom it names.
+    /// Requested address of the response, such as `opc.udp://239.0.0.1:4840`. Without it, the
+    /// response goes to the source of the request (OPC 10000-14, 7.3.2.3). The field is not
+    /// trustworthy: a sender can name any host, and responding to that host lets the sender attack
+    /// it.
     pub response_address: Option<&'a str>,
-    /// What the Requestor wants to have back in the response.
+    /// Data that the Responder copies into the response.
     pub correlation_data: Option<&'a [u8]>,
-    /// PublisherId of the Requestor; that in the header of the NetworkMessage is the Responder's.
+    /// PublisherId of the Requestor. The PublisherId in the NetworkMessage header is the
+    /// Responder's.
     pub requestor_id: Option<PublisherId<'a>>,
-    /// How long the Requestor waits, in milliseconds: see [`timeout`](Self::timeout).
+    /// Time that the Requestor waits for the response, in milliseconds: see
+    /// [`timeout`](Self::timeout).
     pub timeout_hint: Option<f64>,
 }
 
 impl<'a> ActionHeader<'a> {
-    /// A header with nothing else in it.
+    /// Creates a header without optional fields.
     #[must_use]
     pub const fn new(kind: ActionKind) -> Self {
         Self {
@@ -49,7 +53,8 @@ impl<'a> ActionHeader<'a> {
         }
     }
 
-    /// The TimeoutHint as a time; `None` without one, and for one that is no time: 0, negative or not a number.
+    /// Returns the TimeoutHint as a duration, or `None` if it is absent, 0, negative or not a
+    /// number.
     #[must_use]
     pub fn timeout(&self) -> Option<Duration> {
         let seconds = self.timeout_hint.filter(|hint| *hint > 0.0)? / 1000.0;
@@ -130,7 +135,7 @@ impl<'a> ActionHeader<'a> {
     }
 }
 
-/// A Variant of one of the types a PublisherId has (OPC 10000-14, 6.2.7.1).
+/// Reads a Variant of a type that a PublisherId can have (OPC 10000-14, 6.2.7.1).
 fn read_requestor_id<'a>(reader: &mut Reader<'a>) -> Result<PublisherId<'a>, DecodeError> {
     let reserved = DecodeError::Reserved {
         field: "RequestorId",
@@ -153,7 +158,7 @@ fn read_requestor_id<'a>(reader: &mut Reader<'a>) -> Result<PublisherId<'a>, Dec
     }
 }
 
-/// A value whose flag is set is not null.
+/// Rejects null for a value whose flag is set.
 fn present<T>(value: Option<T>, field: &'static str) -> Result<T, DecodeError> {
     value.ok_or(DecodeError::Reserved {
         field,

@@ -1,99 +1,107 @@
-//! Reading requests and responses.
+//! Decodes requests and responses.
 
 use super::{ActionCall, ActionHeader, ActionKind};
 use crate::data_set_message::{self as message, Head};
 use crate::reader::Reader;
 use crate::{DataSetHeader, DecodeError, Fields, NetworkHeader, PublisherId};
 
-/// How a peer lays out Actions. Both sides have to be set to the same.
+/// Layout of Actions on the wire. Requestor and Responder have to use the same dialect.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub enum ActionDialect {
-    /// By the text of OPC 10000-14: a request or response is a DataSetMessage with its header (7.2.4.5.4), whose type
-    /// is 5 or 6 and which says the field encoding; a FieldCount stands in front of the fields of either encoding
-    /// (7.2.4.5.9). Several may share a NetworkMessage.
+    /// Layout of OPC 10000-14. A request or response is a DataSetMessage with a header (7.2.4.5.4)
+    /// of type 5 or 6 that contains the field encoding. A FieldCount precedes the fields in both
+    /// encodings (7.2.4.5.9). A NetworkMessage can hold several requests or responses.
     #[default]
     Standard,
-    /// As UA-.NETStandard 2.0 does it: no DataSetMessage header, so no Status and no field encoding either, which both
-    /// sides have to know; no FieldCount with RawData; one request or response in a NetworkMessage. It knows neither
-    /// repetition nor acknowledgement: a request is sent once and executed as often as it comes.
+    /// Layout of UA-.NETStandard 2.0:
+    ///
+    /// - There is no DataSetMessage header, so there is no Status, and both sides have to know the
+    ///   field encoding.
+    /// - RawData has no FieldCount.
+    /// - A NetworkMessage holds a single request or response.
+    /// - There is no repetition and no acknowledgement: a request is sent once and executed each
+    ///   time it is received.
     UaNetStandard(ActionEncoding),
 }
 
-/// How the fields of a request or response are encoded. DataValues are not allowed (OPC 10000-14, 7.2.4.5.9 and
-/// 7.2.4.5.10).
+/// Encoding of the fields of a request or response. DataValues are not allowed (OPC 10000-14,
+/// 7.2.4.5.9 and 7.2.4.5.10).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub enum ActionEncoding {
-    /// Each with its type.
+    /// Each field carries its type.
     #[default]
     Variant,
-    /// Without types, to be read with the ActionMetaData (OPC 10000-14, 7.2.4.5.11).
+    /// Fields without types, decoded with the ActionMetaData (OPC 10000-14, 7.2.4.5.11).
     RawData,
 }
 
-/// State of one execution of an Action: in a request the one the Requestor wants, in a response the one it is in
-/// (OPC 10000-14, 6.2.11.2.1).
+/// State of an execution of an Action: the requested state in a request, the current state in a
+/// response (OPC 10000-14, 6.2.11.2.1).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum ActionState {
-    /// Nothing is executed; what was is forgotten.
+    /// Nothing is executed, and a previous execution is forgotten.
     Idle,
-    /// Under way.
+    /// In progress.
     Executing,
-    /// Over, and this is what came out.
+    /// Finished; the fields are the results.
     Done,
 }
 
-/// The fields of a request or response as they stand on the wire, unread.
+/// Encoded fields of a request or response.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum ActionFields<'a> {
-    /// FieldCount and so many Variants, as [`Fields::parse`] takes them.
+    /// FieldCount and that many Variants, the input of [`Fields::parse`].
     Variants(&'a [u8]),
-    /// Values without types, as [`RawLayout::read`](crate::RawLayout::read) takes them.
+    /// Values without types, the input of [`RawLayout::read`](crate::RawLayout::read).
     RawData {
-        /// FieldCount; `None` from a peer that does not say it.
+        /// FieldCount; `None` in a dialect without it.
         count: Option<u16>,
-        /// The values.
+        /// Encoded values.
         payload: &'a [u8],
     },
 }
 
-/// The requests or responses of a NetworkMessage one by one, in the order of the DataSetWriterIds.
+/// Iterator over the requests or responses of a NetworkMessage, in the order of the
+/// DataSetWriterIds.
 ///
-/// With several a malformed one is an `Err` in its place and the next ones follow. Sizes that reach past the datagram
-/// end the iteration with one `Err`, as do bytes that belong to no message.
+/// A malformed message among several is returned as an `Err`, and the iteration continues with the
+/// next message. The iteration ends with an `Err` if a size exceeds the datagram or if bytes are
+/// left after the last message.
 #[derive(Debug, Clone)]
 pub struct Actions<'a> {
     of: Of<'a>,
     writer_ids: &'a [[u8; 2]],
-    /// `None` for a single message, which takes the whole payload.
+    /// `None` for a single message, which spans the whole payload.
     sizes: Option<&'a [[u8; 2]]>,
     payload: Reader<'a>,
 }
 
-/// One request or response, with the headers it came under (OPC 10000-14, 7.2.4.5.9 and 7.2.4.5.10).
+/// A request or response, with the headers of its NetworkMessage (OPC 10000-14, 7.2.4.5.9 and
+/// 7.2.4.5.10).
 #[derive(Debug, Clone, Copy)]
 pub struct ActionMessage<'a> {
-    /// PublisherId of the Responder, in requests too.
+    /// PublisherId of the Responder, also in requests.
     pub publisher_id: PublisherId<'a>,
-    /// WriterGroup of the Responder, if it is said.
+    /// WriterGroup of the Responder, if present.
     pub writer_group_id: Option<u16>,
     /// DataSetWriter of the Responder.
     pub writer_id: u16,
-    /// What belongs to all messages of the NetworkMessage.
+    /// ActionHeader, shared by all messages of the NetworkMessage.
     pub action: ActionHeader<'a>,
-    /// What the Action is called on: one of the targets in its ActionMetaData.
+    /// Target that the Action is called on, from its ActionMetaData.
     pub target_id: u16,
-    /// Tells the requests of one RequestorId and CorrelationData apart.
+    /// Distinguishes requests with the same RequestorId and CorrelationData.
     pub request_id: u16,
-    /// The state wanted, or the one there is.
+    /// Requested state in a request, current state in a response.
     pub state: ActionState,
-    /// The fields.
+    /// Encoded fields.
     pub fields: ActionFields<'a>,
-    /// How it was laid out.
+    /// Layout of the message.
     pub dialect: ActionDialect,
     head: Option<Head<'a>>,
 }
 
-/// What the messages of one NetworkMessage have in common.
+/// Headers shared by the messages of a NetworkMessage.
 #[derive(Debug, Clone, Copy)]
 struct Of<'a> {
     publisher_id: PublisherId<'a>,
@@ -128,7 +136,7 @@ impl<'a> ActionFields<'a> {
     /// No fields.
     pub const NONE: Self = Self::Variants(&[0, 0]);
 
-    /// The bytes, of Variants with the FieldCount.
+    /// Returns the encoded fields, with the FieldCount for Variants.
     #[must_use]
     pub const fn bytes(&self) -> &'a [u8] {
         match self {
@@ -136,10 +144,10 @@ impl<'a> ActionFields<'a> {
         }
     }
 
-    /// The Variants one by one.
+    /// Returns an iterator over the Variants.
     ///
     /// # Errors
-    /// [`DecodeError::Misread`] for RawData; else as [`Fields::parse`].
+    /// [`DecodeError::Misread`] for RawData; otherwise as [`Fields::parse`].
     pub fn variants(&self) -> Result<Fields<'a>, DecodeError> {
         match self {
             Self::Variants(block) => Fields::parse(block),
@@ -172,14 +180,14 @@ impl<'a> ActionFields<'a> {
 }
 
 impl<'a> Actions<'a> {
-    /// Reads the ActionHeader, and the Sizes where there are some.
+    /// Reads the ActionHeader, and the Sizes if there are several messages.
     pub(crate) fn read(
         header: &NetworkHeader<'a>,
         writer_ids: Option<&'a [[u8; 2]]>,
         mut payload: Reader<'a>,
         dialect: ActionDialect,
     ) -> Result<Self, DecodeError> {
-        // An Action is addressed by them (OPC 10000-14, 7.2.4.5.9).
+        // An Action is addressed by PublisherId and DataSetWriterId (OPC 10000-14, 7.2.4.5.9).
         let (Some(publisher_id), Some(writer_ids)) = (header.publisher_id, writer_ids) else {
             return Err(DecodeError::Reserved {
                 field: "UADPFlags of an Action message",
@@ -213,7 +221,7 @@ impl<'a> Actions<'a> {
         })
     }
 
-    /// What belongs to all of them.
+    /// Returns the ActionHeader, shared by all messages.
     #[must_use]
     pub const fn header(&self) -> &ActionHeader<'a> {
         &self.of.action
@@ -257,7 +265,7 @@ impl<'a> Iterator for Actions<'a> {
 impl std::iter::FusedIterator for Actions<'_> {}
 
 impl ActionMessage<'_> {
-    /// What it says of itself.
+    /// Returns target, request id and state.
     #[must_use]
     pub const fn call(&self) -> ActionCall {
         ActionCall {
@@ -267,7 +275,8 @@ impl ActionMessage<'_> {
         }
     }
 
-    /// The header fields of the DataSetMessage; the default where the dialect has none.
+    /// Returns the header fields of the DataSetMessage, or the default in a dialect without that
+    /// header.
     #[must_use]
     pub fn header(&self) -> DataSetHeader {
         self.head
@@ -334,7 +343,7 @@ impl<'a> Of<'a> {
 }
 
 impl ActionKind {
-    /// The type in DataSetFlags2.
+    /// Returns the DataSetMessage type in DataSetFlags2.
     pub(crate) const fn data_set_message_type(self) -> u8 {
         match self {
             Self::Request => message::KIND_ACTION_REQUEST,

@@ -1,68 +1,69 @@
-//! How a call ends.
+//! Outcomes of calls.
 
 use super::ActionFields;
 use crate::StatusCode;
 
-/// What became of a call, as far as it is known.
+/// Outcome of a call, as far as the Requestor knows it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Outcome<'a> {
-    /// It was executed, and this came out.
+    /// The call was executed.
     Answered {
-        /// Good, or what went wrong in it.
+        /// Good, or the error of the execution.
         status: StatusCode,
-        /// The fields of the response.
+        /// Fields of the response.
         fields: ActionFields<'a>,
     },
-    /// It was not executed.
+    /// The call was not executed.
     Refused(Refusal),
-    /// It may have been executed, or may be still.
+    /// The call may have been executed, or may still be executing.
     Unknown(Unknown),
 }
 
-/// Why a call is not executed. Each has a StatusCode that tells it in a response without fields.
+/// Reason why a call is not executed. Each reason is sent as a StatusCode in a response without
+/// fields.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, thiserror::Error)]
 #[non_exhaustive]
 pub enum Refusal {
-    /// Nothing there with this address: Bad_MethodInvalid.
+    /// No Action has this address: Bad_MethodInvalid.
     #[error("no such Action")]
     NoSuchAction,
-    /// The Requestor may not: Bad_UserAccessDenied.
+    /// The Requestor has no permission: Bad_UserAccessDenied.
     #[error("not allowed")]
     NotAllowed,
-    /// Not now: Bad_NotExecutable.
+    /// Not executable in the present state: Bad_NotExecutable.
     #[error("not executable now")]
     NotExecutable,
-    /// As many as can be are executed already: Bad_TooManyOperations.
+    /// The limit of concurrent executions is reached: Bad_TooManyOperations.
     #[error("busy")]
     Busy,
-    /// The arguments are not those of the Action: Bad_InvalidArgument.
+    /// The arguments do not match the Action: Bad_InvalidArgument.
     #[error("invalid arguments")]
     InvalidArgument,
     /// The arguments are too big: Bad_RequestTooLarge.
     #[error("arguments too big")]
     TooBig,
-    /// The Responder is about to end: Bad_Shutdown.
+    /// The Responder is shutting down: Bad_Shutdown.
     #[error("shutting down")]
     Shutdown,
 }
 
-/// Why it is not known whether a call was executed.
+/// Reason why the outcome of a call is unknown.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, thiserror::Error)]
 #[non_exhaustive]
 pub enum Unknown {
-    /// There was no answer before the deadline. A Responder tells its own by Bad_Timeout.
+    /// The deadline passed without a response. A Responder reports its own timeout as Bad_Timeout.
     #[error("no answer before the deadline")]
     Deadline,
-    /// Nothing was heard of the Responder for the receive timeout.
+    /// The receive timeout passed without a message of the Responder.
     #[error("the responder is silent")]
     Silent,
-    /// What executed it was lost behind the Responder: Bad_NoCommunication.
+    /// The Responder lost the connection to the executor: Bad_NoCommunication.
     #[error("what executed it was lost")]
     Lost,
 }
 
 impl Refusal {
-    /// All there are.
+    /// All reasons.
     pub const ALL: [Self; 7] = [
         Self::NoSuchAction,
         Self::NotAllowed,
@@ -73,7 +74,7 @@ impl Refusal {
         Self::Shutdown,
     ];
 
-    /// The StatusCode it is told by (OPC 10000-6, A.2).
+    /// Returns the StatusCode of the response (OPC 10000-6, A.2).
     #[must_use]
     pub const fn status_code(self) -> StatusCode {
         StatusCode(match self {
@@ -89,8 +90,8 @@ impl Refusal {
 }
 
 impl Unknown {
-    /// The StatusCode a Responder tells it by (OPC 10000-6, A.2); [`Silent`](Self::Silent) as
-    /// [`Deadline`](Self::Deadline).
+    /// Returns the StatusCode of the response of a Responder (OPC 10000-6, A.2).
+    /// [`Silent`](Self::Silent) has the code of [`Deadline`](Self::Deadline).
     #[must_use]
     pub const fn status_code(self) -> StatusCode {
         StatusCode(match self {
@@ -101,10 +102,10 @@ impl Unknown {
 }
 
 impl<'a> Outcome<'a> {
-    /// What a response with ActionState Done says. Without a status it is good.
+    /// Returns the outcome in a response with ActionState Done. A missing status is Good.
     ///
-    /// A Responder that executes an Action and gives it the status of a refusal, without fields, is not told from one
-    /// that refuses it.
+    /// If a Responder executes an Action and responds with the status of a refusal and without
+    /// fields, the response cannot be distinguished from a refusal.
     #[must_use]
     pub fn of(status: Option<u16>, fields: ActionFields<'a>) -> Self {
         let status = StatusCode::from_status(status.unwrap_or_default());
@@ -122,7 +123,7 @@ impl<'a> Outcome<'a> {
         }
     }
 
-    /// Status and fields of the response that says this.
+    /// Returns status and fields of the response with this outcome.
     #[must_use]
     pub const fn to_response(self) -> (StatusCode, ActionFields<'a>) {
         match self {

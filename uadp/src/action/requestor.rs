@@ -1,4 +1,4 @@
-//! The asking side: requests repeated until something is heard, and an end to every one.
+//! The Requestor: repeats each request until the Responder reacts, and ends each call.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::time::Duration;
@@ -11,18 +11,22 @@ use super::{
 };
 use crate::{DecodeError, Fields, OwnedPublisherId};
 
-/// Asks for Actions over a network that may lose, double, delay and reorder what is sent (OPC 10000-14, 6.2.11.2.2).
+/// Calls Actions over a network that can lose, duplicate, delay and reorder messages (OPC 10000-14,
+/// 6.2.11.2.2).
 ///
-/// A request is repeated at the publishing interval until something is heard of it, and not after that: the Responder
-/// repeats its state by itself, and one that has forgotten the request must not be made to execute it again. An answer is
-/// acknowledged with ActionState Idle, until the Responder is idle too or for
-/// [`idle_repeats`](RequestorSettings::idle_repeats). Every call ends, by its deadline at the latest, in one [`Outcome`]:
-/// from [`handle_response`](Self::handle_response), or from [`poll_given_up`](Self::poll_given_up) when it is unknown.
-/// After that the Responder is told to forget it.
+/// The Requestor repeats a request at the publishing interval until it receives the first response.
+/// After that it stops: the Responder repeats its state by itself, and a Responder that has
+/// forgotten the request must not execute it again. The Requestor acknowledges a response with
+/// ActionState Idle until the Responder is idle too, at most
+/// [`idle_repeats`](RequestorSettings::idle_repeats) times. Every call ends, at its deadline at the
+/// latest, with one [`Outcome`]: from [`handle_response`](Self::handle_response), or from
+/// [`poll_given_up`](Self::poll_given_up) if it is unknown. The Requestor then asks the Responder
+/// to forget the call.
 ///
-/// With [`ActionDialect::UaNetStandard`] a request is sent once, as the peer would execute every repetition.
+/// With [`ActionDialect::UaNetStandard`] a request is sent once, because the peer executes every
+/// repetition.
 ///
-/// `now` counts from any fixed time. What is due is asked for until there is nothing more:
+/// `now` counts from any fixed time. The caller polls until nothing more is due:
 /// ```
 /// use std::time::Duration;
 /// use uadp::action::{
@@ -68,132 +72,138 @@ pub struct Requestor {
     calls: BTreeMap<u64, Call>,
     timers: Timers,
     given_up: VecDeque<(CallId, Unknown)>,
-    /// Bytes of the arguments of all calls.
+    /// Total bytes of the arguments of all calls.
     held: usize,
-    /// CorrelationData of the request that is sent.
+    /// CorrelationData of the request being sent.
     correlation_data: [u8; CORRELATION_DATA],
     counters: RequestorCounters,
 }
 
-/// How a [`Requestor`] asks, and what it may hold.
+/// Timing and limits of a [`Requestor`].
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct RequestorSettings {
-    /// PublishingInterval of the Responder's WriterGroup, at which requests are repeated. Default 100 ms.
+    /// PublishingInterval of the Responder's WriterGroup; requests are repeated at this interval.
+    /// Default 100 ms.
     pub publishing_interval: Duration,
-    /// When nothing was heard of the Responder for so long it is taken for lost. [`Duration::MAX`] leaves that to the
-    /// deadline, for Responders that do not repeat Executing by themselves. Default 2 s.
+    /// Time without a message after which the Responder is considered lost. [`Duration::MAX`]
+    /// leaves this to the deadline, for Responders that do not repeat Executing. Default 2 s.
     pub receive_timeout: Duration,
-    /// How often an acknowledgement is sent at most. Default 5.
+    /// Maximum number of transmissions of an acknowledgement. Default 5.
     pub idle_repeats: u8,
-    /// ResponseAddress to send; `None` to be answered where the Responder answers by itself. Default `None`.
+    /// ResponseAddress of the requests. With `None` the Responder chooses the address. Default
+    /// `None`.
     pub response_address: Option<Box<str>>,
-    /// A request with more bytes of arguments than that is repeated byte for byte, so that the chunks of one repetition fill in
-    /// those lost of another (OPC 10000-14, 7.2.4.4.4). Default 1000.
+    /// Number of argument bytes above which all repetitions of a request are identical, so that
+    /// chunks of one repetition replace lost chunks of another (OPC 10000-14, 7.2.4.4.4). Default
+    /// 1000.
     pub large: usize,
-    /// Calls at a time, those that are only to be acknowledged or told still included. Default 1024.
+    /// Maximum number of open calls, including calls that wait for their acknowledgement or whose
+    /// outcome was not polled. Default 1024.
     pub max_calls: usize,
-    /// Bytes of the arguments of all calls. Default 4 MiB.
+    /// Maximum number of argument bytes of all calls. Default 4 MiB.
     pub max_bytes: usize,
 }
 
-/// What a [`Requestor`] is to ask for.
+/// Input of [`Requestor::call`].
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ActionRequest<'a> {
-    /// Of whom, and on what.
+    /// Responder and target.
     pub address: ActionAddress,
-    /// How the Responder has it.
+    /// Dialect of the Responder.
     pub dialect: ActionDialect,
-    /// The arguments.
+    /// Encoded arguments.
     pub fields: ActionFields<'a>,
-    /// How long an answer is waited for. What is left of it goes with every request as its TimeoutHint; what was left at
-    /// first, where arguments are [large](RequestorSettings::large).
+    /// Time to wait for the response. Each request carries the remaining time as its TimeoutHint;
+    /// [large](RequestorSettings::large) requests always carry the remaining time of their first
+    /// transmission.
     pub timeout: Duration,
 }
 
-/// A call of a [`Requestor`], unlike all others of it.
+/// Identifies a call within its [`Requestor`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct CallId(u64);
 
-/// What a response meant.
+/// Meaning of a response.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Heard<'a> {
-    /// The Responder has the request and executes it.
+    /// The Responder has received the request and is executing it.
     Executing(CallId),
-    /// The call is over.
+    /// The call is finished.
     Done(CallId, Outcome<'a>),
-    /// The Responder has forgotten a call that was over.
+    /// The Responder has forgotten a finished call.
     Closed(CallId),
 }
 
-/// Why there is no call.
+/// Reason why a call was not started.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum CallRefusal {
-    /// There are [`RequestorSettings::max_calls`].
+    /// The limit [`RequestorSettings::max_calls`] is reached.
     #[error("{0} calls at a time are all there may be")]
     TooManyCalls(usize),
-    /// With these arguments there would be more bytes than [`RequestorSettings::max_bytes`].
+    /// The arguments would exceed [`RequestorSettings::max_bytes`].
     #[error("{bytes} bytes of arguments are too many")]
     TooManyBytes {
-        /// Bytes of all arguments there would be.
+        /// Total argument bytes, including the new call.
         bytes: usize,
     },
-    /// A call cannot be answered in no time.
+    /// The timeout is 0.
     #[error("a timeout of 0")]
     NoTime,
-    /// Arguments that are no block of Variants.
+    /// The arguments are not a valid block of Variants.
     #[error("arguments: {0}")]
     Malformed(DecodeError),
-    /// Arguments in an encoding that the dialect has not, or RawData without a FieldCount where it is needed.
+    /// The dialect does not support the encoding of the arguments, or requires a FieldCount for
+    /// RawData.
     #[error("arguments in an encoding the peer does not know")]
     Encoding,
 }
 
-/// Why a response was not taken.
+/// Reason why a response was dropped.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, thiserror::Error)]
 #[non_exhaustive]
 pub enum ResponseDrop {
-    /// It is a request.
+    /// The message is a request.
     #[error("a request")]
     Request,
-    /// It answers another Requestor, or an earlier life of this one.
+    /// The response belongs to another Requestor, or to an earlier instance of this Requestor.
     #[error("an answer to another requestor")]
     Foreign,
-    /// No call of this id, or not any more.
+    /// No open call has this id.
     #[error("an answer to no call")]
     NoCall,
-    /// It does not come from where the call went, or in another dialect.
+    /// The response has another address or dialect than the call.
     #[error("an answer from elsewhere")]
     Elsewhere,
-    /// The call was answered before.
+    /// The call has its response already.
     #[error("an answer once more")]
     Repeated,
-    /// The call was given up before.
+    /// The call was given up.
     #[error("an answer too late")]
     Late,
-    /// A state that means nothing now.
+    /// The state is not valid in the present phase.
     #[error("an unexpected state")]
     State,
 }
 
-/// What became of calls and messages.
+/// Counters of calls and messages.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub struct RequestorCounters {
-    /// Calls begun.
+    /// Started calls.
     pub calls: u64,
-    /// Requests handed out to be sent, acknowledgements and repetitions included.
+    /// Requests returned for sending, including acknowledgements and repetitions.
     pub sent: u64,
-    /// Those of them that repeat one.
+    /// Repetitions among the sent requests.
     pub repeated: u64,
-    /// Calls that were answered or refused.
+    /// Calls that were executed or refused.
     pub answered: u64,
-    /// Calls whose outcome is unknown.
+    /// Calls with unknown outcome.
     pub unknown: u64,
-    /// Calls given up by whoever made them.
+    /// Calls abandoned by the caller.
     pub abandoned: u64,
-    /// Acknowledgements that were not answered.
+    /// Acknowledgements without response.
     pub unacknowledged: u64,
-    /// Responses not taken.
+    /// Dropped responses.
     pub dropped: u64,
 }
 
@@ -201,7 +211,7 @@ pub struct RequestorCounters {
 struct Call {
     address: ActionAddress,
     dialect: ActionDialect,
-    /// Empty when only the acknowledgement is left.
+    /// Empty if only the acknowledgement is pending.
     fields: KeptFields,
     phase: Phase,
     next_send: Option<Duration>,
@@ -211,15 +221,15 @@ struct Call {
 
 #[derive(Debug, Clone, Copy)]
 enum Phase {
-    /// Executing is wanted.
+    /// The Requestor requests Executing.
     Asking {
         deadline: Duration,
-        /// When the Responder is taken for lost.
+        /// Time at which the Responder is considered lost.
         silent: Duration,
-        /// TimeoutHint of a large request, once it was sent.
+        /// TimeoutHint of a large request after its first transmission.
         hint: Option<f64>,
     },
-    /// Idle is wanted, so many more times.
+    /// The Requestor requests Idle, `left` more times.
     Closing { left: u8, given_up: bool },
 }
 
@@ -238,14 +248,15 @@ impl Default for RequestorSettings {
 }
 
 impl Requestor {
-    /// Takes another [`RequestorSettings::receive_timeout`]: for new calls, and for those there are from the next word of their
-    /// Responder on.
+    /// Sets [`RequestorSettings::receive_timeout`]. It applies to new calls, and to open calls from
+    /// the next response on.
     pub const fn set_receive_timeout(&mut self, receive_timeout: Duration) {
         self.settings.receive_timeout = receive_timeout;
     }
 
-    /// A Requestor without calls. `instance` are random bytes, others each time a program starts: they tell its requests
-    /// from those of its earlier lives, which a Responder may still remember.
+    /// Creates a Requestor without calls. `instance` are random bytes, different at each start of
+    /// the program. They distinguish its requests from requests of earlier instances that a
+    /// Responder may remember.
     #[must_use]
     pub const fn new(
         id: OwnedPublisherId,
@@ -275,10 +286,10 @@ impl Requestor {
         }
     }
 
-    /// Begins a call, which is due to be sent at once.
+    /// Starts a call. Its request is due immediately.
     ///
     /// # Errors
-    /// Nothing is begun, for the reason given.
+    /// The reason why the call was not started.
     pub fn call(
         &mut self,
         request: ActionRequest<'_>,
@@ -307,7 +318,7 @@ impl Requestor {
         let deadline = now.saturating_add(timeout);
         let silent = match dialect {
             ActionDialect::Standard => now.saturating_add(self.settings.receive_timeout),
-            // It says nothing before the answer.
+            // This dialect sends nothing before the result.
             ActionDialect::UaNetStandard(_) => deadline,
         };
         let mut call = Call {
@@ -329,8 +340,8 @@ impl Requestor {
         Ok(CallId(id))
     }
 
-    /// Gives a call up: its outcome will not be told, and the Responder is told to forget it. False for a call that is
-    /// over.
+    /// Abandons a call: its outcome is not reported, and the Responder is asked to forget it.
+    /// Returns false if the call is finished.
     pub fn abandon(&mut self, call: CallId, now: Duration) -> bool {
         match self.calls.get(&call.0).map(|call| call.phase) {
             Some(Phase::Asking { .. }) => {
@@ -342,10 +353,10 @@ impl Requestor {
         }
     }
 
-    /// Takes a response of any Responder.
+    /// Handles a response from any Responder.
     ///
     /// # Errors
-    /// It is not taken, for the reason given: nothing changes by it.
+    /// The reason why the response was dropped without effect.
     pub fn handle_response<'a>(
         &mut self,
         response: &ActionMessage<'a>,
@@ -361,16 +372,16 @@ impl Requestor {
         heard
     }
 
-    /// Whether a response answers a call that is open here, whoever sent it.
+    /// Returns true if the response belongs to an open call, regardless of its sender.
     #[must_use]
     pub fn is_awaited(&self, response: &ActionMessage<'_>) -> bool {
         let id = self.id_of(response);
         id.is_ok_and(|id| self.calls.contains_key(&id))
     }
 
-    /// Ends calls that are past their deadline or whose Responder is silent.
+    /// Ends calls that are past their deadline or whose Responder is lost.
     pub fn handle_timeout(&mut self, now: Duration) {
-        // An entry is moved behind `now` or left to be sent, which stands at the front then.
+        // Each due entry is removed, moved behind `now`, or due for sending, which ends the loop.
         while let Some(id) = self.timers.due(now) {
             let Some(call) = self.calls.get(&id) else {
                 return;
@@ -396,7 +407,7 @@ impl Requestor {
         }
     }
 
-    /// The next request that is due to be sent.
+    /// Returns the next request that is due.
     pub fn poll_transmit(&mut self, now: Duration) -> Option<ActionToSend<'_>> {
         self.handle_timeout(now);
         let id = self.timers.due(now)?;
@@ -447,24 +458,24 @@ impl Requestor {
         })
     }
 
-    /// The next call whose outcome is unknown. It is told once.
+    /// Returns the next call with unknown outcome. Each call is returned once.
     pub fn poll_given_up(&mut self) -> Option<(CallId, Unknown)> {
         self.given_up.pop_front()
     }
 
-    /// When [`poll_transmit`](Self::poll_transmit) is to be called next.
+    /// Returns the time of the next call of [`poll_transmit`](Self::poll_transmit).
     #[must_use]
     pub fn poll_timeout(&self) -> Option<Duration> {
         self.timers.next()
     }
 
-    /// Calls that are not over, and those only to be acknowledged still.
+    /// Returns the number of open calls, including calls that wait for their acknowledgement.
     #[must_use]
     pub fn open_calls(&self) -> usize {
         self.calls.len()
     }
 
-    /// What was counted so far.
+    /// Returns the counters.
     #[must_use]
     pub const fn counters(&self) -> &RequestorCounters {
         &self.counters
@@ -507,13 +518,13 @@ impl Requestor {
         }
     }
 
-    /// Which call is answered.
+    /// Returns the id of the call that a response belongs to.
     fn id_of(&self, response: &ActionMessage<'_>) -> Result<u64, ResponseDrop> {
         let action = &response.action;
         if action.kind == ActionKind::Request {
             return Err(ResponseDrop::Request);
         }
-        // Not every Responder gives the RequestorId back.
+        // Some Responders do not return the RequestorId.
         if action.requestor_id.is_some_and(|id| id != self.id.as_id()) {
             return Err(ResponseDrop::Foreign);
         }
@@ -526,13 +537,13 @@ impl Requestor {
         Ok(u64::from(lap) << 16 | u64::from(response.request_id))
     }
 
-    /// Goes on to the acknowledgement, where there is one.
+    /// Starts the acknowledgement, if the dialect has one.
     fn close(&mut self, id: u64, given_up: bool, now: Duration) {
         let left = self.settings.idle_repeats;
         let Some(call) = self.calls.get_mut(&id) else {
             return;
         };
-        // A request that was never sent is nothing to be forgotten.
+        // A request that was never sent does not have to be forgotten.
         if left == 0 || call.dialect != ActionDialect::Standard || !call.sent {
             self.forget(id);
             return;
@@ -567,7 +578,7 @@ impl Call {
     }
 }
 
-/// The arguments can be written in the dialect.
+/// Checks that the dialect supports the encoding of the arguments.
 fn check(dialect: ActionDialect, fields: ActionFields<'_>) -> Result<(), CallRefusal> {
     match (dialect, fields) {
         (
@@ -588,7 +599,8 @@ fn check(dialect: ActionDialect, fields: ActionFields<'_>) -> Result<(), CallRef
     }
 }
 
-/// The RequestIds start over with other CorrelationData when they are used up.
+/// Returns the RequestId. After 65536 ids the CorrelationData changes and the RequestIds start
+/// over.
 fn request_id(id: u64) -> u16 {
     let [low, high, ..] = id.to_le_bytes();
     u16::from_le_bytes([low, high])
@@ -607,5 +619,5 @@ fn correlation_data(instance: [u8; INSTANCE], id: u64) -> [u8; CORRELATION_DATA]
 const INSTANCE: usize = 16;
 const CORRELATION_DATA: usize = INSTANCE + size_of::<u32>();
 
-/// What keeps a publishing interval of 0 from sending without end.
+/// Minimum of the publishing interval, which prevents endless sending at an interval of 0.
 const LEAST_INTERVAL: Duration = Duration::from_millis(1);

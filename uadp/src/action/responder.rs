@@ -1,4 +1,4 @@
-//! The answering side: each request executed at most once, and answered as often as it is asked for.
+//! The Responder: executes each request at most once, and repeats its response on request.
 
 mod entry;
 mod over;
@@ -24,31 +24,38 @@ pub use settings::{
     ResponderSettings,
 };
 
-/// Answers requests that come over a network that may lose, double, delay and reorder them
-/// (OPC 10000-14, 6.2.11.2.2).
+/// Responds to requests over a network that can lose, duplicate, delay and reorder messages (OPC
+/// 10000-14, 6.2.11.2.2).
 ///
-/// A request is known by RequestorId, CorrelationData and RequestId, and executed at most once: whoever owns the
-/// Responder executes what [`handle_request`](Self::handle_request) says, and tells what came out by
-/// [`finish`](Self::finish) or [`refuse`](Self::refuse). Until then the Responder says Executing at every publishing
-/// interval, afterwards Done, until the Requestor wants Idle or it was said
-/// [`done_repeats`](ResponderSettings::done_repeats). A repetition is answered once more, at most once an interval.
+/// A request is identified by RequestorId, CorrelationData and RequestId, and executed at most
+/// once. The owner of the Responder executes the requests that
+/// [`handle_request`](Self::handle_request) returns, and reports the results with
+/// [`finish`](Self::finish) or [`refuse`](Self::refuse). Until then the Responder sends Executing
+/// at every publishing interval. Afterwards it sends Done, until the Requestor requests Idle or
+/// Done was repeated [`done_repeats`](ResponderSettings::done_repeats) times. It also responds to
+/// repetitions, at most once per interval.
 ///
-/// What was asked is remembered for [`remember`](ResponderSettings::remember) after it was heard of last, refusals and
-/// acknowledged answers too: a request that the network doubles and delays for longer than that is executed again, as is
-/// one repeated to a Responder that started anew. With message security [`Opener`](crate::Opener) lets no message
-/// through twice, however late. Of those that are over a few bytes are kept where room is wanted, so that thousands a second
-/// can be remembered; they are not acknowledged again then. While there is no room to remember one more, new requests are
-/// dropped and not answered: a refusal that is forgotten could be executed by a repetition after all.
+/// A request is remembered for [`remember`](ResponderSettings::remember) after its last message,
+/// including refused and acknowledged requests. A request is executed again if the network
+/// duplicates and delays it for longer, or if it is repeated to a restarted Responder. With message
+/// security, [`Opener`](crate::Opener) accepts no message twice, however late.
 ///
-/// Where answers go is the owner's matter: `P` is whatever it takes to send there, given with the request. To answer
-/// where a request asks to be answered lets everybody send the answers to others.
+/// When space is short, only a few bytes of each finished request are kept, so that thousands of
+/// requests per second can be remembered. Such requests are not acknowledged again. If there is no
+/// space to remember a request, it is dropped without response: a repetition of a refused and
+/// forgotten request could be executed.
 ///
-/// Each [`RequestOrigin`] has room of its own, whatever RequestorId a request carries: a sender cannot fill the room of
-/// other senders, and a group of senders cannot fill the room of another group. A request that the owner refuses
-/// by [`handle_judged`](Self::handle_judged) is remembered by its hash and answered once.
+/// The owner decides where responses go. `P` is the address to send to, passed with the request. If
+/// the owner responded to the address in the request, any sender could direct responses to other
+/// hosts.
 ///
-/// A peer of [`ActionDialect::UaNetStandard`] is answered once, without repetition. Its messages have no place for a
-/// status, so an outcome that needs one is not told at all.
+/// Each [`RequestOrigin`] has separate limits, independent of the RequestorId in the request: a
+/// sender cannot exhaust the space of other senders, and a group of senders cannot exhaust the
+/// space of another group. A request that the owner refuses in
+/// [`handle_judged`](Self::handle_judged) is remembered by its hash and gets one response.
+///
+/// A peer with [`ActionDialect::UaNetStandard`] gets one response without repetition. Its messages
+/// have no status, so an outcome that needs a status is not sent.
 ///
 /// `now` counts from any fixed time.
 /// ```
@@ -106,33 +113,33 @@ pub struct Responder<P> {
     entries: BTreeMap<u64, Entry<P>>,
     ids: BTreeMap<Key, u64>,
     timers: Timers,
-    /// Room taken up by each sender of each group.
+    /// Space used by each sender of each group.
     usage: BTreeMap<RequestOrigin<P>, Usage>,
-    /// Room taken up by each group.
+    /// Space used by each group.
     totals: BTreeMap<usize, Usage>,
-    /// Requests that are over, and are remembered by little else than that.
+    /// Finished requests of which only a hash is kept.
     over: Over<P>,
-    /// Requests that were refused before room was taken for them.
+    /// Requests that were refused before space was allocated.
     refused: Refused<P>,
-    /// Answer to a refused request that is sent.
+    /// The response to a refused request that is being sent.
     answer: Option<Answer<P>>,
-    /// Executions past their deadline that were not told yet.
+    /// Executions past their deadline that were not yet polled.
     overdue: BTreeSet<u64>,
     counters: ResponderCounters,
 }
 
-/// Room that is taken up.
+/// Used space.
 #[derive(Debug, Default)]
 struct Usage {
     requests: usize,
     bytes: usize,
     executing: usize,
-    /// Those of the requests that are over, the oldest first.
+    /// Closed requests, oldest first.
     closed: BTreeSet<u64>,
 }
 
 impl<P: Ord + Clone> Responder<P> {
-    /// A Responder that was not asked anything.
+    /// Creates a Responder without requests.
     #[must_use]
     pub fn new(settings: ResponderSettings) -> Self {
         Self {
@@ -151,10 +158,11 @@ impl<P: Ord + Clone> Responder<P> {
         }
     }
 
-    /// Takes a request, whose answer goes to `reply_to`; a repetition is answered where the first one was.
+    /// Handles a request whose response goes to `reply_to`. The response to a repetition goes to
+    /// the address of the first request.
     ///
     /// # Errors
-    /// It is not taken, for the reason given, and not answered.
+    /// The reason why the request was dropped without response.
     pub fn handle_request(
         &mut self,
         request: &ActionMessage<'_>,
@@ -168,13 +176,13 @@ impl<P: Ord + Clone> Responder<P> {
         self.handle_judged(request, (origin, Ok(())), now)
     }
 
-    /// Takes a request as [`handle_request`](Self::handle_request) does, with the owner's verdict on a new request. A refused
-    /// request is remembered by its hash and answered once; its repetitions are answered up to
-    /// [`refusal_repeats`](ResponderSettings::refusal_repeats) times. The verdict does not apply to a request that is
-    /// known already.
+    /// Handles a request as [`handle_request`](Self::handle_request), with the owner's verdict on a
+    /// new request. A refused request is remembered by its hash and gets one response. Its
+    /// repetitions get a response up to [`refusal_repeats`](ResponderSettings::refusal_repeats)
+    /// times. The verdict does not apply to a known request.
     ///
     /// # Errors
-    /// It is not taken, for the reason given, and not answered.
+    /// The reason why the request was dropped without response.
     pub fn handle_judged(
         &mut self,
         request: &ActionMessage<'_>,
@@ -194,10 +202,10 @@ impl<P: Ord + Clone> Responder<P> {
         requested
     }
 
-    /// Says what came out of an execution, for it to be answered.
+    /// Sets the outcome of an execution, which is sent to the Requestor.
     ///
     /// # Errors
-    /// The outcome is not told, for the reason given.
+    /// The reason why the outcome is not sent.
     pub fn finish(
         &mut self,
         execution: ExecutionId,
@@ -227,7 +235,7 @@ impl<P: Ord + Clone> Responder<P> {
         if told.is_ok() && dialect != ActionDialect::Standard && status != StatusCode::GOOD {
             told = Err(FinishRefusal::NoStatus);
         }
-        // A Requestor that has received nothing repeats its request, and a repetition is answered again.
+        // A Requestor without a response repeats its request, and each repetition gets a response.
         let is_repeated = entry_said || !matches!(outcome, Outcome::Refused(_));
         let repeats = match is_repeated {
             true => self.settings.done_repeats,
@@ -237,7 +245,7 @@ impl<P: Ord + Clone> Responder<P> {
         told
     }
 
-    /// Says that a request is not executed.
+    /// Refuses to execute a request.
     ///
     /// # Errors
     /// As [`finish`](Self::finish).
@@ -250,7 +258,7 @@ impl<P: Ord + Clone> Responder<P> {
         self.finish(execution, Outcome::Refused(refusal), now)
     }
 
-    /// Forgets what is too old, and notes which executions are past their deadline.
+    /// Removes expired requests, and records executions that are past their deadline.
     pub fn handle_timeout(&mut self, now: Duration) {
         self.over.forget_until(now);
         self.refused.forget_until(now);
@@ -275,7 +283,7 @@ impl<P: Ord + Clone> Responder<P> {
         }
     }
 
-    /// The next response that is due to be sent, and where to.
+    /// Returns the next response that is due, and its destination.
     pub fn poll_transmit(&mut self, now: Duration) -> Option<(&P, ActionToSend<'_>)> {
         self.handle_timeout(now);
         if let Some(answer) = self.refused.pop() {
@@ -316,20 +324,20 @@ impl<P: Ord + Clone> Responder<P> {
         Some((&entry.origin.sender, response))
     }
 
-    /// An execution that is past its deadline: its Requestor does not wait any more. It is told once, and may still be
-    /// finished.
+    /// Returns an execution that is past its deadline, so that its Requestor has stopped waiting.
+    /// Each execution is returned once and may still be finished.
     pub fn poll_overdue(&mut self) -> Option<ExecutionId> {
         self.overdue.pop_first().map(ExecutionId)
     }
 
-    /// When [`poll_transmit`](Self::poll_transmit) is to be called next.
+    /// Returns the time of the next call of [`poll_transmit`](Self::poll_transmit).
     #[must_use]
     pub fn poll_timeout(&self) -> Option<Duration> {
         let next = self.timers.next();
         next.into_iter().chain(self.refused.due()).min()
     }
 
-    /// Requests that are remembered, and bytes they take up.
+    /// Returns the number of remembered requests and the bytes that they use.
     #[must_use]
     pub fn held(&self) -> (usize, usize) {
         let (over, refused) = (self.over.len(), self.refused.len());
@@ -343,7 +351,7 @@ impl<P: Ord + Clone> Responder<P> {
         )
     }
 
-    /// What was counted so far.
+    /// Returns the counters.
     #[must_use]
     pub const fn counters(&self) -> &ResponderCounters {
         &self.counters
@@ -387,7 +395,7 @@ impl<P: Ord + Clone> Responder<P> {
         }
     }
 
-    /// A request that was not heard before.
+    /// Admits a new request.
     fn admit(
         &mut self,
         key: Key,
@@ -402,7 +410,8 @@ impl<P: Ord + Clone> Responder<P> {
         self.next += 1;
         let execution = ExecutionId(id);
         let (phase, requested) = match request.state {
-            // The request it takes back is lost or still under way: it is not executed any more.
+            // An Idle request ends a request that is lost or still under way, which is then never
+            // executed.
             ActionState::Idle | ActionState::Done => (Phase::Closed, Requested::Closed(execution)),
             ActionState::Executing if is_busy => {
                 let busy = Refusal::Busy;
@@ -451,7 +460,7 @@ impl<P: Ord + Clone> Responder<P> {
         Ok(requested)
     }
 
-    /// Whether as many requests of the sender or of its group are executed as may be.
+    /// Returns true if the sender or its group has reached the limit of concurrent executions.
     fn is_busy(&self, origin: &RequestOrigin<P>) -> bool {
         let executing = |usage: Option<&Usage>| usage.map_or(0, |usage| usage.executing);
         let settings = &self.settings;
@@ -459,7 +468,7 @@ impl<P: Ord + Clone> Responder<P> {
             || executing(self.totals.get(&origin.group)) >= settings.max_executing
     }
 
-    /// Makes room for one more request, at the cost of what is known of those that are over.
+    /// Makes space for a request by reducing closed requests to their hashes.
     fn make_room(&mut self, origin: &RequestOrigin<P>, cost: usize) -> Result<(), RequestDrop> {
         let settings = self.settings;
         while let Some(used) = self.usage.get(origin)
@@ -474,13 +483,13 @@ impl<P: Ord + Clone> Responder<P> {
         {
             let oldest = used.closed.first().copied();
             let shrunk = self.shrink(oldest.ok_or(RequestDrop::Full)?);
-            // The sender itself has room: it is its group that has none.
+            // The sender has space, but its group does not.
             shrunk.map_err(|_| RequestDrop::Full)?;
         }
         Ok(())
     }
 
-    /// Keeps of a request that is over no more than that.
+    /// Reduces a closed request to its hash.
     fn shrink(&mut self, id: u64) -> Result<(), RequestDrop> {
         let entry = self.entries.get(&id).ok_or(RequestDrop::Full)?;
         let until = entry.expires(self.settings.remember);
@@ -490,7 +499,7 @@ impl<P: Ord + Clone> Responder<P> {
         Ok(())
     }
 
-    /// A request that was heard before.
+    /// Handles a repetition of a known request.
     fn repeated(
         &mut self,
         id: u64,
@@ -500,7 +509,7 @@ impl<P: Ord + Clone> Responder<P> {
         let interval = self.interval();
         let entry = self.entries.get_mut(&id).ok_or(RequestDrop::Full)?;
         let arguments = fingerprint(request);
-        // Of one that was taken back before it came, nothing is known.
+        // The arguments of a request that was ended before it was received are unknown.
         let same = entry.arguments == arguments || matches!(entry.phase, Phase::Closed);
         if !entry.address.is_of(request) || entry.dialect != request.dialect || !same {
             return Err(RequestDrop::Reused);
@@ -508,14 +517,14 @@ impl<P: Ord + Clone> Responder<P> {
         entry.touched = now;
         match entry.phase {
             Phase::Executing { .. } | Phase::Done { .. } => entry.answer(now, interval),
-            // Late: it was acknowledged, or taken back.
+            // A late repetition: the request was acknowledged or ended.
             Phase::Closed => {}
         }
         self.schedule(id);
         Ok(Requested::Repeated(ExecutionId(id)))
     }
 
-    /// The Requestor has the answer, or does not want it any more.
+    /// Handles an Idle request: the Requestor has the response, or does not want it.
     fn acknowledged(
         &mut self,
         id: u64,
@@ -555,7 +564,7 @@ impl<P: Ord + Clone> Responder<P> {
         Ok(requested)
     }
 
-    /// The execution is over, with this to say of it.
+    /// Ends an execution with a status and fields.
     fn conclude(
         &mut self,
         id: u64,
@@ -581,7 +590,7 @@ impl<P: Ord + Clone> Responder<P> {
             let bytes = fields.bytes().len();
             entry.answer_bytes = bytes;
             entry.phase = Phase::done(status, fields, repeats);
-            // Executing was said a moment ago, maybe; the answer does not wait for that.
+            // The result is due immediately, even if Executing was sent within this interval.
             entry.last_sent = None;
             entry.next_send = None;
             entry.answer(now, Duration::ZERO);
@@ -607,7 +616,8 @@ impl<P: Ord + Clone> Responder<P> {
             && sender + bytes <= self.settings.max_bytes_per_sender
     }
 
-    /// A request is over: nobody will ask for its answer again, whose bytes are freed.
+    /// Closes a request: its response is not requested again, so the bytes of the response are
+    /// freed.
     fn closed(&mut self, id: u64) {
         if let Some(entry) = self.entries.get_mut(&id) {
             let bytes = std::mem::take(&mut entry.answer_bytes);
@@ -662,14 +672,14 @@ impl<P: Ord + Clone> Responder<P> {
     }
 }
 
-/// Tells other arguments under the same ids.
+/// Returns a hash that detects different arguments with the same ids.
 fn fingerprint(request: &ActionMessage<'_>) -> u64 {
     let mut hasher = DefaultHasher::new();
     request.fields.hash(&mut hasher);
     hasher.finish()
 }
 
-/// The fields can be written in the dialect.
+/// Returns true if the dialect supports the encoding of the fields.
 fn is_written_in(dialect: ActionDialect, fields: ActionFields<'_>) -> bool {
     use super::ActionEncoding::{RawData, Variant};
     match (dialect, fields) {
@@ -679,7 +689,7 @@ fn is_written_in(dialect: ActionDialect, fields: ActionFields<'_>) -> bool {
         ) => block.len() >= 2,
         (ActionDialect::Standard, ActionFields::RawData { count, .. }) => count.is_some(),
         (ActionDialect::UaNetStandard(RawData), ActionFields::RawData { .. }) => true,
-        // What has no fields has no encoding.
+        // An empty field list is valid in either encoding.
         (ActionDialect::UaNetStandard(RawData), ActionFields::Variants(block)) => block == [0, 0],
         (ActionDialect::UaNetStandard(Variant), ActionFields::RawData { .. }) => false,
     }
@@ -688,8 +698,8 @@ fn is_written_in(dialect: ActionDialect, fields: ActionFields<'_>) -> bool {
 const BAD_ENCODING_ERROR: StatusCode = StatusCode(0x8006_0000);
 const BAD_RESPONSE_TOO_LARGE: StatusCode = StatusCode(0x80B9_0000);
 
-/// Repetitions of an answer that nothing but a repetition of its request brings back.
+/// Number of unprompted repetitions of a response that only a repeated request triggers again.
 const ONCE: u32 = 0;
 
-/// What keeps a publishing interval of 0 from sending without end.
+/// Minimum of the publishing interval, which prevents endless sending at an interval of 0.
 const LEAST_INTERVAL: Duration = Duration::from_millis(1);

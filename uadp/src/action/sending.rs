@@ -1,4 +1,4 @@
-//! What a Requestor or Responder has to say next, and to whom it belongs.
+//! Messages that a Requestor or Responder has to send, and their addresses.
 
 use super::{
     ActionCall, ActionDialect, ActionEncoder, ActionFields, ActionHeader, ActionMessage,
@@ -6,38 +6,38 @@ use super::{
 };
 use crate::{DataSetHeader, EncodeError, Extras, GroupHeader, NetworkHeader, OwnedPublisherId};
 
-/// What an Action is called by: its Responder, and which of its targets (OPC 10000-14, 7.2.4.5.9).
+/// Address of an Action: its Responder and target (OPC 10000-14, 7.2.4.5.9).
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct ActionAddress {
     /// PublisherId of the Responder.
     pub publisher_id: OwnedPublisherId,
-    /// Its WriterGroup, where messages say it.
+    /// WriterGroup of the Responder, if messages contain it.
     pub writer_group_id: Option<u16>,
-    /// Its DataSetWriter.
+    /// DataSetWriter of the Responder.
     pub writer_id: u16,
-    /// The target in the ActionMetaData of the DataSetWriter.
+    /// Target in the ActionMetaData of the DataSetWriter.
     pub target_id: u16,
 }
 
-/// A request or response that is due, to be written into a NetworkMessage of its own.
+/// A request or response that is due, encoded as a separate NetworkMessage.
 #[derive(Debug, Clone, Copy)]
 pub struct ActionToSend<'a> {
-    /// The Responder, in responses too.
+    /// Address of the Responder, also in responses.
     pub address: &'a ActionAddress,
     /// The ActionHeader.
     pub action: ActionHeader<'a>,
-    /// Which of the Requestor's requests it is.
+    /// RequestId of the request.
     pub request_id: u16,
-    /// Which call of its Requestor or Responder it is of. Nothing of the wire: it tells a repetition, for which chunks are to
-    /// have the MessageSequenceNumber that they had before.
+    /// Identifies the call within its Requestor or Responder. It is not encoded; it identifies
+    /// repetitions, whose chunks have to carry the MessageSequenceNumber of the first transmission.
     pub call: u64,
-    /// The state wanted, or the one there is.
+    /// Requested state in a request, current state in a response.
     pub state: ActionState,
     /// Status of the DataSetMessage header, in responses.
     pub status: Option<u16>,
-    /// The fields.
+    /// Encoded fields.
     pub fields: ActionFields<'a>,
-    /// How the peer wants to have it.
+    /// Dialect of the peer.
     pub dialect: ActionDialect,
 }
 
@@ -53,7 +53,7 @@ pub(super) enum KeptFields {
 }
 
 impl ActionAddress {
-    /// True for the address of the message.
+    /// Returns true if the message has this address.
     #[must_use]
     pub fn is_of(&self, message: &ActionMessage<'_>) -> bool {
         self.publisher_id.as_id() == message.publisher_id
@@ -75,11 +75,12 @@ impl From<&ActionMessage<'_>> for ActionAddress {
 
 impl ActionToSend<'_> {
     /// Appends the NetworkMessage to `buf`, up to its [`finish`](ActionEncoder::finish) or
-    /// [`finish_sealed`](ActionEncoder::finish_sealed). What `network` says of PublisherId and WriterGroupId is replaced
-    /// by the address.
+    /// [`finish_sealed`](ActionEncoder::finish_sealed). The address replaces PublisherId and
+    /// WriterGroupId of `network`.
     ///
     /// # Errors
-    /// [`EncodeError::TooBig`] when the PublisherId or a part of the ActionHeader is longer than its length can say.
+    /// [`EncodeError::TooBig`] if the PublisherId or a field of the ActionHeader exceeds its length
+    /// field.
     pub fn encode<'b>(
         &self,
         buf: &'b mut Vec<u8>,

@@ -1,9 +1,9 @@
-//! When what has to be looked at next.
+//! Timers, ordered by time.
 
 use std::collections::BTreeSet;
 use std::time::Duration;
 
-/// One time for each id.
+/// A set with one timer per id.
 #[derive(Debug)]
 pub(super) struct Timers {
     at: BTreeSet<(Duration, u64)>,
@@ -16,7 +16,7 @@ impl Timers {
         }
     }
 
-    /// Moves the timer of `id`, which stands at `wake`, to `next`.
+    /// Moves the timer of `id` from `wake` to `next`.
     pub(super) fn move_to(&mut self, id: u64, wake: &mut Duration, next: Duration) {
         self.at.remove(&(*wake, id));
         self.at.insert((next, id));
@@ -27,12 +27,12 @@ impl Timers {
         self.at.remove(&(wake, id));
     }
 
-    /// The first timer.
+    /// Returns the time of the first timer.
     pub(super) fn next(&self) -> Option<Duration> {
         self.at.first().map(|(at, _)| *at)
     }
 
-    /// Whose timer is due first.
+    /// Returns the id of the first timer if it is due.
     pub(super) fn due(&self, now: Duration) -> Option<u64> {
         let (at, id) = self.at.first()?;
         (*at <= now).then_some(*id)

@@ -1,4 +1,4 @@
-//! One request that is remembered.
+//! A remembered request.
 
 use std::time::Duration;
 
@@ -6,7 +6,7 @@ use super::{KeptFields, RequestOrigin};
 use crate::action::{ActionAddress, ActionDialect, ActionFields, ActionMessage};
 use crate::{OwnedPublisherId, StatusCode};
 
-/// What a request is known by (OPC 10000-14, 6.2.11.2.2).
+/// Identity of a request (OPC 10000-14, 6.2.11.2.2).
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub(super) struct Key {
     pub(super) requestor_id: Option<OwnedPublisherId>,
@@ -14,17 +14,17 @@ pub(super) struct Key {
     pub(super) request_id: u16,
 }
 
-/// A request, from when it is first heard until it is forgotten.
+/// A request, from its first message until it expires.
 #[derive(Debug)]
 pub(super) struct Entry<P> {
     pub(super) key: Key,
     pub(super) address: ActionAddress,
     pub(super) dialect: ActionDialect,
     pub(super) origin: RequestOrigin<P>,
-    /// Tells its arguments from others.
+    /// Hash that distinguishes its arguments from other arguments.
     pub(super) arguments: u64,
     pub(super) phase: Phase,
-    /// When it was heard of or changed last.
+    /// Time of the last message or change.
     pub(super) touched: Duration,
     pub(super) last_sent: Option<Duration>,
     pub(super) next_send: Option<Duration>,
@@ -36,18 +36,18 @@ pub(super) struct Entry<P> {
 pub(super) enum Phase {
     Executing {
         deadline: Duration,
-        /// The Requestor wants it forgotten.
+        /// The Requestor has abandoned the request.
         abandoned: bool,
-        /// That the deadline is past was told.
+        /// The passed deadline was recorded.
         overdue: bool,
     },
     Done {
         status: StatusCode,
         fields: KeptFields,
-        /// How often it is said without being asked.
+        /// Remaining number of unprompted repetitions.
         left: u32,
     },
-    /// Acknowledged or taken back. Remembered so that a late repetition is not taken for a new request.
+    /// Acknowledged or ended. Remembered so that a late repetition does not count as a new request.
     Closed,
 }
 
@@ -60,7 +60,7 @@ impl Key {
         }
     }
 
-    /// Bytes an entry takes up, without its answer.
+    /// Returns the bytes that an entry uses, without its response.
     pub(super) fn cost(&self) -> usize {
         let id = match &self.requestor_id {
             Some(OwnedPublisherId::String(id)) => id.len(),
@@ -73,7 +73,7 @@ impl Key {
             | None => 0,
         };
         let correlation_data = self.correlation_data.as_ref().map_or(0, |data| data.len());
-        // Key and id stand in the entry and beside it.
+        // Key and id are stored in the entry and in the index.
         BOOKKEEPING + 2 * (id + correlation_data)
     }
 }
@@ -89,7 +89,7 @@ impl Phase {
 }
 
 impl<P> Entry<P> {
-    /// Says the state once more, but not within an interval of the last time.
+    /// Schedules the state to be sent again, at least an interval after the last transmission.
     pub(super) fn answer(&mut self, now: Duration, interval: Duration) {
         if !self.can_be_said() {
             return;
@@ -101,7 +101,8 @@ impl<P> Entry<P> {
         self.next_send = Some(self.next_send.map_or(free, |at| at.min(free)));
     }
 
-    /// The one-shot dialect knows nothing but good answers.
+    /// Returns true if the dialect can express the state. The UA-.NETStandard dialect has good
+    /// responses only.
     fn can_be_said(&self) -> bool {
         match (self.dialect, &self.phase) {
             (ActionDialect::Standard, _) => true,
@@ -112,7 +113,7 @@ impl<P> Entry<P> {
         }
     }
 
-    /// Notes that the state was said, and when it is said again.
+    /// Records that the state was sent, and schedules the next transmission.
     pub(super) fn sent(&mut self, now: Duration, interval: Duration) {
         self.last_sent = Some(now);
         let again = now.saturating_add(interval);
@@ -130,7 +131,7 @@ impl<P> Entry<P> {
         };
     }
 
-    /// True once, when the deadline of the execution is past.
+    /// Returns true once after the deadline of the execution has passed.
     pub(super) fn is_overdue(&mut self, now: Duration) -> bool {
         match &mut self.phase {
             Phase::Executing {
@@ -140,7 +141,7 @@ impl<P> Entry<P> {
         }
     }
 
-    /// When it is forgotten.
+    /// Returns the time at which the request is forgotten.
     pub(super) fn expires(&self, remember: Duration) -> Duration {
         let since = match self.phase {
             Phase::Executing { deadline, .. } => deadline.max(self.touched),
@@ -163,5 +164,5 @@ impl<P> Entry<P> {
     }
 }
 
-/// About what an entry takes up in the maps it stands in.
+/// Approximate bytes that an entry uses in all maps.
 const BOOKKEEPING: usize = 384;

@@ -1,4 +1,4 @@
-//! Requests that are over: enough of each to know it again, for as long as the network may hold one back.
+//! Finished requests: a hash of each, kept for as long as the network may delay a repetition.
 
 use std::collections::{BTreeMap, HashSet, VecDeque};
 use std::hash::{DefaultHasher, Hash, Hasher};
@@ -7,17 +7,18 @@ use std::time::Duration;
 use super::entry::Key;
 use super::{RequestDrop, RequestOrigin, ResponderSettings};
 
-/// By a hash of what each is known by: two that fall together among some 100000 are not to be expected, and of those the
-/// second would be dropped and not executed twice.
+/// Set of finished requests, each stored as the hash of its key. A hash collision among about
+/// 100000 requests is not expected; it would cause the second request to be dropped, not executed
+/// twice.
 #[derive(Debug)]
 pub(super) struct Over<P> {
     hashes: HashSet<u64>,
-    /// In the order in which they were put in, and until when each is kept.
+    /// Expiry times and hashes in the order of insertion.
     queue: VecDeque<(Duration, u64, RequestOrigin<P>)>,
     counts: Counts<P>,
 }
 
-/// Requests of each sender and of each group.
+/// Number of requests of each sender and of each group.
 #[derive(Debug)]
 pub(super) struct Counts<P> {
     senders: BTreeMap<RequestOrigin<P>, usize>,
@@ -32,7 +33,7 @@ impl<P: Ord + Clone> Counts<P> {
         }
     }
 
-    /// Checks the room for one more request, of the group and of the sender.
+    /// Checks that the group and the sender have space for another request.
     pub(super) fn check(
         &self,
         origin: &RequestOrigin<P>,
@@ -78,12 +79,12 @@ impl<P: Ord + Clone> Over<P> {
         }
     }
 
-    /// Whether it is one of them.
+    /// Returns true if the request is in the set.
     pub(super) fn has(&self, key: &Key) -> bool {
         !self.hashes.is_empty() && self.hashes.contains(&hash(key))
     }
 
-    /// Keeps one until then.
+    /// Keeps a request until the given time.
     pub(super) fn keep(
         &mut self,
         (key, origin): (&Key, &RequestOrigin<P>),
@@ -100,7 +101,7 @@ impl<P: Ord + Clone> Over<P> {
         Ok(())
     }
 
-    /// Forgets those that are old enough. One behind another that is kept for longer waits for that.
+    /// Removes expired requests. A request behind another that expires later waits for that.
     pub(super) fn forget_until(&mut self, now: Duration) {
         while let Some((until, ..)) = self.queue.front()
             && *until <= now
@@ -122,5 +123,5 @@ pub(super) fn hash(key: &Key) -> u64 {
     hasher.finish()
 }
 
-/// About the bytes that one takes up.
+/// Approximate bytes that a request uses.
 pub(super) const COST: usize = 100;

@@ -1,5 +1,5 @@
-//! Requests that are refused before room is taken for them: enough of each to answer its repetitions alike, and to execute
-//! none of them, even where the owner would permit it by then.
+//! Requests that are refused before space is allocated. Enough of each is kept to repeat the
+//! refusal, and to execute no repetition even if the owner permits it by then.
 
 use std::collections::{HashMap, VecDeque};
 use std::time::Duration;
@@ -13,14 +13,14 @@ use crate::action::{
     ActionState, ActionToSend, Refusal,
 };
 
-/// The refused requests, each by a hash of its key.
+/// Refused requests, by the hash of their key.
 #[derive(Debug)]
 pub(super) struct Refused<P> {
     known: HashMap<u64, Known<P>>,
-    /// Hashes in the order in which they were put in, and until when each is kept.
+    /// Expiry times and hashes in the order of insertion.
     queue: VecDeque<(Duration, u64)>,
     counts: Counts<P>,
-    /// Answers to be sent: at most one of each refused request.
+    /// Responses to send, at most one for each refused request.
     answers: VecDeque<Answer<P>>,
 }
 
@@ -28,13 +28,13 @@ pub(super) struct Refused<P> {
 struct Known<P> {
     origin: RequestOrigin<P>,
     refusal: Refusal,
-    /// When it was answered last.
+    /// Time of the last response.
     answered: Duration,
-    /// How often a repetition is still answered.
+    /// Remaining number of responses to repetitions.
     left: u8,
 }
 
-/// An answer to a refused request.
+/// A response to a refused request.
 #[derive(Debug)]
 pub(super) struct Answer<P> {
     pub(super) origin: RequestOrigin<P>,
@@ -55,7 +55,7 @@ impl<P> Answer<P> {
                 ..ActionHeader::new(ActionKind::Response)
             },
             request_id: self.key.request_id,
-            // An answer without fields fits every datagram, so that no chunk needs its number.
+            // A response without fields fits every datagram, so no chunk needs a sequence number.
             call: u64::MAX,
             state: self.state,
             status: self.status,
@@ -75,7 +75,7 @@ impl<P: Ord + Clone> Refused<P> {
         }
     }
 
-    /// Refuses a request for the first time.
+    /// Refuses a new request.
     pub(super) fn refuse(
         &mut self,
         key: Key,
@@ -100,7 +100,7 @@ impl<P: Ord + Clone> Refused<P> {
         Ok(Requested::Declined(refusal))
     }
 
-    /// Answers a request that was refused before; `None` for any other request.
+    /// Responds to a repetition of a refused request; returns `None` for any other request.
     pub(super) fn repeated(
         &mut self,
         key: &Key,
@@ -113,7 +113,7 @@ impl<P: Ord + Clone> Refused<P> {
         }
         let known = self.known.get_mut(&hash(key))?;
         let again = known.answered.saturating_add(settings.publishing_interval);
-        // The acknowledgement follows at once, and is answered like a repetition.
+        // The acknowledgement follows immediately, and gets a response like a repetition.
         let is_due = now >= again || request.state == ActionState::Idle;
         if known.left > 0 && is_due {
             known.left -= 1;
@@ -124,7 +124,8 @@ impl<P: Ord + Clone> Refused<P> {
         Some(RequestDrop::Refused)
     }
 
-    /// Answers with the refusal, or acknowledges an acknowledgement. The one-shot dialect has no place for a status.
+    /// Queues the refusal, or the response to an acknowledgement. The UA-.NETStandard dialect has
+    /// no field for a status.
     fn answer(
         &mut self,
         (key, origin, refusal): (Key, RequestOrigin<P>, Refusal),
@@ -150,17 +151,17 @@ impl<P: Ord + Clone> Refused<P> {
         });
     }
 
-    /// The next answer.
+    /// Returns the next response.
     pub(super) fn pop(&mut self) -> Option<Answer<P>> {
         self.answers.pop_front()
     }
 
-    /// When the next answer is due.
+    /// Returns the time at which the next response is due.
     pub(super) fn due(&self) -> Option<Duration> {
         Some(self.answers.front()?.due)
     }
 
-    /// Forgets those that are old enough.
+    /// Removes expired requests.
     pub(super) fn forget_until(&mut self, now: Duration) {
         while let Some((until, _)) = self.queue.front()
             && *until <= now

@@ -1,164 +1,176 @@
-//! What a Responder may hold, and what it says of requests.
+//! Limits of a Responder, and its decisions on requests.
 
 use std::time::Duration;
 
 use crate::action::Refusal;
 
-/// How a [`Responder`](crate::action::Responder) answers, and what it may hold.
+/// Timing and limits of a [`Responder`](crate::action::Responder).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ResponderSettings {
-    /// PublishingInterval of the WriterGroup, at which states are said again. Default 100 ms.
+    /// PublishingInterval of the WriterGroup; states are repeated at this interval. Default 100 ms.
     pub publishing_interval: Duration,
-    /// How often an answer is said without being asked for again. Default 20.
+    /// Number of unprompted repetitions of a result. Default 20.
     pub done_repeats: u32,
-    /// How often the answer to a request that [`handle_judged`](crate::action::Responder::handle_judged) refuses is said
-    /// again, each time for a repetition of the request. Default 3.
+    /// Number of repeated responses to a request that
+    /// [`handle_judged`](crate::action::Responder::handle_judged) refuses, each triggered by a
+    /// repetition of the request. Default 3.
     pub refusal_repeats: u8,
-    /// How long a request is remembered after it was heard of last: longer than any the network may hold back.
-    /// Default 10 s.
+    /// Time for which a request is remembered after its last message. It has to exceed the longest
+    /// delay of the network. Default 10 s.
     pub remember: Duration,
-    /// Deadline of requests that say none. Default 60 s.
+    /// Deadline of requests without TimeoutHint. Default 60 s.
     pub timeout: Duration,
-    /// Longest deadline that is kept: what is executed for longer goes on, but its answer is not waited for.
-    /// Default 1 h.
+    /// Maximum deadline. A longer execution continues, but its Requestor is considered to have
+    /// stopped waiting. Default 1 h.
     pub max_timeout: Duration,
-    /// Requests of a group executed at a time; further ones are refused as [`Refusal::Busy`]. Default 256.
+    /// Maximum number of concurrent executions of a group; further requests are refused with
+    /// [`Refusal::Busy`]. Default 256.
     pub max_executing: usize,
-    /// Requests of one sender executed at a time; further ones are refused as [`Refusal::Busy`]. Default 256.
+    /// Maximum number of concurrent executions of a sender; further requests are refused with
+    /// [`Refusal::Busy`]. Default 256.
     pub max_executing_per_sender: usize,
-    /// Requests of a group remembered with all that is known of them. Default 8192.
+    /// Maximum number of completely remembered requests of a group. Default 8192.
     pub max_requests: usize,
-    /// Requests of one sender remembered with all that is known of them. Default 2048.
+    /// Maximum number of completely remembered requests of a sender. Default 2048.
     pub max_requests_per_sender: usize,
-    /// Requests of a group that are over, beside those: enough of each is kept to know it again, about 100 bytes.
-    /// Default 131072.
+    /// Maximum number of finished requests of a group that are remembered by hash only, in addition
+    /// to `max_requests`. Each uses about 100 bytes. Default 131072.
     pub max_over: usize,
-    /// Requests of one sender that are over. Default 65536.
+    /// Maximum number of finished requests of a sender that are remembered by hash only. Default
+    /// 65536.
     pub max_over_per_sender: usize,
-    /// Refused requests of a group that are remembered, about 100 bytes each. Default 4096.
+    /// Maximum number of remembered refused requests of a group, about 100 bytes each. Default
+    /// 4096.
     pub max_refused: usize,
-    /// Refused requests of one sender that are remembered. Further ones are dropped without an answer. Default 512.
+    /// Maximum number of remembered refused requests of a sender. Further requests are dropped
+    /// without response. Default 512.
     pub max_refused_per_sender: usize,
-    /// Bytes of all that is remembered of a group, but for those of [`max_over`](Self::max_over). Default 16 MiB.
+    /// Maximum bytes remembered of a group, without the requests under
+    /// [`max_over`](Self::max_over). Default 16 MiB.
     pub max_bytes: usize,
-    /// Bytes remembered of one sender. Default 4 MiB.
+    /// Maximum bytes remembered of a sender. Default 4 MiB.
     pub max_bytes_per_sender: usize,
-    /// Bytes of the fields of one answer, which has to fit in a datagram. Default 60000.
+    /// Maximum bytes of the fields of a response, which has to fit in a datagram. Default 60000.
     pub max_answer: usize,
-    /// Bytes of CorrelationData. Default 64.
+    /// Maximum bytes of CorrelationData. Default 64.
     pub max_correlation_data: usize,
 }
 
-/// The sender of a request, as the carrier distinguishes senders. The request takes up its room.
+/// Sender of a request, as the transport distinguishes senders. Its requests count against its
+/// limits.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct RequestOrigin<P> {
-    /// Number of the group of senders that shares the limits of a group in [`ResponderSettings`], such as a SecurityGroup.
+    /// Number of the group of senders that share the group limits in [`ResponderSettings`], such as
+    /// a SecurityGroup.
     pub group: usize,
-    /// The sender, and where its answers go.
+    /// Sender, and the destination of its responses.
     pub sender: P,
 }
 
-/// A request as its Responder knows it, unlike all others of it.
+/// Identifies a request within its Responder.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct ExecutionId(pub(super) u64);
 
 impl ExecutionId {
-    /// That of a Responder that is made up.
+    /// Creates an id without a Responder, for tests.
     #[must_use]
     pub const fn new(number: u64) -> Self {
         Self(number)
     }
 }
 
-/// What is to be done about a request.
+/// Action that a request requires of the owner.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Requested {
-    /// Execute it, and say what came out; or refuse it.
+    /// Execute the request and report the outcome, or refuse it.
     Execute(ExecutionId),
-    /// Nothing: it is refused.
+    /// Nothing: the Responder refuses the request.
     Refused(ExecutionId, Refusal),
-    /// Nothing: the owner refuses it, and that is answered once.
+    /// Nothing: the owner refuses the request, and one response is sent.
     Declined(Refusal),
-    /// Nothing: it was heard before, and is answered once more.
+    /// Nothing: the request is a repetition and gets another response.
     Repeated(ExecutionId),
-    /// The Requestor does not want what is still executed: cancel it where that can be done, and finish it.
+    /// Cancel the execution if possible, and finish it: the Requestor does not want the result.
     Abandoned(ExecutionId),
-    /// Nothing: the Requestor has the answer, or takes a request back that never came.
+    /// Nothing: the Requestor has the result, or ends a request that was never received.
     Closed(ExecutionId),
 }
 
-/// Why a request was not taken.
+/// Reason why a request was dropped.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, thiserror::Error)]
 #[non_exhaustive]
 pub enum RequestDrop {
-    /// It is a response.
+    /// The message is a response.
     #[error("a response")]
     Response,
-    /// A state that a Requestor cannot want.
+    /// The state is not valid in a request.
     #[error("an unexpected state")]
     State,
-    /// So many bytes of CorrelationData: more than [`ResponderSettings::max_correlation_data`].
+    /// The CorrelationData has this many bytes, more than
+    /// [`ResponderSettings::max_correlation_data`].
     #[error("{0} bytes of CorrelationData")]
     CorrelationData(usize),
-    /// Another request had the same ids.
+    /// Another request has the same ids.
     #[error("the ids of another request")]
     Reused,
-    /// It is over, and not answered any more.
+    /// The request is finished and gets no further response.
     #[error("a request that is over")]
     Over,
-    /// The sender has as much room as it may have.
+    /// The sender has reached its limit.
     #[error("too many requests of this sender")]
     SenderFull,
     /// The request was refused before.
     #[error("a request that was refused")]
     Refused,
-    /// There is no room to remember it.
+    /// The group has reached its limit.
     #[error("too many requests")]
     Full,
 }
 
-/// Why an outcome is not told to the Requestor.
+/// Reason why an outcome is not sent to the Requestor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, thiserror::Error)]
 #[non_exhaustive]
 pub enum FinishRefusal {
-    /// The request was forgotten: its deadline is long past.
+    /// The request has expired: its deadline is long past.
     #[error("the request was forgotten")]
     Forgotten,
-    /// What came out was said before.
+    /// The request has its outcome already.
     #[error("finished before")]
     Finished,
-    /// The Requestor does not want it any more.
+    /// The Requestor has abandoned the request.
     #[error("abandoned by the requestor")]
     Abandoned,
-    /// The answer is too big. The Requestor is told Bad_ResponseTooLarge.
+    /// The response is too big. The Requestor receives Bad_ResponseTooLarge.
     #[error("the answer is too big")]
     TooBig,
-    /// The answer is in an encoding the Requestor does not know. It is told Bad_EncodingError.
+    /// The dialect does not support the encoding of the response. The Requestor receives
+    /// Bad_EncodingError.
     #[error("the answer is in an encoding the peer does not know")]
     Encoding,
-    /// The dialect has no place for a StatusCode: the Requestor is told nothing.
+    /// The dialect has no field for a StatusCode: the Requestor receives nothing.
     #[error("the peer cannot be told a status")]
     NoStatus,
 }
 
-/// What became of requests and messages.
+/// Counters of requests and messages.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub struct ResponderCounters {
-    /// Requests handed out to be executed.
+    /// Requests returned for execution.
     pub executed: u64,
-    /// Requests refused by the owner before room was taken for them, or for want of room to execute them.
+    /// Requests refused by the owner before space was allocated, or by the limit of concurrent
+    /// executions.
     pub refused: u64,
-    /// Requests heard before.
+    /// Repeated requests.
     pub repeated: u64,
-    /// Executions the Requestor gave up.
+    /// Executions abandoned by the Requestor.
     pub abandoned: u64,
-    /// Answers acknowledged, and requests taken back.
+    /// Acknowledged responses, and ended requests.
     pub closed: u64,
-    /// Executions that were forgotten before they were finished.
+    /// Executions that expired before they were finished.
     pub lost: u64,
-    /// Requests not taken.
+    /// Dropped requests.
     pub dropped: u64,
-    /// Responses handed out to be sent.
+    /// Responses returned for sending.
     pub sent: u64,
 }
 
