@@ -1,16 +1,18 @@
-//! Discovery: Subscribers probe, Publishers announce what they publish (OPC 10000-14, 7.2.4.6).
+//! Discovery: Subscribers send probes, Publishers announce their configuration (OPC 10000-14,
+//! 7.2.4.6).
 //!
-//! A [`Probe`] or [`Announcement`] is the payload of a [`NetworkMessage`] of its own
-//! [type](crate::NetworkMessageType). Reading one allocates nothing: arrays are [`List`]s over the checked bytes of the
-//! datagram, ExtensionObjects are looked into on demand by the [`Settings`] of UADP and datagrams. The same structures
-//! are written, with lists that borrow slices.
+//! A [`Probe`] or [`Announcement`] is the payload of a [`NetworkMessage`] of a separate
+//! [type](crate::NetworkMessageType). Decoding allocates nothing: arrays are [`List`]s over the
+//! checked bytes of the datagram, and ExtensionObjects are decoded on demand with the [`Settings`]
+//! of UADP and datagrams. The same structures are encoded, with lists that borrow slices.
 //!
-//! One that is bigger than DiscoveryMaxMessageSize (4096 bytes unless configured: OPC 10000-14, 6.4.1.2.4) travels in
-//! chunks of what [`encode_body`](Announcement::encode_body) writes, under the announcement's SequenceNumber and
-//! without payload header (OPC 10000-14, 7.2.4.4.4). [`decode_body`](Announcement::decode_body) reads the whole.
+//! A message larger than DiscoveryMaxMessageSize (4096 bytes unless configured: OPC 10000-14,
+//! 6.4.1.2.4) is sent in chunks of the bytes that [`encode_body`](Announcement::encode_body)
+//! writes, with the SequenceNumber of the announcement and without payload header (OPC 10000-14,
+//! 7.2.4.4.4). [`decode_body`](Announcement::decode_body) decodes the reassembled bytes.
 //!
-//! [`ProbeTimer`] says when to probe and [`Announcer`] what to answer when; where the datagrams go is the caller's
-//! matter. By default that is `opc.udp://224.0.2.14:4840` for both.
+//! [`ProbeTimer`] schedules probes and [`Announcer`] schedules announcements. The caller sends the
+//! datagrams; the default address for both is `opc.udp://224.0.2.14:4840`.
 //!
 //! # Announcing the content of a DataSet
 //! ```
@@ -122,7 +124,7 @@ use crate::{
     SecurityHeader,
 };
 
-/// The payload of a discovery message that is whole and in clear.
+/// Returns the payload of a discovery message that is neither sealed nor a chunk.
 fn read_payload<'a>(message: &NetworkMessage<'a>) -> Result<&'a [u8], DecodeError> {
     if message.is_sealed() {
         return Err(DecodeError::Misread(
@@ -135,8 +137,8 @@ fn read_payload<'a>(message: &NetworkMessage<'a>) -> Result<&'a [u8], DecodeErro
     Ok(message.payload())
 }
 
-/// The headers all discovery messages have: PublisherId and SecurityHeader, nothing else
-/// (OPC 10000-14, 7.2.4.6.3 and 7.2.4.6.12.1).
+/// Writes the headers of a discovery message: PublisherId and SecurityHeader only (OPC 10000-14,
+/// 7.2.4.6.3 and 7.2.4.6.12.1).
 fn write_headers(
     message_type: NetworkMessageType,
     publisher_id: PublisherId<'_>,

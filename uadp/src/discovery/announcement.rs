@@ -1,4 +1,4 @@
-//! Discovery announcements: what a Publisher says of itself.
+//! Discovery announcements of a Publisher.
 
 use super::configuration::{PubSubConnectionDataType, WriterGroupDataType};
 use super::endpoint::{ApplicationDescription, EndpointDescription};
@@ -14,56 +14,60 @@ use crate::{
 
 /// A discovery announcement (OPC 10000-14, 7.2.4.6.3).
 ///
-/// The PublisherId in the header of its NetworkMessage is that of the Publisher who announces.
+/// The PublisherId in the header of its NetworkMessage identifies the announcing Publisher.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Announcement<'a> {
-    /// One more with every announcement of the PublisherId. Of one sent in chunks it is their
-    /// MessageSequenceNumber too.
+    /// Number that increases by 1 with every announcement of the PublisherId. It is also the
+    /// MessageSequenceNumber of the chunks of the announcement.
     pub sequence_number: u16,
-    /// What is announced.
+    /// Content of the announcement.
     pub announced: Announced<'a>,
 }
 
-/// What an [`Announcement`] tells.
+/// Content of an [`Announcement`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Announced<'a> {
-    /// The Endpoints of the Server beside the Publisher (OPC 10000-14, 7.2.4.6.6).
+    /// The Endpoints of the Server associated with the Publisher (OPC 10000-14, 7.2.4.6.6).
     PublisherEndpoints {
         /// The Endpoints.
         endpoints: List<'a, EndpointDescription<'a>>,
-        /// Bad when it cannot tell.
+        /// Bad if the Publisher has no information.
         status: StatusCode,
     },
     /// The content of the DataSet of a DataSetWriter (OPC 10000-14, 7.2.4.6.4).
     DataSetMetaData {
         /// The DataSetWriter.
         writer_id: u16,
-        /// The metadata; what they say counts only when the status is good.
+        /// The metadata; valid only if the status is good.
         meta_data: DataSetMetaDataType<'a>,
-        /// Bad when it cannot tell, such as of a DataSetWriter it does not have.
+        /// Bad if the Publisher has no information, for example because the DataSetWriter does not
+        /// exist.
         status: StatusCode,
     },
-    /// A WriterGroup with some of its DataSetWriters (OPC 10000-14, 7.2.4.6.9). It also answers the
-    /// [`Probe::WriterGroupConfiguration`](super::Probe), for which the standard has no announcement of its own.
+    /// A WriterGroup with some of its DataSetWriters (OPC 10000-14, 7.2.4.6.9). It is also the
+    /// response to [`Probe::WriterGroupConfiguration`](super::Probe), for which the standard has no
+    /// separate announcement.
     DataSetWriterConfiguration {
-        /// The DataSetWriters it is about.
+        /// Ids of the announced DataSetWriters.
         writer_ids: List<'a, u16>,
-        /// The group, with the DataSetWriters it is about only.
+        /// The group, with the announced DataSetWriters only.
         writer_group: WriterGroupDataType<'a>,
-        /// One for each DataSetWriterId, in their order.
+        /// A status for each DataSetWriterId, in the same order.
         statuses: List<'a, StatusCode>,
     },
     /// The PubSubConnections (OPC 10000-14, 7.2.4.6.8).
     PubSubConnections(List<'a, PubSubConnectionDataType<'a>>),
-    /// One PubSubConnection with a status: not the form of the standard, which has an array and no status, but what
-    /// other stacks send under the same AnnouncementType. To be read, not to be sent.
+    /// A PubSubConnection with a status. The standard defines an array without status instead, but
+    /// other stacks send this form with the same AnnouncementType. It is decoded, but should not be
+    /// sent.
     PubSubConnection {
         /// The connection.
         connection: PubSubConnectionDataType<'a>,
-        /// Bad when it cannot tell.
+        /// Bad if the Publisher has no information.
         status: StatusCode,
     },
-    /// The application, as an answer to [`Probe::FindApplications`](super::Probe) too (OPC 10000-14, 7.2.4.6.5).
+    /// The application; also the response to [`Probe::FindApplications`](super::Probe) (OPC
+    /// 10000-14, 7.2.4.6.5).
     ApplicationDescription {
         /// The application.
         description: ApplicationDescription<'a>,
@@ -74,21 +78,21 @@ pub enum Announced<'a> {
     ApplicationStatus {
         /// State of the PubSubConnection.
         state: ConnectionState,
-        /// Times of a status that is sent cyclically; `None` of one that is sent on change.
+        /// Times of a cyclic status; `None` for a status that is sent on change.
         cyclic: Option<CyclicStatus>,
     },
-    /// The connections that answer Actions (OPC 10000-14, 7.2.4.6.10).
+    /// The connections with Action Responders (OPC 10000-14, 7.2.4.6.10).
     ActionResponder(List<'a, PubSubConnectionDataType<'a>>),
-    /// What goes into an Action and what comes out of it (OPC 10000-14, 7.2.4.6.11).
+    /// Arguments and results of an Action (OPC 10000-14, 7.2.4.6.11).
     ActionMetaData(ActionMetaData<'a>),
 }
 
 structure! {
-    /// When a cyclic status was sent and when the next is to be expected (OPC 10000-14, 7.2.4.6.7).
+    /// Times of a cyclic status and of the next status (OPC 10000-14, 7.2.4.6.7).
     CyclicStatus {
-        /// When the next status comes. Past it, the Publisher is to be taken for failed.
+        /// Time of the next status. If it passes without a status, the Publisher counts as failed.
         next_report_time: DateTime = "NextReportTime",
-        /// When this one was sent.
+        /// Time at which this status was sent.
         timestamp: DateTime = "Timestamp",
     }
 
@@ -96,27 +100,27 @@ structure! {
     ActionMetaData<'a> {
         /// DataSetWriter of the Action.
         writer_id: u16 = "DataSetWriterId",
-        /// What it can be called on.
+        /// Targets of the Action.
         action_targets: List<'a, ActionTargetDataType<'a>> = "ActionTargets",
-        /// Content of requests; its name is that of the Action.
+        /// Content of requests; its name is the name of the Action.
         request: DataSetMetaDataType<'a> = "Request",
         /// Content of responses, with the name and ConfigurationVersion of the request.
         response: DataSetMetaDataType<'a> = "Response",
-        /// The Methods behind the targets, one for each in their order, or none at all.
+        /// The Methods of the targets, in the order of the targets, or empty.
         action_methods: List<'a, ActionMethodDataType<'a>> = "ActionMethods",
     }
 
-    /// Something an Action can be called on (OPC 10000-14, 6.2.3.10.3).
+    /// A target of an Action (OPC 10000-14, 6.2.3.10.3).
     ActionTargetDataType<'a> {
         /// Unique among the targets of the Action.
         action_target_id: u16 = "ActionTargetId",
         /// Its name.
         name: Option<&'a str> = "Name",
-        /// What it is, for people.
+        /// Description for people.
         description: LocalizedText<'a> = "Description",
     }
 
-    /// The Method behind a target of an Action (OPC 10000-14, 6.2.3.10).
+    /// The Method of a target of an Action (OPC 10000-14, 6.2.3.10).
     ActionMethodDataType<'a> {
         /// The Object.
         object_id: NodeId<'a> = "ObjectId",
@@ -126,27 +130,27 @@ structure! {
 }
 
 enumeration! {
-    /// PubSubState as it stands in an announcement (OPC 10000-14, 6.2.1).
+    /// PubSubState in an announcement (OPC 10000-14, 6.2.1).
     ConnectionState {
         /// Not enabled.
         DISABLED = 0,
-        /// Enabled, but something above it is not.
+        /// Enabled, but a parent component is not.
         PAUSED = 1,
-        /// Working.
+        /// Operational.
         OPERATIONAL = 2,
-        /// Enabled, but something is wrong.
+        /// Enabled, but in error.
         ERROR = 3,
-        /// Enabled, and on the way to work.
+        /// Enabled, and becoming operational.
         PRE_OPERATIONAL = 4,
     }
 }
 
 impl<'a> Announcement<'a> {
-    /// Reads the announcement of a NetworkMessage.
+    /// Decodes the announcement of a NetworkMessage.
     ///
     /// # Errors
-    /// [`DecodeError::Misread`] when it is no announcement, a chunk, or still sealed; else as
-    /// [`decode_body`](Self::decode_body).
+    /// [`DecodeError::Misread`] if the message is not an announcement, is a chunk, or is still
+    /// sealed; otherwise as [`decode_body`](Self::decode_body).
     pub fn decode(message: &NetworkMessage<'a>) -> Result<Self, DecodeError> {
         match message.message_type() {
             NetworkMessageType::Announcement => Self::decode_body(read_payload(message)?),
@@ -156,11 +160,11 @@ impl<'a> Announcement<'a> {
         }
     }
 
-    /// Reads what stands behind the headers of an announcement, such as the whole of its chunks.
+    /// Decodes the bytes behind the headers of an announcement, for example its reassembled chunks.
     ///
     /// # Errors
-    /// [`DecodeError::Reserved`] names a kind of announcement that is not known. Else fails when a field is cut off
-    /// or malformed, and for bytes behind the last one.
+    /// [`DecodeError::Reserved`] with the type of an unknown announcement. Otherwise fails if a
+    /// field is truncated or malformed, or if bytes follow the last field.
     pub fn decode_body(body: &'a [u8]) -> Result<Self, DecodeError> {
         let mut reader = Reader::new(body);
         let announcement_type = reader.u8("AnnouncementType")?;
@@ -175,11 +179,11 @@ impl<'a> Announcement<'a> {
         }
     }
 
-    /// Appends the whole NetworkMessage, up to the end of its payload. Without security the header is
+    /// Appends the NetworkMessage, up to the end of its payload. Without security the header is
     /// [`SecurityHeader::NONE`].
     ///
     /// # Errors
-    /// [`EncodeError::TooBig`] when a text, array or nonce is too long for its length.
+    /// [`EncodeError::TooBig`] if a text, array or nonce exceeds its length field.
     pub fn encode(
         &self,
         publisher_id: PublisherId<'_>,
@@ -195,11 +199,11 @@ impl<'a> Announcement<'a> {
         self.encode_body(out)
     }
 
-    /// Appends what stands behind the headers: what is cut in pieces when the NetworkMessage would be longer than the
-    /// DiscoveryMaxMessageSize (OPC 10000-14, 6.4.1.2.4 and 7.2.4.4.4).
+    /// Appends the bytes behind the headers. They are split into chunks if the NetworkMessage would
+    /// exceed the DiscoveryMaxMessageSize (OPC 10000-14, 6.4.1.2.4 and 7.2.4.4.4).
     ///
     /// # Errors
-    /// [`EncodeError::TooBig`] when a text or array is too long for its length.
+    /// [`EncodeError::TooBig`] if a text or array exceeds its length field.
     pub fn encode_body(&self, out: &mut Vec<u8>) -> Result<(), EncodeError> {
         out.push(self.announced.announcement_type());
         out.extend_from_slice(&self.sequence_number.to_le_bytes());
@@ -208,7 +212,7 @@ impl<'a> Announcement<'a> {
 }
 
 impl<'a> Announced<'a> {
-    /// AnnouncementType, 1 to 7 (OPC 10000-14, 7.2.4.6.3).
+    /// Returns the AnnouncementType, 1 to 7 (OPC 10000-14, 7.2.4.6.3).
     #[must_use]
     pub const fn announcement_type(&self) -> u8 {
         match self {
@@ -266,7 +270,8 @@ impl<'a> Announced<'a> {
         })
     }
 
-    /// The standard's form, else that of others. What is neither is reported as the standard's gone wrong.
+    /// Reads the array of the standard, or else the single connection of other stacks. If both
+    /// fail, the error is the error of the array.
     fn read_connections(reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
         let mut other = *reader;
         let connections = List::read(reader, CONNECTIONS).map(Self::PubSubConnections);
@@ -387,7 +392,7 @@ impl<'a> Announced<'a> {
 }
 
 impl<'a> ActionMetaData<'a> {
-    /// The target of an ActionTargetId, and the Method behind it where one is named.
+    /// Returns the target with an ActionTargetId, and its Method if there is one.
     #[must_use]
     pub fn target(
         &self,
@@ -398,8 +403,9 @@ impl<'a> ActionMetaData<'a> {
         Some((target, self.action_methods.get(index)))
     }
 
-    /// Name of the Action; `None` without one, and when request and response are not of one Action: their names and
-    /// ConfigurationVersions have to be equal.
+    /// Returns the name of the Action. Returns `None` without a name, or if names or
+    /// ConfigurationVersions of request and response differ, so that they do not belong to the same
+    /// Action.
     #[must_use]
     pub fn name(&self) -> Option<&'a str> {
         let of = |data: &DataSetMetaDataType<'a>| (data.name, data.configuration_version);

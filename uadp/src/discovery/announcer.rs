@@ -1,16 +1,18 @@
-//! When a Publisher announces: once for many who ask, and never faster than it set out to, however many do.
+//! Schedules the announcements of a Publisher: several probes share an announcement, and the rate
+//! is limited.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::time::Duration;
 
 use super::probe::Probe;
 
-/// What one Publisher has to announce, and when (OPC 10000-14, 7.2.4.6.12.2).
+/// The subjects that a Publisher can announce, and their schedule (OPC 10000-14, 7.2.4.6.12.2).
 ///
-/// A subject that is asked for is announced once, a moment later, to all who asked in between, and again 500 ms after
-/// that at the earliest. DataSetWriters of one WriterGroup share the announcement of their configuration. Probes
-/// cannot make it send more than [`AnnounceLimits::rate`], nor remember more than its own subjects and
-/// [`AnnounceLimits::unknown`] of others.
+/// A probed subject is announced once, after a delay, for all probes during the delay. The same
+/// subject is announced again after 500 ms at the earliest. DataSetWriters of a WriterGroup share
+/// the announcement of their configuration. Probes can neither cause more announcements than
+/// [`AnnounceLimits::rate`], nor more entries than the Publisher's subjects and
+/// [`AnnounceLimits::unknown`] unknown subjects.
 /// ```
 /// use std::time::Duration;
 /// use uadp::discovery::{AnnounceLimits, Announcer, List, Probe, Subject};
@@ -35,30 +37,32 @@ pub struct Announcer {
     groups: BTreeSet<u16>,
     /// DataSetWriters of Actions.
     actions: BTreeSet<u16>,
-    /// What is to be announced, or was too short a time ago to be announced again.
+    /// Planned subjects, and subjects whose last announcement is too recent.
     entries: BTreeMap<Subject, Entry>,
-    /// How many of the entries are of subjects the Publisher does not have.
+    /// Number of entries for unknown subjects.
     unknown: usize,
-    /// When the last announcements were, no more than the rate allows in 500 ms.
+    /// Times of the last announcements, at most as many as the rate allows in 500 ms.
     sent: VecDeque<Duration>,
     sequence_number: u16,
     counters: AnnounceCounters,
 }
 
-/// How an [`Announcer`] answers.
+/// Delays and limits of an [`Announcer`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct AnnounceLimits {
-    /// Time from the first probe to the announcement, in which others can ask for the same. Best another one for
-    /// every Publisher, since all of them are asked at once by [`Probe::FindApplications`].
+    /// Time from the first probe to the announcement, during which further probes for the subject
+    /// are combined. It should differ between Publishers, because [`Probe::FindApplications`]
+    /// probes all of them at once.
     pub gather: Duration,
-    /// Most announcements in any 500 ms, at least 1. What is due beyond that waits.
+    /// Maximum number of announcements in any 500 ms, at least 1. Further announcements are
+    /// delayed.
     pub rate: usize,
-    /// Most DataSetWriters and WriterGroups the Publisher does not have that are answered in 500 ms, with a bad
-    /// status. A probe for more of them is not answered.
+    /// Maximum number of unknown DataSetWriters and WriterGroups that are announced in 500 ms, with
+    /// a bad status. Further unknown ids get no announcement.
     pub unknown: usize,
 }
 
-/// What can be announced.
+/// Subject of an announcement.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Subject {
     /// The application, as [`Announced::ApplicationDescription`](super::Announced).
@@ -73,51 +77,52 @@ pub enum Subject {
     DataSetWriterConfiguration(u16),
     /// The content of the DataSet of a DataSetWriter, as [`Announced::DataSetMetaData`](super::Announced).
     DataSetMetaData(u16),
-    /// The connections that answer Actions, as [`Announced::ActionResponder`](super::Announced).
+    /// The connections with Action Responders, as [`Announced::ActionResponder`](super::Announced).
     ActionResponder,
     /// The Action of a DataSetWriter, as [`Announced::ActionMetaData`](super::Announced).
     ActionMetaData(u16),
 }
 
-/// What an announcement of connections or of a WriterGroup has in it.
+/// Content of an announcement of connections or of a WriterGroup.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub struct Included {
-    /// The WriterGroups of connections.
+    /// Include the WriterGroups of connections.
     pub writer_groups: bool,
-    /// The DataSetWriters of WriterGroups.
+    /// Include the DataSetWriters of WriterGroups.
     pub data_set_writers: bool,
 }
 
-/// An announcement to be sent now.
+/// An announcement that is due.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct DueAnnouncement {
-    /// What it is about. A DataSetWriter or WriterGroup the Publisher does not have gets a bad status.
+    /// Subject of the announcement. An unknown DataSetWriter or WriterGroup is announced with a bad
+    /// status.
     pub subject: Subject,
-    /// What it has in it: all that any of those wants who asked.
+    /// Content of the announcement: the union of all its probes.
     pub included: Included,
-    /// Of DataSetWriter configuration the DataSetWriterIds, in rising order, all of one WriterGroup or all unknown;
-    /// else empty.
+    /// For the configuration of DataSetWriters: their ids in ascending order, all of the same
+    /// WriterGroup or all unknown. Otherwise empty.
     pub writer_ids: Vec<u16>,
-    /// Its SequenceNumber.
+    /// SequenceNumber of the announcement.
     pub sequence_number: u16,
 }
 
-/// Why a subject is not planned to be announced.
+/// Reason why an announcement is not planned.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, thiserror::Error)]
 #[non_exhaustive]
 pub enum AnnounceRefusal {
-    /// It is going to be announced anyway.
+    /// The subject is planned already.
     #[error("about to be announced anyway")]
     Duplicate,
-    /// The Publisher does not have it, and was asked for too many others it does not have.
+    /// The subject is unknown, and the limit of unknown subjects is reached.
     #[error("unknown, as are too many others")]
     Unknown,
 }
 
-/// What became of the subjects [`handle_probe`](Announcer::handle_probe) found in probes.
+/// Counters of the subjects in probes, as handled by [`handle_probe`](Announcer::handle_probe).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub struct AnnounceCounters {
-    /// Planned to be announced.
+    /// Planned announcements.
     pub planned: u64,
     /// Refused as [`AnnounceRefusal::Duplicate`].
     pub duplicate: u64,
@@ -127,16 +132,17 @@ pub struct AnnounceCounters {
 
 #[derive(Debug, Clone, Copy)]
 struct Entry {
-    /// When it is to be announced; `None` when it was and nobody asked since.
+    /// Time of the announcement; `None` if there was no probe after the last announcement.
     due: Option<Duration>,
-    /// Not to be announced before.
+    /// Earliest time of the next announcement.
     earliest: Duration,
     included: Included,
     known: bool,
 }
 
 impl Announcer {
-    /// A Publisher with these DataSetWriters: WriterGroupId and DataSetWriterId of each. Its first SequenceNumber is 0.
+    /// Creates an announcer for the given pairs of WriterGroupId and DataSetWriterId. The first
+    /// SequenceNumber is 0.
     #[must_use]
     pub fn new(writers: impl IntoIterator<Item = (u16, u16)>, limits: AnnounceLimits) -> Self {
         let mut announcer = Self {
@@ -154,8 +160,8 @@ impl Announcer {
         announcer
     }
 
-    /// Changes which DataSetWriters there are. Announcements that are planned are forgotten, since they may be of
-    /// others; the SequenceNumber goes on.
+    /// Replaces the DataSetWriters. Planned announcements are dropped, because they may be of other
+    /// DataSetWriters. The SequenceNumber continues.
     pub fn set_writers(&mut self, writers: impl IntoIterator<Item = (u16, u16)>) {
         self.entries.clear();
         self.unknown = 0;
@@ -167,24 +173,27 @@ impl Announcer {
         }
     }
 
-    /// Adds a DataSetWriter; what is planned of others stays so.
+    /// Adds a DataSetWriter. Planned announcements are kept.
     pub fn add_writer(&mut self, group: u16, writer: u16) {
         self.writers.insert(writer, group);
         self.groups.insert(group);
     }
 
-    /// Changes which DataSetWriters are those of Actions; none at first. They may be among the
-    /// [`set_writers`](Self::set_writers), to have their configuration announced too.
+    /// Replaces the DataSetWriters of Actions; empty at first. They may also be among the
+    /// [`set_writers`](Self::set_writers), so that their configuration is announced too.
     ///
-    /// The standard has no probe for Actions. Here the connections that answer Actions are announced to who asks for
-    /// connections, whose settings the announcement follows (OPC 10000-14, 7.2.4.6.10), and an Action to who asks for
-    /// the DataSetMetaData of its DataSetWriter, which has no other.
+    /// The standard has no probe for Actions. The announcer responds to a probe for connections
+    /// with the connections that have Action Responders too, because that announcement follows the
+    /// same settings (OPC 10000-14, 7.2.4.6.10). It responds to a probe for the DataSetMetaData of
+    /// the Action's DataSetWriter with the Action, because that DataSetWriter has no other
+    /// metadata.
     pub fn set_actions(&mut self, writers: impl IntoIterator<Item = u16>) {
         self.actions = writers.into_iter().collect();
     }
 
-    /// Plans the answers to a probe, which the caller found to be for this Publisher: by the PublisherId in its
-    /// header, and for connections by the TransportProfileUris. The [`counters`](Self::counters) say what was refused.
+    /// Plans the announcements for a probe. The caller has checked that the probe addresses this
+    /// Publisher: by the PublisherId in its header, and for connections by the
+    /// TransportProfileUris. The [`counters`](Self::counters) include refused subjects.
     pub fn handle_probe(&mut self, probe: &Probe<'_>, now: Duration) {
         self.forget(now);
         match *probe {
@@ -238,10 +247,10 @@ impl Announcer {
         }
     }
 
-    /// Plans an announcement nobody asked for: after a change, or at the DiscoveryAnnounceRate.
+    /// Plans an announcement without a probe: after a change, or at the DiscoveryAnnounceRate.
     ///
     /// # Errors
-    /// [`AnnounceRefusal`] when it will not be sent, or not for this call alone.
+    /// [`AnnounceRefusal`] if the announcement is not sent, or was planned already.
     pub fn announce(
         &mut self,
         subject: Subject,
@@ -252,7 +261,7 @@ impl Announcer {
         self.plan(subject, included, now)
     }
 
-    /// The next announcement that is due. To be called until `None`.
+    /// Returns the next announcement that is due. Call it until it returns `None`.
     pub fn poll(&mut self, now: Duration) -> Option<DueAnnouncement> {
         self.forget(now);
         let (due, subject) = self.next()?;
@@ -284,14 +293,14 @@ impl Announcer {
         })
     }
 
-    /// When [`poll`](Self::poll) has something to announce; `None` when nothing is planned.
+    /// Returns the time of the next announcement, or `None` if no announcement is planned.
     #[must_use]
     pub fn poll_timeout(&self) -> Option<Duration> {
         let (due, _) = self.next()?;
         Some(due.max(self.opens()))
     }
 
-    /// What became of the subjects of probes.
+    /// Returns the counters of the subjects in probes.
     #[must_use]
     pub const fn counters(&self) -> &AnnounceCounters {
         &self.counters
@@ -357,7 +366,8 @@ impl Announcer {
         }
     }
 
-    /// The most urgent subject. Of equally urgent ones those the Publisher has come first.
+    /// Returns the subject that is due first. At the same time, known subjects come before unknown
+    /// subjects.
     fn next(&self) -> Option<(Duration, Subject)> {
         let planned = self.entries.iter().filter_map(|(subject, entry)| {
             let due = entry.due?;
@@ -366,8 +376,8 @@ impl Announcer {
         planned.min().map(|(due, _, subject)| (due, subject))
     }
 
-    /// The DataSetWriters whose configuration can go with that of `id`: of the same WriterGroup, asked for, and not
-    /// announced within the last 500 ms.
+    /// Returns the DataSetWriters whose configuration is announced together with `id`: planned, in
+    /// the same WriterGroup, and not announced within the last 500 ms.
     fn writers_with(&self, id: u16, now: Duration) -> Vec<u16> {
         let group = self.writers.get(&id);
         let all =
@@ -389,7 +399,7 @@ impl Announcer {
             .collect()
     }
 
-    /// From when on the rate leaves room for one more.
+    /// Returns the time from which on the rate permits another announcement.
     fn opens(&self) -> Duration {
         match self.sent.front() {
             Some(oldest) if self.sent.len() >= self.rate() => oldest.saturating_add(SPACING),
@@ -411,7 +421,7 @@ impl Announcer {
         }
     }
 
-    /// The subject is being announced: what is included, and never mind until it is asked for again.
+    /// Marks the subject as announced, and returns the content to include.
     fn finish(&mut self, subject: Subject, now: Duration) -> Included {
         let Some(entry) = self.entries.get_mut(&subject) else {
             return Included::default();
@@ -421,7 +431,7 @@ impl Announcer {
         std::mem::take(&mut entry.included)
     }
 
-    /// Drops what was announced long enough ago.
+    /// Removes subjects whose last announcement is long enough ago.
     fn forget(&mut self, now: Duration) {
         let unknown = &mut self.unknown;
         self.entries.retain(|_, entry| {
@@ -441,7 +451,7 @@ impl Included {
     }
 }
 
-/// 50 ms to gather, 50 announcements and 8 unknown subjects in 500 ms.
+/// 50 ms of delay, 50 announcements and 8 unknown subjects in 500 ms.
 impl Default for AnnounceLimits {
     fn default() -> Self {
         Self {
@@ -452,7 +462,7 @@ impl Default for AnnounceLimits {
     }
 }
 
-/// Least time between two announcements of one subject.
+/// Minimum time between two announcements of a subject.
 const SPACING: Duration = Duration::from_millis(500);
 
 #[cfg(test)]
@@ -562,7 +572,7 @@ mod tests {
                 (Subject::DataSetWriterConfiguration(12), vec![12]),
             ]
         );
-        // 10 went along, so it is not due by itself.
+        // Writer 10 is included, so it is not due separately.
         assert_eq!(announcer.poll_timeout(), None);
     }
 
@@ -603,7 +613,7 @@ mod tests {
         announcer.handle_probe(&probe, ms(0));
         let first = announcer.poll(ms(50)).unwrap();
         assert_eq!(first.subject, Subject::PubSubConnections);
-        // DataSetWriters without their groups are nothing that can be included.
+        // DataSetWriters without their groups cannot be included.
         let groups = Included {
             writer_groups: true,
             data_set_writers: false,
@@ -628,7 +638,7 @@ mod tests {
         assert_eq!(announcer.counters().planned, 11);
         assert_eq!(announcer.counters().duplicate, 2 * 11);
         assert_eq!(announcer.counters().unknown, 3 * (59_991 - 11));
-        // 500 ms later there is room for others.
+        // After 500 ms other unknown subjects are permitted.
         announcer.handle_probe(&Probe::DataSetMetaData(List::new(&ids[100..])), ms(550));
         assert_eq!(due(&mut announcer, ms(600)).len(), 8);
     }

@@ -1,4 +1,4 @@
-//! The servers beside a Publisher and how to reach them.
+//! The Servers associated with a Publisher, and their Endpoints.
 
 use super::list::List;
 use super::wire::{enumeration, structure};
@@ -7,27 +7,28 @@ use crate::LocalizedText;
 structure! {
     /// An Endpoint of a Server (OPC 10000-4, 7.14).
     EndpointDescription<'a> {
-        /// Where to connect to.
+        /// Address of the Endpoint.
         endpoint_url: Option<&'a str> = "EndpointUrl",
-        /// Whose Endpoint it is.
+        /// Server of the Endpoint.
         server: ApplicationDescription<'a> = "Server",
-        /// The server's certificate, DER.
+        /// Certificate of the Server, DER.
         server_certificate: Option<&'a [u8]> = "ServerCertificate",
-        /// What is done to messages.
+        /// Security mode of the messages.
         security_mode: MessageSecurityMode = "SecurityMode",
-        /// With which algorithms.
+        /// Algorithms of the security policy.
         security_policy_uri: Option<&'a str> = "SecurityPolicyUri",
-        /// How users can say who they are.
+        /// Supported user identity tokens.
         user_identity_tokens: List<'a, UserTokenPolicy<'a>> = "UserIdentityTokens",
         /// The protocol stack.
         transport_profile_uri: Option<&'a str> = "TransportProfileUri",
-        /// The higher, the more secure among the Endpoints of the server; 0 is advised against.
+        /// Security level among the Endpoints of the Server; a higher level is more secure, 0 is
+        /// not recommended.
         security_level: u8 = "SecurityLevel",
     }
 
     /// An application (OPC 10000-4, 7.2).
     ApplicationDescription<'a> {
-        /// Identity of this instance, which its certificate repeats.
+        /// Identity of this instance, as in its certificate.
         application_uri: Option<&'a str> = "ApplicationUri",
         /// Identity of the product.
         product_uri: Option<&'a str> = "ProductUri",
@@ -35,57 +36,57 @@ structure! {
         application_name: LocalizedText<'a> = "ApplicationName",
         /// Server, client, or both.
         application_type: ApplicationType = "ApplicationType",
-        /// The gateway through which the discovery URLs lead.
+        /// Gateway of the discovery URLs.
         gateway_server_uri: Option<&'a str> = "GatewayServerUri",
-        /// Which discovery the URLs support.
+        /// Discovery profile that the URLs support.
         discovery_profile_uri: Option<&'a str> = "DiscoveryProfileUri",
-        /// Where to ask for Endpoints.
+        /// Addresses of the discovery Endpoints.
         discovery_urls: List<'a, Option<&'a str>> = "DiscoveryUrls",
     }
 
-    /// One way in which users say who they are (OPC 10000-4, 7.41).
+    /// A user identity token that an Endpoint accepts (OPC 10000-4, 7.41).
     UserTokenPolicy<'a> {
         /// Name of the policy within the server.
         policy_id: Option<&'a str> = "PolicyId",
-        /// What the user shows.
+        /// Type of the token.
         token_type: UserTokenType = "TokenType",
         /// Kind of an issued token.
         issued_token_type: Option<&'a str> = "IssuedTokenType",
-        /// Who issues tokens.
+        /// Endpoint of the token issuer.
         issuer_endpoint_url: Option<&'a str> = "IssuerEndpointUrl",
-        /// With which algorithms the token is protected; null for those of the Endpoint.
+        /// Algorithms that protect the token; null for the algorithms of the Endpoint.
         security_policy_uri: Option<&'a str> = "SecurityPolicyUri",
     }
 }
 
 enumeration! {
-    /// What is done to messages (OPC 10000-4, 7.20).
+    /// Security mode of messages (OPC 10000-4, 7.20).
     MessageSecurityMode {
-        /// The default, which names no mode.
+        /// The default, which is not a valid mode.
         INVALID = 0,
-        /// Nothing.
+        /// Messages are neither signed nor encrypted.
         NONE = 1,
-        /// They are signed.
+        /// Messages are signed.
         SIGN = 2,
-        /// They are signed and encrypted.
+        /// Messages are signed and encrypted.
         SIGN_AND_ENCRYPT = 3,
     }
 
-    /// What kind of application one is (OPC 10000-4, 7.2).
+    /// Kind of an application (OPC 10000-4, 7.2).
     ApplicationType {
         /// A server.
         SERVER = 0,
         /// A client.
         CLIENT = 1,
-        /// Both.
+        /// A client and server.
         CLIENT_AND_SERVER = 2,
-        /// A server of nothing but discovery.
+        /// A server for discovery only.
         DISCOVERY_SERVER = 3,
     }
 
-    /// What a user shows (OPC 10000-4, 7.41).
+    /// Type of a user identity token (OPC 10000-4, 7.41).
     UserTokenType {
-        /// Nothing.
+        /// No identity.
         ANONYMOUS = 0,
         /// Name and password.
         USER_NAME = 1,

@@ -1,4 +1,4 @@
-//! Arrays of structures and values that are read one by one from the wire, or written from a slice.
+//! Arrays of structures and values that are decoded element by element, or encoded from a slice.
 
 use std::fmt;
 use std::marker::PhantomData;
@@ -9,8 +9,9 @@ use crate::{DecodeError, EncodeError, writer};
 
 /// An array of a message (OPC 10000-6, 5.2.5), which may be null.
 ///
-/// One that was read is the checked bytes of its elements: nothing is allocated, and every pass over them decodes
-/// them again. One to be written borrows a slice. Equality is that of the elements; the null array equals only itself.
+/// A decoded array consists of the checked bytes of its elements: it allocates nothing, and each
+/// iteration decodes the elements again. An array to encode borrows a slice. Equality compares the
+/// elements; the null array equals only the null array.
 pub struct List<'a, T> {
     elements: Elements<'a, T>,
 }
@@ -25,7 +26,7 @@ enum Elements<'a, T> {
     Slice(&'a [T]),
 }
 
-/// The elements of a [`List`] one by one.
+/// Iterator over the elements of a [`List`].
 pub struct ListIter<'a, T> {
     step: Step<'a, T>,
 }
@@ -40,7 +41,7 @@ enum Step<'a, T> {
 }
 
 impl<'a, T> List<'a, T> {
-    /// The null array, which is not the empty one.
+    /// Creates the null array, which differs from the empty array.
     #[must_use]
     pub const fn null() -> Self {
         Self {
@@ -48,7 +49,7 @@ impl<'a, T> List<'a, T> {
         }
     }
 
-    /// The elements of a slice, in its order.
+    /// Creates an array of the elements of a slice.
     #[must_use]
     pub const fn new(elements: &'a [T]) -> Self {
         Self {
@@ -56,7 +57,7 @@ impl<'a, T> List<'a, T> {
         }
     }
 
-    /// Number of elements, 0 for the null array.
+    /// Returns the number of elements, 0 for the null array.
     #[must_use]
     pub const fn len(&self) -> usize {
         match self.elements {
@@ -66,19 +67,19 @@ impl<'a, T> List<'a, T> {
         }
     }
 
-    /// True without elements, whether null or empty.
+    /// Returns true for the null array and the empty array.
     #[must_use]
     pub const fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// True for the null array (length -1 on the wire).
+    /// Returns true for the null array (length -1 on the wire).
     #[must_use]
     pub const fn is_null(&self) -> bool {
         matches!(self.elements, Elements::Null)
     }
 
-    /// The elements one by one.
+    /// Returns an iterator over the elements.
     #[must_use]
     pub fn iter(&self) -> ListIter<'a, T> {
         ListIter {
@@ -100,7 +101,8 @@ impl<'a, T> List<'a, T> {
     reason = "the builtin types and structures of this crate are all elements there are"
 )]
 impl<'a, T: Structure<'a>> List<'a, T> {
-    /// The element at a place; of one that was read, all before it are decoded too.
+    /// Returns the element at an index. In a decoded array, all elements before the index are
+    /// decoded too.
     #[must_use]
     pub fn get(&self, index: usize) -> Option<T> {
         match self.elements {
@@ -234,7 +236,7 @@ impl<'a, T: Structure<'a>> Iterator for ListIter<'a, T> {
         match &mut self.step {
             Step::Wire { left, reader, .. } => {
                 *left = left.checked_sub(1)?;
-                // The elements were read once when the list was: this does not fail.
+                // The elements were checked when the list was decoded, so this does not fail.
                 T::read(reader, "array").ok()
             }
             Step::Slice(elements) => elements.next().copied(),

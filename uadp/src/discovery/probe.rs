@@ -1,4 +1,4 @@
-//! Discovery probes: what a Subscriber asks a Publisher.
+//! Discovery probes of a Subscriber.
 
 use super::list::List;
 use super::wire::Structure;
@@ -10,43 +10,45 @@ use crate::{
 
 /// A discovery probe (OPC 10000-14, 7.2.4.6.12).
 ///
-/// The PublisherId in the header of its NetworkMessage is that of the Publisher who is asked. When probes are sent
-/// says [`ProbeTimer`](super::ProbeTimer), when they are answered [`Announcer`](super::Announcer).
+/// The PublisherId in the header of its NetworkMessage identifies the probed Publisher.
+/// [`ProbeTimer`](super::ProbeTimer) schedules probes, [`Announcer`](super::Announcer) schedules
+/// their responses.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Probe<'a> {
-    /// Asks for the Endpoints of the Server beside the Publisher.
+    /// Requests the Endpoints of the Server associated with the Publisher.
     PublisherEndpoints,
-    /// Asks for the DataSetMetaData of these DataSetWriters.
+    /// Requests the DataSetMetaData of these DataSetWriters.
     DataSetMetaData(List<'a, u16>),
-    /// Asks for the configuration of these DataSetWriters and their WriterGroups.
+    /// Requests the configuration of these DataSetWriters and their WriterGroups.
     DataSetWriterConfiguration(List<'a, u16>),
-    /// Asks for the configuration of a WriterGroup, which comes as that of DataSetWriters
-    /// ([`Announced::DataSetWriterConfiguration`](super::Announced)).
+    /// Requests the configuration of a WriterGroup, which is announced as
+    /// [`Announced::DataSetWriterConfiguration`](super::Announced).
     WriterGroupConfiguration {
-        /// Which one.
+        /// Id of the WriterGroup.
         writer_group_id: u16,
-        /// With its DataSetWriters.
+        /// Include its DataSetWriters.
         include_data_set_writers: bool,
     },
-    /// Asks for the PubSubConnections.
+    /// Requests the PubSubConnections.
     PubSubConnections {
-        /// Of these transport profiles only; null or empty for all.
+        /// Restricts the response to these transport profiles; null or empty for all.
         transport_profile_uris: List<'a, Option<&'a str>>,
-        /// With their WriterGroups.
+        /// Include their WriterGroups.
         include_writer_groups: bool,
-        /// With the DataSetWriters of those.
+        /// Include the DataSetWriters of the WriterGroups.
         include_data_set_writers: bool,
     },
-    /// Asks every Publisher what application it is. The PublisherId in the header is null.
+    /// Requests the application description of every Publisher. The PublisherId in the header is
+    /// null.
     FindApplications,
 }
 
 impl<'a> Probe<'a> {
-    /// Reads the probe of a NetworkMessage.
+    /// Decodes the probe of a NetworkMessage.
     ///
     /// # Errors
-    /// [`DecodeError::Misread`] when it is no probe, a chunk, or still sealed; else as
-    /// [`decode_body`](Self::decode_body).
+    /// [`DecodeError::Misread`] if the message is not a probe, is a chunk, or is still sealed;
+    /// otherwise as [`decode_body`](Self::decode_body).
     pub fn decode(message: &NetworkMessage<'a>) -> Result<Self, DecodeError> {
         match message.message_type() {
             NetworkMessageType::Probe => Self::decode_body(read_payload(message)?),
@@ -56,12 +58,13 @@ impl<'a> Probe<'a> {
         }
     }
 
-    /// Reads what stands behind the headers of a probe, such as the whole of its chunks. Of the Endpoints probe both
-    /// forms are read: without further field, and as in version 1.04 with an array that is null or empty.
+    /// Decodes the bytes behind the headers of a probe, for example its reassembled chunks. The
+    /// Endpoints probe is accepted in both forms: without further fields, and as in version 1.04
+    /// with an array that is null or empty.
     ///
     /// # Errors
-    /// [`DecodeError::Reserved`] names a kind of probe that is not known. Else fails when a field is cut off or
-    /// malformed, and for bytes behind the last one.
+    /// [`DecodeError::Reserved`] with the type of an unknown probe. Otherwise fails if a field is
+    /// truncated or malformed, or if bytes follow the last field.
     pub fn decode_body(body: &'a [u8]) -> Result<Self, DecodeError> {
         let mut reader = Reader::new(body);
         let probe = match reader.u8("ProbeType")? {
@@ -106,13 +109,13 @@ impl<'a> Probe<'a> {
         })
     }
 
-    /// Appends the whole NetworkMessage, up to the end of its payload. `publisher_id` is that of the Publisher who is
-    /// asked; `None` is written as the Byte 0, which is no one's PublisherId (OPC 10000-14, 6.2.7.1), and is what
-    /// [`FindApplications`](Self::FindApplications) asks for. Without security the header is
-    /// [`SecurityHeader::NONE`].
+    /// Appends the NetworkMessage, up to the end of its payload. `publisher_id` identifies the
+    /// probed Publisher. `None` is encoded as the Byte 0, which is not a valid PublisherId (OPC
+    /// 10000-14, 6.2.7.1) and is required for [`FindApplications`](Self::FindApplications). Without
+    /// security the header is [`SecurityHeader::NONE`].
     ///
     /// # Errors
-    /// [`EncodeError::TooBig`] when a text, array or nonce is too long for its length.
+    /// [`EncodeError::TooBig`] if a text, array or nonce exceeds its length field.
     pub fn encode(
         &self,
         publisher_id: Option<PublisherId<'_>>,
@@ -124,10 +127,10 @@ impl<'a> Probe<'a> {
         self.encode_body(out)
     }
 
-    /// Appends what stands behind the headers.
+    /// Appends the bytes behind the headers.
     ///
     /// # Errors
-    /// [`EncodeError::TooBig`] when a text or array is too long for its length.
+    /// [`EncodeError::TooBig`] if a text or array exceeds its length field.
     pub fn encode_body(&self, out: &mut Vec<u8>) -> Result<(), EncodeError> {
         match self {
             Self::PublisherEndpoints => {
@@ -165,7 +168,7 @@ impl<'a> Probe<'a> {
     }
 }
 
-/// Version 1.04 ends the Endpoints probe with a null array of DataSetWriterIds.
+/// Skips the null array of DataSetWriterIds that ends the Endpoints probe of version 1.04.
 fn skip_no_writer_ids(reader: &mut Reader<'_>) -> Result<(), DecodeError> {
     if reader.remaining() == 0 {
         return Ok(());

@@ -1,13 +1,14 @@
-//! When a Subscriber probes: late enough to hear others do it, and ever more rarely.
+//! Schedules the probes of a Subscriber: after a random delay, and at increasing intervals.
 
 use std::time::Duration;
 
-/// The timing of the probes for one thing a Subscriber needs from a Publisher (OPC 10000-14, 7.2.4.6.12.2).
+/// Timing of the probes for a piece of information that a Subscriber needs from a Publisher (OPC
+/// 10000-14, 7.2.4.6.12.2).
 ///
-/// A probe is sent 100 to 500 ms after it is found to be needed, by chance, so that of many Subscribers one asks and
-/// the others hear it. Then the answer is waited for, 500 ms at first and twice as long after every probe of ours.
-/// Make one when metadata are missing or a version changed; call [`poll`](Self::poll) when
-/// [`poll_timeout`](Self::poll_timeout) has come.
+/// A probe is sent after a random delay of 100 to 500 ms, so that one of many Subscribers sends it
+/// and the others receive it. The Subscriber then waits for the response, 500 ms at first and twice
+/// as long after each of its probes. Create a timer when metadata are missing or a version changed;
+/// call [`poll`](Self::poll) at the time of [`poll_timeout`](Self::poll_timeout).
 /// ```
 /// use std::time::Duration;
 /// use uadp::discovery::{ProbeLimits, ProbeStep, ProbeTimer};
@@ -24,33 +25,33 @@ use std::time::Duration;
 pub struct ProbeTimer {
     limits: ProbeLimits,
     state: State,
-    /// How long the next probe is waited for.
+    /// Time to wait after the next probe.
     period: Duration,
-    /// Own probes sent.
+    /// Number of sent probes.
     sent: u32,
-    /// The last probe waited for was someone else's.
+    /// The last probe was sent by another Subscriber.
     relied: bool,
 }
 
-/// How long a [`ProbeTimer`] goes on; the standard leaves both to the Subscriber.
+/// Limits of a [`ProbeTimer`]; the standard leaves both to the Subscriber.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct ProbeLimits {
-    /// Longest time an answer is waited for. Never below 500 ms.
+    /// Maximum time to wait for a response, at least 500 ms.
     pub max_period: Duration,
-    /// Probes until it gives up.
+    /// Maximum number of probes.
     pub attempts: u32,
 }
 
-/// What [`ProbeTimer::poll`] says is to be done.
+/// Result of [`ProbeTimer::poll`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum ProbeStep {
-    /// Nothing before [`poll_timeout`](ProbeTimer::poll_timeout).
+    /// Wait until [`poll_timeout`](ProbeTimer::poll_timeout).
     Wait,
-    /// Send the probe, for what is still missing.
+    /// Send the probe for the missing information.
     Send,
-    /// Nothing any more: the answer is there.
+    /// The probing has ended with a response.
     Answered,
-    /// Nothing any more: as many probes as allowed got no answer.
+    /// The probing has ended: the maximum number of probes got no response.
     GivenUp,
 }
 
@@ -58,14 +59,15 @@ pub enum ProbeStep {
 enum State {
     /// A probe is due at this time, unless another Subscriber sends it.
     Delayed(Duration),
-    /// Someone probed; the answer is waited for until this time.
+    /// A probe was sent; the timer waits for the response until this time.
     Waiting(Duration),
     Answered,
     GivenUp,
 }
 
 impl ProbeTimer {
-    /// Delays the first probe. `now` is the time since a start that is the same for all calls, `random` any number.
+    /// Creates a timer and delays the first probe. `now` counts from any fixed time, `random` is
+    /// any random number.
     #[must_use]
     pub fn new(now: Duration, random: u32, limits: ProbeLimits) -> Self {
         Self {
@@ -77,7 +79,7 @@ impl ProbeTimer {
         }
     }
 
-    /// What is to be done now. `random` is used when the next probe is to be delayed.
+    /// Returns the step that is due. `random` determines the delay of the next probe.
     pub fn poll(&mut self, now: Duration, random: u32) -> ProbeStep {
         match self.state {
             State::Delayed(due) if now >= due => {
@@ -101,9 +103,10 @@ impl ProbeTimer {
         }
     }
 
-    /// Another Subscriber was heard asking the same Publisher for at least all that is missing. Its answer will do:
-    /// a probe that was about to be sent is not. Twice in a row that does not happen, so that nobody can keep us from
-    /// asking.
+    /// Handles a probe of another Subscriber that requests at least the missing information from
+    /// the same Publisher. A delayed probe is then not sent, because the response to the other
+    /// probe suffices. This does not happen twice in a row, so other Subscribers cannot prevent the
+    /// probing.
     pub fn handle_probe(&mut self, now: Duration) {
         if let State::Delayed(_) = self.state
             && !self.relied
@@ -113,12 +116,13 @@ impl ProbeTimer {
         }
     }
 
-    /// All that was missing was announced, or refused with a bad status. Ends the probing, even one given up.
+    /// Handles a response that contains or refuses (with a bad status) all missing information.
+    /// Ends the probing, even after it was given up.
     pub const fn handle_answer(&mut self) {
         self.state = State::Answered;
     }
 
-    /// When [`poll`](Self::poll) has something to do; `None` when probing is over.
+    /// Returns the time of the next [`poll`](Self::poll), or `None` if the probing has ended.
     #[must_use]
     pub const fn poll_timeout(&self) -> Option<Duration> {
         match self.state {
@@ -133,7 +137,7 @@ impl ProbeTimer {
     }
 }
 
-/// Half a minute at most, eight times: about a minute and a half in all.
+/// At most 30 s of waiting, 8 attempts: about 90 s in total.
 impl Default for ProbeLimits {
     fn default() -> Self {
         Self {
@@ -143,7 +147,7 @@ impl Default for ProbeLimits {
     }
 }
 
-/// 100 to 500 ms, evenly.
+/// Returns an evenly distributed delay of 100 to 500 ms.
 fn delay(random: u32) -> Duration {
     let spread = (u64::from(random) * (SPREAD_NANOS + 1)) >> 32;
     SHORTEST_DELAY + Duration::from_nanos(spread)
@@ -166,7 +170,7 @@ mod tests {
         Duration::from_millis(millis)
     }
 
-    /// Polls whenever it is time; when the probes were sent and when it gave up.
+    /// Polls at each timeout. Returns the times of the probes and of giving up.
     fn run(timer: &mut ProbeTimer, random: u32) -> (Vec<Duration>, Duration) {
         let mut sent = Vec::new();
         let mut now = Duration::ZERO;
@@ -190,7 +194,7 @@ mod tests {
     fn each_probe_is_waited_for_twice_as_long_as_the_one_before() {
         let mut timer = ProbeTimer::new(Duration::ZERO, 0, LIMITS);
         let (sent, end) = run(&mut timer, 0);
-        // 100 ms of delay before each; 500, 1000, 2000 and 2000 ms behind it.
+        // 100 ms of delay before each probe; 500, 1000, 2000 and 2000 ms of waiting after it.
         assert_eq!(sent, [ms(100), ms(700), ms(1800), ms(3900)]);
         assert_eq!(end, ms(5900));
         assert_eq!(timer.poll(ms(9999), 0), ProbeStep::GivenUp);

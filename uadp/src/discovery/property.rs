@@ -1,4 +1,4 @@
-//! Values of the Properties that say what a number means.
+//! Values of Properties that describe a number.
 
 use super::settings::Settings;
 use super::wire::structure;
@@ -7,7 +7,7 @@ use crate::{Array, BuiltinType, DecodeError, EncodeError, LocalizedText, NodeId,
 structure! {
     /// A unit of measure: the Property EngineeringUnits (OPC 10000-8, 5.6.4.3).
     EUInformation<'a> {
-        /// Who numbers the units.
+        /// Namespace of the unit ids.
         namespace_uri: Option<&'a str> = "NamespaceUri",
         /// Number of the unit.
         unit_id: i32 = "UnitId",
@@ -17,21 +17,21 @@ structure! {
         description: LocalizedText<'a> = "Description",
     }
 
-    /// The values that are to be expected: the Property EURange (OPC 10000-8, 5.6.2).
+    /// Expected range of values: the Property EURange (OPC 10000-8, 5.6.2).
     Range {
-        /// The lowest.
+        /// Lowest value.
         low: f64 = "Low",
-        /// The highest.
+        /// Highest value.
         high: f64 = "High",
     }
 
-    /// What a value of an enumeration means: an element of the Property EnumValues (OPC 10000-3, 8.39).
+    /// Meaning of an enumeration value: an element of the Property EnumValues (OPC 10000-3, 8.39).
     EnumValueType<'a> {
         /// The value.
         value: i64 = "Value",
         /// Its name, for people.
         display_name: LocalizedText<'a> = "DisplayName",
-        /// What it means, for people.
+        /// Meaning, for people.
         description: LocalizedText<'a> = "Description",
     }
 }
@@ -52,10 +52,10 @@ impl<'a> Settings<'a> for EnumValueType<'a> {
 }
 
 impl<'a> EnumValueType<'a> {
-    /// The value of the Property EnumValues, its elements in `buffer`.
+    /// Returns the value of the Property EnumValues, with its elements in `buffer`.
     ///
     /// # Errors
-    /// [`EncodeError::TooBig`] for a text that is too long for its length.
+    /// [`EncodeError::TooBig`] for a text that exceeds its length field.
     pub fn array<'b>(values: &[Self], buffer: &'b mut Vec<u8>) -> Result<Variant<'b>, EncodeError> {
         buffer.clear();
         let mut body = Vec::new();
@@ -67,10 +67,11 @@ impl<'a> EnumValueType<'a> {
     }
 }
 
-/// The value of the Property EnumStrings (OPC 10000-3, 5.8.3): the names of 0, 1, 2 and so on, in `buffer`.
+/// Returns the value of the Property EnumStrings (OPC 10000-3, 5.8.3) in `buffer`: the names of 0,
+/// 1, 2 and so on.
 ///
 /// # Errors
-/// [`EncodeError::TooBig`] for a text that is too long for its length.
+/// [`EncodeError::TooBig`] for a text that exceeds its length field.
 pub fn enum_strings<'b>(
     names: &[LocalizedText<'_>],
     buffer: &'b mut Vec<u8>,
@@ -83,7 +84,7 @@ pub fn enum_strings<'b>(
 }
 
 fn elements(element: BuiltinType, count: usize, bytes: &[u8]) -> Result<Variant<'_>, EncodeError> {
-    // What was just written can be read.
+    // The bytes were written above, so they are valid.
     let array: Result<_, DecodeError> = Array::new(element, count, bytes);
     array
         .map(Variant::Array)

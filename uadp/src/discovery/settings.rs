@@ -1,27 +1,27 @@
-//! Structures that come in ExtensionObjects, since others can stand in their place.
+//! Structures in ExtensionObjects, which can also hold other structures.
 
 use super::list::List;
 use super::wire::{Structure, enumeration, read_all, structure};
 use crate::{DecodeError, EncodeError, ExtensionBody, ExtensionObject, NodeId};
 
-/// Settings of a transport or message mapping, which come in an [`ExtensionObject`] and are decoded on demand.
+/// Settings of a transport or message mapping in an [`ExtensionObject`], decoded on demand.
 ///
-/// Those of other mappings stay the ExtensionObject they are: it is written as it was read.
+/// Settings of other mappings remain ExtensionObjects and are encoded as they were decoded.
 #[expect(
     private_bounds,
     reason = "the settings of UADP and datagrams are all there are"
 )]
 pub trait Settings<'a>: Structure<'a> {
-    /// NodeId of the binary encoding, which the ExtensionObject has.
+    /// NodeId of the binary encoding in the ExtensionObject.
     const ENCODING_ID: NodeId<'static>;
 
     /// Name of the structure.
     const NAME: &'static str;
 
-    /// Decodes the object; `None` when it is of another type, null, or not in binary.
+    /// Decodes the object. Returns `None` if it has another type, is null, or is not binary.
     ///
     /// # Errors
-    /// Fails when the body is not exactly this structure.
+    /// Fails if the body is not exactly this structure.
     fn from_object(object: &ExtensionObject<'a>) -> Result<Option<Self>, DecodeError> {
         match object.body {
             ExtensionBody::Binary(body) if object.type_id == Self::ENCODING_ID => {
@@ -31,10 +31,10 @@ pub trait Settings<'a>: Structure<'a> {
         }
     }
 
-    /// Writes the body into `buffer`, from its start, and makes the object of it.
+    /// Writes the body to the start of `buffer`, and returns the object.
     ///
     /// # Errors
-    /// [`EncodeError::TooBig`] when a text or list is too long for its length.
+    /// [`EncodeError::TooBig`] if a text or list exceeds its length field.
     fn write_object<'b>(
         &self,
         buffer: &'b mut Vec<u8>,
@@ -49,29 +49,29 @@ pub trait Settings<'a>: Structure<'a> {
 }
 
 structure! {
-    /// How a WriterGroup makes UADP NetworkMessages (OPC 10000-14, 6.3.1.1.7).
+    /// UADP NetworkMessage settings of a WriterGroup (OPC 10000-14, 6.3.1.1.7).
     UadpWriterGroupMessageDataType<'a> {
         /// Version of the layout, a VersionTime: seconds since 2000-01-01 UTC.
         group_version: u32 = "GroupVersion",
         /// Order of the DataSetMessages.
         data_set_ordering: DataSetOrderingType = "DataSetOrdering",
-        /// UadpNetworkMessageContentMask: the headers there are (OPC 10000-14, 6.3.1.1.4).
+        /// UadpNetworkMessageContentMask: the present headers (OPC 10000-14, 6.3.1.1.4).
         network_message_content_mask: u32 = "NetworkMessageContentMask",
-        /// When in the publishing interval values are sampled, in milliseconds; -1 when that is open.
+        /// Sampling time within the publishing interval, in milliseconds; -1 if undefined.
         sampling_offset: f64 = "SamplingOffset",
-        /// When in the publishing interval each NetworkMessage is sent, in milliseconds.
+        /// Sending time of each NetworkMessage within the publishing interval, in milliseconds.
         publishing_offset: List<'a, f64> = "PublishingOffset",
     }
 
-    /// How a DataSetWriter makes UADP DataSetMessages (OPC 10000-14, 6.3.1.3.6).
+    /// UADP DataSetMessage settings of a DataSetWriter (OPC 10000-14, 6.3.1.3.6).
     UadpDataSetWriterMessageDataType {
-        /// UadpDataSetMessageContentMask: the header fields there are (OPC 10000-14, 6.3.1.3.2).
+        /// UadpDataSetMessageContentMask: the present header fields (OPC 10000-14, 6.3.1.3.2).
         data_set_message_content_mask: u32 = "DataSetMessageContentMask",
-        /// Bytes every DataSetMessage is padded to; 0 without padding.
+        /// Size to which each DataSetMessage is padded, in bytes; 0 for no padding.
         configured_size: u16 = "ConfiguredSize",
-        /// Which NetworkMessage of the publishing interval it stands in; 0 when that is open.
+        /// Number of its NetworkMessage within the publishing interval; 0 if undefined.
         network_message_number: u16 = "NetworkMessageNumber",
-        /// Where it starts in the NetworkMessage, in bytes; 0 when that is open.
+        /// Offset in the NetworkMessage, in bytes; 0 if undefined.
         data_set_offset: u16 = "DataSetOffset",
     }
 
@@ -83,19 +83,20 @@ structure! {
         url: Option<&'a str> = "Url",
     }
 
-    /// How a connection uses datagrams (OPC 10000-14, 6.4.1.2.2).
+    /// Datagram settings of a connection (OPC 10000-14, 6.4.1.2.2).
     DatagramConnectionTransportDataType<'a> {
-        /// Where probes and announcements go; an address such as a [`NetworkAddressUrlDataType`].
+        /// Destination of probes and announcements, such as a [`NetworkAddressUrlDataType`].
         discovery_address: ExtensionObject<'a> = "DiscoveryAddress",
     }
 
-    /// How a connection uses datagrams, since version 1.05 (OPC 10000-14, 6.4.1.2.7).
+    /// Datagram settings of a connection, from version 1.05 on (OPC 10000-14, 6.4.1.2.7).
     DatagramConnectionTransport2DataType<'a> {
-        /// Where probes and announcements go; an address such as a [`NetworkAddressUrlDataType`].
+        /// Destination of probes and announcements, such as a [`NetworkAddressUrlDataType`].
         discovery_address: ExtensionObject<'a> = "DiscoveryAddress",
-        /// Every how many seconds the connection is announced; 0 for only when asked.
+        /// Announcement interval of the connection, in seconds; 0 for announcements on request
+        /// only.
         discovery_announce_rate: u32 = "DiscoveryAnnounceRate",
-        /// Most bytes of a discovery NetworkMessage, beyond which it is sent in chunks.
+        /// Maximum bytes of a discovery NetworkMessage, above which it is sent in chunks.
         discovery_max_message_size: u32 = "DiscoveryMaxMessageSize",
         /// Quality of service; null for best effort.
         qos_category: Option<&'a str> = "QosCategory",
@@ -103,29 +104,30 @@ structure! {
         datagram_qos: List<'a, ExtensionObject<'a>> = "DatagramQos",
     }
 
-    /// How a WriterGroup uses datagrams (OPC 10000-14, 6.4.1.3.3).
+    /// Datagram settings of a WriterGroup (OPC 10000-14, 6.4.1.3.3).
     DatagramWriterGroupTransportDataType {
-        /// How often every NetworkMessage is repeated.
+        /// Number of repetitions of every NetworkMessage.
         message_repeat_count: u8 = "MessageRepeatCount",
         /// Time between the repetitions, in milliseconds.
         message_repeat_delay: f64 = "MessageRepeatDelay",
     }
 
-    /// How a WriterGroup uses datagrams, since version 1.05 (OPC 10000-14, 6.4.1.3.9).
+    /// Datagram settings of a WriterGroup, from version 1.05 on (OPC 10000-14, 6.4.1.3.9).
     DatagramWriterGroupTransport2DataType<'a> {
-        /// How often every NetworkMessage is repeated.
+        /// Number of repetitions of every NetworkMessage.
         message_repeat_count: u8 = "MessageRepeatCount",
         /// Time between the repetitions, in milliseconds.
         message_repeat_delay: f64 = "MessageRepeatDelay",
-        /// Where to, such as a [`NetworkAddressUrlDataType`]; null for the address of the connection.
+        /// Destination, such as a [`NetworkAddressUrlDataType`]; null for the address of the
+        /// connection.
         address: ExtensionObject<'a> = "Address",
-        /// Quality of service; null for that of the connection.
+        /// Quality of service; null for the quality of service of the connection.
         qos_category: Option<&'a str> = "QosCategory",
         /// Parameters of the quality of service.
         datagram_qos: List<'a, ExtensionObject<'a>> = "DatagramQos",
-        /// Every how many seconds the group is announced; 0 for only when asked.
+        /// Announcement interval of the group, in seconds; 0 for announcements on request only.
         discovery_announce_rate: u32 = "DiscoveryAnnounceRate",
-        /// Topic of a middleware that has such.
+        /// Topic, for transports with topics.
         topic: Option<&'a str> = "Topic",
     }
 }
@@ -135,9 +137,9 @@ enumeration! {
     DataSetOrderingType {
         /// Any.
         UNDEFINED = 0,
-        /// By DataSetWriterId, over the NetworkMessages of a publishing interval too.
+        /// By DataSetWriterId, also across the NetworkMessages of a publishing interval.
         ASCENDING_WRITER_ID = 1,
-        /// By DataSetWriterId, and each in a NetworkMessage of its own.
+        /// By DataSetWriterId, each in a separate NetworkMessage.
         ASCENDING_WRITER_ID_SINGLE = 2,
     }
 }

@@ -1,4 +1,4 @@
-//! How a value that stands in a fixed place is read and written, and structures as lists of such places.
+//! Encoding of values at fixed positions, and of structures as lists of such values.
 
 use crate::reader::Reader;
 use crate::writer;
@@ -7,14 +7,16 @@ use crate::{
     NodeId, QualifiedName, StatusCode, Variant,
 };
 
-/// A value whose type says how it is encoded: a builtin type, an array or a structure (OPC 10000-6, 5.2.6).
+/// A value with a fixed encoding: a builtin type, an array or a structure (OPC 10000-6, 5.2.6).
 pub(crate) trait Structure<'a>: Copy {
-    /// The default value of the type: null where there is one, else zero.
+    /// The default value: null if the type has it, otherwise zero.
     const NULL: Self;
-    /// Fewest bytes it takes: what an array length is held against before the elements are read.
+    /// Minimum encoded size in bytes. An array length is checked against it before the elements are
+    /// decoded.
     const MIN_SIZE: usize;
 
-    /// `what` is for the error. A structure names its fields itself.
+    /// Decodes a value. `what` is the field name in errors; a structure uses the names of its
+    /// fields.
     fn read(reader: &mut Reader<'a>, what: &'static str) -> Result<Self, DecodeError>;
 
     /// Appends the encoding; `what` as in [`read`](Self::read).
@@ -44,7 +46,7 @@ macro_rules! number {
 
 number! { u8 u16 u32 i32 i64 f64 }
 
-/// Types that are one value of another type with a name.
+/// Types that wrap a value of another type.
 macro_rules! wrapped {
     ($($wrapper:ident($inner:ty))+) => { $(
         impl Structure<'_> for $wrapper {
@@ -66,7 +68,7 @@ macro_rules! wrapped {
 
 wrapped! { StatusCode(u32) DateTime(i64) }
 
-/// Builtin types that read and write themselves.
+/// Builtin types with `read` and `write` functions.
 macro_rules! builtin {
     ($($builtin:ident: $null:expr, $min_size:literal;)+) => { $(
         impl<'a> Structure<'a> for $builtin<'a> {
@@ -99,7 +101,7 @@ impl Structure<'_> for bool {
     const MIN_SIZE: usize = 1;
 
     fn read(reader: &mut Reader<'_>, what: &'static str) -> Result<Self, DecodeError> {
-        // Every value but 0 is true (OPC 10000-6, 5.2.2.1).
+        // Every value except 0 is true (OPC 10000-6, 5.2.2.1).
         reader.u8(what).map(|byte| byte != 0)
     }
 
@@ -149,7 +151,7 @@ impl<'a> Structure<'a> for Option<&'a [u8]> {
     }
 }
 
-/// Reads a value that takes up all the bytes.
+/// Decodes a value that spans all bytes.
 pub(crate) fn read_all<'a, T: Structure<'a>>(
     bytes: &'a [u8],
     what: &'static str,
@@ -162,7 +164,8 @@ pub(crate) fn read_all<'a, T: Structure<'a>>(
     }
 }
 
-/// A structure of the standard: its fields, in the order of the wire, each with the name errors give it.
+/// Defines structures of the standard by their fields in the order of the encoding, each with its
+/// name in errors.
 macro_rules! structure {
     ($(
         $(#[$meta:meta])*
@@ -205,7 +208,7 @@ macro_rules! structure {
             }
         }
 
-        /// Every field null, or zero where its type knows no null.
+        /// Every field is null, or zero if its type has no null.
         impl $(<$lifetime>)? Default for $name $(<$lifetime>)? {
             fn default() -> Self {
                 <Self as crate::discovery::wire::Structure<'_>>::NULL
@@ -214,7 +217,8 @@ macro_rules! structure {
     )+ };
 }
 
-/// An enumeration of the standard: an Int32 of which other values than the named ones can come.
+/// Defines enumerations of the standard. An enumeration is an Int32 that can also hold other values
+/// than the named constants.
 macro_rules! enumeration {
     ($(
         $(#[$meta:meta])*
