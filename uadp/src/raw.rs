@@ -1,8 +1,9 @@
-//! The RawData field encoding (OPC 10000-14, 7.2.4.5.11): values back to back, without types.
+//! The RawData field encoding (OPC 10000-14, 7.2.4.5.11): values in sequence, without types.
 //!
-//! What the DataSetMetaData says of the fields is a layout ([`layout`]), with which payloads are read ([`read`]) and
-//! written ([`mod@write`]). Both know three forms in which the same values can stand: the two dialects, and what
-//! OPC 10000-6 alone says, which is how open62541 has structures and everybody has ExtensionObjects.
+//! A layout ([`layout`]) holds the DataSetMetaData of the fields; payloads are decoded ([`read`])
+//! and encoded ([`mod@write`]) with it. Both support three forms of the same values: the two
+//! dialects, and the plain form of OPC 10000-6, which open62541 uses for structures and all stacks
+//! use for ExtensionObjects.
 
 mod layout;
 mod read;
@@ -16,41 +17,44 @@ pub use read::{RawFields, RawMembers};
 pub use value::{RawArray, RawElements, RawValue};
 pub use write::{RawWriteError, RawWriteFault};
 
-/// How a peer lays out RawData. Both sides have to be set to the same.
+/// Layout of RawData on the wire. Both sides have to use the same dialect.
 ///
-/// Without texts, arrays and structures there is no difference.
+/// The dialects differ only for texts, arrays and structures.
 ///
-/// Some releases of UA-.NETStandard write padded texts and arrays without their length; that is not read.
+/// Some releases of UA-.NETStandard write padded texts and arrays without their length; this form
+/// is not supported.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 #[non_exhaustive]
 pub enum RawDialect {
-    /// By the text of OPC 10000-14, 7.2.4.5.11:
-    /// - A String or ByteString, also as an element of an array, is its Int32 length and its bytes, padded to the
-    ///   MaxStringLength; a null one is length -1 and padding.
-    /// - An array is its Int32 length and its elements, padded to the ArrayDimensions; a null one is length -1 and
-    ///   padding.
-    /// - A matrix is the number of its dimensions and each of them as Int32 (OPC 10000-6, 5.2.5), then its elements in
-    ///   row-major order, padded to the ArrayDimensions. Where the elements of a matrix shorter than its metadata says
-    ///   stand is read in two ways by peers, one row behind the other or each row in its place. The two differ unless
-    ///   only the outermost dimension is shorter, and such a matrix is neither read nor written.
-    /// - Structures are padded inside in the same way. An optional field which is not there is padding of its size
-    ///   (OPC 10000-6, 5.2.7), a Union is padded to its biggest field (OPC 10000-6, 5.2.8).
+    /// Layout of OPC 10000-14, 7.2.4.5.11:
+    /// - A String or ByteString, also as an element of an array, is its Int32 length and its bytes,
+    ///   padded to the MaxStringLength; a null value is length -1 and padding.
+    /// - An array is its Int32 length and its elements, padded to the ArrayDimensions; a null array
+    ///   is length -1 and padding.
+    /// - A matrix is the number of its dimensions and the size of each dimension as Int32 (OPC
+    ///   10000-6, 5.2.5), then its elements in row-major order, padded to the ArrayDimensions.
+    ///   Peers differ in the position of the rows of a matrix that is shorter than its metadata:
+    ///   rows in sequence, or each row at its maximum offset. The positions are equal if only the
+    ///   outermost dimension is shorter. Other short matrices are neither decoded nor encoded.
+    /// - Structures are padded inside in the same way. An absent optional field is padding of its
+    ///   size (OPC 10000-6, 5.2.7), a Union is padded to its largest field (OPC 10000-6, 5.2.8).
     #[default]
     Standard,
-    /// As open62541 1.5 does it:
-    /// - Texts as in the standard.
-    /// - An array or matrix is one UInt32 per dimension and its elements in row-major order, unpadded; what is shorter
-    ///   than its ArrayDimensions is read but not written. There is no null array.
-    /// - Inside of structures nothing is padded: OPC 10000-6, 5.2.5 to 5.2.8.
+    /// Layout of open62541 1.5:
+    /// - Texts are encoded as in the standard.
+    /// - An array or matrix is a UInt32 per dimension and its elements in row-major order,
+    ///   unpadded. An array shorter than its ArrayDimensions is decoded but not encoded. There is
+    ///   no null array.
+    /// - Structures are not padded inside: OPC 10000-6, 5.2.5 to 5.2.8.
     Open62541,
 }
 
-/// Where the bytes of a field stand.
+/// Byte layout of a field.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Form {
     Standard,
     Open62541,
-    /// OPC 10000-6 alone: no padding.
+    /// OPC 10000-6 without padding.
     Plain,
 }
 
@@ -62,7 +66,7 @@ impl Form {
         }
     }
 
-    /// Form of the fields of a structure which stands in this one.
+    /// Returns the form of the fields of a structure within this form.
     const fn nested(self) -> Self {
         match self {
             Self::Standard => Self::Standard,
@@ -78,7 +82,7 @@ impl Form {
     }
 }
 
-/// Int32 length, Int32 dimension, EncodingMask, SwitchField: all take four bytes.
+/// Size of an Int32 length, an Int32 dimension, an EncodingMask or a SwitchField: 4 bytes.
 const WORD: usize = 4;
 /// ValueRank of a single value.
 const SCALAR: i32 = -1;

@@ -1,7 +1,8 @@
-//! Message security: who may have written a message, and who may read it (OPC 10000-14, 7.2.4.4.3).
+//! Message security: signatures and encryption of NetworkMessages (OPC 10000-14, 7.2.4.4.3).
 //!
-//! A SecurityGroup is a list of [`Keys`], each with a SecurityTokenId, that its members get from a Security Key
-//! Service. [`Opener`] is what a Subscriber holds of the group, [`Sealer`] what a Publisher does.
+//! The keys of a SecurityGroup are a list of [`Keys`], each with a SecurityTokenId, which the
+//! members of the group get from a Security Key Service. A Subscriber has an [`Opener`] for the
+//! group, a Publisher has a [`Sealer`].
 
 mod error;
 mod keys;
@@ -16,7 +17,7 @@ pub use keys::Keys;
 pub use opener::{CountedBy, Opened, Opener, OpenerOptions};
 pub use sealer::{Seal, Sealer};
 
-/// The algorithms of a SecurityGroup: HMAC-SHA2-256 signs, AES in counter mode encrypts (OPC 10000-7).
+/// Algorithms of a SecurityGroup: HMAC-SHA2-256 signs, AES in counter mode encrypts (OPC 10000-7).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum SecurityPolicy {
     /// AES with keys of 128 bits.
@@ -25,17 +26,18 @@ pub enum SecurityPolicy {
     PubSubAes256Ctr,
 }
 
-/// What is done to messages; `MessageSecurityMode.None` is to have no [`Opener`] and no [`Sealer`].
+/// Security mode of messages; with `MessageSecurityMode.None` there is neither an [`Opener`] nor a
+/// [`Sealer`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum SecurityMode {
-    /// Everybody can read them, members alone can have written them.
+    /// Messages are signed by members of the group and readable without keys.
     Sign,
-    /// Payload and footer are encrypted as well; the headers never are.
+    /// Payload and footer are also encrypted; the headers are never encrypted.
     SignAndEncrypt,
 }
 
 impl SecurityPolicy {
-    /// The SecurityPolicyUri.
+    /// Returns the SecurityPolicyUri.
     #[must_use]
     pub const fn uri(self) -> &'static str {
         match self {
@@ -44,7 +46,7 @@ impl SecurityPolicy {
         }
     }
 
-    /// The policy of a SecurityPolicyUri, if it is one for PubSub.
+    /// Returns the policy of a SecurityPolicyUri, or `None` if it is not a PubSub policy.
     #[must_use]
     pub fn from_uri(uri: &str) -> Option<Self> {
         match uri {
@@ -54,7 +56,8 @@ impl SecurityPolicy {
         }
     }
 
-    /// Bytes of key data for one SecurityTokenId: SigningKey, EncryptingKey and KeyNonce.
+    /// Returns the length of the key data of a SecurityTokenId: SigningKey, EncryptingKey and
+    /// KeyNonce.
     #[must_use]
     pub const fn key_data_length(self) -> usize {
         SIGNING_KEY + self.encrypting_key_length() + KEY_NONCE
@@ -74,7 +77,8 @@ const AES256_URI: &str = "http://opcfoundation.org/UA/SecurityPolicy#PubSub-Aes2
 /// Bytes of the SigningKey and of the KeyNonce (OPC 10000-14, 7.2.4.4.3.1).
 const SIGNING_KEY: usize = 32;
 const KEY_NONCE: usize = 4;
-/// Bytes of the MessageNonce: a random half, and the sequence number as UInt32 (OPC 10000-14, 7.2.4.4.3.2).
+/// Bytes of the MessageNonce: 4 random bytes, and the sequence number as UInt32 (OPC 10000-14,
+/// 7.2.4.4.3.2).
 const MESSAGE_NONCE: usize = 8;
 /// Bytes of the signature.
 const SIGNATURE: usize = 32;

@@ -1,18 +1,20 @@
-//! What the DataSetMetaData says of the fields, and the sizes that follow from it.
+//! Metadata of the fields, and the sizes that follow from it.
 
 use super::{Form, RawDialect, SCALAR, WORD};
 use crate::{BuiltinType, NodeId};
 
-/// What a receiver of RawData knows of the fields of a DataSet, in their order (OPC 10000-14, 6.2.3.2.3).
+/// Field metadata of a DataSet in the order of the fields, for RawData (OPC 10000-14, 6.2.3.2.3).
 ///
-/// A DataSetMessage of RawData says nothing about its fields (OPC 10000-14, 7.2.4.5.11): they stand back to back like
-/// the fields of a structure (OPC 10000-6, 5.2.6), structures without the envelope of an ExtensionObject. What is
-/// shorter than its metadata allows is followed by zero bytes, so that every field keeps its place. Peers differ in
-/// how, which is why reading and writing take a [`RawDialect`].
+/// A DataSetMessage of RawData does not describe its fields (OPC 10000-14, 7.2.4.5.11): they are
+/// encoded in sequence like the fields of a structure (OPC 10000-6, 5.2.6), and structures have no
+/// ExtensionObject envelope. A value shorter than the maximum of its metadata is followed by zero
+/// bytes, so that every field has a fixed offset. Peers differ in the details, so decoding and
+/// encoding take a [`RawDialect`].
 ///
-/// What the metadata gives no maximum for (a MaxStringLength of 0, no ArrayDimensions or one of 0) is not padded, and
-/// the fields behind it have no place of their own. With all maxima known, [`fixed_size`](Self::fixed_size) and
-/// [`field_offset`](Self::field_offset) say where every field stands, for patching a message in place.
+/// Values without a maximum in the metadata (a MaxStringLength of 0, no ArrayDimensions or a
+/// dimension of 0) are not padded, and the fields behind them have no fixed offset. If all maxima
+/// are known, [`fixed_size`](Self::fixed_size) and [`field_offset`](Self::field_offset) return the
+/// offsets of the fields, so that a message can be patched in place.
 ///
 /// # Reading
 /// ```
@@ -73,28 +75,31 @@ pub struct RawLayout<'a> {
     fields: &'a [RawField<'a>],
 }
 
-/// One field of a DataSet (FieldMetaData: OPC 10000-14, 6.2.3.2.4) or of a structure (StructureField:
+/// A field of a DataSet (FieldMetaData: OPC 10000-14, 6.2.3.2.4) or of a structure (StructureField:
 /// OPC 10000-3, 8.51).
 ///
-/// An enumeration is an Int32. Not allowed are NodeId, ExpandedNodeId, QualifiedName, LocalizedText, XmlElement,
-/// DiagnosticInfo and DataValue, nor Variant, which stands for abstract types (OPC 10000-14, 7.2.4.5.11 and 6.2.3.2.4).
+/// An enumeration is an Int32. NodeId, ExpandedNodeId, QualifiedName, LocalizedText, XmlElement,
+/// DiagnosticInfo and DataValue are not allowed, nor is Variant, which stands for abstract types
+/// (OPC 10000-14, 7.2.4.5.11 and 6.2.3.2.4).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RawField<'a> {
     /// BuiltInType; ExtensionObject for a structure.
     pub builtin: BuiltinType,
-    /// ValueRank: -1 for a single value, else the number of dimensions.
+    /// ValueRank: -1 for a single value, otherwise the number of dimensions.
     pub value_rank: i32,
-    /// ArrayDimensions: most elements of each dimension, 0 where that is unknown. Either empty or one per dimension.
+    /// ArrayDimensions: maximum number of elements of each dimension, 0 if unknown. Either empty or
+    /// an entry per dimension.
     pub array_dimensions: &'a [u32],
-    /// MaxStringLength: most bytes of a String or ByteString, 0 where that is unknown. Ignored for other types.
+    /// MaxStringLength: maximum bytes of a String or ByteString, 0 if unknown. Ignored for other
+    /// types.
     pub max_string_length: u32,
-    /// What the structure is made of, for ExtensionObject and only for that.
+    /// Definition of the structure, for ExtensionObject only.
     pub structure: Option<&'a RawStructure<'a>>,
     /// IsOptional, in a [`RawStructureType::StructureWithOptionalFields`] only.
     pub optional: bool,
 }
 
-/// A structure DataType: what its StructureDefinition says (OPC 10000-3, 8.48).
+/// A structure DataType with its StructureDefinition (OPC 10000-3, 8.48).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RawStructure<'a> {
     type_id: NodeId<'a>,
@@ -102,52 +107,53 @@ pub struct RawStructure<'a> {
     fields: &'a [RawField<'a>],
     optional: u32,
     depth: usize,
-    /// Bytes with all padding; `None` where they vary.
+    /// Bytes with all padding; `None` if variable.
     padded: Option<usize>,
-    /// Bytes without padding; `None` where they vary.
+    /// Bytes without padding; `None` if variable.
     plain: Option<usize>,
-    /// Fewest bytes, padded or not.
+    /// Minimum number of bytes in either form.
     least: usize,
 }
 
-/// StructureType of a StructureDefinition (OPC 10000-3, 8.49). Those with subtyped values are not allowed in RawData.
+/// StructureType of a StructureDefinition (OPC 10000-3, 8.49). Types with subtyped values are not
+/// allowed in RawData.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum RawStructureType {
-    /// All fields one after the other.
+    /// All fields in sequence.
     Structure,
-    /// An EncodingMask says which of the optional fields are there (OPC 10000-6, 5.2.7).
+    /// An EncodingMask marks the present optional fields (OPC 10000-6, 5.2.7).
     StructureWithOptionalFields,
-    /// A SwitchField says which one field is there (OPC 10000-6, 5.2.8).
+    /// A SwitchField selects the present field (OPC 10000-6, 5.2.8).
     Union,
 }
 
-/// Why fields are no layout.
+/// Error of a layout.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("field {field}: {fault}")]
 pub struct RawLayoutError {
-    /// Position in the fields given, from 0.
+    /// Index of the field.
     pub field: usize,
-    /// What is wrong with it.
+    /// Fault of the field.
     pub fault: RawLayoutFault,
 }
 
-/// What is wrong with a field of a layout.
+/// Fault of a field of a layout.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum RawLayoutFault {
     /// The standard does not allow the type in RawData.
     #[error("{0} is not allowed in RawData")]
     Type(BuiltinType),
-    /// A structure of which nobody says what it is made of.
+    /// The field is an ExtensionObject without a structure definition.
     #[error("an ExtensionObject without its structure")]
     NoStructure,
-    /// Another type with a structure.
+    /// The field has a structure definition and another type.
     #[error("{0} with a structure")]
     NotAStructure(BuiltinType),
-    /// A ValueRank which leaves open whether the value is an array, or is none of the standard's.
+    /// The ValueRank permits both scalars and arrays, or is not defined by the standard.
     #[error("ValueRank {0} is neither -1 nor a number of dimensions")]
     ValueRank(i32),
-    /// As many ArrayDimensions as there are dimensions, or none at all.
+    /// The number of ArrayDimensions is neither 0 nor the number of dimensions.
     #[error("{found} ArrayDimensions with ValueRank {value_rank}")]
     ArrayDimensions {
         /// ValueRank.
@@ -155,21 +161,23 @@ pub enum RawLayoutFault {
         /// Number of ArrayDimensions.
         found: usize,
     },
-    /// An optional field where all fields have to be there, or more than 32 of them.
+    /// The field is optional in a type without optional fields, or there are more than 32 optional
+    /// fields.
     #[error("an optional field too many")]
     Optional,
     /// Structures are nested deeper than [`RawStructure::MAX_DEPTH`].
     #[error("structures nested too deep")]
     TooDeep,
-    /// A structure without fields has no size, so any number of them would fit in any message.
+    /// The structure has no fields. It would have no size, so any number of them would fit in a
+    /// message.
     #[error("a structure without fields")]
     NoFields,
-    /// Up to here the fields take more than 2^31-1 bytes.
+    /// The fields up to this field exceed 2^31-1 bytes.
     #[error("more than 2^31-1 bytes")]
     TooBig,
 }
 
-/// What a value, or each element of an array, is made of.
+/// Encoding of a single value or of an array element.
 pub(super) enum Element<'a> {
     Fixed(usize),
     Text,
@@ -177,10 +185,10 @@ pub(super) enum Element<'a> {
 }
 
 impl<'a> RawLayout<'a> {
-    /// Layout of the fields of a DataSet.
+    /// Creates the layout of the fields of a DataSet.
     ///
     /// # Errors
-    /// Names the first field which is not allowed.
+    /// The first invalid field.
     pub fn new(fields: &'a [RawField<'a>]) -> Result<Self, RawLayoutError> {
         let mut total = 0_usize;
         for (field, metadata) in fields.iter().enumerate() {
@@ -197,24 +205,27 @@ impl<'a> RawLayout<'a> {
         Ok(Self { fields })
     }
 
-    /// The fields.
+    /// Returns the fields.
     #[must_use]
     pub const fn fields(&self) -> &'a [RawField<'a>] {
         self.fields
     }
 
-    /// Bytes of every payload; `None` where they vary, as something has no known maximum.
+    /// Returns the bytes of every payload, or `None` if the size varies because a maximum is
+    /// unknown.
     ///
-    /// In the dialect of open62541 this holds for what is written, not for a shorter array that is read.
+    /// In the dialect of open62541 the size applies to encoded payloads; a decoded payload may have
+    /// shorter arrays.
     #[must_use]
     pub fn fixed_size(&self, dialect: RawDialect) -> Option<usize> {
         fixed_size(self.fields, dialect)
     }
 
-    /// Bytes from the start of the payload to a field, the same in every payload; `None` where they vary, and for a
-    /// field that is none. [`fixed_size`](Self::fixed_size) says more on it.
+    /// Returns the offset of a field in every payload, in bytes. Returns `None` if the offset
+    /// varies or the field does not exist. The limitation of [`fixed_size`](Self::fixed_size)
+    /// applies.
     ///
-    /// At the offset of a text or array stands its length, not its content.
+    /// The offset of a text or array is the offset of its length, not of its content.
     #[must_use]
     pub fn field_offset(&self, field: usize, dialect: RawDialect) -> Option<usize> {
         self.fields.get(field)?;
@@ -230,7 +241,7 @@ fn fixed_size(fields: &[RawField<'_>], dialect: RawDialect) -> Option<usize> {
 }
 
 impl<'a> RawField<'a> {
-    /// A single value of unknown maximum length.
+    /// Creates a single value of unknown maximum length.
     #[must_use]
     pub const fn new(builtin: BuiltinType) -> Self {
         Self {
@@ -243,7 +254,7 @@ impl<'a> RawField<'a> {
         }
     }
 
-    /// A single structure.
+    /// Creates a single structure.
     #[must_use]
     pub const fn structure(structure: &'a RawStructure<'a>) -> Self {
         Self {
@@ -252,7 +263,7 @@ impl<'a> RawField<'a> {
         }
     }
 
-    /// With a MaxStringLength, in bytes.
+    /// Sets the MaxStringLength, in bytes.
     #[must_use]
     pub const fn with_max_string_length(self, max_string_length: u32) -> Self {
         Self {
@@ -261,7 +272,7 @@ impl<'a> RawField<'a> {
         }
     }
 
-    /// An array of these ArrayDimensions, its ValueRank their number.
+    /// Sets the ArrayDimensions, and the ValueRank to their number.
     #[must_use]
     pub fn with_dimensions(self, array_dimensions: &'a [u32]) -> Self {
         Self {
@@ -271,7 +282,7 @@ impl<'a> RawField<'a> {
         }
     }
 
-    /// An optional field of a structure.
+    /// Makes the field of a structure optional.
     #[must_use]
     pub const fn as_optional(self) -> Self {
         Self {
@@ -311,7 +322,7 @@ impl<'a> RawField<'a> {
         }
     }
 
-    /// `None` for what is not allowed in RawData.
+    /// Returns `None` for a type that is not allowed in RawData.
     pub(super) const fn element(&self) -> Option<Element<'a>> {
         match (self.builtin, self.structure) {
             (BuiltinType::String | BuiltinType::ByteString, _) => Some(Element::Text),
@@ -323,12 +334,12 @@ impl<'a> RawField<'a> {
         }
     }
 
-    /// Number of dimensions, 0 for a single value.
+    /// Returns the number of dimensions, 0 for a single value.
     pub(super) fn rank(&self) -> usize {
         usize::try_from(self.value_rank).unwrap_or_default()
     }
 
-    /// Most elements of a dimension, where the form minds.
+    /// Returns the maximum number of elements of a dimension, if the form uses it.
     pub(super) fn most_elements(&self, form: Form, dimension: usize) -> Option<u32> {
         match form {
             Form::Plain => None,
@@ -339,12 +350,12 @@ impl<'a> RawField<'a> {
         }
     }
 
-    /// Bytes a text is padded to.
+    /// Returns the size to which a text is padded, in bytes.
     pub(super) fn text_room(&self, form: Form) -> Option<usize> {
         (form.pads_texts() && self.max_string_length != 0).then(|| to_usize(self.max_string_length))
     }
 
-    /// Bytes of the value, or of one element; `None` where they vary.
+    /// Returns the bytes of the value or of an element, or `None` if variable.
     pub(super) fn element_size(&self, form: Form) -> Option<usize> {
         match self.element()? {
             Element::Fixed(size) => Some(size),
@@ -353,7 +364,7 @@ impl<'a> RawField<'a> {
         }
     }
 
-    /// Fewest bytes of the value, or of one element.
+    /// Returns the minimum number of bytes of the value or of an element.
     pub(super) fn least_element_size(&self) -> usize {
         match self.element() {
             Some(Element::Fixed(size)) => size,
@@ -362,7 +373,7 @@ impl<'a> RawField<'a> {
         }
     }
 
-    /// Bytes in front of the elements of an array.
+    /// Returns the number of bytes before the elements of an array.
     fn header_size(&self, form: Form) -> usize {
         let dimensions = self.rank().saturating_mul(WORD);
         match (self.value_rank, form) {
@@ -372,7 +383,7 @@ impl<'a> RawField<'a> {
         }
     }
 
-    /// Bytes of all elements an array can have, where their number is known.
+    /// Returns the bytes of the maximum number of elements of an array, if known.
     fn elements_size(&self, form: Form) -> Option<usize> {
         if self.array_dimensions.is_empty() || self.array_dimensions.contains(&0) {
             return None;
@@ -382,7 +393,7 @@ impl<'a> RawField<'a> {
         Some(count.saturating_mul(self.element_size(form)?))
     }
 
-    /// Bytes the elements of an array are padded to.
+    /// Returns the size to which the elements of an array are padded, in bytes.
     pub(super) fn array_room(&self, form: Form) -> Option<usize> {
         match form {
             Form::Standard => self.elements_size(form),
@@ -390,7 +401,7 @@ impl<'a> RawField<'a> {
         }
     }
 
-    /// Bytes of the field, `None` where they vary.
+    /// Returns the bytes of the field, or `None` if variable.
     pub(super) fn size(&self, form: Form) -> Option<usize> {
         match (self.value_rank, form) {
             (SCALAR, _) => self.element_size(form),
@@ -402,7 +413,7 @@ impl<'a> RawField<'a> {
         }
     }
 
-    /// Bytes of an optional field which is not there.
+    /// Returns the bytes of an absent optional field.
     pub(super) fn absent_room(&self, form: Form) -> Option<usize> {
         match form {
             Form::Standard => self.size(form),
@@ -419,13 +430,13 @@ impl<'a> RawField<'a> {
 }
 
 impl<'a> RawStructure<'a> {
-    /// How deep structures may stand in structures.
+    /// Maximum nesting depth of structures.
     pub const MAX_DEPTH: usize = 8;
 
-    /// A structure. `type_id` is its DefaultEncodingId, the NodeId of the binary encoding.
+    /// Creates a structure. `type_id` is its DefaultEncodingId, the NodeId of the binary encoding.
     ///
     /// # Errors
-    /// Names the first field which is not allowed.
+    /// The first invalid field.
     pub fn new(
         type_id: NodeId<'a>,
         structure_type: RawStructureType,
@@ -454,30 +465,30 @@ impl<'a> RawStructure<'a> {
         Ok(structure)
     }
 
-    /// NodeId of the binary encoding.
+    /// Returns the NodeId of the binary encoding.
     #[must_use]
     pub const fn type_id(&self) -> NodeId<'a> {
         self.type_id
     }
 
-    /// Which of the fields are there.
+    /// Returns the structure type.
     #[must_use]
     pub const fn structure_type(&self) -> RawStructureType {
         self.structure_type
     }
 
-    /// The fields.
+    /// Returns the fields.
     #[must_use]
     pub const fn fields(&self) -> &'a [RawField<'a>] {
         self.fields
     }
 
-    /// Number of optional fields, 32 at most.
+    /// Returns the number of optional fields, at most 32.
     pub(super) const fn optional(&self) -> u32 {
         self.optional
     }
 
-    /// Bytes in one form of those which structures stand in; `None` where they vary.
+    /// Returns the bytes in a form for structures, or `None` if variable.
     pub(super) const fn size(&self, form: Form) -> Option<usize> {
         match form {
             Form::Standard => self.padded,
@@ -485,7 +496,7 @@ impl<'a> RawStructure<'a> {
         }
     }
 
-    /// Bytes the chosen field of a Union is padded to.
+    /// Returns the size to which the selected field of a Union is padded, in bytes.
     pub(super) fn union_room(&self, form: Form) -> Option<usize> {
         match (self.structure_type, form) {
             (RawStructureType::Union, Form::Standard) => Some(self.padded?.saturating_sub(WORD)),
@@ -529,7 +540,7 @@ impl<'a> RawStructure<'a> {
         }
     }
 
-    /// The EncodingMask or SwitchField.
+    /// Adds the size of the EncodingMask or SwitchField.
     fn add_head(&mut self) {
         if self.structure_type == RawStructureType::Structure {
             return;
@@ -544,5 +555,6 @@ pub(super) fn to_usize(value: u32) -> usize {
     usize::try_from(value).unwrap_or(usize::MAX)
 }
 
-/// The longest ByteString of a chunked message; no sizes computed here overflow below it.
+/// Maximum size of a ByteString of a chunked message. The sizes computed in this module do not
+/// overflow below it.
 const MAX_SIZE: usize = 0x7FFF_FFFF;

@@ -1,4 +1,4 @@
-//! Reading: everything is checked when its field is read, and borrowed from the payload.
+//! Decoding: each field is checked when it is decoded, and borrowed from the payload.
 
 use super::layout::{Element, to_usize};
 use super::{Form, RawArray, RawDialect, RawField, RawLayout, RawStructure, RawStructureType};
@@ -6,10 +6,11 @@ use super::{RawValue, SCALAR, WORD};
 use crate::reader::Reader;
 use crate::{Array, DecodeError, ExtensionBody, ExtensionObject, Matrix, Scalar, Variant};
 
-/// The fields of a RawData payload, read one by one.
+/// Iterator over the fields of a RawData payload.
 ///
-/// Ends after the first `Err`. Zero bytes behind the last field are the padding to a ConfiguredSize
-/// (OPC 10000-14, 6.3.1.3.3) and skipped; others are a last [`DecodeError::TrailingBytes`].
+/// The iterator ends after the first `Err`. Zero bytes behind the last field are the padding to a
+/// ConfiguredSize (OPC 10000-14, 6.3.1.3.3) and are skipped; other bytes cause a final
+/// [`DecodeError::TrailingBytes`].
 #[derive(Debug, Clone)]
 pub struct RawFields<'a> {
     fields: std::slice::Iter<'a, RawField<'a>>,
@@ -17,41 +18,43 @@ pub struct RawFields<'a> {
     reader: Reader<'a>,
 }
 
-/// The fields of a structure that are there, each with its position in [`RawStructure::fields`].
+/// Iterator over the present fields of a structure, each with its index in
+/// [`RawStructure::fields`].
 ///
-/// Ends after the first `Err`; bytes behind the last field are a last [`DecodeError::TrailingBytes`].
+/// The iterator ends after the first `Err`; bytes behind the last field cause a final
+/// [`DecodeError::TrailingBytes`].
 #[derive(Debug, Clone)]
 pub struct RawMembers<'a> {
     walk: Walk<'a>,
     done: bool,
 }
 
-/// A way through the fields of a structure.
+/// Iteration over the fields of a structure.
 #[derive(Debug, Clone)]
 pub(super) struct Walk<'a> {
     structure: &'a RawStructure<'a>,
     form: Form,
     next: usize,
-    /// EncodingMask, shifted to the next optional field; SwitchField.
+    /// EncodingMask, shifted to the next optional field; or SwitchField.
     head: u32,
     reader: Reader<'a>,
 }
 
-/// A field of a structure on the way.
+/// A field of a structure during the iteration.
 pub(super) struct Member<'a> {
     index: usize,
     pub(super) field: &'a RawField<'a>,
-    /// `None` for an optional field which is not there.
+    /// `None` for an absent optional field.
     pub(super) value: Option<RawValue<'a>>,
 }
 
-/// What is read next: bytes of its own which end in padding, or all that is left.
+/// Bytes to decode: a padded range, or all remaining bytes.
 struct Place<'a> {
     padded: bool,
     reader: Reader<'a>,
 }
 
-/// What stands in front of the elements of an array.
+/// Length or dimensions of an array.
 struct Extent<'a> {
     null: bool,
     count: usize,
@@ -59,12 +62,13 @@ struct Extent<'a> {
 }
 
 impl<'a> RawLayout<'a> {
-    /// The fields of a payload, which is [`DataSetMessage::payload`](crate::DataSetMessage::payload) of a key frame of
-    /// RawData. One without bytes is a heartbeat and has none.
+    /// Returns the fields of a payload, which is
+    /// [`DataSetMessage::payload`](crate::DataSetMessage::payload) of a key frame of RawData. A
+    /// payload without bytes is a heartbeat and has no fields.
     ///
-    /// A payload of another dialect, or of another version of the metadata, may well be read without an error: as
-    /// other values. What reveals it is checked: bytes of padding are zero, lengths are within their maximum, and no
-    /// bytes are left.
+    /// A payload of another dialect or metadata version may be decoded to wrong values without an
+    /// error. The following checks can reveal it: padding bytes are zero, lengths are within their
+    /// maximum, and no bytes are left.
     #[must_use]
     pub fn read<'p>(&self, payload: &'p [u8], dialect: RawDialect) -> RawFields<'p>
     where
@@ -105,10 +109,10 @@ impl<'a> Iterator for RawFields<'a> {
 impl std::iter::FusedIterator for RawFields<'_> {}
 
 impl<'a> RawStructure<'a> {
-    /// The fields of a body that was read as this structure.
+    /// Returns the fields of a body that was decoded as this structure.
     ///
     /// # Errors
-    /// Fails when the EncodingMask or SwitchField is cut off or says what the structure does not have.
+    /// Fails if the EncodingMask or SwitchField is truncated or invalid for the structure.
     pub fn members<'p>(
         &'p self,
         body: &'p [u8],
@@ -186,7 +190,7 @@ impl<'a> Walk<'a> {
         })
     }
 
-    /// EncodingMask or SwitchField, before the first step.
+    /// Returns the EncodingMask or SwitchField, before the first step.
     pub(super) const fn head(&self) -> u32 {
         self.head
     }
@@ -195,7 +199,7 @@ impl<'a> Walk<'a> {
         self.reader.remaining()
     }
 
-    /// The next field; of a Union only the chosen one.
+    /// Returns the next field; for a Union the selected field only.
     pub(super) fn step(&mut self) -> Result<Option<Member<'a>>, DecodeError> {
         let index = match self.structure.structure_type() {
             RawStructureType::Union => return self.step_union(),
@@ -246,7 +250,7 @@ impl<'a> Walk<'a> {
         Ok(member)
     }
 
-    /// The field a SwitchField names.
+    /// Returns the field that the SwitchField selects.
     fn chosen(&self) -> Option<(usize, &'a RawField<'a>)> {
         let index = to_usize(self.head).checked_sub(1)?;
         Some((index, self.structure.fields().get(index)?))
@@ -254,7 +258,7 @@ impl<'a> Walk<'a> {
 }
 
 impl<'a> Place<'a> {
-    /// The next `room` bytes, which `reader` then is behind; without that, what `reader` has.
+    /// Takes the next `room` bytes from `reader`; without `room`, copies `reader`.
     fn new(
         room: Option<usize>,
         reader: &mut Reader<'a>,
@@ -292,7 +296,7 @@ fn read_field<'a>(
     }
 }
 
-/// A single value, or one element of an array.
+/// Decodes a single value or an element of an array.
 pub(super) fn read_element<'a>(
     field: &'a RawField<'a>,
     form: Form,
@@ -302,7 +306,7 @@ pub(super) fn read_element<'a>(
         Some(Element::Fixed(_)) => Scalar::read(field.builtin, reader),
         Some(Element::Text) => read_text(field, form, reader),
         Some(Element::Structure(structure)) => read_structure(structure, form.nested(), reader),
-        // No layout holds such a field.
+        // A layout never holds such a field.
         None => Err(DecodeError::Unsupported(field.builtin.name())),
     }
 }
@@ -421,7 +425,7 @@ fn read_dimensions<'a>(
     })
 }
 
-/// True when all dimensions but the outermost are as long as they can be.
+/// Returns true if all dimensions except the outermost have their maximum size.
 fn rows_are_full(field: &RawField<'_>, dimensions: &[[u8; 4]]) -> bool {
     let mut inner = dimensions.iter().zip(field.array_dimensions).skip(1);
     inner.all(|(size, most)| u32::from_le_bytes(*size) == *most)
@@ -474,7 +478,7 @@ fn read_elements<'a>(
     })
 }
 
-/// Inside of the payload nothing but zero pads.
+/// Checks that padding within the payload is zero.
 fn check_zero(padding: &[u8]) -> Result<(), DecodeError> {
     match padding.iter().find(|byte| **byte != 0) {
         Some(byte) => Err(reserved(PADDING, (*byte).into())),

@@ -1,4 +1,4 @@
-//! What a field of RawData is read as.
+//! Decoded values of RawData fields.
 
 use super::read::read_element;
 use super::{Form, RawField};
@@ -8,20 +8,21 @@ use crate::{BuiltinType, Scalar, Variant};
 /// Value of a field.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum RawValue<'a> {
-    /// A single value, or an array or matrix whose elements stand back to back.
+    /// A single value, or an array or matrix whose elements are contiguous.
     ///
-    /// A structure is an ExtensionObject whose body are its fields as they stand on the wire, padding included:
-    /// [`RawStructure::members`](super::RawStructure::members) reads them,
-    /// [`RawStructure::to_plain`](super::RawStructure::to_plain) makes the body of OPC 10000-6 of them.
+    /// A structure is an ExtensionObject. Its body is the encoded fields, including padding.
+    /// [`RawStructure::members`](super::RawStructure::members) decodes them, and
+    /// [`RawStructure::to_plain`](super::RawStructure::to_plain) converts them to the body of OPC
+    /// 10000-6.
     Variant(Variant<'a>),
     /// An array or matrix of structures or padded texts.
     Array(RawArray<'a>),
 }
 
-/// An array or matrix of structures or padded texts, which no [`Array`](crate::Array) can borrow from the wire. Its
-/// elements were checked when it was read.
+/// An array or matrix of structures or padded texts, which an [`Array`](crate::Array) cannot
+/// borrow. The elements were checked by the decoder.
 ///
-/// Equality is that of the elements and dimensions.
+/// Equality compares the elements and dimensions.
 #[derive(Debug, Clone, Copy)]
 pub struct RawArray<'a> {
     pub(super) field: &'a RawField<'a>,
@@ -33,7 +34,7 @@ pub struct RawArray<'a> {
     pub(super) bytes: &'a [u8],
 }
 
-/// The elements of a [`RawArray`].
+/// Iterator over the elements of a [`RawArray`].
 #[derive(Debug, Clone)]
 pub struct RawElements<'a> {
     field: &'a RawField<'a>,
@@ -43,7 +44,8 @@ pub struct RawElements<'a> {
 }
 
 impl<'a> RawValue<'a> {
-    /// Type of the value or of the elements; `None` for the null Variant, which is never read.
+    /// Returns the type of the value or of the elements, or `None` for the null Variant, which is
+    /// never decoded.
     #[must_use]
     pub const fn builtin_type(&self) -> Option<BuiltinType> {
         match self {
@@ -52,7 +54,7 @@ impl<'a> RawValue<'a> {
         }
     }
 
-    /// The value as a Variant; `None` for an array of structures or padded texts.
+    /// Returns the value as a Variant, or `None` for an array of structures or padded texts.
     #[must_use]
     pub const fn variant(self) -> Option<Variant<'a>> {
         match self {
@@ -69,37 +71,38 @@ impl<'a> From<Variant<'a>> for RawValue<'a> {
 }
 
 impl<'a> RawArray<'a> {
-    /// Type of every element: String, ByteString or ExtensionObject.
+    /// Returns the type of the elements: String, ByteString or ExtensionObject.
     #[must_use]
     pub const fn element(&self) -> BuiltinType {
         self.field.builtin
     }
 
-    /// Number of elements, 0 for the null array.
+    /// Returns the number of elements, 0 for the null array.
     #[must_use]
     pub const fn len(&self) -> usize {
         self.len
     }
 
-    /// True without elements, whether null or empty.
+    /// Returns true for the null array and the empty array.
     #[must_use]
     pub const fn is_empty(&self) -> bool {
         self.len == 0
     }
 
-    /// True for the null array (length -1 on the wire).
+    /// Returns true for the null array (length -1 on the wire).
     #[must_use]
     pub const fn is_null(&self) -> bool {
         self.null
     }
 
-    /// Size of each dimension of a matrix, the outermost first; none for a one-dimensional array.
+    /// Returns the size of each dimension of a matrix, outermost first; empty for a one-dimensional
+    /// array.
     #[must_use]
     pub fn dimensions(&self) -> impl ExactSizeIterator<Item = u32> + Clone + use<'a> {
         self.dimensions.iter().map(|size| u32::from_le_bytes(*size))
     }
 
-    /// The elements one by one, of a matrix in row-major order.
+    /// Returns an iterator over the elements; row-major for a matrix.
     #[must_use]
     pub const fn iter(&self) -> RawElements<'a> {
         RawElements {
@@ -143,7 +146,7 @@ impl<'a> Iterator for RawElements<'a> {
 
     fn next(&mut self) -> Option<Scalar<'a>> {
         self.left = self.left.checked_sub(1)?;
-        // The elements were read once when the array was: this does not fail.
+        // The elements were checked when the array was decoded, so this does not fail.
         read_element(self.field, self.form, &mut self.reader).ok()
     }
 

@@ -1,4 +1,4 @@
-//! Writing: the exact types and lengths of the layout, and the padding.
+//! Encoding: checks types and lengths against the layout, and pads values.
 
 use super::layout::{Element, to_usize};
 use super::read::Walk;
@@ -9,17 +9,17 @@ use crate::{
     Array, BuiltinType, DecodeError, ExtensionBody, ExtensionObject, Scalar, Variant, writer,
 };
 
-/// Why values are not written, and at which field. The buffer then holds what it held before.
+/// Reason why values were not encoded, and the field. The buffer is unchanged.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("field {field}: {fault}")]
 pub struct RawWriteError {
-    /// Position in the layout, from 0.
+    /// Index in the layout.
     pub field: usize,
-    /// What is wrong with the value.
+    /// Fault of the value.
     pub fault: RawWriteFault,
 }
 
-/// What is wrong with a value for its field.
+/// Fault of a value for its field.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum RawWriteFault {
@@ -29,7 +29,8 @@ pub enum RawWriteFault {
     /// There are more values than fields.
     #[error("a value without a field")]
     NoField,
-    /// A value of another type than the field's, or the null Variant, which RawData cannot say.
+    /// The value has another type than the field, or is the null Variant, which RawData cannot
+    /// encode.
     #[error("{} where {expected} is expected", found.map_or("null", BuiltinType::name))]
     Type {
         /// BuiltInType of the field.
@@ -37,7 +38,7 @@ pub enum RawWriteFault {
         /// Type of the value; `None` for the null Variant.
         found: Option<BuiltinType>,
     },
-    /// A value of another number of dimensions than the field's.
+    /// The value has another number of dimensions than the field.
     #[error("ValueRank {found} where {expected} is expected")]
     ValueRank {
         /// ValueRank of the field.
@@ -45,7 +46,7 @@ pub enum RawWriteFault {
         /// ValueRank of the value.
         found: i32,
     },
-    /// A text longer than its MaxStringLength.
+    /// The text is longer than its MaxStringLength.
     #[error("{len} bytes where MaxStringLength is {most}")]
     MaxStringLength {
         /// MaxStringLength; 2^31-1 without one.
@@ -53,7 +54,7 @@ pub enum RawWriteFault {
         /// Bytes of the text.
         len: usize,
     },
-    /// A dimension longer than its ArrayDimensions, or shorter where the dialect does not pad it.
+    /// A dimension is longer than its ArrayDimensions, or shorter in a dialect without padding.
     #[error("{len} elements where ArrayDimensions says {expected}")]
     ArrayDimensions {
         /// ArrayDimensions of this dimension; 2^31-1 without it.
@@ -61,44 +62,46 @@ pub enum RawWriteFault {
         /// Elements of the dimension.
         len: usize,
     },
-    /// A null array, which the dialect cannot say.
+    /// The array is null, which the dialect cannot encode.
     #[error("a null array")]
     NullArray,
-    /// Another structure than the field's.
+    /// The structure has another type than the field.
     #[error("a structure of another type")]
     StructureType,
-    /// A structure whose body is missing or XML.
+    /// The body of the structure is missing or XML.
     #[error("a structure without a binary body")]
     NoBody,
-    /// A structure whose body is not what its type says.
+    /// The body is not a valid body of the structure.
     #[error("a structure that is none: {0}")]
     Body(DecodeError),
 }
 
-/// The forms bodies of structures are in, and shall be written in.
+/// Source and target form of structure bodies.
 #[derive(Clone, Copy)]
 struct Forms {
     from: Form,
     to: Form,
 }
 
-/// The elements of an array to write.
+/// Elements of an array to encode.
 enum Items<'a> {
-    /// Bodies of structures in the form the caller says.
+    /// Structure bodies are in the form that the caller specifies.
     Array(Array<'a>),
-    /// Bodies of structures in the form they were read in.
+    /// Structure bodies are in the form that they were decoded from.
     Read(RawArray<'a>),
 }
 
 impl RawLayout<'_> {
-    /// Appends the payload of a key frame: one value per field, [`Variant`]s or what [`read`](Self::read) gives.
+    /// Appends the payload of a key frame with a value per field: [`Variant`]s or the values of
+    /// [`read`](Self::read).
     ///
-    /// The body of a structure is expected as the dialect has it, which is what [`read`](Self::read) in the same
-    /// dialect gives; [`RawStructure::from_plain`] makes it of the body of an ExtensionObject read elsewhere.
+    /// The body of a structure has to be in the form of the dialect, as [`read`](Self::read) in the
+    /// same dialect returns it. [`RawStructure::from_plain`] converts the body of other
+    /// ExtensionObjects.
     ///
     /// # Errors
-    /// Names the first field whose value does not fit. Nothing is cut to fit: a text or array longer than its field is
-    /// refused.
+    /// The first field whose value does not fit. Values are not truncated: a text or array longer
+    /// than its field is an error.
     pub fn write<'v, V: Into<RawValue<'v>>>(
         &self,
         buf: &mut Vec<u8>,
@@ -142,10 +145,12 @@ impl RawLayout<'_> {
 }
 
 impl RawStructure<'_> {
-    /// Appends the body of an ExtensionObject (OPC 10000-6, 5.2.6 to 5.2.8), made of a body read from RawData.
+    /// Appends the body of an ExtensionObject (OPC 10000-6, 5.2.6 to 5.2.8), converted from a
+    /// RawData body.
     ///
     /// # Errors
-    /// [`RawWriteFault::Body`] when it is no body of this structure. The buffer then holds what it held before.
+    /// [`RawWriteFault::Body`] if `body` is not a body of this structure. The buffer is then
+    /// unchanged.
     pub fn to_plain(
         &self,
         body: &[u8],
@@ -157,11 +162,12 @@ impl RawStructure<'_> {
         self.rewrite(body, Forms { from, to }, buf)
     }
 
-    /// Appends the body for RawData, made of the body of an ExtensionObject (OPC 10000-6, 5.2.6 to 5.2.8).
+    /// Appends the RawData body, converted from the body of an ExtensionObject (OPC 10000-6, 5.2.6
+    /// to 5.2.8).
     ///
     /// # Errors
-    /// [`RawWriteFault::Body`] when it is no body of this structure; fails too when a text or array in it is longer
-    /// than its field. The buffer then holds what it held before.
+    /// [`RawWriteFault::Body`] if `body` is not a body of this structure. Also fails if a text or
+    /// array exceeds its field. The buffer is then unchanged.
     pub fn from_plain(
         &self,
         body: &[u8],
@@ -204,7 +210,7 @@ fn write_field(
         });
     }
     match value {
-        // Was refused above for its type.
+        // The null Variant is rejected above by its type.
         RawValue::Variant(Variant::Null) => Ok(()),
         RawValue::Variant(Variant::Scalar(value)) => write_element(field, forms, value, buf),
         RawValue::Variant(Variant::Array(array)) => {
@@ -248,7 +254,7 @@ fn write_element(
     if let (Scalar::ExtensionObject(object), Some(structure)) = (value, field.structure) {
         return write_object(structure, forms, object, buf);
     }
-    // What is left has a fixed size and is always written.
+    // The remaining types have a fixed size, and their encoding does not fail.
     value.write::<false>(buf).map_err(|_| RawWriteFault::Type {
         expected: field.builtin,
         found: Some(value.builtin_type()),
@@ -292,7 +298,7 @@ fn write_object(
     write_structure(structure, Forms { to, ..forms }, body, buf)
 }
 
-/// The body in another form, or in the same when it was checked.
+/// Checks the body and writes it in the target form.
 fn write_structure(
     structure: &RawStructure<'_>,
     forms: Forms,
@@ -383,7 +389,7 @@ fn write_dimensions(
     if form != Form::Open62541 {
         buf.extend_from_slice(&field.value_rank.to_le_bytes());
     }
-    // Rows shorter than their place could stand one behind the other or each in its place.
+    // Short rows have no defined position, so all inner dimensions must have their maximum size.
     let full_rows = items.len() != 0 && field.array_room(form).is_some();
     for (index, size) in dimensions.enumerate() {
         let form = match full_rows && index != 0 {
@@ -396,7 +402,8 @@ fn write_dimensions(
     Ok(())
 }
 
-/// Size of a dimension when it fits: exactly for open62541, else at most what the metadata says.
+/// Returns the size of a dimension if it fits: equal to the metadata for open62541, otherwise at
+/// most the metadata.
 fn dimension(
     field: &RawField<'_>,
     form: Form,
@@ -432,11 +439,11 @@ fn pad(buf: &mut Vec<u8>, bytes: usize) {
     buf.resize(buf.len().saturating_add(bytes), 0);
 }
 
-/// Fills up a place of `room` bytes from `start` on.
+/// Pads the buffer to `room` bytes from `start` on.
 fn pad_from(buf: &mut Vec<u8>, start: usize, room: usize) {
     let end = start.saturating_add(room);
     buf.resize(buf.len().max(end), 0);
 }
 
-/// Longest text and array.
+/// Maximum length of texts and arrays.
 const INT32_MAX: u32 = 0x7FFF_FFFF;

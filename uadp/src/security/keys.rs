@@ -1,4 +1,4 @@
-//! The keys behind one SecurityTokenId, and the algorithms made ready with them.
+//! Keys of a SecurityTokenId, and the algorithms initialized with them.
 
 use std::fmt;
 
@@ -15,9 +15,10 @@ use zeroize::Zeroizing;
 
 use super::{KEY_NONCE, KeyError, MESSAGE_NONCE, Nonce, SIGNATURE, SIGNING_KEY, SecurityPolicy};
 
-/// The key data of one SecurityTokenId, ready for use (OPC 10000-14, 7.2.4.4.3.1).
+/// Key data of a SecurityTokenId, ready for use (OPC 10000-14, 7.2.4.4.3.1).
 ///
-/// Comparing takes the same time whatever differs. Dropped, it leaves zeros; `Debug` shows the policy alone.
+/// Comparison takes constant time. The key data is overwritten with zeros on drop; `Debug` shows
+/// the policy only.
 #[derive(Clone)]
 pub struct Keys(Box<Prepared>);
 
@@ -37,8 +38,8 @@ enum Cipher {
 }
 
 impl Keys {
-    /// Reads SigningKey (32 bytes), EncryptingKey (16 or 32) and KeyNonce (4), as one ByteString of GetSecurityKeys
-    /// holds them.
+    /// Reads SigningKey (32 bytes), EncryptingKey (16 or 32) and KeyNonce (4) from a ByteString of
+    /// GetSecurityKeys.
     ///
     /// # Errors
     /// [`KeyError::Length`].
@@ -52,7 +53,7 @@ impl Keys {
             })
     }
 
-    /// What the keys are for.
+    /// Returns the policy of the keys.
     #[must_use]
     pub const fn policy(&self) -> SecurityPolicy {
         self.0.policy
@@ -64,14 +65,15 @@ impl Keys {
         mac.finalize().into_bytes().into()
     }
 
-    /// Compares in constant time.
+    /// Verifies a signature in constant time.
     pub(super) fn verify(&self, signed: &[u8], signature: &[u8]) -> bool {
         let mut mac = self.0.mac.clone();
         mac.update(signed);
         mac.verify_slice(signature).is_ok()
     }
 
-    /// Encrypts or decrypts, which is the same. Fails only beyond 64 GiB, the end of the block counter.
+    /// Encrypts or decrypts; both are the same operation. Fails only beyond 64 GiB, at the end of
+    /// the block counter.
     pub(super) fn apply_keystream(
         &self,
         nonce: Nonce,
@@ -105,7 +107,8 @@ impl Prepared {
         })
     }
 
-    /// The first counter block: KeyNonce, MessageNonce, and 1 as big-endian UInt32 (OPC 10000-14, 7.2.4.4.3.2).
+    /// Returns the first counter block: KeyNonce, MessageNonce, and 1 as big-endian UInt32 (OPC
+    /// 10000-14, 7.2.4.4.3.2).
     fn counter_block(&self, nonce: Nonce) -> [u8; 16] {
         let mut block = [0; 16];
         let parts = self.key_nonce.iter().copied().chain(nonce.to_bytes());
@@ -127,7 +130,7 @@ fn apply<C: BlockCipherEncrypt + BlockSizeUser<BlockSize = U16>>(
 
 impl PartialEq for Keys {
     fn eq(&self, other: &Self) -> bool {
-        // The length of the key data is that of one policy only.
+        // Each policy has a different length of key data, so the policies need no comparison.
         self.0.key_data.ct_eq(&other.0.key_data).into()
     }
 }
@@ -156,7 +159,7 @@ mod tests {
             .collect()
     }
 
-    /// Test vectors 1 to 3 and 7 to 9 of RFC 3686; those between are of AES with 192 bits.
+    /// Test vectors 1 to 3 and 7 to 9 of RFC 3686; vectors 4 to 6 are for AES with 192 bits.
     #[test]
     fn the_counter_block_is_that_of_rfc_3686() {
         let counting: Vec<u8> = (0..36).collect();

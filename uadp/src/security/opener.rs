@@ -1,4 +1,4 @@
-//! The receiving side: verifying, refusing what was there before, decrypting.
+//! The receiving side: verifies messages, rejects replayed messages, decrypts payloads.
 
 use std::time::Duration;
 
@@ -7,17 +7,19 @@ use super::ring::KeyRing;
 use super::{KeyError, Keys, Nonce, SIGNATURE, SecurityError, SecurityMode};
 use crate::{NetworkMessage, NetworkMessageType, SecurityHeader};
 
-/// Opens the secured messages of one SecurityGroup (OPC 10000-14, 7.2.4.4.3).
+/// Opens the secured messages of a SecurityGroup (OPC 10000-14, 7.2.4.4.3).
 ///
-/// A message is accepted once, if it is at least as secure as the [`SecurityMode`], its signature is right and its
-/// sequence number new: of each PublisherId, WriterGroupId and SecurityTokenId a window of the newest 128 sequence
-/// numbers is kept, so those may come in any order. Publishers without a PublisherId count as one. Nothing changes
-/// here before the signature was verified, and nothing at all by a message that is refused.
+/// A message is accepted once, if it is at least as secure as the [`SecurityMode`], its signature
+/// is valid and its sequence number is new. For each PublisherId, WriterGroupId and SecurityTokenId
+/// the opener keeps a window of the newest 128 sequence numbers, so that messages may arrive in any
+/// order. Publishers without PublisherId share a window. The state changes only after the signature
+/// is verified, and never for a rejected message.
 ///
-/// The first message with a future key makes that the current one; a number of past keys stay valid
+/// The first message with a future key makes this key current. A number of past keys stay valid
 /// ([`OpenerOptions::past_keys`]).
 ///
-/// What no receiver can tell is whether a message recorded before it had its keys is new.
+/// A receiver cannot detect the replay of a message that was recorded before the receiver had its
+/// keys.
 ///
 /// # Examples
 /// ```
@@ -54,56 +56,63 @@ pub struct Opener {
     ring: KeyRing<Streams>,
 }
 
-/// What an [`Opener`] keeps, and what it lets pass.
+/// Limits and options of an [`Opener`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct OpenerOptions {
-    /// Keys older than the current one that stay valid, for publishers which change later and messages under way.
-    /// 2 by default.
+    /// Number of past keys that stay valid, for publishers that change their key later and for
+    /// delayed messages. Default 2.
     pub past_keys: usize,
-    /// Pairs of PublisherId and WriterGroupId followed for each key. While there are as many,
-    /// [`SecurityError::TooManyPublishers`] refuses others: to forget one instead would let its messages be replayed.
-    /// 1024 by default. Only members of the group take up places.
+    /// Maximum number of pairs of PublisherId and WriterGroupId for each key. At the limit, other
+    /// publishers are rejected with [`SecurityError::TooManyPublishers`]: if a publisher were
+    /// removed instead, its messages could be replayed. Only members of the group count. Default
+    /// 1024.
     pub max_streams: usize,
-    /// When nothing of a publisher was accepted for so long it may count anew. The standard wants twice the
-    /// KeepAliveTime, for publishers that do not go on from the last sequence number after a restart
-    /// (OPC 10000-14, 7.2.3). What was recorded of a publisher can be replayed when it was silent for as long; so by
-    /// default this is `None`, and such a publisher is refused until there are new keys.
+    /// Time without an accepted message after which a publisher may restart its sequence numbers.
+    /// The standard requires twice the KeepAliveTime, for publishers that do not continue from the
+    /// last sequence number after a restart (OPC 10000-14, 7.2.3). After such a pause, recorded
+    /// messages of the publisher can be replayed. With the default `None`, a restarted publisher is
+    /// rejected until there are new keys.
     pub forget_after: Option<Duration>,
-    /// Whose messages share a sequence; [`CountedBy::Publisher`] by default.
+    /// Messages that share a sequence. Default [`CountedBy::Publisher`].
     pub counted_by: CountedBy,
-    /// Accept publishers that leave the sequence number at 1, as open62541 does up to version 1.5.7; `false` by
-    /// default. Their messages are marked [`Opened::constant_sequence`] and can be replayed, bar the last one.
+    /// Accepts publishers whose sequence number stays 1, as in open62541 up to version 1.5.7. Their
+    /// messages are marked [`Opened::constant_sequence`] and can be replayed, except the last
+    /// message. Default `false`.
     pub accept_constant_sequence: bool,
 }
 
-/// Whose messages share a sequence.
+/// Messages that share a sequence of sequence numbers.
 ///
-/// Several programs may send with one PublisherId and WriterGroupId, each with sequence numbers of its own: those that
-/// ask for Actions do, with those of the responder, and those that probe. A sender that keeps the random half of its nonces
-/// for as long as it runs can be told from the others by it, since the signature covers the nonce. Nothing of it can be
-/// replayed either, as long as it is followed; and it may count anew when it restarts, with another random half.
+/// Several programs may send with the same PublisherId and WriterGroupId and separate sequence
+/// numbers: Requestors of Actions send with the ids of the Responder, and programs that probe send
+/// with the ids of the Publisher. If a sender keeps the random half of its nonces until it
+/// restarts, that half identifies the sender, because the signature covers the nonce. Its messages
+/// cannot be replayed while it is tracked, and it may restart its sequence numbers with a new
+/// random half.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum CountedBy {
-    /// Those of a PublisherId and WriterGroupId, as the standard has it (OPC 10000-14, 7.2.3).
+    /// Messages of a PublisherId and WriterGroupId, as in the standard (OPC 10000-14, 7.2.3).
     Publisher,
-    /// As `Publisher`; of Actions, probes and announcements those of a sender.
+    /// As `Publisher`, but for Actions, probes and announcements the messages of a sender.
     PublisherOrSender,
-    /// Those of a sender. One that takes other random bytes for each message takes up a place with each.
+    /// Messages of a sender. A sender with new random bytes for each message uses an entry for each
+    /// message.
     Sender,
 }
 
-/// A message that was opened, and what to note about it.
+/// An opened message, and events that it causes.
 #[derive(Debug, Clone)]
 #[non_exhaustive]
 pub struct Opened<'a> {
-    /// The message, its payload and footer readable.
+    /// The message with readable payload and footer.
     pub message: NetworkMessage<'a>,
-    /// It is the first with a future key, which is the current one from now on.
+    /// The message is the first with a future key, which is the current key from then on.
     pub key_changed: bool,
-    /// The publisher is about to leave all present keys: get new ones (OPC 10000-14, 7.2.4.4.2).
+    /// The publisher is about to replace all present keys: get new keys (OPC 10000-14, 7.2.4.4.2).
     pub force_key_reset: bool,
-    /// The publisher does not count its messages, see [`OpenerOptions::accept_constant_sequence`]. That is worth
-    /// a warning: when its random bytes come twice, so does the key stream.
+    /// The publisher does not increment the sequence number, see
+    /// [`OpenerOptions::accept_constant_sequence`]. Log a warning: if its random bytes repeat, its
+    /// key stream repeats.
     pub constant_sequence: bool,
 }
 
@@ -120,13 +129,14 @@ impl Default for OpenerOptions {
 }
 
 impl Opener {
-    /// An opener without keys. It refuses what is less secure than `mode`, and opens what is more secure too.
+    /// Creates an opener without keys. It rejects messages that are less secure than `mode`, and
+    /// accepts messages that are more secure.
     #[must_use]
     pub fn new(mode: SecurityMode) -> Self {
         Self::with(mode, OpenerOptions::default())
     }
 
-    /// As [`new`](Self::new), with other limits.
+    /// Creates an opener with options, as [`new`](Self::new).
     #[must_use]
     pub const fn with(mode: SecurityMode, options: OpenerOptions) -> Self {
         Self {
@@ -136,14 +146,17 @@ impl Opener {
         }
     }
 
-    /// Takes what GetSecurityKeys or SetSecurityKeys delivers: keys with consecutive SecurityTokenIds, the first of
-    /// which is `first_token_id`. Behind the highest one comes 1 (OPC 10000-14, 8.3.2 and 9.1.3.3).
+    /// Adds the keys of GetSecurityKeys or SetSecurityKeys: keys with consecutive SecurityTokenIds
+    /// from `first_token_id` on. The highest SecurityTokenId is followed by 1 (OPC 10000-14, 8.3.2
+    /// and 9.1.3.3).
     ///
-    /// If one of them is known they are added to those known, and the first becomes current unless a newer one is;
-    /// past keys that were let go do not come back. If none is known they replace all others.
+    /// If any of the keys is known, the new keys are added, and the first key becomes current
+    /// unless a newer key is current. Removed past keys are not added again. If all keys are new,
+    /// they replace all present keys.
     ///
     /// # Errors
-    /// [`KeyError::TokenId`] when `first_token_id` is 0, [`KeyError::Count`] without keys and with more than 64.
+    /// [`KeyError::TokenId`] if `first_token_id` is 0; [`KeyError::Count`] for no keys and for more
+    /// than 64.
     pub fn update_keys(
         &mut self,
         first_token_id: u32,
@@ -152,23 +165,23 @@ impl Opener {
         self.ring.update(first_token_id, keys)
     }
 
-    /// SecurityTokenId of the current key, `None` without keys.
+    /// Returns the SecurityTokenId of the current key, or `None` without keys.
     #[must_use]
     pub fn current_token_id(&self) -> Option<u32> {
         self.ring.current_token_id()
     }
 
-    /// SecurityTokenId of the key that comes next, `None` when there is none: time to get more.
+    /// Returns the SecurityTokenId of the next key. `None` means that it is time to get more keys.
     #[must_use]
     pub fn next_token_id(&self) -> Option<u32> {
         self.ring.next_token_id()
     }
 
-    /// Verifies a message, and decrypts it into `scratch` if it is encrypted; one that is only signed is read where
-    /// it is. `now` counts from any fixed time.
+    /// Verifies a message, and decrypts an encrypted message into `scratch`. A message that is only
+    /// signed is read in place. `now` counts from any fixed time.
     ///
     /// # Errors
-    /// The reason why it is refused.
+    /// The reason why the message is rejected.
     pub fn open<'a>(
         &mut self,
         message: &NetworkMessage<'a>,
@@ -209,7 +222,7 @@ impl Opener {
         })
     }
 
-    /// The header of a message that is secured as the group wants it.
+    /// Returns the SecurityHeader if it satisfies the security mode.
     fn checked_header<'a>(
         &self,
         message: &NetworkMessage<'a>,
@@ -226,14 +239,14 @@ impl Opener {
     }
 }
 
-/// What a sealed message is made of.
+/// Parts of a sealed message.
 struct Parts<'a> {
-    /// All but the signature.
+    /// All bytes except the signature.
     signed: &'a [u8],
     signature: &'a [u8],
-    /// Payload and footer, encrypted or not.
+    /// Payload and footer, possibly encrypted.
     body: &'a [u8],
-    /// Where in the body the footer starts.
+    /// Offset of the footer in the body.
     footer_at: usize,
 }
 

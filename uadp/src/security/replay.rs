@@ -1,19 +1,19 @@
-//! Which messages were there before.
+//! Detection of replayed messages.
 
 use std::time::Duration;
 
 use super::{Nonce, OpenerOptions, SecurityError};
 use crate::PublisherId;
 
-/// The publishers heard with one key, each WriterGroup by itself.
+/// Publishers of the messages with a key, separately for each WriterGroup.
 #[derive(Debug, Default)]
 pub(super) struct Streams {
-    /// In the order of their [`StreamId`].
+    /// Sorted by [`StreamId`].
     streams: Vec<Stream>,
 }
 
-/// Who counts: the sequence numbers of two of these have nothing to do with each other. The last part is the random half of
-/// the nonce, where that tells the senders apart.
+/// Identity of a sequence of sequence numbers. The last part is the random half of the nonce, if it
+/// distinguishes the senders.
 pub(super) type StreamId<'a> = (Option<PublisherId<'a>>, Option<u16>, Option<[u8; 4]>);
 
 #[derive(Debug)]
@@ -32,26 +32,27 @@ enum Publisher {
     Named(Box<str>),
 }
 
-/// Sequence numbers accepted. They never start over under one key, since the nonces would.
+/// Accepted sequence numbers. They never restart with the same key, because nonces would repeat.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Window {
     newest: u32,
     /// Bit n is set when `newest - n` was accepted.
     accepted: u128,
-    /// Random half of the nonce that was accepted last.
+    /// Random half of the last accepted nonce.
     random: [u8; 4],
 }
 
-/// What is accepted.
+/// Result for an accepted message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Accepted {
     New,
-    /// Nothing tells whether it was there before: the publisher does not count.
+    /// A replay cannot be detected, because the publisher does not increment the sequence number.
     Uncounted,
 }
 
 impl Streams {
-    /// Accepts a message whose signature is right, or refuses it and stays as it was but for streams out of date.
+    /// Accepts a message with valid signature, or rejects it. A rejection changes nothing except
+    /// that expired streams are removed.
     pub(super) fn accept(
         &mut self,
         id: StreamId<'_>,
@@ -121,7 +122,7 @@ impl Stream {
         (publisher_id, self.writer_group_id, self.sender)
     }
 
-    /// Silent for so long that the publisher may count anew.
+    /// Returns true if the pause is long enough for the publisher to restart its sequence numbers.
     fn is_over(&self, now: Duration, options: &OpenerOptions) -> bool {
         options
             .forget_after
@@ -158,7 +159,8 @@ impl Window {
         }
     }
 
-    /// Nothing but the first sequence number was ever there, and here it is with another nonce than last.
+    /// Returns true if only the first sequence number was ever received, and the nonce differs from
+    /// the last nonce.
     fn is_uncounted(&self, nonce: Nonce) -> bool {
         self.newest == UNCOUNTED && nonce.sequence == UNCOUNTED && nonce.random != self.random
     }
@@ -190,7 +192,7 @@ impl Window {
     }
 }
 
-/// The sequence number publishers start with, and stay with if they do not count.
+/// First sequence number of publishers, and the only number of publishers that do not increment it.
 const UNCOUNTED: u32 = 1;
-/// Steps forward beyond this are invalid (OPC 10000-14, 7.2.3).
+/// Maximum valid step forward (OPC 10000-14, 7.2.3).
 const FARTHEST: u32 = 1 << 30;

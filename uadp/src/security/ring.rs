@@ -1,17 +1,18 @@
-//! The keys of a SecurityGroup in the order of their SecurityTokenIds: past ones, the current one, future ones.
+//! The keys of a SecurityGroup in the order of their SecurityTokenIds: past, current and future
+//! keys.
 
 use super::{KeyError, Keys};
 
-/// Keys, each with a state of the owner's which starts as its default and ends with the key.
+/// Keys, each with a state that starts as its default and is removed with the key.
 #[derive(Debug)]
 pub(super) struct KeyRing<S> {
     /// Oldest first.
     entries: Vec<Entry<S>>,
-    /// SecurityTokenId of the current key, 0 without any keys.
+    /// SecurityTokenId of the current key, 0 without keys.
     current: u32,
-    /// Keys kept that are older than the current one.
+    /// Maximum number of past keys.
     max_past: usize,
-    /// The newest key that was let go as too old.
+    /// Newest key that was removed as too old.
     retired: Option<u32>,
 }
 
@@ -22,7 +23,7 @@ pub(super) struct Entry<S> {
     pub(super) state: S,
 }
 
-/// Keys taken at once, at most.
+/// Maximum number of keys in an update.
 const MAX_KEYS: usize = 64;
 
 impl<S: Default> KeyRing<S> {
@@ -35,12 +36,12 @@ impl<S: Default> KeyRing<S> {
         }
     }
 
-    /// Takes keys with consecutive SecurityTokenIds from `first` on.
+    /// Adds keys with consecutive SecurityTokenIds from `first` on.
     ///
-    /// If one of them is here already they are merged, and the newer of `first` and the current one is current;
-    /// else they replace all there are (OPC 10000-14, 9.1.3.3). A key that was here keeps its state, since with
-    /// a new one its messages could be replayed or its nonces used twice; for the same reason a merge does not
-    /// bring back what was let go.
+    /// If any of the keys is known, the keys are merged, and the newer of `first` and the current
+    /// key becomes current. Otherwise the new keys replace all present keys (OPC 10000-14,
+    /// 9.1.3.3). A known key keeps its state, because a new state would permit replayed messages or
+    /// repeated nonces. For the same reason a merge does not add removed keys again.
     pub(super) fn update(
         &mut self,
         first: u32,
@@ -86,13 +87,13 @@ impl<S: Default> KeyRing<S> {
 
     fn replace(&mut self, first: u32, given: Vec<Entry<S>>) {
         let newest = self.entries.last().map(|entry| entry.token_id);
-        // Lower numbers than before are those of a service that started anew, and may well come again.
+        // Lower ids come from a restarted service, and may occur again.
         self.retired = newest.filter(|newest| is_newer(first, *newest));
         self.entries = given;
         self.current = first;
     }
 
-    /// Makes a key current that is newer than the current one; true if it was.
+    /// Makes a newer key current. Returns true if the current key changed.
     pub(super) fn advance(&mut self, token_id: u32) -> bool {
         if token_id == self.current || !is_newer(token_id, self.current) {
             return false;
@@ -132,12 +133,12 @@ impl<S> KeyRing<S> {
         self.get_mut(self.current)
     }
 
-    /// SecurityTokenId of the current key.
+    /// Returns the SecurityTokenId of the current key.
     pub(super) fn current_token_id(&self) -> Option<u32> {
         (self.current != 0).then_some(self.current)
     }
 
-    /// SecurityTokenId of the key behind the current one, if there is one.
+    /// Returns the SecurityTokenId of the key after the current key, if there is one.
     pub(super) fn next_token_id(&self) -> Option<u32> {
         self.entries
             .iter()
@@ -146,7 +147,7 @@ impl<S> KeyRing<S> {
             .nth(1)
     }
 
-    /// True for a key that was let go as too old, and all before it.
+    /// Returns true for the newest removed key and all older keys.
     pub(super) fn is_retired(&self, token_id: u32) -> bool {
         self.retired.is_some_and(|retired| {
             token_id != 0 && (token_id == retired || is_newer(retired, token_id))
@@ -160,7 +161,7 @@ impl<S> KeyRing<S> {
     }
 }
 
-/// The SecurityTokenId of the next key: behind the highest comes 1 (OPC 10000-14, 9.1.3.3).
+/// Returns the next SecurityTokenId. The highest id is followed by 1 (OPC 10000-14, 9.1.3.3).
 const fn next(token_id: u32) -> u32 {
     match token_id.checked_add(1) {
         Some(next) => next,
@@ -168,21 +169,21 @@ const fn next(token_id: u32) -> u32 {
     }
 }
 
-/// How many SecurityTokenIds after `base` this one is, going round.
+/// Returns the number of steps from `base` to `token_id`, with wrap-around.
 fn ahead(token_id: u32, base: u32) -> u32 {
     match token_id.checked_sub(base) {
         Some(ahead) => ahead,
-        // 0 is left out of the round.
+        // The id 0 is skipped.
         None => u32::MAX - (base - token_id),
     }
 }
 
-/// The nearer way round from `base` leads forward.
+/// Returns true if the shorter way from `base` to `token_id` leads forward.
 fn is_newer(token_id: u32, base: u32) -> bool {
     (1..=HALF).contains(&ahead(token_id, base))
 }
 
-/// Orders the SecurityTokenIds around `middle` by age.
+/// Returns the position of a SecurityTokenId in the order of age around `middle`.
 fn place(token_id: u32, middle: u32) -> u64 {
     let ahead = u64::from(ahead(token_id, middle));
     (ahead + u64::from(HALF)) % u64::from(u32::MAX)

@@ -1,15 +1,16 @@
-//! The sending side: a nonce for each message, encrypting it, signing it.
+//! The sending side: assigns a nonce to each message, encrypts and signs it.
 
 use super::ring::KeyRing;
 use super::{KeyError, Keys, MESSAGE_NONCE, Nonce, SealError, SecurityMode};
 use crate::reader::Reader;
 use crate::{EncodeError, NetworkMessage, SecurityHeader};
 
-/// Secures the messages one Publisher sends to a SecurityGroup (OPC 10000-14, 7.2.4.4.3).
+/// Secures the messages that a Publisher sends to a SecurityGroup (OPC 10000-14, 7.2.4.4.3).
 ///
-/// Every message takes a [`Seal`] of its own. Its sequence numbers go up by one from 1 with every key, and end before
-/// they would start over: a nonce that comes twice with one key gives the payloads of both messages away.
-/// A publisher that restarts while the same key is in use goes on with [`continue_after`](Self::continue_after).
+/// Every message takes a separate [`Seal`]. The sequence numbers of each key start at 1 and
+/// increase by 1. They end instead of wrapping around, because two messages with the same nonce and
+/// key reveal both payloads. A publisher that restarts with the same key in use continues with
+/// [`continue_after`](Self::continue_after).
 ///
 /// # Examples
 /// ```
@@ -39,15 +40,15 @@ use crate::{EncodeError, NetworkMessage, SecurityHeader};
 pub struct Sealer {
     mode: SecurityMode,
     ring: KeyRing<LastSequenceNumber>,
-    /// The SecurityTokenId until which new keys are asked for.
+    /// SecurityTokenId until which messages request new keys.
     resets: Option<u32>,
 }
 
-/// The sequence number the last message of a key had.
+/// Sequence number of the last message with a key.
 #[derive(Debug, Clone, Copy, Default)]
 struct LastSequenceNumber(u32);
 
-/// What one message is secured with. Not to be copied, so that no nonce is used twice.
+/// Keys and nonce for a message. The type is not `Clone`, so that no nonce is used twice.
 #[derive(Debug)]
 #[must_use = "a seal not used leaves a gap in the sequence numbers"]
 pub struct Seal<'a> {
@@ -66,7 +67,7 @@ struct Footer<'a> {
 }
 
 impl Sealer {
-    /// A sealer without keys.
+    /// Creates a sealer without keys.
     #[must_use]
     pub const fn new(mode: SecurityMode) -> Self {
         Self {
@@ -76,15 +77,16 @@ impl Sealer {
         }
     }
 
-    /// Takes what GetSecurityKeys with StartingTokenId 0 or SetSecurityKeys delivers: the current key, whose
-    /// SecurityTokenId is `current_token_id`, and future ones. Behind the highest SecurityTokenId comes 1
-    /// (OPC 10000-14, 8.3.2 and 9.1.3.3).
+    /// Adds the keys of GetSecurityKeys with StartingTokenId 0, or of SetSecurityKeys: the current
+    /// key with the SecurityTokenId `current_token_id`, and future keys. The highest
+    /// SecurityTokenId is followed by 1 (OPC 10000-14, 8.3.2 and 9.1.3.3).
     ///
-    /// If one of them is known they are added to those known, and the first becomes current unless a newer one is.
-    /// If none is known they replace all others.
+    /// If any of the keys is known, the new keys are added, and the first key becomes current
+    /// unless a newer key is current. If all keys are new, they replace all present keys.
     ///
     /// # Errors
-    /// [`KeyError::TokenId`] when `current_token_id` is 0, [`KeyError::Count`] without keys and with more than 64.
+    /// [`KeyError::TokenId`] if `current_token_id` is 0; [`KeyError::Count`] for no keys and for
+    /// more than 64.
     pub fn update_keys(
         &mut self,
         current_token_id: u32,
@@ -93,8 +95,8 @@ impl Sealer {
         self.ring.update(current_token_id, keys)
     }
 
-    /// Moves on to the key behind the current one, as when the KeyLifetime is over. False when there is none:
-    /// then the present key goes on.
+    /// Makes the next key current, for example at the end of the KeyLifetime. Returns false without
+    /// a next key; the present key then stays in use.
     pub fn next_key(&mut self) -> bool {
         match self.ring.next_token_id() {
             Some(next) => self.ring.advance(next),
@@ -102,50 +104,52 @@ impl Sealer {
         }
     }
 
-    /// Moves on to the key with that SecurityTokenId, as when others use it already. False when it is not there, or no newer
-    /// one than the current.
+    /// Makes the key with this SecurityTokenId current, for example because other members use it
+    /// already. Returns false if the key is unknown or is not newer than the current key.
     pub fn move_to(&mut self, token_id: u32) -> bool {
         self.ring.get_mut(token_id).is_some() && self.ring.advance(token_id)
     }
 
-    /// SecurityTokenId of the current key, `None` without keys.
+    /// Returns the SecurityTokenId of the current key, or `None` without keys.
     #[must_use]
     pub fn current_token_id(&self) -> Option<u32> {
         self.ring.current_token_id()
     }
 
-    /// SecurityTokenId of the key that comes next, `None` when there is none: time to get more.
+    /// Returns the SecurityTokenId of the next key. `None` means that it is time to get more keys.
     #[must_use]
     pub fn next_token_id(&self) -> Option<u32> {
         self.ring.next_token_id()
     }
 
-    /// Sequence number of the last seal with the current key, 0 before the first: what to note down for
-    /// [`continue_after`](Self::continue_after).
+    /// Returns the sequence number of the last seal with the current key, 0 before the first seal.
+    /// Store it for [`continue_after`](Self::continue_after).
     #[must_use]
     pub fn sequence_number(&self) -> u32 {
         self.ring.current().map_or(0, |entry| entry.state.0)
     }
 
-    /// Goes on behind a sequence number used before with the current key; never back.
+    /// Continues after a sequence number that was used with the current key. The sequence number
+    /// never decreases.
     pub fn continue_after(&mut self, sequence_number: u32) {
         if let Some(entry) = self.ring.current_mut() {
             entry.state.0 = entry.state.0.max(sequence_number);
         }
     }
 
-    /// Asks the subscribers for new keys until the key changes. They need five times the KeepAliveTime for that
-    /// (OPC 10000-14, 7.2.4.4.2).
+    /// Requests subscribers to get new keys, until the key changes. They need five times the
+    /// KeepAliveTime for it (OPC 10000-14, 7.2.4.4.2).
     pub fn force_key_reset(&mut self) {
         self.resets = self.ring.current_token_id();
     }
 
-    /// Secures one message with the next sequence number. `random` may be pseudo-random
-    /// (OPC 10000-14, 7.2.4.4.3.2), but has to differ from what other publishers with the same keys take: they use
-    /// the same sequence numbers.
+    /// Returns a seal for a message, with the next sequence number. `random` may be pseudo-random
+    /// (OPC 10000-14, 7.2.4.4.3.2), but has to differ from the bytes of other publishers with the
+    /// same keys, because they use the same sequence numbers.
     ///
     /// # Errors
-    /// [`SealError::NoKeys`] before there are any, [`SealError::Exhausted`] after 4294967295 messages with one key.
+    /// [`SealError::NoKeys`] without keys; [`SealError::Exhausted`] after 4294967295 messages with
+    /// a key.
     pub fn seal(&mut self, random: [u8; 4]) -> Result<Seal<'_>, SealError> {
         let (mode, resets) = (self.mode, self.resets);
         let entry = self.ring.current_mut().ok_or(SealError::NoKeys)?;
@@ -163,8 +167,9 @@ impl Sealer {
 }
 
 impl<'a> Seal<'a> {
-    /// A seal with a nonce of the caller's, to write a known message once more. Two different messages with one
-    /// nonce and one key give each other's payload away: what is sent takes [`Sealer::seal`].
+    /// Creates a seal with a given nonce, to reproduce a known message. Two different messages with
+    /// the same nonce and key reveal each other's payload, so use [`Sealer::seal`] for messages to
+    /// send.
     pub const fn with_nonce(
         keys: &'a Keys,
         token_id: u32,
@@ -181,10 +186,11 @@ impl<'a> Seal<'a> {
         }
     }
 
-    /// Adds a SecurityFooter, which is encrypted with the payload. The policies there are have none.
+    /// Adds a SecurityFooter, which is encrypted with the payload. The defined policies have no
+    /// footer.
     ///
     /// # Errors
-    /// [`EncodeError::TooBig`] when it has more than 65535 bytes.
+    /// [`EncodeError::TooBig`] if it has more than 65535 bytes.
     pub fn footer(mut self, bytes: &'a [u8]) -> Result<Self, EncodeError> {
         let size = u16::try_from(bytes.len()).map_err(|_| EncodeError::TooBig {
             what: "SecurityFooter",
@@ -194,7 +200,7 @@ impl<'a> Seal<'a> {
         Ok(self)
     }
 
-    /// The SecurityHeader the message has to be written with.
+    /// Returns the SecurityHeader that the message has to be written with.
     #[must_use]
     pub const fn header(&self) -> SecurityHeader<'_> {
         SecurityHeader {
@@ -210,13 +216,14 @@ impl<'a> Seal<'a> {
         }
     }
 
-    /// Secures the NetworkMessage from `start` to the end of the buffer, of whatever type, that was written with
-    /// [`header`](Self::header) up to the end of its payload: encrypts it and appends the signature.
-    /// [`finish_sealed`](crate::NetworkMessageEncoder::finish_sealed) does the same while writing.
+    /// Secures the NetworkMessage from `start` to the end of the buffer: encrypts it and appends
+    /// the signature. The message, of any type, has to be written with [`header`](Self::header), up
+    /// to the end of its payload. [`finish_sealed`](crate::NetworkMessageEncoder::finish_sealed)
+    /// does the same while writing.
     ///
     /// # Errors
-    /// [`EncodeError::Misplaced`] when no NetworkMessage with this header starts there, [`EncodeError::TooBig`] when
-    /// the payload is one of 64 GiB.
+    /// [`EncodeError::Misplaced`] if no NetworkMessage with this header starts there;
+    /// [`EncodeError::TooBig`] if the payload has 64 GiB.
     pub fn apply(self, buf: &mut Vec<u8>, start: usize) -> Result<(), EncodeError> {
         let datagram = buf.get(start..).unwrap_or_default();
         let message = NetworkMessage::decode(datagram).ok();
@@ -227,7 +234,7 @@ impl<'a> Seal<'a> {
         self.finish(buf, start, payload_at)
     }
 
-    /// As [`apply`](Self::apply), when it is known where the payload starts.
+    /// Secures a message as [`apply`](Self::apply), with a known offset of the payload.
     pub(crate) fn finish(
         self,
         buf: &mut Vec<u8>,
@@ -254,7 +261,7 @@ impl<'a> Seal<'a> {
         Ok(())
     }
 
-    /// The headers of the message end with the SecurityHeader of this seal.
+    /// Returns true if the headers of the message end with the SecurityHeader of this seal.
     fn is_announced(&self, headers: &[u8]) -> bool {
         let len = HEADER + self.footer.map_or(0, |_| size_of::<u16>());
         let at = headers.len().checked_sub(len);

@@ -5,15 +5,16 @@ use crate::header::{EXTENDED_FLAGS1, SECURITY};
 use crate::{EncodeError, NetworkMessage};
 
 impl Seal<'_> {
-    /// Bytes that a message is longer by, at most, once it is secured without a footer: ExtendedFlags1, the SecurityHeader and
-    /// the signature.
+    /// Maximum number of bytes that securing adds to a message without footer: ExtendedFlags1,
+    /// SecurityHeader and signature.
     pub const OVERHEAD: usize = 1 + super::sealer::HEADER + super::SIGNATURE;
 
-    /// Writes a NetworkMessage of whatever type, which is neither signed nor encrypted, secured at the end of `buf`. For who
-    /// has many messages and secures them all on their way out.
+    /// Appends the secured form of an unsecured NetworkMessage of any type to `buf`. For
+    /// applications that secure all messages in a single place before sending.
     ///
     /// # Errors
-    /// [`EncodeError::Misplaced`] when `datagram` is no such message, or has a SecurityFooter; `buf` is as long as before then.
+    /// [`EncodeError::Misplaced`] if `datagram` is not an unsecured NetworkMessage, or has a
+    /// SecurityFooter. The length of `buf` is then unchanged.
     pub fn secure(self, datagram: &[u8], buf: &mut Vec<u8>) -> Result<(), EncodeError> {
         let start = buf.len();
         let payload_at = self.headers(datagram, buf).inspect_err(|_| {
@@ -26,7 +27,8 @@ impl Seal<'_> {
         finished
     }
 
-    /// Writes the headers with the SecurityHeader, and the payload behind them; says where that begins.
+    /// Writes the headers with the SecurityHeader, and the payload. Returns the offset of the
+    /// payload.
     fn headers(&self, datagram: &[u8], buf: &mut Vec<u8>) -> Result<usize, EncodeError> {
         const NO_MESSAGE: EncodeError = EncodeError::Misplaced("a seal on no NetworkMessage");
         let message = NetworkMessage::decode(datagram).map_err(|_| NO_MESSAGE)?;
@@ -35,7 +37,7 @@ impl Seal<'_> {
         }
         let payload = message.payload();
         let headers = datagram.len().checked_sub(payload.len());
-        // The SecurityHeader is the last of the headers, and without security it has one length.
+        // The SecurityHeader is the last header, and has a fixed length without security.
         let before = message.security().map_or(0, |_| UNSECURED);
         let headers = headers.and_then(|len| datagram.get(..len.checked_sub(before)?));
         let Some(([flags], rest)) = headers.and_then(<[u8]>::split_first_chunk) else {
@@ -59,5 +61,5 @@ impl Seal<'_> {
     }
 }
 
-/// Bytes of a SecurityHeader that says that there is no security: flags, SecurityTokenId and NonceLength.
+/// Bytes of a SecurityHeader without security: flags, SecurityTokenId and NonceLength.
 const UNSECURED: usize = 1 + 4 + 1;
