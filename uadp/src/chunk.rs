@@ -1,47 +1,50 @@
-//! Sending what is too big for one NetworkMessage in chunks (OPC 10000-14, 7.2.4.4.4).
+//! Sends messages that exceed a NetworkMessage in chunks (OPC 10000-14, 7.2.4.4.4).
 
 use crate::header_writer::{self, Extras, Form, PayloadHeader};
 use crate::{EncodeError, NetworkHeader, NetworkMessageType};
 
-/// What is to be sent in chunks: one encoded DataSetMessage, or the body of a discovery announcement.
+/// A message to send in chunks: an encoded DataSetMessage, or the body of a discovery announcement.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Whole<'a> {
-    /// What the bytes are.
+    /// Type of the message.
     pub message_type: NetworkMessageType,
-    /// The DataSetWriter, which makes the payload header. `None` in discovery messages, which have none.
+    /// The DataSetWriter in the payload header. `None` in discovery messages, which have no payload
+    /// header.
     pub writer_id: Option<u16>,
-    /// The DataSetMessageSequenceNumber or the announcement's SequenceNumber. No other whole of the writer may have
-    /// it at the same time.
+    /// The DataSetMessageSequenceNumber, or the SequenceNumber of the announcement. It has to be
+    /// unique among the messages that the writer sends at the same time.
     pub message_sequence_number: u16,
     /// The encoded message, without NetworkMessage headers and Sizes.
     pub bytes: &'a [u8],
 }
 
-/// How big a chunk NetworkMessage may become.
+/// Maximum size of a chunk NetworkMessage.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct ChunkBudget {
-    /// Bytes of one NetworkMessage with everything in it: the payload of a UDP datagram
-    /// (MaxNetworkMessageSize: OPC 10000-14, 6.2.5.5).
+    /// Bytes of a complete NetworkMessage: the payload of a UDP datagram (MaxNetworkMessageSize:
+    /// OPC 10000-14, 6.2.5.5).
     pub network_message: usize,
-    /// Bytes that sealing appends behind the payload: SecurityFooter and signature. 0 without security, 32 with the
-    /// AES-CTR policies. The SecurityHeader is not part of it; it counts among the headers.
+    /// Bytes that sealing appends to the payload: SecurityFooter and signature. 0 without security,
+    /// 32 with the AES-CTR policies. The SecurityHeader is not included, because it counts as a
+    /// header.
     pub trailer: usize,
 }
 
-/// Where a chunk NetworkMessage stands in the buffer; it ends where the buffer does.
+/// Position of a chunk NetworkMessage in the buffer; it ends at the end of the buffer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct PlacedChunk {
-    /// Position of its first byte.
+    /// Offset of its first byte.
     pub start: usize,
-    /// Position of its payload, from which on it is encrypted.
+    /// Offset of its payload, where the encryption starts.
     pub payload_at: usize,
 }
 
-/// Writes a [`Whole`] as chunk NetworkMessages, all but the last with equally much of it
-/// (OPC 10000-14, 7.2.4.4.4).
+/// Encodes a [`Whole`] as chunk NetworkMessages. All chunks except the last hold the same number of
+/// bytes (OPC 10000-14, 7.2.4.4.4).
 ///
-/// The chunks have the headers given first; of a group header with SequenceNumber and NetworkMessageNumber both
-/// count on from chunk to chunk, since each is a NetworkMessage of its own (OPC 10000-14, 7.2.4.4.2 and 6.3.1.3.4).
+/// The chunks have the given headers. SequenceNumber and NetworkMessageNumber of the group header
+/// increase from chunk to chunk, because each chunk is a separate NetworkMessage (OPC 10000-14,
+/// 7.2.4.4.2 and 6.3.1.3.4).
 /// ```
 /// use std::time::Duration;
 /// use uadp::{
@@ -92,30 +95,31 @@ pub struct Chunks<'a> {
     whole: Whole<'a>,
     total_size: u32,
     budget: ChunkBudget,
-    /// Bytes of the whole in each chunk but the last.
+    /// Bytes of the whole in each chunk except the last.
     room: usize,
     offset: usize,
 }
 
-/// Why something cannot be sent in chunks.
+/// Reason why a message cannot be sent in chunks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum ChunkError {
-    /// The budget leaves not a byte for the message.
+    /// The budget leaves no byte for the message.
     #[error("{budget} bytes are no room beside {overhead} bytes of headers and trailer")]
     NoRoom {
-        /// Bytes one NetworkMessage may have.
+        /// Maximum bytes of a NetworkMessage.
         budget: usize,
-        /// Bytes it has without any of the message.
+        /// Bytes of headers and trailer.
         overhead: usize,
     },
-    /// There is nothing to send.
+    /// The message is empty.
     #[error("nothing to send in chunks")]
     Empty,
-    /// More bytes than TotalSize can say, or more chunks than NetworkMessageNumber can count.
+    /// The message has more bytes than TotalSize or more chunks than NetworkMessageNumber can
+    /// represent.
     #[error("{0} bytes are too many for chunks")]
     TooBig(usize),
-    /// A header could not be written.
+    /// A header could not be encoded.
     #[error(transparent)]
     Header(#[from] EncodeError),
 }
@@ -133,7 +137,7 @@ impl ChunkBudget {
         trailer: 0,
     };
 
-    /// The same with so many bytes of footer and signature.
+    /// Sets the bytes of footer and signature.
     #[must_use]
     pub const fn with_trailer(self, trailer: usize) -> Self {
         Self { trailer, ..self }
@@ -141,13 +145,15 @@ impl ChunkBudget {
 }
 
 impl<'a> Chunks<'a> {
-    /// Prepares the chunks. `header` is that of the first one, `extras` are like those each chunk will get: a nonce
-    /// as long as theirs.
+    /// Prepares the chunks. `header` is the header of the first chunk. `extras` have the size of
+    /// the extras of each chunk, including the length of the nonce.
     ///
     /// # Errors
-    /// [`ChunkError::NoRoom`] when the headers and the trailer take up the budget, [`ChunkError::Empty`] without
-    /// bytes, [`ChunkError::TooBig`] past 2^32-1 bytes or when NetworkMessageNumber would not hold, and
-    /// [`ChunkError::Header`] as [`NetworkMessageEncoder::with`](crate::NetworkMessageEncoder::with).
+    /// - [`ChunkError::NoRoom`] if headers and trailer use up the budget.
+    /// - [`ChunkError::Empty`] without bytes.
+    /// - [`ChunkError::TooBig`] above 2^32-1 bytes, or if NetworkMessageNumber would overflow.
+    /// - [`ChunkError::Header`] as
+    ///   [`NetworkMessageEncoder::with`](crate::NetworkMessageEncoder::with).
     pub fn new(
         header: &NetworkHeader<'a>,
         extras: &Extras<'_>,
@@ -186,22 +192,23 @@ impl<'a> Chunks<'a> {
         })
     }
 
-    /// Goes on at byte `offset` of the whole, as [`offset`](Self::offset) said of chunks of the same whole, headers
-    /// and budget: what is sent over a time need not stay borrowed.
+    /// Continues at an [`offset`](Self::offset) of the same whole with the same headers and budget,
+    /// so that the whole does not have to stay borrowed while it is sent.
     #[must_use]
     pub const fn resumed_at(mut self, offset: usize) -> Self {
         self.offset = offset;
         self
     }
 
-    /// How many bytes of the whole are written.
+    /// Returns the number of encoded bytes of the whole.
     #[must_use]
     pub const fn offset(&self) -> usize {
         self.offset
     }
 
-    /// Appends the next chunk NetworkMessage to `buf`; `None` when all are written. `extras` are its own: with
-    /// security a nonce that no other NetworkMessage has. After an error `buf` is as before.
+    /// Appends the next chunk NetworkMessage to `buf`. Returns `None` after the last chunk.
+    /// `extras` apply to this chunk: with security they hold a nonce that no other NetworkMessage
+    /// has. After an error `buf` is unchanged.
     pub fn append(
         &mut self,
         buf: &mut Vec<u8>,
@@ -218,7 +225,8 @@ impl<'a> Chunks<'a> {
         Some(placed)
     }
 
-    /// How many chunks are still to be written: the SequenceNumbers of the WriterGroup they will use up.
+    /// Returns the number of remaining chunks, which is the number of SequenceNumbers of the
+    /// WriterGroup that they use.
     #[must_use]
     pub const fn remaining(&self) -> usize {
         self.whole
@@ -252,7 +260,7 @@ impl<'a> Chunks<'a> {
         Ok(PlacedChunk { start, payload_at })
     }
 
-    /// Makes the group header that of the next NetworkMessage.
+    /// Updates the group header for the next NetworkMessage.
     const fn count_on(&mut self) {
         if let Some(group) = &mut self.header.group {
             if let Some(number) = &mut group.sequence_number {

@@ -1,8 +1,9 @@
-//! A slice that shrinks from the left. Whoever takes from it names what is missing when it is too short.
+//! A slice that is consumed from the left. Reads take the name of the field for the error of a
+//! truncated field.
 
 use crate::DecodeError;
 
-/// The bytes not read yet. A reader over a prefix cannot see what stands behind it.
+/// The unread bytes. A reader over a prefix cannot read beyond the prefix.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Reader<'a> {
     rest: &'a [u8],
@@ -24,13 +25,13 @@ impl<'a> Reader<'a> {
         self.rest.len()
     }
 
-    /// How many bytes were read since `before`, an earlier copy of this reader.
+    /// Returns the number of bytes read after `before`, an earlier copy of this reader.
     #[inline]
     pub(crate) const fn since_start(&self, before: &Self) -> usize {
         before.rest.len().saturating_sub(self.rest.len())
     }
 
-    /// What was read since `before`, an earlier copy of this reader.
+    /// Returns the bytes read after `before`, an earlier copy of this reader.
     #[inline]
     pub(crate) fn since(&self, before: &Self) -> &'a [u8] {
         let read = before.rest.len().saturating_sub(self.rest.len());
@@ -74,7 +75,7 @@ impl<'a> Reader<'a> {
         }
     }
 
-    /// All that is left.
+    /// Takes the remaining bytes.
     #[inline]
     pub(crate) const fn take_rest(&mut self) -> &'a [u8] {
         let rest = self.rest;
@@ -82,7 +83,7 @@ impl<'a> Reader<'a> {
         rest
     }
 
-    /// What stands before the last `len` bytes, and those.
+    /// Splits off the last `len` bytes. Returns the bytes before them, and the last bytes.
     pub(crate) fn split_end(
         &self,
         len: usize,
@@ -98,7 +99,7 @@ impl<'a> Reader<'a> {
         Ok((Self::new(head), Self::new(tail)))
     }
 
-    /// `count` UInt16, unread.
+    /// Takes `count` UInt16 without decoding them.
     #[inline]
     pub(crate) fn u16s(
         &mut self,
@@ -134,7 +135,7 @@ impl<'a> Reader<'a> {
         self.array(what).map(i64::from_le_bytes)
     }
 
-    /// Int32 length, `None` for -1.
+    /// Reads an Int32 length, `None` for -1.
     #[inline]
     pub(crate) fn length(&mut self, what: &'static str) -> Result<Option<usize>, DecodeError> {
         let length = self.i32(what)?;
@@ -148,7 +149,7 @@ impl<'a> Reader<'a> {
         }
     }
 
-    /// ByteString (OPC 10000-6, 5.2.2.7), `None` for null.
+    /// Reads a ByteString (OPC 10000-6, 5.2.2.7), `None` for null.
     #[inline]
     pub(crate) fn byte_string(
         &mut self,
@@ -160,7 +161,7 @@ impl<'a> Reader<'a> {
         }
     }
 
-    /// String (OPC 10000-6, 5.2.2.4), `None` for null.
+    /// Reads a String (OPC 10000-6, 5.2.2.4), `None` for null.
     #[inline]
     pub(crate) fn text(&mut self, what: &'static str) -> Result<Option<&'a str>, DecodeError> {
         match self.byte_string(what)? {

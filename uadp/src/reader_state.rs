@@ -1,4 +1,5 @@
-//! What a DataSetReader takes of the DataSetMessages that reach it, and the state it is in (OPC 10000-14, 6.2.9).
+//! Acceptance of DataSetMessages by a DataSetReader, and the state of the reader (OPC 10000-14,
+//! 6.2.9).
 
 mod record;
 mod verdict;
@@ -12,26 +13,29 @@ use crate::{
 use record::{Numbers, Record};
 pub use verdict::{Accepted, ReaderCounters, ReaderDrop};
 
-/// Judges the DataSetMessages of one DataSetWriter by their headers, and keeps the state of the DataSetReader
-/// (OPC 10000-14, 6.2.1, 6.2.9 and 7.2.3).
+/// Decides by their headers which DataSetMessages of a DataSetWriter are accepted, and keeps the
+/// state of the DataSetReader (OPC 10000-14, 6.2.1, 6.2.9 and 7.2.3).
 ///
-/// Time is a parameter: how long it is since a start that is the same for all calls.
+/// Times are parameters that count from any fixed time.
 ///
-/// # What is new
-/// The DataSetMessageSequenceNumber tells by the window of OPC 10000-14, 7.2.3. Without it the SequenceNumber of the
-/// group header does, by which nothing lost is known; without either every message is new (6.2.9.6). A writer that
-/// changes between the two is configured anew (7.2.4.5.4), so that its numbers start over. A keep-alive
-/// carries the number of the next message (7.2.4.5.8). A late message is dropped, or with
-/// [`accept_late`](ReaderSettings::accept_late) accepted once. A heartbeat is a key frame like any other.
+/// # New messages
+/// The DataSetMessageSequenceNumber identifies new messages, by the window of OPC 10000-14, 7.2.3.
+/// Without it the SequenceNumber of the group header does, which does not reveal lost messages.
+/// Without both, every message is new (6.2.9.6). A writer that changes from one number to the other
+/// has a new configuration (7.2.4.5.4), so its numbers start over. A keep-alive carries the number
+/// of the next message (7.2.4.5.8). A late message is dropped, or accepted once with
+/// [`accept_late`](ReaderSettings::accept_late). A heartbeat is handled as any key frame.
 ///
-/// # A writer that starts over
-/// Its numbers look old or invalid. It is accepted again as soon as either its Timestamp is later than that of the
-/// newest message, or nothing new was received for [`forget_after`](ReaderSettings::forget_after), which is twice the
-/// MessageReceiveTimeout (7.2.3). Not later than that, whatever its numbers are.
+/// # Restarted writers
+/// The sequence numbers of a restarted writer look old or invalid. The writer is accepted again if
+/// its Timestamp is later than the Timestamp of the newest message, or if no new message was
+/// received for [`forget_after`](ReaderSettings::forget_after), which is twice the
+/// MessageReceiveTimeout (7.2.3). After that time any sequence number is accepted.
 ///
 /// # State
-/// Enabled, the reader is PreOperational until the first key frame or event, then Operational (6.2.1, Table 2).
-/// When nothing new came for the MessageReceiveTimeout it is in Error until the next message, then Operational
+/// An enabled reader is PreOperational until the first key frame or event, then Operational (6.2.1,
+/// Table 2). If no new message arrives for the MessageReceiveTimeout, the reader is in Error until
+/// the next message. Then it is Operational again, or PreOperational if it needs a key frame first.
 /// again, or PreOperational when a key frame is needed first.
 /// ```
 /// use std::time::Duration;
@@ -72,59 +76,60 @@ pub struct DataSetReaderState {
     settings: ReaderSettings,
     machine: StateMachine,
     record: Option<Record>,
-    /// Timestamp of the newest message, where they have one.
+    /// Timestamp of the newest message with a Timestamp.
     stamp: Option<Timestamp>,
-    /// When the last new message came, if only to be dropped for its content.
+    /// Time of the last new message, including messages that were dropped for their content.
     new_at: Duration,
-    /// From when on the MessageReceiveTimeout counts.
+    /// Start of the MessageReceiveTimeout.
     alive_at: Duration,
     basis: Option<Basis>,
     mismatch: Option<Mismatch>,
     counters: ReaderCounters,
 }
 
-/// How a [`DataSetReaderState`] judges. The default supervises no time and checks no contract.
+/// Settings of a [`DataSetReaderState`]. The default has no timeout and checks no versions.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub struct ReaderSettings {
-    /// MessageReceiveTimeout (OPC 10000-14, 6.2.9.6). Zero supervises nothing.
+    /// MessageReceiveTimeout (OPC 10000-14, 6.2.9.6). Zero disables the timeout.
     pub message_receive_timeout: Duration,
-    /// ConfigurationVersion of the DataSetMetaData that messages are decoded with; `None` when they are decoded
-    /// without (OPC 10000-14, 6.2.9.4).
+    /// ConfigurationVersion of the DataSetMetaData that decodes the messages; `None` if they are
+    /// decoded without metadata (OPC 10000-14, 6.2.9.4).
     pub metadata: Option<ConfigurationVersion>,
-    /// GroupVersion expected of the group header (OPC 10000-14, 6.3.1.4.1).
+    /// Expected GroupVersion of the group header (OPC 10000-14, 6.3.1.4.1).
     pub group_version: Option<u32>,
-    /// NetworkMessageNumber expected of the group header (OPC 10000-14, 6.3.1.4.2).
+    /// Expected NetworkMessageNumber of the group header (OPC 10000-14, 6.3.1.4.2).
     pub network_message_number: Option<u16>,
-    /// Accepts a message that comes after newer ones, at most 64 behind: for events, all of which are wanted. A late
-    /// key or delta frame would put old values over new ones.
+    /// Accepts messages that arrive after newer messages, at most 64 behind. Use it for events,
+    /// because no event should be lost. A late key frame or delta frame would replace new values
+    /// with old values.
     pub accept_late: bool,
 }
 
-/// What the headers say of one DataSetMessage.
+/// Header fields of a DataSetMessage that the reader uses.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Arrival {
     /// The group header.
     pub group: GroupHeader,
-    /// Which of the DataSetMessages of its NetworkMessage it is, from 0.
+    /// Index of the DataSetMessage in its NetworkMessage.
     pub position: usize,
-    /// When it was made: its own Timestamp, else that of the NetworkMessage.
+    /// Timestamp of the DataSetMessage, or else of the NetworkMessage.
     pub timestamp: Option<Timestamp>,
     /// The header of the DataSetMessage.
     pub header: DataSetHeader,
-    /// What the payload is.
+    /// Kind of the payload.
     pub kind: MessageKind,
 }
 
-/// What delta frames are put over.
+/// Values that delta frames apply to.
 #[derive(Debug, Clone, Copy)]
 struct Basis {
     /// Major version of the key frame.
     major_version: Option<u32>,
-    /// Nothing was missed since.
+    /// No message was missed after the key frame.
     complete: bool,
 }
 
-/// Messages come that need other metadata.
+/// Messages arrive that need other metadata.
 #[derive(Debug, Clone, Copy)]
 struct Mismatch {
     major_version: u32,
@@ -132,8 +137,8 @@ struct Mismatch {
 }
 
 impl ReaderSettings {
-    /// How long nothing new may come until the writer is held to start over: twice the MessageReceiveTimeout
-    /// (OPC 10000-14, 7.2.3), 10 s where there is none.
+    /// Returns the time without new messages after which the writer counts as restarted: twice the
+    /// MessageReceiveTimeout (OPC 10000-14, 7.2.3), or 10 s without timeout.
     #[must_use]
     pub const fn forget_after(&self) -> Duration {
         match self.message_receive_timeout {
@@ -144,7 +149,7 @@ impl ReaderSettings {
 }
 
 impl Arrival {
-    /// What the headers say of `message`, the one at `position` of the NetworkMessage.
+    /// Returns the header fields of `message` at `position` of the NetworkMessage.
     #[must_use]
     pub fn of(network: &NetworkHeader<'_>, position: usize, message: &DataSetMessage<'_>) -> Self {
         let stamp = |time, picoseconds: Option<u16>| Timestamp {
@@ -165,7 +170,7 @@ impl Arrival {
         }
     }
 
-    /// A message without any header fields.
+    /// Returns a message without header fields.
     #[must_use]
     pub fn of_kind(kind: MessageKind) -> Self {
         Self {
@@ -179,7 +184,7 @@ impl Arrival {
 }
 
 impl DataSetReaderState {
-    /// A reader in Disabled, below a ReaderGroup in the given state.
+    /// Creates a reader in Disabled, below a ReaderGroup in the given state.
     #[must_use]
     pub const fn new(settings: ReaderSettings, parent: PubSubState) -> Self {
         Self {
@@ -195,10 +200,11 @@ impl DataSetReaderState {
         }
     }
 
-    /// Judges a message. What is accepted is to be processed, keep-alives as a sign of life.
+    /// Decides whether a message is accepted. Accepted messages have to be processed, keep-alives
+    /// as a sign of life.
     ///
     /// # Errors
-    /// [`ReaderDrop`] when it is to be dropped.
+    /// [`ReaderDrop`] if the message has to be dropped.
     pub fn receive(&mut self, arrival: &Arrival, now: Duration) -> Result<Accepted, ReaderDrop> {
         self.handle_timeout(now);
         let verdict = self.judge(arrival, now);
@@ -209,7 +215,7 @@ impl DataSetReaderState {
         verdict
     }
 
-    /// Notices that the MessageReceiveTimeout passed; true when the state became Error by that.
+    /// Checks the MessageReceiveTimeout. Returns true if the state changed to Error.
     pub fn handle_timeout(&mut self, now: Duration) -> bool {
         let failed = self.poll_timeout().is_some_and(|at| now >= at)
             && self.machine.settle(StateEvent::Fail);
@@ -219,7 +225,7 @@ impl DataSetReaderState {
         failed
     }
 
-    /// When [`handle_timeout`](Self::handle_timeout) has something to notice.
+    /// Returns the time of the next [`handle_timeout`](Self::handle_timeout).
     #[must_use]
     pub fn poll_timeout(&self) -> Option<Duration> {
         let timeout = self.settings.message_receive_timeout;
@@ -234,10 +240,10 @@ impl DataSetReaderState {
         since.map(|since| since.saturating_add(timeout))
     }
 
-    /// Enables the reader; the new state.
+    /// Enables the reader, and returns the new state.
     ///
     /// # Errors
-    /// [`StateRefused`] when it is enabled.
+    /// [`StateRefused`] if the reader is enabled already.
     pub fn enable(&mut self, now: Duration) -> Result<PubSubState, StateRefused> {
         let before = self.machine.state();
         let state = self.machine.enable()?;
@@ -245,15 +251,15 @@ impl DataSetReaderState {
         Ok(state)
     }
 
-    /// Disables the reader; what it knows of the writer is forgotten when it is enabled again.
+    /// Disables the reader. Its information about the writer is dropped when it is enabled again.
     ///
     /// # Errors
-    /// [`StateRefused`] when it is disabled.
+    /// [`StateRefused`] if the reader is disabled already.
     pub const fn disable(&mut self) -> Result<PubSubState, StateRefused> {
         self.machine.disable()
     }
 
-    /// Takes note of the ReaderGroup's state; the own state that follows.
+    /// Sets the state of the ReaderGroup, and returns the resulting state of the reader.
     pub fn set_parent(&mut self, parent: PubSubState, now: Duration) -> PubSubState {
         let before = self.machine.state();
         self.machine.set_parent(parent);
@@ -261,38 +267,39 @@ impl DataSetReaderState {
         self.machine.state()
     }
 
-    /// Decodes with other metadata from now on, for which a key frame comes first.
+    /// Sets the metadata version. Delta frames are dropped until the next key frame.
     pub fn set_metadata(&mut self, metadata: Option<ConfigurationVersion>) {
         self.settings.metadata = metadata;
         self.mismatch = None;
         self.basis = None;
     }
 
-    /// The major version of the metadata that messages are dropped for want of.
+    /// Returns the major version of the missing metadata, for which messages are dropped.
     #[must_use]
     pub fn metadata_needed(&self) -> Option<u32> {
         self.mismatch.map(|mismatch| mismatch.major_version)
     }
 
-    /// The state of the DataSetReader.
+    /// Returns the state of the DataSetReader.
     #[must_use]
     pub const fn state(&self) -> PubSubState {
         self.machine.state()
     }
 
-    /// How it judges.
+    /// Returns the settings.
     #[must_use]
     pub const fn settings(&self) -> &ReaderSettings {
         &self.settings
     }
 
-    /// What became of the messages so far.
+    /// Returns the counters of messages.
     #[must_use]
     pub const fn counters(&self) -> &ReaderCounters {
         &self.counters
     }
 
-    /// When the last new message came, keep-alives included; before the first, when the reader became active.
+    /// Returns the time of the last new message, including keep-alives. Before the first message it
+    /// is the time at which the reader became active.
     #[must_use]
     pub const fn heard_at(&self) -> Duration {
         self.new_at
@@ -339,7 +346,7 @@ impl DataSetReaderState {
         Ok(())
     }
 
-    /// Finds the place of the message in the sequence and takes note of it.
+    /// Places the message in the sequence and records it.
     fn place(&mut self, arrival: &Arrival, now: Duration) -> Result<Accepted, ReaderDrop> {
         let Some((of, number)) = Numbers::of(arrival) else {
             return Ok(Accepted::default());
@@ -367,19 +374,20 @@ impl DataSetReaderState {
         Ok(accepted)
     }
 
-    /// Whether a message was made after the newest one. 0 stands for a Timestamp that was not filled in.
+    /// Returns true if a message is later than the newest message. A Timestamp of 0 counts as
+    /// missing.
     fn is_later(&self, stamp: Option<Timestamp>) -> bool {
         matches!((stamp, self.stamp), (Some(new), Some(last)) if last.time.0 != 0 && new > last)
     }
 
-    /// Forgets the writer as it was: it may have started over.
+    /// Drops the information about the writer, which may have restarted.
     const fn forget(&mut self) {
         self.record = None;
         self.stamp = None;
         self.basis = None;
     }
 
-    /// The minor version to be told of.
+    /// Checks the version. Returns the minor version if it differs.
     fn check_version(
         &mut self,
         header: &DataSetHeader,
@@ -411,7 +419,7 @@ impl DataSetReaderState {
             .filter(|found| *found != metadata.minor))
     }
 
-    /// Keeps up what delta frames are put over; true when the message is one with nothing below it.
+    /// Updates the base of delta frames. Returns true for a delta frame without base.
     fn rebase(&mut self, arrival: &Arrival, accepted: Accepted) -> bool {
         if accepted.missed > 0
             && let Some(basis) = &mut self.basis
@@ -434,7 +442,7 @@ impl DataSetReaderState {
         }
     }
 
-    /// The state after a new message.
+    /// Updates the state after a new message.
     fn revive(&mut self, kind: MessageKind, now: Duration) {
         self.alive_at = now;
         let event = match (self.machine.state(), kind, self.basis) {

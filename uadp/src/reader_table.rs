@@ -1,4 +1,4 @@
-//! The readers of many writers, known by their triple.
+//! Readers of many writers, by PublisherId, WriterGroupId and DataSetWriterId.
 
 use std::time::Duration;
 
@@ -7,24 +7,24 @@ use crate::{
     PubSubState, PublisherId, ReaderDrop, ReaderSettings,
 };
 
-/// A [`DataSetReaderState`] for each DataSetWriter that is heard, made when it is first heard: for receivers that are
-/// not told beforehand who sends.
+/// A table with a [`DataSetReaderState`] for each DataSetWriter, created at its first message. For
+/// receivers without a configured list of publishers.
 ///
-/// It holds as many readers as it was made for. When it is full, a new writer takes the place of the one that was
-/// silent longest, if that was for [`ReaderSettings::forget_after`]; else the new writer is refused. So nobody can
-/// push out writers that live by inventing others.
+/// The table has a fixed capacity. If it is full, a new writer replaces the writer with the longest
+/// pause, if that pause is at least [`ReaderSettings::forget_after`]. Otherwise the new writer is
+/// rejected. So invented writers cannot displace active writers.
 #[derive(Debug)]
 pub struct ReaderTable {
     settings: ReaderSettings,
     parent: PubSubState,
     capacity: usize,
-    /// Sorted by the keys.
+    /// Sorted by key.
     readers: Vec<(ReaderKey, DataSetReaderState)>,
     refused: u64,
     replaced: u64,
 }
 
-/// What tells one DataSetWriter from another. `None` is what its NetworkMessages leave out.
+/// Identity of a DataSetWriter. Fields that its NetworkMessages omit are `None`.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct ReaderKey {
     /// The publisher.
@@ -35,7 +35,7 @@ pub struct ReaderKey {
     pub writer_id: Option<u16>,
 }
 
-/// A [`ReaderKey`] for looking up, without owning the PublisherId; ordered as the keys are.
+/// A [`ReaderKey`] for lookups, which borrows the PublisherId and has the same order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 struct Triple<'a> {
     publisher_id: Option<PublisherId<'a>>,
@@ -64,10 +64,11 @@ impl From<Triple<'_>> for ReaderKey {
 }
 
 impl ReaderTable {
-    /// Bytes a PublisherId of type String may have here.
+    /// Maximum bytes of a PublisherId of type String.
     pub const MAX_PUBLISHER_ID: usize = 1024;
 
-    /// An empty table for so many writers. Its readers are enabled, below a ReaderGroup that is Operational.
+    /// Creates an empty table with a capacity. Its readers are enabled, below a ReaderGroup that is
+    /// Operational.
     #[must_use]
     pub const fn new(capacity: usize, settings: ReaderSettings) -> Self {
         Self {
@@ -80,8 +81,7 @@ impl ReaderTable {
         }
     }
 
-    /// Has the writer's reader judge the message, which is at `position` among the DataSetMessages of its
-    /// NetworkMessage.
+    /// Passes the message at `position` of its NetworkMessage to the reader of its writer.
     ///
     /// # Errors
     /// As [`reader`](Self::reader) and [`DataSetReaderState::receive`].
@@ -96,10 +96,10 @@ impl ReaderTable {
         reader.receive(&Arrival::of(network, position, message), now)
     }
 
-    /// The reader of a writer, made if there is none.
+    /// Returns the reader of a writer, and creates it if there is none.
     ///
     /// # Errors
-    /// [`ReaderDrop::TableFull`] when there is no place for another, and [`ReaderDrop::PublisherIdTooLong`] past
+    /// [`ReaderDrop::TableFull`] if the table is full; [`ReaderDrop::PublisherIdTooLong`] above
     /// [`MAX_PUBLISHER_ID`](Self::MAX_PUBLISHER_ID).
     pub fn reader(
         &mut self,
@@ -128,7 +128,8 @@ impl ReaderTable {
             .ok_or(ReaderDrop::TableFull)
     }
 
-    /// Notices for which readers the MessageReceiveTimeout passed; `failed` is told of each whose state became Error.
+    /// Checks the MessageReceiveTimeout of all readers. Calls `failed` for each reader whose state
+    /// changed to Error.
     pub fn handle_timeout(&mut self, now: Duration, mut failed: impl FnMut(&ReaderKey)) {
         for (key, reader) in &mut self.readers {
             if reader.handle_timeout(now) {
@@ -137,7 +138,7 @@ impl ReaderTable {
         }
     }
 
-    /// When [`handle_timeout`](Self::handle_timeout) has something to notice.
+    /// Returns the time of the next [`handle_timeout`](Self::handle_timeout).
     #[must_use]
     pub fn poll_timeout(&self) -> Option<Duration> {
         let timeouts = self.readers.iter();
@@ -146,7 +147,7 @@ impl ReaderTable {
             .min()
     }
 
-    /// Tells all readers the state of their ReaderGroup, those to come included.
+    /// Sets the state of the ReaderGroup for present and future readers.
     pub fn set_parent(&mut self, parent: PubSubState, now: Duration) {
         self.parent = parent;
         for (_, reader) in &mut self.readers {
@@ -154,18 +155,18 @@ impl ReaderTable {
         }
     }
 
-    /// The readers there are.
+    /// Returns the readers.
     pub fn iter(&self) -> impl ExactSizeIterator<Item = (&ReaderKey, &DataSetReaderState)> {
         self.readers.iter().map(|(key, reader)| (key, reader))
     }
 
-    /// How often a writer was refused, once for each message.
+    /// Returns the number of messages of rejected writers.
     #[must_use]
     pub const fn refused(&self) -> u64 {
         self.refused
     }
 
-    /// How often a silent writer made place for another.
+    /// Returns the number of replaced writers.
     #[must_use]
     pub const fn replaced(&self) -> u64 {
         self.replaced
@@ -186,7 +187,7 @@ impl ReaderTable {
             self.make_room(now)?;
         }
         let mut reader = DataSetReaderState::new(self.settings, self.parent);
-        // A new reader is Disabled, which is the only state in which this does something.
+        // Enabling succeeds, because a new reader is Disabled.
         if reader.enable(now).is_err() {
             return Err(ReaderDrop::Inactive);
         }

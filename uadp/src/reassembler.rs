@@ -1,4 +1,4 @@
-//! Putting chunks together again (OPC 10000-14, 7.2.4.4.4).
+//! Reassembles chunks (OPC 10000-14, 7.2.4.4.4).
 
 mod open;
 
@@ -13,130 +13,135 @@ use open::{Done, Insertion, KeyRef, Open};
 
 /// Collects chunk NetworkMessages until a whole is complete (OPC 10000-14, 7.2.4.4.4).
 ///
-/// A whole is known by PublisherId, WriterGroupId, NetworkMessage type, DataSetWriterId, MessageSequenceNumber and
-/// how it is secured, so that nothing unsigned gets into what was signed. Chunks may come in any order and in uneven
-/// pieces, although the standard has all but the last equally long.
+/// A whole is identified by PublisherId, WriterGroupId, NetworkMessage type, DataSetWriterId,
+/// MessageSequenceNumber and security mode, so unsigned chunks never become part of a signed whole.
+/// Chunks may arrive in any order and have different sizes, although the standard requires equal
+/// sizes except for the last chunk.
 ///
-/// Whoever can send to a group can make up chunks of any writer. With [`receive_from`](Self::receive_from) a whole is
-/// known by its sender as well, an address or whatever `S` is: nobody gets a chunk into what another sends. Each sender
-/// has limits of its own, and where all together reach one, the sender that holds most gives way.
+/// Every host that can send to a group can send chunks with the ids of any writer. With
+/// [`receive_from`](Self::receive_from) a whole is also identified by its sender, such as an
+/// address, so that a sender cannot add chunks to the wholes of another sender. Each sender has
+/// separate limits. If all senders together reach a limit, a whole of the sender that holds the
+/// most is given up.
 ///
-/// Only what has arrived is held: TotalSize reserves nothing. A datagram makes it hold its own piece and about a
-/// hundred bytes, the last piece of a whole in addition one buffer for the whole, which is used again. When a limit
-/// is reached the whole that was begun first is given up, of the sender that holds most. The same chunk once more is refused, for
-/// [`age`](ReassemblyLimits::age) also after the whole was complete. Other bytes in the same place begin a new whole,
-/// so that a publisher that starts over mixes nothing; another TotalSize is refused while the earlier whole is
-/// incomplete, for [`age`](ReassemblyLimits::age) at most.
+/// Memory is allocated for received bytes only, not for TotalSize. A datagram allocates its chunk
+/// and about a hundred bytes; the last chunk of a whole also uses a reusable buffer for the whole.
+/// At a limit, the oldest whole of the sender that holds the most is given up. A repeated chunk is
+/// rejected, also after its whole is complete, for [`age`](ReassemblyLimits::age). Different bytes
+/// at the same offset start a new whole, so that data of a restarted publisher is never mixed with
+/// earlier data. A different TotalSize is rejected while the earlier whole is incomplete, at most
+/// for [`age`](ReassemblyLimits::age).
 ///
 /// # Publishers that chunk the NetworkMessage
-/// UA-.NETStandard sends no payload header with its chunks and cuts up the encoded NetworkMessage instead of one
-/// DataSetMessage. A whole without [`writer_id`](Reassembled::writer_id) that is no discovery message may be such
-/// a one: read it with [`NetworkMessage::decode`] from [`bytes`](Reassembled::bytes).
+/// UA-.NETStandard sends chunks without payload header, and splits the encoded NetworkMessage
+/// instead of a DataSetMessage. A whole without [`writer_id`](Reassembled::writer_id) that is not a
+/// discovery message may be such a message: decode its [`bytes`](Reassembled::bytes) with
+/// [`NetworkMessage::decode`].
 ///
-/// An example stands at [`Chunks`](crate::Chunks).
+/// See [`Chunks`](crate::Chunks) for an example.
 #[derive(Debug)]
 pub struct Reassembler<S = ()> {
     limits: ReassemblyLimits,
-    /// In the order they were begun.
+    /// Incomplete wholes, oldest first.
     open: VecDeque<Open<S>>,
-    /// Completed ones, whose chunks may come again; in the order they were completed.
+    /// Completed wholes, whose chunks may be repeated; in the order of completion.
     done: VecDeque<Done<S>>,
-    /// Cost of all in `open` and `done`.
+    /// Cost of all entries in `open` and `done`.
     held: usize,
-    /// The whole that was completed last.
+    /// The last completed whole.
     whole: Vec<u8>,
     counters: ReassemblyCounters,
-    /// What [`poll_given_up`](Self::poll_given_up) hands out.
+    /// Wholes to return from [`poll_given_up`](Self::poll_given_up).
     given_up: VecDeque<GivenUp<S>>,
 }
 
-/// What a [`Reassembler`] may hold.
+/// Limits of a [`Reassembler`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct ReassemblyLimits {
-    /// Bytes of one whole, as its TotalSize says. Default 16 MiB.
+    /// Maximum bytes of a whole, as in its TotalSize. Default 16 MiB.
     pub whole: u32,
-    /// Bytes of all incomplete wholes, their bookkeeping included. Default 64 MiB.
+    /// Maximum bytes of all incomplete wholes, including overhead. Default 64 MiB.
     pub total: usize,
-    /// The same of one sender's. Default 64 MiB.
+    /// Maximum bytes of the incomplete wholes of a sender, including overhead. Default 64 MiB.
     pub total_per_sender: usize,
-    /// Incomplete wholes, and completed ones that are remembered. Default 64.
+    /// Maximum number of incomplete wholes, and of remembered completed wholes. Default 64.
     pub open: usize,
-    /// Incomplete wholes of one sender. Default 64.
+    /// Maximum number of incomplete wholes of a sender. Default 64.
     pub open_per_sender: usize,
-    /// Incomplete wholes of one DataSetWriter, so that one that loses chunks does not push out the others'.
-    /// Default 4.
+    /// Maximum number of incomplete wholes of a DataSetWriter, so that a writer with lost chunks
+    /// does not displace the wholes of other writers. Default 4.
     pub open_per_writer: usize,
-    /// Pieces of one whole. Default 32768.
+    /// Maximum number of chunks of a whole. Default 32768.
     pub pieces: usize,
-    /// How long a whole may take from its first chunk to its last. Default 2 s.
+    /// Maximum time from the first chunk of a whole to the last. Default 2 s.
     pub age: Duration,
 }
 
-/// A whole that is complete.
+/// A completed whole.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Reassembled<'r> {
-    /// The headers of the NetworkMessage with the chunk that came last.
+    /// Headers of the NetworkMessage with the last received chunk.
     pub header: NetworkHeader<'r>,
-    /// What the bytes are.
+    /// Type of the message.
     pub message_type: NetworkMessageType,
     /// The DataSetWriter; `None` without payload header.
     pub writer_id: Option<u16>,
-    /// The number of the whole among those of the DataSetWriter.
+    /// MessageSequenceNumber of the whole.
     pub message_sequence_number: u16,
-    /// The bytes: one DataSetMessage, or the body of a discovery message.
+    /// The bytes: a DataSetMessage, or the body of a discovery message.
     pub bytes: &'r [u8],
 }
 
-/// Why a chunk was not taken.
+/// Reason why a chunk was rejected.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum ChunkRefusal {
-    /// It is no chunk, sealed, or malformed.
+    /// The message is not a chunk, is sealed, or is malformed.
     #[error(transparent)]
     Malformed(#[from] DecodeError),
-    /// The whole would be bigger than [`ReassemblyLimits::whole`].
+    /// The whole would exceed [`ReassemblyLimits::whole`].
     #[error("a whole of {total_size} bytes")]
     TooBig {
-        /// Bytes it would have.
+        /// TotalSize of the whole.
         total_size: u32,
     },
-    /// Its TotalSize is not that of the chunks before.
+    /// The TotalSize differs from the earlier chunks.
     #[error("TotalSize {found} after {expected}")]
     TotalSize {
-        /// What the first chunk said.
+        /// TotalSize of the first chunk.
         expected: u32,
-        /// What this one says.
+        /// TotalSize of this chunk.
         found: u32,
     },
-    /// It came before.
+    /// The chunk was received before.
     #[error("a chunk once more")]
     Duplicate,
-    /// It covers a part of another chunk.
+    /// The chunk overlaps another chunk.
     #[error("a chunk over others")]
     Overlap,
-    /// The whole has [`ReassemblyLimits::pieces`] already.
+    /// The whole has reached [`ReassemblyLimits::pieces`].
     #[error("too many chunks of one whole")]
     TooManyPieces,
 }
 
-/// What became of the chunks and wholes.
+/// Counters of chunks and wholes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub struct ReassemblyCounters {
-    /// Wholes handed out.
+    /// Completed wholes.
     pub completed: u64,
-    /// Chunks taken.
+    /// Accepted chunks.
     pub chunks: u64,
-    /// Chunks refused as [`ChunkRefusal::Malformed`].
+    /// Chunks rejected as [`ChunkRefusal::Malformed`].
     pub malformed: u64,
-    /// Chunks refused as [`ChunkRefusal::TooBig`].
+    /// Chunks rejected as [`ChunkRefusal::TooBig`].
     pub too_big: u64,
-    /// Chunks refused as [`ChunkRefusal::TotalSize`].
+    /// Chunks rejected as [`ChunkRefusal::TotalSize`].
     pub total_size: u64,
-    /// Chunks refused as [`ChunkRefusal::Duplicate`].
+    /// Chunks rejected as [`ChunkRefusal::Duplicate`].
     pub duplicates: u64,
-    /// Chunks refused as [`ChunkRefusal::Overlap`].
+    /// Chunks rejected as [`ChunkRefusal::Overlap`].
     pub overlaps: u64,
-    /// Chunks refused as [`ChunkRefusal::TooManyPieces`].
+    /// Chunks rejected as [`ChunkRefusal::TooManyPieces`].
     pub too_many_pieces: u64,
     /// Wholes given up because of [`ReassemblyLimits::age`].
     pub expired: u64,
@@ -146,55 +151,57 @@ pub struct ReassemblyCounters {
     pub out_of_places: u64,
     /// Wholes given up because of [`ReassemblyLimits::open_per_writer`].
     pub superseded: u64,
-    /// Wholes given up because a chunk in the place of an earlier one had other bytes: the number is in use again.
-    /// That chunk begins a new whole.
+    /// Wholes given up because a chunk at the offset of an earlier chunk had different bytes, so
+    /// that the number is in use again. That chunk starts a new whole.
     pub contradicted: u64,
 }
 
-/// A whole that did not become complete.
+/// An incomplete whole that was given up.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct GivenUp<S = ()> {
-    /// Where its chunks came from.
+    /// Sender of its chunks.
     pub sender: S,
-    /// Who sent it, as it says.
+    /// PublisherId in its chunks.
     pub publisher_id: Option<OwnedPublisherId>,
     /// The WriterGroup.
     pub writer_group_id: Option<u16>,
     /// The DataSetWriter; `None` without payload header.
     pub writer_id: Option<u16>,
-    /// The number of the whole among those of the DataSetWriter.
+    /// MessageSequenceNumber of the whole.
     pub message_sequence_number: u16,
-    /// Bytes that had arrived.
+    /// Received bytes.
     pub received: u32,
-    /// Bytes it would have had.
+    /// TotalSize of the whole.
     pub total_size: u32,
-    /// Why it was not waited for any longer.
+    /// Reason for giving it up.
     pub why: GiveUp,
 }
 
-/// Why a whole was given up.
+/// Reason why a whole was given up.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum GiveUp {
-    /// [`ReassemblyLimits::age`] had passed.
+    /// The time of [`ReassemblyLimits::age`] passed.
     Expired,
-    /// Its sender held most when [`ReassemblyLimits::total`] was reached, or reached
-    /// [`ReassemblyLimits::total_per_sender`], and began it first.
+    /// It was the oldest whole of its sender, which held the most bytes when
+    /// [`ReassemblyLimits::total`] was reached, or which reached
+    /// [`ReassemblyLimits::total_per_sender`].
     OutOfBytes,
-    /// Its sender had most when [`ReassemblyLimits::open`] was reached, or reached
-    /// [`ReassemblyLimits::open_per_sender`], and began it first.
+    /// It was the oldest whole of its sender, which had the most wholes when
+    /// [`ReassemblyLimits::open`] was reached, or which reached
+    /// [`ReassemblyLimits::open_per_sender`].
     OutOfPlaces,
-    /// [`ReassemblyLimits::open_per_writer`] was reached, and it was the writer's oldest.
+    /// It was the oldest whole of its writer, which reached [`ReassemblyLimits::open_per_writer`].
     Superseded,
-    /// A chunk in the place of an earlier one had other bytes.
+    /// A chunk at the offset of an earlier chunk had different bytes.
     Contradicted,
 }
 
-/// What taking a chunk led to.
+/// Result of accepting a chunk.
 enum Step {
     Incomplete,
-    /// The chunk is the whole.
+    /// The chunk is the complete whole.
     Alone,
-    /// The whole stands in the buffer.
+    /// The complete whole is in the buffer.
     Complete,
 }
 
@@ -220,10 +227,10 @@ impl<S> Default for Reassembler<S> {
 }
 
 impl Reassembler {
-    /// As [`receive_from`](Reassembler::receive_from), where all chunks come from one sender.
+    /// Handles a chunk as [`receive_from`](Reassembler::receive_from), with a single sender.
     ///
     /// # Errors
-    /// As there.
+    /// As [`receive_from`](Reassembler::receive_from).
     pub fn receive<'r>(
         &'r mut self,
         message: &NetworkMessage<'r>,
@@ -234,8 +241,9 @@ impl Reassembler {
 }
 
 impl<S> Reassembler<S> {
-    /// Holds nothing. [`open`](ReassemblyLimits::open), [`open_per_sender`](ReassemblyLimits::open_per_sender) and
-    /// [`open_per_writer`](ReassemblyLimits::open_per_writer) count as 1 when they are 0.
+    /// Creates an empty reassembler. The limits [`open`](ReassemblyLimits::open),
+    /// [`open_per_sender`](ReassemblyLimits::open_per_sender) and
+    /// [`open_per_writer`](ReassemblyLimits::open_per_writer) are at least 1.
     #[must_use]
     pub const fn new(limits: ReassemblyLimits) -> Self {
         Self {
@@ -263,7 +271,7 @@ impl<S> Reassembler<S> {
         }
     }
 
-    /// Gives up the wholes that are too old.
+    /// Gives up expired wholes.
     pub fn expire(&mut self, now: Duration) {
         let age = self.limits.age;
         let is_old = |since: Duration| now.saturating_sub(since) >= age;
@@ -275,33 +283,35 @@ impl<S> Reassembler<S> {
         }
     }
 
-    /// When [`expire`](Self::expire) has something to give up; `None` while no whole is incomplete.
+    /// Returns the time of the next [`expire`](Self::expire), or `None` if no whole is incomplete.
     #[must_use]
     pub fn poll_timeout(&self) -> Option<Duration> {
         let oldest = self.open.front()?;
         Some(oldest.since.saturating_add(self.limits.age))
     }
 
-    /// The next whole that was given up; to be asked after each [`receive_from`](Self::receive_from) and
-    /// [`expire`](Self::expire) until there is none. No more than [`ReassemblyLimits::open`] are kept for who does not.
+    /// Returns the next whole that was given up. Call it after each
+    /// [`receive_from`](Self::receive_from) and [`expire`](Self::expire) until it returns `None`.
+    /// About [`ReassemblyLimits::open`] entries are kept; older entries are dropped.
     pub fn poll_given_up(&mut self) -> Option<GivenUp<S>> {
         self.given_up.pop_front()
     }
 
-    /// What became of the chunks and wholes so far.
+    /// Returns the counters of chunks and wholes.
     #[must_use]
     pub const fn counters(&self) -> &ReassemblyCounters {
         &self.counters
     }
 
-    /// Bytes held for incomplete wholes with their bookkeeping, never more than [`ReassemblyLimits::total`]; the
-    /// buffer of the last whole is not among them.
+    /// Returns the bytes held for incomplete wholes, including overhead. The value never exceeds
+    /// [`ReassemblyLimits::total`]; the buffer of the last whole is not included.
     #[must_use]
     pub const fn held(&self) -> usize {
         self.held
     }
 
-    /// Moves out the buffer with the whole that was completed last; empty when that was a single chunk.
+    /// Takes the buffer with the last completed whole. The buffer is empty if the whole was a
+    /// single chunk.
     #[must_use]
     pub fn take_whole(&mut self) -> Vec<u8> {
         std::mem::take(&mut self.whole)
@@ -317,7 +327,8 @@ impl<S> Reassembler<S> {
         Step::Complete
     }
 
-    /// Refuses a chunk of the completed whole at `at`; else its number is in use again.
+    /// Rejects a repeated chunk of the completed whole at `at`. Otherwise removes the whole,
+    /// because its number is in use again.
     fn forget_unless_same(&mut self, at: usize, chunk: &Chunk<'_>) -> Result<(), ChunkRefusal> {
         if self.done.get(at).is_some_and(|done| done.had(chunk)) {
             return Err(ChunkRefusal::Duplicate);
@@ -338,7 +349,7 @@ impl<S> Reassembler<S> {
         }
     }
 
-    /// Makes the place of the oldest completed whole free; false when there is none.
+    /// Removes the oldest completed whole. Returns false if there is none.
     fn forget_oldest(&mut self) -> bool {
         let Some(done) = self.done.pop_front() else {
             return false;
@@ -353,7 +364,8 @@ impl<S> Reassembler<S> {
         };
         self.held -= open.cost();
         self.counters.count_given_up(why);
-        // One call gives up no more than were open, so that nothing is lost to who asks after each.
+        // A single call gives up at most the open wholes, so a caller that polls after each call
+        // misses no entry.
         if self.given_up.len() > self.limits.open {
             self.given_up.pop_front();
         }
@@ -362,11 +374,11 @@ impl<S> Reassembler<S> {
 }
 
 impl<S: Copy + Ord> Reassembler<S> {
-    /// Takes a chunk; the whole when it was the last that was missing. `now` is the time since a start that is the
-    /// same for all calls.
+    /// Handles a chunk. Returns the whole if this was the last missing chunk. `now` counts from any
+    /// fixed time.
     ///
     /// # Errors
-    /// [`ChunkRefusal`] when the chunk is not taken. It says nothing of the other chunks.
+    /// [`ChunkRefusal`] if the chunk is rejected. Other chunks are not affected.
     pub fn receive_from<'r>(
         &'r mut self,
         sender: S,
@@ -432,7 +444,7 @@ impl<S: Copy + Ord> Reassembler<S> {
         Ok((chunk, step))
     }
 
-    /// Puts the chunk into the whole at `at`; where the whole then stands.
+    /// Adds the chunk to the whole at `at`. Returns the new index of the whole.
     fn extend(
         &mut self,
         at: usize,
@@ -466,7 +478,7 @@ impl<S: Copy + Ord> Reassembler<S> {
         }
     }
 
-    /// Begins a whole with its first chunk; where it stands.
+    /// Starts a whole with its first chunk. Returns the index of the whole.
     fn begin(
         &mut self,
         key: &KeyRef<'_, S>,
@@ -499,8 +511,9 @@ impl<S: Copy + Ord> Reassembler<S> {
         Ok(self.open.len() - 1)
     }
 
-    /// Forgets completed wholes, then gives up what the sender that holds most began first, until the rest fits; before
-    /// that what `sender` began first, until what it holds is within its own limit.
+    /// Gives up the oldest wholes of `sender` until it is within its own limit. Then removes
+    /// completed wholes, and gives up the oldest wholes of the sender that holds the most, until
+    /// the rest is within the total limit.
     fn make_room(&mut self, sender: S) {
         let most = self.limits.total_per_sender;
         while self.held > most {
@@ -523,8 +536,9 @@ impl<S: Copy + Ord> Reassembler<S> {
         }
     }
 
-    /// What the sender began first of whose incomplete wholes `weight` gives the greatest sum. Of several it is `sender`:
-    /// nobody makes place for who holds as much.
+    /// Returns the oldest whole of the sender with the greatest sum of `weight`. If several senders
+    /// have the greatest sum and `sender` is among them, it is `sender`: no other sender makes
+    /// space for a sender that holds as much.
     fn oldest_of_greediest(&self, sender: S, weight: impl Fn(&Open<S>) -> usize) -> Option<usize> {
         let mut sums: BTreeMap<S, usize> = BTreeMap::new();
         for open in &self.open {
@@ -540,11 +554,11 @@ impl<S: Copy + Ord> Reassembler<S> {
 }
 
 impl<'r> Reassembled<'r> {
-    /// Reads the header of the DataSetMessage.
+    /// Decodes the DataSetMessage.
     ///
     /// # Errors
-    /// [`DecodeError::Misread`] for a discovery message, else as
-    /// [`NetworkMessage::messages`] for a message that is malformed.
+    /// [`DecodeError::Misread`] for a discovery message; otherwise as [`NetworkMessage::messages`]
+    /// for a malformed message.
     pub fn data_set_message(&self) -> Result<DataSetMessage<'r>, DecodeError> {
         match self.message_type {
             NetworkMessageType::DataSet => DataSetMessage::decode(self.writer_id, self.bytes),
@@ -585,7 +599,8 @@ impl ReassemblyCounters {
 mod tests {
     use super::*;
 
-    /// A signed chunk of DataSetWriter 10: two bytes of a whole of four, and a signature of one byte.
+    /// A signed chunk of DataSetWriter 10: two of four bytes of a whole, and a signature of one
+    /// byte.
     const SIGNED: [u8; 26] = [
         0xC1, 0x90, 0x01, 10, 0, // flags, DataSetWriterId
         0x01, 7, 0, 0, 0, 1, 0xEE, // signed, token 7, a nonce of one byte

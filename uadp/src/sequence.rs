@@ -1,9 +1,10 @@
-//! SequenceNumbers: which message is newer, which one came before, which number is next (OPC 10000-14, 7.2.3).
+//! SequenceNumbers: order of received numbers, duplicates, and assignment of numbers (OPC 10000-14,
+//! 7.2.3).
 
-/// Where a received SequenceNumber stands to the last processed one (OPC 10000-14, 7.2.3).
+/// Relation of a received SequenceNumber to the last processed number (OPC 10000-14, 7.2.3).
 ///
-/// With N bits, `(received - 1 - last) modulo 2^N` below 2^(N-2) is newer, above 2^N - 2^(N-2) older or the same,
-/// and anything between is invalid.
+/// With N bits, `(received - 1 - last) modulo 2^N` is newer below 2^(N-2), older or the same above
+/// 2^N - 2^(N-2), and otherwise invalid.
 /// ```
 /// use uadp::SequenceOrder;
 ///
@@ -15,31 +16,32 @@
 /// ```
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum SequenceOrder {
-    /// To be processed. So many numbers between the two were not received.
+    /// Newer: process the message. The field is the number of missing numbers in between.
     Newer {
-        /// 0 when the received number is the next one.
+        /// 0 if the received number is the next number.
         missed: u32,
     },
-    /// The last processed one once more.
+    /// Equal to the last processed number.
     Same,
-    /// To be ignored unless late messages are wanted.
+    /// Older: ignore the message, unless late messages are accepted.
     Older {
-        /// How far behind the last one, at least 1.
+        /// Distance to the last number, at least 1.
         by: u32,
     },
-    /// So far away that neither can be told; to be ignored.
+    /// Too far away to be newer or older; ignore the message.
     Invalid,
 }
 
 impl SequenceOrder {
-    /// For the UInt16 of NetworkMessages, DataSetMessages and chunks.
+    /// Compares UInt16 numbers of NetworkMessages, DataSetMessages and chunks.
     #[must_use]
     pub const fn of_u16(last: u16, received: u16) -> Self {
         let distance = received.wrapping_sub(1).wrapping_sub(last);
         Self::classify(distance as u32, u16::MAX as u32)
     }
 
-    /// For the UInt32 in the MessageNonce of the AES-CTR policies (OPC 10000-14, 7.2.4.4.3.2).
+    /// Compares UInt32 numbers in the MessageNonce of the AES-CTR policies (OPC 10000-14,
+    /// 7.2.4.4.3.2).
     #[must_use]
     pub const fn of_u32(last: u32, received: u32) -> Self {
         let distance = received.wrapping_sub(1).wrapping_sub(last);
@@ -61,69 +63,70 @@ impl SequenceOrder {
     }
 }
 
-/// The SequenceNumbers a sender hands out: from 0, each one more than the one before, 0 after 65535
-/// (OPC 10000-14, 7.2.3).
+/// SequenceNumbers of a sender: start at 0, increase by 1, and continue with 0 after 65535 (OPC
+/// 10000-14, 7.2.3).
 ///
-/// One counts the DataSetMessages of a DataSetWriter, one the NetworkMessages of a WriterGroup, one the
-/// announcements of a publisher.
+/// There are separate counters for the DataSetMessages of a DataSetWriter, for the NetworkMessages
+/// of a WriterGroup, and for the announcements of a publisher.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub struct SequenceCounter {
     next: u16,
 }
 
 impl SequenceCounter {
-    /// A counter that goes on where an earlier one stopped.
+    /// Creates a counter that continues an earlier counter.
     #[must_use]
     pub const fn starting_at(next: u16) -> Self {
         Self { next }
     }
 
-    /// The number the next message will have; what a keep-alive carries (OPC 10000-14, 7.2.4.5.8).
+    /// Returns the number of the next message, which a keep-alive carries (OPC 10000-14,
+    /// 7.2.4.5.8).
     #[must_use]
     pub const fn peek(&self) -> u16 {
         self.next
     }
 
-    /// Uses up the next number.
+    /// Returns the next number and advances the counter.
     pub const fn take(&mut self) -> u16 {
         let number = self.next;
         self.advance(1);
         number
     }
 
-    /// Uses up `count` numbers, such as those of the NetworkMessages of several chunks.
+    /// Uses up `count` numbers, for example of the NetworkMessages of several chunks.
     pub const fn advance(&mut self, count: u16) {
         self.next = self.next.wrapping_add(count);
     }
 }
 
-/// The last SequenceNumber and which of the [`REACH`] numbers up to it were received.
+/// The last SequenceNumber, and which of the [`REACH`] numbers up to it were received.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct SequenceWindow {
     last: u16,
-    /// Bit n stands for `last - n`.
+    /// Bit n represents `last - n`.
     seen: u64,
 }
 
-/// Where a number falls in a [`SequenceWindow`].
+/// Position of a number relative to a [`SequenceWindow`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Place {
     Newer {
         missed: u16,
     },
     Seen,
-    /// Not received so far, as far as the window reaches.
+    /// Not received, as far as the window reaches.
     Behind {
         by: u16,
     },
     Invalid,
 }
 
-/// How many numbers a [`SequenceWindow`] remembers.
+/// Number of sequence numbers that a [`SequenceWindow`] remembers.
 pub(crate) const REACH: u16 = 64;
 
 impl SequenceWindow {
-    /// `number` was received.
+    /// Creates a window in which `number` was received.
     pub(crate) const fn at(number: u16) -> Self {
         Self {
             last: number,
@@ -131,7 +134,7 @@ impl SequenceWindow {
         }
     }
 
-    /// The next number is to be `next`; none before it was received.
+    /// Creates a window in which `next` is expected and no earlier number was received.
     pub(crate) const fn before(next: u16) -> Self {
         Self {
             last: next.wrapping_sub(1),
@@ -150,12 +153,12 @@ impl SequenceWindow {
         }
     }
 
-    /// True for the newest number, received or not.
+    /// Returns true for the newest number, received or not.
     pub(crate) const fn is_last(&self, number: u16) -> bool {
         self.last == number
     }
 
-    /// How far `number` is behind the newest one.
+    /// Returns the distance of `number` to the newest number.
     pub(crate) const fn distance(&self, number: u16) -> u16 {
         self.last.wrapping_sub(number)
     }
@@ -167,7 +170,7 @@ impl SequenceWindow {
         }
     }
 
-    /// Takes note of a received number, one [`place`](Self::place) calls newer or behind.
+    /// Records a number for which [`place`](Self::place) returns newer or behind.
     pub(crate) fn receive(&mut self, number: u16) {
         match self.place(number) {
             Place::Newer { missed } => {
@@ -180,7 +183,7 @@ impl SequenceWindow {
         }
     }
 
-    /// Moves on to the number before `next` without having received it.
+    /// Advances to the number before `next` without marking it as received.
     pub(crate) fn expect(&mut self, next: u16) {
         let last = next.wrapping_sub(1);
         self.shift(last.wrapping_sub(self.last));
@@ -192,7 +195,7 @@ impl SequenceWindow {
     }
 }
 
-/// A distance between two UInt16, which is always below 2^16.
+/// Converts a distance between two UInt16, which is always below 2^16.
 fn saturated(distance: u32) -> u16 {
     u16::try_from(distance).unwrap_or(u16::MAX)
 }
@@ -201,7 +204,7 @@ fn saturated(distance: u32) -> u16 {
 mod tests {
     use super::*;
 
-    /// The formula and the bounds of 7.2.3 in numbers that cannot overflow.
+    /// Formula and bounds of 7.2.3, computed without overflow.
     fn by_the_book(bits: u32, last: u32, received: u32) -> SequenceOrder {
         let range = 1_i64 << bits;
         let result = (i64::from(received) - 1 - i64::from(last)).rem_euclid(range);

@@ -11,46 +11,47 @@ pub enum PubSubState {
     Paused = 1,
     /// Working.
     Operational = 2,
-    /// Enabled, but something is wrong.
+    /// Enabled, but in error.
     Error = 3,
-    /// Enabled, and busy with what it needs to become Operational.
+    /// Enabled, and becoming Operational.
     PreOperational = 4,
 }
 
-/// What makes a component change its state (OPC 10000-14, 6.2.1, Table 2).
+/// Event that changes the state of a component (OPC 10000-14, 6.2.1, Table 2).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum StateEvent {
-    /// Enabled, below a parent in the given state.
+    /// The component is enabled, below a parent in the given state.
     Enable {
         /// State of the parent component.
         parent: PubSubState,
     },
-    /// Disabled.
+    /// The component is disabled.
     Disable,
-    /// The parent is now in this state.
+    /// The parent changed to this state.
     Parent(PubSubState),
-    /// The steps to Operational are done: network and keys, or a reader's first key frame or event.
+    /// The component is ready: network and keys are available, or a reader received its first key
+    /// frame or event.
     Ready,
-    /// Something is wrong.
+    /// An error occurred.
     Fail,
-    /// Nothing is wrong any more, and the component works again at once.
+    /// The error is resolved, and the component is Operational again.
     Resolve,
-    /// Nothing is wrong any more, but the steps to Operational are to be done again.
+    /// The error is resolved, but the component has to become Operational again.
     Restart,
 }
 
-/// The event has no place in the state.
+/// Error of an event that is not valid in the state.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, thiserror::Error)]
 #[error("{event:?} refused in state {state:?}")]
 pub struct StateRefused {
-    /// The state, which stays as it is.
+    /// The state, which is unchanged.
     pub state: PubSubState,
-    /// What was to change it.
+    /// The rejected event.
     pub event: StateEvent,
 }
 
 impl PubSubState {
-    /// State of a value of the enumeration; `None` above 4.
+    /// Returns the state of an enumeration value, or `None` above 4.
     #[must_use]
     pub const fn from_value(value: u8) -> Option<Self> {
         Some(match value {
@@ -63,12 +64,13 @@ impl PubSubState {
         })
     }
 
-    /// The state after `event`: the transitions of OPC 10000-14, 6.2.1, Table 2. A parent's change that the table does
-    /// not name, such as to Error, leaves the state as it is.
+    /// Returns the state after `event`: the transitions of OPC 10000-14, 6.2.1, Table 2. Parent
+    /// states that the table does not mention, such as Error, do not change the state.
     ///
     /// # Errors
-    /// [`StateRefused`] for what the table does not have: enabling what is not Disabled, disabling what is, `Ready`
-    /// outside of PreOperational, `Fail` in Disabled, Paused and Error, `Resolve` and `Restart` outside of Error.
+    /// [`StateRefused`] for transitions that are not in the table: `Enable` outside of Disabled,
+    /// `Disable` in Disabled, `Ready` outside of PreOperational, `Fail` in Disabled, Paused and
+    /// Error, `Resolve` and `Restart` outside of Error.
     pub const fn next(self, event: StateEvent) -> Result<Self, StateRefused> {
         Ok(match (self, event) {
             (Self::Disabled, StateEvent::Enable { parent }) => match parent {
@@ -94,8 +96,8 @@ impl PubSubState {
         })
     }
 
-    /// True in the states that take part in the traffic: Operational, PreOperational, and Error, which a component
-    /// leaves by what it receives.
+    /// Returns true if the component takes part in the communication: in Operational,
+    /// PreOperational, and Error, because received messages can resolve an Error.
     #[must_use]
     pub const fn is_active(self) -> bool {
         match self {
@@ -105,10 +107,11 @@ impl PubSubState {
     }
 }
 
-/// The state of a component below a parent, such as a DataSetWriter below its WriterGroup below its
+/// State of a component below a parent, such as a DataSetWriter below its WriterGroup below its
 /// PubSubConnection (OPC 10000-14, 6.2.1, Figure 22).
 ///
-/// Each change of a parent is told to its children by [`set_parent`](Self::set_parent), from the top down.
+/// The owner passes each change of a parent to its children with [`set_parent`](Self::set_parent),
+/// from the top down.
 /// ```
 /// use uadp::{PubSubState, StateEvent, StateMachine};
 ///
@@ -138,7 +141,7 @@ pub struct StateMachine {
 }
 
 impl StateMachine {
-    /// A component in Disabled, below a parent in the given state.
+    /// Creates a component in Disabled, below a parent in the given state.
     #[must_use]
     pub const fn new(parent: PubSubState) -> Self {
         Self {
@@ -147,10 +150,10 @@ impl StateMachine {
         }
     }
 
-    /// Takes the event; the new state.
+    /// Handles the event, and returns the new state.
     ///
     /// # Errors
-    /// As [`PubSubState::next`]; the state is then as before.
+    /// As [`PubSubState::next`]; the state is then unchanged.
     pub const fn handle(&mut self, event: StateEvent) -> Result<PubSubState, StateRefused> {
         match self.state.next(event) {
             Ok(state) => {
@@ -161,10 +164,10 @@ impl StateMachine {
         }
     }
 
-    /// Enables the component: to Paused or PreOperational.
+    /// Enables the component, which becomes Paused or PreOperational.
     ///
     /// # Errors
-    /// [`StateRefused`] when it is enabled.
+    /// [`StateRefused`] if the component is enabled already.
     pub const fn enable(&mut self) -> Result<PubSubState, StateRefused> {
         self.handle(StateEvent::Enable {
             parent: self.parent,
@@ -174,30 +177,30 @@ impl StateMachine {
     /// Disables the component.
     ///
     /// # Errors
-    /// [`StateRefused`] when it is disabled.
+    /// [`StateRefused`] if the component is disabled already.
     pub const fn disable(&mut self) -> Result<PubSubState, StateRefused> {
         self.handle(StateEvent::Disable)
     }
 
-    /// Takes note of the parent's state; the own state that follows.
+    /// Sets the state of the parent, and returns the resulting state of the component.
     pub const fn set_parent(&mut self, parent: PubSubState) -> PubSubState {
         self.parent = parent;
         self.settle(StateEvent::Parent(parent));
         self.state
     }
 
-    /// Takes the event if it has a place in the state; false when it has none.
+    /// Handles the event. Returns false if the event is not valid in the state.
     pub(crate) const fn settle(&mut self, event: StateEvent) -> bool {
         self.handle(event).is_ok()
     }
 
-    /// The state of the component.
+    /// Returns the state of the component.
     #[must_use]
     pub const fn state(&self) -> PubSubState {
         self.state
     }
 
-    /// The state the parent was last said to be in.
+    /// Returns the last known state of the parent.
     #[must_use]
     pub const fn parent(&self) -> PubSubState {
         self.parent

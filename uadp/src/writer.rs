@@ -1,21 +1,22 @@
-//! Appending to a buffer, and patching what only the end of a section tells.
+//! Appends to a buffer, and patches values that are known only at the end of a section.
 
 use crate::{BuiltinType, EncodeError};
 
-/// Room at the end of a buffer for a few small values: a buffer that may grow at every value costs more.
+/// Space at the end of a buffer for a few small values. Checking the capacity for every value costs
+/// more.
 pub(crate) struct Room<'b, const CAPACITY: usize> {
     bytes: &'b mut [u8; CAPACITY],
     len: usize,
 }
 
 impl<const CAPACITY: usize> Room<'_, CAPACITY> {
-    /// Bytes used.
+    /// Returns the number of used bytes.
     #[inline]
     pub(crate) const fn len(&self) -> usize {
         self.len
     }
 
-    /// The next value. `CAPACITY` has to hold all of them.
+    /// Appends a value. `CAPACITY` has to suffice for all values.
     #[inline]
     pub(crate) fn put<const N: usize>(&mut self, value: [u8; N]) {
         let place = self.bytes.get_mut(self.len..);
@@ -28,7 +29,7 @@ impl<const CAPACITY: usize> Room<'_, CAPACITY> {
     }
 }
 
-/// Appends what `fill` puts into the room, at most `CAPACITY` bytes.
+/// Appends the bytes that `fill` writes, at most `CAPACITY`.
 #[inline]
 pub(crate) fn with_room<const CAPACITY: usize, T>(
     out: &mut Vec<u8>,
@@ -44,7 +45,8 @@ pub(crate) fn with_room<const CAPACITY: usize, T>(
     Some(filled)
 }
 
-/// A fixed-size value, with the encoding byte of a Variant before it when `TAGGED`: one reserve, one copy.
+/// Appends a fixed-size value, after the encoding byte of a Variant if `TAGGED`: one reserve, one
+/// copy.
 #[inline]
 pub(crate) fn fixed<const TAGGED: bool, const N: usize>(
     out: &mut Vec<u8>,
@@ -52,7 +54,7 @@ pub(crate) fn fixed<const TAGGED: bool, const N: usize>(
     value: [u8; N],
 ) {
     if TAGGED {
-        // Sized for the longest fixed value, the Guid; the compiler keeps the part in use only.
+        // The size fits the longest fixed value, a Guid. The compiler keeps only the used part.
         let mut cell = [0; 17];
         if let Some((tag, rest)) = cell.split_first_mut() {
             *tag = builtin.id();
@@ -66,7 +68,7 @@ pub(crate) fn fixed<const TAGGED: bool, const N: usize>(
     }
 }
 
-/// Length of a String, ByteString, body or array as the standard's Int32.
+/// Returns the Int32 length of a String, ByteString, body or array.
 #[inline]
 pub(crate) fn int32_length(len: usize, what: &'static str) -> Result<[u8; 4], EncodeError> {
     match i32::try_from(len) {
@@ -75,7 +77,7 @@ pub(crate) fn int32_length(len: usize, what: &'static str) -> Result<[u8; 4], En
     }
 }
 
-/// String or ByteString (OPC 10000-6, 5.2.2.4 and 5.2.2.7); `None` is null.
+/// Appends a String or ByteString (OPC 10000-6, 5.2.2.4 and 5.2.2.7); `None` is null.
 #[inline]
 pub(crate) fn byte_string(
     out: &mut Vec<u8>,
@@ -94,7 +96,7 @@ pub(crate) fn byte_string(
     Ok(())
 }
 
-/// Replaces the `N` bytes at `at`, which the caller wrote before.
+/// Replaces `N` bytes at `at` that were written before.
 #[inline]
 pub(crate) fn patch<const N: usize>(out: &mut [u8], at: usize, value: [u8; N]) {
     if let Some(place) = out.get_mut(at..).and_then(<[u8]>::first_chunk_mut) {
@@ -102,7 +104,7 @@ pub(crate) fn patch<const N: usize>(out: &mut [u8], at: usize, value: [u8; N]) {
     }
 }
 
-/// `bit` where what it announces is present.
+/// Returns `bit` if the field is present, otherwise 0.
 #[inline]
 pub(crate) const fn flag(present: bool, bit: u8) -> u8 {
     match present {

@@ -1,4 +1,4 @@
-//! When a DataSetWriter sends what, and the state it is in (OPC 10000-14, 6.2.4 and 6.2.6).
+//! Schedule and state of a DataSetWriter (OPC 10000-14, 6.2.4 and 6.2.6).
 
 use std::time::Duration;
 
@@ -7,12 +7,13 @@ use crate::{
     StateMachine, StateRefused,
 };
 
-/// Numbers the DataSetMessages of one DataSetWriter, says when which kind is due, and keeps its state
-/// (OPC 10000-14, 6.2.1, 6.2.4.3, 6.2.6.2 and 6.2.6.3).
+/// Numbers the DataSetMessages of a DataSetWriter, schedules their kinds, and keeps the state of
+/// the writer (OPC 10000-14, 6.2.1, 6.2.4.3, 6.2.6.2 and 6.2.6.3).
 ///
-/// Time is a parameter: how long it is since a start that is the same for all calls. [`poll`](Self::poll) is called
-/// when [`poll_timeout`](Self::poll_timeout) says so, and for events also when there is one. What it names is encoded
-/// with the numbers of [`header`](Self::header), sent, and told to [`sent`](Self::sent).
+/// Times are parameters that count from any fixed time. The caller calls [`poll`](Self::poll) at
+/// [`poll_timeout`](Self::poll_timeout), and for event writers also when there is an event. It
+/// encodes the returned kind with the numbers of [`header`](Self::header), sends the message, and
+/// calls [`sent`](Self::sent).
 /// ```
 /// use std::time::Duration;
 /// use uadp::{DataSetWriterState, MessageKind, PubSubState, WriterSettings};
@@ -44,17 +45,17 @@ pub struct DataSetWriterState {
     machine: StateMachine,
     sequence: SequenceCounter,
     version: ConfigurationVersion,
-    /// Metadata changed and was not announced.
+    /// The metadata changed and was not announced yet.
     unannounced: bool,
-    /// When the next PublishingInterval begins.
+    /// Start of the next PublishingInterval.
     next_interval: Duration,
-    /// PublishingIntervals since the one with the last key frame; `None` when one is needed at once.
+    /// Number of PublishingIntervals after the last key frame; `None` if a key frame is due.
     intervals: Option<u32>,
-    /// When a DataSetMessage was last sent, or a keep-alive last due.
+    /// Time of the last DataSetMessage, or at which a keep-alive was last due.
     spoken_at: Duration,
 }
 
-/// The parameters of a DataSetWriter and its WriterGroup that say when it sends.
+/// Timing parameters of a DataSetWriter and its WriterGroup.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct WriterSettings {
     publishing_interval: Duration,
@@ -62,7 +63,7 @@ pub struct WriterSettings {
     key_frame_count: u32,
 }
 
-/// Parameters the standard does not allow together.
+/// Combination of parameters that the standard does not permit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum WriterSettingsError {
@@ -74,17 +75,18 @@ pub enum WriterSettingsError {
         /// The PublishingInterval.
         publishing_interval: Duration,
     },
-    /// Without a PublishingInterval there is nothing to count key frames by (OPC 10000-14, 6.2.6.2).
+    /// A KeyFrameCount needs a PublishingInterval to count (OPC 10000-14, 6.2.6.2).
     #[error("KeyFrameCount {0} without PublishingInterval")]
     KeyFrameCount(u32),
 }
 
 impl WriterSettings {
-    /// PublishingInterval, KeepAliveTime and KeyFrameCount. A KeyFrameCount of 0 is for events, 1 sends key frames
-    /// only (OPC 10000-14, 6.2.4.3); with a PublishingInterval of zero events are due at once.
+    /// Creates settings from PublishingInterval, KeepAliveTime and KeyFrameCount. A KeyFrameCount
+    /// of 0 is for events, 1 sends key frames only (OPC 10000-14, 6.2.4.3). With a
+    /// PublishingInterval of zero events are due immediately.
     ///
     /// # Errors
-    /// [`WriterSettingsError`] when the standard does not allow them.
+    /// [`WriterSettingsError`] if the standard does not permit the values.
     pub fn new(
         publishing_interval: Duration,
         keep_alive_time: Duration,
@@ -106,19 +108,19 @@ impl WriterSettings {
         })
     }
 
-    /// PublishingInterval (OPC 10000-14, 6.2.6.2).
+    /// Returns the PublishingInterval (OPC 10000-14, 6.2.6.2).
     #[must_use]
     pub const fn publishing_interval(&self) -> Duration {
         self.publishing_interval
     }
 
-    /// KeepAliveTime (OPC 10000-14, 6.2.6.3).
+    /// Returns the KeepAliveTime (OPC 10000-14, 6.2.6.3).
     #[must_use]
     pub const fn keep_alive_time(&self) -> Duration {
         self.keep_alive_time
     }
 
-    /// KeyFrameCount (OPC 10000-14, 6.2.4.3).
+    /// Returns the KeyFrameCount (OPC 10000-14, 6.2.4.3).
     #[must_use]
     pub const fn key_frame_count(&self) -> u32 {
         self.key_frame_count
@@ -126,7 +128,8 @@ impl WriterSettings {
 }
 
 impl DataSetWriterState {
-    /// A writer in Disabled, below a WriterGroup in the given state. Its first message has sequence number 0.
+    /// Creates a writer in Disabled, below a WriterGroup in the given state. Its first message has
+    /// sequence number 0.
     #[must_use]
     pub const fn new(settings: WriterSettings, parent: PubSubState) -> Self {
         Self {
@@ -141,8 +144,8 @@ impl DataSetWriterState {
         }
     }
 
-    /// The same writer, going on with the sequence number and the version of an earlier life, so that readers take it
-    /// for the same at once (OPC 10000-14, 7.2.3).
+    /// Continues with the sequence number and version of an earlier instance, so that readers
+    /// immediately accept its messages (OPC 10000-14, 7.2.3).
     #[must_use]
     pub const fn resuming(self, sequence: SequenceCounter, version: ConfigurationVersion) -> Self {
         Self {
@@ -152,11 +155,12 @@ impl DataSetWriterState {
         }
     }
 
-    /// What is to be sent now. `changed` says whether a field changed since the last DataSetMessage, of a writer of
-    /// events whether one waits. A kind is named once per PublishingInterval or KeepAliveTime, sent or not; a key
-    /// frame that was due and not sent is due again with the next interval.
+    /// Returns the kind of message that is due. `changed` states whether a field changed after the
+    /// last DataSetMessage, or for event writers whether an event is pending. A kind is returned
+    /// once per PublishingInterval or KeepAliveTime, even if it is not sent. A key frame that was
+    /// due and not sent is due again in the next interval.
     ///
-    /// A delta frame bigger than a key frame would be is to be sent as one (OPC 10000-14, 7.2.4.5.6).
+    /// Send a key frame instead of a delta frame that would be larger (OPC 10000-14, 7.2.4.5.6).
     pub fn poll(&mut self, now: Duration, changed: bool) -> Option<MessageKind> {
         if self.machine.state() != PubSubState::Operational {
             return None;
@@ -172,7 +176,7 @@ impl DataSetWriterState {
         Some(MessageKind::KeepAlive)
     }
 
-    /// Takes note that a DataSetMessage was sent with the numbers of [`header`](Self::header).
+    /// Records that a DataSetMessage was sent with the numbers of [`header`](Self::header).
     pub const fn sent(&mut self, kind: MessageKind, now: Duration) {
         self.spoken_at = now;
         match kind {
@@ -185,7 +189,8 @@ impl DataSetWriterState {
         }
     }
 
-    /// When [`poll`](Self::poll) has something to say, or a PublishingInterval begins; `None` unless Operational.
+    /// Returns the time of the next message or of the next PublishingInterval; `None` unless
+    /// Operational.
     #[must_use]
     pub fn poll_timeout(&self) -> Option<Duration> {
         if self.machine.state() != PubSubState::Operational {
@@ -198,9 +203,9 @@ impl DataSetWriterState {
         })
     }
 
-    /// The numbers of the next DataSetMessage, whatever its kind: a keep-alive has the number of the message after it
-    /// (OPC 10000-14, 7.2.4.5.8). Which of them go on the wire is for the DataSetMessageContentMask to say
-    /// (6.3.1.3.2).
+    /// Returns the numbers of the next DataSetMessage of any kind. A keep-alive has the number of
+    /// the message after it (OPC 10000-14, 7.2.4.5.8). The DataSetMessageContentMask selects the
+    /// encoded fields (6.3.1.3.2).
     #[must_use]
     pub fn header(&self) -> DataSetHeader {
         DataSetHeader {
@@ -211,53 +216,55 @@ impl DataSetWriterState {
         }
     }
 
-    /// The version of the metadata.
+    /// Returns the version of the metadata.
     #[must_use]
     pub const fn version(&self) -> ConfigurationVersion {
         self.version
     }
 
-    /// The sequence numbers, for [`resuming`](Self::resuming).
+    /// Returns the sequence numbers, for [`resuming`](Self::resuming).
     #[must_use]
     pub const fn sequence(&self) -> SequenceCounter {
         self.sequence
     }
 
-    /// The metadata changed as [`ConfigurationVersion::changed`] says, at the VersionTime `at`: a key frame and an
-    /// announcement are due.
+    /// Changes the version as [`ConfigurationVersion::changed`], at the VersionTime `at`: a key
+    /// frame and an announcement are due.
     pub fn change_metadata(&mut self, at: u32) {
         self.set_version(self.version.changed(at));
     }
 
-    /// Fields were added at the end, at the VersionTime `at`: a key frame and an announcement are due.
+    /// Changes the version for fields added at the end, at the VersionTime `at`: a key frame and an
+    /// announcement are due.
     pub fn extend_metadata(&mut self, at: u32) {
         self.set_version(self.version.extended(at));
     }
 
-    /// True once after the metadata changed: it is to be announced without being asked for
-    /// (OPC 10000-14, 7.2.4.6.4).
+    /// Returns true once after the metadata changed: it has to be announced without a probe (OPC
+    /// 10000-14, 7.2.4.6.4).
     #[must_use = "the announcement is not asked for again"]
     pub const fn take_announcement(&mut self) -> bool {
         std::mem::replace(&mut self.unannounced, false)
     }
 
-    /// Enables the writer; the new state, Paused or PreOperational.
+    /// Enables the writer, and returns the new state, Paused or PreOperational.
     ///
     /// # Errors
-    /// [`StateRefused`] when it is enabled.
+    /// [`StateRefused`] if the writer is enabled already.
     pub const fn enable(&mut self) -> Result<PubSubState, StateRefused> {
         self.machine.enable()
     }
 
-    /// Disables the writer. Its sequence numbers go on when it is enabled again.
+    /// Disables the writer. Its sequence numbers continue when it is enabled again.
     ///
     /// # Errors
-    /// [`StateRefused`] when it is disabled.
+    /// [`StateRefused`] if the writer is disabled already.
     pub const fn disable(&mut self) -> Result<PubSubState, StateRefused> {
         self.machine.disable()
     }
 
-    /// All is there that the writer needs, network and keys: Operational, and a key frame is due.
+    /// Reports that network and keys are available: the writer becomes Operational, and a key frame
+    /// is due.
     ///
     /// # Errors
     /// [`StateRefused`] outside of PreOperational.
@@ -267,7 +274,7 @@ impl DataSetWriterState {
         Ok(state)
     }
 
-    /// Something is wrong: Error, and nothing is sent.
+    /// Reports an error: the writer changes to Error and sends nothing.
     ///
     /// # Errors
     /// [`StateRefused`] in Disabled, Paused and Error.
@@ -275,7 +282,7 @@ impl DataSetWriterState {
         self.machine.handle(StateEvent::Fail)
     }
 
-    /// Nothing is wrong any more: Operational, and a key frame is due.
+    /// Reports that the error is resolved: the writer becomes Operational, and a key frame is due.
     ///
     /// # Errors
     /// [`StateRefused`] outside of Error.
@@ -285,18 +292,18 @@ impl DataSetWriterState {
         Ok(state)
     }
 
-    /// Takes note of the WriterGroup's state; the own state that follows.
+    /// Sets the state of the WriterGroup, and returns the resulting state of the writer.
     pub const fn set_parent(&mut self, parent: PubSubState) -> PubSubState {
         self.machine.set_parent(parent)
     }
 
-    /// The state of the DataSetWriter.
+    /// Returns the state of the DataSetWriter.
     #[must_use]
     pub const fn state(&self) -> PubSubState {
         self.machine.state()
     }
 
-    /// When it sends.
+    /// Returns the settings.
     #[must_use]
     pub const fn settings(&self) -> &WriterSettings {
         &self.settings
@@ -314,8 +321,8 @@ impl DataSetWriterState {
         self.intervals = None;
     }
 
-    /// Whether a PublishingInterval began since the last call. Intervals that passed unnoticed count for the key
-    /// frames; the grid they lie on stays.
+    /// Returns true if a PublishingInterval started after the last call. Skipped intervals count
+    /// for the key frames; the interval grid is unchanged.
     fn begin_interval(&mut self, now: Duration) -> bool {
         let interval = self.settings.publishing_interval;
         if interval.is_zero() || now < self.next_interval {
@@ -331,7 +338,7 @@ impl DataSetWriterState {
         true
     }
 
-    /// The kind of DataSetMessage that is due, apart from keep-alives.
+    /// Returns the kind of DataSetMessage that is due, except keep-alives.
     fn data_due(&self, begins: bool, changed: bool) -> Option<MessageKind> {
         match self.settings.key_frame_count {
             0 => {

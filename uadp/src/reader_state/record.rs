@@ -1,9 +1,9 @@
-//! Which sequence numbers of a writer were received.
+//! Received sequence numbers of a writer.
 
 use crate::sequence::{Place, REACH, SequenceWindow};
 use crate::{Accepted, Arrival, MessageKind, ReaderDrop};
 
-/// The sequence numbers received so far.
+/// Sequence numbers received so far.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Record {
     pub(super) of: Numbers,
@@ -12,7 +12,7 @@ pub(super) struct Record {
     position: usize,
 }
 
-/// Whose sequence numbers tell the messages apart.
+/// Kind of the sequence numbers that identify messages.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Numbers {
     DataSetMessages,
@@ -20,7 +20,7 @@ pub(super) enum Numbers {
 }
 
 impl Numbers {
-    /// The number that tells the message apart, if it has one.
+    /// Returns the number that identifies the message, if there is one.
     pub(super) fn of(arrival: &Arrival) -> Option<(Self, u16)> {
         let own = arrival.header.sequence_number;
         let group = arrival.group.sequence_number;
@@ -41,7 +41,7 @@ impl Record {
         }
     }
 
-    /// The record with the message in it, and how that stands to the ones before.
+    /// Returns the record with the message, and the relation of the message to earlier messages.
     pub(super) fn place(
         mut self,
         number: u16,
@@ -54,12 +54,12 @@ impl Record {
         let mut accepted = Accepted::default();
         match self.window.place(number) {
             Place::Newer { missed } => {
-                // A NetworkMessage that is missing need not have had a message of this writer.
+                // A missing NetworkMessage may not have contained a message of this writer.
                 if self.of == Numbers::DataSetMessages {
                     accepted.missed = missed;
                 }
             }
-            // The next of several messages in one NetworkMessage.
+            // Another message of the same NetworkMessage.
             Place::Seen if self.is_same_network_message(number, arrival) => {}
             Place::Seen => return Err(ReaderDrop::Duplicate),
             Place::Behind { by } if accept_late && by < REACH => {
@@ -81,7 +81,7 @@ impl Record {
             && arrival.position > self.position
     }
 
-    /// Takes note of a keep-alive: `next` is the number of the message to come.
+    /// Records a keep-alive: `next` is the number of the next message.
     fn expect(mut self, next: u16) -> Result<(Self, Accepted), ReaderDrop> {
         let mut accepted = Accepted::default();
         let last = next.wrapping_sub(1);

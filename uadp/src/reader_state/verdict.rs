@@ -1,71 +1,72 @@
-//! What becomes of a message, and how often.
+//! Results and counters of received messages.
 
 use crate::MessageKind;
 
-/// How an accepted message stands to the ones before.
+/// Relation of an accepted message to earlier messages.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub struct Accepted {
-    /// Messages of the writer that should have come before it and did not.
+    /// Number of missed messages of the writer before this message.
     pub missed: u16,
-    /// It came after newer ones.
+    /// The message arrived after newer messages.
     pub late: bool,
-    /// The writer started over.
+    /// The writer has restarted.
     pub restarted: bool,
-    /// Messages were missed since the last key frame: fields that are not in this delta frame may be old.
+    /// Messages were missed after the last key frame: fields that are not in this delta frame may
+    /// be outdated.
     pub incomplete: bool,
-    /// Its minor version, where that is not the one of the metadata: it may have more fields or fewer at the end
-    /// (OPC 10000-14, 6.2.3.2.6).
+    /// Minor version of the message if it differs from the metadata: there may be more or fewer
+    /// fields at the end (OPC 10000-14, 6.2.3.2.6).
     pub minor_version: Option<u32>,
 }
 
-/// Why a DataSetMessage was dropped.
+/// Reason why a DataSetMessage was dropped.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, thiserror::Error)]
 #[non_exhaustive]
 pub enum ReaderDrop {
     /// The reader is Disabled or Paused.
     #[error("the reader is not active")]
     Inactive,
-    /// The publisher says it is not valid (OPC 10000-14, 7.2.4.5.4).
+    /// The publisher marks the message as invalid (OPC 10000-14, 7.2.4.5.4).
     #[error("marked as not valid")]
     Invalid,
-    /// The table of readers is full of writers that live.
+    /// The table of readers is full of active writers.
     #[error("no place for another writer")]
     TableFull,
-    /// The PublisherId is too long to be kept in a table.
+    /// The PublisherId is too long for the table.
     #[error("a PublisherId of {len} bytes")]
     PublisherIdTooLong {
-        /// Its length.
+        /// Length of the PublisherId.
         len: usize,
     },
-    /// Another GroupVersion than the configured one, or none.
+    /// The GroupVersion is missing or differs from the configuration.
     #[error("GroupVersion {found:?} where {expected} is configured")]
     GroupVersion {
-        /// The configured one.
+        /// Configured GroupVersion.
         expected: u32,
-        /// That of the group header.
+        /// GroupVersion of the group header.
         found: Option<u32>,
     },
-    /// Another NetworkMessageNumber than the configured one, or none.
+    /// The NetworkMessageNumber is missing or differs from the configuration.
     #[error("NetworkMessageNumber {found:?} where {expected} is configured")]
     NetworkMessageNumber {
-        /// The configured one.
+        /// Configured NetworkMessageNumber.
         expected: u16,
-        /// That of the group header.
+        /// NetworkMessageNumber of the group header.
         found: Option<u16>,
     },
-    /// It came before.
+    /// The message was received before.
     #[error("received before")]
     Duplicate,
-    /// It is older than the newest one, or a keep-alive that is.
+    /// The message or keep-alive is older than the newest message.
     #[error("{behind} behind the newest message")]
     Stale {
-        /// How many numbers behind.
+        /// Distance to the newest sequence number.
         behind: u16,
     },
-    /// Its number is neither newer nor older (OPC 10000-14, 7.2.3).
+    /// The sequence number is neither newer nor older (OPC 10000-14, 7.2.3).
     #[error("a sequence number out of the window")]
     OutOfWindow,
-    /// It is to be decoded with other metadata, which is needed now (OPC 10000-14, 6.2.9.4).
+    /// The message needs other metadata (OPC 10000-14, 6.2.9.4).
     #[error("major version {found} where the metadata has {expected}")]
     MajorVersion {
         /// Major version of the metadata.
@@ -73,25 +74,25 @@ pub enum ReaderDrop {
         /// Major version of the message.
         found: u32,
     },
-    /// A delta frame, and no key frame before it that it belongs to.
+    /// The message is a delta frame without a preceding matching key frame.
     #[error("a delta frame before its key frame")]
     NeedsKeyFrame,
 }
 
-/// What became of the messages of a writer.
+/// Counters of the messages of a writer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub struct ReaderCounters {
-    /// Messages accepted, keep-alives included.
+    /// Accepted messages, including keep-alives.
     pub accepted: u64,
-    /// Keep-alives accepted.
+    /// Accepted keep-alives.
     pub keep_alives: u64,
-    /// Messages missed, by the gaps in the sequence numbers. Those that came late are among them.
+    /// Missed messages, from gaps in the sequence numbers, including messages that arrived late.
     pub missed: u64,
-    /// Messages accepted after newer ones.
+    /// Accepted late messages.
     pub late: u64,
-    /// How often the writer started over.
+    /// Restarts of the writer.
     pub restarts: u64,
-    /// How often the MessageReceiveTimeout passed.
+    /// Passed MessageReceiveTimeouts.
     pub timeouts: u64,
     /// Dropped as [`ReaderDrop::Inactive`].
     pub inactive: u64,
@@ -129,7 +130,7 @@ impl ReaderCounters {
         needs_key_frame: 0,
     };
 
-    /// Counts what the sequence number of a message told, whether it is accepted in the end or not.
+    /// Counts missed messages and restarts, which apply even if the message is dropped later.
     pub(super) fn placed(&mut self, accepted: &Accepted) {
         self.missed += u64::from(accepted.missed);
         self.restarts += u64::from(accepted.restarted);
@@ -143,7 +144,7 @@ impl ReaderCounters {
 
     pub(super) const fn dropped(&mut self, reason: ReaderDrop) {
         let counter = match reason {
-            // The tables count these: there is no reader then.
+            // The tables count these, because there is no reader.
             ReaderDrop::TableFull | ReaderDrop::PublisherIdTooLong { .. } => return,
             ReaderDrop::Inactive => &mut self.inactive,
             ReaderDrop::Invalid => &mut self.invalid,

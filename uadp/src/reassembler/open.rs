@@ -1,4 +1,4 @@
-//! One whole of which chunks are missing.
+//! An incomplete whole.
 
 use std::collections::BTreeMap;
 use std::hash::{DefaultHasher, Hasher};
@@ -8,17 +8,17 @@ use super::{GiveUp, GivenUp};
 use crate::publisher_id::OwnedPublisherId;
 use crate::{Chunk, NetworkMessage, NetworkMessageType, PublisherId};
 
-/// What tells one whole from another.
+/// Identity of a whole.
 #[derive(Debug)]
 pub(super) struct Key<S> {
-    /// Where its chunks come from.
+    /// Sender of its chunks.
     pub(super) sender: S,
     publisher_id: Option<OwnedPublisherId>,
     writer: Writer,
     message_sequence_number: u16,
 }
 
-/// The same for looking up, without owning the PublisherId.
+/// A [`Key`] for lookups, which borrows the PublisherId.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct KeyRef<'a, S> {
     pub(super) sender: S,
@@ -36,39 +36,39 @@ struct Writer {
     encrypted: bool,
 }
 
-/// A whole in pieces.
+/// A whole during reassembly.
 #[derive(Debug)]
 pub(super) struct Open<S> {
     pub(super) key: Key<S>,
     pub(super) total_size: u32,
-    /// When its first chunk came.
+    /// Time of its first chunk.
     pub(super) since: Duration,
-    /// By offset; none touches another's bytes.
+    /// Pieces by offset, without overlaps.
     pieces: BTreeMap<u32, Box<[u8]>>,
-    /// Bytes of the pieces.
+    /// Total bytes of the pieces.
     received: u32,
 }
 
-/// A whole that was complete, by what its chunks are known again.
+/// A completed whole, with the digests of its chunks.
 #[derive(Debug)]
 pub(super) struct Done<S> {
     pub(super) key: Key<S>,
-    /// When it was complete.
+    /// Time of completion.
     pub(super) at: Duration,
     total_size: u32,
-    /// The offsets of the pieces, rising, and their digests.
+    /// Offsets of the pieces in ascending order, and their digests.
     pieces: Box<[(u32, u64)]>,
 }
 
-/// What became of a chunk.
+/// Result of inserting a chunk.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Insertion {
     Taken,
-    /// The same bytes are there.
+    /// The same bytes are present.
     Duplicate,
-    /// Other bytes are in the same place.
+    /// Different bytes are present at the same offset.
     Contradiction,
-    /// A part of its place is taken.
+    /// A part of the range is present.
     Overlap,
     TooMany,
 }
@@ -111,7 +111,7 @@ impl<'a, S: Copy + Eq> KeyRef<'a, S> {
 }
 
 impl<S> Key<S> {
-    /// Bytes it takes, roughly.
+    /// Returns the approximate bytes that the key uses.
     pub(super) fn cost(&self) -> usize {
         let text = match &self.publisher_id {
             Some(OwnedPublisherId::String(text)) => text.len(),
@@ -138,7 +138,7 @@ impl<S> Open<S> {
         }
     }
 
-    /// Keeps the piece, unless it is there or the whole has `limit` pieces.
+    /// Adds the piece, unless it is present or the whole has `limit` pieces.
     pub(super) fn insert(&mut self, chunk: &Chunk<'_>, limit: usize) -> Insertion {
         match self.pieces.get(&chunk.offset) {
             Some(piece) if **piece == *chunk.data => return Insertion::Duplicate,
@@ -167,12 +167,12 @@ impl<S> Open<S> {
             || after.is_some_and(|(at, _)| *at - offset < len)
     }
 
-    /// True when no piece is missing: they do not overlap, so their number of bytes tells.
+    /// Returns true if no piece is missing. Pieces do not overlap, so the number of bytes suffices.
     pub(super) const fn is_complete(&self) -> bool {
         self.received == self.total_size
     }
 
-    /// Replaces the contents of `out` by the pieces.
+    /// Replaces the contents of `out` with the pieces.
     pub(super) fn write(&self, out: &mut Vec<u8>) {
         out.clear();
         out.reserve_exact(self.received as usize);
@@ -181,7 +181,7 @@ impl<S> Open<S> {
         }
     }
 
-    /// What is remembered of it.
+    /// Converts the whole to the entry that is remembered after completion.
     pub(super) fn done(self, at: Duration) -> Done<S> {
         let Self {
             key,
@@ -198,12 +198,13 @@ impl<S> Open<S> {
             key,
             at,
             total_size,
-            // Copied to where the pieces were: behind them it would keep an allocator from giving their room back.
+            // The copy reuses the memory of the pieces. Behind them it would keep the allocator
+            // from releasing their memory.
             pieces: digests.as_slice().into(),
         }
     }
 
-    /// What is told of it when it is not waited for any longer.
+    /// Converts the whole to the entry that reports it as given up.
     pub(super) fn given_up(self, why: GiveUp) -> GivenUp<S> {
         GivenUp {
             sender: self.key.sender,
@@ -217,14 +218,14 @@ impl<S> Open<S> {
         }
     }
 
-    /// Bytes it takes, roughly.
+    /// Returns the approximate bytes that the whole uses.
     pub(super) fn cost(&self) -> usize {
         self.key.cost() + self.received as usize + self.pieces.len() * PIECE_COST
     }
 }
 
 impl<S> Done<S> {
-    /// A whole of one piece.
+    /// Creates the entry of a whole with a single chunk.
     pub(super) fn alone(key: Key<S>, chunk: &Chunk<'_>, at: Duration) -> Self {
         Self {
             key,
@@ -234,7 +235,7 @@ impl<S> Done<S> {
         }
     }
 
-    /// True when one of its pieces was this one.
+    /// Returns true if the chunk is a piece of the whole.
     pub(super) fn had(&self, chunk: &Chunk<'_>) -> bool {
         let pieces = &self.pieces;
         let found = pieces.binary_search_by_key(&chunk.offset, |(at, _)| *at);
@@ -243,7 +244,7 @@ impl<S> Done<S> {
             && piece.is_some_and(|(_, known)| *known == digest(chunk.data))
     }
 
-    /// Bytes it takes, roughly.
+    /// Returns the approximate bytes that the entry uses.
     pub(super) fn cost(&self) -> usize {
         self.key.cost() + self.pieces.len() * size_of::<(u32, u64)>()
     }
@@ -255,7 +256,7 @@ fn digest(piece: &[u8]) -> u64 {
     hasher.finish()
 }
 
-/// A key with its place in a queue, and the empty lists of a whole.
+/// Bytes of a key with its queue entry, and of the empty collections of a whole.
 const KEY_COST: usize = 160;
-/// A piece with its place in the tree and what the allocator adds.
+/// Bytes of a piece with its tree entry and the allocator overhead.
 const PIECE_COST: usize = 96;
