@@ -1,4 +1,4 @@
-//! The builtin types of OPC UA and the small ones among their values.
+//! The builtin types of OPC UA, and their smaller values.
 
 use std::fmt;
 
@@ -35,7 +35,7 @@ pub enum BuiltinType {
 }
 
 impl BuiltinType {
-    /// Every builtin type, in the order of the ids.
+    /// All builtin types, in the order of the ids.
     pub const ALL: [Self; 25] = [
         Self::Boolean,
         Self::SByte,
@@ -64,7 +64,7 @@ impl BuiltinType {
         Self::DiagnosticInfo,
     ];
 
-    /// Builtin type of an id; `None` outside 1 to 25.
+    /// Returns the builtin type with an id, or `None` outside 1 to 25.
     #[inline]
     #[must_use]
     pub const fn from_id(id: u8) -> Option<Self> {
@@ -98,14 +98,14 @@ impl BuiltinType {
         })
     }
 
-    /// Id in the encoding byte of a Variant, 1 to 25.
+    /// Returns the id in the encoding byte of a Variant, 1 to 25.
     #[inline]
     #[must_use]
     pub const fn id(self) -> u8 {
         self as u8
     }
 
-    /// Name in the standard, such as `UInt16`.
+    /// Returns the name in the standard, such as `UInt16`.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -137,13 +137,13 @@ impl BuiltinType {
         }
     }
 
-    /// Builtin type of a [`name`](Self::name), spelled exactly so.
+    /// Returns the builtin type with a [`name`](Self::name); the spelling has to be exact.
     #[must_use]
     pub fn from_name(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|builtin| builtin.name() == name)
     }
 
-    /// Bytes of one value on the wire (OPC 10000-6, 5.2.2), `None` where they vary.
+    /// Returns the encoded size of a value in bytes (OPC 10000-6, 5.2.2), or `None` if variable.
     #[inline]
     #[must_use]
     pub const fn fixed_size(self) -> Option<usize> {
@@ -167,7 +167,8 @@ impl BuiltinType {
         })
     }
 
-    /// Fewest bytes one value takes: what an array length is held against before its elements are read.
+    /// Returns the minimum encoded size of a value in bytes. An array length is checked against it
+    /// before the elements are decoded.
     pub(crate) fn min_size(self) -> usize {
         let least = if matches!(self, Self::QualifiedName) {
             6
@@ -190,12 +191,13 @@ impl fmt::Display for BuiltinType {
     }
 }
 
-/// Guid, its 16 bytes as on the wire: Data1 to Data3 little-endian, Data4 in order (OPC 10000-6, 5.2.2.6).
+/// A Guid in its encoding of 16 bytes: Data1 to Data3 little-endian, Data4 in order (OPC 10000-6,
+/// 5.2.2.6).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
 pub struct Guid(pub [u8; 16]);
 
 impl Guid {
-    /// Guid from the four fields of OPC 10000-6, 5.1.3.
+    /// Creates a Guid from the four fields of OPC 10000-6, 5.1.3.
     #[must_use]
     pub const fn from_fields(data1: u32, data2: u16, data3: u16, data4: [u8; 8]) -> Self {
         let [a, b, c, d] = data1.to_le_bytes();
@@ -206,7 +208,7 @@ impl Guid {
     }
 }
 
-/// The text form of OPC 10000-6, 5.1.3: `72962B91-FA75-4AE6-8D28-B404DC7DAF63`.
+/// Formats the Guid as in OPC 10000-6, 5.1.3: `72962B91-FA75-4AE6-8D28-B404DC7DAF63`.
 impl fmt::Display for Guid {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let [a, b, c, d, e, g, h, i, j, k, l, m, n, o, p, q] = self.0;
@@ -221,7 +223,7 @@ impl fmt::Display for Guid {
     }
 }
 
-/// StatusCode, 32 bits; the two highest are the severity (OPC 10000-4, 7.39).
+/// A StatusCode of 32 bits; the two highest bits are the severity (OPC 10000-4, 7.39).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
 pub struct StatusCode(pub u32);
 
@@ -229,13 +231,14 @@ impl StatusCode {
     /// Good, 0.
     pub const GOOD: Self = Self(0);
 
-    /// StatusCode of a DataSetMessage header, which carries the upper 16 bits (OPC 10000-14, 7.2.4.5.4).
+    /// Returns the StatusCode of a DataSetMessage header, which contains the upper 16 bits (OPC
+    /// 10000-14, 7.2.4.5.4).
     #[must_use]
     pub const fn from_status(status: u16) -> Self {
         Self((status as u32) << 16)
     }
 
-    /// The upper 16 bits, as a DataSetMessage header carries them.
+    /// Returns the upper 16 bits, as in a DataSetMessage header.
     #[must_use]
     pub const fn status(self) -> u16 {
         let [_, _, low, high] = self.0.to_le_bytes();

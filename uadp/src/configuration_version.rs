@@ -1,18 +1,20 @@
-//! ConfigurationVersion: which DataSetMetaData describes a DataSetMessage (OPC 10000-14, 6.2.3.2.6).
+//! ConfigurationVersion: the relation of DataSetMetaData and DataSetMessages (OPC 10000-14,
+//! 6.2.3.2.6).
 
-/// When the content of a DataSet last changed: VersionTimes, seconds since 2000-01-01 UTC
-/// (OPC 10000-14, 6.2.3.2.6).
+/// Time of the last change to the content of a DataSet. Both versions are VersionTimes, in seconds
+/// since 2000-01-01 UTC (OPC 10000-14, 6.2.3.2.6).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
 pub struct ConfigurationVersion {
-    /// The last change that is more than fields added at the end.
+    /// Last change other than fields added at the end.
     pub major: u32,
-    /// The last change at all.
+    /// Last change of any kind.
     pub minor: u32,
 }
 
 impl ConfigurationVersion {
-    /// The version after fields were removed, reordered, put in between or given another DataType, or a Property of
-    /// a field changed: both numbers are `at`, or the smallest that is new when `at` is not.
+    /// Returns the version after a major change: fields removed, reordered or inserted, another
+    /// DataType, or a changed Property of a field. Both numbers are `at`, or the smallest new
+    /// number if `at` is not new.
     #[must_use]
     pub fn changed(self, at: u32) -> Self {
         let at = self.later(at);
@@ -22,7 +24,8 @@ impl ConfigurationVersion {
         }
     }
 
-    /// The version after fields were added at the end: the minor number is `at`, or the smallest that is new.
+    /// Returns the version after fields were added at the end: the minor number is `at`, or the
+    /// smallest new number.
     #[must_use]
     pub fn extended(self, at: u32) -> Self {
         Self {
@@ -31,7 +34,8 @@ impl ConfigurationVersion {
         }
     }
 
-    /// Two changes within a second, or a clock that was set back, would give a version that was used before.
+    /// Returns a new version time. It differs from `at` for two changes within a second or after
+    /// the clock was set back, which would repeat an earlier version.
     fn later(self, at: u32) -> u32 {
         at.max(self.major.max(self.minor).saturating_add(1))
     }

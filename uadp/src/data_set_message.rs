@@ -1,35 +1,36 @@
-//! DataSetMessage: one writer's header, and its fields read one by one.
+//! DataSetMessage: decodes the header and iterates over the fields.
 
 use crate::reader::Reader;
 use crate::{DataValue, DateTime, DecodeError, DeltaNull, Variant};
 
-/// One DataSetMessage whose header was read (OPC 10000-14, 7.2.4.5.4).
+/// A DataSetMessage with decoded header (OPC 10000-14, 7.2.4.5.4).
 ///
-/// Where [`is_valid`](Self::is_valid) is false the standard forbids to process the rest: skip it.
+/// If [`is_valid`](Self::is_valid) is false, the standard forbids processing the message: skip it.
 #[derive(Debug, Clone)]
 pub struct DataSetMessage<'a> {
-    /// DataSetWriter within the publisher; `None` without payload header.
+    /// DataSetWriterId within the publisher; `None` without payload header.
     pub writer_id: Option<u16>,
-    /// What the payload is.
+    /// Kind of the payload.
     pub kind: MessageKind,
     head: Head<'a>,
     payload: Reader<'a>,
 }
 
-/// The header fields of a DataSetMessage. What is `None` is not on the wire.
+/// The header fields of a DataSetMessage. Fields that are `None` are not encoded.
 ///
-/// The default has none and is valid.
+/// The default has no fields and is valid.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct DataSetHeader {
-    /// False: the publisher could not make the message; nothing else in it counts.
+    /// False if the publisher could not create the message; the other fields are then meaningless.
     pub valid: bool,
-    /// Counts the messages of the writer. In a keep-alive, the number the next one will have.
+    /// Sequence number of the message; a keep-alive has the number of the next message.
     pub sequence_number: Option<u16>,
-    /// When the values were taken.
+    /// Time of the values.
     pub timestamp: Option<DateTime>,
-    /// Refines the timestamp, in units of 10 ps.
+    /// Part of the timestamp below its resolution, in units of 10 ps.
     pub picoseconds: Option<u16>,
-    /// Upper half of a StatusCode, see [`StatusCode::from_status`](crate::StatusCode::from_status).
+    /// Upper 16 bits of a StatusCode, see
+    /// [`StatusCode::from_status`](crate::StatusCode::from_status).
     pub status: Option<u16>,
     /// Major version of the configuration, a VersionTime: seconds since 2000-01-01 UTC.
     pub major_version: Option<u32>,
@@ -44,28 +45,30 @@ pub enum MessageKind {
     KeyFrame,
     /// The changed fields, each with its index (OPC 10000-14, 7.2.4.5.6).
     DeltaFrame,
-    /// The fields of one event (OPC 10000-14, 7.2.4.5.7).
+    /// The fields of an event (OPC 10000-14, 7.2.4.5.7).
     Event,
-    /// A header only: the writer lives and has nothing new (OPC 10000-14, 7.2.4.5.8).
+    /// A header without fields: the writer is alive and has no new values (OPC 10000-14,
+    /// 7.2.4.5.8).
     KeepAlive,
 }
 
-/// How the fields of a DataSetMessage are encoded: DataSetFlags1 bits 1 and 2 (OPC 10000-14, 7.2.4.5.4).
+/// Field encoding of a DataSetMessage: DataSetFlags1 bits 1 and 2 (OPC 10000-14, 7.2.4.5.4).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub enum FieldEncoding {
-    /// Each with its type.
+    /// Each field carries its type.
     #[default]
     Variant,
-    /// Without types, to be read with the DataSetMetaData (OPC 10000-14, 7.2.4.5.11).
+    /// Fields without types, decoded with the DataSetMetaData (OPC 10000-14, 7.2.4.5.11).
     RawData,
-    /// Each with its type, quality and times.
+    /// Each field carries its type, quality and times.
     DataValue,
 }
 
-/// The Variants of a key frame or event, read one by one.
+/// Iterator over the Variants of a key frame or event.
 ///
-/// Ends after the first `Err`. Zero bytes behind the last field are the padding to a ConfiguredSize
-/// (OPC 10000-14, 6.3.1.3.3) and skipped; others are a last [`DecodeError::TrailingBytes`].
+/// The iterator ends after the first `Err`. Zero bytes behind the last field are the padding to a
+/// ConfiguredSize (OPC 10000-14, 6.3.1.3.3) and are skipped; other bytes cause a final
+/// [`DecodeError::TrailingBytes`].
 #[derive(Debug, Clone)]
 pub struct Fields<'a> {
     block: &'a [u8],
@@ -74,7 +77,7 @@ pub struct Fields<'a> {
     left: u16,
 }
 
-/// The fields of any DataSetMessage but a RawData one, read one by one. Ends as [`Fields`] do.
+/// Iterator over the fields of a DataSetMessage, except RawData. It ends like [`Fields`].
 #[derive(Debug, Clone)]
 pub struct FieldValues<'a> {
     reader: Reader<'a>,
@@ -84,12 +87,12 @@ pub struct FieldValues<'a> {
     encoding: FieldEncoding,
 }
 
-/// A field and which of the DataSet's it is.
+/// A field and its index in the DataSet.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FieldValue<'a> {
-    /// Position in the DataSetMetaData, from 0.
+    /// Index in the DataSetMetaData.
     pub index: u16,
-    /// The value; from a Variant only the value.
+    /// The value; a Variant has no quality or times.
     pub value: DataValue<'a>,
 }
 
@@ -108,16 +111,16 @@ impl Default for DataSetHeader {
 }
 
 impl<'a> DataSetMessage<'a> {
-    /// Reads the header of a DataSetMessage that stands alone, as reassembled chunks give it. `writer_id` is the
-    /// DataSetWriterId of the chunks.
+    /// Decodes the header of a single DataSetMessage, for example from reassembled chunks.
+    /// `writer_id` is the DataSetWriterId of the chunks.
     ///
     /// # Errors
-    /// Fails as an item of [`NetworkMessage::messages`](crate::NetworkMessage::messages) does.
+    /// Fails like an item of [`NetworkMessage::messages`](crate::NetworkMessage::messages).
     pub fn decode(writer_id: Option<u16>, bytes: &'a [u8]) -> Result<Self, DecodeError> {
         Self::read(writer_id, Reader::new(bytes))
     }
 
-    /// Reads the header of the message that `reader` holds and nothing else.
+    /// Decodes the header of the message. `reader` holds exactly this message.
     #[inline]
     pub(crate) fn read(
         writer_id: Option<u16>,
@@ -127,7 +130,7 @@ impl<'a> DataSetMessage<'a> {
         let valid = flags1 & VALID != 0;
         let (head, kind) = match Head::read(flags1, &mut reader, read_kind) {
             Ok(read) => read,
-            // Nothing behind a cleared valid bit means anything, not even the flags.
+            // Nothing behind a cleared valid bit is meaningful, not even the flags.
             Err(_) if !valid => (Head::INVALID, MessageKind::KeyFrame),
             Err(error) => return Err(error),
         };
@@ -142,34 +145,35 @@ impl<'a> DataSetMessage<'a> {
         })
     }
 
-    /// The header fields.
+    /// Returns the header fields.
     #[inline]
     #[must_use]
     pub fn header(&self) -> DataSetHeader {
         self.head.fields()
     }
 
-    /// The DataSetMessageSequenceNumber; alone it costs less than the whole header.
+    /// Returns the DataSetMessageSequenceNumber. This is cheaper than decoding the whole header.
     #[inline]
     #[must_use]
     pub fn sequence_number(&self) -> Option<u16> {
         match self.head.flags1 & SEQUENCE_NUMBER {
             0 => None,
-            // It is the first of the fields.
+            // It is the first field.
             _ => Reader::new(self.head.fields)
                 .u16("DataSetMessageSequenceNumber")
                 .ok(),
         }
     }
 
-    /// False: the publisher could not make the message; nothing else in it counts.
+    /// Returns false if the publisher could not create the message; the other fields are then
+    /// meaningless.
     #[inline]
     #[must_use]
     pub const fn is_valid(&self) -> bool {
         self.head.flags1 & VALID != 0
     }
 
-    /// How the fields are encoded.
+    /// Returns the field encoding.
     #[inline]
     #[must_use]
     pub const fn encoding(&self) -> FieldEncoding {
@@ -180,26 +184,28 @@ impl<'a> DataSetMessage<'a> {
         }
     }
 
-    /// What stands behind the header, padding included. Of a RawData message that is what
-    /// [`RawLayout::read`](crate::RawLayout::read) takes.
+    /// Returns the bytes behind the header, including padding.
+    /// [`RawLayout::read`](crate::RawLayout::read) decodes the payload of a RawData message.
     #[inline]
     #[must_use]
     pub const fn payload(&self) -> &'a [u8] {
         self.payload.rest()
     }
 
-    /// The fields of a Variant encoded key frame or event. A keep-alive and a heartbeat, with or without its
-    /// FieldCount, have none. [`values`](Self::values) reads the others too.
+    /// Returns the fields of a Variant encoded key frame or event. A keep-alive and a heartbeat
+    /// have no fields, with or without FieldCount. [`values`](Self::values) also returns the fields
+    /// of other messages.
     ///
     /// # Errors
-    /// [`DecodeError::Misread`] for delta frames and for the RawData and DataValue field encodings;
-    /// else fails when the FieldCount is cut off or cannot be met by the bytes that follow.
+    /// [`DecodeError::Misread`] for delta frames and for the RawData and DataValue field encodings.
+    /// Otherwise fails if the FieldCount is truncated or exceeds the number of following bytes.
     #[inline]
     pub fn fields(&self) -> Result<Fields<'a>, DecodeError> {
         match (self.kind, self.encoding()) {
             (MessageKind::KeepAlive, _) => Ok(Fields::NONE),
             (_, FieldEncoding::RawData) => Err(RAW_DATA),
-            // A heartbeat is its header (OPC 10000-14, 7.2.4.5.5); most peers know only the one with a FieldCount of 0.
+            // A heartbeat is a header only (OPC 10000-14, 7.2.4.5.5); most peers support only a
+            // heartbeat with a FieldCount of 0.
             (MessageKind::KeyFrame, _) if self.payload.remaining() == 0 => Ok(Fields::NONE),
             (_, FieldEncoding::DataValue) => Err(DecodeError::Misread("encoded as DataValues")),
             (MessageKind::DeltaFrame, FieldEncoding::Variant) => Err(DecodeError::Misread(
@@ -211,13 +217,14 @@ impl<'a> DataSetMessage<'a> {
         }
     }
 
-    /// The fields with their indexes, of a delta frame those it has.
+    /// Returns the fields with their indexes. A delta frame contains the changed fields only.
     ///
-    /// open62541 1.5 ends a delta frame with entries that change nothing: see [`FieldValue::is_filler`].
+    /// open62541 1.5 pads a delta frame with entries that change nothing: see
+    /// [`FieldValue::is_filler`].
     ///
     /// # Errors
-    /// [`DecodeError::Misread`] for the RawData field encoding; else fails when the FieldCount is cut off or cannot be
-    /// met by the bytes that follow.
+    /// [`DecodeError::Misread`] for the RawData field encoding. Otherwise fails if the FieldCount
+    /// is truncated or exceeds the number of following bytes.
     pub fn values(&self) -> Result<FieldValues<'a>, DecodeError> {
         let mut reader = self.payload;
         let count = match self.kind {
@@ -287,8 +294,9 @@ impl<'a> Iterator for FieldValues<'a> {
 impl std::iter::FusedIterator for FieldValues<'_> {}
 
 impl FieldValue<'_> {
-    /// True for index 0 and a null Variant. In a delta frame that is what open62541 1.5 fills the frame up with to the
-    /// number of fields of the DataSet, so it is better not taken for a change of field 0.
+    /// Returns true for index 0 and a null Variant. open62541 1.5 pads delta frames with such
+    /// entries up to the number of fields of the DataSet, so they should not be handled as changes
+    /// of field 0.
     #[must_use]
     pub fn is_filler(&self) -> bool {
         let is_null = self.value == DataValue::from(Variant::Null);
@@ -304,10 +312,11 @@ impl<'a> Fields<'a> {
         left: 0,
     };
 
-    /// Reads a block as [`bytes`](Self::bytes) gives it: FieldCount (UInt16) and so many Variants.
+    /// Parses a block as returned by [`bytes`](Self::bytes): FieldCount (UInt16) and that many
+    /// Variants.
     ///
     /// # Errors
-    /// Fails when the FieldCount is cut off or above the number of bytes that follow.
+    /// Fails if the FieldCount is truncated or exceeds the number of following bytes.
     #[inline]
     pub fn parse(block: &'a [u8]) -> Result<Self, DecodeError> {
         let mut reader = Reader::new(block);
@@ -326,30 +335,30 @@ impl<'a> Fields<'a> {
         })
     }
 
-    /// FieldCount, however many fields were read already.
+    /// Returns the FieldCount, independent of the progress of the iteration.
     #[inline]
     #[must_use]
     pub const fn len(&self) -> usize {
         self.count as usize
     }
 
-    /// True without fields: a heartbeat or keep-alive.
+    /// Returns true without fields, as in a heartbeat or keep-alive.
     #[inline]
     #[must_use]
     pub const fn is_empty(&self) -> bool {
         self.count == 0
     }
 
-    /// The whole block as on the wire, unchecked: FieldCount, Variants, and padding where there is some.
+    /// Returns the encoded block without checks: FieldCount, Variants, and padding if present.
     #[inline]
     #[must_use]
     pub const fn bytes(&self) -> &'a [u8] {
         self.block
     }
 
-    /// The next `count` fields at once, when each is a single value of `builtin`, a type of fixed size: their Variants as
-    /// on the wire, each an encoding byte and the value, little endian. `None`, and nothing taken, when one is otherwise or
-    /// not there.
+    /// Takes the next `count` fields at once, if each is a single value of `builtin`, a type of
+    /// fixed size. Returns the encoded Variants: an encoding byte and a little-endian value for
+    /// each. Returns `None` and takes nothing if a field is missing or has another type.
     #[inline]
     pub fn take_scalars(&mut self, builtin: crate::BuiltinType, count: u16) -> Option<&'a [u8]> {
         let left = self.left.checked_sub(count)?;
@@ -366,10 +375,10 @@ impl<'a> Fields<'a> {
         Some(taken)
     }
 
-    /// Reads all fields to the end; the block without padding.
+    /// Checks all fields, and returns the block without padding.
     ///
     /// # Errors
-    /// Fails as the first field that cannot be read does.
+    /// Fails with the error of the first invalid field.
     pub fn checked_bytes(&self) -> Result<&'a [u8], DecodeError> {
         let start = Reader::new(self.block);
         let mut reader = start;
@@ -409,7 +418,7 @@ impl<'a> Iterator for Fields<'a> {
 
 impl std::iter::FusedIterator for Fields<'_> {}
 
-/// The flags and the header fields they announce, checked to be there.
+/// The flags and the bytes of the header fields, which are checked for their length.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Head<'a> {
     flags1: u8,
@@ -424,7 +433,8 @@ impl<'a> Head<'a> {
         fields: &[],
     };
 
-    /// Reads what follows DataSetFlags1; `read_kind` makes the type of message of DataSetFlags2.
+    /// Reads the header after DataSetFlags1. `read_kind` converts the message type of
+    /// DataSetFlags2.
     #[inline]
     pub(crate) fn read<K>(
         flags1: u8,
@@ -459,7 +469,8 @@ impl<'a> Head<'a> {
         ];
         let mut size = 0;
         for (present, bytes) in sizes {
-            // Branches are predicted, so that the fields are read before the size is known; a sum of bits is waited for.
+            // The branches are predicted, so the fields are read before the size is known. A sum of
+            // bits would have to be waited for.
             size += match present {
                 0 => 0,
                 _ => bytes,
@@ -472,7 +483,7 @@ impl<'a> Head<'a> {
         };
         match reader.bytes(size, "DataSetMessage header") {
             Ok(fields) => Ok((Self { fields, ..head }, kind)),
-            // Field by field, to name the one that is cut off.
+            // Reads field by field, so that the error has the name of the truncated field.
             Err(_) => Err(head.read_fields().err().unwrap_or(CUT_OFF)),
         }
     }
@@ -481,7 +492,7 @@ impl<'a> Head<'a> {
     pub(crate) fn fields(&self) -> DataSetHeader {
         match self.read_fields() {
             Ok(fields) => fields,
-            // Only of an invalid message, which has nothing to read.
+            // Only possible for an invalid message, which has no meaningful fields.
             Err(_) => DataSetHeader {
                 valid: self.flags1 & VALID != 0,
                 ..DataSetHeader::default()
@@ -554,7 +565,7 @@ fn read_kind(kind: u8) -> Result<MessageKind, DecodeError> {
     }
 }
 
-/// What stands behind the end of a message may only be the zero padding to its ConfiguredSize.
+/// Checks that the bytes behind the end of a message are zero, as padding to its ConfiguredSize.
 #[inline]
 pub(crate) fn check_padding(rest: &[u8]) -> Result<(), DecodeError> {
     match rest.iter().all(|byte| *byte == 0) {

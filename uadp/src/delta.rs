@@ -1,33 +1,33 @@
-//! Putting the entries of a delta frame over the fields of a key frame (OPC 10000-14, 7.2.4.5.6).
+//! Applies the entries of a delta frame to the fields of a key frame (OPC 10000-14, 7.2.4.5.6).
 
-/// What an entry of a delta frame with index 0 and a null Variant means.
+/// Meaning of a delta frame entry with index 0 and a null Variant.
 ///
-/// open62541 1.5.7 fills its delta frames up to the number of fields with such entries, also when nothing changed,
-/// so that none of them may wipe field 0. The price is that with such publishers about, a field 0 that really became
-/// null shows with the next key frame only. Null in other fields is a value either way.
+/// open62541 1.5.7 pads its delta frames with such entries up to the number of fields, even if
+/// nothing changed, so they must not clear field 0. As a consequence, a change of field 0 to null
+/// is visible only with the next key frame. In other fields, null is always a value.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub enum DeltaNull {
-    /// Nothing: it is filler.
+    /// The entry is filler and changes nothing.
     #[default]
     Filler,
-    /// Field 0 became null, as the tables of the standard have it.
+    /// Field 0 became null, as in the tables of the standard.
     Value,
 }
 
-/// What became of the entries of a delta frame.
+/// Result of applying a delta frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub struct Merged {
     /// Entries that replaced a field.
     pub applied: usize,
-    /// Entries taken as filler.
+    /// Entries ignored as filler.
     pub filler: usize,
-    /// Entries past the last field known: the DataSet has more fields in a newer minor version
+    /// Entries behind the last known field: the DataSet has more fields in a newer minor version
     /// (OPC 10000-14, 6.2.3.2.6).
     pub unknown: usize,
 }
 
 impl DeltaNull {
-    /// True when an entry of a delta frame replaces the field of its index.
+    /// Returns true if a delta frame entry replaces the field of its index.
     #[must_use]
     pub const fn applies(self, index: u16, is_null: bool) -> bool {
         match self {
@@ -36,8 +36,8 @@ impl DeltaNull {
         }
     }
 
-    /// Replaces the fields of the last key frame by the entries, each a FieldIndex and a value. `is_null` tells the
-    /// null Variant from other values.
+    /// Replaces the fields of the last key frame with the entries, each a FieldIndex and a value.
+    /// `is_null` returns true for the null Variant.
     /// ```
     /// use uadp::{DeltaNull, Merged, Scalar, Variant};
     ///

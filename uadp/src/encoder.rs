@@ -1,4 +1,4 @@
-//! Writing a NetworkMessage: headers first, then one DataSetMessage after the other, in one pass.
+//! Encodes a NetworkMessage: first the headers, then the DataSetMessages, in a single pass.
 
 use crate::action::ActionHeader;
 use crate::data_set_message as message;
@@ -7,41 +7,42 @@ use crate::header_writer::{self, Extras, Form, PayloadHeader};
 use crate::writer::flag;
 use crate::{DataSetHeader, EncodeError, NetworkHeader, NetworkMessageType, Seal, writer};
 
-/// Appends one NetworkMessage to a buffer (OPC 10000-14, 7.2.4.4.2).
+/// Appends a NetworkMessage to a buffer (OPC 10000-14, 7.2.4.4.2).
 ///
-/// The flags follow from what the headers hold. After an error the buffer holds an unfinished message.
+/// The flags follow from the fields that are set in the headers. After an error the buffer holds an
+/// incomplete message.
 #[derive(Debug)]
 #[must_use = "a message is complete with `finish`"]
 pub struct NetworkMessageEncoder<'b> {
     pub(crate) buf: &'b mut Vec<u8>,
     pub(crate) progress: Progress,
     timestamp_at: Option<usize>,
-    /// Where the NetworkMessage and its payload start in the buffer.
+    /// Offsets of the NetworkMessage and of its payload in the buffer.
     start: usize,
     payload_at: usize,
-    /// The SecurityHeader promises a signature.
+    /// The SecurityHeader announces a signature.
     sealed: bool,
-    /// Bytes of the SecurityFooter it promises.
+    /// Bytes of the announced SecurityFooter.
     footer_size: usize,
     payload_header: bool,
 }
 
-/// What is finished of the payload.
+/// Progress of the payload.
 #[derive(Debug)]
 pub(crate) struct Progress {
-    /// DataSetMessages the payload header announces.
+    /// Number of DataSetMessages that the payload header announces.
     announced: usize,
     written: usize,
-    /// Where the Sizes start; there are none for a single message.
+    /// Offset of the Sizes; `None` for a single message.
     sizes_at: Option<usize>,
-    /// Where the last finished DataSetMessage ends.
+    /// End of the last finished DataSetMessage.
     end: usize,
-    /// Bytes every DataSetMessage is to take, 0 for as many as it needs.
+    /// Fixed size of every DataSetMessage in bytes, 0 for variable sizes.
     configured_size: usize,
 }
 
 impl Progress {
-    /// Counts the DataSetMessage that ends with the buffer and patches its size.
+    /// Counts the DataSetMessage at the end of the buffer and patches its size.
     #[inline]
     pub(crate) fn message_finished(&mut self, buf: &mut Vec<u8>) -> Result<(), EncodeError> {
         if self.configured_size != 0 {
@@ -60,12 +61,13 @@ impl Progress {
         Ok(())
     }
 
-    /// Gives the DataSetMessage that ends with the buffer its ConfiguredSize.
+    /// Resizes the DataSetMessage at the end of the buffer to its ConfiguredSize.
     #[cold]
     fn fit(&self, buf: &mut Vec<u8>) {
         let end = self.end + self.configured_size;
         if buf.len() > end {
-            // Too long: cleared valid bit, and nothing behind it counts.
+            // A message that is too long becomes zeros: its valid bit is cleared, so its content is
+            // meaningless.
             buf.truncate(self.end);
         }
         buf.resize(end, 0);
@@ -73,12 +75,12 @@ impl Progress {
 }
 
 impl<'b> NetworkMessageEncoder<'b> {
-    /// Appends the headers to `buf`. `writer_ids` make the payload header, one DataSetMessage each;
-    /// with `None` there is no payload header and exactly one DataSetMessage.
+    /// Appends the headers to `buf`. The payload header holds `writer_ids`, one per DataSetMessage.
+    /// With `None` there is no payload header and exactly a single DataSetMessage.
     ///
     /// # Errors
-    /// [`EncodeError::MessageCount`] when `writer_ids` is empty, [`EncodeError::TooBig`] when it is longer than 255
-    /// or the PublisherId longer than a String can be.
+    /// [`EncodeError::MessageCount`] if `writer_ids` is empty; [`EncodeError::TooBig`] if it has
+    /// more than 255 ids, or if the PublisherId exceeds the maximum length of a String.
     #[inline]
     pub fn new(
         buf: &'b mut Vec<u8>,
@@ -88,11 +90,11 @@ impl<'b> NetworkMessageEncoder<'b> {
         Self::with(buf, header, writer_ids, &Extras::default())
     }
 
-    /// As [`new`](Self::new), with the headers few messages have.
+    /// Appends the headers as [`new`](Self::new), with rarely used headers.
     ///
     /// # Errors
-    /// As [`new`](Self::new), and [`EncodeError::TooBig`] for PromotedFields of more than 65535 bytes or a nonce of
-    /// more than 255.
+    /// As [`new`](Self::new), and [`EncodeError::TooBig`] for PromotedFields of more than 65535
+    /// bytes or a nonce of more than 255 bytes.
     #[inline]
     pub fn with(
         buf: &'b mut Vec<u8>,
@@ -103,7 +105,8 @@ impl<'b> NetworkMessageEncoder<'b> {
         Self::with_action(buf, header, writer_ids, extras, None)
     }
 
-    /// As [`with`](Self::with); the payload starts with an ActionHeader where there is one.
+    /// Appends the headers as [`with`](Self::with), and an ActionHeader at the start of the payload
+    /// if given.
     #[inline]
     pub(crate) fn with_action(
         buf: &'b mut Vec<u8>,
@@ -160,8 +163,9 @@ impl<'b> NetworkMessageEncoder<'b> {
         })
     }
 
-    /// Without payload header, so many DataSetMessages instead of one. Receivers find them by DataSetOffset
-    /// (OPC 10000-14, 6.3.1.3.5), so each is best given a [`configured_size`](Self::configured_size).
+    /// Sets the number of DataSetMessages without payload header. Receivers find them by
+    /// DataSetOffset (OPC 10000-14, 6.3.1.3.5), so each should have a
+    /// [`configured_size`](Self::configured_size).
     ///
     /// # Errors
     /// [`EncodeError::Misplaced`] with a payload header.
@@ -173,24 +177,25 @@ impl<'b> NetworkMessageEncoder<'b> {
         Ok(self)
     }
 
-    /// Pads every following DataSetMessage with zeros to so many bytes; one that is longer becomes an invalid
-    /// message of that size (ConfiguredSize: OPC 10000-14, 6.3.1.3.3). 0 leaves the sizes alone.
+    /// Pads every following DataSetMessage with zeros to `size` bytes. A longer message becomes an
+    /// invalid message of that size (ConfiguredSize: OPC 10000-14, 6.3.1.3.3). 0 disables the
+    /// padding.
     pub fn configured_size(&mut self, size: u16) {
         self.progress.configured_size = size.into();
     }
 
-    /// Opens a key frame of Variants. One left without [`FieldEncoder::finish`] is taken back by the next call.
-    /// Finished without a field it is a heartbeat with its FieldCount: not the form of the standard, which is
-    /// [`heartbeat`](Self::heartbeat), but the one that peers can read.
+    /// Starts a key frame of Variants. A key frame without [`FieldEncoder::finish`] is removed by
+    /// the next call. Without fields it is a heartbeat with a FieldCount. This is not the form of
+    /// the standard ([`heartbeat`](Self::heartbeat)), but the form that peers support.
     ///
     /// # Errors
-    /// [`EncodeError::MessageCount`] when all announced messages are written.
+    /// [`EncodeError::MessageCount`] if all announced messages are written.
     #[inline]
     pub fn key_frame(&mut self, header: &DataSetHeader) -> Result<FieldEncoder<'_>, EncodeError> {
         self.counted(header, message::KIND_KEY_FRAME, 0)
     }
 
-    /// Opens an event (OPC 10000-14, 7.2.4.5.7).
+    /// Starts an event (OPC 10000-14, 7.2.4.5.7).
     ///
     /// # Errors
     /// As for [`key_frame`](Self::key_frame).
@@ -198,7 +203,7 @@ impl<'b> NetworkMessageEncoder<'b> {
         self.counted(header, message::KIND_EVENT, 0)
     }
 
-    /// Opens a delta frame of Variants (OPC 10000-14, 7.2.4.5.6).
+    /// Starts a delta frame of Variants (OPC 10000-14, 7.2.4.5.6).
     ///
     /// # Errors
     /// As for [`key_frame`](Self::key_frame).
@@ -207,7 +212,7 @@ impl<'b> NetworkMessageEncoder<'b> {
         Ok(DeltaEncoder::new(fields))
     }
 
-    /// Opens a key frame of DataValues.
+    /// Starts a key frame of DataValues.
     ///
     /// # Errors
     /// As for [`key_frame`](Self::key_frame).
@@ -220,7 +225,7 @@ impl<'b> NetworkMessageEncoder<'b> {
         Ok(DataValueEncoder::new(fields, false))
     }
 
-    /// Opens a delta frame of DataValues.
+    /// Starts a delta frame of DataValues.
     ///
     /// # Errors
     /// As for [`key_frame`](Self::key_frame).
@@ -233,11 +238,11 @@ impl<'b> NetworkMessageEncoder<'b> {
         Ok(DataValueEncoder::new(fields, true))
     }
 
-    /// Appends a key frame of RawData whose fields `write` appends, for instance with
+    /// Appends a key frame of RawData. `write` appends the fields, for example with
     /// [`RawLayout::write`](crate::RawLayout::write).
     ///
     /// # Errors
-    /// As for [`key_frame`](Self::key_frame), and what `write` gives.
+    /// As for [`key_frame`](Self::key_frame), and the errors of `write`.
     pub fn raw_key_frame(
         &mut self,
         header: &DataSetHeader,
@@ -246,8 +251,8 @@ impl<'b> NetworkMessageEncoder<'b> {
         self.raw_or_bare(header, message::RAW_FIELDS, write)
     }
 
-    /// Appends a heartbeat: the header of a key frame and nothing else (OPC 10000-14, 7.2.4.5.5). Of the peers tried,
-    /// open62541 1.5 and asyncua 2.1, none can read it.
+    /// Appends a heartbeat: the header of a key frame without fields (OPC 10000-14, 7.2.4.5.5). The
+    /// tested peers, open62541 1.5 and asyncua 2.1, cannot decode it.
     ///
     /// # Errors
     /// As for [`key_frame`](Self::key_frame).
@@ -255,29 +260,29 @@ impl<'b> NetworkMessageEncoder<'b> {
         self.raw_or_bare(header, 0, |_| Ok(()))
     }
 
-    /// Appends a keep-alive. Its sequence number is the one the next message will have
-    /// (OPC 10000-14, 7.2.4.5.8).
+    /// Appends a keep-alive. Its sequence number is the number of the next message (OPC 10000-14,
+    /// 7.2.4.5.8).
     ///
     /// # Errors
-    /// [`EncodeError::MessageCount`] when all announced messages are written.
+    /// [`EncodeError::MessageCount`] if all announced messages are written.
     pub fn keep_alive(&mut self, header: &DataSetHeader) -> Result<(), EncodeError> {
         self.begin_message()?;
         write_data_set_header(self.buf, header, message::KIND_KEEP_ALIVE, 0, false);
         self.progress.message_finished(self.buf)
     }
 
-    /// Appends a DataSetMessage that was encoded before, as another NetworkMessage has it.
+    /// Appends an encoded DataSetMessage of another NetworkMessage.
     ///
     /// # Errors
-    /// [`EncodeError::MessageCount`] when all announced messages are written, [`EncodeError::TooBig`] when it is one of
-    /// several and longer than 65535 bytes.
+    /// [`EncodeError::MessageCount`] if all announced messages are written; [`EncodeError::TooBig`]
+    /// if there are several messages and this message has more than 65535 bytes.
     pub fn encoded(&mut self, message: &[u8]) -> Result<(), EncodeError> {
         self.begin_message()?;
         self.buf.extend_from_slice(message);
         self.progress.message_finished(self.buf)
     }
 
-    /// A key frame without FieldCount.
+    /// Appends a key frame without FieldCount.
     fn raw_or_bare(
         &mut self,
         header: &DataSetHeader,
@@ -290,7 +295,7 @@ impl<'b> NetworkMessageEncoder<'b> {
         self.progress.message_finished(self.buf)
     }
 
-    /// A message that starts with a FieldCount.
+    /// Starts a message with a FieldCount.
     #[inline]
     fn counted(
         &mut self,
@@ -303,21 +308,22 @@ impl<'b> NetworkMessageEncoder<'b> {
         Ok(FieldEncoder::new(self.buf, &mut self.progress, offsets))
     }
 
-    /// Ends the NetworkMessage.
+    /// Finishes the NetworkMessage.
     ///
     /// # Errors
-    /// [`EncodeError::MessageCount`] when an announced message was not written, [`EncodeError::Misplaced`] when the
-    /// SecurityHeader promises a footer, or a signature: that is [`finish_sealed`](Self::finish_sealed).
+    /// [`EncodeError::MessageCount`] if an announced message was not written.
+    /// [`EncodeError::Misplaced`] if the SecurityHeader announces a footer, or a signature, which
+    /// requires [`finish_sealed`](Self::finish_sealed).
     #[inline]
     pub fn finish(self) -> Result<(), EncodeError> {
         self.finish_with_footer(&[])
     }
 
-    /// Ends the NetworkMessage with a SecurityFooter.
+    /// Finishes the NetworkMessage with a SecurityFooter.
     ///
     /// # Errors
-    /// As for [`finish`](Self::finish), and [`EncodeError::Misplaced`] when the footer is not as long as the
-    /// SecurityHeader says.
+    /// As for [`finish`](Self::finish), and [`EncodeError::Misplaced`] if the length of the footer
+    /// differs from the SecurityHeader.
     #[inline]
     pub fn finish_with_footer(self, footer: &[u8]) -> Result<(), EncodeError> {
         if self.sealed {
@@ -333,11 +339,12 @@ impl<'b> NetworkMessageEncoder<'b> {
         Ok(())
     }
 
-    /// Ends a NetworkMessage that was begun with the [`header`](Seal::header) of this seal: encrypts the payload and
-    /// appends the signature (OPC 10000-14, 7.2.4.4.3).
+    /// Finishes a NetworkMessage that was started with the [`header`](Seal::header) of this seal:
+    /// encrypts the payload and appends the signature (OPC 10000-14, 7.2.4.4.3).
     ///
     /// # Errors
-    /// As [`finish`](Self::finish); [`EncodeError::Misplaced`] when the SecurityHeader is not that of the seal.
+    /// As [`finish`](Self::finish); [`EncodeError::Misplaced`] if the SecurityHeader does not
+    /// belong to the seal.
     pub fn finish_sealed(self, seal: Seal<'_>) -> Result<(), EncodeError> {
         self.check_finished()?;
         if !self.sealed {
@@ -360,13 +367,16 @@ impl<'b> NetworkMessageEncoder<'b> {
         Ok(())
     }
 
-    /// Position in the buffer of the payload: of the ActionHeader where there is one, of the Sizes with several DataSetMessages, else of the DataSetMessage.
+    /// Returns the offset of the payload in the buffer. The payload starts with the ActionHeader if
+    /// present, otherwise with the Sizes of several DataSetMessages, otherwise with the
+    /// DataSetMessage.
     #[must_use]
     pub const fn payload_offset(&self) -> usize {
         self.payload_at
     }
 
-    /// Position in the buffer of the NetworkMessage's Timestamp (Int64), for patching it before sending.
+    /// Returns the offset of the Timestamp (Int64) of the NetworkMessage in the buffer, to patch it
+    /// before sending.
     #[must_use]
     pub const fn timestamp_offset(&self) -> Option<usize> {
         self.timestamp_at
@@ -391,14 +401,14 @@ impl<'b> NetworkMessageEncoder<'b> {
     }
 }
 
-/// Positions in the buffer of the header fields that are patched when a message is sent again.
+/// Offsets in the buffer of header fields that are patched when a message is sent again.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Offsets {
     pub(crate) sequence_number: Option<usize>,
     pub(crate) timestamp: Option<usize>,
 }
 
-/// Appends the header of a DataSetMessage and, where it has one, room for the FieldCount.
+/// Appends the header of a DataSetMessage and, if `counted`, space for the FieldCount.
 #[inline]
 pub(crate) fn write_data_set_header(
     buf: &mut Vec<u8>,

@@ -1,55 +1,58 @@
-//! What makes reading or writing fail, with the offending value.
+//! Errors of decoding and encoding, with the invalid value.
 
 use crate::{BuiltinType, RawWriteError};
 
-/// Why bytes are not a UADP message this crate reads.
+/// Reason why bytes cannot be decoded as a UADP message.
 ///
-/// [`Unsupported`](Self::Unsupported) is our limit; every other variant is the sender's fault or a cut datagram.
+/// [`Unsupported`](Self::Unsupported) is a limit of this crate, [`Misread`](Self::Misread) an error
+/// of the caller; all other variants are errors of the sender or a truncated datagram.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum DecodeError {
-    /// The bytes end before the named item does.
+    /// The bytes end within the named field.
     #[error("{field} is cut off: {expected} bytes expected, {found} left")]
     Truncated {
-        /// What was to be read, as the standard's tables name it.
+        /// Field, as in the tables of the standard.
         field: &'static str,
-        /// Bytes it takes.
+        /// Size of the field in bytes.
         expected: usize,
-        /// Bytes there are.
+        /// Remaining bytes.
         found: usize,
     },
-    /// A value the standard reserves; receivers skip the message (OPC 10000-14, 7.2.4.4.2 and 7.2.4.5.4).
+    /// The value is reserved by the standard; receivers skip the message (OPC 10000-14, 7.2.4.4.2
+    /// and 7.2.4.5.4).
     #[error("{field} has the reserved value {value:#x}")]
     Reserved {
-        /// The field of the standard's tables.
+        /// Field, as in the tables of the standard.
         field: &'static str,
-        /// What stood there, reserved bits only where the field is a set of flags.
+        /// The value; for flags the reserved bits only.
         value: u32,
     },
-    /// Allowed by the standard, not read by this crate.
+    /// The feature is part of the standard, but not supported by this crate.
     #[error("{0} not supported")]
     Unsupported(&'static str),
-    /// Not this way: the message is what the text says. Nobody's fault but the caller's.
+    /// The message needs another method, because it is of the described kind. This is an error of
+    /// the caller.
     #[error("the message is {0}")]
     Misread(&'static str),
-    /// A count that not even the smallest elements could reach in the bytes that are left.
+    /// The count exceeds the remaining bytes, even with elements of minimum size.
     #[error("{field} {value} does not fit in the bytes left")]
     Limit {
-        /// The counting field.
+        /// The count field.
         field: &'static str,
         /// The count.
         value: u32,
     },
-    /// Dimensions whose product is not the number of elements (OPC 10000-6, 5.2.2.16).
+    /// The product of the dimensions differs from the number of elements (OPC 10000-6, 5.2.2.16).
     #[error("array dimensions do not fit its {elements} elements")]
     Dimensions {
-        /// Elements there are.
+        /// Number of elements.
         elements: usize,
     },
-    /// Values nested in values beyond [`MAX_NESTING`](crate::MAX_NESTING).
+    /// The values are nested deeper than [`MAX_NESTING`](crate::MAX_NESTING).
     #[error("values nested deeper than {MAX_NESTING} levels", MAX_NESTING = crate::MAX_NESTING)]
     TooDeep,
-    /// So many bytes stand after the end of the message and are not zero padding.
+    /// This number of bytes follows the end of the message, and they are not zero padding.
     #[error("{0} bytes after the end of the message")]
     TrailingBytes(usize),
     /// The named text is not UTF-8.
@@ -58,7 +61,8 @@ pub enum DecodeError {
 }
 
 impl DecodeError {
-    /// What it is about, as the standard's tables name it, whatever stood there: the same for all errors of a kind.
+    /// Returns the field or subject of the error, as in the tables of the standard, without its
+    /// value. It is equal for all errors of a kind.
     #[must_use]
     pub const fn subject(&self) -> &'static str {
         match self {
@@ -73,35 +77,35 @@ impl DecodeError {
     }
 }
 
-/// Why a message could not be written. The buffer then holds an unfinished message.
+/// Reason why a message could not be encoded. The buffer then holds an incomplete message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum EncodeError {
-    /// The value does not fit in the length field the standard gives it.
+    /// The value exceeds the length field of the standard.
     #[error("{what} of {len} is too big")]
     TooBig {
-        /// What is too big.
+        /// Name of the value.
         what: &'static str,
-        /// Its length: bytes of a text or message, else a count.
+        /// Length in bytes for a text or message, otherwise a count.
         len: usize,
     },
-    /// The payload header names another number of DataSetMessages than were written.
+    /// The number of DataSetMessages differs from the payload header.
     #[error("{announced} DataSetMessages announced, {written} written")]
     MessageCount {
-        /// DataSetWriterIds in the payload header, or one without it.
+        /// Number of DataSetWriterIds in the payload header; 1 without payload header.
         announced: usize,
-        /// DataSetMessages finished.
+        /// Number of finished DataSetMessages.
         written: usize,
     },
-    /// A call that has no place here, such as a field while an array is open.
+    /// The call is not valid in the present state, for example a field within an open array.
     #[error("{0}")]
     Misplaced(&'static str),
-    /// An element of another type than its array.
+    /// The element has another type than its array.
     #[error("{found:?} in an array of {expected:?}")]
     ElementType {
-        /// Element type the array was opened with.
+        /// Element type of the array.
         expected: BuiltinType,
-        /// Type of the value given.
+        /// Type of the element.
         found: BuiltinType,
     },
     /// The bytes of a packed array are not `count` elements of a fixed-size type.
@@ -109,12 +113,12 @@ pub enum EncodeError {
     PackedSize {
         /// Element type.
         element: BuiltinType,
-        /// Elements announced.
+        /// Announced number of elements.
         count: usize,
-        /// Bytes given.
+        /// Number of bytes.
         bytes: usize,
     },
-    /// A value that the layout of RawData does not take.
+    /// The value does not match the RawData layout.
     #[error(transparent)]
     Raw(#[from] RawWriteError),
     /// Structures are nested deeper than [`FieldEncoder::MAX_DEPTH`](crate::FieldEncoder::MAX_DEPTH).

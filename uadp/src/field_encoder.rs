@@ -1,31 +1,32 @@
-//! Writing the fields of a key frame, structures included.
+//! Encodes the fields of a key frame, including structures.
 
 use crate::encoder::{Offsets, Progress};
 use crate::scalar::{BINARY_BODY, Scalar};
 use crate::{BuiltinType, DataValue, EncodeError, NodeId, Variant, variant, writer};
 
-/// Appends the fields of one key frame or event as Variants (OPC 10000-14, 7.2.4.5.5 and 7.2.4.5.7).
+/// Appends the fields of a key frame or event as Variants (OPC 10000-14, 7.2.4.5.5 and 7.2.4.5.7).
 ///
-/// Between [`begin_structure`](Self::begin_structure) and [`end_structure`](Self::end_structure) the same calls
-/// write the fields of the structure: values without the encoding byte of a Variant (OPC 10000-6, 5.2.6).
+/// Between [`begin_structure`](Self::begin_structure) and [`end_structure`](Self::end_structure)
+/// the same methods write the fields of the structure, without the encoding byte of a Variant (OPC
+/// 10000-6, 5.2.6).
 #[derive(Debug)]
 #[must_use = "a message is complete with `finish`"]
 pub struct FieldEncoder<'m> {
     buf: &'m mut Vec<u8>,
     progress: &'m mut Progress,
     offsets: Offsets,
-    /// Where the FieldCount stands.
+    /// Offset of the FieldCount.
     count_at: usize,
     fields: usize,
-    /// Elements an open array still wants, and their type.
+    /// Number of missing elements of an open array, and their type.
     wanted: u32,
     element: BuiltinType,
     depth: usize,
-    /// The open structures, outermost first; `depth` of them are in use.
+    /// The open structures, outermost first; the first `depth` entries are in use.
     outer: [Outer; MAX_DEPTH],
 }
 
-/// Appends the fields of one delta frame as Variants (OPC 10000-14, 7.2.4.5.6).
+/// Appends the fields of a delta frame as Variants (OPC 10000-14, 7.2.4.5.6).
 #[derive(Debug)]
 #[must_use = "a message is complete with `finish`"]
 pub struct DeltaEncoder<'m> {
@@ -33,7 +34,7 @@ pub struct DeltaEncoder<'m> {
     indexes: usize,
 }
 
-/// Appends the fields of one key or delta frame as DataValues.
+/// Appends the fields of a key frame or delta frame as DataValues.
 #[derive(Debug)]
 #[must_use = "a message is complete with `finish`"]
 pub struct DataValueEncoder<'m> {
@@ -41,22 +42,22 @@ pub struct DataValueEncoder<'m> {
     delta: bool,
 }
 
-/// What is open around a structure.
+/// State outside of an open structure.
 #[derive(Debug, Clone, Copy)]
 struct Outer {
-    /// Where the length of the structure's body stands.
+    /// Offset of the length of the structure's body.
     length_at: u32,
-    /// Elements wanted behind the structure.
+    /// Number of missing elements behind the structure.
     wanted: u32,
 }
 
 const MAX_DEPTH: usize = 8;
 
 impl<'m> FieldEncoder<'m> {
-    /// How deep structures may stand in structures.
+    /// Maximum nesting depth of structures.
     pub const MAX_DEPTH: usize = MAX_DEPTH;
 
-    /// The buffer ends with the room for the FieldCount.
+    /// Creates an encoder. The buffer ends with the space for the FieldCount.
     #[inline]
     pub(crate) fn new(buf: &'m mut Vec<u8>, progress: &'m mut Progress, offsets: Offsets) -> Self {
         let count_at = buf.len().saturating_sub(2);
@@ -76,33 +77,33 @@ impl<'m> FieldEncoder<'m> {
         }
     }
 
-    /// Position in the buffer of the DataSetMessageSequenceNumber (UInt16).
+    /// Returns the offset of the DataSetMessageSequenceNumber (UInt16) in the buffer.
     #[inline]
     #[must_use]
     pub const fn sequence_offset(&self) -> Option<usize> {
         self.offsets.sequence_number
     }
 
-    /// Position in the buffer of the DataSetMessage's Timestamp (Int64).
+    /// Returns the offset of the Timestamp (Int64) of the DataSetMessage in the buffer.
     #[inline]
     #[must_use]
     pub const fn timestamp_offset(&self) -> Option<usize> {
         self.offsets.timestamp
     }
 
-    /// A field without a value.
+    /// Appends a field without a value.
     ///
     /// # Errors
-    /// [`EncodeError::Misplaced`] inside a structure or while an array wants elements.
+    /// [`EncodeError::Misplaced`] inside a structure or in an incomplete array.
     pub fn null(&mut self) -> Result<(), EncodeError> {
         self.variant(&Variant::Null)
     }
 
-    /// A field of one value; inside a structure, its next field.
+    /// Appends a field with a single value; inside a structure, its next field.
     ///
     /// # Errors
-    /// [`EncodeError::Misplaced`] while an array wants elements, [`EncodeError::TooBig`] for a text or byte string
-    /// longer than 2^31-1 bytes.
+    /// [`EncodeError::Misplaced`] in an incomplete array; [`EncodeError::TooBig`] for a text or
+    /// byte string of more than 2^31-1 bytes.
     #[inline]
     pub fn scalar(&mut self, value: Scalar<'_>) -> Result<(), EncodeError> {
         self.begin_value()?;
@@ -112,12 +113,12 @@ impl<'m> FieldEncoder<'m> {
         }
     }
 
-    /// Fields of one value each, all of `builtin`, a type of fixed size; inside a structure, its next fields. `bytes` are
-    /// the values as on the wire: little endian, back to back.
+    /// Appends fields with a single value each, all of `builtin`, a type of fixed size; inside a
+    /// structure, its next fields. `bytes` are the encoded values: little-endian and contiguous.
     ///
     /// # Errors
-    /// [`EncodeError::PackedSize`] when `bytes` are no whole number of values or the type has no fixed size,
-    /// [`EncodeError::Misplaced`] while an array wants elements.
+    /// [`EncodeError::PackedSize`] if `bytes` is not a multiple of the value size or the type has
+    /// no fixed size; [`EncodeError::Misplaced`] in an incomplete array.
     #[inline]
     pub fn scalars(&mut self, builtin: BuiltinType, bytes: &[u8]) -> Result<(), EncodeError> {
         let size = builtin.fixed_size().unwrap_or_default();
@@ -153,11 +154,11 @@ impl<'m> FieldEncoder<'m> {
         Ok(())
     }
 
-    /// A field as it was read, or as it shall be read.
+    /// Appends a field from a Variant.
     ///
     /// # Errors
-    /// [`EncodeError::Misplaced`] inside a structure or while an array wants elements, [`EncodeError::TooBig`] as
-    /// for [`scalar`](Self::scalar).
+    /// [`EncodeError::Misplaced`] inside a structure or in an incomplete array;
+    /// [`EncodeError::TooBig`] as for [`scalar`](Self::scalar).
     #[inline]
     pub fn variant(&mut self, value: &Variant<'_>) -> Result<(), EncodeError> {
         if self.depth != 0 {
@@ -167,11 +168,12 @@ impl<'m> FieldEncoder<'m> {
         value.write(self.buf)
     }
 
-    /// An array of `count` fixed-size elements given as on the wire: little-endian, back to back.
+    /// Appends an array of `count` fixed-size elements. `bytes` are the encoded elements:
+    /// little-endian and contiguous.
     ///
     /// # Errors
-    /// [`EncodeError::PackedSize`] when `bytes` are not so many elements or the type has no fixed size,
-    /// [`EncodeError::Misplaced`] while an array wants elements.
+    /// [`EncodeError::PackedSize`] if `bytes` has another size or the type has no fixed size;
+    /// [`EncodeError::Misplaced`] in an incomplete array.
     #[inline]
     pub fn packed_array(
         &mut self,
@@ -194,10 +196,11 @@ impl<'m> FieldEncoder<'m> {
         Ok(())
     }
 
-    /// Opens an array; exactly `count` calls of [`element`](Self::element) follow.
+    /// Starts an array; exactly `count` calls of [`element`](Self::element) have to follow.
     ///
     /// # Errors
-    /// [`EncodeError::Misplaced`] while another array wants elements, [`EncodeError::TooBig`] past 2^31-1 elements.
+    /// [`EncodeError::Misplaced`] in another incomplete array; [`EncodeError::TooBig`] above 2^31-1
+    /// elements.
     pub fn array(&mut self, element: BuiltinType, count: usize) -> Result<(), EncodeError> {
         let wanted = u32::try_from(count).map_err(|_| EncodeError::TooBig {
             what: "array",
@@ -209,11 +212,12 @@ impl<'m> FieldEncoder<'m> {
         Ok(())
     }
 
-    /// The next element of the open array.
+    /// Appends the next element of the open array.
     ///
     /// # Errors
-    /// [`EncodeError::Misplaced`] when no array wants elements, [`EncodeError::ElementType`] when the value is of
-    /// another type than the array, [`EncodeError::TooBig`] as for [`scalar`](Self::scalar).
+    /// [`EncodeError::Misplaced`] without an incomplete array; [`EncodeError::ElementType`] if the
+    /// value has another type than the array; [`EncodeError::TooBig`] as for
+    /// [`scalar`](Self::scalar).
     #[inline]
     pub fn element(&mut self, value: Scalar<'_>) -> Result<(), EncodeError> {
         let left = self.wanted.checked_sub(1).ok_or(NO_ARRAY)?;
@@ -228,8 +232,8 @@ impl<'m> FieldEncoder<'m> {
         value.write::<false>(self.buf)
     }
 
-    /// Opens an array of `count` structures; each is a [`begin_structure`](Self::begin_structure) and an
-    /// [`end_structure`](Self::end_structure).
+    /// Starts an array of `count` structures. Each structure is a
+    /// [`begin_structure`](Self::begin_structure) and an [`end_structure`](Self::end_structure).
     ///
     /// # Errors
     /// As for [`array`](Self::array).
@@ -237,12 +241,12 @@ impl<'m> FieldEncoder<'m> {
         self.array(BuiltinType::ExtensionObject, count)
     }
 
-    /// Inside a structure, the length of an array of `count` structures by value: their fields follow inline, one
-    /// structure after the other (OPC 10000-6, 5.2.6).
+    /// Appends the length of an array of `count` structures by value, inside a structure. The
+    /// fields of the structures follow inline (OPC 10000-6, 5.2.6).
     ///
     /// # Errors
-    /// [`EncodeError::Misplaced`] outside of a structure or while an array wants elements, [`EncodeError::TooBig`]
-    /// past 2^31-1 structures.
+    /// [`EncodeError::Misplaced`] outside of a structure or in an incomplete array;
+    /// [`EncodeError::TooBig`] above 2^31-1 structures.
     pub fn inline_structures(&mut self, count: usize) -> Result<(), EncodeError> {
         if self.depth == 0 {
             return Err(EncodeError::Misplaced(
@@ -252,12 +256,13 @@ impl<'m> FieldEncoder<'m> {
         self.begin_array(BuiltinType::ExtensionObject, count)
     }
 
-    /// Opens an ExtensionObject with a binary body: the next of the open array of structures, or with no array
-    /// open a value of its own. `type_id` names the binary encoding of the structure's type.
+    /// Starts an ExtensionObject with a binary body: the next element of the open array of
+    /// structures, or a separate value without an open array. `type_id` is the NodeId of the binary
+    /// encoding of the structure.
     ///
     /// # Errors
-    /// [`EncodeError::TooDeep`] past [`MAX_DEPTH`](Self::MAX_DEPTH), [`EncodeError::ElementType`] in an array of
-    /// another type.
+    /// [`EncodeError::TooDeep`] above [`MAX_DEPTH`](Self::MAX_DEPTH); [`EncodeError::ElementType`]
+    /// in an array of another type.
     pub fn begin_structure(&mut self, type_id: NodeId<'_>) -> Result<(), EncodeError> {
         if self.depth == MAX_DEPTH {
             return Err(EncodeError::TooDeep);
@@ -297,11 +302,11 @@ impl<'m> FieldEncoder<'m> {
         Ok(())
     }
 
-    /// Closes the innermost structure.
+    /// Ends the innermost structure.
     ///
     /// # Errors
-    /// [`EncodeError::Misplaced`] when none is open or an array in it wants elements, [`EncodeError::TooBig`] for a
-    /// body longer than 2^31-1 bytes.
+    /// [`EncodeError::Misplaced`] without an open structure or in an incomplete array;
+    /// [`EncodeError::TooBig`] for a body of more than 2^31-1 bytes.
     pub fn end_structure(&mut self) -> Result<(), EncodeError> {
         if self.wanted != 0 {
             return Err(ELEMENTS_WANTED);
@@ -319,14 +324,15 @@ impl<'m> FieldEncoder<'m> {
         Ok(())
     }
 
-    /// All fields at once: a block as [`Fields::bytes`](crate::Fields::bytes) gives it, copied unread.
+    /// Appends all fields at once: copies a block as returned by
+    /// [`Fields::bytes`](crate::Fields::bytes) without decoding it.
     ///
     /// # Errors
-    /// [`EncodeError::Misplaced`] after another field, in a delta frame, or when the block is shorter than its
-    /// FieldCount.
+    /// [`EncodeError::Misplaced`] after another field, in a delta frame, or if the block has no
+    /// complete FieldCount.
     pub fn fields_block(&mut self, block: &[u8]) -> Result<(), EncodeError> {
         self.begin_value()?;
-        // In a delta frame the FieldIndex stands there already.
+        // In a delta frame the FieldIndex is already written.
         if self.buf.len() != self.count_at + 2 {
             return Err(EncodeError::Misplaced("block of fields after a field"));
         }
@@ -341,11 +347,11 @@ impl<'m> FieldEncoder<'m> {
         Ok(())
     }
 
-    /// Ends the key frame.
+    /// Finishes the key frame.
     ///
     /// # Errors
-    /// [`EncodeError::Misplaced`] while a structure or an array is open, [`EncodeError::TooBig`] past 65535 fields
-    /// or, among several DataSetMessages, past 65535 bytes.
+    /// [`EncodeError::Misplaced`] with an open structure or array; [`EncodeError::TooBig`] above
+    /// 65535 fields or, with several DataSetMessages, above 65535 bytes.
     #[inline]
     pub fn finish(self) -> Result<(), EncodeError> {
         if self.wanted != 0 {
@@ -364,7 +370,7 @@ impl<'m> FieldEncoder<'m> {
         self.progress.message_finished(self.buf)
     }
 
-    /// Counts a value that starts a field, unless it stands inside a structure.
+    /// Counts a value that starts a field, except inside a structure.
     #[inline]
     const fn begin_value(&mut self) -> Result<(), EncodeError> {
         if self.wanted != 0 {
@@ -390,7 +396,7 @@ impl<'m> FieldEncoder<'m> {
     }
 }
 
-/// Of a size the compiler knows, which makes it a few moves each.
+/// Appends tagged values. With a constant size, each value compiles to a few moves.
 #[inline]
 fn push_tagged<const N: usize>(buf: &mut Vec<u8>, id: u8, bytes: &[u8]) {
     let (values, _) = bytes.as_chunks::<N>();
@@ -405,10 +411,11 @@ impl<'m> DeltaEncoder<'m> {
         Self { fields, indexes: 0 }
     }
 
-    /// The changed field of that position in the DataSetMetaData, from 0; exactly one value is to be written to it.
+    /// Starts the changed field at an index in the DataSetMetaData; exactly a single value has to
+    /// be written to it.
     ///
     /// # Errors
-    /// [`EncodeError::Misplaced`] when the field before did not get its one value.
+    /// [`EncodeError::Misplaced`] if the previous field does not have exactly a single value.
     pub fn field(&mut self, index: u16) -> Result<&mut FieldEncoder<'m>, EncodeError> {
         self.check()?;
         self.fields.buf.extend_from_slice(&index.to_le_bytes());
@@ -416,7 +423,7 @@ impl<'m> DeltaEncoder<'m> {
         Ok(&mut self.fields)
     }
 
-    /// Ends the delta frame.
+    /// Finishes the delta frame.
     ///
     /// # Errors
     /// As for [`field`](Self::field) and [`FieldEncoder::finish`].
@@ -441,7 +448,7 @@ impl<'m> DataValueEncoder<'m> {
         Self { fields, delta }
     }
 
-    /// The next field of a key frame.
+    /// Appends the next field of a key frame.
     ///
     /// # Errors
     /// [`EncodeError::Misplaced`] in a delta frame, [`EncodeError::TooBig`] as for [`FieldEncoder::scalar`].
@@ -455,7 +462,7 @@ impl<'m> DataValueEncoder<'m> {
         value.write(self.fields.buf)
     }
 
-    /// A changed field of a delta frame, by its position in the DataSetMetaData, from 0.
+    /// Appends a changed field of a delta frame, by its index in the DataSetMetaData.
     ///
     /// # Errors
     /// [`EncodeError::Misplaced`] in a key frame, [`EncodeError::TooBig`] as for [`FieldEncoder::scalar`].
@@ -468,7 +475,7 @@ impl<'m> DataValueEncoder<'m> {
         value.write(self.fields.buf)
     }
 
-    /// Ends the frame.
+    /// Finishes the frame.
     ///
     /// # Errors
     /// As for [`FieldEncoder::finish`].

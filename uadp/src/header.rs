@@ -1,37 +1,38 @@
-//! The headers of a NetworkMessage and the bits that announce them.
+//! The headers of a NetworkMessage and their flags.
 
 use crate::reader::Reader;
 use crate::{DateTime, DecodeError, Guid};
 
-/// The header fields before the payload. What is `None` is not on the wire.
+/// The header fields before the payload. Fields that are `None` are not encoded.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct NetworkHeader<'a> {
-    /// Who sends.
+    /// The publisher.
     pub publisher_id: Option<PublisherId<'a>>,
-    /// DataSetClass all DataSetMessages belong to.
+    /// DataSetClass of all DataSetMessages.
     pub data_set_class_id: Option<Guid>,
     /// The group header.
     pub group: Option<GroupHeader>,
-    /// When the NetworkMessage was made.
+    /// Time at which the NetworkMessage was created.
     pub timestamp: Option<DateTime>,
-    /// Refines the timestamp, in units of 10 ps.
+    /// Part of the timestamp below its resolution, in units of 10 ps.
     pub picoseconds: Option<u16>,
 }
 
-/// The SecurityHeader, which always stands in clear (OPC 10000-14, 7.2.4.4.3).
+/// The SecurityHeader, which is never encrypted (OPC 10000-14, 7.2.4.4.3).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub struct SecurityHeader<'a> {
-    /// The message ends with a signature over all of it.
+    /// The message ends with a signature of all its bytes.
     pub signed: bool,
     /// Payload and footer are encrypted.
     pub encrypted: bool,
-    /// The publisher asks for new keys before the lifetime of these ends.
+    /// The publisher requests new keys before the lifetime of the present keys ends.
     pub force_key_reset: bool,
-    /// Which keys of the SecurityGroup; 0 in a message that is neither signed nor encrypted.
+    /// SecurityTokenId of the keys; 0 in a message that is neither signed nor encrypted.
     pub token_id: u32,
     /// MessageNonce: with the AES-CTR policies 4 random bytes and a UInt32 sequence number.
     pub nonce: &'a [u8],
-    /// Bytes of the SecurityFooter, `None` when it is not enabled. The AES-CTR policies have none.
+    /// Size of the SecurityFooter in bytes, `None` if not enabled. The AES-CTR policies have no
+    /// footer.
     pub footer_size: Option<u16>,
 }
 
@@ -47,7 +48,8 @@ pub enum NetworkMessageType {
     Announcement,
 }
 
-/// Identity of a publisher; equal only with equal type and value (OPC 10000-14, 7.2.4.4.2).
+/// Identity of a publisher. Two ids are equal if their type and value are equal (OPC 10000-14,
+/// 7.2.4.4.2).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 #[expect(missing_docs, reason = "the names are those of the builtin types")]
 pub enum PublisherId<'a> {
@@ -65,13 +67,13 @@ pub struct GroupHeader {
     pub writer_group_id: Option<u16>,
     /// VersionTime of the layout: seconds since 2000-01-01 UTC.
     pub group_version: Option<u32>,
-    /// Number of this NetworkMessage among those of one publishing interval.
+    /// Number of this NetworkMessage within a publishing interval.
     pub network_message_number: Option<u16>,
-    /// Counts the NetworkMessages of the WriterGroup.
+    /// Sequence number of the NetworkMessages of the WriterGroup.
     pub sequence_number: Option<u16>,
 }
 
-/// The first one to three bytes; a byte left out is 0.
+/// The first one to three bytes; an omitted byte is 0.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Flags {
     pub(crate) uadp: u8,
@@ -138,7 +140,7 @@ fn reserved(field: &'static str, value: u8) -> DecodeError {
 }
 
 impl<'a> PublisherId<'a> {
-    /// Reads past an id and checks it.
+    /// Skips and checks an id.
     #[inline]
     pub(crate) fn skip(id_type: u8, reader: &mut Reader<'a>) -> Result<(), DecodeError> {
         let size = match id_type {
@@ -160,7 +162,7 @@ impl<'a> PublisherId<'a> {
             PUBLISHER_ID_UINT64 => Self::UInt64(u64::from_le_bytes(reader.array("PublisherId")?)),
             _ => match reader.text("PublisherId")? {
                 Some(text) => Self::String(text),
-                // A null String names no publisher.
+                // A null String is not a valid PublisherId.
                 None => {
                     return Err(DecodeError::Reserved {
                         field: "PublisherId length",
@@ -183,7 +185,7 @@ impl<'a> PublisherId<'a> {
 }
 
 impl GroupHeader {
-    /// Reads past a group header and checks it.
+    /// Skips and checks a group header.
     #[inline]
     pub(crate) fn skip(reader: &mut Reader<'_>) -> Result<(), DecodeError> {
         let mut ahead = *reader;
@@ -196,7 +198,7 @@ impl GroupHeader {
             *reader = ahead;
             return Ok(());
         }
-        // The slow way names what is wrong.
+        // Decodes field by field, so that the error has the name of the invalid field.
         Self::read(reader).map(|_| ())
     }
 
@@ -236,7 +238,7 @@ impl GroupHeader {
 }
 
 impl<'a> SecurityHeader<'a> {
-    /// Neither signed nor encrypted: what discovery messages carry without security (OPC 10000-14, 7.2.4.6).
+    /// Header without security, as in unsecured discovery messages (OPC 10000-14, 7.2.4.6).
     pub const NONE: Self = Self {
         signed: false,
         encrypted: false,
@@ -246,7 +248,7 @@ impl<'a> SecurityHeader<'a> {
         footer_size: None,
     };
 
-    /// True when the message is signed or encrypted.
+    /// Returns true if the message is signed or encrypted.
     #[must_use]
     pub const fn is_secured(&self) -> bool {
         self.signed || self.encrypted

@@ -1,4 +1,4 @@
-//! Writing the headers of a NetworkMessage. Which flags are set follows from what there is to write.
+//! Encodes the headers of a NetworkMessage. The flags follow from the present fields.
 
 use crate::header::{
     self, GroupHeader, NetworkHeader, NetworkMessageType, PublisherId, SecurityHeader,
@@ -6,42 +6,43 @@ use crate::header::{
 use crate::writer::{self, Room, flag};
 use crate::{EncodeError, Variant};
 
-/// The headers few NetworkMessages have. The default has none.
+/// Rarely used headers of NetworkMessages. The default has no such headers.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Extras<'a> {
-    /// Values repeated from the DataSet so that brokers can filter by them; only with a single DataSetMessage
-    /// (OPC 10000-14, 7.2.4.4.2).
+    /// Values repeated from the DataSet so that brokers can filter by them; only with a single
+    /// DataSetMessage (OPC 10000-14, 7.2.4.4.2).
     pub promoted_fields: Option<&'a [Variant<'a>]>,
     /// The SecurityHeader.
     pub security: Option<SecurityHeader<'a>>,
 }
 
-/// What names the DataSetWriters.
+/// Form of the payload header.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum PayloadHeader<'a> {
     None,
     /// Count and DataSetWriterIds.
     Count(&'a [u16]),
-    /// The bare DataSetWriterId of a chunk.
+    /// DataSetWriterId of a chunk, without Count.
     Chunk(u16),
 }
 
-/// What a NetworkMessage is besides a plain one with DataSetMessages.
+/// Properties of a NetworkMessage that differ from a plain message with DataSetMessages.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Form<'a> {
     pub(crate) message_type: NetworkMessageType,
     pub(crate) chunk: bool,
-    /// An ActionHeader stands at the start of the payload.
+    /// The payload starts with an ActionHeader.
     pub(crate) action: bool,
     pub(crate) extras: &'a Extras<'a>,
 }
 
-/// The most bytes of fixed size that stand together: flags, PublisherId, DataSetClassId and group header, or one
-/// DataSetWriterId, Timestamp and PicoSeconds behind them.
+/// Maximum number of contiguous bytes of fixed size: flags, PublisherId, DataSetClassId, group
+/// header, a single DataSetWriterId, Timestamp and PicoSeconds.
 const ROOM: usize = 64;
 type Fixed<'b> = Room<'b, ROOM>;
 
-/// Appends everything before the payload; the position of the Timestamp, if there is one.
+/// Appends all headers before the payload. Returns the offset of the Timestamp, if there is a
+/// Timestamp.
 #[inline]
 pub(crate) fn write(
     buf: &mut Vec<u8>,
@@ -71,7 +72,8 @@ pub(crate) fn write(
     Ok(timestamp_at)
 }
 
-/// As the headers are written in [`write`], where the PublisherId is a String or there is not one DataSetWriterId.
+/// Appends the headers as [`write`], for a PublisherId of type String or a number of
+/// DataSetWriterIds other than one.
 #[cold]
 fn write_in_parts(
     buf: &mut Vec<u8>,
@@ -99,7 +101,7 @@ fn write_in_parts(
     Ok(timestamp.flatten().map(|at| start + at))
 }
 
-/// PublisherId unless it is a String, DataSetClassId and group header.
+/// Appends PublisherId unless it is a String, DataSetClassId and group header.
 #[inline]
 fn write_ids(fixed: &mut Fixed<'_>, header: &NetworkHeader<'_>) {
     match header.publisher_id {
@@ -129,7 +131,7 @@ fn write_writer_id(fixed: &mut Fixed<'_>, payload_header: PayloadHeader<'_>) {
     }
 }
 
-/// Timestamp and PicoSeconds; where in the room the Timestamp stands.
+/// Appends Timestamp and PicoSeconds. Returns the offset of the Timestamp.
 #[inline]
 fn write_times(fixed: &mut Fixed<'_>, header: &NetworkHeader<'_>) -> Option<usize> {
     let at = header.timestamp.map(|timestamp| {
@@ -215,7 +217,7 @@ fn write_group_header(fixed: &mut Fixed<'_>, group: &GroupHeader) {
     }
 }
 
-/// Count and DataSetWriterIds, unless it is just one.
+/// Appends Count and DataSetWriterIds; a single id is handled by `write_writer_id`.
 fn write_writer_ids(buf: &mut Vec<u8>, ids: &[u16]) -> Result<(), EncodeError> {
     let count = u8::try_from(ids.len()).map_err(|_| EncodeError::TooBig {
         what: "DataSetWriterIds",

@@ -1,4 +1,4 @@
-//! Values that hold values: DataValue, DiagnosticInfo, and Variants inside of Variants.
+//! Values that contain values: DataValue, DiagnosticInfo, and nested Variants.
 
 use std::fmt;
 use std::marker::PhantomData;
@@ -6,25 +6,26 @@ use std::marker::PhantomData;
 use crate::reader::Reader;
 use crate::{DateTime, DecodeError, EncodeError, StatusCode, Variant, writer};
 
-/// DataValue (OPC 10000-6, 5.2.2.17): a value with its quality and its times. What is `None` is not on the wire.
+/// DataValue (OPC 10000-6, 5.2.2.17): a value with its quality and its times. Fields that are
+/// `None` are not encoded.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct DataValue<'a> {
     /// The value.
     pub value: Option<Variant<'a>>,
-    /// Quality; left out for Good.
+    /// Quality; omitted for Good.
     pub status: Option<StatusCode>,
-    /// When the source took the value.
+    /// Time at the source.
     pub source_timestamp: Option<DateTime>,
-    /// Refines the source's time, in units of 10 ps.
+    /// Part of the source time below its resolution, in units of 10 ps.
     pub source_picoseconds: Option<u16>,
-    /// When the server or publisher got the value.
+    /// Time at which the server or publisher received the value.
     pub server_timestamp: Option<DateTime>,
-    /// Refines the server's time, in units of 10 ps.
+    /// Part of the server time below its resolution, in units of 10 ps.
     pub server_picoseconds: Option<u16>,
 }
 
-/// DiagnosticInfo (OPC 10000-6, 5.2.2.12). What is `None` is not on the wire; the first four are indexes into a
-/// table of strings that comes with the message that carries them.
+/// DiagnosticInfo (OPC 10000-6, 5.2.2.12). Fields that are `None` are not encoded. The first four
+/// fields are indexes into a string table of the containing message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct DiagnosticInfo<'a> {
     /// Name of the error.
@@ -33,48 +34,50 @@ pub struct DiagnosticInfo<'a> {
     pub namespace_uri: Option<i32>,
     /// Language of the text.
     pub locale: Option<i32>,
-    /// Text for a reader.
+    /// Text for people.
     pub localized_text: Option<i32>,
-    /// More, in words of the sender. The inner `None` is the null String.
+    /// Further information of the sender. The inner `None` is the null String.
     pub additional_info: Option<Option<&'a str>>,
-    /// StatusCode of the system below.
+    /// StatusCode of the underlying system.
     pub inner_status_code: Option<StatusCode>,
-    /// What the system below says.
+    /// DiagnosticInfo of the underlying system.
     pub inner: Option<Encoded<'a, Self>>,
 }
 
-/// A value of type `T` as its bytes, which were checked when this was made: nesting needs no allocation.
+/// A value of type `T` in encoded form, checked when it was created. Nesting therefore needs no
+/// allocation.
 ///
-/// Equality is that of the bytes.
+/// Equality compares the bytes.
 pub struct Encoded<'a, T> {
     bytes: &'a [u8],
     value: PhantomData<fn() -> T>,
 }
 
-/// What can stand inside of another value.
+/// A value that can be nested in another value.
 pub(crate) trait Nest<'a>: Sized {
     fn read_nested(reader: &mut Reader<'a>, depth: Depth) -> Result<Self, DecodeError>;
 
-    /// Finds the end of a value and checks it on the way.
+    /// Skips and checks a value.
     #[inline]
     fn skip(reader: &mut Reader<'a>, depth: Depth) -> Result<(), DecodeError> {
         Self::read_nested(reader, depth).map(|_| ())
     }
 }
 
-/// Levels of values in values that are read, beyond which there is [`DecodeError::TooDeep`].
+/// Maximum nesting depth of decoded values. Deeper values are [`DecodeError::TooDeep`].
 ///
-/// Version 1.05 expects no decoder to take more than 10 levels of DiagnosticInfo, and at least 4 (OPC 10000-6,
-/// 5.2.2.12). Every level more would let a datagram that nests as deep cost a reader of all its values that much more.
+/// Version 1.05 requires decoders to support at least 4 and at most 10 levels of DiagnosticInfo
+/// (OPC 10000-6, 5.2.2.12). Each additional level would increase the cost of reading all values of
+/// a deeply nested datagram.
 pub const MAX_NESTING: u8 = 10;
 
-/// How many levels a value may still hold.
+/// Number of levels that a value may still contain.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Depth {
-    /// So many.
+    /// The number of remaining levels.
     Left(u8),
-    /// As many as it has: its bytes were checked before, and nothing follows them. Values inside of it are not walked
-    /// through once more, or going down level by level would take the square of their number.
+    /// No limit: the bytes were checked before, and nothing follows them. Nested values are not
+    /// skipped through again; otherwise descending level by level would take quadratic time.
     Checked,
 }
 
@@ -91,7 +94,7 @@ impl Depth {
     }
 }
 
-/// Moves behind `count` values.
+/// Skips `count` values.
 pub(crate) fn skip<'a, T: Nest<'a>>(
     count: usize,
     reader: &mut Reader<'a>,
@@ -105,10 +108,10 @@ pub(crate) fn skip<'a, T: Nest<'a>>(
 
 #[expect(private_bounds, reason = "the three values that nest are all of them")]
 impl<'a, T: Nest<'a>> Encoded<'a, T> {
-    /// Checks that the bytes are exactly one value.
+    /// Checks that the bytes are exactly a single value.
     ///
     /// # Errors
-    /// Fails where reading the value does, and for bytes behind it.
+    /// Fails as decoding the value, and for bytes behind it.
     pub fn new(bytes: &'a [u8]) -> Result<Self, DecodeError> {
         let mut reader = Reader::new(bytes);
         let encoded = Self::read(&mut reader, Depth::FULL)?;
@@ -118,10 +121,10 @@ impl<'a, T: Nest<'a>> Encoded<'a, T> {
         }
     }
 
-    /// The value; values inside of it are given as their bytes again.
+    /// Decodes the value; nested values stay encoded.
     ///
     /// # Errors
-    /// None: the bytes were read once before. The type says so because nothing here may panic.
+    /// Does not fail, because the bytes were checked before. The `Result` avoids a panic.
     pub fn get(self) -> Result<T, DecodeError> {
         T::read_nested(&mut Reader::new(self.bytes), Depth::Checked)
     }
@@ -137,7 +140,7 @@ impl<'a, T: Nest<'a>> Encoded<'a, T> {
 }
 
 impl<'a, T> Encoded<'a, T> {
-    /// The value as on the wire.
+    /// Returns the encoded value.
     #[must_use]
     pub const fn bytes(self) -> &'a [u8] {
         self.bytes
@@ -145,10 +148,10 @@ impl<'a, T> Encoded<'a, T> {
 }
 
 impl<'a> Encoded<'a, Variant<'a>> {
-    /// Writes a Variant into `buffer`, from its start, as the element of an array of Variants.
+    /// Encodes a Variant to the start of `buffer`, as an element of an array of Variants.
     ///
     /// # Errors
-    /// As writing the value does.
+    /// As encoding the value.
     pub fn variant(value: &Variant<'_>, buffer: &'a mut Vec<u8>) -> Result<Self, EncodeError> {
         buffer.clear();
         value.write(buffer)?;
@@ -157,10 +160,10 @@ impl<'a> Encoded<'a, Variant<'a>> {
 }
 
 impl<'a> Encoded<'a, DataValue<'a>> {
-    /// Writes a DataValue into `buffer`, from its start.
+    /// Encodes a DataValue to the start of `buffer`.
     ///
     /// # Errors
-    /// As writing the value does.
+    /// As encoding the value.
     pub fn data_value(value: &DataValue<'_>, buffer: &'a mut Vec<u8>) -> Result<Self, EncodeError> {
         buffer.clear();
         value.write(buffer)?;
@@ -169,10 +172,10 @@ impl<'a> Encoded<'a, DataValue<'a>> {
 }
 
 impl<'a> Encoded<'a, DiagnosticInfo<'a>> {
-    /// Writes a DiagnosticInfo into `buffer`, from its start.
+    /// Encodes a DiagnosticInfo to the start of `buffer`.
     ///
     /// # Errors
-    /// [`EncodeError::TooBig`] for a text that is too long.
+    /// [`EncodeError::TooBig`] for a text that exceeds its length field.
     pub fn diagnostic_info(
         value: &DiagnosticInfo<'_>,
         buffer: &'a mut Vec<u8>,
@@ -305,7 +308,7 @@ impl<'a> From<Variant<'a>> for DataValue<'a> {
     }
 }
 
-/// Bytes of what follows the value of a DataValue.
+/// Returns the number of bytes behind the value of a DataValue.
 fn size_behind_value(mask: u8) -> usize {
     [
         (STATUS, 4),
@@ -428,7 +431,7 @@ const SERVER_TIMESTAMP: u8 = 0x08;
 const SOURCE_PICOSECONDS: u8 = 0x10;
 const SERVER_PICOSECONDS: u8 = 0x20;
 const DATA_VALUE_RESERVED: u8 = 0xC0;
-/// What decoders take more for (OPC 10000-6, 5.2.2.17).
+/// Maximum value; decoders reduce larger values to it (OPC 10000-6, 5.2.2.17).
 const MOST_PICOSECONDS: u16 = 9999;
 
 const SYMBOLIC_ID: u8 = 0x01;

@@ -1,4 +1,4 @@
-//! NetworkMessage: the header of a datagram, and where its DataSetMessages lie.
+//! NetworkMessage: the headers of a datagram, and access to its DataSetMessages.
 
 use crate::action::{ActionDialect, Actions};
 use crate::header::{self, Flags};
@@ -8,15 +8,16 @@ use crate::{
     PublisherId, SecurityHeader, Variant,
 };
 
-/// A datagram whose headers were read (OPC 10000-14, 7.2.4.4.2). What follows them is read on demand.
+/// A datagram with decoded headers (OPC 10000-14, 7.2.4.4.2). The payload is decoded on demand.
 ///
-/// The payload of a signed or encrypted message is readable once it was opened with the keys of its SecurityGroup,
-/// that of a chunk once it was reassembled. What an Action message holds is read by [`actions`](Self::actions).
+/// The payload of a signed or encrypted message is readable after it was opened with the keys of
+/// its SecurityGroup, the payload of a chunk after reassembly. [`actions`](Self::actions) decodes
+/// an Action message.
 #[derive(Debug, Clone)]
 pub struct NetworkMessage<'a> {
     datagram: &'a [u8],
     flags: Flags,
-    /// From these on the header fields follow, all of them in the datagram.
+    /// Offsets of the header fields, which are all within the datagram.
     publisher_at: usize,
     group_at: usize,
     timestamp_at: usize,
@@ -26,7 +27,7 @@ pub struct NetworkMessage<'a> {
     rest: Option<Rest<'a>>,
 }
 
-/// The headers few messages have.
+/// Rarely used headers.
 #[derive(Debug, Clone, Copy)]
 struct Rest<'a> {
     message_type: NetworkMessageType,
@@ -39,31 +40,34 @@ struct Rest<'a> {
     footer: &'a [u8],
 }
 
-/// A piece of a DataSetMessage or discovery message too big for one NetworkMessage (OPC 10000-14, 7.2.4.4.4).
+/// A part of a DataSetMessage or discovery message that exceeds a NetworkMessage (OPC 10000-14,
+/// 7.2.4.4.4).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Chunk<'a> {
-    /// DataSetWriter of the whole; `None` without payload header, as in discovery messages.
+    /// DataSetWriterId of the message; `None` without payload header, as in discovery messages.
     pub writer_id: Option<u16>,
-    /// Which whole of the DataSetWriter this is a piece of.
+    /// Number of the message that this is a part of.
     pub message_sequence_number: u16,
-    /// Where the piece belongs in the whole, in bytes.
+    /// Offset of the part in the message, in bytes.
     pub offset: u32,
-    /// Bytes of the whole.
+    /// Size of the message in bytes.
     pub total_size: u32,
-    /// The piece.
+    /// Bytes of the part.
     pub data: &'a [u8],
 }
 
-/// The PromotedFields of a NetworkMessage one by one (OPC 10000-14, 7.2.4.4.2). Ends after the first `Err`.
+/// Iterator over the PromotedFields of a NetworkMessage (OPC 10000-14, 7.2.4.4.2). It ends after
+/// the first `Err`.
 #[derive(Debug, Clone)]
 pub struct PromotedFields<'a> {
     reader: Reader<'a>,
 }
 
-/// The DataSetMessages of a [`NetworkMessage`], in the order of the DataSetWriterIds.
+/// Iterator over the DataSetMessages of a [`NetworkMessage`], in the order of the DataSetWriterIds.
 ///
-/// With several messages a malformed one is an `Err` in its place and the next ones follow.
-/// Sizes that reach past the datagram end the iteration with one `Err`, as do bytes that belong to no message.
+/// A malformed message among several is returned as an `Err`, and the iteration continues with the
+/// next message. The iteration ends with an `Err` if a size exceeds the datagram or if bytes are
+/// left after the last message.
 #[derive(Debug, Clone)]
 pub struct Messages<'a> {
     step: Step<'a>,
@@ -72,7 +76,7 @@ pub struct Messages<'a> {
 
 #[derive(Debug, Clone)]
 enum Step<'a> {
-    /// One message takes the whole payload.
+    /// A single message spans the whole payload.
     Single {
         writer_id: Option<u16>,
     },
@@ -84,16 +88,16 @@ enum Step<'a> {
         writer_ids: &'a [[u8; 2]],
         sizes: &'a [[u8; 2]],
     },
-    /// The NetworkMessage has none to give.
+    /// The NetworkMessage has no DataSetMessages that can be decoded here.
     Misread(&'static str),
     Done,
 }
 
 impl<'a> NetworkMessage<'a> {
-    /// Reads the headers of a datagram.
+    /// Decodes the headers of a datagram.
     ///
     /// # Errors
-    /// Fails when a header is cut off, uses a reserved value, or announces what this crate does not read.
+    /// Fails if a header is truncated, has a reserved value, or announces an unsupported feature.
     #[inline]
     pub fn decode(datagram: &'a [u8]) -> Result<Self, DecodeError> {
         let start = Reader::new(datagram);
@@ -140,7 +144,7 @@ impl<'a> NetworkMessage<'a> {
         })
     }
 
-    /// The header fields.
+    /// Returns the header fields.
     #[inline]
     #[must_use]
     pub fn header(&self) -> NetworkHeader<'a> {
@@ -162,7 +166,7 @@ impl<'a> NetworkMessage<'a> {
         }
     }
 
-    /// Who sends; alone it costs less than the whole header.
+    /// Returns the PublisherId. This is cheaper than decoding the whole header.
     #[inline]
     #[must_use]
     pub fn publisher_id(&self) -> Option<PublisherId<'a>> {
@@ -175,7 +179,7 @@ impl<'a> NetworkMessage<'a> {
         }
     }
 
-    /// The group header; alone it costs less than the whole header.
+    /// Returns the group header. This is cheaper than decoding the whole header.
     #[inline]
     #[must_use]
     pub fn group(&self) -> Option<GroupHeader> {
@@ -189,7 +193,7 @@ impl<'a> NetworkMessage<'a> {
     fn data_set_class_id(&self) -> Option<Guid> {
         match self.flags.extended1 & header::DATA_SET_CLASS_ID {
             0 => None,
-            // It ends where the group header starts.
+            // It ends at the start of the group header.
             _ => {
                 let mut reader = self.reader_at(self.group_at.checked_sub(16)?);
                 reader.array("DataSetClassId").ok().map(Guid)
@@ -202,7 +206,8 @@ impl<'a> NetworkMessage<'a> {
         Reader::new(self.datagram.get(at..).unwrap_or_default())
     }
 
-    /// DataSetWriterIds of the payload header, at least one; `None` without payload header.
+    /// Returns the DataSetWriterIds of the payload header, at least one; `None` without payload
+    /// header.
     #[inline]
     #[must_use]
     pub fn writer_ids(&self) -> Option<impl ExactSizeIterator<Item = u16> + Clone + use<'a>> {
@@ -210,47 +215,48 @@ impl<'a> NetworkMessage<'a> {
             .map(|ids| ids.iter().map(|id| u16::from_le_bytes(*id)))
     }
 
-    /// What the NetworkMessage is for.
+    /// Returns the type of the NetworkMessage.
     #[must_use]
     pub fn message_type(&self) -> NetworkMessageType {
         self.rest
             .map_or_else(Default::default, |rest| rest.message_type)
     }
 
-    /// True for a chunk: read it with [`chunk`](Self::chunk).
+    /// Returns true for a chunk: decode it with [`chunk`](Self::chunk).
     #[inline]
     #[must_use]
     pub fn is_chunk(&self) -> bool {
         self.rest.is_some_and(|rest| rest.chunk)
     }
 
-    /// True for requests or responses of Actions: read them with [`actions`](Self::actions).
+    /// Returns true for requests or responses of Actions: decode them with
+    /// [`actions`](Self::actions).
     #[inline]
     #[must_use]
     pub fn is_action(&self) -> bool {
         self.rest.is_some_and(|rest| rest.action)
     }
 
-    /// The SecurityHeader. Only what it says of `signed` and `encrypted` tells whether the message is secured.
+    /// Returns the SecurityHeader. The message is secured only if `signed` or `encrypted` is set.
     #[must_use]
     pub fn security(&self) -> Option<SecurityHeader<'a>> {
         self.rest.and_then(|rest| rest.security)
     }
 
-    /// The SecurityFooter, empty without one and as long as the message was not opened.
+    /// Returns the SecurityFooter; empty without footer, and until the message is opened.
     #[must_use]
     pub fn footer(&self) -> &'a [u8] {
         self.rest.map_or(&[], |rest| rest.footer)
     }
 
-    /// True while the payload is signed or encrypted and was not opened.
+    /// Returns true if the payload is signed or encrypted and was not opened.
     #[inline]
     #[must_use]
     pub fn is_sealed(&self) -> bool {
         self.rest.is_some_and(|rest| rest.sealed)
     }
 
-    /// The PromotedFields; `None` when they are not enabled.
+    /// Returns the PromotedFields, or `None` if they are not enabled.
     #[must_use]
     pub fn promoted_fields(&self) -> Option<PromotedFields<'a>> {
         let promoted = self.rest?.promoted?;
@@ -259,26 +265,26 @@ impl<'a> NetworkMessage<'a> {
         })
     }
 
-    /// What stands behind the headers. Of a sealed message that is the ciphertext, the footer and the signature; the
-    /// ActionHeader of an Action message belongs to it.
+    /// Returns the bytes behind the headers. In a sealed message these are the ciphertext, the
+    /// footer and the signature. The ActionHeader of an Action message is part of the payload.
     #[must_use]
     pub const fn payload(&self) -> &'a [u8] {
         self.payload.rest()
     }
 
-    /// Where the payload starts in the datagram.
+    /// Returns the offset of the payload in the datagram.
     #[must_use]
     pub const fn payload_offset(&self) -> usize {
         self.payload_at
     }
 
-    /// All bytes, from the first flags on.
+    /// Returns all bytes, from the first flags on.
     #[must_use]
     pub const fn datagram(&self) -> &'a [u8] {
         self.datagram
     }
 
-    /// The same message with the payload and footer that opening it gave.
+    /// Returns the message with its opened payload and footer.
     pub(crate) fn opened<'b>(&self, payload: &'b [u8], footer: &'b [u8]) -> NetworkMessage<'b>
     where
         'a: 'b,
@@ -294,12 +300,12 @@ impl<'a> NetworkMessage<'a> {
         }
     }
 
-    /// The piece of a chunk NetworkMessage.
+    /// Returns the part in a chunk NetworkMessage.
     ///
     /// # Errors
-    /// [`DecodeError::Misread`] when it is no chunk or still sealed, [`DecodeError::Unsupported`] for one with an
-    /// ActionHeader. Else fails when the header of the chunk is cut off, the piece is empty, or reaches past the end of
-    /// the whole.
+    /// [`DecodeError::Misread`] if the message is not a chunk or is still sealed;
+    /// [`DecodeError::Unsupported`] for a chunk with an ActionHeader. Otherwise fails if the header
+    /// of the chunk is truncated, the part is empty, or it exceeds the TotalSize.
     pub fn chunk(&self) -> Result<Chunk<'a>, DecodeError> {
         if self.is_sealed() {
             return Err(DecodeError::Misread(SEALED));
@@ -333,10 +339,12 @@ impl<'a> NetworkMessage<'a> {
         })
     }
 
-    /// The DataSetMessages. Without payload header that is one, without a DataSetWriterId; where several are
-    /// configured without one, see [`data_set_message_at`](Self::data_set_message_at).
+    /// Returns the DataSetMessages. Without payload header there is a single message without
+    /// DataSetWriterId; for several configured messages without payload header see
+    /// [`data_set_message_at`](Self::data_set_message_at).
     ///
-    /// A chunk, a discovery message, an Action message and a sealed message give one [`DecodeError::Misread`].
+    /// A chunk, a discovery message, an Action message and a sealed message return a single
+    /// [`DecodeError::Misread`].
     #[inline]
     #[must_use]
     pub fn messages(&self) -> Messages<'a> {
@@ -354,11 +362,13 @@ impl<'a> NetworkMessage<'a> {
         }
     }
 
-    /// The DataSetMessage of `size` bytes that starts `offset` bytes into the NetworkMessage, as the DataSetReader of
-    /// a fixed layout has it configured (DataSetOffset and ConfiguredSize: OPC 10000-14, 6.3.1.3.3 and 6.3.1.3.5).
+    /// Returns the DataSetMessage of `size` bytes at `offset` in the NetworkMessage, as configured
+    /// in the DataSetReader of a fixed layout (DataSetOffset and ConfiguredSize: OPC 10000-14,
+    /// 6.3.1.3.3 and 6.3.1.3.5).
     ///
     /// # Errors
-    /// As for [`messages`](Self::messages); [`DecodeError::Truncated`] when it would not lie in the payload.
+    /// As for [`messages`](Self::messages); [`DecodeError::Truncated`] if the range is not within
+    /// the payload.
     pub fn data_set_message_at(
         &self,
         offset: usize,
@@ -379,13 +389,15 @@ impl<'a> NetworkMessage<'a> {
         DataSetMessage::read(None, Reader::new(message))
     }
 
-    /// The requests or responses of an Action message (OPC 10000-14, 7.2.4.5.9 and 7.2.4.5.10), laid out as the peer
-    /// does it.
+    /// Returns the requests or responses of an Action message (OPC 10000-14, 7.2.4.5.9 and
+    /// 7.2.4.5.10), in the dialect of the peer.
     ///
     /// # Errors
-    /// [`DecodeError::Misread`] when it is no Action message, a chunk, or still sealed; [`DecodeError::Reserved`] when it
-    /// does not name its responder, with a PublisherId and a payload header; else as the ActionHeader is cut off or
-    /// malformed.
+    /// - [`DecodeError::Misread`] if the message is not an Action message, is a chunk, or is still
+    ///   sealed.
+    /// - [`DecodeError::Reserved`] without PublisherId or payload header, which identify the
+    ///   Responder.
+    /// - Otherwise if the ActionHeader is truncated or malformed.
     pub fn actions(&self, dialect: ActionDialect) -> Result<Actions<'a>, DecodeError> {
         match self.rest.as_ref() {
             Some(rest) if rest.sealed => Err(DecodeError::Misread(SEALED)),
@@ -405,7 +417,8 @@ impl<'a> NetworkMessage<'a> {
 }
 
 impl<'a> Rest<'a> {
-    /// PromotedFields, SecurityHeader, and where neither signed nor encrypted the SecurityFooter.
+    /// Reads PromotedFields, SecurityHeader, and the SecurityFooter if the message is neither
+    /// signed nor encrypted.
     #[cold]
     fn read(flags: Flags, reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
         let promoted = match flags.extended2 & header::PROMOTED_FIELDS {
@@ -537,7 +550,7 @@ impl<'a> Iterator for PromotedFields<'a> {
 
 impl std::iter::FusedIterator for PromotedFields<'_> {}
 
-/// Count, never 0 (OPC 10000-14, 7.2.4.5.2), and DataSetWriterIds.
+/// Reads Count, which is never 0 (OPC 10000-14, 7.2.4.5.2), and DataSetWriterIds.
 #[inline]
 fn read_writer_ids<'a>(reader: &mut Reader<'a>) -> Result<&'a [[u8; 2]], DecodeError> {
     match reader.u8("DataSetMessage Count")? {

@@ -3,12 +3,13 @@
 use crate::reader::Reader;
 use crate::{DecodeError, EncodeError, Guid, writer};
 
-/// NodeId (OPC 10000-6, 5.2.2.9). Written in the shortest of its encodings, whichever it was read from.
+/// NodeId (OPC 10000-6, 5.2.2.9). It is encoded in its shortest form, independent of the form it
+/// was decoded from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct NodeId<'a> {
     /// Index into the sender's namespace array.
     pub namespace: u16,
-    /// What names the node within the namespace.
+    /// Identifier of the node within the namespace.
     pub identifier: Identifier<'a>,
 }
 
@@ -25,11 +26,11 @@ pub enum Identifier<'a> {
 /// ExpandedNodeId (OPC 10000-6, 5.2.2.10).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct ExpandedNodeId<'a> {
-    /// The node; its namespace index says nothing when there is a URI.
+    /// The node; its namespace index is meaningless if there is a URI.
     pub node_id: NodeId<'a>,
-    /// Namespace by name. A null URI on the wire reads as `None`.
+    /// URI of the namespace. A null URI is decoded as `None`.
     pub namespace_uri: Option<&'a str>,
-    /// Index into the sender's server array; 0, the own server, is not written.
+    /// Index into the sender's server array; 0, the local server, is not encoded.
     pub server_index: u32,
 }
 
@@ -37,7 +38,7 @@ impl<'a> NodeId<'a> {
     /// The null NodeId, `i=0`.
     pub const NULL: Self = Self::numeric(0, 0);
 
-    /// NodeId with a numeric identifier.
+    /// Creates a NodeId with a numeric identifier.
     #[must_use]
     pub const fn numeric(namespace: u16, identifier: u32) -> Self {
         Self {
@@ -46,7 +47,7 @@ impl<'a> NodeId<'a> {
         }
     }
 
-    /// NodeId with a string identifier.
+    /// Creates a NodeId with a string identifier.
     #[must_use]
     pub const fn string(namespace: u16, identifier: &'a str) -> Self {
         Self {

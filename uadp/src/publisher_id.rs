@@ -1,10 +1,11 @@
-//! A PublisherId that outlives its datagram.
+//! An owned PublisherId, independent of the datagram.
 
 use std::fmt;
 
 use crate::PublisherId;
 
-/// Owned form of a [`PublisherId`], equal to another only with equal type and value (OPC 10000-14, 7.2.4.4.2).
+/// Owned form of a [`PublisherId`]. Two ids are equal if their type and value are equal (OPC
+/// 10000-14, 7.2.4.4.2).
 #[derive(Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
 #[expect(missing_docs, reason = "the names are those of the builtin types")]
 pub enum OwnedPublisherId {
@@ -16,7 +17,7 @@ pub enum OwnedPublisherId {
 }
 
 impl OwnedPublisherId {
-    /// The borrowed form.
+    /// Returns the borrowed form.
     #[must_use]
     pub const fn as_id(&self) -> PublisherId<'_> {
         match self {

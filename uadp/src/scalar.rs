@@ -1,14 +1,14 @@
-//! One value of a builtin type.
+//! A single value of a builtin type.
 
 use crate::nested::{self, DataValue, Depth, DiagnosticInfo, Encoded};
 use crate::node_id::{ExpandedNodeId, NodeId};
 use crate::reader::Reader;
 use crate::{BuiltinType, DateTime, DecodeError, EncodeError, Guid, StatusCode, Variant, writer};
 
-/// A single value, borrowing from the datagram it was read from.
+/// A single value, borrowed from its datagram.
 ///
-/// `None` is the null String, ByteString or XmlElement, which is not the empty one.
-/// Equality is that of the values, so a NaN equals nothing.
+/// `None` is the null String, ByteString or XmlElement, which differs from the empty value.
+/// Equality compares values, so a NaN is not equal to itself.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[expect(missing_docs, reason = "the names are those of the builtin types")]
 pub enum Scalar<'a> {
@@ -35,7 +35,8 @@ pub enum Scalar<'a> {
     LocalizedText(LocalizedText<'a>),
     ExtensionObject(ExtensionObject<'a>),
     DataValue(Encoded<'a, DataValue<'a>>),
-    /// Only the element of an array: a Variant does not hold a Variant directly (OPC 10000-6, 5.2.2.16).
+    /// Only as an element of an array: a Variant does not contain a Variant directly (OPC 10000-6,
+    /// 5.2.2.16).
     Variant(Encoded<'a, Variant<'a>>),
     DiagnosticInfo(Encoded<'a, DiagnosticInfo<'a>>),
 }
@@ -49,7 +50,7 @@ pub struct QualifiedName<'a> {
     pub name: Option<&'a str>,
 }
 
-/// LocalizedText (OPC 10000-6, 5.2.2.14). A part left out on the wire and a null one both read as `None`.
+/// LocalizedText (OPC 10000-6, 5.2.2.14). Omitted and null parts are decoded as `None`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct LocalizedText<'a> {
     /// Language tag such as `en-US`.
@@ -58,7 +59,7 @@ pub struct LocalizedText<'a> {
     pub text: Option<&'a str>,
 }
 
-/// ExtensionObject (OPC 10000-6, 5.2.2.15): a structure this crate does not look into.
+/// ExtensionObject (OPC 10000-6, 5.2.2.15): a structure that this crate does not decode.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct ExtensionObject<'a> {
     /// NodeId of the encoding of the structure's type, not of the type.
@@ -67,7 +68,7 @@ pub struct ExtensionObject<'a> {
     pub body: ExtensionBody<'a>,
 }
 
-/// Body of an [`ExtensionObject`]. A null body with an encoding reads as an empty one.
+/// Body of an [`ExtensionObject`]. A null body with an encoding is decoded as an empty body.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum ExtensionBody<'a> {
     /// Encoding 0.
@@ -79,7 +80,7 @@ pub enum ExtensionBody<'a> {
 }
 
 impl<'a> Scalar<'a> {
-    /// Type of the value.
+    /// Returns the type of the value.
     #[inline]
     #[must_use]
     pub const fn builtin_type(&self) -> BuiltinType {
@@ -112,13 +113,13 @@ impl<'a> Scalar<'a> {
         }
     }
 
-    /// One value in the binary encoding of OPC 10000-6, 5.2.2.
+    /// Decodes a value in the binary encoding of OPC 10000-6, 5.2.2.
     #[inline]
     pub(crate) fn read(builtin: BuiltinType, reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
         Self::read_at(builtin, reader, Depth::FULL)
     }
 
-    /// As [`read`](Self::read), inside of another value.
+    /// Decodes a nested value as [`read`](Self::read).
     #[inline]
     pub(crate) fn read_at(
         builtin: BuiltinType,
@@ -126,7 +127,7 @@ impl<'a> Scalar<'a> {
         depth: Depth,
     ) -> Result<Self, DecodeError> {
         Ok(match builtin {
-            // The standard takes every byte but 0 as true (OPC 10000-6, 5.2.2.1).
+            // The standard defines every byte except 0 as true (OPC 10000-6, 5.2.2.1).
             BuiltinType::Boolean => Self::Boolean(reader.u8("Boolean")? != 0),
             BuiltinType::SByte => Self::SByte(i8::from_le_bytes(reader.array("SByte")?)),
             BuiltinType::Byte => Self::Byte(reader.u8("Byte")?),
@@ -157,7 +158,7 @@ impl<'a> Scalar<'a> {
         })
     }
 
-    /// Moves behind `count` values and checks them on the way.
+    /// Skips and checks `count` values.
     pub(crate) fn skip(
         builtin: BuiltinType,
         count: usize,
@@ -179,7 +180,7 @@ impl<'a> Scalar<'a> {
         Ok(())
     }
 
-    /// The value in the binary encoding, after the encoding byte of a Variant when `TAGGED`.
+    /// Appends the value in the binary encoding, after the encoding byte of a Variant if `TAGGED`.
     #[inline]
     pub(crate) fn write<const TAGGED: bool>(&self, out: &mut Vec<u8>) -> Result<(), EncodeError> {
         let builtin = self.builtin_type();

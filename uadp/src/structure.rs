@@ -1,20 +1,20 @@
-//! Reading the body of a structure whose fields the caller knows.
+//! Decodes the body of a structure with known fields.
 
 use crate::reader::Reader;
 use crate::{Array, BuiltinType, DecodeError, Scalar};
 
-/// Reads the binary body of an [`ExtensionObject`](crate::ExtensionObject) field by field: values without the
-/// encoding byte of a Variant (OPC 10000-6, 5.2.6). Which fields there are, the caller has to know.
+/// Reads the binary body of an [`ExtensionObject`](crate::ExtensionObject) field by field: values
+/// without the encoding byte of a Variant (OPC 10000-6, 5.2.6). The caller has to know the fields.
 #[derive(Debug, Clone)]
 pub struct StructureReader<'a> {
     reader: Reader<'a>,
 }
 
 impl<'a> StructureReader<'a> {
-    /// Structures without fields that one array may have.
+    /// Maximum number of structures without fields in an array.
     pub const MAX_WITHOUT_FIELDS: usize = 65_536;
 
-    /// Reads from the start of a body.
+    /// Creates a reader at the start of a body.
     #[must_use]
     pub const fn new(body: &'a [u8]) -> Self {
         Self {
@@ -22,23 +22,23 @@ impl<'a> StructureReader<'a> {
         }
     }
 
-    /// The next field, one value.
+    /// Reads the next field, a single value.
     ///
     /// # Errors
-    /// Fails when the body ends in it or its bytes are no such value.
+    /// Fails if the field is truncated or malformed.
     pub fn scalar(&mut self, builtin: BuiltinType) -> Result<Scalar<'a>, DecodeError> {
         Scalar::read(builtin, &mut self.reader)
     }
 
-    /// The next `count` fields at once, single values of `builtin`, a type of fixed size: little endian, back to back.
-    /// `None`, and nothing taken, when the body ends before.
+    /// Takes the next `count` fields at once: single values of `builtin`, a type of fixed size,
+    /// little-endian and contiguous. Returns `None` and takes nothing if the body is too short.
     pub fn take_scalars(&mut self, builtin: BuiltinType, count: u16) -> Option<&'a [u8]> {
         let size = builtin.fixed_size()?;
         let len = usize::from(count).checked_mul(size)?;
         self.reader.bytes(len, "structure").ok()
     }
 
-    /// The next field, an array.
+    /// Reads the next field, an array.
     ///
     /// # Errors
     /// As for [`scalar`](Self::scalar).
@@ -46,13 +46,15 @@ impl<'a> StructureReader<'a> {
         Array::read(element, &mut self.reader)
     }
 
-    /// The length of the next field, an array of structures by value whose fields follow inline. `None` for null.
+    /// Reads the length of the next field, an array of structures by value whose fields follow
+    /// inline. Returns `None` for null.
     ///
-    /// Structures without fields take no byte, so up to [`MAX_WITHOUT_FIELDS`](Self::MAX_WITHOUT_FIELDS) are believed
-    /// whatever follows: whoever reads many such arrays is to bound them together.
+    /// Structures without fields have no bytes, so up to
+    /// [`MAX_WITHOUT_FIELDS`](Self::MAX_WITHOUT_FIELDS) are accepted independent of the remaining
+    /// bytes. Callers that read many such arrays have to limit their total.
     ///
     /// # Errors
-    /// Fails when it is negative or above that.
+    /// Fails if the length is negative or exceeds the maximum.
     pub fn length(&mut self) -> Result<Option<usize>, DecodeError> {
         let length = self.reader.length("array of structures")?;
         let most = self.reader.remaining().max(Self::MAX_WITHOUT_FIELDS);
@@ -65,7 +67,7 @@ impl<'a> StructureReader<'a> {
         }
     }
 
-    /// Bytes not read yet.
+    /// Returns the number of unread bytes.
     #[must_use]
     pub const fn remaining(&self) -> usize {
         self.reader.remaining()

@@ -1,22 +1,24 @@
-//! DateTime and its refinement by PicoSeconds, and what they are in Unix time.
+//! DateTime, PicoSeconds, and their conversion to Unix time.
 
 /// 100 ns ticks since 1601-01-01 00:00 UTC (OPC 10000-6, 5.2.2.5).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
 pub struct DateTime(pub i64);
 
-/// A DateTime with its PicoSeconds, in units of 10 ps, 0 to 9999 (OPC 10000-14, 7.2.4.4.2 and 7.2.4.5.4).
+/// A DateTime with its PicoSeconds, in units of 10 ps, 0 to 9999 (OPC 10000-14, 7.2.4.4.2 and
+/// 7.2.4.5.4).
 ///
-/// Keeps nanoseconds, which a DateTime alone cuts to hundreds.
+/// It preserves nanoseconds; a DateTime has a resolution of 100 ns.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
 pub struct Timestamp {
-    /// Whole ticks.
+    /// DateTime in ticks of 100 ns.
     pub time: DateTime,
-    /// What is left of the tick, in units of 10 ps. 9999 at most.
+    /// Remainder of the tick in units of 10 ps, at most 9999.
     pub picoseconds: u16,
 }
 
 impl Timestamp {
-    /// Timestamp of nanoseconds since 1970-01-01 UTC; past the range of a DateTime, the end of the range.
+    /// Creates a Timestamp from nanoseconds since 1970-01-01 UTC. Values outside of the range of a
+    /// DateTime are clamped.
     #[must_use]
     pub fn from_unix_nanos(nanos: i128) -> Self {
         let ticks = nanos.div_euclid(NANOS_PER_TICK) + UNIX_EPOCH_TICKS;
@@ -37,7 +39,7 @@ impl Timestamp {
         }
     }
 
-    /// Nanoseconds since 1970-01-01 UTC, the part below a nanosecond cut off.
+    /// Returns nanoseconds since 1970-01-01 UTC, rounded down.
     #[must_use]
     pub fn unix_nanos(self) -> i128 {
         (i128::from(self.time.0) - UNIX_EPOCH_TICKS) * NANOS_PER_TICK

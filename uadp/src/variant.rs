@@ -1,35 +1,36 @@
-//! Variant: a value together with its type, or an array of such in one or more dimensions.
+//! Variant: a value with its type, or an array of values in one or more dimensions.
 
 use crate::nested::Depth;
 use crate::reader::Reader;
 use crate::scalar::Scalar;
 use crate::{BuiltinType, DecodeError, EncodeError, writer};
 
-/// A field's value (OPC 10000-6, 5.2.2.16).
+/// Value of a field (OPC 10000-6, 5.2.2.16).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Variant<'a> {
     /// No value and no type: encoding byte 0.
     Null,
-    /// One value.
+    /// A single value.
     Scalar(Scalar<'a>),
     /// A one-dimensional array, which may be null or empty.
     Array(Array<'a>),
-    /// An array that says its dimensions.
+    /// An array with dimensions.
     Matrix(Matrix<'a>),
 }
 
-/// A multi-dimensional array (OPC 10000-6, 5.2.2.16). The number of elements is the product of the dimensions.
+/// A multi-dimensional array (OPC 10000-6, 5.2.2.16). The number of elements is the product of the
+/// dimensions.
 ///
-/// One of fewer than two dimensions, or without elements, is written as an [`Array`].
+/// A matrix with fewer than two dimensions, or without elements, is encoded as an [`Array`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Matrix<'a> {
     elements: Array<'a>,
     dimensions: &'a [[u8; 4]],
 }
 
-/// A one-dimensional array whose elements were checked when it was made.
+/// A one-dimensional array whose elements were checked when it was created.
 ///
-/// Equality compares the elements as they stand on the wire.
+/// Equality compares the encoded elements.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Array<'a> {
     element: BuiltinType,
@@ -38,9 +39,9 @@ pub struct Array<'a> {
     bytes: &'a [u8],
 }
 
-/// The elements of an [`Array`].
+/// Iterator over the elements of an [`Array`].
 ///
-/// The bytes of a value that holds values are walked through to find the next element.
+/// Elements that contain values are skipped through to find the next element.
 #[derive(Debug, Clone)]
 pub struct Elements<'a> {
     element: BuiltinType,
@@ -49,7 +50,7 @@ pub struct Elements<'a> {
 }
 
 impl<'a> Variant<'a> {
-    /// Type of the value or of the elements; `None` for the null Variant.
+    /// Returns the type of the value or of the elements, or `None` for the null Variant.
     #[must_use]
     pub const fn builtin_type(&self) -> Option<BuiltinType> {
         match self {
@@ -65,7 +66,7 @@ impl<'a> Variant<'a> {
         Self::read_at(reader, Depth::FULL)
     }
 
-    /// As [`read`](Self::read), inside of another value.
+    /// Decodes a nested Variant as [`read`](Self::read).
     #[inline]
     pub(crate) fn read_at(reader: &mut Reader<'a>, depth: Depth) -> Result<Self, DecodeError> {
         let encoding = reader.u8("Variant")?;
@@ -88,7 +89,7 @@ impl<'a> Variant<'a> {
         }
     }
 
-    /// Moves behind a Variant and checks it on the way.
+    /// Skips and checks a Variant.
     #[inline]
     pub(crate) fn skip_at(reader: &mut Reader<'a>, depth: Depth) -> Result<(), DecodeError> {
         let encoding = reader.rest().first().copied().unwrap_or_default();
@@ -103,12 +104,12 @@ impl<'a> Variant<'a> {
         }
     }
 
-    /// What a Variant holds whose type is none that is assigned; `None` for nothing.
+    /// Returns the type of a Variant with an unassigned type id, or `None` for the null Variant.
     #[cold]
     fn without_type(encoding: u8) -> Result<Option<BuiltinType>, DecodeError> {
         match encoding {
             0 => Ok(None),
-            // Types yet to come: decoders take what they hold for ByteStrings (OPC 10000-6, 5.2.2.16).
+            // Decoders treat values of unassigned types as ByteStrings (OPC 10000-6, 5.2.2.16).
             _ if matches!(encoding & TYPE_ID, 26..=31) => Ok(Some(BuiltinType::ByteString)),
             _ => Err(DecodeError::Reserved {
                 field: "Variant encoding",
@@ -160,17 +161,19 @@ impl<'a> From<Matrix<'a>> for Variant<'a> {
 }
 
 impl<'a> Matrix<'a> {
-    /// A matrix of elements in row-major order; each dimension a little-endian Int32, the outermost first.
+    /// Creates a matrix of elements in row-major order. Each dimension is a little-endian Int32,
+    /// outermost first.
     ///
     /// # Errors
-    /// [`DecodeError::Dimensions`] when the product of the dimensions is not the number of elements, or one is
-    /// negative.
+    /// [`DecodeError::Dimensions`] if the product of the dimensions differs from the number of
+    /// elements, or a dimension is negative.
     pub fn new(elements: Array<'a>, dimensions: &'a [[u8; 4]]) -> Result<Self, DecodeError> {
         let elements_wanted = dimensions.iter().try_fold(1_usize, |product, dimension| {
             let dimension = usize::try_from(i32::from_le_bytes(*dimension)).ok()?;
             product.checked_mul(dimension)
         });
-        // No dimensions at all say nothing about an array that is null or has one element.
+        // Empty dimensions are valid for an empty or null array, and for an array with a single
+        // element.
         match elements_wanted {
             Some(wanted) if wanted == elements.len => Ok(Self {
                 elements,
@@ -186,26 +189,26 @@ impl<'a> Matrix<'a> {
         }
     }
 
-    /// The elements in row-major order.
+    /// Returns the elements in row-major order.
     #[inline]
     #[must_use]
     pub const fn elements(&self) -> Array<'a> {
         self.elements
     }
 
-    /// Size of each dimension, the outermost first.
+    /// Returns the size of each dimension, outermost first.
     #[must_use]
     pub fn dimensions(&self) -> impl ExactSizeIterator<Item = u32> + Clone + use<'a> {
         self.dimensions.iter().map(|size| u32::from_le_bytes(*size))
     }
 
-    /// The elements as an array, then the dimensions as one.
+    /// Reads the array of elements, then the array of dimensions.
     fn read_at(
         element: BuiltinType,
         reader: &mut Reader<'a>,
         depth: Depth,
     ) -> Result<Self, DecodeError> {
-        // Where the dimensions start, only the elements before them tell.
+        // Only decoding the elements reveals where the dimensions start.
         let depth = match depth {
             Depth::Checked => Depth::FULL,
             left @ Depth::Left(_) => left,
@@ -223,7 +226,8 @@ impl<'a> Matrix<'a> {
         Self::new(elements, dimensions)
     }
 
-    /// ArrayDimensions are to be there only for two dimensions or more, none of them empty (OPC 10000-6, 5.2.2.16).
+    /// Returns true if ArrayDimensions are encoded: only for two or more dimensions, all of them
+    /// non-empty (OPC 10000-6, 5.2.2.16).
     const fn has_dimensions(&self) -> bool {
         self.dimensions.len() >= 2 && !self.elements.is_empty()
     }
@@ -241,7 +245,7 @@ impl<'a> Matrix<'a> {
 }
 
 impl<'a> Array<'a> {
-    /// The null array, which is not the empty one.
+    /// Creates the null array, which differs from the empty array.
     #[must_use]
     pub const fn null(element: BuiltinType) -> Self {
         Self {
@@ -252,10 +256,10 @@ impl<'a> Array<'a> {
         }
     }
 
-    /// An array of `len` elements from their encodings, back to back.
+    /// Creates an array of `len` elements from their contiguous encodings.
     ///
     /// # Errors
-    /// Fails when the bytes are not exactly that many well-formed elements.
+    /// Fails if the bytes are not exactly `len` well-formed elements.
     pub fn new(element: BuiltinType, len: usize, bytes: &'a [u8]) -> Result<Self, DecodeError> {
         let mut reader = Reader::new(bytes);
         let array = Self::read_elements(element, len, &mut reader, Depth::FULL)?;
@@ -265,40 +269,40 @@ impl<'a> Array<'a> {
         }
     }
 
-    /// Type of every element.
+    /// Returns the type of the elements.
     #[inline]
     #[must_use]
     pub const fn element(&self) -> BuiltinType {
         self.element
     }
 
-    /// Number of elements, 0 for the null array.
+    /// Returns the number of elements, 0 for the null array.
     #[inline]
     #[must_use]
     pub const fn len(&self) -> usize {
         self.len
     }
 
-    /// True without elements, whether null or empty.
+    /// Returns true for the null array and the empty array.
     #[must_use]
     pub const fn is_empty(&self) -> bool {
         self.len == 0
     }
 
-    /// True for the null array (length -1 on the wire).
+    /// Returns true for the null array (length -1 on the wire).
     #[must_use]
     pub const fn is_null(&self) -> bool {
         self.null
     }
 
-    /// The elements as on the wire, without the length: little-endian, back to back.
+    /// Returns the encoded elements without the length: little-endian and contiguous.
     #[inline]
     #[must_use]
     pub const fn bytes(&self) -> &'a [u8] {
         self.bytes
     }
 
-    /// The elements one by one.
+    /// Returns an iterator over the elements.
     #[inline]
     #[must_use]
     pub const fn iter(&self) -> Elements<'a> {
@@ -309,7 +313,7 @@ impl<'a> Array<'a> {
         }
     }
 
-    /// Int32 length and elements (OPC 10000-6, 5.2.5).
+    /// Reads an Int32 length and the elements (OPC 10000-6, 5.2.5).
     pub(crate) fn read(element: BuiltinType, reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
         Self::read_at(element, reader, Depth::FULL)
     }
@@ -356,7 +360,7 @@ impl<'a> Array<'a> {
         })
     }
 
-    /// Int32 length and elements.
+    /// Appends the Int32 length and the elements.
     pub(crate) fn write(&self, out: &mut Vec<u8>) -> Result<(), EncodeError> {
         let length = match self.null {
             true => writer::NULL_LENGTH,
@@ -397,7 +401,7 @@ impl<'a> Iterator for Elements<'a> {
             0 => Depth::Checked,
             _ => Depth::FULL,
         };
-        // The elements were read once when the array was made: this does not fail.
+        // The elements were checked when the array was created, so this does not fail.
         Scalar::read_at(self.element, &mut self.reader, depth).ok()
     }
 
