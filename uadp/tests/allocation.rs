@@ -1,4 +1,4 @@
-//! Reading a datagram allocates nothing, and writing into a buffer that was used before neither.
+//! Decoding a datagram, and encoding into a used buffer, allocate nothing.
 
 use crate::everything;
 
@@ -68,7 +68,7 @@ fn writing_into_a_used_buffer_allocates_nothing() {
     assert_eq!(allocations.count_total, 0);
 }
 
-/// One DataSetMessage of every kind; `inner` takes the encodings of values in values.
+/// Encodes a DataSetMessage of every kind. `inner` is a buffer for nested values.
 fn write(datagram: &mut Vec<u8>, inner: &mut Vec<u8>) {
     let header = NetworkHeader {
         publisher_id: Some(PublisherId::String("cell 4")),

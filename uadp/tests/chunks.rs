@@ -1,5 +1,4 @@
-//! What is too big for one datagram goes through in chunks, and nothing a network may do to them costs more than
-//! the limits.
+//! Chunks of messages that exceed a datagram, and limits that hold for all errors of a network.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -32,7 +31,8 @@ fn vector(name: &str) -> Vec<u8> {
         .collect()
 }
 
-/// A chunk NetworkMessage of PublisherId UInt16 `publisher` and DataSetWriterId 10, byte by byte.
+/// Returns the bytes of a chunk NetworkMessage of PublisherId UInt16 `publisher` and
+/// DataSetWriterId 10.
 fn chunk(publisher: u16, number: u16, offset: u32, total: u32, data: &[u8]) -> Vec<u8> {
     let mut out = vec![0xD1, 0x81, 0x01];
     out.extend(publisher.to_le_bytes());
@@ -44,7 +44,7 @@ fn chunk(publisher: u16, number: u16, offset: u32, total: u32, data: &[u8]) -> V
     out
 }
 
-/// What the reassembler makes of a datagram: the whole, if it is complete.
+/// Passes a datagram to the reassembler. Returns the whole if it is complete.
 fn receive(
     reassembler: &mut Reassembler,
     datagram: &[u8],
@@ -91,7 +91,7 @@ fn split(
     Ok(datagrams)
 }
 
-/// The DataSetMessage in the three composite_chunk vectors.
+/// Returns the DataSetMessage of the three composite_chunk vectors.
 fn composite() -> Vec<u8> {
     let mut out = Vec::new();
     let mut message =
@@ -164,7 +164,8 @@ fn the_chunks_of_the_vectors_make_the_message_in_any_order() {
 
 #[test]
 fn a_chunk_with_a_count_in_its_payload_header_never_becomes_a_message() {
-    // asyncua writes a Count, which shifts everything behind it: 512000 bytes of DataSetWriter 1281 are announced.
+    // asyncua writes a Count, which shifts the following fields: they announce 512000 bytes of
+    // DataSetWriter 1281.
     let datagram = vector("asyncua_chunk");
     let mut reassembler = Reassembler::default();
     let message = NetworkMessage::decode(&datagram).unwrap();
@@ -414,7 +415,7 @@ fn a_number_in_use_again_begins_a_new_whole_and_mixes_nothing() {
     let mut reassembler = Reassembler::default();
     receive(&mut reassembler, &chunk(2, 0, 0, 6, &[1, 1]), START).unwrap();
     receive(&mut reassembler, &chunk(2, 0, 2, 6, &[1, 1]), START).unwrap();
-    // The last chunk is lost, the publisher starts over with number 0.
+    // The last chunk is lost, and the publisher restarts with number 0.
     for offset in [0, 2] {
         let datagram = chunk(2, 0, offset, 6, &[2, 2]);
         assert_eq!(receive(&mut reassembler, &datagram, START), Ok(None));
@@ -422,11 +423,11 @@ fn a_number_in_use_again_begins_a_new_whole_and_mixes_nothing() {
     let whole = receive(&mut reassembler, &chunk(2, 0, 4, 6, &[2, 2]), START);
     assert_eq!(whole, Ok(Some(vec![2; 6])));
     assert_eq!(reassembler.counters().contradicted, 1);
-    // And once more, after a whole that was complete.
+    // The same after a complete whole.
     receive(&mut reassembler, &chunk(2, 0, 0, 6, &[3, 3, 3]), START).unwrap();
     let whole = receive(&mut reassembler, &chunk(2, 0, 3, 6, &[3, 3, 3]), START);
     assert_eq!(whole, Ok(Some(vec![3; 6])));
-    // A longer one that begins alike is another.
+    // A longer whole with the same start is a different whole.
     for offset in [0, 3, 6] {
         let datagram = chunk(2, 0, offset, 12, &[3, 3, 3]);
         assert_eq!(receive(&mut reassembler, &datagram, START), Ok(None));
@@ -489,7 +490,7 @@ fn a_whole_in_one_chunk_is_complete_at_once_and_only_once() {
 
 #[test]
 fn a_whole_network_message_in_chunks_is_read_from_the_bytes() {
-    // As UA-.NETStandard sends it: no payload header, and the pieces are those of an encoded NetworkMessage.
+    // UA-.NETStandard sends chunks of an encoded NetworkMessage, without payload header.
     let mut inner = Vec::new();
     let mut message = NetworkMessageEncoder::new(&mut inner, &header(), Some(&[10])).unwrap();
     message.keep_alive(&DataSetHeader::default()).unwrap();
@@ -582,7 +583,7 @@ fn a_whole_is_given_up_when_it_takes_too_long() {
     reassembler.expire(ms(2100));
     assert_eq!(reassembler.counters().expired, 1);
     assert_eq!(reassembler.poll_timeout(), Some(ms(2300)));
-    // A chunk that comes too late does not complete it, also when nobody called `expire`.
+    // A late chunk does not complete the whole, even without a call of `expire`.
     let late = receive(&mut reassembler, &chunk(2, 2, 2, 4, &[2, 3]), ms(2300));
     assert_eq!(late, Ok(None));
     assert_eq!(reassembler.counters().expired, 2);
@@ -646,7 +647,7 @@ fn the_bytes_of_all_wholes_stay_below_the_limit() {
         START,
     );
     assert_eq!(whole.unwrap().unwrap().len(), 5000);
-    // One that is too big alone is given up as well.
+    // A whole that exceeds the limit alone is given up too.
     receive(
         &mut reassembler,
         &chunk(60, 1, 0, 30_000, &[0; 9000]),
@@ -706,7 +707,7 @@ fn a_total_size_costs_nothing_before_the_bytes_are_there() {
 fn a_datagram_of_64_kib_makes_it_allocate_little_more_than_that() {
     let mut reassembler = Reassembler::default();
     let data = vec![0; 65_000];
-    // From the back, so that nothing before a piece is there.
+    // The order is descending, so that no bytes before a piece are present.
     for at in (0..200).rev() {
         let datagram = chunk(2, 1, 1_000_000 + at * 65_000, 16 << 20, &data);
         let message = NetworkMessage::decode(&datagram).unwrap();
@@ -758,7 +759,7 @@ fn a_data_set_message_alone_is_read_like_one_in_a_network_message() {
     );
 }
 
-/// What a hostile or broken network does.
+/// Events of a hostile or broken network.
 #[derive(Debug, Clone)]
 enum Step {
     Chunk {
@@ -862,7 +863,7 @@ proptest! {
     }
 }
 
-/// As [`receive`], of several senders.
+/// Passes a datagram as [`receive`], for several senders.
 fn receive_from(
     reassembler: &mut Reassembler<u16>,
     sender: u16,
@@ -878,7 +879,8 @@ fn nobody_gets_a_chunk_into_what_another_sends_or_ends_it() {
     let mut reassembler = Reassembler::default();
     let begun = receive_from(&mut reassembler, 1, &chunk(2, 1, 0, 4, &[0, 1]));
     assert_eq!(begun, Ok(None));
-    // Other bytes in its place, another TotalSize, newer wholes of its writer, and the rest of it.
+    // Other bytes at the same offset, another TotalSize, newer wholes of its writer, and its
+    // missing part.
     let other_bytes = chunk(2, 1, 0, 4, &[9, 9]);
     let other_size = chunk(2, 1, 0, 7, &[0, 1]);
     let newer = (2..20).map(|number| chunk(2, number, 0, 4, &[0, 1]));

@@ -1,5 +1,5 @@
-//! Datagrams of 64 KiB made to cost as much as they can. Reading them through every accessor allocates nothing, and
-//! what is well formed in them is found.
+//! Datagrams of 64 KiB that maximize the cost of decoding. Reading them through every accessor
+//! allocates nothing, and finds all well-formed values.
 
 use crate::everything;
 
@@ -7,7 +7,7 @@ use allocation_counter::measure;
 use everything::read_everything;
 
 const SIZE: usize = 65_536;
-/// How deep values may stand in values.
+/// Maximum nesting depth of values.
 const LEVELS: usize = uadp::MAX_NESTING as usize;
 
 const NULL: &[u8] = &[0];
@@ -17,7 +17,7 @@ const DIAGNOSTIC_INFO: u8 = 25;
 const ARRAY: u8 = 0x80;
 const MATRIX: u8 = 0xC0;
 
-/// One key frame of Variants after the shortest header.
+/// Returns a key frame of Variants behind the shortest header.
 fn key_frame(count: u16, fields: &[u8]) -> Vec<u8> {
     [&[0x01, 0x01], &count.to_le_bytes()[..], fields].concat()
 }
@@ -36,7 +36,8 @@ fn matrix(element: u8, count: usize, elements: &[u8], dimensions: &[u32]) -> Vec
     out
 }
 
-/// `wrap`ped as often as may be, around an array of Variants that makes the datagram full.
+/// Nests an array of Variants to the maximum depth with `wrap`, and fills the datagram with its
+/// elements.
 fn nested(mut wrap: impl FnMut(&[u8]) -> Vec<u8>) -> Vec<u8> {
     let around = (0..LEVELS - 1).fold(array(VARIANT, 0, &[]), |inner, _| wrap(&inner));
     let count = SIZE - key_frame(1, &around).len();
@@ -44,19 +45,19 @@ fn nested(mut wrap: impl FnMut(&[u8]) -> Vec<u8>) -> Vec<u8> {
     key_frame(1, &(0..LEVELS - 1).fold(core, |inner, _| wrap(&inner)))
 }
 
-/// As many copies of a field as there is room for.
+/// Returns a datagram full of copies of a field.
 fn full(field: &[u8]) -> Vec<u8> {
     let count = (SIZE - 4) / field.len();
     key_frame(count as u16, &field.repeat(count))
 }
 
-/// One array with as many copies of an element as there is room for.
+/// Returns a datagram with an array full of copies of an element.
 fn full_array(element: u8, bytes: &[u8]) -> Vec<u8> {
     let count = (SIZE - 9) / bytes.len();
     key_frame(1, &array(element, count, &bytes.repeat(count)))
 }
 
-/// `values` are found in the datagram, without an allocation.
+/// Checks that `values` values are found in the datagram, without an allocation.
 #[track_caller]
 fn check(name: &str, datagram: &[u8], values: usize) {
     assert!(

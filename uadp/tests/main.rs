@@ -1,4 +1,4 @@
-//! The tests of the codec and its states, one program so that they are linked once.
+//! Tests of the codec and its states, as a single program so that they are linked once.
 #![expect(
     clippy::cast_possible_truncation,
     clippy::indexing_slicing,

@@ -1,5 +1,5 @@
-//! What holds for every message: it comes back as it was written, no part of it passes for the whole, and no bytes
-//! whatsoever make the reader panic.
+//! Properties of every message: decoding returns the encoded values, no part of a message is
+//! accepted as a complete message, and no bytes cause a panic.
 
 use crate::everything;
 use crate::model;
@@ -28,7 +28,7 @@ struct Network {
     messages: Vec<Message>,
 }
 
-/// A SecurityHeader of a message that is not secured.
+/// The SecurityHeader of an unsecured message.
 #[derive(Debug, Clone)]
 struct Security {
     force_key_reset: bool,
@@ -55,7 +55,7 @@ enum Payload {
     Raw(Vec<u8>),
 }
 
-/// A field that was written.
+/// An encoded field.
 enum Sent<'s> {
     Value(&'s Value),
     Sample(&'s Sample),
@@ -89,7 +89,7 @@ impl Network {
         self.encode_sized(0)
     }
 
-    /// With so many bytes for each DataSetMessage; 0 for as many as it needs.
+    /// Encodes the message with a size for each DataSetMessage; 0 for variable sizes.
     fn encode_sized(&self, size: u16) -> Vec<u8> {
         let promoted = self
             .promoted
@@ -114,13 +114,13 @@ impl Network {
         out
     }
 
-    /// The size of the longest DataSetMessage.
+    /// Returns the size of the longest DataSetMessage.
     fn longest(&self) -> u16 {
         let sizes = self.messages.iter().map(Message::size);
         sizes.max().unwrap_or_default()
     }
 
-    /// The messages of [`encode_sized`](Self::encode_sized).
+    /// Decodes the messages of [`encode_sized`](Self::encode_sized).
     fn read_sized<'d>(
         &self,
         network: &NetworkMessage<'d>,
@@ -189,7 +189,7 @@ impl Message {
         }
     }
 
-    /// Bytes it takes without padding.
+    /// Returns its size without padding.
     fn size(&self) -> u16 {
         let mut out = Vec::new();
         let header = NetworkHeader::default();
@@ -199,7 +199,7 @@ impl Message {
         (out.len() - 1) as u16
     }
 
-    /// Checks that this is what was found.
+    /// Checks that the decoded message equals this message.
     fn check(&self, found: &DataSetMessage<'_>) -> Result<(), TestCaseError> {
         prop_assert_eq!(found.header(), self.header);
         let kind = (found.kind, found.encoding());
@@ -246,7 +246,7 @@ impl Payload {
         }
     }
 
-    /// The fields and their indexes.
+    /// Returns the fields and their indexes.
     fn sent(&self) -> Vec<(u16, Sent<'_>)> {
         match self {
             Self::KeepAlive | Self::Raw(_) => Vec::new(),
@@ -291,7 +291,7 @@ fn write_fields(mut out: FieldEncoder<'_>, values: &[Value]) {
     out.finish().unwrap();
 }
 
-/// Arrays element by element, as a caller without their encoding would.
+/// Writes a field. Arrays are written element by element, as by a caller without their encoding.
 fn write_field(out: &mut FieldEncoder<'_>, value: &Value) {
     let elements = match value {
         Value::Null => return out.null().unwrap(),
@@ -308,14 +308,14 @@ fn write_field(out: &mut FieldEncoder<'_>, value: &Value) {
     }
 }
 
-/// All fields one after the other, as they were read.
+/// Writes all fields in sequence, as they were read.
 fn as_read(out: &mut FieldEncoder<'_>, fields: Fields<'_>) {
     for field in fields {
         out.variant(&field.unwrap()).unwrap();
     }
 }
 
-/// Reads everything up to the first error; the number of fields.
+/// Reads everything up to the first error. Returns the number of fields.
 fn read_all(datagram: &[u8]) -> Result<usize, DecodeError> {
     let network = NetworkMessage::decode(datagram)?;
     for field in network.promoted_fields().into_iter().flatten() {
@@ -393,7 +393,7 @@ fn message(payload: impl Strategy<Value = Payload>) -> impl Strategy<Value = Mes
 }
 
 fn security() -> impl Strategy<Value = Security> {
-    // A footer that starts with 0 would pass for padding when a byte is put behind it.
+    // A footer that starts with 0 would be accepted as padding when a byte is appended.
     let footer = option::of(vec(1..=255_u8, 0..4));
     (any::<bool>(), any::<u32>(), vec(any::<u8>(), 0..9), footer).prop_map(
         |(force_key_reset, token_id, nonce, footer)| Security {
@@ -430,7 +430,7 @@ fn network_header() -> impl Strategy<Value = NetworkHeader<'static>> {
         )
 }
 
-/// With a payload header any number of messages, without one a single message.
+/// Generates any number of messages with a payload header, and a single message without it.
 fn network() -> impl Strategy<Value = Network> {
     network_of(payload()).prop_map(|mut network| {
         if !network.payload_header {
@@ -555,7 +555,8 @@ proptest! {
 
     #[test]
     fn no_part_of_a_message_passes_for_the_whole(mut sent in network()) {
-        // An invalid message ends where it is looked at, and a key frame cut behind its header is a heartbeat.
+        // An invalid message ends at its header, and a key frame truncated behind its header is a
+        // heartbeat.
         for message in &mut sent.messages {
             message.header.valid = true;
         }
@@ -659,7 +660,7 @@ proptest! {
         }
         bytes.truncate(len.index(bytes.len() + 1));
         let block = [&[1, 0], &bytes[..]].concat();
-        // Read as a field, and passed over as an element.
+        // The value is read as a field, and skipped as an element.
         let read = Fields::parse(&block).map(|mut fields| fields.next());
         let passed = Encoded::<Variant<'_>>::new(&bytes);
         match (read, passed) {

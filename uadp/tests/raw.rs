@@ -1,7 +1,8 @@
-//! RawData: the datagrams of other stacks, the tables of the standard, and what is refused.
+//! RawData: datagrams of other stacks, the tables of the standard, and rejected input.
 //!
-//! The standard has no example of a RawData payload. What is expected of `RawDialect::Standard` is laid out by hand
-//! from OPC 10000-14, 7.2.4.5.11; the structures in it are the examples of OPC 10000-6, 5.2.7 and 5.2.8.
+//! The standard has no example of a RawData payload. The expected bytes of `RawDialect::Standard`
+//! are encoded by hand from OPC 10000-14, 7.2.4.5.11; their structures are the examples of OPC
+//! 10000-6, 5.2.7 and 5.2.8.
 
 use std::path::PathBuf;
 
@@ -19,7 +20,7 @@ use RawDialect::{Open62541, Standard};
 
 const DIALECTS: [RawDialect; 2] = [Standard, Open62541];
 
-/// Reads everything.
+/// Decodes all fields.
 fn read<'p>(
     fields: &'p [RawField<'p>],
     payload: &'p [u8],
@@ -43,7 +44,7 @@ fn write<'v, V: Into<RawValue<'v>>>(
     Ok(payload)
 }
 
-/// Both ways: the bytes are read as the values, and the values are written as the bytes.
+/// Checks that the bytes decode to the values, and that the values encode to the bytes.
 #[track_caller]
 fn same<'p>(
     fields: &'p [RawField<'p>],
@@ -190,7 +191,8 @@ mod other_stacks {
         out
     }
 
-    /// The layout of the JSON's metaData, and of the two vectors it says too little of.
+    /// Returns the layout of the metaData in the JSON file. For two vectors the JSON file is not
+    /// sufficient.
     fn fields<'a>(name: &str, message: &Value, range: &'a RawStructure<'a>) -> Vec<RawField<'a>> {
         let Some(metadata) = message["metaData"].as_array() else {
             assert_eq!(name, "asyncua_raw");
@@ -337,7 +339,7 @@ fn a_text_is_padded_to_its_maximum_behind_its_real_length() {
     ];
     let payload = [
         4, 0, 0, 0, b'c', b'e', b'l', b'l', 0, 0, // shorter
-        2, 0, 0, 0, 0, 0, // as long as can be, its bytes zero
+        2, 0, 0, 0, 0, 0, // maximum length, bytes are zero
         0, 0, 0, 0, 0, 0, // empty
         0xFF, 0xFF, 0xFF, 0xFF, 0, 0, 0, // null
         9,
@@ -495,7 +497,7 @@ fn each_text_of_an_array_is_padded_and_then_the_array() {
     let standard = [
         2, 0, 0, 0, // two of three
         1, 0, 0, 0, b'x', 0, 0, 0xFF, 0xFF, 0xFF, 0xFF, 0, 0, 0, // "x", null
-        0, 0, 0, 0, 0, 0, 0, // no third
+        0, 0, 0, 0, 0, 0, 0, // no third element
         9,
     ];
     let values = read(&fields, &standard, Standard).unwrap();
@@ -521,9 +523,9 @@ const TYPE_A: &[RawField<'_>] = &[
     RawField::new(SByte),
     RawField::new(Int32).as_optional(),
 ];
-/// The 13 bytes of the example: O2 is there, O1 is not.
+/// The 13 bytes of the example: O2 is present, O1 is absent.
 const TYPE_A_PLAIN: [u8; 13] = [2, 0, 0, 0, 5, 0, 0, 0, 0xFD, 6, 0, 0, 0];
-/// The same with room for O1.
+/// The same structure with padding for O1.
 const TYPE_A_PADDED: [u8; 17] = [2, 0, 0, 0, 5, 0, 0, 0, 0, 0, 0, 0, 0xFD, 6, 0, 0, 0];
 
 fn type_a() -> RawStructure<'static> {

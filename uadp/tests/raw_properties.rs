@@ -1,5 +1,5 @@
-//! What holds for every layout and every payload of RawData. The payloads are laid out here a second time, straight
-//! from OPC 10000-14, 7.2.4.5.11 and OPC 10000-6, 5.2.5 to 5.2.8, so that the crate is not its own judge.
+//! Properties of every layout and payload of RawData. The tests encode the payloads independently
+//! of the crate, from OPC 10000-14, 7.2.4.5.11 and OPC 10000-6, 5.2.5 to 5.2.8.
 
 use proptest::collection::vec;
 use proptest::prelude::*;
@@ -10,7 +10,7 @@ use uadp::{
 
 use RawDialect::{Open62541, Standard};
 
-/// Choices, from 0 on once they are used up: shrinking makes them few and small.
+/// Choices that become 0 when they are used up: shrinking makes them few and small.
 struct Tape {
     bytes: std::vec::IntoIter<u8>,
 }
@@ -20,13 +20,13 @@ impl Tape {
         self.bytes.next().unwrap_or(0)
     }
 
-    /// Below `n`.
+    /// Returns a number below `n`.
     fn pick(&mut self, n: u8) -> u8 {
         self.byte() % n
     }
 }
 
-/// How one place of the wire is laid out.
+/// Form of a range of bytes.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Form {
     Standard,
@@ -95,7 +95,7 @@ fn layout(tape: &mut Tape) -> &'static [RawField<'static>] {
     fields.leak()
 }
 
-/// Leaked: the fields of a structure are borrowed, and these structures are made on the way.
+/// The field is leaked, because structures borrow their fields and are created during the test.
 fn field(tape: &mut Tape, depth: u8) -> RawField<'static> {
     let kind = tape.pick(22);
     let field = match TYPES.get(usize::from(kind)) {
@@ -228,7 +228,7 @@ fn inside(tape: &mut Tape, structure: &RawStructure<'_>, form: Form) -> Leaf {
     Leaf::Structure { head, fields }
 }
 
-/// Bytes of one element, where they do not vary.
+/// Returns the bytes of an element, or `None` if variable.
 fn element_size(field: &RawField<'_>, form: Form) -> Option<usize> {
     let Some(structure) = field.structure else {
         return match (field.builtin.fixed_size(), field.max_string_length) {
@@ -255,7 +255,7 @@ fn element_size(field: &RawField<'_>, form: Form) -> Option<usize> {
     }
 }
 
-/// Bytes of all elements there can be.
+/// Returns the bytes of the maximum number of elements.
 fn full(field: &RawField<'_>, form: Form) -> Option<usize> {
     let dimensions = field.array_dimensions;
     if dimensions.is_empty() || dimensions.contains(&0) {
@@ -430,7 +430,7 @@ fn found_scalar(scalar: Scalar<'_>, field: &RawField<'_>, dialect: RawDialect) -
     format!("{fields:?}")
 }
 
-/// A layout, a payload of it, and what is in it.
+/// A layout, a payload, and its values.
 #[derive(Debug)]
 struct Sample {
     fields: &'static [RawField<'static>],
@@ -485,7 +485,7 @@ fn samples() -> impl Strategy<Value = Sample> {
     (vec(any::<u8>(), 0..160), dialect).prop_map(|(bytes, dialect)| Sample::new(bytes, dialect))
 }
 
-/// The elements of a tree with the header that an array of the crate has them with.
+/// Returns the elements of a tree in the encoding of an array of the crate, and their number.
 fn packed(tree: &Tree, field: &RawField<'_>, form: Form) -> Option<(Vec<u8>, usize)> {
     let Tree::Many { items, .. } = tree else {
         return None;
@@ -628,7 +628,7 @@ proptest! {
         let mut written = Vec::new();
         match sample.layout().write(&mut written, sample.dialect, values) {
             Ok(()) => prop_assert_eq!(sample.found(&sample.read(&written).unwrap()), expected),
-            // A short array is read, but not written.
+            // A short array is decoded, but not encoded.
             Err(error) => prop_assert!(sample.dialect == Open62541, "{}", error),
         }
     }

@@ -1,4 +1,4 @@
-//! What a receiver meets on a network, datagram by datagram.
+//! Decoding of the datagrams that a receiver can get from a network.
 
 use uadp::{
     Array, BuiltinType, Chunk, DataSetMessage, DataValue, DateTime, DecodeError, DiagnosticInfo,
@@ -14,7 +14,7 @@ fn messages(datagram: &[u8]) -> Vec<Result<DataSetMessage<'_>, DecodeError>> {
         .collect()
 }
 
-/// The fields of a datagram of the smallest header and one message of these bytes.
+/// Returns the fields of a message behind the smallest NetworkMessage header.
 fn fields(message: &[u8]) -> Result<Vec<String>, DecodeError> {
     let datagram = [&[0x01], message].concat();
     let message = NetworkMessage::decode(&datagram)?
@@ -35,7 +35,7 @@ const fn cut(field: &'static str, expected: usize, found: usize) -> DecodeError 
     }
 }
 
-/// The one message of these bytes after the smallest header, its values with their indexes.
+/// Returns the values and indexes of a single message behind the smallest NetworkMessage header.
 fn values(message: &[u8]) -> Result<Vec<String>, DecodeError> {
     let datagram = [&[0x01], message].concat();
     let message = messages(&datagram).remove(0)?;
@@ -43,7 +43,7 @@ fn values(message: &[u8]) -> Result<Vec<String>, DecodeError> {
     message.values()?.map(|field| field.map(describe)).collect()
 }
 
-/// The one field of a block.
+/// Checks a block with a single field.
 fn field(variant: &[u8]) -> Result<(), DecodeError> {
     let block = [&[1, 0], variant].concat();
     Fields::parse(&block)?.try_for_each(|field| field.map(|_| ()))
@@ -241,7 +241,8 @@ fn reserved_encodings_of_values_are_refused() {
     );
 }
 
-/// OPC 10000-6, 5.2.2.16: decoders take what types 26 to 31 hold for ByteStrings; encoders do not use them.
+/// OPC 10000-6, 5.2.2.16: decoders treat values of the types 26 to 31 as ByteStrings; encoders do
+/// not use them.
 #[test]
 fn a_variant_of_a_type_yet_to_come_is_read_as_its_bytes() {
     let two = [2, 0, 0, 0, 7, 8];
@@ -397,7 +398,7 @@ fn a_keep_alive_may_be_padded_but_carries_nothing() {
     assert_eq!(error, DecodeError::TrailingBytes(1));
 }
 
-/// An array of one element around `inner`, `levels` times.
+/// Returns an array with a single element around `inner`, nested `levels` times.
 fn nested(levels: usize, opening: &[u8], inner: &[u8], closing: &[u8]) -> Vec<u8> {
     [&opening.repeat(levels), inner, &closing.repeat(levels)].concat()
 }
@@ -708,7 +709,7 @@ fn what_fills_up_a_delta_frame_is_told_from_a_change_to_null() {
         2, 0, 3, 7, // field 2 is Byte 7
         1, 0, 0, // field 1 is null
         0, 0, 3, 0, // field 0 is Byte 0
-        0, 0, 0, // nothing
+        0, 0, 0, // filler
     ];
     let datagram = [&[0x01], &delta[..]].concat();
     let message = messages(&datagram).remove(0).unwrap();
@@ -797,7 +798,7 @@ fn a_secured_message_shows_its_headers_and_no_messages() {
         let datagram = [
             0xC1, 0x10, 1, 5, 0, // DataSetWriterId 5, SecurityHeader
             flags, 9, 0, 0, 0, 2, 0xAB, 0xCD, // token 9 and a nonce of two bytes
-            0x01, 1, 0, 0x03, 7, // what would be a key frame
+            0x01, 1, 0, 0x03, 7, // content of a key frame
         ];
         let message = NetworkMessage::decode(&datagram).unwrap();
         let header = SecurityHeader {
@@ -859,7 +860,7 @@ fn the_footer_is_no_part_of_the_payload() {
     let datagram = |size: u8| {
         [
             0x81, 0x10, 0x04, 0, 0, 0, 0, 0, size, 0, // SecurityHeader with a footer
-            0x01, 1, 0, 0x03, 7, 0xF1, 0xF2, // a key frame and two bytes more
+            0x01, 1, 0, 0x03, 7, 0xF1, 0xF2, // key frame and two more bytes
         ]
     };
     let with_footer = datagram(2);
@@ -962,7 +963,7 @@ fn promoted_fields_end_where_their_size_says() {
 fn promoted_fields_past_the_end_are_refused() {
     let error = NetworkMessage::decode(&[0x81, 0x80, 0x02, 4, 0, 3, 7, 3]).unwrap_err();
     assert_eq!(error, cut("PromotedFields", 4, 3));
-    // Size 3 cuts the second field: the message behind it is read all the same.
+    // Size 3 truncates the second field; the message behind it is still decoded.
     let datagram = [0x81, 0x80, 0x02, 3, 0, 3, 7, 3, 0x01, 1, 0, 3, 9];
     let message = NetworkMessage::decode(&datagram).unwrap();
     let promoted: Vec<_> = message.promoted_fields().unwrap().collect();

@@ -1,4 +1,4 @@
-//! What a writer may ask for, and what it is refused.
+//! Calls that an encoder accepts, and calls that it rejects.
 
 use uadp::{
     BuiltinType, DataSetHeader, DataValue, DateTime, DecodeError, EncodeError, Encoded,
@@ -6,7 +6,8 @@ use uadp::{
     NetworkMessageEncoder, NodeId, Scalar, SecurityHeader, StatusCode, Variant,
 };
 
-/// What a key frame of the smallest header becomes: bytes behind the header, or why not.
+/// Encodes a key frame behind the smallest header. Returns the bytes behind the header, or the
+/// error.
 fn block(
     write: impl FnOnce(&mut FieldEncoder<'_>) -> Result<(), EncodeError>,
 ) -> Result<Vec<u8>, EncodeError> {
@@ -19,7 +20,7 @@ fn block(
     Ok(out.split_off(2))
 }
 
-/// What one DataSetMessage behind the smallest header becomes, or why not.
+/// Encodes a DataSetMessage behind the smallest header. Returns its bytes, or the error.
 fn message(
     write: impl FnOnce(&mut NetworkMessageEncoder<'_>) -> Result<(), EncodeError>,
 ) -> Result<Vec<u8>, EncodeError> {
@@ -500,7 +501,7 @@ fn what_is_given_as_encoded_has_to_be_one_value() {
     );
 }
 
-/// A keep-alive behind this SecurityHeader, and the footer where there is one.
+/// Encodes a keep-alive with this SecurityHeader, and the footer if present.
 fn secured(security: SecurityHeader<'_>, footer: Option<&[u8]>) -> Result<Vec<u8>, EncodeError> {
     let mut out = Vec::new();
     let extras = Extras {

@@ -1,4 +1,5 @@
-//! Measures the codec: without arguments wall time, with `count CASE N` just work for an instruction counter.
+//! Benchmark of the codec. Without arguments it measures wall time; `count CASE N` only performs
+//! the work, for an instruction counter.
 
 mod ours;
 mod theirs;
@@ -9,11 +10,11 @@ use std::time::{Duration, Instant};
 
 use ours::{Config, Payload};
 
-/// Of so many rounds the fastest counts: what is slower was disturbed.
+/// Number of rounds. The fastest round counts, because slower rounds were disturbed.
 const ROUNDS: u32 = 15;
 const MESSAGES: u32 = 100_000;
 
-/// What is measured, by a name for tables and the command line.
+/// A measured case, with a name for tables and the command line.
 struct Case {
     name: String,
     work: Box<dyn FnMut(u32)>,
@@ -78,7 +79,7 @@ fn cases() -> Vec<Case> {
     cases
 }
 
-/// Not counted, only timed.
+/// Cases that are timed only, not counted.
 fn their_cases() -> Vec<Case> {
     let mut cases = Vec::new();
     for payload in Payload::ALL {
@@ -112,7 +113,7 @@ fn case(what: &str, payload: &str, work: impl FnMut(u32) + 'static) -> Case {
     }
 }
 
-/// The cases in turn, so that all of them see the same machine.
+/// Measures the cases in turn, so that all of them run under the same conditions.
 fn wall(cases: &mut [Case]) {
     let mut best = vec![Duration::MAX; cases.len()];
     for _ in 0..ROUNDS {

@@ -1,4 +1,4 @@
-//! The payloads and what is measured of them, with `uadp`.
+//! The payloads and the measured functions, with `uadp`.
 
 use std::hint::black_box;
 
@@ -7,10 +7,10 @@ use uadp::{
     PublisherId, Scalar, Variant,
 };
 
-/// What a message holds.
+/// Content of a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Payload {
-    /// One Double.
+    /// A single Double.
     Double,
     /// 20 Int32.
     Ints,
@@ -32,7 +32,7 @@ impl Payload {
 
 pub(crate) const BLOB: [u8; 1024] = [0x5A; 1024];
 
-/// What a writer is configured with: not known when the measurement is compiled.
+/// Configuration of a writer, which is unknown at compile time.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Config {
     header: NetworkHeader<'static>,
@@ -62,7 +62,7 @@ impl Config {
     }
 }
 
-/// Encodes message number `number` into the buffer, from its start.
+/// Encodes message number `number` to the start of the buffer.
 #[inline(never)]
 pub(crate) fn encode(payload: Payload, number: u16, config: &Config, datagram: &mut Vec<u8>) {
     datagram.clear();
@@ -88,7 +88,7 @@ pub(crate) fn encode(payload: Payload, number: u16, config: &Config, datagram: &
     message.finish().unwrap();
 }
 
-/// Reads the headers and every field; the sum of what was seen.
+/// Decodes the headers and every field. Returns a sum of their values.
 #[inline(never)]
 pub(crate) fn decode(datagram: &[u8]) -> u64 {
     let network = NetworkMessage::decode(datagram).unwrap();

@@ -1,4 +1,5 @@
-//! The same payloads with `zerodds-opcua-pubsub`, in its fastest ways: owned values made before, a buffer sized before.
+//! The same payloads with `zerodds-opcua-pubsub` in its fastest form: owned values created before
+//! the measurement, and a buffer of sufficient size.
 
 use std::hint::black_box;
 
@@ -8,7 +9,7 @@ use zerodds_opcua_pubsub::{UaEncode, UaWriter, from_binary};
 
 use crate::ours::{BLOB, Payload};
 
-/// A message to encode; making it is not measured.
+/// Returns a message to encode; its creation is not measured.
 pub(crate) fn message(payload: Payload) -> NetworkMessage {
     let fields = match payload {
         Payload::Double => vec![Variant::scalar(VariantValue::Double(2.5))],
@@ -32,7 +33,7 @@ pub(crate) fn message(payload: Payload) -> NetworkMessage {
     }
 }
 
-/// Encodes into a buffer of its own, which is the only kind it has.
+/// Encodes into a new buffer, which is the only option of that crate.
 #[inline(never)]
 pub(crate) fn encode(message: &NetworkMessage) -> UaWriter {
     let mut writer = UaWriter::with_capacity(2048);

@@ -1,4 +1,4 @@
-//! What holds for every Action message, and what is refused.
+//! Properties of every Action message, and rejected input.
 
 use proptest::collection::vec;
 use proptest::option;
@@ -15,7 +15,7 @@ use uadp::{
 use super::vectors::{all, dialect, vector};
 use super::{STANDARD, read, rewrite};
 
-/// Why a datagram cannot be read to its end.
+/// Returns the first error of a datagram.
 fn fault(datagram: &[u8], dialect: ActionDialect) -> Option<DecodeError> {
     let network = match NetworkMessage::decode(datagram) {
         Ok(network) => network,
@@ -44,7 +44,7 @@ fn fault(datagram: &[u8], dialect: ActionDialect) -> Option<DecodeError> {
     None
 }
 
-/// The vector with one byte replaced.
+/// Returns the vector with a byte replaced.
 fn with(name: &str, at: usize, byte: u8) -> Vec<u8> {
     let mut bytes = vector(name);
     bytes[at] = byte;
@@ -55,7 +55,7 @@ fn with(name: &str, at: usize, byte: u8) -> Vec<u8> {
 fn no_part_of_a_message_passes_for_the_whole() {
     for (name, bytes) in all() {
         assert_eq!(fault(&bytes, dialect(name)), None, "{name}");
-        // Behind the FieldCount nothing tells how long RawData is.
+        // The length of RawData behind the FieldCount is not encoded.
         let whole = match name {
             "raw_data" => bytes.len() - 12,
             "netstandard_raw_response" => bytes.len() - 4,
@@ -74,7 +74,7 @@ fn no_part_of_a_message_passes_for_the_whole() {
 fn reserved_values_are_refused_by_name() {
     let reserved = |field, value| Some(DecodeError::Reserved { field, value });
     let read = |bytes: Vec<u8>| fault(&bytes, STANDARD);
-    // ActionFlags stand at 11 of the response, the DataSetMessage at 22, its ActionState at 30.
+    // In the response, ActionFlags are at 11, the DataSetMessage at 22, its ActionState at 30.
     assert_eq!(
         read(with("response", 11, 0x2C)),
         reserved("ActionFlags", 0x20)
@@ -165,7 +165,7 @@ fn several_one_shot_actions_in_a_message_are_refused() {
 
 #[test]
 fn a_malformed_message_of_several_leaves_the_next_one_readable() {
-    // The ActionState of the first of two.
+    // The ActionState of the first message.
     let bytes = with("two_requests", 29, 9);
     let network = NetworkMessage::decode(&bytes).unwrap();
     let mut actions = network.actions(STANDARD).unwrap();

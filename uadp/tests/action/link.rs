@@ -1,4 +1,4 @@
-//! Requestors and a Responder over a network that loses, doubles, delays and reorders.
+//! Requestors and a Responder over a network that loses, duplicates, delays and reorders messages.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
@@ -15,14 +15,14 @@ use super::peers::{block, message, number, request, requests, responses};
 
 #[derive(Debug, Clone, Copy)]
 struct Network {
-    /// In percent.
+    /// Probability of loss in percent.
     loss: u64,
     doubled: u64,
-    /// Longest time under way, in milliseconds.
+    /// Maximum delay in milliseconds.
     delay: u64,
 }
 
-/// What the network does next.
+/// Random numbers for the next event of the network.
 struct Dice(u64);
 
 impl Dice {
@@ -38,7 +38,7 @@ impl Dice {
 #[derive(Debug, Clone)]
 struct Call {
     requestor: usize,
-    /// When, and how long it waits, in milliseconds.
+    /// Start and timeout in milliseconds.
     at: u64,
     timeout: u64,
     work: Work,
@@ -58,10 +58,10 @@ struct World {
     network: Network,
     dice: Dice,
     now: Duration,
-    /// What is under way, by arrival: to the Responder, or to all Requestors.
+    /// Datagrams under way, by arrival: to the Responder, or to all Requestors.
     under_way: BTreeMap<(Duration, u64), (bool, Vec<u8>)>,
     sent: u64,
-    /// What is executed, by when it ends.
+    /// Running executions, by their end.
     working: BTreeSet<(Duration, ExecutionId, usize)>,
     calls: Vec<Call>,
     begun: usize,
@@ -110,7 +110,7 @@ impl World {
         }
     }
 
-    /// Until nothing is going to happen any more; the number of steps.
+    /// Runs until no further event is due. Returns the number of steps.
     fn run(&mut self) -> usize {
         for step in 0..100_000 {
             self.transmit();
@@ -238,7 +238,7 @@ impl World {
                 },
             };
             match self.responder.finish(execution, outcome, self.now) {
-                // Nobody waits for it any more.
+                // The Requestor has stopped waiting.
                 Ok(()) | Err(FinishRefusal::Abandoned | FinishRefusal::Forgotten) => {}
                 Err(refusal) => panic!("{refusal}"),
             }
@@ -338,7 +338,7 @@ proptest! {
     fn every_call_is_executed_once_at_most_and_told_right_however_bad_the_network(
         loss in 0..70_u64,
         doubled in 0..30_u64,
-        // Less than the Responder remembers.
+        // Shorter than the memory of the Responder.
         delay in prop_oneof![0..50_u64, 0..1000_u64, 0..9000_u64],
         seed in any::<u64>(),
         calls in prop::collection::vec(call(), 1..12),

@@ -1,4 +1,5 @@
-//! Actions: bytes by the tables, what is written comes back, and who asks and who answers understand each other.
+//! Actions: bytes from the tables of the standard, round trips, and exchanges of Requestors and
+//! Responders.
 
 mod codec;
 mod link;
@@ -13,7 +14,7 @@ use uadp::{EncodeError, Extras, NetworkMessage};
 
 const STANDARD: ActionDialect = ActionDialect::Standard;
 
-/// The messages of a datagram, all of them readable.
+/// Returns the messages of a datagram; all of them have to be valid.
 fn read(datagram: &[u8], dialect: ActionDialect) -> Vec<ActionMessage<'_>> {
     let network = NetworkMessage::decode(datagram).unwrap();
     network
@@ -23,7 +24,7 @@ fn read(datagram: &[u8], dialect: ActionDialect) -> Vec<ActionMessage<'_>> {
         .collect()
 }
 
-/// A datagram once more from what was read of it.
+/// Encodes a datagram again from its decoded content.
 fn rewrite(datagram: &[u8], dialect: ActionDialect) -> Result<Vec<u8>, EncodeError> {
     let network = NetworkMessage::decode(datagram).unwrap();
     let actions = network.actions(dialect).unwrap();
@@ -37,7 +38,7 @@ fn rewrite(datagram: &[u8], dialect: ActionDialect) -> Result<Vec<u8>, EncodeErr
         },
     };
     let ids: Vec<u16> = network.writer_ids().unwrap().collect();
-    // Not from the start of the buffer: every position in it is relative.
+    // The offset in the buffer is not 0, because all positions have to be relative.
     let mut out = vec![0xAA; 3];
     let mut encoder = ActionEncoder::new(&mut out, &start, &ids)?;
     for message in actions {

@@ -1,4 +1,4 @@
-//! A Requestor and a Responder with bytes between them.
+//! A Requestor and a Responder that exchange bytes.
 
 use std::time::Duration;
 
@@ -25,7 +25,7 @@ pub(super) fn address(target_id: u16) -> ActionAddress {
     }
 }
 
-/// Arguments or an answer: a block of one Int32.
+/// Returns arguments or a result: a block with a single Int32.
 pub(super) fn block(number: i32) -> Vec<u8> {
     let mut block = vec![1, 0, 6];
     block.extend_from_slice(&number.to_le_bytes());
@@ -59,7 +59,7 @@ pub(super) fn responder() -> Responder<u16> {
     Responder::new(ResponderSettings::default())
 }
 
-/// The requests that are due.
+/// Returns the requests that are due.
 pub(super) fn requests(requestor: &mut Requestor, now: Duration) -> Vec<Vec<u8>> {
     let mut datagrams = Vec::new();
     while let Some(request) = requestor.poll_transmit(now) {
@@ -71,7 +71,7 @@ pub(super) fn requests(requestor: &mut Requestor, now: Duration) -> Vec<Vec<u8>>
     datagrams
 }
 
-/// The responses that are due.
+/// Returns the responses that are due.
 pub(super) fn responses(responder: &mut Responder<u16>, now: Duration) -> Vec<Vec<u8>> {
     let mut datagrams = Vec::new();
     while let Some((_, response)) = responder.poll_transmit(now) {
@@ -83,7 +83,7 @@ pub(super) fn responses(responder: &mut Responder<u16>, now: Duration) -> Vec<Ve
     datagrams
 }
 
-/// Calls `then` with the one message of a datagram.
+/// Calls `then` with the single message of a datagram.
 pub(super) fn message<T>(
     datagram: &[u8],
     dialect: ActionDialect,
@@ -104,7 +104,7 @@ pub(super) fn ask(
     ask_from(responder, 0, datagram, now)
 }
 
-/// As [`ask`], from another sender.
+/// Passes a request as [`ask`], from another sender.
 pub(super) fn ask_from(
     responder: &mut Responder<u16>,
     sender: u16,
@@ -116,7 +116,7 @@ pub(super) fn ask_from(
     })
 }
 
-/// What the response says, with the fields left out.
+/// Returns the meaning of the response, without the fields.
 pub(super) fn answer(
     requestor: &mut Requestor,
     datagram: &[u8],

@@ -1,4 +1,4 @@
-//! Who asks: repeats until something is heard, acknowledges, and ends every call.
+//! The Requestor: repeats until the first response, acknowledges, and ends every call.
 
 use uadp::OwnedPublisherId;
 use uadp::action::{
@@ -11,7 +11,7 @@ use super::peers::{
     INTERVAL, answer, ask, at, block, message, request, requestor, requests, responder, responses,
 };
 
-/// State and TimeoutHint of each request that is due, in milliseconds.
+/// Returns state and TimeoutHint of each request that is due, in milliseconds.
 fn due(requestor: &mut Requestor, now: u64) -> Vec<(ActionState, Option<u128>)> {
     requests(requestor, at(now))
         .iter()

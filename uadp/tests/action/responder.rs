@@ -1,4 +1,4 @@
-//! Who answers: executes once, remembers, and holds no more than it may.
+//! The Responder: executes once, remembers, and keeps its limits.
 
 use std::time::Duration;
 
@@ -14,7 +14,7 @@ use super::peers::{
     ask, ask_from, at, block, message, number, request, requestor, requests, responder, responses,
 };
 
-/// One request, as bytes.
+/// Returns a request as bytes.
 fn asked(arguments: i32) -> Vec<u8> {
     let mut requestor = requestor();
     let arguments = block(arguments);
@@ -24,7 +24,7 @@ fn asked(arguments: i32) -> Vec<u8> {
     requests(&mut requestor, at(0)).remove(0)
 }
 
-/// The request with ActionState Idle: the state stands in front of the fields.
+/// Changes a request to ActionState Idle. The state precedes the fields.
 fn idle(asked: &[u8]) -> Vec<u8> {
     let mut idle = asked.to_vec();
     let state = idle.len() - block(0).len() - 1;
@@ -40,7 +40,7 @@ fn execute(requested: Result<Requested, RequestDrop>) -> ExecutionId {
     }
 }
 
-/// States of the responses that are due.
+/// Returns the states of the responses that are due.
 fn due(responder: &mut Responder<u16>, now: u64) -> Vec<ActionState> {
     responses(responder, at(now))
         .iter()
@@ -148,7 +148,7 @@ fn a_request_is_forgotten_when_it_is_old() {
 #[test]
 fn what_is_executed_past_its_deadline_is_told_once_and_freed_by_age() {
     let mut responder = responder();
-    let asked = asked(1); // waits for 5 s
+    let asked = asked(1); // timeout of 5 s
     let execution = execute(ask(&mut responder, &asked, at(0)));
     for now in (0..5000).step_by(100) {
         assert_eq!(due(&mut responder, now), [EXECUTING]);
@@ -246,7 +246,7 @@ fn what_a_requestor_cannot_want_is_dropped() {
     assert_eq!(responder.counters().dropped, 2);
 }
 
-/// Requests of a Requestor, each as bytes.
+/// Returns requests of a Requestor as bytes.
 fn many(requestor_id: u16, count: i32) -> Vec<Vec<u8>> {
     let mut requestor = Requestor::new(
         OwnedPublisherId::UInt16(requestor_id),
@@ -284,7 +284,7 @@ fn requests_beyond_the_memory_are_dropped_by_reason_and_not_answered() {
         Err(RequestDrop::Full)
     );
     assert_eq!(due(&mut responder, 0).len(), 5);
-    // It is heard once there is room again.
+    // The request is accepted when there is space again.
     responder.handle_timeout(at(20_000));
     execute(ask(&mut responder, &two[2], at(20_000)));
 }
@@ -306,7 +306,7 @@ fn requests_that_are_over_make_room_for_others_and_are_still_known() {
         let closed = ask(responder, &idle(asked), at(0));
         assert_eq!(closed, Ok(Requested::Closed(execution)));
     };
-    // Two with all that is known of them, and 8 more.
+    // Two complete requests and 8 hashes.
     for asked in &one[..10] {
         play(&mut responder, 0, asked);
     }
@@ -324,7 +324,7 @@ fn requests_that_are_over_make_room_for_others_and_are_still_known() {
         }
     }
     while responder.poll_transmit(at(9_000)).is_some() {}
-    // Those that were kept whole were heard of again.
+    // The completely remembered requests received a message at 9 s.
     responder.handle_timeout(at(10_000));
     assert_eq!(responder.held().0, 4);
     execute(ask(&mut responder, &one[10], at(10_000)));
@@ -362,7 +362,7 @@ fn a_requestor_that_takes_all_answers_can_ask_thousands_of_times_a_second() {
     assert_eq!(late, Err(RequestDrop::Over));
 }
 
-/// Has each hear what the other says until both are silent.
+/// Exchanges messages until no message is due on either side.
 fn exchange(requestor: &mut Requestor, responder: &mut Responder<u16>, now: Duration) {
     loop {
         let said = responses(responder, now);
@@ -433,7 +433,7 @@ fn bytes_are_bounded_for_each_sender_and_in_all() {
     assert_eq!(responder.held(), (0, 0));
 }
 
-/// Asks in a group, with the verdict of the owner.
+/// Passes a request of a group, with the verdict of the owner.
 fn ask_judged(
     responder: &mut Responder<u16>,
     (group, sender): (usize, u16),
@@ -457,7 +457,7 @@ fn a_refused_request_is_answered_once_and_its_repetitions_a_few_times() {
     let status = message(&said[0], STANDARD, |response| response.header().status);
     assert_eq!((said.len(), status), (1, Some(0x801F)));
     assert_eq!(responder.poll_timeout(), None, "nothing is left to be said");
-    // A repetition within the publishing interval is not answered, and never executed.
+    // A repetition within the publishing interval gets no response, and is never executed.
     let mut answers = 0;
     for now in (50..9_000).step_by(50) {
         let again = ask_judged(&mut responder, (0, 0), &asked, (Ok(()), now));
@@ -502,7 +502,7 @@ fn refused_requests_fill_the_room_of_their_sender_and_group_alone() {
     ask_of((0, 2), 4, refused).unwrap();
     ask_of((0, 2), 5, refused).unwrap();
     assert_eq!(ask_of((0, 2), 6, refused), Err(RequestDrop::Full));
-    // Refusals take no room of requests, and requests of one group none of another.
+    // Refusals use no space of requests, and each group has its own space.
     execute(ask_of((0, 3), 7, Ok(())));
     let busy = ask_of((0, 4), 8, Ok(()));
     assert!(matches!(busy, Ok(Requested::Refused(_, Refusal::Busy))));

@@ -17,7 +17,7 @@ fn keys() -> Keys {
     Keys::from_bytes(SecurityPolicy::PubSubAes128Ctr, &key_data).unwrap()
 }
 
-/// A request with a secret in its CorrelationData and another in its field.
+/// Returns a request with a secret in its CorrelationData and another secret in its field.
 fn sealed(mode: SecurityMode) -> Vec<u8> {
     let mut sealer = Sealer::new(mode);
     sealer.update_keys(1, [keys()]).unwrap();

@@ -1,4 +1,4 @@
-//! Bytes put together by hand.
+//! Datagrams encoded by hand.
 
 use std::time::Duration;
 
@@ -16,7 +16,7 @@ const TEXT: &str = include_str!("vectors.txt");
 const ONE_SHOT: ActionDialect = ActionDialect::UaNetStandard(ActionEncoding::Variant);
 const ONE_SHOT_RAW: ActionDialect = ActionDialect::UaNetStandard(ActionEncoding::RawData);
 
-/// All vectors by name.
+/// Returns all vectors by name.
 pub(super) fn all() -> Vec<(&'static str, Vec<u8>)> {
     let mut vectors: Vec<(&str, Vec<u8>)> = Vec::new();
     for line in TEXT.lines() {

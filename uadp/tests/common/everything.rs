@@ -1,11 +1,11 @@
-//! A datagram read through every accessor there is, with what has to hold whatever the bytes are.
+//! Reads a datagram through every accessor, and checks invariants that hold for all bytes.
 
 use uadp::{
     Array, BuiltinType, DataSetMessage, DataValue, DiagnosticInfo, ExtensionBody, FieldEncoding,
     MessageKind, NetworkMessage, Scalar, StructureReader, Variant,
 };
 
-/// Reads a datagram, behind errors too; the number of values found, those inside of others included.
+/// Reads a datagram, also behind errors. Returns the number of values, including nested values.
 pub(crate) fn read_everything(datagram: &[u8]) -> usize {
     let Ok(network) = NetworkMessage::decode(datagram) else {
         return 0;
@@ -132,7 +132,7 @@ fn read_scalar(scalar: Scalar<'_>) -> usize {
     }
 }
 
-/// What a body could start with; the number of types it could be.
+/// Returns the number of types that a body could start with.
 fn read_body(body: &[u8]) -> usize {
     let body = StructureReader::new(body);
     std::hint::black_box(body.clone().length().is_ok());

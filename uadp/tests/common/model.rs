@@ -1,4 +1,4 @@
-//! Owned values of every type, from which those of the crate borrow, and how to make them up.
+//! Owned values of every type, which the values of the crate borrow from, and their generators.
 
 use proptest::collection::vec;
 use proptest::option;
@@ -9,7 +9,7 @@ use uadp::{
     NetworkHeader, NetworkMessageEncoder, NodeId, QualifiedName, Scalar, StatusCode, Variant,
 };
 
-/// What a [`Scalar`] of any type borrows from.
+/// Data that a [`Scalar`] of any type borrows from.
 #[derive(Debug, Clone)]
 pub(crate) struct Seed {
     builtin: BuiltinType,
@@ -22,7 +22,7 @@ pub(crate) struct Seed {
     inside: Inside,
 }
 
-/// The value in a value, beside `Seed::bytes`, its encoding.
+/// The nested value of a value. `Seed::bytes` is its encoding.
 #[derive(Debug, Clone)]
 enum Inside {
     Nothing,
@@ -56,7 +56,7 @@ pub(crate) struct Sample {
     rest: DataValue<'static>,
 }
 
-/// A DiagnosticInfo, `inner` with its encoding.
+/// A DiagnosticInfo; `inner` includes its encoding.
 #[derive(Debug, Clone)]
 pub(crate) struct Info {
     indexes: [Option<i32>; 4],
@@ -66,7 +66,7 @@ pub(crate) struct Info {
 }
 
 impl Seed {
-    /// A seed of one of the types that hold values.
+    /// Returns a seed of a type that contains values.
     fn holding(inside: Inside) -> Self {
         let mut bytes = Vec::new();
         let builtin = match &inside {
@@ -169,7 +169,7 @@ impl Seed {
         }
     }
 
-    /// Equal as bits, so that a NaN is the same NaN, and down to the innermost value.
+    /// Compares bits, so that a NaN equals the same NaN, including all nested values.
     fn is(&self, found: &Scalar<'_>) -> bool {
         match (found, self.scalar(), &self.inside) {
             (Scalar::Float(a), Scalar::Float(b), _) => a.to_bits() == b.to_bits(),
@@ -200,7 +200,8 @@ impl Elements {
         }
         fields.finish().unwrap();
         message.finish().unwrap();
-        // Behind the two flag bytes, the FieldCount, the encoding byte and the array's length.
+        // The elements follow two flag bytes, the FieldCount, the encoding byte and the array
+        // length.
         let bytes = out.split_off(9);
         Self {
             builtin,
@@ -300,7 +301,7 @@ impl Info {
     }
 }
 
-/// A Variant that holds others several levels deep.
+/// Generates a Variant that contains several levels of values.
 pub(crate) fn value() -> impl Strategy<Value = Value> {
     let leaf = plain(1..=22).prop_map(|seed| Value::Scalar(Box::new(seed)));
     let leaf = prop_oneof![1 => Just(Value::Null), 6 => leaf];
@@ -319,7 +320,7 @@ fn elements(
     inner: BoxedStrategy<Value>,
     count: impl Strategy<Value = usize>,
 ) -> impl Strategy<Value = Elements> {
-    // Half of them hold values.
+    // Half of the elements contain values.
     let id = prop_oneof![1..=22_u8, 23..=25_u8];
     (id, count).prop_flat_map(move |(id, count)| {
         let builtin = BuiltinType::from_id(id).unwrap();
@@ -328,7 +329,7 @@ fn elements(
     })
 }
 
-/// Two dimensions or more, none of them empty: any other is written as an array.
+/// Generates at least two non-empty dimensions, because any other matrix is encoded as an array.
 fn matrix(inner: BoxedStrategy<Value>) -> impl Strategy<Value = Value> {
     vec(1..3_u32, 2..4).prop_flat_map(move |sizes| {
         let count = sizes.iter().product::<u32>() as usize;
@@ -380,7 +381,7 @@ fn info() -> impl Strategy<Value = Info> {
     })
 }
 
-/// A value of the type of that id, `inner` the Variants in it.
+/// Generates a value of the type with an id. `inner` are its nested Variants.
 fn seed(id: u8, inner: &BoxedStrategy<Value>) -> BoxedStrategy<Seed> {
     let inner = inner.clone();
     match BuiltinType::from_id(id).unwrap() {
@@ -397,7 +398,7 @@ fn seed(id: u8, inner: &BoxedStrategy<Value>) -> BoxedStrategy<Seed> {
     }
 }
 
-/// A value of a type that holds no others.
+/// Generates a value of a type that contains no other values.
 fn plain(ids: std::ops::RangeInclusive<u8>) -> impl Strategy<Value = Seed> {
     (
         ids.prop_map(|id| BuiltinType::from_id(id).unwrap()),

@@ -1,4 +1,4 @@
-//! Writing a datagram once more from nothing but what was read of it.
+//! Encodes a datagram again from its decoded content only.
 
 use uadp::{
     DataSetMessage, DecodeError, Extras, FieldEncoder, FieldEncoding, Fields, MessageKind,
@@ -17,7 +17,7 @@ pub(crate) fn rewrite(datagram: &[u8], fields: WriteFields) -> Result<Vec<u8>, D
         promoted_fields: promoted.as_deref(),
         security: network.security(),
     };
-    // Not from the start of the buffer: every position in it is relative.
+    // The offset in the buffer is not 0, because all positions have to be relative.
     let mut out = vec![0xAA; 3];
     let ids = writer_ids.as_deref();
     let mut encoder =

@@ -1,5 +1,5 @@
-//! Structures as another stack encodes them. `asyncua.hex` was written by `encode_asyncua.py` with asyncua 2.1.0; the
-//! values below repeat those of the script.
+//! Structures in the encoding of another stack. `asyncua.hex` was written by `encode_asyncua.py`
+//! with asyncua 2.1.0; the values below repeat the values of the script.
 
 use uadp::discovery::{
     ActionMetaData, ActionMethodDataType, ActionTargetDataType, Announced, Announcement,
@@ -18,14 +18,14 @@ use uadp::{
 
 use crate::discovery::{body, unhex};
 
-/// The encoding of a structure.
+/// Returns the encoding of a structure.
 pub(crate) fn structure(name: &str) -> Vec<u8> {
     let lines = include_str!("asyncua.hex").lines();
     let mut pairs = lines.map(|line| line.split_once(' ').unwrap());
     unhex(pairs.find(|(found, _)| *found == name).unwrap().1)
 }
 
-/// Bodies of announcements with the structures in them.
+/// Returns bodies of announcements that contain the structures.
 pub(crate) fn bodies() -> Vec<Vec<u8>> {
     let good = [0; 4];
     let one = [1, 0, 0, 0];

@@ -1,4 +1,4 @@
-//! Reading allocates nothing, whatever the counts in it say.
+//! Decoding allocates nothing, independent of the encoded counts.
 
 use allocation_counter::measure;
 use uadp::DecodeError;
@@ -19,7 +19,7 @@ fn reading_allocates_nothing() {
             fields += ids.iter().count();
         }
     });
-    // One in each of five DataSetMetaData, and two ids.
+    // A field in each of five DataSetMetaData, and two ids.
     assert_eq!(fields, 5 + 2);
     assert_eq!(allocations.count_total, 0);
 }
@@ -77,7 +77,7 @@ fn hostile_lengths_anywhere_are_refused_or_harmless_and_allocate_nothing() {
     }
 }
 
-/// Fields of all DataSetMetaData in it.
+/// Returns the number of fields of all DataSetMetaData.
 fn count_fields(announced: &Announced<'_>) -> usize {
     let meta_data = |meta_data: &DataSetMetaDataType<'_>| meta_data.fields.iter().count();
     match announced {

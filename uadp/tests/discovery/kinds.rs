@@ -1,4 +1,4 @@
-//! Each kind of probe and announcement, and what is none.
+//! Each kind of probe and announcement, and other messages.
 
 use uadp::discovery::{
     Announced, Announcement, ApplicationDescription, ConfigurationVersion, ConnectionState,
@@ -126,7 +126,7 @@ fn connections_are_an_array_without_a_status() {
     let one = (bytes.len() - 7) / 2;
     assert_eq!(bytes[7..7 + one], bytes[7 + one..]);
 
-    // What others send instead is told apart, and what is neither is refused.
+    // The form of other stacks is recognized, and any other form is rejected.
     let single = announced(Announced::PubSubConnection {
         connection: connections[0],
         status: StatusCode::GOOD,
@@ -216,7 +216,7 @@ fn other_messages_are_not_taken_for_discovery() {
         Err(DecodeError::Misread(_))
     ));
 
-    // ExtendedFlags2 bit 0 makes a chunk of it.
+    // ExtendedFlags2 bit 0 marks a chunk.
     probe[2] |= 1;
     let message = NetworkMessage::decode(&probe).unwrap();
     assert_eq!(
@@ -287,7 +287,7 @@ fn metadata_fit_messages_of_their_major_version() {
     }
 }
 
-/// The body with SequenceNumber 1, read back.
+/// Returns the body with SequenceNumber 1 after a round trip.
 fn announced(announced: Announced<'_>) -> Vec<u8> {
     let announcement = Announcement {
         sequence_number: 1,
@@ -298,7 +298,8 @@ fn announced(announced: Announced<'_>) -> Vec<u8> {
     bytes
 }
 
-/// An ActionMetaData announcement by its table (OPC 10000-14, 7.2.4.6.11), with so many ActionMethods.
+/// Returns an ActionMetaData announcement from its table (OPC 10000-14, 7.2.4.6.11), with a number
+/// of ActionMethods.
 fn action_meta_data(methods: i32) -> Vec<u8> {
     let null = [0xFF; 4];
     let meta_data = [

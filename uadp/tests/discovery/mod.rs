@@ -1,5 +1,5 @@
-//! Discovery messages: read as their makers meant them, written back byte for byte, and refused without cost when they
-//! are malformed.
+//! Discovery messages: decoded as intended by their senders, encoded byte for byte, and rejected at
+//! no cost if malformed.
 
 mod asyncua;
 mod cost;
@@ -29,7 +29,7 @@ fn probe_body(probe: &Probe<'_>) -> Vec<u8> {
     out
 }
 
-/// The datagram of a Publisher without security.
+/// Returns the datagram of a Publisher without security.
 fn datagram(announcement: &Announcement<'_>) -> Vec<u8> {
     let mut out = Vec::new();
     announcement

@@ -1,5 +1,5 @@
-//! What holds for every message: it comes back as it was written, no part of it passes for the whole, and no bytes
-//! whatsoever make the reader panic.
+//! Properties of every message: decoding returns the encoded values, no part of a message is
+//! accepted as a complete message, and no bytes cause a panic.
 
 use proptest::collection::vec;
 use proptest::option;
@@ -21,7 +21,7 @@ use uadp::{
 use crate::discovery::asyncua::bodies;
 use crate::discovery::{body, datagram, probe_body};
 
-/// The structures borrow; what they borrow is as short-lived as the test program.
+/// Leaks the values, because the structures borrow them. The test program is short-lived.
 fn leak<T>(values: Vec<T>) -> &'static [T] {
     values.leak()
 }
@@ -482,7 +482,7 @@ fn probe() -> impl Strategy<Value = Probe<'static>> {
     ]
 }
 
-/// Reads everything in it; what can be read is written the same every time.
+/// Reads everything. A decoded message always has the same encoding.
 fn read_on(bytes: &[u8]) {
     if let Ok(announcement) = Announcement::decode_body(bytes) {
         let written = body(&announcement);

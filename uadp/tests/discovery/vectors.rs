@@ -297,7 +297,8 @@ fn settings_are_decoded_on_demand_and_others_left_alone() {
     assert!(UadpWriterGroupMessageDataType::from_object(&cut).is_err());
 }
 
-/// Equal to what is read from the vector, and written the same.
+/// Checks that the vector decodes to the announcement, and that the announcement encodes to the
+/// vector.
 fn same(name: &str, announced: Announced<'_>) {
     let announcement = Announcement {
         sequence_number: 7,
@@ -309,7 +310,7 @@ fn same(name: &str, announced: Announced<'_>) {
     assert_eq!(datagram(&announcement), bytes, "{name}");
 }
 
-/// What the JSON file says, its header checked.
+/// Returns the description in the JSON file, after checking its header.
 fn described_in(name: &str, message: &NetworkMessage<'_>) -> Value {
     let json: Value = serde_json::from_str(&file(&format!("{name}.json"))).unwrap();
     assert_eq!(

@@ -1,4 +1,4 @@
-//! Once its buffers are used, neither side allocates.
+//! Opening and sealing allocate nothing with used buffers.
 
 use allocation_counter::measure;
 use uadp::{NetworkMessage, PublisherId, Sealer, SecurityError, SecurityMode};

@@ -1,4 +1,4 @@
-//! Datagrams of another stack: opened, and written once more byte for byte.
+//! Datagrams of another stack: opened, and encoded again byte for byte.
 
 use std::path::Path;
 
@@ -64,7 +64,7 @@ impl Foreign {
         self.json["security"]["securityTokenId"].as_u64().unwrap() as u32
     }
 
-    /// The payload before it was encrypted.
+    /// Returns the payload before encryption.
     fn payload(&self) -> Vec<u8> {
         let offset = |what| self.json["security"][what].as_u64().unwrap() as usize;
         match self.mode() {

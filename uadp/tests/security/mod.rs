@@ -1,4 +1,4 @@
-//! Secured messages: what is opened, what is refused and why, and what is sent.
+//! Secured messages: accepted messages, rejected messages with their reasons, and sent messages.
 
 mod allocation;
 mod foreign;
@@ -17,12 +17,12 @@ use uadp::{
 
 const START: Duration = Duration::ZERO;
 
-/// Keys made of one byte over and over.
+/// Returns keys that repeat a single byte.
 fn keys(byte: u8) -> Keys {
     Keys::from_bytes(SecurityPolicy::PubSubAes128Ctr, &[byte; 52]).unwrap()
 }
 
-/// An opener whose current key, of token 1, is `keys(1)`.
+/// Returns an opener whose current key, of token 1, is `keys(1)`.
 fn opener(mode: SecurityMode) -> Opener {
     opener_with(OpenerOptions::default(), mode)
 }
@@ -33,7 +33,7 @@ fn opener_with(options: OpenerOptions, mode: SecurityMode) -> Opener {
     opener
 }
 
-/// An encrypted message sealed with `keys(token as u8)`, of publisher 2 and WriterGroup 5.
+/// Returns an encrypted message sealed with `keys(token as u8)`, of publisher 2 and WriterGroup 5.
 fn sealed(token: u32, sequence: u32) -> Vec<u8> {
     sealed_by(PublisherId::UInt16(2), Some(5), token, sequence)
 }
@@ -81,7 +81,7 @@ fn write(
     message.finish_sealed(seal)
 }
 
-/// What opening the datagram at a time gives; true for a message of which nothing tells whether it is new.
+/// Opens the datagram at a time. Returns true for a message with constant sequence number.
 fn open_at(opener: &mut Opener, datagram: &[u8], now: Duration) -> Result<bool, SecurityError> {
     let message = NetworkMessage::decode(datagram).unwrap();
     let mut scratch = Vec::new();

@@ -1,4 +1,4 @@
-//! What is not opened for what it is.
+//! Messages that are rejected for their content.
 
 use uadp::{
     DataSetHeader, Extras, KeyError, Keys, NetworkMessage, NetworkMessageEncoder, Opener,
@@ -49,7 +49,7 @@ fn signed_messages_are_refused_where_encryption_is_asked_for_and_not_the_other_w
     assert_eq!(open(&mut readable, &encrypted), Ok(false));
 }
 
-/// A message with any SecurityHeader and nothing behind it but these bytes.
+/// Returns a message with any SecurityHeader, followed by these bytes only.
 fn with_security(security: SecurityHeader<'_>, rest: &[u8]) -> Vec<u8> {
     let extras = Extras {
         security: Some(security),

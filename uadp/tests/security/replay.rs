@@ -1,4 +1,4 @@
-//! Messages that come a second time, late, or out of the blue.
+//! Replayed, late and unexpected messages.
 
 use std::time::Duration;
 
@@ -232,7 +232,7 @@ fn senders_that_share_a_publisher_id_are_told_apart_by_their_nonces() {
     };
     let mut opener = opener_with(options, ENCRYPT);
     assert_eq!(open(&mut opener, &by(1, 5000)), Ok(false));
-    // Another run counts from 1.
+    // Another run starts at 1.
     assert_eq!(open(&mut opener, &by(2, 1)), Ok(false));
     assert_eq!(open(&mut opener, &by(2, 2)), Ok(false));
     for (random, sequence) in [(1, 5000), (2, 1), (2, 2)] {

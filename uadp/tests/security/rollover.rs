@@ -1,4 +1,4 @@
-//! From one key to the next, on both sides.
+//! Key changes on both sides.
 
 use uadp::{NetworkMessage, Opener, PublisherId, SealError, Sealer, SecurityError, SecurityMode};
 
@@ -6,7 +6,7 @@ use super::{START, header, keys, open, opener, sealed, write};
 
 const ENCRYPT: SecurityMode = SecurityMode::SignAndEncrypt;
 
-/// Whether the message made its key current.
+/// Returns true if the message made its key current.
 fn changes_key(opener: &mut Opener, datagram: &[u8]) -> bool {
     let message = NetworkMessage::decode(datagram).unwrap();
     let mut scratch = Vec::new();

@@ -1,4 +1,4 @@
-//! What is written comes back, and a seal goes on nothing it was not made for.
+//! Round trips of sealed messages, and seals for other messages.
 
 use proptest::collection::vec;
 use proptest::prelude::*;
@@ -10,7 +10,7 @@ use uadp::{
 
 use super::{START, header, keys, nonce, sealed, write};
 
-/// Appends a message whose payload has one Byte array.
+/// Appends a message whose payload is a single Byte array.
 fn write_bytes(out: &mut Vec<u8>, bytes: &[u8], seal: Seal<'_>) -> Result<(), EncodeError> {
     let extras = Extras {
         security: Some(seal.header()),
@@ -245,7 +245,7 @@ fn a_message_secured_on_its_way_out_is_as_one_that_was_written_so() {
         let header = header(PublisherId::UInt16(2), Some(5));
         let mut expected = Vec::new();
         write(&mut expected, &header, seal()).unwrap();
-        // In clear, with and without a SecurityHeader that says so.
+        // Unsecured messages, without and with a SecurityHeader.
         for security in [None, Some(SecurityHeader::NONE)] {
             let extras = Extras {
                 security,
@@ -263,7 +263,7 @@ fn a_message_secured_on_its_way_out_is_as_one_that_was_written_so() {
             assert_eq!(out[1..], expected, "{mode:?} {security:?}");
             assert!(out.len() - 1 <= clear.len() + Seal::OVERHEAD);
         }
-        // What is sealed already, or no message, is left alone.
+        // Sealed messages and other bytes are rejected, and the buffer is unchanged.
         for bad in [&expected[..], &[], &[0xF1], b"no message"] {
             let mut out = vec![0xAA];
             assert!(seal().secure(bad, &mut out).is_err());
@@ -274,7 +274,7 @@ fn a_message_secured_on_its_way_out_is_as_one_that_was_written_so() {
 
 #[test]
 fn a_message_without_extended_flags_can_be_secured_too() {
-    // PublisherId 2 as Byte, and one DataSetMessage without anything.
+    // PublisherId 2 as Byte, and an empty DataSetMessage.
     let clear = [0x11, 2, 0x01, 0, 0];
     let mut sealer = Sealer::new(SecurityMode::SignAndEncrypt);
     sealer.update_keys(1, [keys(1)]).unwrap();

@@ -1,4 +1,4 @@
-//! The state machine and the parents.
+//! The state machine and its parents.
 
 use uadp::PubSubState::{Disabled, Error, Operational, Paused, PreOperational};
 use uadp::{

@@ -1,4 +1,4 @@
-//! What a reader takes and what it drops, when a writer sends, and the states both are in.
+//! Accepted and dropped messages of a reader, the schedule of a writer, and the states of both.
 
 mod machine;
 mod properties;
@@ -48,7 +48,7 @@ fn settings() -> ReaderSettings {
     }
 }
 
-/// A reader that is enabled at time 0, below a group that is Operational.
+/// Returns a reader that is enabled at time 0, below a group that is Operational.
 fn start_reader(settings: ReaderSettings) -> DataSetReaderState {
     let mut reader = DataSetReaderState::new(settings, PubSubState::Operational);
     assert_eq!(reader.enable(ms(0)), Ok(PubSubState::PreOperational));
@@ -72,7 +72,7 @@ fn stamped(kind: MessageKind, number: u16, ticks: i64) -> Arrival {
     }
 }
 
-/// A key frame with a group header, and nothing in its own.
+/// Returns a key frame with a group header, and without header fields of its own.
 fn in_group(number: u16, position: usize) -> Arrival {
     Arrival {
         group: GroupHeader {

@@ -1,4 +1,4 @@
-//! What holds whatever happens.
+//! Properties that hold for all sequences of events.
 
 use std::collections::BTreeSet;
 use std::time::Duration;
@@ -16,22 +16,23 @@ use crate::state::machine::STATES;
 use crate::state::writer::start_writer;
 use crate::state::{TIMEOUT, ms, start_reader, versioned};
 
-/// What happens between a publisher and a reader.
+/// Events between a publisher and a reader.
 #[derive(Debug, Clone)]
 enum Step {
-    /// The publisher makes a message; it arrives, or it is lost.
+    /// The publisher creates a message, which arrives or is lost.
     Send {
         kind: MessageKind,
         arrives: bool,
     },
-    /// A message that was sent since the publisher started arrives, once more or late: so many back.
+    /// An earlier message of the present run arrives, repeated or late. `back` counts messages
+    /// backwards.
     Again {
         back: usize,
     },
     Wait(u64),
-    /// The publisher starts over.
+    /// The publisher restarts.
     Restart,
-    /// Its DataSet changes.
+    /// The DataSet of the publisher changes.
     Version(u32),
     Parent(PubSubState),
     Disable,
@@ -45,7 +46,7 @@ enum Numbered {
     Group,
 }
 
-/// What is sent and received, with what must hold of it.
+/// Sent and received messages, with their invariants.
 struct Scene {
     reader: DataSetReaderState,
     numbered: Numbered,
@@ -55,9 +56,10 @@ struct Scene {
     next: u16,
     ticks: i64,
     version: u32,
-    /// Stamps of the accepted messages the reader must remember. They are unique in this scene.
+    /// Timestamps of the accepted messages that the reader must remember. They are unique in this
+    /// scene.
     accepted: BTreeSet<i64>,
-    /// When the reader last accepted something, or forgot everything.
+    /// Time at which the reader last accepted a message, or was reset.
     accepted_at: Duration,
 }
 
@@ -119,7 +121,7 @@ impl Scene {
             Step::Send { kind, arrives } => {
                 let arrival = self.make(kind);
                 if arrives {
-                    // Accepted or not: `deliver` looks whether it may be.
+                    // `deliver` checks whether the message may be accepted.
                     self.deliver(arrival).ok();
                 }
             }
@@ -155,7 +157,7 @@ impl Scene {
         }
     }
 
-    /// The publisher goes on with key frames: how long until one is accepted.
+    /// The publisher continues with key frames. Returns the time until a key frame is accepted.
     fn recover(&mut self) -> Duration {
         self.reader.enable(self.now).ok();
         self.reader.set_parent(Operational, self.now);
@@ -259,7 +261,7 @@ proptest! {
                     }
                 }
             }
-            // What could not be sent leaves a keep-alive due, once.
+            // After a message that could not be sent, a keep-alive is due once.
             let again = writer.poll(now, changed);
             prop_assert!(again.is_none() || !works && again == Some(KeepAlive));
             prop_assert_eq!(writer.poll(now, changed), None);

@@ -1,4 +1,4 @@
-//! The states of a reader, and what it makes of contents.
+//! The states of a reader, and its handling of the content of messages.
 
 use serde_json::Value;
 use uadp::MessageKind::{DeltaFrame, Event, KeepAlive, KeyFrame};
@@ -57,7 +57,7 @@ fn a_delta_frame_ends_the_error_while_its_key_frame_is_known() {
     let accepted = reader.receive(&message(DeltaFrame, 1), ms(1500)).unwrap();
     assert!(!accepted.incomplete);
     assert_eq!(reader.state(), Operational);
-    // After two timeouts nothing is known of the writer.
+    // After two timeouts the reader has no information about the writer.
     reader.handle_timeout(ms(3500));
     let delta = reader.receive(&message(DeltaFrame, 2), ms(3500));
     assert_eq!(delta, Err(ReaderDrop::NeedsKeyFrame));
@@ -157,7 +157,8 @@ fn another_major_version_is_dropped_and_asks_for_metadata() {
     };
     assert_eq!(refused, Err(other));
     assert_eq!(reader.metadata_needed(), Some(200));
-    // It is in Error when the metadata does not come within the timeout, though messages come.
+    // The reader is in Error if the metadata does not arrive within the timeout, even though
+    // messages arrive.
     assert_eq!(reader.poll_timeout(), Some(ms(1800)));
     assert_eq!(
         reader.receive(&versioned(KeyFrame, 2, 200, 200), ms(1700)),
@@ -169,7 +170,7 @@ fn another_major_version_is_dropped_and_asks_for_metadata() {
         Err(other)
     );
     assert_eq!(reader.state(), Error);
-    // With the metadata it goes on, from a key frame; what was dropped was not lost on the way.
+    // With the metadata it continues from a key frame; dropped messages do not count as lost.
     reader.set_metadata(Some(ConfigurationVersion {
         major: 200,
         minor: 200,
@@ -214,7 +215,7 @@ fn another_minor_version_is_accepted_and_told_of() {
     };
     assert_eq!(minor(&mut reader, 0, 100), None);
     assert_eq!(minor(&mut reader, 1, 150), Some(150));
-    // Without versions in the message nothing can be said.
+    // A message without versions cannot be compared.
     let accepted = reader.receive(&message(KeyFrame, 2), ms(1)).unwrap();
     assert_eq!(accepted.minor_version, None);
 }
@@ -335,7 +336,7 @@ fn what_the_headers_say_is_found_in_datagrams() {
         Some(own) => assert_eq!(arrival.timestamp.unwrap().time, own),
         None => assert_eq!(arrival.timestamp.unwrap().time, stamp),
     }
-    // Its own Timestamp goes before that of the NetworkMessage.
+    // The Timestamp of the DataSetMessage has priority over the Timestamp of the NetworkMessage.
     let with_time = [0x81, 0x30, 5, 0, 0, 0, 0, 0, 0, 0, 6, 0, 0, 0];
     let own = DataSetMessage::decode(None, &with_time).unwrap();
     let arrival = Arrival::of(&network.header(), 0, &own);

@@ -1,4 +1,4 @@
-//! Which messages a reader takes for new, and a writer that starts over.
+//! Detection of new messages, and of restarted writers.
 
 use uadp::MessageKind::{DeltaFrame, Event, KeepAlive, KeyFrame};
 use uadp::PubSubState::Operational;
@@ -61,7 +61,7 @@ fn a_reader_of_events_takes_late_ones_once() {
         let again = reader.receive(&message(Event, number), ms(2));
         assert_eq!(again, Err(ReaderDrop::Duplicate));
     }
-    // 64 numbers back is as far as it remembers.
+    // The reader remembers 64 numbers.
     assert!(reader.receive(&message(Event, 40), ms(2)).unwrap().late);
     let too_late = reader.receive(&message(Event, 39), ms(2));
     assert_eq!(too_late, Err(ReaderDrop::Stale { behind: 64 }));
@@ -73,12 +73,12 @@ fn a_reader_of_events_takes_late_ones_once() {
 fn a_keep_alive_tells_of_messages_lost_before_it() {
     let mut reader = start_reader(settings());
     reader.receive(&message(KeyFrame, 5), ms(1)).unwrap();
-    // 6 is the next: nothing is lost, however often it is said.
+    // 6 is the next number: nothing is lost, independent of the number of keep-alives.
     for _ in 0..3 {
         let accepted = reader.receive(&message(KeepAlive, 6), ms(1)).unwrap();
         assert_eq!(accepted, Accepted::default());
     }
-    // 9 is the next: 6, 7 and 8 are lost.
+    // 9 is the next number: 6, 7 and 8 are lost.
     let accepted = reader.receive(&message(KeepAlive, 9), ms(1)).unwrap();
     assert_eq!(accepted.missed, 3);
     let late = reader.receive(&message(KeyFrame, 8), ms(1));
@@ -143,7 +143,7 @@ fn a_writer_that_starts_over_is_known_by_its_timestamp_at_once() {
             .receive(&stamped(KeyFrame, number, ticks), ms(1))
             .unwrap();
     }
-    // A replay has the stamps it had.
+    // A replayed message has its original Timestamp.
     let replayed = reader.receive(&stamped(KeyFrame, 5001, 20), ms(2));
     assert_eq!(replayed, Err(ReaderDrop::Duplicate));
     let replayed = reader.receive(&stamped(KeyFrame, 4000, 5), ms(2));
@@ -189,7 +189,7 @@ fn without_timestamps_a_writer_that_starts_over_is_heard_after_two_timeouts() {
         let mut heard = None;
         for (number, at) in (0..).zip((50..3000).step_by(50)) {
             let accepted = reader.receive(&message(KeyFrame, number), ms(at));
-            // 5000 messages back a few may pass for new ones by their numbers.
+            // 5000 messages back, a few messages may be accepted as new by their numbers.
             if accepted.is_ok() {
                 heard = heard.or(Some(at));
             } else {
@@ -209,7 +209,7 @@ fn without_a_timeout_a_writer_that_starts_over_is_heard_after_ten_seconds() {
     assert_eq!(early, Err(ReaderDrop::Stale { behind: 5000 }));
     let accepted = reader.receive(&message(KeyFrame, 1), ms(10_000)).unwrap();
     assert!(accepted.restarted);
-    // A slow one that does not start over goes on, and its delta frames need no key frame.
+    // A slow writer without restart continues, and its delta frames need no key frame.
     let accepted = reader.receive(&message(DeltaFrame, 3), ms(80_000)).unwrap();
     assert!(!accepted.restarted);
     assert_eq!(accepted.missed, 1);

@@ -12,7 +12,7 @@ fn publisher(id: PublisherId<'_>) -> NetworkHeader<'_> {
     }
 }
 
-/// A key frame without any fields.
+/// Returns a key frame without fields.
 fn heartbeat(writer_id: u16) -> DataSetMessage<'static> {
     DataSetMessage::decode(Some(writer_id), &[0x01]).unwrap()
 }

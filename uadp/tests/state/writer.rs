@@ -1,4 +1,4 @@
-//! When a writer sends what.
+//! Schedules of writers.
 
 use uadp::MessageKind::{DeltaFrame, Event, KeepAlive, KeyFrame};
 use uadp::PubSubState::{Error, Operational, Paused, PreOperational};
@@ -17,7 +17,7 @@ pub(crate) fn start_writer(interval: u64, keep_alive: u64, key_frames: u32) -> D
     writer
 }
 
-/// Polls at each of the times and sends what is due.
+/// Polls at each time, and sends the messages that are due.
 fn run(
     writer: &mut DataSetWriterState,
     steps: &[(u64, bool)],
@@ -76,7 +76,7 @@ fn intervals_that_were_slept_through_count_for_the_key_frame() {
         run(&mut writer, &[(499, true)]),
         [(499, DeltaFrame, Some(2))]
     );
-    // The grid stays where it was.
+    // The grid is unchanged.
     assert_eq!(writer.poll_timeout(), Some(ms(500)));
     assert_eq!(
         run(&mut writer, &[(500, false)]),

@@ -1,4 +1,4 @@
-//! What was read, in the words of the JSON files.
+//! Decoded messages, described as in the JSON files.
 
 use serde_json::{Map, Value, json};
 use uadp::{
@@ -7,7 +7,7 @@ use uadp::{
     NodeId, PublisherId, Scalar, Variant,
 };
 
-/// The headers of a NetworkMessage and of the chunk in it.
+/// Describes the headers of a NetworkMessage and of its chunk.
 pub(crate) fn describe_headers(message: &NetworkMessage<'_>) -> Result<Value, DecodeError> {
     let header = message.header();
     let promoted = message.promoted_fields().map(|fields| {
@@ -66,7 +66,7 @@ fn describe_group(group: GroupHeader) -> Value {
     Value::Object(out)
 }
 
-/// The DataSetMessages, those of RawData without their fields.
+/// Describes the DataSetMessages, without the fields of RawData messages.
 pub(crate) fn describe_messages(message: &NetworkMessage<'_>) -> Result<Value, DecodeError> {
     let ids = message.writer_ids().into_iter().flatten().map(Some);
     let mut messages = Vec::new();
@@ -224,7 +224,8 @@ fn describe_node_id(node_id: NodeId<'_>) -> String {
     }
 }
 
-/// Structures of the standard by the NodeId of their binary encoding; any other as its bytes.
+/// Describes structures of the standard by the NodeId of their binary encoding; other structures by
+/// their bytes.
 fn describe_structure(object: ExtensionObject<'_>) -> Value {
     let body = match object.body {
         ExtensionBody::None => {

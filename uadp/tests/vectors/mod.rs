@@ -1,5 +1,6 @@
-//! Every datagram under `tests/vectors`: read as its JSON says and written back byte for byte. Of those in [`NOT_READ`]
-//! and [`RAW_DATA`] only what stands in clear and needs no metadata.
+//! Every datagram under `tests/vectors`: decoded as its JSON file describes, and encoded byte for
+//! byte. For vectors in [`NOT_READ`] and [`RAW_DATA`], only the parts that are not encrypted and
+//! need no metadata.
 
 mod found;
 mod not_read;

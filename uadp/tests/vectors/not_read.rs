@@ -1,7 +1,7 @@
-//! What it takes more than the datagram to read.
+//! Vectors that need more than the datagram to be decoded.
 
-/// Vectors without a DataSetMessage to be had from the datagram alone, by what `messages` says that they are:
-/// `chunks.rs`, `discovery.rs` and `security.rs` beside this folder read them.
+/// Vectors without DataSetMessages that can be decoded from the datagram alone, by the reason that
+/// `messages` returns. The tests in `chunks.rs`, `discovery.rs` and `security.rs` decode them.
 pub(crate) const NOT_READ: &[(&str, &[&str])] = &[
     (
         "a chunk, to be reassembled first",
@@ -42,7 +42,8 @@ pub(crate) const NOT_READ: &[(&str, &[&str])] = &[
     ),
 ];
 
-/// Vectors whose fields have no types on the wire: `raw.rs` reads them with their DataSetMetaData.
+/// Vectors whose fields have no types in the datagram: `raw.rs` decodes them with their
+/// DataSetMetaData.
 pub(crate) const RAW_DATA: &[&str] = &[
     "asyncua_raw",
     "raw_all_fixed_scalars",

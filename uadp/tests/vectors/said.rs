@@ -1,11 +1,11 @@
-//! What a JSON file says, in the words in which `found` describes a datagram.
+//! Content of the JSON files, in the form in which `found` describes a datagram.
 
 use serde_json::{Value, json};
 use uadp::BuiltinType;
 
 use crate::vectors::found::base64;
 
-/// The headers of a NetworkMessage and of the chunk in it.
+/// Returns the expected headers of a NetworkMessage and of its chunk.
 pub(crate) fn expected_headers(json: &Value) -> Value {
     assert_eq!(json["uadpVersion"], 1);
     let promoted = json["promotedFields"].as_array();
@@ -51,7 +51,7 @@ fn expected_security(json: &Value) -> Value {
     })
 }
 
-/// The DataSetMessages, those of RawData without their fields.
+/// Returns the expected DataSetMessages, without the fields of RawData messages.
 pub(crate) fn expected_messages(json: &Value) -> Value {
     let messages = json["dataSetMessages"].as_array().unwrap();
     messages.iter().map(expected_message).collect()
@@ -173,7 +173,7 @@ fn text_or_number(json: &Value) -> Value {
     }
 }
 
-/// Ticks of a DateTime written like `2026-05-17T12:34:56.7890123Z`.
+/// Returns the ticks of a DateTime in the form `2026-05-17T12:34:56.7890123Z`.
 fn ticks(iso: &str) -> i64 {
     let number = |from: usize, to: usize| iso[from..to].parse::<i64>().unwrap();
     let (year, month, day) = (number(0, 4), number(5, 7), number(8, 10));

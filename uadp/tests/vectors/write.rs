@@ -1,4 +1,4 @@
-//! Three ways of writing the fields that were read, which have to come to the same bytes.
+//! Three ways of encoding decoded fields, which have to result in the same bytes.
 
 use uadp::{
     Array, BuiltinType, Encoded, ExtensionBody, ExtensionObject, FieldEncoder, Fields, Matrix,
