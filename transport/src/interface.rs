@@ -3,16 +3,16 @@
 use std::fmt;
 use std::net::{IpAddr, Ipv4Addr};
 
-/// One IPv4 address of one network interface of this machine.
+/// An IPv4 address of a network interface of this host.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Interface {
-    /// The name the system gives it, such as `eth0`.
+    /// Name of the interface, such as `eth0`.
     pub name: String,
-    /// The index the kernel knows it by.
+    /// Interface index of the kernel.
     pub index: u32,
-    /// An IPv4 address it has.
+    /// IPv4 address of the interface.
     pub address: Ipv4Addr,
-    /// Whether it is up and has a link.
+    /// True if the interface is up and has a link.
     pub up: bool,
 }
 
@@ -22,28 +22,28 @@ impl fmt::Display for Interface {
     }
 }
 
-/// Why no interface could be chosen.
+/// Reason why no interface was found.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum InterfaceError {
-    /// No interface has the name or address asked for.
+    /// No interface has the requested name or address.
     #[error("no network interface `{wanted}` here; there are: {present}")]
     Unknown {
-        /// What was asked for.
+        /// Requested name or address.
         wanted: String,
-        /// What there is, for the message.
+        /// Present interfaces, for the message.
         present: String,
     },
-    /// The system would not list its interfaces.
+    /// The system cannot list its interfaces.
     #[error("the network interfaces cannot be listed: {0}")]
     List(#[source] std::io::Error),
 }
 
 impl Interface {
-    /// Finds the interface that `wanted` names: by name (`eth0`) or by one of its IPv4 addresses.
+    /// Finds the interface with a name (`eth0`) or an IPv4 address.
     ///
     /// # Errors
-    /// [`InterfaceError::Unknown`] lists what there is.
+    /// [`InterfaceError::Unknown`] with the present interfaces.
     pub fn find(wanted: &str) -> Result<Self, InterfaceError> {
         let present = interfaces().map_err(InterfaceError::List)?;
         present
@@ -64,21 +64,22 @@ impl Interface {
             })
     }
 
-    /// Whether that is its name or its address.
+    /// Returns true for the name or the address of the interface.
     pub(crate) fn is(&self, wanted: &str) -> bool {
         self.name == wanted || wanted.parse() == Ok(self.address)
     }
 
-    /// Whether the kernel has kept what was made for `other`: one that was made anew has another index.
+    /// Returns true if kernel state of `other` is still valid. A recreated interface has another
+    /// index.
     pub(crate) fn is_same(&self, other: &Self) -> bool {
         (&self.name, self.index, self.address) == (&other.name, other.index, other.address)
     }
 }
 
-/// The IPv4 addresses of this machine's interfaces, in the system's order.
+/// Returns the IPv4 addresses of the interfaces of this host, in the order of the system.
 ///
 /// # Errors
-/// What the system answers when it will not list them.
+/// The error of the system if it cannot list its interfaces.
 pub fn interfaces() -> std::io::Result<Vec<Interface>> {
     let mut found: Vec<Interface> = if_addrs::get_if_addrs()?
         .into_iter()

@@ -1,8 +1,8 @@
 //! Datagrams over UDP multicast and unicast.
 //!
-//! What a datagram means is nobody's business here: bytes go in and come out. One [`Udp`] is one group (or one
-//! unicast address) on one interface, as OPC 10000-14 7.3.2 (UADP over UDP) has it: the address is where is listened
-//! and where is sent.
+//! This crate sends and receives bytes and does not interpret datagrams. A [`Udp`] is a multicast
+//! group (or a unicast address) on a network interface. As in OPC 10000-14, 7.3.2 (UADP over UDP),
+//! the address is used for receiving and sending.
 
 mod interface;
 mod udp;

@@ -1,4 +1,4 @@
-//! One UDP socket for a multicast group or a unicast address.
+//! A UDP socket for a multicast group or a unicast address.
 
 use std::io;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
@@ -10,49 +10,52 @@ use tracing::info;
 use crate::interface::{Interface, InterfaceError, interfaces};
 use crate::watch::{Change, Wanted, Watch};
 
-/// A UDP socket that hears and sends the datagrams of one PubSub connection.
+/// A UDP socket that receives and sends the datagrams of a PubSub connection.
 #[derive(Debug)]
 pub struct Udp {
     receiver: UdpSocket,
-    /// Sends from a port of its own, so that several processes of one host share the group's port and still tell
-    /// each other apart by the source address.
+    /// Sends from a separate port, so that several processes of a host can share the port of the
+    /// group and distinguish each other by source address.
     sender: UdpSocket,
     targets: Vec<SocketAddr>,
     local: SocketAddr,
     options: Options,
-    /// The interface they are on; `None` where the system's choice needs no following.
+    /// Interface of the sockets; `None` if the interface does not have to be watched.
     watch: Option<Watch>,
 }
 
-/// Where to listen and send, and how.
+/// Addresses and options of a [`Udp`].
 #[derive(Debug, Clone)]
 pub struct Options {
-    /// A multicast group with its port; or a unicast address: of this host to listen at, of another to send to while
-    /// listening at the same port here.
+    /// A multicast group with its port, or a unicast address. A unicast address of this host is
+    /// bound for receiving. For an address of another host, datagrams are sent to it and received
+    /// on the same port of this host.
     pub address: SocketAddr,
-    /// The interface to join and send on, by name or address. `None`: the system's choice.
+    /// Interface to join and send on, by name or address. `None`: the default interface of the
+    /// system.
     pub interface: Option<String>,
-    /// Routers a multicast datagram may pass; 1 stays in the subnet, 0 in this host.
+    /// Maximum number of routers that a multicast datagram passes; 1 stays in the subnet, 0 in this
+    /// host.
     pub ttl: u32,
-    /// Whether other processes of this host hear what is sent to the group.
+    /// Whether other processes of this host receive datagrams that are sent to the group.
     pub loopback: bool,
-    /// Bytes the kernel may hold for us; the system may grant less, which is logged.
+    /// Size of the receive buffer in bytes. The system may grant less, which is logged.
     pub receive_buffer: usize,
-    /// Unicast addresses to send to instead of `address`, where multicast cannot be had.
+    /// Unicast addresses to send to instead of `address`, for networks without multicast.
     pub peers: Vec<SocketAddr>,
 }
 
-/// Why a socket could not be made.
+/// Reason why a socket could not be opened.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum OpenError {
-    /// The interface asked for is not here.
+    /// The requested interface does not exist.
     #[error(transparent)]
     Interface(#[from] InterfaceError),
     /// IPv6 groups are not supported.
     #[error("{0}: IPv6 is not supported, give an IPv4 address")]
     Ipv6(SocketAddr),
-    /// Another program holds the port and does not share it.
+    /// Another program uses the port and does not share it.
     #[error(
         "UDP port {} is taken by a program that does not share it (find it with `ss -ulpn`); end it or give another port",
         .0.port()
@@ -65,46 +68,47 @@ pub enum OpenError {
     Join {
         /// The multicast group.
         group: Ipv4Addr,
-        /// The interface as it was to be used.
+        /// Interface for the group.
         interface: String,
-        /// What the system said.
+        /// Error of the system.
         source: io::Error,
     },
-    /// The unicast address to listen at is no longer one of this host.
+    /// The unicast address to receive on is not an address of this host.
     #[error("the address to listen at, {0}, is on no network interface here")]
     Gone(SocketAddr),
-    /// Anything else the system refused.
+    /// Another error of the system.
     #[error("cannot {what} for {address}: {source}")]
     Socket {
-        /// What was being done.
+        /// Operation that failed.
         what: &'static str,
-        /// The address it was done for.
+        /// Address of the operation.
         address: SocketAddr,
-        /// What the system said.
+        /// Error of the system.
         source: io::Error,
     },
 }
 
-/// Why a datagram was not sent. None of these ends the socket: the next datagram may go.
+/// Reason why a datagram was not sent. The socket stays usable: the next datagram may be sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, thiserror::Error)]
 #[non_exhaustive]
 pub enum SendError {
     /// The kernel's send buffer is full.
     #[error("the send buffer is full")]
     Busy,
-    /// Larger than a UDP datagram may be.
+    /// The datagram exceeds the maximum size of a UDP datagram.
     #[error("larger than a UDP datagram")]
     TooBig,
-    /// No route, interface down, or a unicast peer that refused.
+    /// There is no route, the interface is down, or a unicast peer refused the datagram.
     #[error("the network is unreachable")]
     Unreachable,
-    /// The system gave another error.
+    /// Another error of the system.
     #[error("the system refused the datagram")]
     Refused,
 }
 
 impl Options {
-    /// The usual options for `address`: TTL 1, heard by this host too, 4 MiB receive buffer, no peers.
+    /// Returns the default options for `address`: TTL 1, multicast loopback, 4 MiB receive buffer,
+    /// no peers.
     #[must_use]
     pub const fn new(address: SocketAddr) -> Self {
         Self {
@@ -119,12 +123,12 @@ impl Options {
 }
 
 impl Udp {
-    /// Opens the socket, joins the group when the address is one, and logs group and interface.
+    /// Opens the socket, joins a multicast group, and logs group and interface.
     ///
     /// Must be called within a tokio runtime.
     ///
     /// # Errors
-    /// [`OpenError`] names the interface, port or group that is at fault.
+    /// [`OpenError`] with the interface, port or group that caused it.
     pub fn open(options: &Options) -> Result<Self, OpenError> {
         let address = options.address;
         let IpAddr::V4(ip) = address.ip() else {
@@ -160,9 +164,10 @@ impl Udp {
         })
     }
 
-    /// Looks at the interface the sockets are on, and makes them anew where it was made anew, has another address, or is
-    /// back; to be called every [`LOOK`](crate::LOOK). The [`source`](Self::source) may be another then, and what was
-    /// received and not taken yet is lost.
+    /// Checks the interface of the sockets. Recreates the sockets if the interface was recreated,
+    /// has another address, or is available again. Call it every [`LOOK`](crate::LOOK). The
+    /// [`source`](Self::source) may change, and received datagrams that were not yet taken are
+    /// lost.
     pub fn follow(&mut self) -> Option<Change> {
         let (options, receiver) = (&self.options, &self.receiver);
         let mut made = None;
@@ -179,7 +184,8 @@ impl Udp {
         change
     }
 
-    /// Why nothing is heard and sent now: what [`follow`](Self::follow) found of the interface.
+    /// Returns the reason why no datagrams are received and sent, as detected by
+    /// [`follow`](Self::follow).
     #[must_use]
     pub fn lost(&self) -> Option<&str> {
         self.watch.as_ref()?.lost()
@@ -196,32 +202,34 @@ impl Udp {
         named.unwrap_or_else(|| "the default interface".to_owned())
     }
 
-    /// Waits for a datagram and gives its length and sender. Cancel-safe: nothing is lost when dropped.
+    /// Waits for a datagram. Returns its length and sender. Cancel-safe: no datagram is lost when
+    /// the future is dropped.
     ///
-    /// A datagram larger than `buffer` is cut to it; 65 536 bytes hold any.
+    /// A datagram larger than `buffer` is truncated; 65 536 bytes suffice for any datagram.
     ///
     /// # Errors
-    /// What the system says; the socket stays usable.
+    /// The error of the system; the socket stays usable.
     pub async fn recv(&self, buffer: &mut [u8]) -> io::Result<(usize, SocketAddr)> {
         self.receiver.recv_from(buffer).await
     }
 
-    /// Takes a datagram that is already there.
+    /// Returns a datagram that was already received.
     ///
     /// # Errors
-    /// `WouldBlock` when there is none.
+    /// `WouldBlock` if there is none.
     pub fn try_recv(&self, buffer: &mut [u8]) -> io::Result<(usize, SocketAddr)> {
         self.receiver.try_recv_from(buffer)
     }
 
-    /// Sends one datagram to the group (or to each peer) without waiting.
+    /// Sends a datagram to the group (or to each peer) without waiting.
     ///
     /// # Errors
-    /// The first [`SendError`] of its targets; the others are still tried.
+    /// The first [`SendError`] of its targets; the datagram is still sent to the other targets.
     pub fn try_send(&self, datagram: &[u8]) -> Result<(), SendError> {
         let mut result = Ok(());
         for target in &self.targets {
-            // Past tokio's readiness: a datagram socket is nearly always writable, and a full one says so itself.
+            // Bypasses the readiness of tokio: a datagram socket is nearly always writable, and a
+            // full buffer is reported as an error.
             let sent = socket2::SockRef::from(&self.sender).send_to(datagram, &(*target).into());
             if let Err(error) = sent
                 && result.is_ok()
@@ -232,8 +240,8 @@ impl Udp {
         result
     }
 
-    /// The address that our own datagrams carry as their source, as far as it is known before sending: the IP may
-    /// be unspecified when no interface was named.
+    /// Returns the source address of sent datagrams as known before sending. The IP address may be
+    /// unspecified if no interface was configured.
     #[must_use]
     pub const fn source(&self) -> SocketAddr {
         self.local
@@ -241,7 +249,8 @@ impl Udp {
 }
 
 impl Options {
-    /// The interface whose coming and going matters. Without a group and a name, nothing is bound to one.
+    /// Returns the interface to watch. Without a group and an interface name, the sockets are not
+    /// bound to an interface.
     fn wanted(&self) -> Option<Wanted> {
         match &self.interface {
             Some(wanted) => Some(Wanted::Named(wanted.clone())),
@@ -253,8 +262,8 @@ impl Options {
 
 type Sender = (UdpSocket, SocketAddr);
 
-/// The sockets as they are on an interface that is another by now. A receiver that is bound to what is still there is
-/// kept: no other could have its port.
+/// Returns new sockets for a changed interface. A receiver that is bound to a present address is
+/// kept, because its port cannot be bound twice.
 fn anew(
     options: &Options,
     receiver: &UdpSocket,
@@ -264,7 +273,7 @@ fn anew(
     let IpAddr::V4(ip) = address.ip() else {
         return Err(OpenError::Ipv6(address));
     };
-    // Without a name it is the system that chooses, and again for each datagram.
+    // Without an interface name, the system selects the interface for each datagram.
     let interface = options.interface.is_some().then_some(interface);
     let bound = receiver.local_addr().map(|bound| bound.ip()).ok();
     let bound_to_own = bound == Some(address.ip());
@@ -303,7 +312,7 @@ fn send_error(error: &io::Error) -> SendError {
     }
 }
 
-/// Linux's number for "message too long", which std has no `ErrorKind` for.
+/// The error number of Linux for "message too long", for which std has no `ErrorKind`.
 const EMSGSIZE: i32 = 90;
 
 fn receiver(
@@ -322,7 +331,7 @@ fn receiver(
     let socket =
         Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP)).map_err(at("make a socket"))?;
     if ip.is_multicast() {
-        // All programs of one host listen at the same port of the group.
+        // All programs of a host receive on the same port of the group.
         socket
             .set_reuse_address(true)
             .map_err(at("share the port"))?;
@@ -333,9 +342,11 @@ fn receiver(
     socket
         .set_recv_buffer_size(options.receive_buffer)
         .map_err(at("set the receive buffer"))?;
-    // Bound to the group itself, so that datagrams of other groups at this port stay away.
+    // The socket is bound to the group address, so that it does not receive datagrams of other
+    // groups at this port.
     let bound = socket.bind(&address.into()).or_else(|error| {
-        // A unicast address of another host: there is sent, and here is listened at the same port.
+        // A unicast address of another host: datagrams are sent to it, and received on the same
+        // port of this host.
         if ip.is_multicast() || error.kind() != io::ErrorKind::AddrNotAvailable {
             return Err(error);
         }
@@ -377,7 +388,8 @@ fn join(socket: &Socket, group: Ipv4Addr, interface: Option<&Interface>) -> Resu
                 .map_or_else(|| "the default interface".to_owned(), ToString::to_string),
             source,
         })?;
-    // Off, so that a group somebody else on this host joined on another interface is not heard here.
+    // Off, so that the socket does not receive groups that other programs of this host have joined
+    // on other interfaces.
     socket
         .set_multicast_all_v4(false)
         .or_else(|error| {
@@ -394,7 +406,7 @@ fn join(socket: &Socket, group: Ipv4Addr, interface: Option<&Interface>) -> Resu
         })
 }
 
-/// The sender, and the address it is bound to.
+/// Returns the sending socket and its local address.
 fn sender(options: &Options, interface: Option<&Interface>) -> Result<Sender, OpenError> {
     let address = options.address;
     let at = |what| {
@@ -409,7 +421,8 @@ fn sender(options: &Options, interface: Option<&Interface>) -> Result<Sender, Op
     socket
         .set_nonblocking(true)
         .map_err(at("set non-blocking mode"))?;
-    // The chunks of a large message come in bursts, and nothing waits for a full buffer. The system may grant less.
+    // The chunks of a large message are sent in bursts without waiting for space in the buffer. The
+    // system may grant less.
     socket
         .set_send_buffer_size(SEND_BUFFER)
         .map_err(at("set the send buffer"))?;
@@ -433,7 +446,7 @@ fn sender(options: &Options, interface: Option<&Interface>) -> Result<Sender, Op
     Ok((socket, local))
 }
 
-/// Bytes the kernel may hold on their way out.
+/// Size of the send buffer in bytes.
 const SEND_BUFFER: usize = 1 << 20;
 
 #[cfg(test)]
@@ -462,7 +475,7 @@ mod tests {
         })
     }
 
-    /// A port nobody holds now. Multicast ports are shared, so two tests must not meet on one group.
+    /// Returns an unused port. Multicast ports are shared, so each test needs a separate group.
     fn free_port() -> u16 {
         std::net::UdpSocket::bind("127.0.0.1:0")
             .unwrap()
@@ -501,7 +514,7 @@ mod tests {
     fn with_another_hosts_unicast_address_its_port_is_listened_at_here() {
         run(async {
             let port = free_port();
-            // An address for documentation, which no host has; nothing is sent to it.
+            // A documentation address, which is not assigned to any host; nothing is sent to it.
             let udp = Udp::open(&on_loopback(&format!("203.0.113.7:{port}"))).unwrap();
             let other = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
             other.send_to(b"cover", ("127.0.0.1", port)).unwrap();

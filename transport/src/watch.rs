@@ -1,8 +1,9 @@
-//! Interfaces that come and go while a program runs.
+//! Detection of interfaces that change while a program runs.
 //!
-//! A multicast group is joined on an interface, by its index, and a sender is bound to an address: when the interface is
-//! deleted and made again, or gets another address, both are void, and the kernel says so to nobody. So it is looked at,
-//! each second: one list of the interfaces, which costs less than a tenth of a millisecond and needs no privilege.
+//! A multicast group is joined on an interface by its index, and a sender is bound to an address.
+//! If the interface is deleted and recreated, or gets another address, both become invalid without
+//! a notification of the kernel. So the interfaces are polled each second. Listing them takes less
+//! than a tenth of a millisecond and needs no privilege.
 
 use std::io;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr, UdpSocket};
@@ -10,39 +11,39 @@ use std::time::Duration;
 
 use crate::interface::{Interface, interfaces};
 
-/// How often interfaces are to be looked at.
+/// Polling interval of interfaces.
 pub const LOOK: Duration = Duration::from_secs(1);
 
-/// What became of an interface between two looks.
+/// Change of an interface between two polls.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Change {
-    /// It cannot be used, for this reason.
+    /// The interface cannot be used, for this reason.
     Lost(String),
-    /// It can be used again, or is another one by now.
+    /// The interface can be used again, or was replaced.
     Back(Interface),
 }
 
-/// Which interface sockets are on.
+/// Selection of the interface of the sockets.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum Wanted {
-    /// That of this name or address.
+    /// The interface with this name or address.
     Named(String),
-    /// The one by which the system reaches this multicast group.
+    /// The interface that the system uses for this multicast group.
     Towards(SocketAddr),
 }
 
-/// The one interface that sockets of ours are on.
+/// The interface of our sockets.
 #[derive(Debug)]
 pub(crate) struct Watch {
     wanted: Wanted,
-    /// As it was when the sockets were made.
+    /// The interface at the time when the sockets were created.
     held: Interface,
-    /// Why it cannot be used now.
+    /// Reason why the interface cannot be used at present.
     lost: Option<String>,
 }
 
 impl Watch {
-    /// Begins with what there is; `None` where nothing is to be followed.
+    /// Starts to watch the present interface; `None` if there is no interface to watch.
     pub(crate) fn start(wanted: Wanted) -> Option<Self> {
         let held = wanted.find(&interfaces().ok()?, None).ok()?;
         Some(Self {
@@ -61,13 +62,13 @@ impl Watch {
         &self.held
     }
 
-    /// Looks at the interfaces. Where the wanted one is there and is not what it was, `take` makes the sockets anew; what
-    /// it cannot is tried again with the next look.
+    /// Checks the interfaces. If the watched interface is present and has changed, `take` recreates
+    /// the sockets. A failure is retried at the next poll.
     pub(crate) fn look(
         &mut self,
         take: impl FnOnce(&Interface) -> Result<(), String>,
     ) -> Option<Change> {
-        // A system that lists nothing now says nothing of its interfaces.
+        // If the system cannot list its interfaces, their state is unknown.
         self.see(&interfaces().ok()?, take)
     }
 
@@ -118,7 +119,7 @@ impl Wanted {
                 )
             }
         };
-        // As long as it has the address it had, others beside it do not matter.
+        // While the previous address is present, other addresses of the interface are ignored.
         let kept = held.and_then(|held| {
             let kept = present.iter().find(|interface| interface.is_same(held));
             kept.filter(|interface| interface.is(&wanted))
@@ -128,7 +129,7 @@ impl Wanted {
     }
 }
 
-/// Which of our addresses datagrams to there have. Nothing is sent.
+/// Returns the local address of datagrams to a group. Nothing is sent.
 fn source_towards(group: SocketAddr) -> io::Result<Ipv4Addr> {
     let socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0))?;
     socket.connect(group)?;
@@ -138,13 +139,13 @@ fn source_towards(group: SocketAddr) -> io::Result<Ipv4Addr> {
     }
 }
 
-/// Interfaces whose addresses a library has taken for good: it cannot be told of others while it runs.
+/// Interfaces whose addresses a library uses permanently: it cannot change them while it runs.
 #[derive(Debug)]
 pub struct Held {
     held: Vec<Holding>,
-    /// Whether it took all there were.
+    /// Whether the library uses all interfaces.
     all: bool,
-    /// Interfaces that came later and were told of.
+    /// Reported interfaces that appeared later.
     late: Vec<String>,
 }
 
@@ -161,22 +162,23 @@ enum State {
     Gone,
 }
 
-/// What a look at held interfaces found.
+/// Result of a check of held interfaces.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Finding {
-    /// One cannot be used now, for this reason.
+    /// An interface cannot be used at present, for this reason.
     Lost(String),
-    /// One can be used again, as it was.
+    /// An unchanged interface can be used again.
     Back(Interface),
-    /// One is there that the library took nothing of.
+    /// A new interface is available that the library does not use.
     Late(Interface),
-    /// What the library holds is void, while what it needs is there: only a new start takes it up.
+    /// The addresses of the library are invalid, but its interface is available: a restart is
+    /// required to use it.
     Void(String),
 }
 
 impl Held {
-    /// Those of these addresses; all that are not loopback where none is given. Loopback needs no watching: without one of
-    /// other addresses, `None`.
+    /// Starts to watch the given addresses, or all addresses except loopback if the list is empty.
+    /// Loopback is not watched: returns `None` if there are no other addresses.
     #[must_use]
     pub fn start(addresses: &[IpAddr]) -> Option<Self> {
         let all = addresses.is_empty();
@@ -205,12 +207,13 @@ impl Held {
         }
     }
 
-    /// Looks at the interfaces.
+    /// Checks the interfaces.
     pub fn look(&mut self) -> Vec<Finding> {
         interfaces().map_or_else(|_not_now| Vec::new(), |present| self.see(&present))
     }
 
-    /// Why the library can do nothing now: each of what it holds is gone or down.
+    /// Returns the reason why the library cannot communicate: each of its interfaces is removed or
+    /// down.
     #[must_use]
     pub fn lost(&self) -> Option<String> {
         let first = self.held.first()?;
@@ -229,7 +232,7 @@ impl Held {
             };
             let before = std::mem::replace(&mut holding.state, state);
             match (before, state) {
-                // What the kernel kept for it went with it.
+                // The kernel removed its state together with the interface.
                 (State::Gone, State::There | State::Down) => {
                     findings.push(Finding::Void(format!(
                         "the network interface {} is there anew",
@@ -249,7 +252,7 @@ impl Held {
         findings
     }
 
-    /// Of what is there, what takes the place of something held, or is beside it.
+    /// Returns present interfaces that replace a held interface or are new.
     fn changed(&mut self, present: &[Interface]) -> Vec<Finding> {
         let mut findings = Vec::new();
         let usable = |one: &&Interface| one.up && !one.address.is_loopback();
@@ -292,7 +295,7 @@ impl Holding {
     }
 }
 
-/// Interfaces that came later and are told of; containers bring new names without end.
+/// Maximum number of reported new interfaces; containers create new names without end.
 const MAX_LATE: usize = 64;
 
 #[cfg(test)]
@@ -323,7 +326,7 @@ mod tests {
         }
     }
 
-    /// One look, and whether the sockets were made anew.
+    /// Performs a check. Returns the change, and true if the sockets were recreated.
     fn look(watch: &mut Watch, present: &[Interface]) -> (Option<Change>, bool) {
         let mut made = false;
         let change = watch.see(present, |_| {
@@ -337,7 +340,7 @@ mod tests {
     fn an_interface_that_is_what_it_was_is_left_alone() {
         let mut watch = named("wire0");
         assert_eq!(look(&mut watch, &[wire(3, 1)]), (None, false));
-        // Another address beside it, and in front of it, changes nothing.
+        // An additional address changes nothing, even at the front of the list.
         assert_eq!(look(&mut watch, &[wire(3, 9), wire(3, 1)]), (None, false));
     }
 
@@ -390,7 +393,7 @@ mod tests {
     #[test]
     fn what_a_library_holds_is_void_once_the_interface_is_another() {
         for anew in [wire(4, 1), wire(3, 2), wire(4, 2)] {
-            // Between two looks, and with one in between.
+            // The interface changes between two checks, or is absent during a check.
             for looks in [&[][..], &[&[][..]]] {
                 let mut held = Held::of(vec![wire(3, 1)], false);
                 for present in looks {
@@ -431,11 +434,12 @@ mod tests {
         let mut all = Held::of(vec![wire(3, 1)], true);
         assert_eq!(all.see(&both), [Finding::Late(other.clone())]);
         assert_eq!(all.see(&both), []);
-        // One of several that is lost keeps nobody from working.
+        // The loss of one of several interfaces does not prevent communication.
         let mut two = Held::of(both.to_vec(), true);
         assert!(matches!(two.see(&both[..1])[..], [Finding::Lost(_)]));
         assert_eq!(two.lost(), None);
-        // With none at all, or one that is down as that of containers, there was nothing to work with.
+        // Without interfaces, or with an interface that is down (as for containers), no
+        // communication was possible.
         for nothing in [vec![], vec![down(other)]] {
             let mut none = Held::of(nothing, true);
             assert!(matches!(none.see(&both[..1])[..], [.., Finding::Void(_)]));
