@@ -37,7 +37,7 @@ pub struct Options {
     /// Maximum number of routers that a multicast datagram passes; 1 stays in the subnet, 0 in this
     /// host.
     pub ttl: u32,
-    /// Whether other processes of this host receive datagrams that are sent to the group.
+    /// True if other processes of this host receive the datagrams that are sent to the group.
     pub loopback: bool,
     /// Size of the receive buffer in bytes. The system may grant less, which is logged.
     pub receive_buffer: usize,

@@ -57,7 +57,7 @@ impl Watch {
         self.lost.as_deref()
     }
 
-    /// Returns the interface as it was when the sockets were made.
+    /// Returns the interface at the time when the sockets were created.
     pub(crate) const fn interface(&self) -> &Interface {
         &self.held
     }
@@ -143,7 +143,7 @@ fn source_towards(group: SocketAddr) -> io::Result<Ipv4Addr> {
 #[derive(Debug)]
 pub struct Held {
     held: Vec<Holding>,
-    /// Whether the library uses all interfaces.
+    /// True if the library uses all interfaces.
     all: bool,
     /// Reported interfaces that appeared later.
     late: Vec<String>,
@@ -177,8 +177,9 @@ pub enum Finding {
 }
 
 impl Held {
-    /// Starts to watch the given addresses, or all addresses except loopback if the list is empty.
-    /// Loopback is not watched: returns `None` if there are no other addresses.
+    /// Starts to watch the interfaces with the given addresses, or all interfaces except loopback
+    /// if the list is empty. Loopback is not watched: returns `None` if no other interface has a
+    /// given address.
     #[must_use]
     pub fn start(addresses: &[IpAddr]) -> Option<Self> {
         let all = addresses.is_empty();

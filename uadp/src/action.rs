@@ -23,8 +23,8 @@
 //! ActionHeader identifies the message of a chunk, and a [`Reassembler`](crate::Reassembler) does
 //! not read it. UA-.NETStandard splits the encoded NetworkMessage instead. Such messages pass
 //! through [`Chunks`](crate::Chunks) and [`Reassembler`](crate::Reassembler) unchanged, as a
-//! [`Whole`](crate::Whole) without DataSetWriter, whose bytes are decoded with
-//! [`NetworkMessage::decode`](crate::NetworkMessage::decode).
+//! [`Whole`](crate::Whole) without DataSetWriter.
+//! [`NetworkMessage::decode`](crate::NetworkMessage::decode) decodes its bytes.
 //!
 //! # Announcing
 //! An [`ActionMetaData`](crate::discovery::ActionMetaData) announcement describes the arguments,

@@ -121,7 +121,8 @@ pub enum EncodeError {
     /// The value does not match the RawData layout.
     #[error(transparent)]
     Raw(#[from] RawWriteError),
-    /// Structures are nested deeper than [`FieldEncoder::MAX_DEPTH`](crate::FieldEncoder::MAX_DEPTH).
+    /// Structures are nested deeper than
+    /// [`FieldEncoder::MAX_DEPTH`](crate::FieldEncoder::MAX_DEPTH).
     #[error("structures nested too deep")]
     TooDeep,
 }

@@ -451,7 +451,8 @@ impl<'m> DataValueEncoder<'m> {
     /// Appends the next field of a key frame.
     ///
     /// # Errors
-    /// [`EncodeError::Misplaced`] in a delta frame, [`EncodeError::TooBig`] as for [`FieldEncoder::scalar`].
+    /// [`EncodeError::Misplaced`] in a delta frame; [`EncodeError::TooBig`] as for
+    /// [`FieldEncoder::scalar`].
     pub fn value(&mut self, value: &DataValue<'_>) -> Result<(), EncodeError> {
         if self.delta {
             return Err(EncodeError::Misplaced(
@@ -465,7 +466,8 @@ impl<'m> DataValueEncoder<'m> {
     /// Appends a changed field of a delta frame, by its index in the DataSetMetaData.
     ///
     /// # Errors
-    /// [`EncodeError::Misplaced`] in a key frame, [`EncodeError::TooBig`] as for [`FieldEncoder::scalar`].
+    /// [`EncodeError::Misplaced`] in a key frame; [`EncodeError::TooBig`] as for
+    /// [`FieldEncoder::scalar`].
     pub fn changed(&mut self, index: u16, value: &DataValue<'_>) -> Result<(), EncodeError> {
         if !self.delta {
             return Err(EncodeError::Misplaced("an index in a key frame"));

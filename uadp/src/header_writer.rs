@@ -73,7 +73,7 @@ pub(crate) fn write(
 }
 
 /// Appends the headers as [`write`], for a PublisherId of type String or a number of
-/// DataSetWriterIds other than one.
+/// DataSetWriterIds other than 1.
 #[cold]
 fn write_in_parts(
     buf: &mut Vec<u8>,

@@ -66,9 +66,9 @@ pub(crate) trait Nest<'a>: Sized {
 
 /// Maximum nesting depth of decoded values. Deeper values are [`DecodeError::TooDeep`].
 ///
-/// Version 1.05 requires decoders to support at least 4 and at most 10 levels of DiagnosticInfo
-/// (OPC 10000-6, 5.2.2.12). Each additional level would increase the cost of reading all values of
-/// a deeply nested datagram.
+/// Version 1.05 requires decoders to support at least 4 levels of DiagnosticInfo, and expects no
+/// more than 10 (OPC 10000-6, 5.2.2.12). Each additional level would increase the cost of reading
+/// all values of a deeply nested datagram.
 pub const MAX_NESTING: u8 = 10;
 
 /// Number of levels that a value may still contain.

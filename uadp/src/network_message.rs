@@ -80,7 +80,7 @@ enum Step<'a> {
     Single {
         writer_id: Option<u16>,
     },
-    /// Count is above one: the payload starts with the Sizes, one per DataSetWriterId.
+    /// Count is above 1: the payload starts with the Sizes, one per DataSetWriterId.
     Sizes {
         writer_ids: &'a [[u8; 2]],
     },

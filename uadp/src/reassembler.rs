@@ -44,7 +44,7 @@ pub struct Reassembler<S = ()> {
     limits: ReassemblyLimits,
     /// Incomplete wholes, oldest first.
     open: VecDeque<Open<S>>,
-    /// Completed wholes, whose chunks may be repeated; in the order of completion.
+    /// Completed wholes, in the order of completion, to detect repeated chunks.
     done: VecDeque<Done<S>>,
     /// Cost of all entries in `open` and `done`.
     held: usize,
@@ -145,9 +145,11 @@ pub struct ReassemblyCounters {
     pub too_many_pieces: u64,
     /// Wholes given up because of [`ReassemblyLimits::age`].
     pub expired: u64,
-    /// Wholes given up because of [`ReassemblyLimits::total`] or [`ReassemblyLimits::total_per_sender`].
+    /// Wholes given up because of [`ReassemblyLimits::total`] or
+    /// [`ReassemblyLimits::total_per_sender`].
     pub out_of_bytes: u64,
-    /// Wholes given up because of [`ReassemblyLimits::open`] or [`ReassemblyLimits::open_per_sender`].
+    /// Wholes given up because of [`ReassemblyLimits::open`] or
+    /// [`ReassemblyLimits::open_per_sender`].
     pub out_of_places: u64,
     /// Wholes given up because of [`ReassemblyLimits::open_per_writer`].
     pub superseded: u64,

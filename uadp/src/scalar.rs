@@ -356,6 +356,6 @@ impl<'a> ExtensionObject<'a> {
 const HAS_LOCALE: u8 = 1;
 const HAS_TEXT: u8 = 2;
 const NO_BODY: u8 = 0;
-/// Encoding byte of an ExtensionObject whose body is OPC UA binary.
+/// Encoding byte of an ExtensionObject with an OPC UA binary body.
 pub(crate) const BINARY_BODY: u8 = 1;
 const XML_BODY: u8 = 2;

@@ -46,8 +46,8 @@ impl<'a> StructureReader<'a> {
         Array::read(element, &mut self.reader)
     }
 
-    /// Reads the length of the next field, an array of structures by value whose fields follow
-    /// inline. Returns `None` for null.
+    /// Reads the length of the next field, an array of structures by value. The fields of the
+    /// structures follow inline. Returns `None` for null.
     ///
     /// Structures without fields have no bytes, so up to
     /// [`MAX_WITHOUT_FIELDS`](Self::MAX_WITHOUT_FIELDS) are accepted independent of the remaining

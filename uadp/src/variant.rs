@@ -28,7 +28,7 @@ pub struct Matrix<'a> {
     dimensions: &'a [[u8; 4]],
 }
 
-/// A one-dimensional array whose elements were checked when it was created.
+/// A one-dimensional array. Its elements were checked when it was created.
 ///
 /// Equality compares the encoded elements.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -49,7 +49,7 @@ impl<'b> ActionEncoder<'b> {
     ///
     /// # Errors
     /// - [`EncodeError::MessageCount`] if `writer_ids` is empty, or has several ids in a dialect
-    ///   with one message per NetworkMessage.
+    ///   with a single message per NetworkMessage.
     /// - [`EncodeError::Misplaced`] without a PublisherId.
     /// - [`EncodeError::TooBig`] as for [`NetworkMessageEncoder::with`], and for ActionHeader
     ///   fields that exceed their length field.

@@ -158,7 +158,7 @@ fn read_requestor_id<'a>(reader: &mut Reader<'a>) -> Result<PublisherId<'a>, Dec
     }
 }
 
-/// Rejects null for a value whose flag is set.
+/// Rejects a null value, because its flag is set.
 fn present<T>(value: Option<T>, field: &'static str) -> Result<T, DecodeError> {
     value.ok_or(DecodeError::Reserved {
         field,

@@ -97,8 +97,8 @@ pub struct RequestorSettings {
     /// chunks of one repetition replace lost chunks of another (OPC 10000-14, 7.2.4.4.4). Default
     /// 1000.
     pub large: usize,
-    /// Maximum number of open calls, including calls that wait for their acknowledgement or whose
-    /// outcome was not polled. Default 1024.
+    /// Maximum number of open calls, including calls that wait for their acknowledgement, and
+    /// outcomes that were not polled. Default 1024.
     pub max_calls: usize,
     /// Maximum number of argument bytes of all calls. Default 4 MiB.
     pub max_bytes: usize,
@@ -537,7 +537,7 @@ impl Requestor {
         Ok(u64::from(lap) << 16 | u64::from(response.request_id))
     }
 
-    /// Starts the acknowledgement, if the dialect has one.
+    /// Starts the acknowledgement, if the dialect supports it.
     fn close(&mut self, id: u64, given_up: bool, now: Duration) {
         let left = self.settings.idle_repeats;
         let Some(call) = self.calls.get_mut(&id) else {

@@ -29,7 +29,7 @@ pub struct ActionToSend<'a> {
     /// RequestId of the request.
     pub request_id: u16,
     /// Identifies the call within its Requestor or Responder. It is not encoded; it identifies
-    /// repetitions, whose chunks have to carry the MessageSequenceNumber of the first transmission.
+    /// repetitions. Their chunks have to carry the MessageSequenceNumber of the first transmission.
     pub call: u64,
     /// Requested state in a request, current state in a response.
     pub state: ActionState,

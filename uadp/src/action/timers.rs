@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 use std::time::Duration;
 
-/// A set with one timer per id.
+/// A set with a timer per id.
 #[derive(Debug)]
 pub(super) struct Timers {
     at: BTreeSet<(Duration, u64)>,

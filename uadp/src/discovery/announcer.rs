@@ -37,7 +37,7 @@ pub struct Announcer {
     groups: BTreeSet<u16>,
     /// DataSetWriters of Actions.
     actions: BTreeSet<u16>,
-    /// Planned subjects, and subjects whose last announcement is too recent.
+    /// Planned subjects, and recently announced subjects.
     entries: BTreeMap<Subject, Entry>,
     /// Number of entries for unknown subjects.
     unknown: usize,
@@ -75,7 +75,8 @@ pub enum Subject {
     WriterGroupConfiguration(u16),
     /// A DataSetWriter, as [`Announced::DataSetWriterConfiguration`](super::Announced).
     DataSetWriterConfiguration(u16),
-    /// The content of the DataSet of a DataSetWriter, as [`Announced::DataSetMetaData`](super::Announced).
+    /// The content of the DataSet of a DataSetWriter, as
+    /// [`Announced::DataSetMetaData`](super::Announced).
     DataSetMetaData(u16),
     /// The connections with Action Responders, as [`Announced::ActionResponder`](super::Announced).
     ActionResponder,
@@ -376,8 +377,8 @@ impl Announcer {
         planned.min().map(|(due, _, subject)| (due, subject))
     }
 
-    /// Returns the DataSetWriters whose configuration is announced together with `id`: planned, in
-    /// the same WriterGroup, and not announced within the last 500 ms.
+    /// Returns the DataSetWriters that are announced together with `id`: planned, in the same
+    /// WriterGroup, and not announced within the last 500 ms.
     fn writers_with(&self, id: u16, now: Duration) -> Vec<u16> {
         let group = self.writers.get(&id);
         let all =
@@ -431,7 +432,7 @@ impl Announcer {
         std::mem::take(&mut entry.included)
     }
 
-    /// Removes subjects whose last announcement is long enough ago.
+    /// Removes subjects that were announced long enough ago.
     fn forget(&mut self, now: Duration) {
         let unknown = &mut self.unknown;
         self.entries.retain(|_, entry| {

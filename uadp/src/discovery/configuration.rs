@@ -19,7 +19,7 @@ structure! {
     PubSubConnectionDataType<'a> {
         /// Unique among the connections.
         name: Option<&'a str> = "Name",
-        /// Whether it is enabled.
+        /// True if enabled.
         enabled: bool = "Enabled",
         /// The PublisherId, of the type it has on the wire.
         publisher_id: Variant<'a> = "PublisherId",
@@ -42,11 +42,11 @@ structure! {
     PubSubGroupDataType<'a> {
         /// Unique among the groups of the connection.
         name: Option<&'a str> = "Name",
-        /// Whether it is enabled.
+        /// True if enabled.
         enabled: bool = "Enabled",
         /// Security mode of the NetworkMessages.
         security_mode: MessageSecurityMode = "SecurityMode",
-        /// The SecurityGroup whose keys are used.
+        /// SecurityGroup that provides the keys.
         security_group_id: Option<&'a str> = "SecurityGroupId",
         /// Endpoints of the Security Key Services.
         security_key_services: List<'a, EndpointDescription<'a>> = "SecurityKeyServices",
@@ -87,7 +87,7 @@ structure! {
     DataSetWriterDataType<'a> {
         /// Unique in the group.
         name: Option<&'a str> = "Name",
-        /// Whether it is enabled.
+        /// True if enabled.
         enabled: bool = "Enabled",
         /// Unique among the DataSetWriters of the Publisher; 0 is null.
         data_set_writer_id: u16 = "DataSetWriterId",
@@ -123,7 +123,7 @@ structure! {
     DataSetReaderDataType<'a> {
         /// Unique in the group.
         name: Option<&'a str> = "Name",
-        /// Whether it is enabled.
+        /// True if enabled.
         enabled: bool = "Enabled",
         /// PublisherId of the received messages; null for any.
         publisher_id: Variant<'a> = "PublisherId",

@@ -79,7 +79,7 @@ structure! {
     StructureDefinition<'a> {
         /// NodeId of the encoding in an ExtensionObject; null if the structure occurs only nested.
         default_encoding_id: NodeId<'a> = "DefaultEncodingId",
-        /// The DataType this one extends.
+        /// Base DataType.
         base_data_type: NodeId<'a> = "BaseDataType",
         /// Layout of the fields.
         structure_type: StructureType = "StructureType",
@@ -142,7 +142,7 @@ structure! {
         data_type_id: NodeId<'a> = "DataTypeId",
         /// Name of the DataType.
         name: QualifiedName<'a> = "Name",
-        /// The DataType this one extends.
+        /// Base DataType.
         base_data_type: NodeId<'a> = "BaseDataType",
         /// Id of the builtin type of the encoding.
         built_in_type: u8 = "BuiltInType",

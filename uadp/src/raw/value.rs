@@ -8,7 +8,7 @@ use crate::{BuiltinType, Scalar, Variant};
 /// Value of a field.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum RawValue<'a> {
-    /// A single value, or an array or matrix whose elements are contiguous.
+    /// A single value, or an array or matrix of contiguous elements.
     ///
     /// A structure is an ExtensionObject. Its body is the encoded fields, including padding.
     /// [`RawStructure::members`](super::RawStructure::members) decodes them, and

@@ -49,7 +49,7 @@ pub enum RawWriteFault {
     /// The text is longer than its MaxStringLength.
     #[error("{len} bytes where MaxStringLength is {most}")]
     MaxStringLength {
-        /// MaxStringLength; 2^31-1 without one.
+        /// MaxStringLength; 2^31-1 if there is no maximum.
         most: u32,
         /// Bytes of the text.
         len: usize,

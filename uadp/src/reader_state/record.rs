@@ -100,7 +100,8 @@ impl Record {
     }
 }
 
-/// Keep-alives carry the DataSetMessageSequenceNumber of the next message (OPC 10000-14, 7.2.4.5.8).
+/// Returns true for keep-alives, which carry the DataSetMessageSequenceNumber of the next message
+/// (OPC 10000-14, 7.2.4.5.8).
 fn is_next_expected(of: Numbers, arrival: &Arrival) -> bool {
     of == Numbers::DataSetMessages && arrival.kind == MessageKind::KeepAlive
 }

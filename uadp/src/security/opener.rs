@@ -75,8 +75,8 @@ pub struct OpenerOptions {
     pub forget_after: Option<Duration>,
     /// Messages that share a sequence. Default [`CountedBy::Publisher`].
     pub counted_by: CountedBy,
-    /// Accepts publishers whose sequence number stays 1, as in open62541 up to version 1.5.7. Their
-    /// messages are marked [`Opened::constant_sequence`] and can be replayed, except the last
+    /// Accepts publishers with the constant sequence number 1, as in open62541 up to version 1.5.7.
+    /// Their messages are marked [`Opened::constant_sequence`] and can be replayed, except the last
     /// message. Default `false`.
     pub accept_constant_sequence: bool,
 }

@@ -272,5 +272,6 @@ impl<'a> Seal<'a> {
     }
 }
 
-/// Bytes of the SecurityHeader without SecurityFooterSize: flags, SecurityTokenId, NonceLength and nonce.
+/// Bytes of the SecurityHeader without SecurityFooterSize: flags, SecurityTokenId, NonceLength and
+/// nonce.
 pub(super) const HEADER: usize = 1 + 4 + 1 + MESSAGE_NONCE;

@@ -22,7 +22,7 @@ fn keys(byte: u8) -> Keys {
     Keys::from_bytes(SecurityPolicy::PubSubAes128Ctr, &[byte; 52]).unwrap()
 }
 
-/// Returns an opener whose current key, of token 1, is `keys(1)`.
+/// Returns an opener with the current key `keys(1)` of token 1.
 fn opener(mode: SecurityMode) -> Opener {
     opener_with(OpenerOptions::default(), mode)
 }

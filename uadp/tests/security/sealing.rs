@@ -10,7 +10,7 @@ use uadp::{
 
 use super::{START, header, keys, nonce, sealed, write};
 
-/// Appends a message whose payload is a single Byte array.
+/// Appends a message with a single Byte array.
 fn write_bytes(out: &mut Vec<u8>, bytes: &[u8], seal: Seal<'_>) -> Result<(), EncodeError> {
     let extras = Extras {
         security: Some(seal.header()),

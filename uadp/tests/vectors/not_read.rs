@@ -42,8 +42,7 @@ pub(crate) const NOT_READ: &[(&str, &[&str])] = &[
     ),
 ];
 
-/// Vectors whose fields have no types in the datagram: `raw.rs` decodes them with their
-/// DataSetMetaData.
+/// Vectors with fields without types: `raw.rs` decodes them with their DataSetMetaData.
 pub(crate) const RAW_DATA: &[&str] = &[
     "asyncua_raw",
     "raw_all_fixed_scalars",
