@@ -1,5 +1,5 @@
-//! Actions: a Requestor sends requests, a Responder executes them and sends responses (OPC
-//! 10000-14, 5.4.3 and 6.2.11.2).
+//! Actions: a Requestor sends requests, a Responder executes them and sends responses
+//! (OPC 10000-14, 5.4.3 and 6.2.11.2).
 //!
 //! Requests and responses are DataSetMessages behind an ActionHeader. Both carry the PublisherId,
 //! WriterGroupId and DataSetWriterId of the Responder, so these ids address the Action and do not

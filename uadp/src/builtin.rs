@@ -231,8 +231,8 @@ impl StatusCode {
     /// Good, 0.
     pub const GOOD: Self = Self(0);
 
-    /// Returns the StatusCode of a DataSetMessage header, which contains the upper 16 bits (OPC
-    /// 10000-14, 7.2.4.5.4).
+    /// Returns the StatusCode of a DataSetMessage header, which contains the upper 16 bits
+    /// (OPC 10000-14, 7.2.4.5.4).
     #[must_use]
     pub const fn from_status(status: u16) -> Self {
         Self((status as u32) << 16)

@@ -7,8 +7,8 @@ use crate::{BuiltinType, DataValue, EncodeError, NodeId, Variant, variant, write
 /// Appends the fields of a key frame or event as Variants (OPC 10000-14, 7.2.4.5.5 and 7.2.4.5.7).
 ///
 /// Between [`begin_structure`](Self::begin_structure) and [`end_structure`](Self::end_structure)
-/// the same methods write the fields of the structure, without the encoding byte of a Variant (OPC
-/// 10000-6, 5.2.6).
+/// the same methods write the fields of the structure, without the encoding byte of a Variant
+/// (OPC 10000-6, 5.2.6).
 #[derive(Debug)]
 #[must_use = "a message is complete with `finish`"]
 pub struct FieldEncoder<'m> {

@@ -16,8 +16,8 @@
 //! | calls over a network that loses messages | [`action::Requestor`], [`action::Responder`] |
 //! | sequence numbers, timeouts and states | [`DataSetReaderState`], [`ReaderTable`], [`DataSetWriterState`] |
 //!
-//! Variants of the unassigned builtin types 26 to 31, and chunks with an ActionHeader, are
-//! [`DecodeError::Unsupported`].
+//! Variants of the unassigned builtin types 26 to 31 are decoded as ByteStrings (OPC 10000-6,
+//! 5.2.2.16). Chunks with an ActionHeader are [`DecodeError::Unsupported`].
 //!
 //! The crate has no sockets, clock, threads or randomness: bytes, times and random numbers are
 //! parameters. Decoding borrows from the datagram and allocates nothing; decryption and reassembly

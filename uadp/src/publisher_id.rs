@@ -4,8 +4,8 @@ use std::fmt;
 
 use crate::PublisherId;
 
-/// Owned form of a [`PublisherId`]. Two ids are equal if their type and value are equal (OPC
-/// 10000-14, 7.2.4.4.2).
+/// Owned form of a [`PublisherId`]. Two ids are equal if their type and value are equal
+/// (OPC 10000-14, 7.2.4.4.2).
 #[derive(Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
 #[expect(missing_docs, reason = "the names are those of the builtin types")]
 pub enum OwnedPublisherId {

@@ -31,8 +31,8 @@ pub enum RawDialect {
     ///   padded to the MaxStringLength; a null value is length -1 and padding.
     /// - An array is its Int32 length and its elements, padded to the ArrayDimensions; a null array
     ///   is length -1 and padding.
-    /// - A matrix is the number of its dimensions and the size of each dimension as Int32 (OPC
-    ///   10000-6, 5.2.5), then its elements in row-major order, padded to the ArrayDimensions.
+    /// - A matrix is the number of its dimensions and the size of each dimension as Int32
+    ///   (OPC 10000-6, 5.2.5), then its elements in row-major order, padded to the ArrayDimensions.
     ///   Peers differ in the position of the rows of a matrix that is shorter than its metadata:
     ///   rows in sequence, or each row at its maximum offset. The positions are equal if only the
     ///   outermost dimension is shorter. Other short matrices are neither decoded nor encoded.

@@ -63,8 +63,8 @@ impl SequenceOrder {
     }
 }
 
-/// SequenceNumbers of a sender: start at 0, increase by 1, and continue with 0 after 65535 (OPC
-/// 10000-14, 7.2.3).
+/// SequenceNumbers of a sender: start at 0, increase by 1, and continue with 0 after 65535
+/// (OPC 10000-14, 7.2.3).
 ///
 /// There are separate counters for the DataSetMessages of a DataSetWriter, for the NetworkMessages
 /// of a WriterGroup, and for the announcements of a publisher.

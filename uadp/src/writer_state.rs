@@ -240,8 +240,8 @@ impl DataSetWriterState {
         self.set_version(self.version.extended(at));
     }
 
-    /// Returns true once after the metadata changed: it has to be announced without a probe (OPC
-    /// 10000-14, 7.2.4.6.4).
+    /// Returns true once after the metadata changed: it has to be announced without a probe
+    /// (OPC 10000-14, 7.2.4.6.4).
     #[must_use = "the announcement is not asked for again"]
     pub const fn take_announcement(&mut self) -> bool {
         std::mem::replace(&mut self.unannounced, false)

@@ -1,8 +1,8 @@
 //! RawData: datagrams of other stacks, the tables of the standard, and rejected input.
 //!
 //! The standard has no example of a RawData payload. The expected bytes of `RawDialect::Standard`
-//! are encoded by hand from OPC 10000-14, 7.2.4.5.11; their structures are the examples of OPC
-//! 10000-6, 5.2.7 and 5.2.8.
+//! are encoded by hand from OPC 10000-14, 7.2.4.5.11; their structures are the examples of
+//! OPC 10000-6, 5.2.7 and 5.2.8.
 
 use std::path::PathBuf;
 

@@ -24,8 +24,8 @@ pub use settings::{
     ResponderSettings,
 };
 
-/// Responds to requests over a network that can lose, duplicate, delay and reorder messages (OPC
-/// 10000-14, 6.2.11.2.2).
+/// Responds to requests over a network that can lose, duplicate, delay and reorder messages
+/// (OPC 10000-14, 6.2.11.2.2).
 ///
 /// A request is identified by RequestorId, CorrelationData and RequestId, and executed at most
 /// once. The owner of the Responder executes the requests that

@@ -66,8 +66,8 @@ pub enum Announced<'a> {
         /// Bad if the Publisher has no information.
         status: StatusCode,
     },
-    /// The application; also the response to [`Probe::FindApplications`](super::Probe) (OPC
-    /// 10000-14, 7.2.4.6.5).
+    /// The application; also the response to [`Probe::FindApplications`](super::Probe)
+    /// (OPC 10000-14, 7.2.4.6.5).
     ApplicationDescription {
         /// The application.
         description: ApplicationDescription<'a>,

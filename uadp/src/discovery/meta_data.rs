@@ -40,8 +40,8 @@ structure! {
         /// The DataType; its namespace index refers to the
         /// [schema](DataTypeSchemaHeader::namespace_uri).
         data_type: NodeId<'a> = "DataType",
-        /// -1 for a scalar, otherwise the number of dimensions or the permitted numbers (OPC
-        /// 10000-3, 5.6.2).
+        /// -1 for a scalar, otherwise the number of dimensions or the permitted numbers
+        /// (OPC 10000-3, 5.6.2).
         value_rank: i32 = "ValueRank",
         /// Maximum number of elements in each dimension, 0 for no limit; null for a scalar.
         array_dimensions: List<'a, u32> = "ArrayDimensions",
@@ -172,7 +172,7 @@ pub enum VersionMatch {
     Same,
     /// The versions differ in fields at the end; fields in both versions are the same.
     Minor,
-    /// The metadata have another major version, and must not be used to decode the message.
+    /// The metadata do not describe the message, and must not be used to decode it.
     Major,
     /// The message does not contain its version.
     Unsaid,

@@ -110,9 +110,9 @@ impl<'a> Probe<'a> {
     }
 
     /// Appends the NetworkMessage, up to the end of its payload. `publisher_id` identifies the
-    /// probed Publisher. `None` is encoded as the Byte 0, which is not a valid PublisherId (OPC
-    /// 10000-14, 6.2.7.1) and is required for [`FindApplications`](Self::FindApplications). Without
-    /// security the header is [`SecurityHeader::NONE`].
+    /// probed Publisher. `None` is encoded as the Byte 0, which is not a valid PublisherId
+    /// (OPC 10000-14, 6.2.7.1) and is required for [`FindApplications`](Self::FindApplications).
+    /// Without security the header is [`SecurityHeader::NONE`].
     ///
     /// # Errors
     /// [`EncodeError::TooBig`] if a text, array or nonce exceeds its length field.

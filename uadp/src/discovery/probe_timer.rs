@@ -2,8 +2,8 @@
 
 use std::time::Duration;
 
-/// Timing of the probes for a piece of information that a Subscriber needs from a Publisher (OPC
-/// 10000-14, 7.2.4.6.12.2).
+/// Timing of the probes for a piece of information that a Subscriber needs from a Publisher
+/// (OPC 10000-14, 7.2.4.6.12.2).
 ///
 /// A probe is sent after a random delay of 100 to 500 ms, so that one of many Subscribers sends it
 /// and the others receive it. The Subscriber then waits for the response, 500 ms at first and twice

@@ -12,8 +12,8 @@ pub enum RawValue<'a> {
     ///
     /// A structure is an ExtensionObject. Its body is the encoded fields, including padding.
     /// [`RawStructure::members`](super::RawStructure::members) decodes them, and
-    /// [`RawStructure::to_plain`](super::RawStructure::to_plain) converts them to the body of OPC
-    /// 10000-6.
+    /// [`RawStructure::to_plain`](super::RawStructure::to_plain) converts them to the body of
+    /// OPC 10000-6.
     Variant(Variant<'a>),
     /// An array or matrix of structures or padded texts.
     Array(RawArray<'a>),

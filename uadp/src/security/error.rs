@@ -74,8 +74,8 @@ pub enum SecurityError {
         /// Highest accepted sequence number.
         newest: u32,
     },
-    /// The sequence number is so far ahead of the newest that the standard declares it invalid (OPC
-    /// 10000-14, 7.2.3).
+    /// The sequence number is so far ahead of the newest that the standard declares it invalid
+    /// (OPC 10000-14, 7.2.3).
     #[error("sequence number {sequence} is too far ahead of {newest}")]
     TooFarAhead {
         /// Sequence number of the message.

@@ -107,8 +107,8 @@ impl Prepared {
         })
     }
 
-    /// Returns the first counter block: KeyNonce, MessageNonce, and 1 as big-endian UInt32 (OPC
-    /// 10000-14, 7.2.4.4.3.2).
+    /// Returns the first counter block: KeyNonce, MessageNonce, and 1 as big-endian UInt32
+    /// (OPC 10000-14, 7.2.4.4.3.2).
     fn counter_block(&self, nonce: Nonce) -> [u8; 16] {
         let mut block = [0; 16];
         let parts = self.key_nonce.iter().copied().chain(nonce.to_bytes());

@@ -12,7 +12,7 @@ pub(super) struct Streams {
     streams: Vec<Stream>,
 }
 
-/// Identity of a sequence of sequence numbers. The last part is the random half of the nonce, if it
+/// Identity of a sequence of messages. The last part is the random half of the nonce, if it
 /// distinguishes the senders.
 pub(super) type StreamId<'a> = (Option<PublisherId<'a>>, Option<u16>, Option<[u8; 4]>);
 
