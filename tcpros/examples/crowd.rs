@@ -1,9 +1,11 @@
-//! What many topics cost in one process: threads, memory and files, as one JSON object a line on standard output.
+//! Measures the cost of many topics in a process. The counts of threads, memory and files are
+//! printed to standard output, with a JSON object per line.
 //!
-//! `crowd steady N` publishes N topics in one node and subscribes them in another, and says what that takes once all
-//! are connected. `crowd churn N ROUNDS` lets N publishers of `/crowd/out_*` and N subscribers of `/crowd/in_*` come
-//! and go; other nodes must be there that subscribe the ones and publish the others. It says what there is after a
-//! tenth of the rounds, when all pools are filled, and at the end.
+//! `crowd steady N` publishes N topics in a node, subscribes to them in another node, and prints
+//! the cost once all are connected. `crowd churn N ROUNDS` repeatedly creates and drops N
+//! publishers of `/crowd/out_*` and N subscribers of `/crowd/in_*`; other nodes have to subscribe
+//! to the outputs and publish the inputs. It prints the cost after a tenth of the rounds, when all
+//! pools are filled, and at the end.
 
 #![expect(clippy::print_stdout, reason = "what it measures is its output")]
 
@@ -51,7 +53,7 @@ async fn steady(topics: usize) -> Result<(), Box<dyn std::error::Error>> {
     }
     let ready = started.elapsed();
     for publisher in &publishers {
-        // A subscriber that has gone again shows in the count of what arrives.
+        // A lost subscriber shows in the count of received messages.
         let _published = publisher.publish(content());
     }
     within("messages", async {
@@ -92,7 +94,7 @@ async fn churn(topics: usize, rounds: usize) -> Result<(), Box<dyn std::error::E
         })
         .await?;
         for publisher in &publishers {
-            // Who takes it is of no interest here.
+            // The receivers are of no interest here.
             let _published = publisher.publish(content());
         }
         drop((subscriptions, publishers));
@@ -138,18 +140,18 @@ fn subscribe(
         .collect()
 }
 
-/// A `std_msgs/String`.
+/// A serialized `std_msgs/String`.
 const fn content() -> Bytes {
     Bytes::from_static(b"\x02\0\0\0hi")
 }
 
-/// One wait, with an end: a crowd that does not come together is a failure to be told.
+/// Waits with a time limit, so that missing connections are reported as a failure.
 async fn within<T>(what: &str, wait: impl Future<Output = T>) -> Result<T, String> {
     let done = timeout(LONGEST_WAIT, wait).await;
     done.map_err(|_| format!("waited {LONGEST_WAIT:?} for {what}"))
 }
 
-/// Waits until no file is opened or closed any more.
+/// Waits until the number of open files is stable.
 async fn settled() -> std::io::Result<()> {
     let mut before = files()?;
     let mut quiet = 0;

@@ -1,6 +1,7 @@
 //! Repeats topics of any type under other names: `relay IN OUT [IN OUT]..`.
 //!
-//! The types are not known beforehand: they come from the connection headers of the first publishers.
+//! The types are not known beforehand: they come from the connection headers of the first
+//! publishers.
 
 use std::collections::HashMap;
 use std::error::Error;
@@ -18,7 +19,7 @@ async fn main() -> Result<(), Box<dyn Error + Send + Sync>> {
     tracing_subscriber::fmt()
         .with_writer(std::io::stderr)
         .init();
-    // As a task of its own: waking the future of `main` costs a system call for each message.
+    // A task, because waking the future of `main` costs a system call for each message.
     tokio::spawn(relay()).await?
 }
 
@@ -54,7 +55,7 @@ async fn relay() -> Result<(), Box<dyn Error + Send + Sync>> {
                     Ok(publisher) => {
                         publishers.insert(output, publisher);
                     }
-                    // The next publisher may tell a whole type.
+                    // The next publisher may send a complete type.
                     Err(error) => {
                         tracing::warn!(publisher = peer.caller_id, %error, "a publisher is passed over");
                     }
@@ -62,7 +63,7 @@ async fn relay() -> Result<(), Box<dyn Error + Send + Sync>> {
             }
             InboxEvent::Message(message) => {
                 if let Some(publisher) = publishers.get(&output) {
-                    // Losses of slow subscribers are counted by the publisher.
+                    // The publisher counts the losses of slow subscribers.
                     let _published = publisher.publish(message.bytes);
                 }
             }
@@ -74,7 +75,7 @@ async fn relay() -> Result<(), Box<dyn Error + Send + Sync>> {
     Ok(())
 }
 
-/// Ends when a signal asks for it, or the master.
+/// Completes when a signal or the master requests the end.
 fn stop(node: &Node) -> std::io::Result<impl Future<Output = ()> + use<>> {
     let mut terminate = signal(SignalKind::terminate())?;
     let mut interrupt = signal(SignalKind::interrupt())?;

@@ -1,10 +1,10 @@
-//! The one place that reads clocks.
+//! The only module that reads clocks.
 
 use std::time::{Duration, SystemTime};
 
 use tokio::time::Instant;
 
-/// Wall clock time, for the stamp of a received message.
+/// Returns the wall clock time, for the stamp of a received message.
 #[expect(
     clippy::disallowed_methods,
     reason = "the stamp of a message is taken where its last byte is read"
@@ -13,17 +13,19 @@ pub(crate) fn utc() -> SystemTime {
     SystemTime::now()
 }
 
-/// Steady time, for time limits.
+/// Returns the steady time, for time limits.
 pub(crate) fn now() -> Instant {
     Instant::now()
 }
 
-/// When a time limit ends. One too long for the clock ends so late that it is none.
+/// Returns the end of a time limit. A limit that exceeds the range of the clock ends in thirty
+/// years, which is effectively never.
 pub(crate) fn after(start: Instant, limit: Duration) -> Instant {
     start.checked_add(limit).unwrap_or_else(|| start + FOREVER)
 }
 
-/// Thirty years: no clock that counts from the start of the machine ends before.
+/// Thirty years, which is within the range of every clock that counts from the start of the
+/// machine.
 const FOREVER: Duration = Duration::from_secs(30 * 365 * 24 * 3600);
 
 #[cfg(test)]
@@ -39,7 +41,7 @@ mod tests {
         );
         let year = Duration::from_secs(365 * 24 * 3600);
         assert!(after(start, Duration::MAX) > start + year);
-        // Ends that are computed from one another stay in range as well.
+        // Ends that are computed from other ends stay in range as well.
         assert!(after(after(start, Duration::MAX), Duration::MAX) > start + year);
     }
 }

@@ -20,11 +20,12 @@ use crate::outbox::lock;
 use crate::rpc::{self, Endpoint, RpcError};
 use crate::xmlrpc::{Call, Fault, Response, Value};
 
-/// A running master: registrations of topics and services, and the tree of parameters. It ends on drop.
+/// A running master: registrations of topics and services, and the parameter tree. It stops on
+/// drop.
 ///
-/// It answers the Master and Parameter Server APIs of `wiki.ros.org/ROS`, tells nodes of changed topics and
-/// parameters, and tells a node to shut down whose name another takes. Unlike `roscore` it has no `/rosout`, and it
-/// keeps nothing in files.
+/// It serves the Master and Parameter Server APIs of `wiki.ros.org/ROS`, notifies nodes of changed
+/// topics and parameters, and requests a node to shut down when another node registers the same
+/// name. Unlike `roscore` it has no `/rosout` and stores nothing in files.
 #[derive(Debug)]
 pub struct Core {
     address: SocketAddr,
@@ -33,8 +34,8 @@ pub struct Core {
 }
 
 impl Core {
-    /// Listens on an address; port 0 takes a free one. Must be called inside a tokio runtime. Fails when the port is
-    /// taken.
+    /// Listens on an address; port 0 selects a free port. Must be called inside a tokio runtime.
+    /// Fails if the port is in use.
     pub fn start(address: SocketAddr) -> std::io::Result<Self> {
         let listener = std::net::TcpListener::bind(address)?;
         listener.set_nonblocking(true)?;
@@ -59,12 +60,12 @@ impl Core {
         })
     }
 
-    /// The value for `ROS_MASTER_URI`.
+    /// Returns the value for `ROS_MASTER_URI`.
     pub fn uri(&self) -> &str {
         &self.shared.uri
     }
 
-    /// Where it listens.
+    /// Returns the address of the listener.
     pub const fn address(&self) -> SocketAddr {
         self.address
     }
@@ -86,11 +87,12 @@ struct Registry {
     /// URIs of the slave APIs by node name.
     nodes: BTreeMap<String, String>,
     parameters: Tree,
-    /// Topics whose subscribers have not been told of the last change.
+    /// Topics with a change that their subscribers have not been notified of.
     dirty: BTreeSet<String>,
-    /// Changes of parameters that have not been told, by slave API; of one key only the last.
+    /// Pending parameter updates by slave API, with only the latest update per key.
     updates: BTreeMap<String, Vec<(String, Value)>>,
-    /// Slave APIs and names of nodes that have lost their name to another and have not been told.
+    /// Slave APIs and names of nodes that have lost their name to another node and have not been
+    /// notified.
     displaced: BTreeSet<(String, String)>,
 }
 
@@ -143,7 +145,7 @@ impl Shared {
 impl Registry {
     fn new() -> Self {
         let mut registry = Self::default();
-        // Tools tell one run of a master from the next by it.
+        // Tools distinguish the runs of a master by this parameter.
         let since = clock::utc().duration_since(SystemTime::UNIX_EPOCH);
         let started = since.unwrap_or_default().as_nanos();
         let run_id = format!("{started:x}-{:x}", std::process::id());
@@ -156,7 +158,7 @@ impl Registry {
         Ok(match (method, texts) {
             ("registerPublisher", [caller, topic, type_name, api]) => {
                 self.know(caller, api);
-                // Whoever publishes any type takes nothing from what is known.
+                // A publisher of any type does not replace a known type.
                 if *type_name != "*" || !self.types.contains_key(*topic) {
                     self.types
                         .insert((*topic).to_owned(), (*type_name).to_owned());
@@ -193,7 +195,7 @@ impl Registry {
                 done(1)
             }
             ("unregisterService", [caller, service, service_api]) => {
-                // A service that another node has taken over is that node's.
+                // A service that another node has taken over belongs to that node.
                 let own = |(node, api): &(String, String)| node == caller && api == service_api;
                 let removed = self.services.get(*service).is_some_and(own);
                 if removed {
@@ -269,7 +271,8 @@ impl Registry {
         })
     }
 
-    /// Remembers what followers of parameters have to be told; what they were not told of the same key is outdated.
+    /// Queues parameter updates for their subscribers. A queued update of the same key is outdated
+    /// and removed.
     fn tell(&mut self, told: Vec<Update>) {
         for (api, key, value) in told {
             let waiting = self.updates.entry(api).or_default();
@@ -285,7 +288,7 @@ impl Registry {
     fn know(&mut self, caller: &str, api: &str) {
         let before = self.nodes.insert(caller.to_owned(), api.to_owned());
         if let Some(before) = before.filter(|before| before != api) {
-            // The name has a new owner: what the old one had registered is void.
+            // The name has a new owner: the registrations of the previous owner are void.
             for registrations in [&mut self.publishers, &mut self.subscribers] {
                 for (topic, nodes) in registrations.iter_mut() {
                     nodes.retain(|(node, _)| node != caller);
@@ -299,7 +302,7 @@ impl Registry {
         }
     }
 
-    /// The calls to make, by slave API and in their order.
+    /// Returns the pending calls by slave API, in order.
     fn news(&mut self) -> BTreeMap<String, Vec<(&'static str, Vec<Value>)>> {
         let mut news: BTreeMap<String, Vec<_>> = BTreeMap::new();
         for topic in std::mem::take(&mut self.dirty) {
@@ -357,7 +360,8 @@ impl Registry {
         ])
     }
 
-    /// The types of the topics that have a publisher, of those below a namespace only; an empty one is all.
+    /// Returns the types of the published topics below a namespace; an empty namespace selects all
+    /// topics.
     fn published_topics(&self, subgraph: &str) -> Value {
         let namespace = match subgraph.trim_end_matches('/') {
             "" => String::new(),
@@ -377,7 +381,8 @@ impl Registry {
     }
 }
 
-/// Tells nodes what concerns them, in rounds, so that no node hears something older after something newer.
+/// Notifies nodes of changes in rounds, so that no node receives an older state after a newer
+/// state.
 async fn notify(shared: Arc<Shared>) {
     loop {
         shared.changed.notified().await;
@@ -441,7 +446,8 @@ fn not_set(name: &str) -> Value {
     triple(-1, &format!("Parameter [{name}] is not set"), 0)
 }
 
-/// A parameter's name as the caller means it, in canonical form. Fails for one of more than [`MAX_PARTS`] parts.
+/// Resolves the name of a parameter relative to the caller and returns its canonical form. Fails
+/// for a name of more than [`MAX_PARTS`] parts.
 fn full_name(name: &str, caller: &str) -> Result<String, Fault> {
     let full = names::of_caller(name, caller)
         .map_err(|error: NameError| fault(clipped(&error.to_string()).to_owned()))?;
@@ -463,9 +469,10 @@ const fn fault(message: String) -> Fault {
     Fault { code: -1, message }
 }
 
-/// Parts of a parameter's name: the tree is gone through by recursion, which must not go as deep as a peer likes.
+/// Maximum number of parts in the name of a parameter. The tree is traversed by recursion, and its
+/// depth must not depend on peers.
 const MAX_PARTS: usize = 32;
-/// How a master calls itself.
+/// Caller id of the master.
 const MASTER: &str = "/master";
 const NOTIFY_LIMIT: Duration = Duration::from_secs(3);
 
@@ -507,7 +514,7 @@ mod tests {
             vec!["searchParam", &deep, "a"],
             vec!["subscribeParam", "/n", "http://127.0.0.1:1/", &deep],
             vec!["unsubscribeParam", "/n", "http://127.0.0.1:1/", &deep],
-            // A name is relative to who asks.
+            // The name is relative to the caller.
             vec!["setParam", &deep, "a", "1"],
         ] {
             let (method, texts) = call.split_first().unwrap();

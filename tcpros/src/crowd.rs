@@ -1,7 +1,8 @@
-//! Who is connected: how many connections there may be, in all and from one address, and who gives way.
+//! Limits of connections, in total and per address, and the choice of the connection to close.
 //!
-//! A process has so many file descriptors. What peers can take of them leaves enough for what the node needs itself, so
-//! that nobody who opens connections and says nothing keeps it from its master.
+//! The number of file descriptors of a process is limited. The limits of this module reserve enough
+//! descriptors for the node itself, so that idle connections of peers cannot separate the node from
+//! its master.
 
 use std::net::IpAddr;
 use std::sync::Arc;
@@ -10,7 +11,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use rustix::process::{Resource, getrlimit};
 use tokio::task::AbortHandle;
 
-/// How many connections a listener may have.
+/// Connection limits of a listener.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Places {
     pub(crate) total: usize,
@@ -26,8 +27,8 @@ impl Places {
     }
 }
 
-/// How the file descriptors of a process are divided up; what is left over is for calls to the master, for files, and
-/// for what else the program has open.
+/// Division of the file descriptors of a process. The rest is for calls to the master, for files,
+/// and for all other descriptors of the program.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Shares {
     /// Subscribers and clients of services.
@@ -38,15 +39,16 @@ pub(crate) struct Shares {
     pub(crate) nodes: Places,
     /// Publishers that are connected or being connected.
     pub(crate) publishers: usize,
-    /// Those of one topic.
+    /// Publishers of a topic that are connected or being connected.
     pub(crate) publishers_of_topic: usize,
 }
 
 impl Shares {
-    /// By the limit of this process (`RLIMIT_NOFILE`).
+    /// Returns the shares for the limit of this process (`RLIMIT_NOFILE`).
     pub(crate) fn of_process() -> Self {
         let limit = getrlimit(Resource::Nofile).current;
-        // Without a limit there is the one of the system, which is no less than the most that is of use.
+        // Without a process limit the limit of the system applies, which is at least the useful
+        // maximum.
         Self::of(limit.map_or(usize::MAX, |limit| {
             usize::try_from(limit).unwrap_or(usize::MAX)
         }))
@@ -69,7 +71,7 @@ impl Shares {
     }
 }
 
-/// One place there is always: without descriptors nothing works anyway.
+/// Limits a number, with a minimum of 1: without descriptors nothing works anyway.
 const fn at_most(number: usize, most: usize) -> usize {
     if number == 0 {
         1
@@ -80,7 +82,7 @@ const fn at_most(number: usize, most: usize) -> usize {
     }
 }
 
-/// The connections of a listener in the order in which they came.
+/// The connections of a listener in the order of arrival.
 #[derive(Debug)]
 pub(crate) struct Crowd {
     places: Places,
@@ -94,7 +96,8 @@ struct Guest {
     task: AbortHandle,
 }
 
-/// Whether a connection has come to what it is for. Until then it gives way to another.
+/// Marks a connection that has completed its handshake or request. A connection without the mark
+/// may be closed in favour of another connection.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Settled(Arc<AtomicBool>);
 
@@ -108,14 +111,15 @@ impl Settled {
     }
 }
 
-/// What became of a connection.
+/// Outcome of a new connection.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Admission {
-    /// It is let in.
+    /// The connection is admitted.
     Free,
-    /// It is let in, and the oldest that had not come to anything was ended, which was from there.
+    /// The connection is admitted; the oldest unsettled connection, which was from this address,
+    /// was closed.
     InPlaceOf(IpAddr),
-    /// All there are have come to something, and so many there may be.
+    /// The connection is refused: no other connection may be closed for it, and this is the limit.
     Full(usize),
 }
 
@@ -127,7 +131,7 @@ impl Crowd {
         }
     }
 
-    /// Begins a connection from an address, unless there is no place for it.
+    /// Admits a connection from an address and starts its task, or refuses the connection.
     pub(crate) fn admit(
         &mut self,
         address: IpAddr,
@@ -212,14 +216,15 @@ mod tests {
         assert_eq!(come(A, true).0, Admission::Free);
         assert_eq!(come(B, false).0, Admission::Free);
         let (_, silent) = come(A, false);
-        // The share of one address: its own silent one gives way, not that of another.
+        // The address has used its share: its own idle connection is closed, not that of another
+        // address.
         let (admission, second) = come(A, false);
         assert_eq!(admission, Admission::InPlaceOf(A));
         drop(silent);
         second.unwrap().settle();
         assert_eq!(come(A, false).0, Admission::Full(2));
         assert_eq!(come(B, true).0, Admission::Free);
-        // All places are taken: the one that is left to say nothing gives way.
+        // All connections are in use: the remaining idle connection is closed.
         let c = IpAddr::V4(std::net::Ipv4Addr::new(10, 0, 0, 3));
         assert_eq!(come(c, true).0, Admission::InPlaceOf(B));
         assert_eq!(come(c, false).0, Admission::Full(4));

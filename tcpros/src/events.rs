@@ -1,6 +1,7 @@
-//! What this crate tells operators, one function per event.
+//! Log messages of this crate, with a function per event.
 //!
-//! DEBUG: something ended or was retried as it should. WARN: a peer or the set-up is wrong, and we go on.
+//! DEBUG: something ended or was retried as expected. WARN: a peer or the set-up is wrong, and the
+//! node continues.
 
 use std::fmt::Display;
 use std::net::IpAddr;
@@ -69,7 +70,7 @@ pub(crate) fn shutdown_asked(reason: &str) {
     warn!(reason, "told to shut down, as `rosnode kill` does");
 }
 
-/// `more`: how many of these lines were held back since the last.
+/// `more`: the number of suppressed entries since the last entry.
 pub(crate) fn name_kept(name: &str, more: u64) {
     warn!(
         name,
@@ -78,7 +79,7 @@ pub(crate) fn name_kept(name: &str, more: u64) {
     );
 }
 
-/// `missing` registrations, of which `first` is one.
+/// `missing`: the number of lost registrations; `first` is an example.
 pub(crate) fn registrations_lost(uri: &str, first: &str, missing: usize) {
     warn!(
         ROS_MASTER_URI = uri,
@@ -108,7 +109,7 @@ pub(crate) fn message_too_long(topic: &str, bytes: usize) {
     );
 }
 
-/// `more`: how many of these lines were held back since the last.
+/// `more`: the number of suppressed entries since the last entry.
 pub(crate) fn service_failed(service: &str, client: &str, why: &str, more: u64) {
     warn!(service, client, why, more, "a request was given up");
 }
@@ -117,7 +118,7 @@ pub(crate) fn publisher_joined(topic: &str, publisher: &str) {
     debug!(topic, publisher, "connected to a publisher");
 }
 
-/// `more`: how many of these lines were held back since the last.
+/// `more`: the number of suppressed entries since the last entry.
 pub(crate) fn link_failed(
     (topic, uri): (&str, &str),
     node: Option<&str>,
@@ -150,7 +151,7 @@ pub(crate) fn link_waits(topic: &str, more: u64) {
     );
 }
 
-/// `named`: how many publishers the topic has as the master says, or whoever called in its name.
+/// `named`: the number of publishers of the topic in the list from the master or another caller.
 pub(crate) fn too_many_publishers(topic: &str, named: usize, limit: usize, more: u64) {
     warn!(
         topic,
@@ -165,7 +166,7 @@ pub(crate) fn link_retried(topic: &str, uri: &str, error: &dyn Display, wait: Du
     debug!(topic, uri, %error, ?wait, "a connection to a publisher failed or ended");
 }
 
-/// What a listener could not take, with one line per ten seconds.
+/// Rate limits for logs of refused connections: an entry per kind in ten seconds.
 pub(crate) struct Refusals {
     server: &'static str,
     accept: Throttle,
@@ -184,7 +185,7 @@ impl Refusals {
         }
     }
 
-    /// Running out of file descriptors must not become a busy loop: waits a little.
+    /// Waits briefly, so that a lack of file descriptors does not cause a busy loop.
     pub(crate) async fn accept_failed(&mut self, error: &std::io::Error) {
         if let Some(more) = self.accept.admit(clock::now()) {
             warn!(server = self.server, %error, more, "a connection could not be accepted");
@@ -203,7 +204,7 @@ impl Refusals {
         }
     }
 
-    /// A connection was ended for another's sake.
+    /// Logs that a connection was closed in favour of another connection.
     pub(crate) fn gave_way(&mut self, address: IpAddr) {
         if let Some(more) = self.crowd.admit(clock::now()) {
             warn!(

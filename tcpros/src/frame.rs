@@ -1,16 +1,17 @@
-//! Messages out of a TCP stream: UInt32 length, little endian, then that many bytes.
+//! Decodes messages from a TCP stream: UInt32 length, little endian, then that many bytes.
 
 use bytes::{Bytes, BytesMut};
 use thiserror::Error;
 
-/// A read buffer that hands out complete messages without copying them.
+/// A read buffer that returns complete messages without copying them.
 #[derive(Debug)]
 pub(crate) struct Frames {
     buffer: BytesMut,
     limit: usize,
-    /// What one read may take; grows while reads fill it, so that idle links stay small.
+    /// Size of a read; grows while reads fill it, so that idle links stay small.
     window: usize,
-    /// What the last message took, its length included: the next one is likely to need as much.
+    /// Size of the last message with its length field: the next message is likely to have the same
+    /// size.
     last: usize,
 }
 
@@ -24,7 +25,7 @@ impl Frames {
         }
     }
 
-    /// The next complete message, if its last byte is here.
+    /// Returns the next complete message if its last byte was received.
     pub(crate) fn next(&mut self) -> Result<Option<Bytes>, FrameTooLong> {
         let Some((len, _)) = self.buffer.split_first_chunk::<4>() else {
             return Ok(None);
@@ -46,20 +47,22 @@ impl Frames {
         Ok(Some(frame.slice(4..)))
     }
 
-    /// Whether no part of another message is here.
+    /// Returns whether the buffer holds no part of another message.
     pub(crate) fn is_empty(&self) -> bool {
         self.buffer.is_empty()
     }
 
-    /// The buffer with room for the next read: for what is missing of a message, or for one like the last, so that
-    /// messages of one size are not read in two pieces and moved. What a peer announces is believed only as far as
-    /// it delivers: the buffer at most doubles past `TRUSTED`.
+    /// Returns the buffer with space for the next read: for the missing part of a message, or for a
+    /// message of the size of the last message. Messages of equal size are thus neither read in two
+    /// pieces nor moved. An announced length is trusted only as far as the peer delivers: the
+    /// buffer at most doubles past `TRUSTED`.
     pub(crate) fn room(&mut self) -> &mut BytesMut {
         let missing = match self.buffer.split_first_chunk::<4>() {
             Some((len, rest)) => usize::try_from(u32::from_le_bytes(*len))
                 .unwrap_or(usize::MAX)
                 .saturating_sub(rest.len()),
-            // A byte more: a read that leaves room has emptied the socket, and needs no second one to find that out.
+            // An additional byte: a read that does not fill the space has emptied the socket, so
+            // that no second read is needed to detect this.
             None => (self.last + 1).saturating_sub(self.buffer.len()),
         };
         let trusted = TRUSTED.max(self.buffer.len());
@@ -70,7 +73,7 @@ impl Frames {
         &mut self.buffer
     }
 
-    /// Notes how much of the room a read has used.
+    /// Adapts the read size to the number of bytes of a read.
     pub(crate) fn filled(&mut self, read: usize) {
         if read >= self.window {
             self.window = (self.window * 2).min(MAX_WINDOW);
@@ -78,7 +81,7 @@ impl Frames {
     }
 }
 
-/// The peer announced a message longer than this side takes.
+/// The peer announced a message longer than the limit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Error)]
 #[error("the peer announced a message of {announced} bytes, more than the limit of {limit}")]
 pub(crate) struct FrameTooLong {

@@ -1,6 +1,7 @@
-//! The connection header: what two TCPROS peers tell one another before the first message.
+//! The connection header, which two TCPROS peers exchange before the first message.
 //!
-//! On the wire: UInt32 length of all fields, then per field UInt32 length and `name=value`, little endian.
+//! On the wire: UInt32 length of all fields, then per field UInt32 length and `name=value`, little
+//! endian.
 
 use std::collections::BTreeMap;
 
@@ -14,8 +15,9 @@ pub struct ConnectionHeader {
 }
 
 impl ConnectionHeader {
-    /// Reads the fields of a header without its leading total length. Text that is not UTF-8 (old message
-    /// definitions have Latin-1 comments) is kept with U+FFFD in place of the bytes that do not decode.
+    /// Reads the fields of a header without its leading total length. Text that is not UTF-8 (old
+    /// message definitions have Latin-1 comments) is kept with U+FFFD in place of the bytes that do
+    /// not decode.
     pub fn parse(mut bytes: &[u8]) -> Result<Self, HeaderError> {
         let mut fields = BTreeMap::new();
         while !bytes.is_empty() {
@@ -40,7 +42,7 @@ impl ConnectionHeader {
         Ok(Self { fields })
     }
 
-    /// Reads a whole header, which must arrive within the caller's time limit.
+    /// Reads a whole header. The caller has to apply a time limit.
     pub(crate) async fn read(stream: &mut (impl AsyncRead + Unpin)) -> Result<Self, HeaderError> {
         let len = stream.read_u32_le().await?;
         if len > MAX_HEADER {
@@ -51,9 +53,10 @@ impl ConnectionHeader {
         Self::parse(&bytes)
     }
 
-    /// The header as on the wire, with its leading total length.
+    /// Returns the header as on the wire, with its leading total length.
     ///
-    /// Fails when it is longer than what peers accept, 1 MiB.
+    /// # Errors
+    /// Fails if the header is longer than the limit of peers, 1 MiB.
     pub fn encode(&self) -> Result<Vec<u8>, HeaderError> {
         let mut out = vec![0; 4];
         for (name, value) in &self.fields {
@@ -69,44 +72,45 @@ impl ConnectionHeader {
         Ok(out)
     }
 
-    /// Adds a field, replacing one of that name.
+    /// Adds a field, replacing a field of the same name.
     #[must_use]
     pub fn with(mut self, name: &str, value: impl Into<String>) -> Self {
         self.fields.insert(name.to_owned(), value.into());
         self
     }
 
-    /// A field by name.
+    /// Returns a field by name.
     pub fn get(&self, name: &str) -> Option<&str> {
         self.fields.get(name).map(String::as_str)
     }
 
-    /// `callerid`: the resolved name of the node that sent the header, or nothing.
+    /// Returns `callerid`, the resolved name of the node that sent the header, or an empty text.
     pub fn caller_id(&self) -> &str {
         self.get("callerid").unwrap_or("")
     }
 
-    /// `type`, such as `std_msgs/String`; `*` stands for any.
+    /// Returns `type`, such as `std_msgs/String`; `*` stands for any type.
     pub fn type_name(&self) -> Option<&str> {
         self.get("type")
     }
 
-    /// `md5sum` of the type; `*` stands for any.
+    /// Returns `md5sum` of the type; `*` stands for any type.
     pub fn md5sum(&self) -> Option<&str> {
         self.get("md5sum")
     }
 
-    /// `message_definition`: the text of the type with those it contains appended.
+    /// Returns `message_definition`, the text of the type followed by the texts of the contained
+    /// types.
     pub fn message_definition(&self) -> Option<&str> {
         self.get("message_definition")
     }
 
-    /// Whether the publisher repeats its last message to late subscribers.
+    /// Returns whether the publisher repeats its last message to late subscribers.
     pub fn latching(&self) -> bool {
         self.get("latching") == Some("1")
     }
 
-    /// All fields in the order of their names.
+    /// Returns all fields in the order of their names.
     pub fn iter(&self) -> impl Iterator<Item = (&str, &str)> {
         self.fields
             .iter()
@@ -114,20 +118,20 @@ impl ConnectionHeader {
     }
 }
 
-/// Why a connection header could not be read or written.
+/// Error while reading or writing a connection header.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum HeaderError {
-    /// A length points past the end.
+    /// A length exceeds the header.
     #[error("a field of the connection header runs past its end")]
     Truncated,
     /// A field is not `name=value`.
     #[error("a field of the connection header has no `=`")]
     NoEquals,
-    /// Longer than 1 MiB.
+    /// The header is longer than 1 MiB.
     #[error("the connection header has {0} bytes, more than {MAX_HEADER}")]
     TooLong(u32),
-    /// More fields than a sane peer sends.
+    /// The header has more fields than any valid peer sends.
     #[error("the connection header has more than {MAX_FIELDS} fields")]
     TooManyFields,
     /// The connection failed while the header was read.
@@ -135,7 +139,7 @@ pub enum HeaderError {
     Io(#[from] std::io::Error),
 }
 
-/// What a peer says, short enough for an answer and a log line.
+/// Clips a text of a peer to the length for replies and log entries.
 pub(crate) fn clipped(text: &str) -> &str {
     let rest = text.char_indices().nth(MAX_QUOTED);
     rest.map_or(text, |(end, _)| text.split_at(end).0)

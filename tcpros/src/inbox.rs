@@ -1,4 +1,4 @@
-//! One consumer for the messages of many subscriptions.
+//! A consumer for the messages of many subscriptions.
 
 use std::collections::{HashMap, VecDeque};
 use std::future::poll_fn;
@@ -11,55 +11,57 @@ use bytes::Bytes;
 use crate::header::ConnectionHeader;
 use crate::outbox::{Limit, lock};
 
-/// A message as it came from a publisher.
+/// A message received from a publisher.
 #[derive(Clone, Debug)]
 pub struct Message {
     /// The serialized message, without its length.
     pub bytes: Bytes,
-    /// Who sent it.
+    /// The publisher.
     pub peer: Arc<Peer>,
-    /// When its last byte was read. Messages that came in one piece are a nanosecond apart, so that the time also
-    /// tells them from one another.
+    /// Time at which the last byte of the message was read. Messages from the same read differ by a
+    /// nanosecond, so that the time also identifies a message.
     pub received: SystemTime,
 }
 
 /// The node at the other end of a connection: a publisher, or a client of a service.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Peer {
-    /// Its resolved node name.
+    /// Resolved name of the node.
     pub caller_id: String,
-    /// What it said of itself and of the topic or service.
+    /// Connection header of the node, which describes the node and the topic or service.
     pub header: ConnectionHeader,
 }
 
-/// What a subscription reports.
+/// Event of a subscription.
 #[derive(Clone, Debug)]
 pub enum InboxEvent {
     /// A message, in the order of its publisher.
     Message(Message),
     /// A connection to a publisher was made or ended.
     Peer {
-        /// True when it was made.
+        /// True if the connection was made.
         connected: bool,
-        /// How many publishers this subscription is connected to now.
+        /// Number of publishers that this subscription is connected to.
         publishers: usize,
-        /// Whose connection it is.
+        /// The publisher.
         peer: Arc<Peer>,
     },
-    /// So many messages were lost since the last report because the consumer did not keep up: the oldest give way.
+    /// Number of messages lost since the last event because the consumer did not keep up. The
+    /// oldest messages are dropped.
     Dropped(u64),
 }
 
-/// Receives from many subscriptions, each with a bounded queue of its own, in turns. `K` tells them apart.
+/// Receives in turns from many subscriptions, each with a bounded queue of its own. `K` identifies
+/// the subscription.
 ///
-/// A subscription that floods fills its own queue only and gets one turn in a round.
+/// A subscription with too many messages fills only its own queue and gets one turn in a round.
 #[derive(Debug)]
 pub struct Inbox<K> {
     shared: Arc<Shared<K>>,
 }
 
 impl<K: Clone + Send + 'static> Inbox<K> {
-    /// An inbox without subscriptions: `recv` waits until there are some.
+    /// Creates an inbox without subscriptions: `recv` waits until a subscription has an event.
     pub fn new() -> Self {
         let state = State {
             slots: HashMap::new(),
@@ -74,12 +76,12 @@ impl<K: Clone + Send + 'static> Inbox<K> {
         }
     }
 
-    /// The next event. Cancel-safe: an event is taken only when it is returned.
+    /// Returns the next event. Cancel-safe: an event is removed only when it is returned.
     pub async fn recv(&mut self) -> (K, InboxEvent) {
         poll_fn(|cx| self.poll_recv(cx)).await
     }
 
-    /// The next event for callers with a poll loop of their own.
+    /// Polls for the next event, for callers with a poll loop of their own.
     pub fn poll_recv(&mut self, cx: &mut Context<'_>) -> Poll<(K, InboxEvent)> {
         let mut state = lock(&self.shared.state);
         if let Some(event) = state.next() {
@@ -95,7 +97,7 @@ impl<K: Clone + Send + 'static> Inbox<K> {
         Poll::Pending
     }
 
-    /// The next event if there is one.
+    /// Returns the next event if an event is queued.
     pub fn try_recv(&mut self) -> Option<(K, InboxEvent)> {
         lock(&self.shared.state).next()
     }
@@ -118,16 +120,16 @@ impl<K: Clone + Send + 'static> Default for Inbox<K> {
     }
 }
 
-/// Where a subscription's connections put what they read.
+/// Receiver for the messages of a subscription's connections.
 pub(crate) trait Deliver: Send + Sync {
-    /// Queues a message and returns how many older ones gave way.
+    /// Queues a message and returns the number of older messages that were dropped.
     fn message(&self, message: Message) -> u64;
     fn peer(&self, connected: bool, publishers: usize, peer: Arc<Peer>);
-    /// Forgets the subscription with all it has queued.
+    /// Removes the subscription and its queue.
     fn close(&self);
 }
 
-/// The way of one subscription into an inbox.
+/// Entry of one subscription into an inbox.
 pub(crate) struct Entrance<K> {
     shared: Arc<Shared<K>>,
     id: u64,
@@ -154,7 +156,7 @@ impl<K: Clone + Send + 'static> Deliver for Entrance<K> {
         let removed = state.slots.remove(&self.id);
         state.ready.retain(|id| *id != self.id);
         drop(state);
-        // Keys and messages may have destructors of their own: not under the lock.
+        // Keys and messages may have destructors of their own, which must not run under the lock.
         drop(removed);
     }
 }
@@ -188,7 +190,7 @@ struct Shared<K> {
 #[derive(Debug)]
 struct State<K> {
     slots: HashMap<u64, Slot<K>>,
-    /// The slots that have something, in the order of their turns.
+    /// The slots with queued events, in the order of their turns.
     ready: VecDeque<u64>,
     waker: Option<Waker>,
     next_id: u64,
@@ -217,7 +219,8 @@ impl<K: Clone> State<K> {
 struct Slot<K> {
     key: K,
     limit: Limit,
-    /// Messages and changes of peers in order; at most `limit.messages` of the one and `MAX_PEERS` of the other.
+    /// Messages and peer events in order, with at most `limit.messages` messages and `MAX_PEERS`
+    /// peer events.
     queue: VecDeque<InboxEvent>,
     messages: usize,
     bytes: usize,
@@ -265,7 +268,8 @@ impl<K> Slot<K> {
         }
     }
 
-    /// A peer that flaps while nobody listens must not fill the memory: old changes go, as the count is absolute.
+    /// Queues a peer event. A peer that reconnects often while nothing is consumed must not fill
+    /// the memory: the oldest peer events are dropped, as the publisher count is absolute.
     fn peer(&mut self, event: InboxEvent) {
         if self.queue.len() - self.messages >= MAX_PEERS {
             let oldest = self

@@ -1,22 +1,27 @@
 //! A ROS 1 node on tokio.
 //!
-//! A [`Node`] registers with a ROS master, publishes and subscribes topics and offers and calls services of any type
-//! as bytes, and answers the slave API. It knows no message type: types are given with their checksum and text, or
-//! learned from the peer's [`ConnectionHeader`].
+//! A [`Node`] registers with a ROS master, publishes and subscribes to topics, offers and calls
+//! services, and serves the slave API. Messages of any type are passed as bytes. The node knows no
+//! message type: a type is given with its checksum and text, or learned from the peer's
+//! [`ConnectionHeader`].
 //!
-//! - It needs no master to start: it registers when one comes, and again after a restart. Connections between nodes
-//!   do not depend on the master and stay.
-//! - Every queue is bounded in messages and in bytes, drops its oldest messages and counts them. A slow peer costs
-//!   nobody but itself.
-//! - What peers send is checked; a peer that breaks the protocol loses its connection, with a line in the log.
-//! - What peers can open leaves file descriptors for the node itself: of `RLIMIT_NOFILE` subscribers and clients have three
-//!   eighths, callers of the slave API one, and publishers three. A process with several nodes needs a limit for all.
-//! - It runs on a `current_thread` runtime as well as on several threads. A consumer on a `current_thread` runtime
-//!   is served fastest when it is a spawned task: waking the future given to `block_on` costs a system call.
+//! - The node starts without a master: it registers when a master is available, and again after a
+//!   restart of the master. Connections between nodes do not depend on the master and stay.
+//! - Every queue is bounded in messages and in bytes, drops its oldest messages and counts them. A
+//!   slow peer affects only itself.
+//! - Messages of peers are checked; a peer that violates the protocol is disconnected with a log
+//!   entry.
+//! - Connections of peers leave file descriptors for the node itself: of `RLIMIT_NOFILE`
+//!   subscribers and clients have three eighths, callers of the slave API one eighth, and
+//!   publishers three eighths. A process with several nodes needs a limit for all of them.
+//! - The node runs on a `current_thread` runtime as well as on several threads. A consumer on a
+//!   `current_thread` runtime is served fastest if it is a spawned task: waking the future given to
+//!   `block_on` costs a system call.
 //!
-//! To read the code: `node` has the state, `registrar` the master's side of it, `publisher` and `topic_server` what
-//! goes out, `subscription` and `link` what comes in, `inbox` where it is taken, `service` what is called,
-//! `crowd` who may be connected, `parameters` what the master keeps. [`actionlib`] stands on topics alone.
+//! Guide to the code: `node` has the state, and `registrar` keeps the master up to date.
+//! `publisher` and `topic_server` send messages; `subscription` and `link` receive messages into an
+//! `inbox`. `service` has services, `crowd` the limits of connections, and `parameters` the
+//! parameter server. [`actionlib`] is built on topics alone.
 
 pub mod actionlib;
 mod clock;

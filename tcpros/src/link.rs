@@ -1,4 +1,5 @@
-//! The way to one publisher of one topic: asking it for its address, connecting, reading, and all of it again.
+//! The link to a publisher of a topic: requesting its address, connecting, reading, and
+//! reconnecting.
 
 use std::os::fd::AsRawFd;
 use std::sync::atomic::Ordering;
@@ -25,17 +26,17 @@ use crate::rpc::{self, Endpoint, RpcError};
 use crate::subscription::{Feed, LinkState};
 use crate::xmlrpc::Value;
 
-/// What all links of a node share.
+/// State shared by all links of a node.
 #[derive(Debug)]
 pub(crate) struct LinkContext {
     caller_id: String,
     max_message: usize,
     pub(crate) master: Master,
-    /// How many publishers one topic is connected to.
+    /// Maximum number of connected publishers of a topic.
     pub(crate) publishers_of_topic: usize,
-    /// One for each publisher that is connected or being connected.
+    /// A permit for each publisher that is connected or being connected.
     places: Semaphore,
-    /// Lines of the log about publishers that cannot be reached.
+    /// Rate limit for log entries about unreachable publishers.
     failures: Mutex<Throttle>,
     crowded: Mutex<Throttle>,
 }
@@ -58,7 +59,7 @@ impl LinkContext {
         }
     }
 
-    /// Waits for a connection to be allowed, in the order of those that want one.
+    /// Waits for the permission to connect, in the order of the requests.
     async fn place(&self, topic: &str) -> Option<SemaphorePermit<'_>> {
         if let Ok(place) = self.places.try_acquire() {
             return Some(place);
@@ -66,11 +67,12 @@ impl LinkContext {
         if let Some(more) = lock(&self.crowded).admit(clock::now()) {
             events::link_waits(topic, more);
         }
-        // It is never closed.
+        // The semaphore is never closed.
         self.places.acquire().await.ok()
     }
 
-    /// Whether a line may be written about a publisher that cannot be reached, and how many were not before it.
+    /// Returns the number of suppressed log entries about unreachable publishers if an entry may be
+    /// written now.
     fn may_tell(&self) -> Option<u64> {
         let mut failures = lock(&self.failures);
         let more = failures.admit(clock::now());
@@ -83,7 +85,8 @@ impl LinkContext {
     }
 }
 
-/// Keeps a subscription connected to one publisher until the master no longer names it. A task of its own.
+/// Keeps a subscription connected to a publisher until the master no longer lists the publisher.
+/// Runs as a task of its own.
 pub(crate) async fn run(
     feed: Arc<Feed>,
     context: Arc<LinkContext>,
@@ -224,7 +227,8 @@ async fn shake_hands(
     }
 }
 
-/// Delivers what the publisher sends until the connection ends, and returns how it ended.
+/// Delivers the messages of the publisher until the connection ends, and returns the reason of the
+/// end.
 async fn follow(
     mut stream: TcpStream,
     peer: Arc<Peer>,
@@ -248,8 +252,8 @@ async fn follow(
             }
             Err(error) => return LinkError::Io(error),
         }
-        // One look at the clock serves all messages that this read completes. They still differ: a stamp tells one
-        // sample from the next.
+        // A reading of the clock serves all messages that this read completes. The stamps still
+        // differ, because a stamp identifies a sample.
         let mut received = clock::utc();
         loop {
             match frames.next() {
@@ -263,7 +267,8 @@ async fn follow(
                     });
                     received += Duration::from_nanos(1);
                     if ahead >= TURN {
-                        // One read may bring more than the inbox holds: its consumer gets to run in between.
+                        // A read may contain more than the inbox holds: the consumer must be able
+                        // to run in between.
                         ahead = 0;
                         tokio::task::yield_now().await;
                     }
@@ -278,7 +283,8 @@ async fn follow(
     }
 }
 
-/// Small messages leave at once, and a peer that has silently gone is noticed in minutes instead of never.
+/// Sets the socket options: small messages are sent without delay, and keepalive detects a lost
+/// peer in minutes.
 pub(crate) fn prepare(stream: &TcpStream) -> std::io::Result<()> {
     stream.set_nodelay(true)?;
     let keepalive = TcpKeepalive::new()
@@ -288,7 +294,7 @@ pub(crate) fn prepare(stream: &TcpStream) -> std::io::Result<()> {
     SockRef::from(stream).set_tcp_keepalive(&keepalive)
 }
 
-/// A connection as `rosnode info` reads it.
+/// Returns the description of a connection for `rosnode info`.
 pub(crate) fn transport_info(stream: &TcpStream) -> String {
     match (stream.local_addr(), stream.peer_addr()) {
         (Ok(local), Ok(peer)) => format!(
@@ -296,12 +302,12 @@ pub(crate) fn transport_info(stream: &TcpStream) -> String {
             local.port(),
             stream.as_raw_fd()
         ),
-        // It broke off just now.
+        // The connection has just failed.
         _ => String::new(),
     }
 }
 
-/// Why there is no connection to a publisher at the moment.
+/// Reason for which a publisher is not connected.
 #[derive(Debug, Error)]
 enum LinkError {
     #[error("it does not tell its address: {0}")]
@@ -327,7 +333,7 @@ enum LinkError {
 }
 
 impl LinkError {
-    /// Whether an operator must do something, however short it lasts.
+    /// Returns whether the error needs an action of an operator, even if it occurs once.
     const fn is_fault(&self) -> bool {
         matches!(
             self,
@@ -350,24 +356,26 @@ impl From<RpcError> for LinkError {
     }
 }
 
-/// Work between two turns of the consumer: messages, and pages of those.
+/// Amount of work between two turns of the consumer, in messages plus their pages.
 const TURN: usize = 64;
 const REQUEST_LIMIT: Duration = Duration::from_secs(5);
 const CONNECT_LIMIT: Duration = Duration::from_secs(5);
 const HANDSHAKE_LIMIT: Duration = Duration::from_secs(5);
 const FIRST_WAIT: Duration = Duration::from_millis(100);
 const LAST_WAIT: Duration = Duration::from_secs(20);
-/// Failures in a row before the first warning: a publisher that just starts or ends is no news.
+/// Number of consecutive failures before the first warning: a publisher that is starting or
+/// stopping is not worth a warning.
 const PATIENCE: u32 = 4;
 const LOG_PERIOD: Duration = Duration::from_secs(60);
-/// Publishers that cannot be reached and are named in the log per period; the others are counted.
+/// Number of unreachable publishers named in the log per period; the others are counted.
 const FAILURES_LOGGED: u32 = 20;
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    /// Requirement: small messages are not held back, and a peer that is gone without a word is noticed.
+    /// Requirement: small messages are not delayed, and a peer that is lost without a message is
+    /// detected.
     #[tokio::test]
     async fn a_connection_has_no_delay_and_is_kept_alive() {
         let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();

@@ -1,4 +1,4 @@
-//! The master API as its client sees it.
+//! The client of the master API.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -10,46 +10,48 @@ use thiserror::Error;
 use crate::rpc::{self, Endpoint, RpcError};
 use crate::xmlrpc::Value;
 
-/// Who publishes, subscribes and offers what, as the master knows it.
+/// The publishers, subscribers and services that are registered with the master.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Graph {
     /// Names of the publishing nodes by topic.
     pub publishers: BTreeMap<String, Vec<String>>,
     /// Names of the subscribing nodes by topic.
     pub subscribers: BTreeMap<String, Vec<String>>,
-    /// Names of the nodes that offer services, by service. The master keeps one for each: the last that registered.
+    /// Names of the nodes that offer services, by service. The master keeps a node per service:
+    /// the last that registered.
     pub services: BTreeMap<String, Vec<String>>,
-    /// Type names by topic. A topic that has only subscribers of any type says `*` or is missing.
+    /// Type names by topic. A topic that has only subscribers of any type has `*` or is missing.
     pub types: BTreeMap<String, String>,
 }
 
 impl Graph {
-    /// Asks the master at `uri` (`http://host:port`) without becoming a node of its graph. Takes as long as two calls
-    /// may at most, 3 s each.
+    /// Reads the graph from the master at `uri` (`http://host:port`) without registering a node.
+    /// Takes at most two calls of 3 s each.
     ///
     /// # Errors
-    /// The URI is none, the master cannot be reached, or answers what no master does.
+    /// Fails if the URI is invalid, if the master cannot be reached, or if its reply violates the
+    /// API.
     pub async fn of_master(uri: &str, caller_id: &str) -> Result<Self, MasterError> {
         Master::at(uri, caller_id)?.graph().await
     }
 }
 
-/// One master, called in the name of one node.
+/// A master, called with the name of a node.
 #[derive(Clone, Debug)]
 pub(crate) struct Master {
     endpoint: Endpoint,
     uri: String,
     caller_id: String,
     caller_uri: String,
-    /// Whether it turned out not to take several calls in one request.
+    /// Whether the master has refused several calls in a single request.
     one_by_one: Arc<AtomicBool>,
 }
 
-/// One call: the method, and its parameters without the caller id.
+/// A call: the method, and its parameters without the caller id.
 pub(crate) type Request = (&'static str, Vec<Value>);
 
 impl Master {
-    /// That of the URI, for one that is no node of its graph.
+    /// Returns a client of the master at a URI, for a caller that is not a node of its graph.
     pub(crate) fn at(uri: &str, caller_id: &str) -> Result<Self, MasterError> {
         let endpoint = Endpoint::parse(uri).ok_or(RpcError::Uri)?;
         Ok(Self::new(
@@ -75,7 +77,8 @@ impl Master {
         }
     }
 
-    /// Whether other nodes are tried by IPv6 before IPv4, as this one is told to.
+    /// Returns whether the IPv6 addresses of other nodes are tried before their IPv4 addresses, as
+    /// configured for this node.
     pub(crate) const fn prefers_ipv6(&self) -> bool {
         self.endpoint.prefers_ipv6()
     }
@@ -91,7 +94,7 @@ impl Master {
             .ok_or(MasterError::Shape("getPid"))
     }
 
-    /// The URI registered for a node, `None` when the master knows no such node.
+    /// Returns the URI registered for a node, or `None` if the node is unknown.
     pub(crate) async fn lookup_node(&self, name: &str) -> Result<Option<String>, MasterError> {
         self.lookup("lookupNode", name).await
     }
@@ -116,7 +119,7 @@ impl Master {
         )
     }
 
-    /// Its result is read by [`publishers`].
+    /// Returns the registration of a subscriber; its result is decoded by [`publishers`].
     pub(crate) fn register_subscriber(&self, topic: &str, type_name: &str) -> Request {
         let uri = self.caller_uri.as_str();
         (
@@ -150,7 +153,7 @@ impl Master {
         )
     }
 
-    /// The URI registered for a service, `None` when the master knows no such service.
+    /// Returns the URI registered for a service, or `None` if the service is unknown.
     pub(crate) async fn lookup_service(
         &self,
         service: &str,
@@ -168,7 +171,7 @@ impl Master {
         })
     }
 
-    /// The graph without the types.
+    /// Reads the graph without the types.
     pub(crate) async fn registrations(&self) -> Result<Graph, MasterError> {
         let state = self.call("getSystemState", vec![]).await?;
         let [publishers, subscribers, services, ..] = state.as_array().unwrap_or_default() else {
@@ -183,7 +186,8 @@ impl Master {
         })
     }
 
-    /// The name of the publisher of a topic that has this URI. Looks at a few publishers only: it is for messages.
+    /// Returns the name of the publisher of a topic with this URI. Checks only a few publishers,
+    /// because the name is used only in log messages.
     pub(crate) async fn name_of(&self, topic: &str, uri: &str) -> Option<String> {
         let graph = self.graph().await.ok()?;
         for name in graph.publishers.get(topic)?.iter().take(8) {
@@ -194,12 +198,13 @@ impl Master {
         None
     }
 
-    /// Makes several calls, in their order, and returns a result for each: in one request (`system.multicall`, an
-    /// extension of XML-RPC that rosmaster has), because to rosmaster a connection costs more than a registration. A
-    /// master without it is called one by one.
+    /// Makes several calls in order and returns a result for each call. The calls use one request
+    /// (`system.multicall`, an extension of XML-RPC that rosmaster supports), because to rosmaster
+    /// a connection costs more than a registration. A master without this method receives single
+    /// calls.
     ///
     /// # Errors
-    /// When the master cannot be reached; some of the calls may have been made then.
+    /// Fails if the master cannot be reached; some of the calls may have been made then.
     pub(crate) async fn call_all(
         &self,
         requests: Vec<Request>,
@@ -246,7 +251,8 @@ impl Master {
         Ok(replies.into_iter().zip(methods).map(unwrap_one).collect())
     }
 
-    /// Calls with the caller id in front and unwraps `[code, message, result]`.
+    /// Makes a call with the caller id as its first parameter and unwraps `[code, message,
+    /// result]`.
     pub(crate) async fn call(
         &self,
         method: &'static str,
@@ -258,7 +264,7 @@ impl Master {
     }
 }
 
-/// One answer of several: its result in an array of its own, or a struct that says why there is none.
+/// Unwraps a reply of a multicall: its result in an array of its own, or a struct with a fault.
 fn unwrap_one((reply, method): (Value, &'static str)) -> Result<Value, MasterError> {
     let Value::Array(result) = reply else {
         return Err(MasterError::Shape(method));
@@ -267,12 +273,12 @@ fn unwrap_one((reply, method): (Value, &'static str)) -> Result<Value, MasterErr
     unwrap_triple(result, method)
 }
 
-/// The URIs of a topic's publishers, as `registerSubscriber` answers.
+/// Decodes the URIs of a topic's publishers from the reply to `registerSubscriber`.
 pub(crate) fn publishers(result: &Value) -> Result<Vec<String>, MasterError> {
     strings(result).ok_or(MasterError::Shape("registerSubscriber"))
 }
 
-/// Unwraps what every ROS API returns: status code, status message, result.
+/// Unwraps the reply of every ROS API: status code, status message, result.
 pub(crate) fn unwrap_triple(reply: Value, method: &'static str) -> Result<Value, MasterError> {
     let Value::Array(items) = reply else {
         return Err(MasterError::Shape(method));
@@ -290,22 +296,22 @@ pub(crate) fn unwrap_triple(reply: Value, method: &'static str) -> Result<Value,
     }
 }
 
-/// Why the master, or another node's API, gave no result.
+/// Error of a call of the master or of another node's API.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum MasterError {
     /// The call itself failed.
     #[error(transparent)]
     Rpc(#[from] RpcError),
-    /// The peer answered with an error of its own.
+    /// The peer replied with an error of its own.
     #[error("{method} was refused: {message}")]
     Refused {
-        /// The method called.
+        /// The called method.
         method: &'static str,
-        /// What the peer says.
+        /// The status message of the peer.
         message: String,
     },
-    /// The peer's answer is not what the ROS API prescribes.
+    /// The reply of the peer violates the ROS API.
     #[error("the answer to {0} is not of the form ROS prescribes")]
     Shape(&'static str),
 }
@@ -339,7 +345,7 @@ mod tests {
     use super::*;
     use crate::xmlrpc::{Call, Fault, Response};
 
-    /// A master that answers as `answer` says, and the methods it was asked for.
+    /// Returns a master that replies with `answer`, and the list of the called methods.
     async fn master(
         answer: fn(&Call) -> Response,
     ) -> (Master, Arc<Mutex<Vec<String>>>, JoinSet<()>) {

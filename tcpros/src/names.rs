@@ -1,4 +1,4 @@
-//! Graph resource names: what `chatter`, `/chatter`, `~chatter` and a remapping come to.
+//! Graph resource names: resolves `chatter`, `/chatter`, `~chatter` and remappings.
 
 use thiserror::Error;
 
@@ -11,7 +11,7 @@ pub(crate) struct Names {
 }
 
 impl Names {
-    /// Fails when the node's own name or namespace or a remapping is no graph name.
+    /// Fails if the node's own name or namespace or a remapping is not a graph name.
     pub(crate) fn new(
         name: &str,
         namespace: &str,
@@ -39,19 +39,20 @@ impl Names {
         Ok(names)
     }
 
-    /// The resolved name of the node itself.
+    /// Returns the resolved name of the node itself.
     pub(crate) fn node(&self) -> &str {
         &self.node
     }
 
-    /// A topic's name in the graph, remapped.
+    /// Returns the resolved name of a topic, with remappings applied.
     pub(crate) fn resolve(&self, name: &str) -> Result<String, NameError> {
         let name = self.expand(name)?;
         let remapped = self.remappings.iter().find(|(from, _)| *from == name);
         Ok(remapped.map_or(name, |(_, to)| to.clone()))
     }
 
-    /// A name for the master to search upwards: as it is, unless it is private or remapped and thus has its place.
+    /// Returns a name for the upward search of the master. The name is unchanged, except that a
+    /// private or remapped name is resolved.
     pub(crate) fn searched(&self, name: &str) -> Result<String, NameError> {
         let resolved = self.resolve(name)?;
         if name.starts_with(['~', '/']) || resolved != self.expand(name)? {
@@ -68,8 +69,8 @@ impl Names {
     }
 }
 
-/// A parameter's name as a node of this name means it, `/` included; for a master, which knows no remappings and takes
-/// more characters than graph names have.
+/// Resolves a parameter name relative to the calling node, `/` included. A master uses this
+/// function, because it knows no remappings and accepts more characters than graph names have.
 pub(crate) fn of_caller(name: &str, caller: &str) -> Result<String, NameError> {
     if name.is_empty() {
         return Err(NameError::Invalid(name.to_owned()));
@@ -91,7 +92,7 @@ fn full(name: &str, node: &str, namespace: &str) -> String {
     }
 }
 
-/// A full name without doubled slashes and one at the end; `None` for the root.
+/// Returns a full name without double or trailing slashes, or `None` for the root.
 fn canonical(full: &str) -> Option<String> {
     let mut clean = String::with_capacity(full.len());
     for part in full.split('/').filter(|part| !part.is_empty()) {
@@ -101,16 +102,16 @@ fn canonical(full: &str) -> Option<String> {
     (!clean.is_empty()).then_some(clean)
 }
 
-/// A name that is no graph resource name.
+/// Error for an invalid graph resource name.
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
 #[non_exhaustive]
 pub enum NameError {
-    /// Something other than a letter, `/` or `~`, then letters, digits, `_` and `/`.
+    /// Not a letter, `/` or `~` followed by letters, digits, `_` and `/`.
     #[error(
         "`{0}` is no ROS name: letters, digits, `_` and `/`, beginning with a letter, `/` or `~`"
     )]
     Invalid(String),
-    /// A node's name holds no `/`; that part is its namespace.
+    /// The name of a node contains no `/`; the part before it belongs to the namespace.
     #[error("`{0}` is no node name: put what stands before the last `/` into the namespace")]
     NodeName(String),
 }
@@ -123,7 +124,7 @@ fn join(namespace: &str, name: &str) -> String {
     )
 }
 
-/// Whether a name is one of ROS (`wiki.ros.org/Names`).
+/// Checks that a name is a valid ROS name (`wiki.ros.org/Names`).
 pub(crate) fn check(name: &str) -> Result<(), NameError> {
     let mut bytes = name.bytes();
     let head = bytes

@@ -1,4 +1,4 @@
-//! The node: what it publishes, subscribes and offers, and the tasks that serve it.
+//! The node: its topics and services, and the tasks that serve it.
 
 use std::collections::HashMap;
 use std::net::{IpAddr, SocketAddr};
@@ -32,10 +32,12 @@ use crate::subscription::{Feed, SubscriberOptions, Subscription, Wanted};
 use crate::time::{CLOCK_MD5, CLOCK_TYPE, RosClock, RosTime};
 use crate::{registrar, rpc, slave, topic_server};
 
-/// A ROS 1 node. Dropping it ends its connections; only [`Node::shutdown`] also tells the master.
+/// A ROS 1 node. Dropping it ends its connections; only [`Node::shutdown`] also unregisters it at
+/// the master.
 ///
-/// Three tasks belong to it: the slave API, the listener for subscribers and clients, and the one that keeps the master
-/// informed. Each connection to a subscriber, publisher or client is a task besides. All end with the node.
+/// A node has three tasks: the slave API, the listener for subscribers and clients, and the
+/// registrar that keeps the master up to date. Each connection to a subscriber, publisher or client
+/// has another task. All tasks end with the node.
 #[derive(Debug)]
 pub struct Node {
     inner: Arc<Inner>,
@@ -43,10 +45,13 @@ pub struct Node {
 }
 
 impl Node {
-    /// Opens the node's two ports and begins to look for the master, which need not be there yet.
+    /// Opens the two ports of the node and starts to connect to the master, which may start later.
     ///
-    /// Must be called inside a tokio runtime with IO and time. Fails when a name is no ROS name, when the master's
-    /// URI does not read as one, or when no port can be opened.
+    /// Must be called inside a tokio runtime with IO and time.
+    ///
+    /// # Errors
+    /// Fails if a name is not a valid ROS name, if the master's URI is invalid, or if no port can
+    /// be opened.
     pub fn start(options: NodeOptions) -> Result<Self, NodeError> {
         if tokio::runtime::Handle::try_current().is_err() {
             return Err(NodeError::NoRuntime);
@@ -101,58 +106,64 @@ impl Node {
         Ok(Self { inner, tasks })
     }
 
-    /// The node's resolved name, as others see it in `callerid`.
+    /// Returns the node's resolved name, which other nodes see in `callerid`.
     pub fn name(&self) -> &str {
         self.inner.name()
     }
 
-    /// The URI of the node's slave API, as the master is told it.
+    /// Returns the URI of the node's slave API, which is registered with the master.
     pub fn uri(&self) -> &str {
         &self.inner.uri
     }
 
-    /// A topic's or service's name as this node resolves it: namespace, `~` and remappings applied.
+    /// Resolves the name of a topic or service: applies the namespace, `~` and remappings.
     pub fn resolve(&self, topic: &str) -> Result<String, NameError> {
         self.inner.names.resolve(topic)
     }
 
-    /// The time for the stamps of messages: that of [`Node::clock`].
+    /// Returns the time of [`Node::clock`] for the stamps of messages.
     pub fn now(&self) -> RosTime {
         self.inner.clock.now()
     }
 
-    /// The clock that follows `/use_sim_time` and `/clock`. From [`MasterState::Registered`] on it is the one the
-    /// master wants; before that it is the wall clock.
+    /// Returns the clock that follows `/use_sim_time` and `/clock`. Before
+    /// [`MasterState::Registered`] it is the wall clock, from then on the clock that the master's
+    /// parameter selects.
     pub fn clock(&self) -> RosClock {
         self.inner.clock.clone()
     }
 
-    /// The parameters of the node's master.
+    /// Returns the parameters of the node's master.
     pub fn parameters(&self) -> Parameters {
         Parameters::new(Arc::clone(&self.inner))
     }
 
-    /// Whether the master has been found, now and as it changes.
+    /// Returns the state of the connection to the master and its changes.
     pub fn master_state(&self) -> watch::Receiver<MasterState> {
         self.inner.master_state.subscribe()
     }
 
-    /// Waits until this node is told to shut down, as by `rosnode kill`, or has lost its name to another node, and
-    /// gives the reason. Cancel-safe, and free to outlive the borrow of the node.
+    /// Waits for the request to shut down, as by `rosnode kill`, or for the loss of the node's name
+    /// to another node, and returns the reason. Cancel-safe. The future may outlive the borrow of
+    /// the node.
     pub fn shutdown_requested(&self) -> impl Future<Output = String> + Send + use<> {
         let mut asked = self.inner.shutdown.subscribe();
         async move {
             let reason = asked.wait_for(Option::is_some).await;
             match reason.map(|reason| reason.clone()) {
                 Ok(reason) => reason.unwrap_or_default(),
-                // The node is gone, and nobody can ask it any more.
+                // The node was dropped, and no request can arrive.
                 Err(_) => std::future::pending().await,
             }
         }
     }
 
-    /// Publishes a topic. Fails when the name is no ROS name, when this node already publishes it, or when the type
-    /// is not complete: subscribers compare its checksum, and `rosbag` records its definition.
+    /// Publishes a topic.
+    ///
+    /// # Errors
+    /// Fails if the name is not a valid ROS name, if this node already publishes the topic, or if
+    /// the type is incomplete. Subscribers compare the checksum of the type, and `rosbag` records
+    /// its definition.
     pub fn advertise(
         &self,
         topic: &str,
@@ -185,8 +196,8 @@ impl Node {
         Ok(Publisher::new(hub, Arc::clone(&self.inner)))
     }
 
-    /// Subscribes a topic into an inbox. What this node publishes itself is not received. Fails when the name is no
-    /// ROS name.
+    /// Subscribes to a topic with an inbox. Messages of this node itself are not received. Fails if
+    /// the name is not a valid ROS name.
     #[expect(
         clippy::too_many_arguments,
         reason = "the key and the inbox belong to the call, not to a subscriber's options"
@@ -206,15 +217,18 @@ impl Node {
         };
         let entrance = Box::new(inbox.open(key, limit));
         let feed = Arc::new(Feed::new(topic, wanted, entrance));
-        // A node that can still be asked is open.
+        // A node that can still be called is open.
         let _open = self.inner.follow(&feed);
         Ok(Subscription::new(feed, Arc::clone(&self.inner)))
     }
 
-    /// Offers a service. The handler is called once per request, for several clients at a time; what it fails with
-    /// reaches the client as text. Where several nodes offer one service, the master sends clients to the last.
+    /// Offers a service. The handler is called once per request, for several clients at a time; its
+    /// error is sent to the client as text. If several nodes offer the same service, the master
+    /// directs clients to the last node that registered.
     ///
-    /// Fails when the name is no ROS name, when this node already offers it, or when the type is not complete.
+    /// # Errors
+    /// Fails if the name is not a valid ROS name, if this node already offers the service, or if
+    /// the type is incomplete.
     pub fn advertise_service<H, F>(
         &self,
         service: &str,
@@ -251,8 +265,8 @@ impl Node {
         Ok(ServiceServer::new(served, Arc::clone(&self.inner)))
     }
 
-    /// A client of a service, which need not be there yet: nobody is asked before the first call. Fails when the name
-    /// is no ROS name.
+    /// Creates a client of a service, which may be offered later: the first request is sent with
+    /// the first call. Fails if the name is not a valid ROS name.
     pub fn service_client(
         &self,
         service: &str,
@@ -263,27 +277,29 @@ impl Node {
         Ok(ServiceClient::new(service, options, self.name(), master))
     }
 
-    /// Asks the master who publishes, subscribes and offers what.
+    /// Reads the publishers, subscribers and services from the master.
     pub async fn graph(&self) -> Result<Graph, MasterError> {
         self.inner.master.graph().await
     }
 
-    /// Asks the same in another task, which may outlive the node.
+    /// Returns a reader of the graph for another task, which may outlive the node.
     pub fn graph_reader(&self) -> GraphReader {
         GraphReader {
             master: self.inner.master.clone(),
         }
     }
 
-    /// Withdraws everything from the master and ends: connections to subscribers after their queues are written, those
-    /// to clients after their requests are answered, all within two seconds. What a master that cannot be reached keeps
-    /// is logged by its names; one that answers too slowly is logged as such.
+    /// Unregisters everything from the master and stops within two seconds. Connections to
+    /// subscribers end after their queues are written, connections to clients after their requests
+    /// are answered. Registrations that stay behind in an unreachable master are logged by name; a
+    /// master that replies too slowly is logged as well.
     pub async fn shutdown(mut self) {
         let mut settled = self.inner.settled.subscribe();
         let mut draining = self.inner.draining.subscribe();
         self.inner.close();
         self.inner.changed.notify_one();
-        // What the two give is a lock that must not be held while the other waits; an error is the end as well.
+        // Both results are locks that must not be held during the other wait; an error is the end
+        // as well.
         let done = async {
             let _settled = settled.wait_for(|settled| *settled).await.is_ok();
             let _drained = draining.wait_for(|open| *open == 0).await.is_ok();
@@ -301,48 +317,49 @@ impl Drop for Node {
     }
 }
 
-/// Asks the master of a node who publishes, subscribes and offers what.
+/// Reads the graph from the master of a node.
 #[derive(Clone, Debug)]
 pub struct GraphReader {
     master: Master,
 }
 
 impl GraphReader {
-    /// The graph as the master knows it now. Takes a few seconds at most; fails while there is no master.
+    /// Returns the current graph of the master. Takes a few seconds at most; fails without a
+    /// master.
     pub async fn read(&self) -> Result<Graph, MasterError> {
         self.master.graph().await
     }
 }
 
-/// Where the node stands with its master.
+/// State of the connection to the master.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum MasterState {
-    /// Not found yet, or lost: the node looks for it.
+    /// Not found yet, or lost: the node tries to connect.
     Awaited,
-    /// It answers, and was told of all that the node had then. What it refused is tried again, with a line in the log,
-    /// and what was added since may still be on its way.
+    /// The master replies, and was sent all registrations of that time. Refused registrations are
+    /// logged and retried, and later registrations may still be on their way.
     Registered,
 }
 
-/// Why a node could not start or a topic or service could not be taken.
+/// Error of starting a node, or of a topic or service.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum NodeError {
     /// Called outside a tokio runtime.
     #[error("a node needs a running tokio runtime")]
     NoRuntime,
-    /// A name that is no ROS name.
+    /// A name is not a valid ROS name.
     #[error(transparent)]
     Name(#[from] NameError),
     /// The master's URI is not `http://host:port`.
     #[error("the master's URI `{0}` is not of the form http://host:11311 (ROS_MASTER_URI)")]
     MasterUri(String),
-    /// No port to listen on.
+    /// No port can be opened.
     #[error("cannot listen on {address}: {source}")]
     Listen {
-        /// The address tried.
+        /// The address.
         address: IpAddr,
-        /// What the system says.
+        /// The error of the system.
         #[source]
         source: std::io::Error,
     },
@@ -354,28 +371,28 @@ pub enum NodeError {
     Type {
         /// The resolved topic.
         topic: String,
-        /// The name given.
+        /// The given type name.
         type_name: String,
     },
     /// This node offers the service already.
     #[error("{0} is already offered by this node")]
     AlreadyOffered(String),
-    /// The service's type has no package or no checksum.
+    /// The type of the service has no package or no checksum.
     #[error("{service} cannot be offered with the incomplete type `{type_name}`")]
     ServiceType {
         /// The resolved service.
         service: String,
-        /// The name given.
+        /// The given type name.
         type_name: String,
     },
 }
 
-/// What the node's handles and tasks share.
+/// State shared by the handles and tasks of the node.
 #[derive(Debug)]
 pub(crate) struct Inner {
     names: Names,
     pub(crate) uri: String,
-    /// Where the node's services are called, as the master is told it.
+    /// Address of the node's services, which is registered with the master.
     pub(crate) service_uri: String,
     pub(crate) hostname: String,
     pub(crate) topics_port: u16,
@@ -383,21 +400,21 @@ pub(crate) struct Inner {
     links: Arc<LinkContext>,
     pub(crate) params: Params,
     clock: RosClock,
-    /// The subscription of `/clock` while time is simulated.
+    /// The subscription to `/clock` while time is simulated.
     clock_feed: Mutex<Option<Arc<Feed>>>,
     registry: Mutex<Registry>,
-    /// Rings when the registry no longer is what the master was told.
+    /// Notifies that the registry differs from the state of the master.
     pub(crate) changed: Notify,
     pub(crate) master_state: watch::Sender<MasterState>,
-    /// The reason once the master asked for it.
+    /// The reason of the master's request to shut down.
     shutdown: watch::Sender<Option<String>>,
-    /// How often the master said that another node has taken this node's name, and of how many of them it was found out
-    /// that the name is this node's.
+    /// Number of reports of the master that another node has taken this node's name, and the number
+    /// of these reports for which the name turned out to be this node's.
     contests: AtomicU64,
     decided: AtomicU64,
-    /// True once everything is closed and the master was told so.
+    /// True once everything is closed and unregistered at the master.
     pub(crate) settled: watch::Sender<bool>,
-    /// Connections to subscribers and clients, those of withdrawn topics and services included.
+    /// Number of connections to subscribers and clients, including withdrawn topics and services.
     draining: watch::Sender<usize>,
     next_id: AtomicI32,
 }
@@ -421,20 +438,20 @@ impl Registry {
 #[derive(Debug)]
 struct Subscribed {
     generation: u64,
-    /// How many lists of publishers have come.
+    /// Number of received lists of publishers.
     updates: u64,
-    /// The last of them.
+    /// The last received list of publishers.
     publishers: Vec<String>,
     feeds: Vec<Arc<Feed>>,
 }
 
-/// What the master should know of one topic or service, and which version of it.
+/// The registration of a topic or service, with its version.
 #[derive(Clone, Debug)]
 pub(crate) struct Registration {
     pub(crate) name: String,
     pub(crate) kind: ResourceKind,
     pub(crate) generation: u64,
-    /// Of a topic; the master is not told the type of a service.
+    /// Type of a topic; empty for a service, because its type is not registered.
     pub(crate) type_name: String,
 }
 
@@ -475,7 +492,7 @@ impl Inner {
             .collect()
     }
 
-    /// The full name of a parameter; `/` is the root of all.
+    /// Returns the full name of a parameter; `/` is the root of the tree.
     pub(crate) fn parameter_name(&self, name: &str) -> Result<String, NameError> {
         if name == "/" {
             Ok(name.to_owned())
@@ -484,18 +501,19 @@ impl Inner {
         }
     }
 
-    /// A parameter's name for the master to search upwards from this node. A remapped name is no longer relative.
+    /// Returns the name of a parameter for the upward search of the master. A remapped name is
+    /// absolute.
     pub(crate) fn searched_name(&self, name: &str) -> Result<String, NameError> {
         self.names.searched(name)
     }
 
-    /// What is followed of a parameter or namespace has to be read anew.
+    /// Marks the subscriptions of a parameter or namespace for another read.
     pub(crate) fn parameter_changed(&self, name: &str) {
         self.params.touch(name);
         self.changed.notify_one();
     }
 
-    /// Goes over to simulated time, or back.
+    /// Switches to simulated time, or back to the wall clock.
     pub(crate) fn simulate(&self, simulated: bool) {
         if !self.clock.simulate(simulated) {
             return;
@@ -518,8 +536,8 @@ impl Inner {
         }
     }
 
-    /// Registers a subscription and links it to the publishers known. False once the node is closed, which closes the
-    /// feed as well.
+    /// Registers a subscription and links it to the known publishers. Returns false if the node is
+    /// closed; then the feed is closed as well.
     fn follow(&self, feed: &Arc<Feed>) -> bool {
         let mut registry = lock(&self.registry);
         if registry.closed {
@@ -587,7 +605,7 @@ impl Inner {
         self.changed.notify_one();
     }
 
-    /// All that the master should know now.
+    /// Returns all registrations that the master should have.
     pub(crate) fn wanted_registrations(&self) -> Vec<Registration> {
         let registry = lock(&self.registry);
         let published = registry.publications.values().map(|hub| Registration {
@@ -618,7 +636,7 @@ impl Inner {
         published.chain(subscribed).chain(offered).collect()
     }
 
-    /// How many lists of publishers have come for a topic.
+    /// Returns the number of received lists of publishers of a topic.
     pub(crate) fn updates(&self, topic: &str) -> u64 {
         lock(&self.registry)
             .subscriptions
@@ -626,17 +644,18 @@ impl Inner {
             .map_or(0, |entry| entry.updates)
     }
 
-    /// Takes the list that answers a registration, unless a newer one came meanwhile.
+    /// Applies the list in the reply to a registration, unless a newer list was received in the
+    /// meantime.
     pub(crate) fn registered_publishers(&self, topic: &str, publishers: &[String], seen: u64) {
         self.take_publishers(topic, publishers, |updates| updates == seen);
     }
 
-    /// Takes the list that the master sends unasked.
+    /// Applies a list that the master sends on its own.
     pub(crate) fn publishers_changed(&self, topic: &str, publishers: &[String]) {
         self.take_publishers(topic, publishers, |_| true);
     }
 
-    /// Compares and links under one lock, so that no list is overtaken by an older one.
+    /// Compares and links under one lock, so that an older list never replaces a newer list.
     fn take_publishers(&self, topic: &str, publishers: &[String], due: impl Fn(u64) -> bool) {
         let mut registry = lock(&self.registry);
         if registry.closed {
@@ -649,7 +668,7 @@ impl Inner {
             return;
         }
         entry.updates += 1;
-        // Those that no subscription would be connected to need not be kept.
+        // Publishers beyond the limit of connections need not be stored.
         let most = self.links.publishers_of_topic;
         entry.publishers = publishers.iter().take(most).cloned().collect();
         for feed in &entry.feeds {
@@ -657,8 +676,8 @@ impl Inner {
         }
     }
 
-    /// Links a feed to publishers other than this node itself. Called with the registry locked, whose lock comes before
-    /// that of a feed's links.
+    /// Links a feed to publishers other than this node itself. Called with the registry locked;
+    /// this lock is taken before the lock of a feed's links.
     fn connect(&self, feed: &Arc<Feed>, publishers: &[String]) {
         let own = self.uri.trim_end_matches('/');
         let others: Vec<String> = publishers
@@ -669,7 +688,7 @@ impl Inner {
         feed.update(&others, &self.links, || self.next_connection_id());
     }
 
-    /// Tells whoever waits in [`Node::shutdown_requested`].
+    /// Notifies the waiters of [`Node::shutdown_requested`].
     pub(crate) fn ask_to_shut_down(&self, reason: &str) {
         self.shutdown.send_if_modified(|asked| {
             let first = asked.is_none();
@@ -678,25 +697,26 @@ impl Inner {
         });
     }
 
-    /// The master says that another node has taken this node's name: nothing is registered until it is clear whose it is.
+    /// Records the master's report that another node has taken this node's name. Nothing is
+    /// registered until the owner of the name is known.
     pub(crate) fn name_is_contested(&self) {
         self.contests.fetch_add(1, Ordering::AcqRel);
         self.changed.notify_one();
     }
 
-    /// Which of the contests for the name is open.
+    /// Returns the number of the contest for the name that is open.
     pub(crate) fn contest(&self) -> Option<u64> {
         let last = self.contests.load(Ordering::Acquire);
         let open = last != self.decided.load(Ordering::Acquire) && !self.is_asked_to_shut_down();
         open.then_some(last)
     }
 
-    /// The name was this node's when the master was asked after so many contests.
+    /// Records that the name was this node's after this number of contests.
     pub(crate) fn decided(&self, contest: u64) {
         self.decided.store(contest, Ordering::Release);
     }
 
-    /// Whether the name is this node's, as far as it knows.
+    /// Returns whether the name is this node's, as far as it knows.
     pub(crate) fn may_register(&self) -> bool {
         !self.is_asked_to_shut_down() && self.contest().is_none()
     }
@@ -709,7 +729,7 @@ impl Inner {
         lock(&self.registry).closed
     }
 
-    /// Ends all topics and services, for good.
+    /// Closes all topics and services permanently.
     fn close(&self) {
         let mut registry = lock(&self.registry);
         registry.closed = true;
@@ -738,7 +758,7 @@ impl Inner {
     }
 }
 
-/// The parameters to begin with, by their full names. Of several for one name the last counts.
+/// Returns the initial parameters by their full names. The last value of a name is used.
 fn params(names: &Names, given: Vec<(String, ParamValue)>) -> Result<Params, NodeError> {
     let mut last: Vec<(String, ParamValue)> = Vec::new();
     for (name, value) in given {
@@ -749,7 +769,7 @@ fn params(names: &Names, given: Vec<(String, ParamValue)>) -> Result<Params, Nod
     Ok(Params::new(last, names.resolve("/use_sim_time")?))
 }
 
-/// Listens on a port of the system's choosing.
+/// Listens on a port chosen by the system.
 fn listen(address: IpAddr) -> Result<(TcpListener, u16), NodeError> {
     let open = || {
         let address = SocketAddr::from((address, 0));
@@ -765,8 +785,8 @@ fn listen(address: IpAddr) -> Result<(TcpListener, u16), NodeError> {
 }
 
 const SHUTDOWN_LIMIT: Duration = Duration::from_secs(2);
-/// Peers that may connect in one moment: a launch file starts a whole graph at once, and one that is not let in tries
-/// again after a second.
+/// Number of peers that may connect at the same moment: a launch file starts a whole graph at once,
+/// and a refused peer tries again after a second.
 const BACKLOG: i32 = 1024;
 
 #[cfg(test)]
@@ -777,7 +797,7 @@ mod tests {
 
     fn options() -> NodeOptions {
         let mut options = NodeOptions::from_env("n");
-        // Nothing listens there.
+        // No server listens there.
         "http://127.0.0.1:1".clone_into(&mut options.master_uri);
         "/".clone_into(&mut options.namespace);
         options.advertise_as("127.0.0.1");

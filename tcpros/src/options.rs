@@ -1,4 +1,4 @@
-//! How a node is called, where its master is, and under which address others reach it.
+//! The options of a node: its name, the address of its master, and its own address for other nodes.
 
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr};
 
@@ -8,33 +8,35 @@ use crate::names::{self, NameError, Names};
 use crate::parameters::{self, ParamError, ParamValue};
 use crate::rpc::Endpoint;
 
-/// What a node needs to know before it starts.
+/// The settings of a node before its start.
 #[derive(Clone, Debug, PartialEq)]
 pub struct NodeOptions {
     /// Name without namespace, such as `bridge`.
     pub name: String,
     /// Namespace of the node's name and of relative topics, such as `/` or `/cell`.
     pub namespace: String,
-    /// Such as `http://localhost:11311`.
+    /// URI of the master, such as `http://localhost:11311`.
     pub master_uri: String,
-    /// Host name or address that other nodes are told.
+    /// Host name or address that is announced to other nodes.
     pub hostname: String,
     /// Address the node listens on.
     pub bind: IpAddr,
-    /// Pairs of names: who uses the first gets the second.
+    /// Pairs of names: uses of the first name resolve to the second name.
     pub remappings: Vec<(String, String)>,
-    /// Private parameters by their names without `~`. They are set at the master before the node counts as
-    /// registered, and after a restart of the master those that are no longer set.
+    /// Private parameters by their names without `~`. They are set at the master before the node
+    /// counts as registered. After a restart of the master, parameters that are not set are set
+    /// again.
     pub parameters: Vec<(String, ParamValue)>,
     /// Whether the IPv6 addresses of a host are tried before its IPv4 addresses (`ROS_IPV6=on`).
     pub ipv6: bool,
-    /// Longest message taken from a publisher, in bytes. A longer one closes its connection.
+    /// Maximum length of a message from a publisher, in bytes. A longer message closes its
+    /// connection.
     pub max_message: usize,
 }
 
 impl NodeOptions {
-    /// Reads `ROS_MASTER_URI`, `ROS_HOSTNAME`, `ROS_IP`, `ROS_NAMESPACE` and `ROS_IPV6`, with the defaults of ROS for
-    /// those that are not set: port 11311 here, and the name of this machine
+    /// Reads `ROS_MASTER_URI`, `ROS_HOSTNAME`, `ROS_IP`, `ROS_NAMESPACE` and `ROS_IPV6`. Unset
+    /// variables have the defaults of ROS: port 11311 on this host, and the name of this machine
     /// (`wiki.ros.org/ROS/EnvironmentVariables`).
     pub fn from_env(name: &str) -> Self {
         Self::from_lookup(name, |key| std::env::var(key).ok())
@@ -60,17 +62,20 @@ impl NodeOptions {
         }
     }
 
-    /// Takes the arguments that ROS gives a meaning to: `__name:=`, `__ns:=`, `__ip:=`, `__hostname:=`, `__master:=`,
-    /// `__log:=` (without effect: this crate writes no log file), `from:=to` and `_parameter:=value`
-    /// (`wiki.ros.org/Remapping Arguments`). Returns the others in their order, unknown `__` words among them.
+    /// Applies the arguments of ROS: `__name:=`, `__ns:=`, `__ip:=`, `__hostname:=`, `__master:=`,
+    /// `__log:=` (without effect: this crate writes no log file), `from:=to` and
+    /// `_parameter:=value` (`wiki.ros.org/Remapping Arguments`). Returns the other arguments in
+    /// order, including unknown `__` arguments.
     ///
-    /// Fails when a remapping or a parameter has no ROS name, or a parameter is an integer past 32 bits.
+    /// # Errors
+    /// Fails if the name of a remapping or parameter is not a valid ROS name, or if a parameter is
+    /// an integer of more than 32 bits.
     pub fn apply_arguments<S: AsRef<str>>(
         &mut self,
         arguments: &[S],
     ) -> Result<Vec<String>, ArgumentError> {
         let mut others = Vec::new();
-        // An address given by name wins over `__ip`, whatever their order.
+        // `__hostname` takes precedence over `__ip`, regardless of their order.
         let mut named = false;
         for argument in arguments {
             let argument = argument.as_ref();
@@ -110,7 +115,8 @@ impl NodeOptions {
         Ok(())
     }
 
-    /// Sets the address that others are told, and with it the one to listen on: all, or loopback alone.
+    /// Sets the announced address, and with it the address to listen on: all interfaces, or
+    /// loopback only.
     pub fn advertise_as(&mut self, hostname: &str) {
         hostname.clone_into(&mut self.hostname);
         self.bind = bind_for(hostname, self.ipv6);
@@ -125,8 +131,8 @@ impl NodeOptions {
     }
 }
 
-/// Where to listen so that others reach this host name: everywhere, or on loopback alone. Listening on `::` takes
-/// IPv4 as well.
+/// Returns the address to listen on so that other nodes reach this host name: all interfaces, or
+/// loopback only. Listening on `::` includes IPv4.
 fn bind_for(hostname: &str, ipv6: bool) -> IpAddr {
     match hostname.parse::<IpAddr>() {
         Ok(address) if address.is_loopback() => address,
@@ -138,7 +144,7 @@ fn bind_for(hostname: &str, ipv6: bool) -> IpAddr {
     }
 }
 
-/// A word of the command line that looks like one of ROS and is none.
+/// Error for an invalid remapping or private parameter on the command line.
 #[derive(Debug, Error)]
 #[error(
     "`{word}` is neither a remapping (from:=to) nor a private parameter (_name:=value): {reason}"
@@ -157,13 +163,13 @@ impl ArgumentError {
         }
     }
 
-    /// The word.
+    /// Returns the argument.
     pub fn word(&self) -> &str {
         &self.word
     }
 }
 
-/// As much as a point cloud or an uncompressed image takes, and a quarter of where roscpp stops.
+/// Suffices for a point cloud or an uncompressed image, and is a quarter of the limit of roscpp.
 const DEFAULT_MAX_MESSAGE: usize = 256 * 1024 * 1024;
 
 #[cfg(test)]

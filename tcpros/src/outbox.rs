@@ -1,4 +1,4 @@
-//! The bounded queue between a publisher and the task that writes to one subscriber.
+//! The bounded queue between a publisher and the task that writes to a subscriber.
 
 use std::collections::VecDeque;
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -6,8 +6,8 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use bytes::Bytes;
 use tokio::sync::Notify;
 
-/// Messages waiting for one subscriber. When it is full the oldest go; the newest is always kept, so a message
-/// larger than the byte limit waits alone.
+/// Messages waiting for a subscriber. When the queue is full the oldest messages are dropped. The
+/// newest message is always kept, so a message larger than the byte limit waits alone.
 #[derive(Debug)]
 pub(crate) struct Outbox {
     limit: Limit,
@@ -16,7 +16,7 @@ pub(crate) struct Outbox {
     ended: Notify,
 }
 
-/// How much a queue holds.
+/// Capacity of a queue.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Limit {
     pub(crate) messages: usize,
@@ -41,7 +41,8 @@ impl Outbox {
         }
     }
 
-    /// Queues a message and returns how many older ones gave way. A closed queue takes nothing.
+    /// Queues a message and returns the number of older messages that were dropped. A closed queue
+    /// ignores the message.
     pub(crate) fn push(&self, message: Bytes) -> u64 {
         let mut state = lock(&self.state);
         if state.closed {
@@ -65,8 +66,9 @@ impl Outbox {
         dropped
     }
 
-    /// Moves up to `batch` bytes of messages, at least one, to `into`; waits for the first. False when the queue is
-    /// closed and empty. Cancel-safe: nothing is taken before it returns.
+    /// Moves up to `batch` bytes of messages, and at least one message, to `into`. Waits for the
+    /// first message. Returns false if the queue is closed and empty. Cancel-safe: no message is
+    /// removed before the function returns.
     pub(crate) async fn take(&self, into: &mut Vec<Bytes>, batch: usize) -> bool {
         loop {
             {
@@ -91,7 +93,7 @@ impl Outbox {
         }
     }
 
-    /// Takes no more messages; those queued may still be taken.
+    /// Closes the queue for new messages; queued messages may still be taken.
     pub(crate) fn close(&self) {
         lock(&self.state).closed = true;
         self.changed.notify_one();
@@ -101,7 +103,7 @@ impl Outbox {
     /// Waits for `close`.
     pub(crate) async fn closed(&self) {
         let mut notified = std::pin::pin!(self.ended.notified());
-        // Registered before the look, so that a close in between is not missed.
+        // Registered before the check, so that a close in between is not missed.
         notified.as_mut().enable();
         if !lock(&self.state).closed {
             notified.await;
@@ -113,7 +115,8 @@ impl Outbox {
     }
 }
 
-/// Locks also after a panic elsewhere: all state behind our locks is whole between statements.
+/// Locks a mutex even after a panic of another thread: the state behind the locks of this crate is
+/// consistent between statements.
 pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

@@ -1,8 +1,8 @@
-//! The parameter server: reading, setting and following parameters.
+//! The parameter server: reads, sets and subscribes to parameters.
 //!
-//! A followed parameter is read anew whenever the master says that something in it changed. What the master says
-//! the change is, is not used: it does not tell an emptied namespace from a deleted one, and two of its calls may
-//! overtake each other.
+//! A subscribed parameter is read again whenever the master reports a change in it. The reported
+//! value is not used: it does not distinguish an emptied namespace from a deleted namespace, and
+//! two calls of the master may overtake each other.
 
 mod argument;
 mod follow;
@@ -23,11 +23,12 @@ pub(crate) use self::argument::value as argument_value;
 pub(crate) use self::follow::{Heard, Params, settle};
 pub use self::value::ParamValue;
 
-/// The parameters of a node's master, with names as the node sees them: `~` and remappings apply, and `/` is the
-/// whole tree. It may outlive the borrow of the node, and goes on to work when the node has ended, except for
-/// subscriptions.
+/// The parameters of a node's master, with names as the node sees them: `~` and remappings apply,
+/// and `/` is the whole tree. The handle may outlive the borrow of the node. It stays usable after
+/// the end of the node, except for subscriptions.
 ///
-/// Every call is one request to the master and takes a few seconds at most; all fail while there is no master.
+/// Every call is a request to the master and takes a few seconds at most; all calls fail without
+/// a master.
 #[derive(Clone)]
 pub struct Parameters {
     node: Arc<Inner>,
@@ -38,22 +39,23 @@ impl Parameters {
         Self { node }
     }
 
-    /// The value of a parameter, or all that a namespace holds as a map; `None` when it is not set.
+    /// Returns the value of a parameter, or the members of a namespace as a map, or `None` if it is
+    /// not set.
     pub async fn get(&self, name: &str) -> Result<Option<ParamValue>, ParamError> {
         let name = self.node.parameter_name(name)?;
         Ok(read(&self.node, &name).await?)
     }
 
-    /// Sets a parameter. A map replaces all that the namespace held.
+    /// Sets a parameter. A map replaces all members of the namespace.
     pub async fn set(&self, name: &str, value: impl Into<ParamValue>) -> Result<(), ParamError> {
         let name = self.node.parameter_name(name)?;
         write(&self.node, &name, value.into()).await?;
-        // The master tells everyone but the node that made the change.
+        // The master notifies all nodes except the node that made the change.
         self.node.parameter_changed(&name);
         Ok(())
     }
 
-    /// Deletes a parameter or a namespace with all it holds. Returns whether it was set.
+    /// Deletes a parameter, or a namespace with all its members. Returns whether it was set.
     pub async fn delete(&self, name: &str) -> Result<bool, ParamError> {
         let name = self.node.parameter_name(name)?;
         let params = vec![name.as_str().into()];
@@ -67,15 +69,16 @@ impl Parameters {
         }
     }
 
-    /// Whether a parameter or namespace is set.
+    /// Returns whether a parameter or namespace is set.
     pub async fn has(&self, name: &str) -> Result<bool, ParamError> {
         let name = self.node.parameter_name(name)?;
         Ok(exists(&self.node, &name).await?)
     }
 
-    /// Looks for the first part of a relative name in the node's own namespace, then in those above it, and gives the
-    /// full name where it is found, such as `/line/robot_description` for `robot_description`. A name that is not
-    /// relative, or remapped, is looked for where it is.
+    /// Searches for the first part of a relative name in the node's own namespace, then in the
+    /// parent namespaces. Returns the full name in the namespace that contains the first part, such
+    /// as `/line/robot_description` for `robot_description`. A name that is absolute, private or
+    /// remapped is checked only at its own location.
     pub async fn search(&self, name: &str) -> Result<Option<String>, ParamError> {
         let asked = self.node.searched_name(name)?;
         match self
@@ -93,14 +96,14 @@ impl Parameters {
         }
     }
 
-    /// The full names of all parameters of the master.
+    /// Returns the full names of all parameters of the master.
     pub async fn names(&self) -> Result<Vec<String>, ParamError> {
         let names = self.node.master.call("getParamNames", vec![]).await?;
         Ok(crate::master::strings(&names).ok_or(MasterError::Shape("getParamNames"))?)
     }
 
-    /// Follows a parameter, or all that a namespace holds, through restarts of the master. There need not be a master
-    /// yet. Fails only when the name is no ROS name.
+    /// Subscribes to a parameter, or to all members of a namespace, across restarts of the master.
+    /// The master may start later. Fails only if the name is not a valid ROS name.
     pub fn subscribe(&self, name: &str) -> Result<ParamSubscription, ParamError> {
         let name = self.node.parameter_name(name)?;
         let heard = self.node.params.hold(&name);
@@ -122,8 +125,8 @@ impl fmt::Debug for Parameters {
     }
 }
 
-/// Follows one parameter or namespace. It holds one value, the newest: changes that come faster than they are taken
-/// become one. Dropping it unsubscribes.
+/// A subscription to a parameter or namespace. It holds only the newest value: changes that
+/// arrive faster than they are read are merged. Dropping it unsubscribes.
 pub struct ParamSubscription {
     name: String,
     heard: watch::Receiver<Heard>,
@@ -131,12 +134,13 @@ pub struct ParamSubscription {
 }
 
 impl ParamSubscription {
-    /// The parameter's resolved name.
+    /// Returns the resolved name of the parameter.
     pub fn name(&self) -> &str {
         &self.name
     }
 
-    /// The value as last told by the master; `None` when it is not set, or the master has not been asked yet.
+    /// Returns the last value from the master, or `None` if the parameter is not set or was not
+    /// read yet.
     pub fn current(&self) -> Option<ParamValue> {
         match &*self.heard.borrow() {
             Heard::Value(value) => value.clone(),
@@ -144,9 +148,9 @@ impl ParamSubscription {
         }
     }
 
-    /// Waits for a value that was not returned before: the first time what the master says now, then each change.
-    /// `None` says that the parameter is not set. Cancel-safe. Fails with [`ParamError::NodeEnded`] once the node has
-    /// ended.
+    /// Waits for a value that was not returned before: first the current value at the master, then
+    /// each change. `None` means that the parameter is not set. Cancel-safe. Fails with
+    /// [`ParamError::NodeEnded`] once the node has ended.
     pub async fn recv(&mut self) -> Result<Option<ParamValue>, ParamError> {
         loop {
             let changed = self.heard.changed().await;
@@ -174,27 +178,27 @@ impl Drop for ParamSubscription {
     }
 }
 
-/// Why a parameter was not read or set.
+/// Error while reading or setting a parameter.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ParamError {
-    /// The name is no ROS name.
+    /// The name is not a valid ROS name.
     #[error(transparent)]
     Name(#[from] NameError),
-    /// An integer that XML-RPC cannot say. Nothing was sent.
+    /// An integer that XML-RPC cannot represent. Nothing was sent.
     #[error(
         "{0} does not fit into the 32 bits of a ROS integer: give it as a number with a point, or in quotes as text"
     )]
     IntRange(String),
-    /// The master is not there or refused.
+    /// The master is not reachable or refused the call.
     #[error(transparent)]
     Master(#[from] MasterError),
-    /// The node that held the subscription has ended.
+    /// The node of the subscription has ended.
     #[error("the node has ended, and its parameters are no longer followed")]
     NodeEnded,
 }
 
-/// Asks the master for a parameter by its full name.
+/// Reads a parameter from the master by its full name.
 async fn read(node: &Inner, name: &str) -> Result<Option<ParamValue>, MasterError> {
     match node.master.call("getParam", vec![name.into()]).await {
         Ok(value) => known("getParam", value).map(Some),

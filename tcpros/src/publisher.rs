@@ -1,4 +1,4 @@
-//! Publishing: one topic, its subscribers, and the message a late one gets.
+//! Publishing: one topic, its subscribers, and the messages for late subscribers.
 
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -15,29 +15,30 @@ use crate::outbox::{Limit, Outbox, lock};
 /// The type of a topic, as publishers and subscribers compare it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct TopicType {
-    /// Such as `std_msgs/String`.
+    /// Name, such as `std_msgs/String`.
     pub name: String,
     /// Checksum of the definition, 32 hexadecimal digits.
     pub md5sum: String,
-    /// Text of the definition with those it contains appended, as `rosbag` needs it.
+    /// Text of the definition followed by the texts of the contained types, as `rosbag` needs it.
     pub definition: String,
 }
 
-/// How a publisher treats its subscribers.
+/// Options of a publisher.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct PublisherOptions {
-    /// Whether late subscribers get the last message.
+    /// Whether late subscribers receive the last message.
     pub latch: bool,
-    /// How many messages may wait for one subscriber; then its oldest are dropped.
+    /// Maximum number of messages waiting for a subscriber; beyond it the oldest are dropped.
     pub queue_messages: usize,
-    /// How many bytes may wait for one subscriber; then its oldest are dropped. The newest message is always kept.
-    /// Subscribers that are slow at the same time wait for the same messages, which are held once: beyond this, each
-    /// costs what is being written to it, 64 KiB or one longer message.
+    /// Maximum number of bytes waiting for a subscriber; beyond it the oldest messages are
+    /// dropped. The newest message is always kept. Subscribers that are slow at the same time share
+    /// the waiting messages, which are stored once. In addition, each subscriber needs memory for
+    /// the data being written: 64 KiB or a longer message.
     pub queue_bytes: usize,
 }
 
 impl Default for PublisherOptions {
-    /// Not latched, 1000 messages, 16 MiB.
+    /// Returns options without latching, for 1000 messages and 16 MiB.
     fn default() -> Self {
         Self {
             latch: false,
@@ -47,23 +48,24 @@ impl Default for PublisherOptions {
     }
 }
 
-/// What became of one message.
+/// Outcome of publishing a message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[must_use]
 pub struct Published {
-    /// Subscribers it was queued for.
+    /// Number of subscribers that the message was queued for.
     pub sent_to: usize,
-    /// Older messages that gave way to it, over all subscribers.
+    /// Number of older messages that were dropped for it, over all subscribers.
     pub dropped_oldest: u64,
 }
 
-/// Which of the messages for late subscribers a message is. They get them in the order of their keys.
+/// Selects how a message is kept for late subscribers. They receive the kept messages in the order
+/// of their keys.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Latched {
-    /// It takes the place of all others.
+    /// The message replaces all other kept messages.
     Alone(u64),
-    /// It is one of several, and takes the place of the one with its key. Of more than [`MAX_LATCHED`] the first
-    /// other one gives way.
+    /// The message is kept beside others and replaces the message with the same key. Beyond
+    /// [`MAX_LATCHED`] messages the first other message is dropped.
     Beside(u64),
 }
 
@@ -75,7 +77,8 @@ impl Latched {
     }
 }
 
-/// Publishes on one topic. Dropping it withdraws the topic; what is queued is still sent, within a second.
+/// Publishes on a topic. Dropping it withdraws the topic; queued messages are still sent within a
+/// second.
 #[derive(Debug)]
 pub struct Publisher {
     hub: Arc<Hub>,
@@ -87,40 +90,43 @@ impl Publisher {
         Self { hub, node }
     }
 
-    /// Queues a serialized message, without its length, for every subscriber. Never waits: a slow subscriber loses
-    /// its oldest messages and nobody else's. A message past 4 GiB has no length on the wire: it goes to nobody, with
-    /// a line in the log.
+    /// Queues a serialized message, without its length, for every subscriber. Never waits: a slow
+    /// subscriber loses its own oldest messages only. A message of more than 4 GiB cannot be
+    /// encoded: it is not sent, and the error is logged.
     pub fn publish(&self, message: Bytes) -> Published {
         self.hub.publish(message, Latched::Alone(0))
     }
 
-    /// As [`publish`](Self::publish), where late subscribers may get the last message of several sources: `latched` says
-    /// which of them stay. Without `latch` none does.
+    /// Publishes like [`publish`](Self::publish), for topics on which late subscribers receive the
+    /// last messages of several sources. `latched` selects the messages that are kept. Without
+    /// `latch` no message is kept.
     pub fn publish_latched(&self, message: Bytes, latched: Latched) -> Published {
         self.hub.publish(message, latched)
     }
 
-    /// Keeps a message for late subscribers under `key` beside others. It goes to those that came after it was published
-    /// and did not find it, and to nobody else.
+    /// Keeps a message for late subscribers under `key` beside others. It is also sent to the
+    /// subscribers that joined after its publication and did not receive it, and to no other
+    /// subscriber.
     pub fn latch(&self, key: u64, message: Bytes) {
         if u32::try_from(message.len()).is_ok() {
             self.hub.latch(message, Latched::Beside(key));
         }
     }
 
-    /// Late subscribers no longer get what is latched under `key`.
+    /// Removes the message latched under `key`.
     pub fn forget_latched(&self, key: u64) {
         lock(&self.hub.state)
             .latched
             .retain(|(other, _)| *other != key);
     }
 
-    /// Late subscribers no longer get anything of what was published so far.
+    /// Removes all latched messages.
     pub fn forget_all_latched(&self) {
         lock(&self.hub.state).latched.clear();
     }
 
-    /// Changes whether late subscribers get the last message. A publisher that stops to latch forgets what it latched.
+    /// Changes whether late subscribers receive the last message. Switching off removes all latched
+    /// messages.
     pub fn set_latching(&self, latch: bool) {
         let was = self.hub.latching.swap(latch, Ordering::Relaxed);
         if was && !latch {
@@ -128,35 +134,38 @@ impl Publisher {
         }
     }
 
-    /// How many subscribers are connected.
+    /// Returns the number of connected subscribers.
     pub fn subscribers(&self) -> usize {
         lock(&self.hub.state).subscribers.len()
     }
 
-    /// Whether the node of this resolved name is connected.
+    /// Returns whether the node of this resolved name is connected.
     pub fn is_subscribed_by(&self, node: &str) -> bool {
         let state = lock(&self.hub.state);
         state.subscribers.iter().any(|s| s.caller_id == node)
     }
 
-    /// Whether the node of this resolved name asked for the topic without TCPROS among its protocols.
+    /// Returns whether the node of this resolved name requested the topic without TCPROS among its
+    /// protocols.
     pub fn asks_for_udp(&self, node: &str) -> bool {
         let state = lock(&self.hub.state);
         state.without_tcpros.iter().any(|one| one == node)
     }
 
-    /// The topic's resolved name.
+    /// Returns the resolved name of the topic.
     pub fn topic(&self) -> &str {
         &self.hub.topic
     }
 
-    /// The type that a subscriber was turned away with last, such as `std_msgs/Float32`.
+    /// Returns the type of the last subscriber that was refused for its type, such as
+    /// `std_msgs/Float32`.
     pub fn refused_type(&self) -> Option<String> {
         lock(&self.hub.state).refused_type.clone()
     }
 
-    /// Messages lost so far: by slow subscribers, by late ones whose queue does not hold all that is latched, and latched
-    /// ones that gave way past [`MAX_LATCHED`].
+    /// Returns the number of lost messages: dropped for slow subscribers, dropped for late
+    /// subscribers with a queue too small for all latched messages, and latched messages beyond
+    /// [`MAX_LATCHED`].
     pub fn dropped(&self) -> u64 {
         self.hub.dropped.load(Ordering::Relaxed)
     }
@@ -174,10 +183,10 @@ impl Drop for Publisher {
 pub(crate) struct Hub {
     pub(crate) topic: String,
     pub(crate) topic_type: TopicType,
-    /// Tells this registration from an earlier one of the same topic.
+    /// Distinguishes this registration from earlier registrations of the same topic.
     pub(crate) generation: u64,
     options: PublisherOptions,
-    /// Whether late subscribers get the last message by now.
+    /// Whether late subscribers currently receive the last message.
     latching: AtomicBool,
     state: Mutex<HubState>,
     dropped: AtomicU64,
@@ -188,28 +197,29 @@ pub(crate) struct Hub {
 #[derive(Debug, Default)]
 struct HubState {
     subscribers: Vec<Arc<Subscriber>>,
-    /// Ordered by key.
+    /// Latched messages, ordered by key.
     latched: Vec<(u64, Bytes)>,
-    /// Messages published so far.
+    /// Number of messages published so far.
     count: u64,
-    /// The keys of the last of them, each with the count before it; at most [`MAX_LATCHED`].
+    /// The keys of the last published messages, each with the count before it; at most
+    /// [`MAX_LATCHED`].
     recent: VecDeque<(u64, u64)>,
     refused_type: Option<String>,
-    /// The nodes that asked for other protocols than TCPROS only, at most [`MAX_WITHOUT_TCPROS`].
+    /// The nodes that requested only other protocols than TCPROS, at most [`MAX_WITHOUT_TCPROS`].
     without_tcpros: VecDeque<String>,
     closed: bool,
 }
 
-/// One connected subscriber.
+/// A connected subscriber.
 #[derive(Debug)]
 pub(crate) struct Subscriber {
     pub(crate) id: i32,
     pub(crate) caller_id: String,
-    /// What `rosnode info` shows of the connection.
+    /// Description of the connection for `rosnode info`.
     pub(crate) transport: String,
-    /// The topic's count of messages when it came.
+    /// The topic's count of messages at the time of joining.
     joined: u64,
-    /// The keys of the latched messages it found.
+    /// The keys of the messages that were latched at the time of joining.
     found: Vec<u64>,
     pub(crate) outbox: Outbox,
     pub(crate) bytes: AtomicU64,
@@ -277,7 +287,8 @@ impl Hub {
         }
     }
 
-    /// Adds a subscriber, its queue beginning with the latched messages; `None` once the topic is withdrawn.
+    /// Adds a subscriber; its queue starts with the latched messages. Returns `None` if the topic
+    /// is withdrawn.
     pub(crate) fn join(
         self: &Arc<Self>,
         id: i32,
@@ -330,7 +341,7 @@ impl Hub {
         lock(&self.state).subscribers.clone()
     }
 
-    /// Notes that a node asked for the topic over other protocols than TCPROS only.
+    /// Records that a node requested the topic over other protocols than TCPROS only.
     pub(crate) fn refuse_protocols(&self, caller: &str) {
         let mut state = lock(&self.state);
         if state.without_tcpros.iter().any(|one| one == caller) {
@@ -342,7 +353,8 @@ impl Hub {
         state.without_tcpros.push_back(caller.to_owned());
     }
 
-    /// What a subscriber is told of this topic, or why it does not fit.
+    /// Returns the reply header for a subscriber, or the reason for which the subscriber is
+    /// refused.
     pub(crate) fn reply_to(
         &self,
         request: &ConnectionHeader,
@@ -356,7 +368,8 @@ impl Hub {
                     .to_owned(),
             );
         };
-        // As roscpp and rospy do it: the checksum decides. Names alone differ where packages were renamed.
+        // As in roscpp and rospy, only the checksum decides. The names alone differ if packages
+        // were renamed.
         if !fits(Some(md5sum), &ours.md5sum) {
             let wanted = clipped(request.type_name().unwrap_or("*"));
             lock(&self.state).refused_type = request.type_name().map(|_| wanted.to_owned());
@@ -381,9 +394,9 @@ impl Hub {
 }
 
 impl HubState {
-    /// Takes note of a message that goes to all who are there.
+    /// Records a message that is sent to all connected subscribers.
     fn note(&mut self, key: u64) {
-        // One source after another is the rule: its messages take one place.
+        // A source often sends several messages in a row: they use a single entry.
         if self.recent.back().is_some_and(|(last, _)| *last == key) {
             self.recent.pop_back();
         } else if self.recent.len() >= MAX_LATCHED {
@@ -393,8 +406,8 @@ impl HubState {
         self.count += 1;
     }
 
-    /// Gives a message that is latched anew to those who came between its publication and now, and returns how many
-    /// other messages gave way to it.
+    /// Sends a message that is latched again to the subscribers that joined after its publication.
+    /// Returns the number of other messages that were dropped for it.
     fn make_up(&self, key: u64, message: &Bytes) -> u64 {
         let latched = self.latched.binary_search_by_key(&key, |(key, _)| *key);
         let published = self.recent.iter().rev().find(|(other, _)| *other == key);
@@ -406,7 +419,8 @@ impl HubState {
         late.map(|s| s.outbox.push(message.clone())).sum()
     }
 
-    /// Keeps a message for late subscribers, and returns how many others gave way for want of room.
+    /// Keeps a message for late subscribers. Returns the number of messages dropped for lack of
+    /// space.
     fn latch(&mut self, message: Bytes, latched: Latched) -> u64 {
         if self.closed {
             return 0;
@@ -430,7 +444,7 @@ impl HubState {
                 if self.latched.len() <= MAX_LATCHED {
                     return 0;
                 }
-                // Never the one that has just come, which may be the first itself.
+                // Never removes the new message, which may be the first itself.
                 self.latched.remove(usize::from(at == 0));
                 1
             }
@@ -438,7 +452,7 @@ impl HubState {
     }
 }
 
-/// A subscriber's place at a topic, given up on drop.
+/// The membership of a subscriber in a topic, which ends on drop.
 #[derive(Debug)]
 pub(crate) struct Joined {
     pub(crate) hub: Arc<Hub>,
@@ -455,9 +469,9 @@ impl Drop for Joined {
     }
 }
 
-/// Nodes without TCPROS that are remembered of a topic.
+/// Maximum number of recorded nodes without TCPROS per topic.
 const MAX_WITHOUT_TCPROS: usize = 16;
-/// Messages latched side by side.
+/// Maximum number of latched messages of a topic.
 pub const MAX_LATCHED: usize = 64;
 
 #[cfg(test)]

@@ -1,7 +1,8 @@
-//! Keeps the master's knowledge of this node equal to what the node publishes, subscribes and offers.
+//! Keeps the registrations at the master equal to the topics and services of the node.
 //!
-//! It compares what should be registered with what the master was told and settles the difference, so the order in
-//! which topics and services come and go, a master that starts late, and one that restarts are the same case.
+//! The registrar compares the desired registrations with the registrations sent to the master and
+//! sends the difference. The order in which topics and services are created and dropped, a master
+//! that starts late, and a master that restarts are thus the same case.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -18,7 +19,7 @@ use crate::node::{Inner, MasterState, Registration, ResourceKind};
 use crate::parameters;
 use crate::xmlrpc::Value;
 
-/// Works until the node is closed and the master has been told.
+/// Runs until the node is closed and everything is unregistered at the master.
 pub(crate) async fn run(node: Arc<Inner>) {
     let mut chores = JoinSet::new();
     chores.spawn(check_hostname(node.hostname.clone()));
@@ -35,11 +36,11 @@ pub(crate) async fn run(node: Arc<Inner>) {
     };
     let mut wait = TICK;
     loop {
-        // Before the comparison: it then sees no more than what was there at closing.
+        // Read before the comparison, which then covers only the state at closing.
         let closed = node.is_closed();
         match registrar.turn(closed).await {
             Ok(()) => {
-                // While closing, a turn may have had nothing to ask the master.
+                // While closing, a turn may not have called the master at all.
                 if !closed {
                     registrar.found();
                 }
@@ -67,15 +68,15 @@ pub(crate) async fn run(node: Arc<Inner>) {
 
 struct Registrar {
     node: Arc<Inner>,
-    /// What the master was told, whether or not it has answered yet.
+    /// The registrations sent to the master, with or without a reply.
     told: HashMap<(String, ResourceKind), Told>,
     pid: Option<i32>,
-    /// `None` before the first try.
+    /// `None` before the first attempt.
     found: Option<bool>,
     checked: Option<Instant>,
-    /// When what the master lists was compared with what it was told.
+    /// Time of the last comparison of the registrations with the master's list.
     compared: Option<Instant>,
-    /// Since when it is open whose name this node's is.
+    /// Start of the contest for this node's name.
     contested: Option<Instant>,
     contests: Throttle,
     refusals: Throttle,
@@ -139,7 +140,7 @@ impl Registrar {
             let noted = match finished {
                 Ok(Ok(outcomes)) => outcomes.into_iter().try_for_each(|one| self.note(one)),
                 Ok(Err(error)) => Err(error),
-                // It was aborted with the node's runtime.
+                // The task was aborted with the runtime of the node.
                 Err(_) => Ok(()),
             };
             if let Err(error) = noted {
@@ -152,14 +153,15 @@ impl Registrar {
         failure.map_or(Ok(()), Err)
     }
 
-    /// Gives up and names what the master may still have: nobody is there to be told.
+    /// Discards the registrations that the master may still have, and logs them: the master is
+    /// unreachable.
     fn abandon(&mut self, error: &MasterError) {
         for (name, _) in self.told.drain().map(|(key, _)| key) {
             events::unregistration_failed(&name, error);
         }
     }
 
-    /// Finds out whether the master is there, is the same as before, and still knows this node.
+    /// Checks whether the master is reachable, is the same as before, and still knows this node.
     async fn check(&mut self) -> Result<(), MasterError> {
         let master = &self.node.master;
         let pid = master.pid().await?;
@@ -189,15 +191,16 @@ impl Registrar {
         Ok(())
     }
 
-    /// Finds out what a master that knows this node no longer lists of it, as after `rosnode cleanup`: that is registered
-    /// again. A service that another node has taken over is that node's.
+    /// Finds the registrations that a master that knows this node no longer lists, as after
+    /// `rosnode cleanup`; they are registered again. A service that another node has taken over
+    /// stays with that node.
     async fn compare(&mut self) {
         if !self.told.values().any(|told| told.confirmed) {
             return;
         }
         let listed = match self.node.master.registrations().await {
             Ok(listed) => listed,
-            // The next check finds out whether the master is there.
+            // The next check finds out whether the master is reachable.
             Err(error) => {
                 tracing::debug!(%error, "the registrations at the master were not read");
                 return;
@@ -224,9 +227,11 @@ impl Registrar {
         }
     }
 
-    /// Asks the master whose this node's name is, as another has claimed it: of two nodes that start at once each may be
-    /// told to end, the one by a registration of the other that was on its way. Nothing is registered meanwhile, and
-    /// nothing of this node is on its way here, so the name stays with whom it belongs to now.
+    /// Looks up the owner of this node's name at the master, after another node has claimed the
+    /// name. If two nodes start at once, each may receive a request to shut down, one of them
+    /// because of a registration that was still on its way. Nothing is registered during the
+    /// contest, and no registration of this node is on its way, so the reported owner keeps the
+    /// name.
     async fn decide(&mut self, contest: u64) -> Result<(), MasterError> {
         let since = *self.contested.get_or_insert_with(clock::now);
         let name = self.node.name();
@@ -236,7 +241,8 @@ impl Registrar {
                 if let Some(more) = self.contests.admit(clock::now()) {
                     events::name_kept(name, more);
                 }
-                // The other may have had the name for a while, with which all that was registered is lost.
+                // The other node may have had the name for a while, which removes all
+                // registrations.
                 self.compared = None;
                 self.node.params.forget();
                 self.node.decided(contest);
@@ -260,7 +266,7 @@ impl Registrar {
     fn jobs(&mut self) -> Vec<Job> {
         let mut wanted = self.node.wanted_registrations();
         if !self.node.may_register() {
-            // The name may belong to another node now, which a registration would push out in turn.
+            // The name may belong to another node, which a registration would displace in turn.
             wanted.retain(|registration| {
                 let key = (registration.name.clone(), registration.kind);
                 let told = self.told.get(&key);
@@ -296,7 +302,7 @@ impl Registrar {
         jobs
     }
 
-    /// Takes the result of one job. Only a master that cannot be reached is a failure of the turn.
+    /// Applies the result of a job. Only an unreachable master is a failure of the turn.
     fn note(&mut self, outcome: Outcome) -> Result<(), MasterError> {
         let (key, registered, result) = outcome;
         match (registered, result) {
@@ -315,7 +321,7 @@ impl Registrar {
                     events::registration_refused(&key.0, &error);
                 }
             }
-            // A master that does not know the registration has nothing to forget.
+            // A master that does not know the registration has nothing to remove.
             (None, Err(MasterError::Refused { .. } | MasterError::Shape(_))) => {
                 self.told.remove(&key);
             }
@@ -339,9 +345,10 @@ impl Registrar {
     }
 }
 
-/// What is told to the master in one request: what is new or gone, many at a time. Whatever takes another's place goes by
-/// itself, in two requests: rospy takes two lists of publishers that come at once for one, sees no difference, and
-/// leaves it to its retry half a second later to connect anew.
+/// Groups jobs into requests. New and removed registrations are sent many at a time. A registration
+/// that replaces another registration is a group of its own and takes two requests. The reason is
+/// that rospy merges two lists of publishers that arrive at once. It would see no difference, and
+/// reconnect only with its retry half a second later.
 fn batches(jobs: Vec<Job>) -> Vec<Vec<Job>> {
     let (alone, mut together): (Vec<Job>, Vec<Job>) = jobs.into_iter().partition(Job::replaces);
     let mut batches: Vec<Vec<Job>> = alone.into_iter().map(|job| vec![job]).collect();
@@ -352,9 +359,9 @@ fn batches(jobs: Vec<Job>) -> Vec<Vec<Job>> {
     batches
 }
 
-/// Tells the master several things.
+/// Sends several jobs to the master.
 async fn perform(node: Arc<Inner>, jobs: Vec<Job>) -> Result<Vec<Outcome>, MasterError> {
-    // Lists of publishers that come while the master answers are newer than its answer.
+    // Lists of publishers that arrive before the reply of the master are newer than the reply.
     let seen: Vec<u64> = jobs.iter().map(|job| job.updates(&node)).collect();
     let requests: Vec<Request> = jobs.iter().flat_map(|job| job.requests(&node)).collect();
     let mut results = Vec::with_capacity(requests.len());
@@ -374,7 +381,7 @@ async fn perform(node: Arc<Inner>, jobs: Vec<Job>) -> Result<Vec<Outcome>, Maste
                 registration,
                 replaces,
             } => {
-                // A master that does not know the one before has nothing to forget.
+                // A master that does not know the previous registration has nothing to remove.
                 let forgotten = if replaces { next().map(drop) } else { Ok(()) };
                 drop(forgotten);
                 let result =
@@ -388,7 +395,7 @@ async fn perform(node: Arc<Inner>, jobs: Vec<Job>) -> Result<Vec<Outcome>, Maste
     Ok(jobs.into_iter().zip(seen).map(settle).collect())
 }
 
-/// What follows from the master's answer to a registration.
+/// Applies the master's reply to a registration.
 fn registered(
     node: &Inner,
     registration: &Registration,
@@ -403,7 +410,7 @@ fn registered(
 }
 
 impl Job {
-    /// What the master has to be asked, in this order.
+    /// Returns the calls to the master, in order.
     fn requests(&self, node: &Inner) -> Vec<Request> {
         let master = &node.master;
         match self {
@@ -439,7 +446,8 @@ impl Job {
         }
     }
 
-    /// Publishers before subscribers: a registered subscriber is told of each publisher that comes after it.
+    /// Returns the order of jobs: publishers before subscribers, because the master notifies a
+    /// registered subscriber of each later publisher.
     fn rank(&self) -> u8 {
         match self {
             Self::Unregister { .. } => 0,
@@ -460,7 +468,8 @@ fn unregister(node: &Inner, name: &str, kind: ResourceKind) -> Request {
     }
 }
 
-/// The commonest set-up fault of ROS 1: a node that others cannot reach under the name it gives.
+/// Checks for the most common set-up fault of ROS 1: a node that announces a name under which
+/// others cannot reach it.
 async fn check_hostname(hostname: String) {
     let lookup = tokio::net::lookup_host((hostname.as_str(), 0));
     match timeout(Duration::from_secs(10), lookup).await {
@@ -472,11 +481,11 @@ async fn check_hostname(hostname: String) {
 
 const TICK: Duration = Duration::from_secs(1);
 const LONGEST_WAIT: Duration = Duration::from_secs(2);
-/// Between two comparisons with what the master lists, which is all of the graph.
+/// Period between two comparisons with the master's list, which is the whole graph.
 const COMPARED: Duration = Duration::from_secs(5);
-/// How long a master that does not answer is asked whose a name is.
+/// Time limit for looking up the owner of a name at a master that does not reply.
 const LONGEST_CONTEST: Duration = Duration::from_secs(5);
-/// Registrations in one request.
+/// Number of registrations in a single request.
 const BATCH: usize = 64;
-/// Requests at a time.
+/// Number of concurrent requests.
 const PARALLEL: usize = 16;

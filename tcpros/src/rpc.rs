@@ -1,4 +1,4 @@
-//! XML-RPC over HTTP, both ends, with a time limit on everything.
+//! XML-RPC over HTTP, client and server, with a time limit on every operation.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -20,7 +20,7 @@ use crate::crowd::{Admission, Crowd, Places};
 use crate::events;
 use crate::xmlrpc::{Call, Fault, Response, Value, XmlError, encode_response, parse_response};
 
-/// Where an XML-RPC server listens.
+/// Address of an XML-RPC server.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
 pub(crate) struct Endpoint {
     host: String,
@@ -30,7 +30,7 @@ pub(crate) struct Endpoint {
 }
 
 impl Endpoint {
-    /// Reads `http://host:port[/path]`.
+    /// Parses `http://host:port[/path]`.
     pub(crate) fn parse(uri: &str) -> Option<Self> {
         let (host, port, path) = parts(uri, "http://")?;
         Some(Self {
@@ -41,7 +41,7 @@ impl Endpoint {
         })
     }
 
-    /// Tries the IPv6 addresses of the host before the others, or after them.
+    /// Selects whether the IPv6 addresses of the host are tried before the other addresses.
     pub(crate) const fn ipv6_first(mut self, ipv6_first: bool) -> Self {
         self.ipv6_first = ipv6_first;
         self
@@ -52,7 +52,7 @@ impl Endpoint {
     }
 }
 
-/// A host as it stands before a port: an IPv6 address in brackets.
+/// Returns a host as written before a port: an IPv6 address in brackets.
 pub(crate) fn bracketed(host: &str) -> String {
     if host.contains(':') {
         format!("[{host}]")
@@ -61,7 +61,7 @@ pub(crate) fn bracketed(host: &str) -> String {
     }
 }
 
-/// Host, port and path of a URI of this scheme.
+/// Returns host, port and path of a URI of this scheme.
 pub(crate) fn parts<'a>(uri: &'a str, scheme: &str) -> Option<(&'a str, u16, &'a str)> {
     let rest = uri.trim().strip_prefix(scheme)?;
     let (authority, path) = rest.find('/').map_or((rest, "/"), |at| rest.split_at(at));
@@ -121,7 +121,8 @@ async fn exchange(endpoint: &Endpoint, body: String) -> Result<Bytes, RpcError> 
             .map_err(|error| RpcError::Body(error.to_string()))?
             .to_bytes())
     };
-    // The connection does the reading and writing; once it ends, what it has read still waits in the response.
+    // The connection does the reading and writing. Once it ends, received data still waits in the
+    // response.
     let drive = async {
         if let Err(error) = connection.await {
             tracing::trace!(%error, "an XML-RPC connection ended early");
@@ -134,8 +135,8 @@ async fn exchange(endpoint: &Endpoint, body: String) -> Result<Bytes, RpcError> 
     }
 }
 
-/// Connects with Nagle's algorithm off, to the IPv4 addresses of a name first, as ROS 1 peers listen there unless
-/// they are told to use IPv6.
+/// Connects without Nagle's algorithm. The IPv4 addresses of a name are tried first unless IPv6 is
+/// configured, because ROS 1 peers listen on IPv4 by default.
 pub(crate) async fn connect(host: &str, port: u16, ipv6_first: bool) -> std::io::Result<TcpStream> {
     let mut addresses: Vec<SocketAddr> = tokio::net::lookup_host((host, port)).await?.collect();
     addresses.sort_by_key(|address| address.is_ipv6() != ipv6_first);
@@ -144,10 +145,11 @@ pub(crate) async fn connect(host: &str, port: u16, ipv6_first: bool) -> std::io:
     Ok(stream)
 }
 
-/// Answers calls on a listener until it is dropped. The handler must not wait: it runs in the connection's task.
+/// Serves calls on a listener until it is dropped. The handler must not wait: it runs in the
+/// connection's task.
 ///
-/// A call takes milliseconds, so who comes is always let in: where there are too many, the oldest connection gives way,
-/// whose caller makes a new one for its next call.
+/// A call takes milliseconds, so a new connection is always admitted. Beyond the limit the oldest
+/// connection is closed; its caller makes a new connection for its next call.
 pub(crate) async fn serve<H>(listener: TcpListener, places: Places, handler: H)
 where
     H: Fn(Call) -> Response + Send + Sync + 'static,
@@ -193,7 +195,7 @@ where
     let served = hyper::server::conn::http1::Builder::new()
         .timer(TokioTimer::new())
         .header_read_timeout(READ_LIMIT)
-        // XmlRpc++ of old looks for `Content-length`, in some case or other.
+        // Old versions of XmlRpc++ search for `Content-length` in various cases.
         .title_case_headers(true)
         .serve_connection(TokioIo::new(stream), service)
         .await;
@@ -244,29 +246,29 @@ fn plain(status: StatusCode) -> hyper::Response<Full<Bytes>> {
     response
 }
 
-/// Why a call brought no result.
+/// Error of a call.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum RpcError {
     /// The URI of the server is not `http://host:port`.
     #[error("the URI is not http://host:port")]
     Uri,
-    /// Nobody listens there, or the name does not resolve.
+    /// No server listens at the address, or the name does not resolve.
     #[error("no connection: {0}")]
     Connect(#[source] std::io::Error),
-    /// No answer in time.
+    /// No response in time.
     #[error("no answer within {0:?}")]
     Timeout(Duration),
-    /// The peer does not speak HTTP, or stopped midway.
+    /// The peer does not use HTTP, or stopped midway.
     #[error("HTTP failed: {0}")]
     Http(#[from] hyper::Error),
-    /// The answer's body did not arrive or is longer than 4 MiB.
+    /// The body of the response was not received or is longer than 4 MiB.
     #[error("the answer was not read: {0}")]
     Body(String),
     /// A status other than 200.
     #[error("HTTP status {0}")]
     Status(u16),
-    /// The answer is not XML-RPC.
+    /// The response is not XML-RPC.
     #[error("the answer is not XML-RPC: {0}")]
     Xml(#[from] XmlError),
     /// The method failed at the peer.
@@ -276,7 +278,8 @@ pub enum RpcError {
 
 const XML: &str = "text/xml";
 const MAX_BODY: usize = 4 * 1024 * 1024;
-/// For the head of a call, from the one before on a connection that is kept, and for its body.
+/// Time limit for the header of a call, from the previous call on a persistent connection, and for
+/// its body.
 const READ_LIMIT: Duration = Duration::from_secs(5);
 
 #[cfg(test)]

@@ -1,8 +1,8 @@
-//! Services: one request, one answer, as bytes of any type.
+//! Services: a request and a response, as bytes of any type.
 //!
-//! The wire is TCPROS with the header field `service`
-//! (<https://wiki.ros.org/ROS/TCPROS>, "Service"): a request is UInt32 length and body, an answer the ok byte, UInt32
-//! length and body, little endian. An ok byte of 0 makes the body an error text.
+//! The wire format is TCPROS with the header field `service` (<https://wiki.ros.org/ROS/TCPROS>,
+//! "Service"). A request is a UInt32 length and a body. A response is the ok byte, a UInt32 length
+//! and a body, little endian. If the ok byte is 0, the body is an error text.
 
 mod client;
 mod server;
@@ -11,18 +11,18 @@ pub use self::client::{CallPhase, ServiceClient, ServiceClientOptions, ServiceEr
 pub(crate) use self::server::{Admitted, ClientFault, Served, nonexistent};
 pub use self::server::{ServiceOptions, ServiceRequest, ServiceServer};
 
-/// The type of a service, as its clients compare and `rosservice` shows it.
+/// The type of a service, as its clients compare it and `rosservice` shows it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ServiceType {
-    /// Such as `std_srvs/SetBool`.
+    /// Name, such as `std_srvs/SetBool`.
     pub name: String,
     /// Checksum of the definition, request and response together, 32 hexadecimal digits.
     pub md5sum: String,
-    /// Such as `std_srvs/SetBoolRequest`.
+    /// Name of the request type, such as `std_srvs/SetBoolRequest`.
     pub request_type: String,
-    /// Such as `std_srvs/SetBoolResponse`.
+    /// Name of the response type, such as `std_srvs/SetBoolResponse`.
     pub response_type: String,
 }
 
-/// 64 MiB: what one request or answer may have unless the options say otherwise, in bytes.
+/// Default limit of a request or a response: 64 MiB, in bytes.
 const DEFAULT_MAX_BODY: usize = 64 * 1024 * 1024;

@@ -1,6 +1,6 @@
-//! The slave API: what the master, other nodes and `rosnode` ask of this node.
+//! The slave API: the calls of the master, other nodes and `rosnode` to this node.
 //!
-//! Every call is answered at once; what it sets in motion goes on in tasks of its own.
+//! Every call is answered at once; its effects continue in tasks of their own.
 
 use std::sync::atomic::Ordering;
 
@@ -11,7 +11,7 @@ use crate::node::Inner;
 use crate::outbox::lock;
 use crate::xmlrpc::{Call, Fault, Response, Value};
 
-/// Answers one call.
+/// Answers a call.
 pub(crate) fn answer(node: &Inner, call: Call) -> Response {
     let params = call.params.as_slice();
     match call.method.as_str() {
@@ -47,7 +47,7 @@ fn param_update(node: &Inner, params: &[Value]) -> Value {
     let [_, Value::String(key), _] = params else {
         return refused("paramUpdate takes (caller_id, key, value)");
     };
-    // The key of a namespace ends in a slash, and that of the root is nothing else.
+    // The key of a namespace ends in a slash, and the key of the root is only a slash.
     let name = key.trim_end_matches('/');
     node.parameter_changed(if name.is_empty() { "/" } else { name });
     done(0)
@@ -105,7 +105,7 @@ fn subscriptions(node: &Inner) -> Value {
     Value::Array(node.feeds().iter().map(pair).collect())
 }
 
-/// `[publishStats, subscribeStats, serviceStats]`.
+/// Returns `[publishStats, subscribeStats, serviceStats]`.
 fn bus_stats(node: &Inner) -> Value {
     let mut published = Vec::new();
     for hub in node.publications() {
@@ -137,7 +137,8 @@ fn bus_stats(node: &Inner) -> Value {
         let connections: Vec<Value> = feed.connections().into_iter().map(connection).collect();
         subscribed.push(vec![feed.topic.as_str().into(), connections.into()].into());
     }
-    // Requests, bytes received, bytes sent, over all services: the slave API knows no more of them.
+    // Requests, bytes received and bytes sent over all services: the slave API has no finer
+    // statistics.
     let (mut calls, mut received, mut sent) = (0u64, 0u64, 0u64);
     for served in node.services() {
         let counters = &served.counters;
@@ -153,8 +154,9 @@ fn bus_stats(node: &Inner) -> Value {
     ])
 }
 
-/// `[connectionId, destinationId, direction, transport, topic, connected, connectionInfo]` per connection, the
-/// destination being the name of a subscriber or the URI of a publisher, as rospy and roscpp have it.
+/// Returns `[connectionId, destinationId, direction, transport, topic, connected, connectionInfo]`
+/// per connection. The destination is the name of a subscriber or the URI of a publisher, as in
+/// rospy and roscpp.
 fn bus_info(node: &Inner) -> Value {
     let mut entries = Vec::new();
     for hub in node.publications() {
@@ -186,7 +188,7 @@ fn bus_info(node: &Inner) -> Value {
     Value::Array(entries)
 }
 
-/// XML-RPC integers have 32 bits: counts stop at their end.
+/// Returns a count as an XML-RPC integer of 32 bits; larger counts are limited.
 fn count(number: u64) -> Value {
     Value::Int(i32::try_from(number).unwrap_or(i32::MAX))
 }
@@ -203,5 +205,6 @@ fn triple(code: i32, message: &str, result: impl Into<Value>) -> Value {
     Value::Array(vec![code.into(), message.into(), result.into()])
 }
 
-/// What the master says to the node that had a name before (`rosmaster/registrations.py`).
+/// Text with which the master displaces the previous owner of a name
+/// (`rosmaster/registrations.py`).
 const NAME_TAKEN: &str = "new node registered with same name";

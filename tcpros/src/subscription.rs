@@ -17,26 +17,27 @@ use crate::link::{self, LinkContext};
 use crate::node::Inner;
 use crate::outbox::lock;
 
-/// What a subscriber asks publishers for. `None` takes anything.
+/// The type that a subscriber requests from publishers. `None` accepts any type.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Wanted {
-    /// Such as `std_msgs/String`.
+    /// Name, such as `std_msgs/String`.
     pub type_name: Option<String>,
     /// Checksum of the definition.
     pub md5sum: Option<String>,
 }
 
-/// How much a subscription holds for a consumer that is late.
+/// Queue limits of a subscription.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SubscriberOptions {
-    /// How many messages may wait; then the oldest are dropped.
+    /// Maximum number of waiting messages; beyond it the oldest are dropped.
     pub queue_messages: usize,
-    /// How many bytes may wait; then the oldest messages are dropped. The newest is always kept.
+    /// Maximum number of waiting bytes; beyond it the oldest messages are dropped. The newest
+    /// message is always kept.
     pub queue_bytes: usize,
 }
 
 impl Default for SubscriberOptions {
-    /// 1000 messages, 16 MiB.
+    /// Returns limits of 1000 messages and 16 MiB.
     fn default() -> Self {
         Self {
             queue_messages: 1000,
@@ -45,7 +46,7 @@ impl Default for SubscriberOptions {
     }
 }
 
-/// Receives one topic into an inbox. Dropping it unsubscribes and discards what is still queued.
+/// Receives a topic into an inbox. Dropping it unsubscribes and discards the queued messages.
 #[derive(Debug)]
 pub struct Subscription {
     feed: Arc<Feed>,
@@ -57,22 +58,23 @@ impl Subscription {
         Self { feed, node }
     }
 
-    /// The topic's resolved name.
+    /// Returns the resolved name of the topic.
     pub fn topic(&self) -> &str {
         &self.feed.topic
     }
 
-    /// How many publishers are connected.
+    /// Returns the number of connected publishers.
     pub fn publishers(&self) -> usize {
         self.feed.publishers.load(Ordering::Relaxed)
     }
 
-    /// Messages lost so far because the consumer was late.
+    /// Returns the number of messages lost because the consumer was late.
     pub fn dropped(&self) -> u64 {
         self.feed.dropped.load(Ordering::Relaxed)
     }
 
-    /// Connections closed because a publisher announced a message past the limit.
+    /// Returns the number of connections closed because a publisher announced a message past the
+    /// limit.
     pub fn refused_frames(&self) -> u64 {
         self.feed.refused_frames.load(Ordering::Relaxed)
     }
@@ -105,23 +107,24 @@ struct Links {
 
 #[derive(Debug)]
 struct Link {
-    /// Whether the master names this publisher. One that it no longer names is followed while it is connected:
-    /// after a restart the master does not know the nodes that never register again, and they go on publishing.
+    /// Whether the master lists this publisher. A publisher that is no longer listed is followed
+    /// while it is connected. After a restart the master does not know the nodes that never
+    /// register again, although they continue to publish.
     named: bool,
     state: Arc<LinkState>,
     task: AbortHandle,
 }
 
-/// What one link has done.
+/// State and counters of a link.
 #[derive(Debug)]
 pub(crate) struct LinkState {
     pub(crate) id: i32,
     pub(crate) bytes: AtomicU64,
     pub(crate) messages: AtomicU64,
     pub(crate) connected: AtomicBool,
-    /// What `rosnode info` shows of the connection.
+    /// Description of the connection for `rosnode info`.
     pub(crate) transport: Mutex<String>,
-    /// Rings when the publisher is named again, which ends the wait for the next try.
+    /// Notifies that the publisher is listed again, which ends the wait for the next attempt.
     pub(crate) named_again: Notify,
 }
 
@@ -152,9 +155,10 @@ impl Feed {
         }
     }
 
-    /// Takes the master's list of publishers: links to new ones start, those to others end unless connected. One that
-    /// is named again may just have come back under its old address, so its link does not wait any longer. There are
-    /// so many links at most; of more publishers those that come first in the list are followed.
+    /// Applies the master's list of publishers: starts links to new publishers, and ends links to
+    /// unlisted publishers unless they are connected. A publisher that is listed again may have
+    /// restarted under its old address, so its link retries at once. The number of links is
+    /// limited; beyond the limit only the first publishers of the list are followed.
     pub(crate) fn update(
         self: &Arc<Self>,
         uris: &[String],
@@ -206,10 +210,11 @@ impl Feed {
         }
     }
 
-    /// Asked by a link that has lost its connection. One that is not wanted is forgotten.
+    /// Returns whether a link that has lost its connection should reconnect. A link that is not
+    /// wanted is removed.
     pub(crate) fn still_wanted(&self, uri: &str, state: &Arc<LinkState>) -> bool {
         let mut links = lock(&self.links);
-        // A later link to the same publisher is not this one's to judge or forget.
+        // A later link to the same publisher is not affected by this call.
         let own = links
             .by_uri
             .get(uri)
@@ -223,7 +228,7 @@ impl Feed {
         named
     }
 
-    /// Counts and reports a connection until the guard goes.
+    /// Counts and reports a connection until the guard is dropped.
     pub(crate) fn connected<'a>(&'a self, peer: Arc<Peer>, state: &'a LinkState) -> Connected<'a> {
         state.connected.store(true, Ordering::Release);
         let publishers = self.publishers.fetch_add(1, Ordering::AcqRel) + 1;
@@ -242,7 +247,7 @@ impl Feed {
         }
     }
 
-    /// Ends all links; nothing reaches the inbox any more.
+    /// Ends all links; afterwards no event reaches the inbox.
     pub(crate) fn close(&self) {
         let mut links = lock(&self.links);
         links.closed = true;
@@ -257,7 +262,7 @@ impl Feed {
         self.dropped.load(Ordering::Relaxed)
     }
 
-    /// The connected links with the URIs of their publishers.
+    /// Returns the connected links with the URIs of their publishers.
     pub(crate) fn connections(&self) -> Vec<(String, Arc<LinkState>)> {
         let links = lock(&self.links);
         let connected = links
@@ -279,7 +284,7 @@ impl fmt::Debug for Feed {
     }
 }
 
-/// One connection to a publisher.
+/// A connection to a publisher.
 pub(crate) struct Connected<'a> {
     feed: &'a Feed,
     peer: Arc<Peer>,
@@ -297,5 +302,5 @@ impl Drop for Connected<'_> {
 }
 
 const LOG_PERIOD: Duration = Duration::from_secs(60);
-/// Bytes of a publisher's URI: a host name has 253 at most.
+/// Maximum length of a publisher's URI, in bytes: a host name has 253 at most.
 const MAX_URI: usize = 1024;

@@ -1,4 +1,4 @@
-//! Time as ROS messages carry it, and the clock it is read from.
+//! Time as in ROS messages, and the clock of a node.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -7,7 +7,8 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use crate::clock;
 use crate::inbox::{Deliver, Message, Peer};
 
-/// A point in time, as the `time` of a message: since the Unix epoch, or since the start of a simulation.
+/// A point in time, as the `time` of a message: since the Unix epoch, or since the start of a
+/// simulation.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct RosTime {
     /// Whole seconds.
@@ -17,7 +18,8 @@ pub struct RosTime {
 }
 
 impl RosTime {
-    /// Reads the wall clock. What lies outside the 136 years a ROS time can say becomes the nearer end.
+    /// Converts a wall clock time. A time outside the 136 years of ROS time becomes the nearer
+    /// limit.
     pub fn from_system(time: SystemTime) -> Self {
         let since = time.duration_since(UNIX_EPOCH).unwrap_or(Duration::ZERO);
         u32::try_from(since.as_secs()).map_or(
@@ -33,12 +35,12 @@ impl RosTime {
     }
 }
 
-/// The clock of a node: the wall clock, or the simulated one of `/clock` while the parameter `/use_sim_time` is true
-/// (`wiki.ros.org/Clock`).
+/// The clock of a node: the wall clock, or the simulated clock of `/clock` while the parameter
+/// `/use_sim_time` is true (`wiki.ros.org/Clock`).
 ///
-/// It is for what messages say. Simulated time stands still and jumps back as its publisher likes, so time limits,
-/// the watch over the master and reconnecting never look at it. A `/clock` that this very node publishes is not
-/// heard, as no node hears itself.
+/// The clock is for the contents of messages. Simulated time stops and jumps back at the will of
+/// its publisher, so time limits, the supervision of the master and reconnecting never use it. A
+/// `/clock` that this very node publishes is not received, as no node receives its own messages.
 #[derive(Clone, Debug, Default)]
 pub struct RosClock {
     simulation: Arc<Simulation>,
@@ -53,7 +55,8 @@ struct Simulation {
 }
 
 impl RosClock {
-    /// The time now. Simulated time is the last that came, and zero before the first.
+    /// Returns the current time. Simulated time is the last received time, and zero before the
+    /// first.
     pub fn now(&self) -> RosTime {
         if !self.is_simulated() {
             return RosTime::from_system(clock::utc());
@@ -65,17 +68,18 @@ impl RosClock {
         }
     }
 
-    /// Whether the time is that of `/clock`.
+    /// Returns whether the time is that of `/clock`.
     pub fn is_simulated(&self) -> bool {
         self.simulation.runs.load(Ordering::Acquire)
     }
 
-    /// Messages of `/clock` that said no time, since the start.
+    /// Returns the number of invalid messages of `/clock` since the start.
     pub fn malformed(&self) -> u64 {
         self.simulation.malformed.load(Ordering::Relaxed)
     }
 
-    /// Goes over to simulated time, which begins at zero, or back to the wall clock. Returns whether that was a change.
+    /// Switches to simulated time, which starts at zero, or back to the wall clock. Returns whether
+    /// the source has changed.
     pub(crate) fn simulate(&self, simulated: bool) -> bool {
         if self.is_simulated() == simulated {
             return false;
@@ -100,7 +104,8 @@ impl RosClock {
     }
 }
 
-/// The messages of `/clock` go straight into the clock: nothing waits, and the newest is what counts.
+/// The messages of `/clock` are passed directly to the clock: nothing is queued, and only the
+/// newest message matters.
 impl Deliver for RosClock {
     fn message(&self, message: Message) -> u64 {
         self.set(&message.bytes);

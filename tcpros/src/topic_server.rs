@@ -1,7 +1,8 @@
-//! Where subscribers and the clients of services connect: accepting, the handshake, and writing to each on its own.
+//! The listener for subscribers and clients of services: accepting, the handshake, and writing to
+//! each connection independently.
 //!
-//! The accept loop only accepts. Each connection is one task, which ends with the connection, with its publisher, or
-//! with the node, whose accept task owns them all.
+//! The accept loop only accepts. Each connection is a task, which ends with the connection, with
+//! its publisher, or with the node; the accept task of the node owns all tasks.
 
 use std::net::SocketAddr;
 use std::pin::Pin;
@@ -25,8 +26,8 @@ use crate::node::Inner;
 use crate::publisher::{Joined, Subscriber};
 use crate::service::{self, ClientFault};
 
-/// Serves the subscribers and clients of a node until it is dropped. Where there are too many, those that have not
-/// shaken hands yet give way, and then who comes is turned away.
+/// Serves the subscribers and clients of a node until it is dropped. Beyond the limit, connections
+/// without a completed handshake are closed first; otherwise the new connection is refused.
 pub(crate) async fn serve(listener: TcpListener, places: Places, node: Arc<Inner>) {
     let mut crowd = Crowd::new(places);
     let mut connections: JoinSet<Result<(), (SocketAddr, Refused)>> = JoinSet::new();
@@ -83,7 +84,7 @@ async fn serve_one(mut stream: TcpStream, node: &Inner, settled: &Settled) -> Re
     Ok(())
 }
 
-/// What a peer has come for and may have.
+/// Role of an admitted peer.
 enum Admitted {
     Subscriber(Joined),
     Service(service::Admitted),
@@ -106,7 +107,7 @@ async fn shake_hands(stream: &mut TcpStream, node: &Inner) -> Result<Admitted, R
     }
 }
 
-/// Joins before the reply is written, so that what is published from then on arrives.
+/// Joins before the reply is written, so that all messages published from then on arrive.
 fn admit(
     request: ConnectionHeader,
     node: &Inner,
@@ -150,7 +151,8 @@ async fn write_messages(stream: &mut TcpStream, subscriber: &Subscriber) -> Ende
     });
     loop {
         waiting.clear();
-        // Both branches are cancel-safe: `take` takes nothing before it returns, and what is read is of no use.
+        // Both branches are cancel-safe: `take` removes nothing before it returns, and data from
+        // the subscriber is discarded.
         let more = tokio::select! {
             biased;
             more = outbox.take(&mut waiting, BATCH) => more,
@@ -175,7 +177,7 @@ async fn write_messages(stream: &mut TcpStream, subscriber: &Subscriber) -> Ende
     }
 }
 
-/// Writes messages: small ones together in one piece, a large one without copying it.
+/// Writes messages: small messages together in a single piece, a large message without copying it.
 async fn write_all(
     writer: &mut (impl AsyncWrite + Unpin),
     messages: &mut Vec<Bytes>,
@@ -193,8 +195,8 @@ async fn write_all(
     write(writer, batch.split().freeze(), Bytes::new(), overdue).await
 }
 
-/// Writes two pieces as one, the second without copying it, as long as the peer takes at least something in time and
-/// `overdue` does not end.
+/// Writes two pieces as one, the second without copying it. Fails if the peer accepts no data in
+/// time or if `overdue` completes.
 pub(crate) async fn write(
     writer: &mut (impl AsyncWrite + Unpin),
     head: Bytes,
@@ -217,7 +219,8 @@ pub(crate) async fn write(
     Ok(())
 }
 
-/// A subscriber has nothing to say after its header: reading is how its leaving is noticed.
+/// Reads until the subscriber disconnects. A subscriber sends nothing after its header, so reading
+/// only detects the end.
 pub(crate) async fn until_closed(reader: &mut ReadHalf<'_>) -> Ended {
     let mut nothing = [0; 256];
     loop {
@@ -230,13 +233,13 @@ pub(crate) async fn until_closed(reader: &mut ReadHalf<'_>) -> Ended {
 }
 
 fn length(message: &Bytes) -> [u8; 4] {
-    // `publish` lets nothing longer in.
+    // `publish` refuses longer messages.
     u32::try_from(message.len())
         .unwrap_or(u32::MAX)
         .to_le_bytes()
 }
 
-/// Why a peer was turned away.
+/// Reason for which a peer was refused.
 #[derive(Debug, Error)]
 enum Refused {
     #[error("it sent no connection header within {0:?}")]
@@ -251,7 +254,7 @@ enum Refused {
     Io(#[from] std::io::Error),
 }
 
-/// How a connection came to its end.
+/// Reason for the end of a connection.
 #[derive(Debug, Error)]
 pub(crate) enum Ended {
     #[error("it closed the connection")]
@@ -266,11 +269,11 @@ pub(crate) enum Ended {
 
 const HANDSHAKE_LIMIT: Duration = Duration::from_secs(5);
 pub(crate) const STALL_LIMIT: Duration = Duration::from_secs(10);
-/// How long what has been withdrawn may take to send what it still has.
+/// Time limit for sending the queued data of a withdrawn topic or service.
 pub(crate) const DRAIN_LIMIT: Duration = Duration::from_secs(1);
-/// Messages written in one go.
+/// Number of message bytes written at once.
 const BATCH: usize = 64 * 1024;
-/// Up to here copying a message into the batch is cheaper than a write of its own.
+/// Up to this size, copying a message into the batch is cheaper than a write of its own.
 const COPIED: usize = 16 * 1024;
 
 #[cfg(test)]
@@ -282,7 +285,8 @@ mod tests {
     use super::*;
     use crate::outbox::{Limit, Outbox};
 
-    /// Takes everything and notes the pieces of each write: where they are and how long.
+    /// A writer that accepts all data and records the address and length of the pieces of each
+    /// write.
     #[derive(Default)]
     struct Recorder {
         writes: Vec<Vec<(*const u8, usize)>>,
@@ -347,7 +351,7 @@ mod tests {
         recorder
     }
 
-    /// Requirement: small messages that wait leave in one write.
+    /// Requirement: small messages that wait leave in a single write.
     #[tokio::test]
     async fn small_messages_that_wait_leave_in_one_write() {
         let messages: Vec<Bytes> = (0..100u8).map(|n| Bytes::from(vec![n; 16])).collect();
@@ -364,7 +368,8 @@ mod tests {
         let small = Bytes::from_static(b"small");
         let large = Bytes::from(vec![7; 100_000]);
         let recorder = written(&[small, large.clone()]).await;
-        // The one that fits a batch goes ahead; the other is one write of two pieces.
+        // The message that fits a batch is written first; the other message is a single write of
+        // two pieces.
         assert_eq!(recorder.writes[1][0].1, 4);
         assert_eq!(recorder.writes[1][1], (large.as_ptr(), large.len()));
         assert_eq!(recorder.writes.len(), 2);

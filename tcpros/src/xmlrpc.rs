@@ -1,8 +1,9 @@
-//! XML-RPC as ROS 1 speaks it: calls, responses and faults as text.
+//! XML-RPC as used by ROS 1: calls, responses and faults as text.
 //!
-//! The reader takes what the specification allows and what ROS peers add (`<value>` without a type, `<nil/>`,
-//! `<i8>`), and refuses the rest with the place it stopped at. It does not read DTDs, so there are no entities to
-//! expand, and it bounds nesting; the size of a document is the caller's to bound.
+//! The reader accepts the specification and the extensions of ROS peers (`<value>` without a type,
+//! `<nil/>`, `<i8>`), and refuses everything else with the position of the error. It does not read
+//! DTDs, so there are no entities to expand, and it limits nesting. The caller has to limit the
+//! size of a document.
 
 mod reader;
 mod writer;
@@ -12,7 +13,7 @@ use thiserror::Error;
 use self::reader::Reader;
 use self::writer::{escape, write_value};
 
-/// One XML-RPC value.
+/// An XML-RPC value.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) enum Value {
     /// `<i4>` and `<int>`; also `<i8>` where the number fits.
@@ -36,7 +37,7 @@ pub(crate) enum Value {
 }
 
 impl Value {
-    /// The text of a string value.
+    /// Returns the text of a string value.
     pub(crate) fn as_str(&self) -> Option<&str> {
         if let Self::String(text) = self {
             Some(text)
@@ -45,7 +46,8 @@ impl Value {
         }
     }
 
-    /// The number of an integer value; a boolean counts as 0 or 1, as some peers write status codes so.
+    /// Returns the number of an integer value; a boolean counts as 0 or 1, because some peers write
+    /// status codes as booleans.
     pub(crate) fn as_int(&self) -> Option<i32> {
         match self {
             Self::Int(number) => Some(*number),
@@ -60,7 +62,7 @@ impl Value {
         }
     }
 
-    /// The elements of an array value.
+    /// Returns the elements of an array value.
     pub(crate) fn as_array(&self) -> Option<&[Self]> {
         if let Self::Array(items) = self {
             Some(items)
@@ -99,7 +101,7 @@ impl From<Vec<Self>> for Value {
 pub(crate) struct Call {
     /// Name of the method.
     pub(crate) method: String,
-    /// Its arguments, in order.
+    /// Arguments in order.
     pub(crate) params: Vec<Value>,
 }
 
@@ -117,7 +119,7 @@ impl Call {
         Ok(Self { method, params })
     }
 
-    /// The call as a document.
+    /// Returns the call as a document.
     pub(crate) fn encode(&self) -> String {
         let mut out = String::from("<?xml version=\"1.0\"?>\n<methodCall><methodName>");
         escape(&self.method, &mut out);
@@ -142,7 +144,7 @@ pub struct Fault {
     pub message: String,
 }
 
-/// What a method call came to.
+/// The result of a method call.
 pub(crate) type Response = Result<Value, Fault>;
 
 /// Reads a `<methodResponse>` document.
@@ -169,7 +171,7 @@ pub(crate) fn parse_response(document: &[u8]) -> Result<Response, XmlError> {
     Ok(response)
 }
 
-/// A response as a document.
+/// Returns a response as a document.
 pub(crate) fn encode_response(response: &Response) -> String {
     let mut out = String::from("<?xml version=\"1.0\"?>\n<methodResponse>");
     match response {
@@ -195,33 +197,33 @@ pub(crate) fn encode_response(response: &Response) -> String {
     out
 }
 
-/// Why a document was refused. Positions are byte offsets.
+/// Error in a document. Positions are byte offsets.
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
 #[non_exhaustive]
 pub enum XmlError {
     /// Not UTF-8, which is the only encoding ROS peers use.
     #[error("the document is not UTF-8")]
     NotUtf8,
-    /// A tag other than those allowed here, or none.
+    /// A tag is missing or not allowed here.
     #[error("expected {expected} at byte {at}")]
     Tag {
-        /// What would have been right.
+        /// The expected tag.
         expected: &'static str,
-        /// Where.
+        /// Position of the error.
         at: usize,
     },
-    /// The text inside a tag does not read as its type.
+    /// The text inside a tag is invalid for its type.
     #[error("expected {expected} before byte {at}")]
     Content {
-        /// What would have been right.
+        /// The expected content.
         expected: &'static str,
-        /// Where the text ends.
+        /// Position of the end of the text.
         at: usize,
     },
     /// The document ends inside an element.
     #[error("the document ends inside {0}")]
     Truncated(&'static str),
-    /// Arrays and structs nested deeper than ROS uses.
+    /// Arrays and structs are nested deeper than ROS uses.
     #[error("values are nested more than {MAX_DEPTH} deep")]
     TooDeep,
 }
@@ -425,7 +427,7 @@ mod tests {
 
         #[test]
         fn random_tags_never_panic(text in "(<(/)?(methodCall|methodName|params|param|value|array|data|struct|member|name|i4|base64)(/)?>|[a&;#<>!\\[\\]-]){0,60}") {
-            // The call may be well formed by chance; what counts is that reading ends in a value or an error.
+            // The call may be well formed by chance; reading has to end in a value or an error.
             if let Ok(call) = Call::parse(text.as_bytes()) {
                 prop_assert_eq!(Call::parse(call.encode().as_bytes()), Ok(call));
             }

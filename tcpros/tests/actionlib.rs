@@ -1,5 +1,5 @@
-//! Action clients and servers of this crate with one another, and with messages made by hand, around a master in this
-//! process.
+//! Action clients and servers of this crate with each other, and with hand-made messages, around a
+//! master in this process.
 
 #![expect(clippy::unwrap_used, clippy::panic, reason = "test code")]
 
@@ -248,7 +248,8 @@ async fn a_goal_with_an_id_of_the_caller_is_stamped_by_its_server() {
     first.succeed(b"", "").unwrap();
     ahead.secs += 1000;
     assert_eq!(client.cancel_before(ahead), 1);
-    // Any stamp of this host is earlier than the last one the server has: the goal would be recalled.
+    // Any stamp of this host is earlier than the last cancel time at the server: the goal would be
+    // recalled.
     let _handle = client.send_goal_as("mine".to_owned(), b"2").unwrap();
     let held = goal(&mut server).await;
     assert_eq!(held.goal_id().id, "mine");
@@ -306,7 +307,7 @@ async fn a_server_that_goes_loses_its_goals_and_the_next_one_is_found() {
     let held = goal(&mut server).await;
     held.accept("").unwrap();
     state(&mut handle, CommState::Active).await;
-    // As when its process dies: the connections end, and nothing more is said.
+    // As when the process dies: the connections end without any further message.
     std::mem::forget((held, server));
     drop(robot);
     let reason = lost(&mut handle).await;
@@ -334,7 +335,7 @@ async fn closing_a_client_ends_its_goals() {
     assert_eq!(lost(&mut handle).await, LostReason::ClientClosed);
 }
 
-/// An action's topics by hand: what a client hears, and what a server does.
+/// A hand-made server: publishes the topics of an action, and receives goals and cancel requests.
 struct ByHand {
     status: Publisher,
     feedback: Publisher,
@@ -402,7 +403,7 @@ fn impatient() -> ActionClientOptions {
     }
 }
 
-/// A server by hand that a client has found, and a goal sent to it.
+/// Returns a hand-made server that a client has found, and a goal sent to it.
 async fn sent_by_hand(robot: &Node, client: &ActionClient) -> (ByHand, GoalHandle) {
     let mut server = ByHand::server(robot);
     within("the server", async {

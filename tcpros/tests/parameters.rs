@@ -68,7 +68,7 @@ async fn next(subscription: &mut ParamSubscription) -> Option<ParamValue> {
     within("a value", subscription.recv()).await.unwrap()
 }
 
-/// A master where the last one was.
+/// Starts a master at the address of the previous master.
 async fn again(address: SocketAddr) -> Core {
     within("the port", async {
         loop {
@@ -209,10 +209,10 @@ async fn a_subscription_tells_the_value_now_and_each_change() {
     other.set("rate", 5).await.unwrap();
     assert_eq!(next(&mut rate).await, Some(5.into()));
     assert_eq!(rate.current(), Some(5.into()));
-    // The master does not tell a node of what it sets itself.
+    // The master does not notify a node of its own changes.
     ours.set("rate", 6).await.unwrap();
     assert_eq!(next(&mut rate).await, Some(6.into()));
-    // One that comes later begins with what is known.
+    // A later subscription starts with the known value.
     let mut second = ours.subscribe("rate").unwrap();
     assert_eq!(next(&mut second).await, Some(6.into()));
     drop(second);
@@ -298,7 +298,7 @@ async fn the_end_of_a_node_ends_its_subscriptions_and_leaves_no_name_behind() {
     assert_eq!(parameters.get("/rate").await.unwrap(), Some(1.into()));
 }
 
-/// What the master answers to `lookupNode`.
+/// Returns the reply of the master to `lookupNode`.
 async fn known_as(core: &Core, name: &str) -> String {
     call(
         core.address(),
@@ -343,7 +343,8 @@ async fn private_parameters_of_the_command_line_are_there_when_the_node_is_regis
     assert_eq!(own["frame"], "map".into());
     assert_eq!(own["gains"], [("p", 0.5)].into());
     assert_eq!((own.get("old"), &own["new"]), (None, &1.into()));
-    // A restarted master gets them again, except for those that somebody has set meanwhile.
+    // A restarted master gets the parameters again, except for parameters that were set in the
+    // meantime.
     drop(first);
     reaches(&node, MasterState::Awaited).await;
     let second = again(address).await;
@@ -441,7 +442,8 @@ async fn watching_the_master_and_reconnecting_go_on_while_simulated_time_stands_
     eventually("the link", || heard.publishers() == 1).await;
     tick(&clock, 2);
     eventually("the jump back", || ours.now().secs == 2).await;
-    // From here on the clock says nothing more. The publisher goes and comes back, and so does the master.
+    // From here on the clock publishes nothing. The publisher and the master are stopped and
+    // restarted.
     drop(publisher);
     eventually("the loss of the link", || heard.publishers() == 0).await;
     let publisher = simulator
@@ -464,7 +466,7 @@ async fn watching_the_master_and_reconnecting_go_on_while_simulated_time_stands_
     })
     .await;
     assert_eq!(before, RosTime { secs: 2, nsecs: 5 });
-    // The new master knows nothing of a simulation.
+    // The new master has no simulated time.
     eventually("the wall clock", || !ours.clock().is_simulated()).await;
     drop(publisher);
 }
@@ -482,7 +484,7 @@ async fn the_first_of_two_nodes_of_one_name_leaves_and_takes_nothing_of_the_seco
     let reason = within("the request", first.shutdown_requested()).await;
     assert!(reason.contains("/line/twin"), "{reason}");
     registered(&second).await;
-    // What the first does now must not push out the second.
+    // Later registrations of the first node must not displace the second node.
     let late = first
         .advertise("/late", string(), Default::default())
         .unwrap();
@@ -500,7 +502,7 @@ async fn the_first_of_two_nodes_of_one_name_leaves_and_takes_nothing_of_the_seco
     let graph = second.graph().await.unwrap();
     assert_eq!(graph.publishers.keys().collect::<Vec<_>>(), ["/a"]);
     assert!(known_as(&core, "/line/twin").await.contains(second.uri()));
-    // It still hears of parameters.
+    // The second node still receives parameter updates.
     let mut heard = second.parameters().subscribe("/heard").unwrap();
     second.parameters().set("/heard", 1).await.unwrap();
     eventually("the value", || heard.current() == Some(1.into())).await;

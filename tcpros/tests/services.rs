@@ -1,4 +1,5 @@
-//! Services of this crate with one another and with peers that misbehave, around a master in this process.
+//! Services of this crate with each other and with misbehaving peers, around a master in this
+//! process.
 
 #![expect(clippy::unwrap_used, clippy::panic, reason = "test code")]
 
@@ -45,7 +46,7 @@ fn set_bool() -> ServiceType {
     }
 }
 
-/// Answers with the request, except to what it takes for a command.
+/// Responds with the request, except for a few commands.
 async fn echo(request: ServiceRequest) -> Result<Bytes, String> {
     match request.bytes.as_ref() {
         b"fail" => Err("the gripper is stuck".to_owned()),
@@ -144,7 +145,7 @@ async fn call_api(address: &str, method: &str, arguments: &[&str]) -> String {
     post(address, &call).await
 }
 
-/// Registers an address for a service, as a server made by hand does.
+/// Registers an address for a service, as a hand-made server does.
 async fn register(core: &Core, service: &str, address: SocketAddr) {
     let (master, uri) = (core.address().to_string(), format!("rosrpc://{address}"));
     let arguments = ["/by_hand", service, &uri, "http://127.0.0.1:1/"];
@@ -164,7 +165,7 @@ async fn read_header(stream: &mut TcpStream) -> ConnectionHeader {
     ConnectionHeader::parse(&header).unwrap()
 }
 
-/// Accepts a client as a server made by hand, up to its first request.
+/// Accepts a client as a hand-made server, up to its first request.
 async fn accept(listener: &TcpListener) -> (TcpStream, ConnectionHeader) {
     let (mut stream, _) = within("a client", listener.accept()).await.unwrap();
     let header = read_header(&mut stream).await;
@@ -182,7 +183,7 @@ async fn take_request(stream: &mut TcpStream) -> Vec<u8> {
     request
 }
 
-/// Connects to the server of a service as a client made by hand, and gives the server's header.
+/// Connects to the server of a service as a hand-made client, and returns the server's header.
 async fn client_by_hand(
     core: &Core,
     service: &str,
@@ -401,7 +402,7 @@ async fn a_server_that_does_not_grant_persistence_is_connected_to_for_every_call
                 .write_all(&[1, 1, 0, 0, 0, request[0]])
                 .await
                 .unwrap();
-            // Late enough for the next call to be there first.
+            // Late enough for the next call to be first.
             tokio::time::sleep(Duration::from_millis(3)).await;
         }
     };
@@ -671,7 +672,7 @@ async fn a_service_that_is_full_says_so() {
         matches!(&error, ServiceError::Refused { message, .. } if message.contains("2 clients")),
         "{error}"
     );
-    // It may still be looked at.
+    // A probe is still possible.
     assert!(within("the probe", third.probe()).await.is_ok());
     drop(kept);
     eventually("free places", || server.clients() == 0).await;
@@ -756,7 +757,7 @@ async fn requests_sent_ahead_do_not_keep_a_withdrawn_service_up() {
     eventually("the first request", || begun.load(Ordering::SeqCst) == 1).await;
     drop(server);
     go.notify_one();
-    // A connection that is closed with a request unread may end in a reset.
+    // A connection that is closed with an unread request may end in a reset.
     let mut answers = Vec::new();
     let mut byte = [0];
     while let Ok(1) = within("the end", stream.read(&mut byte)).await {
@@ -911,7 +912,7 @@ async fn the_statistics_of_a_node_count_its_services() {
         .trim_start_matches("http://")
         .trim_end_matches('/');
     let stats = call_api(api, "getBusStats", &["/rosnode"]).await;
-    // 2 requests, 8 bytes of them, 4 + 20 bytes of answers.
+    // 2 requests with 8 bytes, and 4 + 20 bytes of responses.
     let numbers: Vec<_> = stats.split("<i4>").skip(1).collect();
     let numbers: Vec<_> = numbers
         .iter()
@@ -922,7 +923,7 @@ async fn the_statistics_of_a_node_count_its_services() {
 
 #[tokio::test]
 async fn a_thousand_calls_and_two_hundred_services_leave_nothing_open() {
-    // The few connections of the watchdogs, which come and go.
+    // The few connections of the watchdogs, which open and close.
     const WATCHED: usize = 4;
     let open = || std::fs::read_dir("/proc/self/fd").unwrap().count();
     let alive = || {

@@ -1,4 +1,4 @@
-//! The client: sends goals, and hands each what its server says of it.
+//! The action client: sends goals and follows the state of each goal.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard};
@@ -28,28 +28,33 @@ use crate::subscription::{SubscriberOptions, Subscription};
 use crate::time::RosClock;
 use crate::time::RosTime;
 
-/// How long a client waits, in steady time, and how much it holds.
+/// Time limits, in steady time, and queue sizes of an [`ActionClient`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ActionClientOptions {
-    /// From sending a goal until a server must have listed it.
+    /// Limit from sending a goal until a server must have listed it.
     pub acknowledge_timeout: Duration,
-    /// Without a status of the server before its goals are lost. Servers send five a second, those of roscpp and rospy
-    /// by ROS time: where a simulation may pause, give it the longest pause.
+    /// Limit without a status of the server, after which its goals are lost. Servers send five
+    /// statuses a second; roscpp and rospy servers do so by ROS time. If a simulation may pause,
+    /// set this limit to the longest pause.
     pub silence_timeout: Duration,
-    /// From the end of the connection to the server until its goals are lost; they are not if it comes back sooner.
+    /// Limit from the end of the connection to the server until its goals are lost. Goals survive
+    /// if the server reconnects sooner.
     pub reconnect_timeout: Duration,
-    /// From the status that a goal has ended until its result must have come.
+    /// Limit from the status that a goal has ended until its result must have been received.
     pub result_timeout: Duration,
-    /// From a result until it is told: feedback that was sent before it comes on another connection, and may come after it.
+    /// Delay between receiving a result and reporting it. Feedback that was sent before the result
+    /// uses another connection and may be received after the result.
     pub feedback_grace: Duration,
-    /// How many reports of progress may wait per goal; then the oldest are dropped.
+    /// Maximum number of queued feedback messages per goal; beyond it the oldest are dropped.
     pub feedback_messages: usize,
-    /// How many bytes of them may wait per goal; then the oldest are dropped. The newest is always kept.
+    /// Maximum number of queued feedback bytes per goal; beyond it the oldest messages are dropped.
+    /// The newest message is always kept.
     pub feedback_bytes: usize,
 }
 
 impl Default for ActionClientOptions {
-    /// Five seconds, for the end of a connection one, for feedback that was overtaken 10 ms; 100 reports of progress and 16 MiB.
+    /// Returns limits of five seconds, except 1 second for a lost connection and 10 ms for
+    /// overtaken feedback. Queues hold 100 feedback messages and 16 MiB.
     fn default() -> Self {
         let five = Duration::from_secs(5);
         Self {
@@ -64,7 +69,8 @@ impl Default for ActionClientOptions {
     }
 }
 
-/// Sends goals to the server of an action. Dropping it ends its goals as lost; it does not cancel them.
+/// Sends goals to the server of an action. Dropping the client ends its goals as lost; it does not
+/// cancel them.
 #[derive(Debug)]
 pub struct ActionClient {
     shared: Arc<Shared>,
@@ -73,11 +79,14 @@ pub struct ActionClient {
 }
 
 impl ActionClient {
-    /// Opens the action's topics; the server need not be there yet, and may come and go.
+    /// Opens the topics of the action. The server may start later, stop and restart.
     ///
-    /// `name` is the action's, such as `arm/move`, and is resolved as a topic's. Must be called inside the node's
-    /// runtime. Fails when the name is no ROS name, when this node has a client of the action already, or when the
-    /// goal's type is incomplete or not an `ActionGoal`.
+    /// `name` is the name of the action, such as `arm/move`; it is resolved like the name of a
+    /// topic. Must be called inside the runtime of the node.
+    ///
+    /// # Errors
+    /// Fails if the name is not a valid ROS name, if this node already has a client of the action,
+    /// or if the type of the goal is incomplete or not an `ActionGoal`.
     pub fn new(
         node: &Node,
         name: &str,
@@ -127,19 +136,21 @@ impl ActionClient {
         })
     }
 
-    /// Sends a goal, the serialized `XGoal`. Never waits, and does not fail: a goal that nobody can receive is lost at
-    /// once, see [`LostReason::NoServer`]. To send it to a server that is starting, wait for that first.
+    /// Sends a goal, the serialized `XGoal`. Never waits and never fails: a goal without any
+    /// subscriber is lost at once, see [`LostReason::NoServer`]. To send a goal to a server that is
+    /// starting, wait for the server first.
     pub fn send_goal(&self, body: &[u8]) -> GoalHandle {
         let goal_id = self.shared.new_id();
         self.send(lock(&self.shared.state), goal_id, body)
     }
 
-    /// As [`Self::send_goal`], under an id of the caller's, which no other goal of the action has or had, and with the
-    /// stamp 0. A server then stamps the goal by its own clock, as actionlib does: a `SimpleActionServer` rejects a goal
-    /// with an earlier stamp than the last one, and the clocks of two hosts differ.
+    /// Sends a goal as [`Self::send_goal`] does, with an id chosen by the caller and with the stamp
+    /// 0. The id must be unique among all past and present goals of the action. A server then
+    /// stamps the goal by its own clock, as actionlib does. A `SimpleActionServer` rejects a goal
+    /// with an earlier stamp than the last goal, and the clocks of two hosts differ.
     ///
     /// # Errors
-    /// [`IdInUse`] while there is a handle of a goal with that id; then nothing is sent.
+    /// [`IdInUse`] while a handle of a goal with that id exists; then nothing is sent.
     pub fn send_goal_as(&self, id: String, body: &[u8]) -> Result<GoalHandle, IdInUse> {
         let state = lock(&self.shared.state);
         if state.goals.goal(&id).is_some() {
@@ -174,7 +185,7 @@ impl ActionClient {
         }
     }
 
-    /// Asks the server to cancel one goal, as [`GoalHandle::cancel`] does.
+    /// Requests the server to cancel a goal, as [`GoalHandle::cancel`] does.
     pub fn cancel_goal(&self, id: &str) -> CancelSent {
         let mut state = lock(&self.shared.state);
         let Some(goal) = state.goals.goal(id) else {
@@ -201,21 +212,22 @@ impl ActionClient {
         }
     }
 
-    /// The ids of the goals that there are handles of and that have not ended.
+    /// Returns the ids of the goals that have a handle and have not ended.
     pub fn open_goals(&self) -> Vec<String> {
         lock(&self.shared.state).goals.open()
     }
 
-    /// Asks the server to cancel all goals of the action, those of other clients too. Returns how many nodes were
-    /// asked. The goals say what comes of it.
+    /// Requests the server to cancel all goals of the action, including the goals of other clients.
+    /// Returns the number of nodes that the request was sent to. The goals report the outcome.
     pub fn cancel_all(&self) -> usize {
         self.shared.send_cancel(&GoalId::default())
     }
 
-    /// Asks the server to cancel all goals requested at `time` or before, those of other clients too, by the clocks
-    /// of their clients. It will also recall goals of such a time that come later. Returns how many nodes were asked.
+    /// Requests the server to cancel all goals with a stamp of `time` or earlier, including the
+    /// goals of other clients. Stamps are by the clocks of the clients. The server also recalls
+    /// later goals with such a stamp. Returns the number of nodes that the request was sent to.
     ///
-    /// The time zero stands for all, as with [`Self::cancel_all`].
+    /// The time zero stands for all goals, as with [`Self::cancel_all`].
     pub fn cancel_before(&self, time: RosTime) -> usize {
         self.shared.send_cancel(&GoalId {
             stamp: time,
@@ -223,8 +235,9 @@ impl ActionClient {
         })
     }
 
-    /// The node that serves the action: it sends feedback and results, its status has come after it
-    /// was connected for both, and it takes goals and requests to cancel.
+    /// Returns the node that serves the action. A server is ready when it publishes feedback and
+    /// results, its status came after both connections were made, and it subscribes to goals and
+    /// cancel requests.
     pub fn server(&self) -> Result<String, NoServer> {
         let state = lock(&self.shared.state);
         let missing = |reason| NoServer {
@@ -249,15 +262,17 @@ impl ActionClient {
         }
     }
 
-    /// Waits until there is a [`Self::server`]. Fails when there is none within `limit`, and tells what was missing.
-    /// Cancel-safe.
+    /// Waits until [`Self::server`] succeeds. Cancel-safe.
+    ///
+    /// # Errors
+    /// Fails with the missing part if no server is ready within `limit`.
     pub async fn wait_for_server(&self, limit: Duration) -> Result<String, NoServer> {
         let found = async {
             loop {
                 if let Ok(server) = self.server() {
                     return server;
                 }
-                // Publishers do not report who subscribes.
+                // Publishers do not report their subscribers.
                 tokio::time::sleep(SERVER_POLL).await;
             }
         };
@@ -267,12 +282,12 @@ impl ActionClient {
         }
     }
 
-    /// The action's resolved name.
+    /// Returns the resolved name of the action.
     pub fn name(&self) -> &str {
         &self.shared.name
     }
 
-    /// What was received so far and could not be used.
+    /// Returns the counts of received data that could not be used.
     pub fn counters(&self) -> ClientCounters {
         lock(&self.shared.state).goals.counters
     }
@@ -289,27 +304,28 @@ impl Drop for ActionClient {
     }
 }
 
-/// What became of a request to cancel one goal.
+/// Outcome of a request to cancel a goal.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum CancelSent {
-    /// The server is asked, or knows already. The goal says what comes of it.
+    /// The request was sent, or the server already knows of a request. The goal reports the
+    /// outcome.
     Asked,
     /// The goal has ended.
     Ended,
-    /// Nobody takes requests to cancel.
+    /// No node subscribes to cancel requests.
     NoServer,
-    /// There is no handle of a goal with that id.
+    /// No goal with that id has a handle.
     NotFollowed,
 }
 
-/// A goal with that id is followed already.
+/// A goal with that id has a handle already.
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
 #[error("there is a goal `{id}` already")]
 pub struct IdInUse {
     id: String,
 }
 
-/// No server is ready to take goals.
+/// No server is ready to receive goals.
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
 #[error("no server of the action {action}: {reason}")]
 pub struct NoServer {
@@ -317,7 +333,8 @@ pub struct NoServer {
     reason: &'static str,
 }
 
-/// A goal that was sent. Dropping it ends the interest in the goal; it does not cancel it.
+/// A goal that was sent. Dropping the handle ends the events of the goal; it does not cancel the
+/// goal.
 #[derive(Debug)]
 pub struct GoalHandle {
     shared: Arc<Shared>,
@@ -326,20 +343,21 @@ pub struct GoalHandle {
 }
 
 impl GoalHandle {
-    /// The goal's id, `<node>-<count>-<seconds>.<nanoseconds>`, and the time it was sent; of a goal with an id of the
-    /// caller's the time 0.
+    /// Returns the id of the goal and the time it was sent. Generated ids have the form
+    /// `<node>-<count>-<seconds>.<nanoseconds>`. A goal with an id of the caller has the time 0.
     pub fn goal_id(&self) -> &GoalId {
         &self.goal_id
     }
 
-    /// Where the goal is.
+    /// Returns the state of the goal.
     pub fn state(&self) -> CommState {
         let state = lock(&self.shared.state);
         let goal = state.goals.goal(&self.goal_id.id);
         goal.map_or(CommState::Lost, |goal| goal.state)
     }
 
-    /// What the server said of the goal last: pending while it has said nothing, lost when the goal is.
+    /// Returns the last status from the server: pending before the first status, lost if the goal
+    /// is lost.
     pub fn status(&self) -> GoalStatus {
         let state = lock(&self.shared.state);
         let goal = state.goals.goal(&self.goal_id.id);
@@ -350,8 +368,9 @@ impl GoalHandle {
         }
     }
 
-    /// The next event, in order; `None` after the one that ends the goal. It always ends within the client's time
-    /// limits once its server has fallen silent. Cancel-safe.
+    /// Returns the next event in order, or `None` after the last event. The last event always
+    /// arrives within the time limits of the client after its server has stopped sending.
+    /// Cancel-safe.
     pub async fn recv(&mut self) -> Option<GoalEvent> {
         loop {
             let rung = self.wake.notified();
@@ -370,7 +389,8 @@ impl GoalHandle {
         }
     }
 
-    /// Waits for the end of the goal, passing over what else happens to it. May be asked again. Cancel-safe.
+    /// Waits for the end of the goal and discards all other events. May be called again.
+    /// Cancel-safe.
     pub async fn outcome(&mut self) -> Result<GoalResult, LostReason> {
         while self.recv().await.is_some() {}
         let state = lock(&self.shared.state);
@@ -379,8 +399,9 @@ impl GoalHandle {
             .unwrap_or(Err(LostReason::ClientClosed))
     }
 
-    /// Asks the server to cancel the goal. The goal goes on until the server says what came of it, which may be
-    /// success. False when the request was not sent: the goal has ended, its server already knows, or nobody is there.
+    /// Requests the server to cancel the goal. The goal continues until the server reports the
+    /// outcome, which may be success. Returns false if the request was not sent: the goal has
+    /// ended, its server already knows, or no server is connected.
     pub fn cancel(&self) -> bool {
         let wanted = lock(&self.shared.state).goals.cancel(&self.goal_id.id);
         wanted
@@ -397,7 +418,7 @@ impl Drop for GoalHandle {
     }
 }
 
-/// What the client, its task and its goals share.
+/// State shared by the client, its task and its goals.
 #[derive(Debug)]
 struct Shared {
     name: String,
@@ -424,7 +445,8 @@ struct Outputs {
 
 impl Shared {
     fn new_id(&self) -> GoalId {
-        // For all clients of the process: two of one node must not give the same id.
+        // Shared by all clients of the process: two clients of a node must not create the same
+        // id.
         static COUNT: AtomicU64 = AtomicU64::new(1);
         let stamp = self.clock.now();
         let count = COUNT.fetch_add(1, Ordering::Relaxed);
@@ -494,7 +516,7 @@ impl State {
     }
 }
 
-/// Takes what the server sends and ends goals whose time is up, until aborted.
+/// Receives the messages of the server and ends goals after their time limits, until aborted.
 async fn run(shared: Arc<Shared>, mut inbox: Inbox<Source>) {
     loop {
         let deadline = lock(&shared.state).goals.deadline();
@@ -517,7 +539,7 @@ async fn run(shared: Arc<Shared>, mut inbox: Inbox<Source>) {
                 break;
             }
         }
-        // Silence is judged only when nothing waits to be read.
+        // Time limits are checked only when no message waits to be read.
         if taken < BATCH {
             lock(&shared.state).goals.expire(clock::now());
         } else {

@@ -1,7 +1,9 @@
-//! The client's side of goals: which state each is in by what its server says, and when it is lost.
+//! The client's side of goals: the state of each goal, derived from the messages of its server, and
+//! the rules for lost goals.
 //!
-//! No clock and no network: messages and steady time come in, events of goals come out. A goal enters each state at
-//! most once, so that of its events only the feedback needs a bound.
+//! This module uses no clock and no network. Its inputs are messages and steady time, its outputs
+//! are events of goals. A goal enters each state at most once, so that only the feedback events
+//! need a bound.
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
@@ -17,31 +19,31 @@ use super::wire::StatusEntry;
 use crate::clock;
 use crate::inbox::Peer;
 
-/// Where a goal is between its client and its server.
+/// State of a goal between its client and its server.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum CommState {
-    /// Sent, and not in a status of the server yet.
+    /// Sent, and not yet in a status of the server.
     WaitingForGoalAck,
-    /// The server has it and has not decided.
+    /// Received by the server, which has not decided yet.
     Pending,
-    /// The server works on it.
+    /// The server works on the goal.
     Active,
-    /// It has ended; the result is on its way.
+    /// The goal has ended; the result is not received yet.
     WaitingForResult,
-    /// The client asked to cancel it, and the server has not reacted.
+    /// The client requested to cancel the goal, and the server has not reacted.
     WaitingForCancelAck,
-    /// The server knows of the request to cancel and has not begun.
+    /// The server knows of the cancel request and has not started the goal.
     Recalling,
-    /// The server knows of the request to cancel and still works on it.
+    /// The server knows of the cancel request and still works on the goal.
     Preempting,
     /// Ended with its result.
     Done,
-    /// Ended without one, see [`LostReason`].
+    /// Ended without a result, see [`LostReason`].
     Lost,
 }
 
 impl CommState {
-    /// Whether a goal stays in this state.
+    /// Returns whether the state is final.
     pub const fn is_end(self) -> bool {
         match self {
             Self::Done | Self::Lost => true,
@@ -56,18 +58,19 @@ impl CommState {
     }
 }
 
-/// What happened to a goal.
+/// Event of a goal.
 #[derive(Clone, Debug)]
 pub enum GoalEvent {
-    /// It went on to another state, one event for each on the way. `Done` and `Lost` have events of their own.
+    /// The goal has entered another state, with an event for each state on the way. `Done` and
+    /// `Lost` have events of their own.
     State(CommState),
     /// The server reports progress.
     Feedback(Feedback),
-    /// So many reports of progress gave way to newer ones since the last event.
+    /// Number of feedback messages dropped in favour of newer messages since the last event.
     FeedbackDropped(u64),
-    /// The last event of a goal that came to its end.
+    /// The last event of a goal that ended with a result.
     Done(GoalResult),
-    /// The last event of a goal of which nothing more will be heard.
+    /// The last event of a goal that is lost.
     Lost(LostReason),
 }
 
@@ -83,9 +86,9 @@ pub struct Feedback {
 /// The end of a goal.
 #[derive(Clone, Debug)]
 pub struct GoalResult {
-    /// How it ended. `Lost` stands for a code of the server that is no end.
+    /// Final status. `Lost` stands for a code of the server that is not terminal.
     pub status: Status,
-    /// What the server says of it, for people.
+    /// Text of the server about the result, for people.
     pub text: String,
     /// The serialized `XResult`.
     pub body: Bytes,
@@ -93,11 +96,11 @@ pub struct GoalResult {
     pub peer: Arc<Peer>,
 }
 
-/// Why nothing more will be heard of a goal. The server may still work on it where it was reached at all.
+/// Reason for which a goal is lost. The server may still work on a goal that it received.
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
 #[non_exhaustive]
 pub enum LostReason {
-    /// Nobody subscribes to the goals.
+    /// No node subscribes to the goals.
     #[error(
         "the goal was sent to nobody: no node subscribes to {topic}; start the action's server or check its name"
     )]
@@ -105,35 +108,35 @@ pub enum LostReason {
         /// The resolved topic.
         topic: String,
     },
-    /// Sent, and never in a status of a server.
+    /// The goal was sent and was never in a status of a server.
     #[error("no server has taken the goal on within {0:?}")]
     NotAcknowledged(Duration),
-    /// The server is connected and says nothing.
+    /// The server is connected and sends no status.
     #[error("the server {server} has sent no status for {silence:?}")]
     Silent {
-        /// Its node.
+        /// Name of the server's node.
         server: String,
-        /// How long that is too long.
+        /// Time limit that was exceeded.
         silence: Duration,
     },
-    /// The server's connection ended and did not come back.
+    /// The connection to the server ended and was not restored.
     #[error("the connection to the server {server} ended")]
     Disconnected {
-        /// Its node.
+        /// Name of the server's node.
         server: String,
     },
     /// The server no longer lists the goal.
     #[error("the server {server} no longer knows the goal; it may have been restarted")]
     Forgotten {
-        /// Its node.
+        /// Name of the server's node.
         server: String,
     },
     /// The server listed the goal as ended and sent no result.
     #[error("the goal ended as {status:?}, and no result came within {waited:?}")]
     NoResult {
-        /// How it ended.
+        /// Final status of the goal.
         status: Status,
-        /// How long that is too long.
+        /// Time limit that was exceeded.
         waited: Duration,
     },
     /// This process closed the client.
@@ -141,18 +144,18 @@ pub enum LostReason {
     ClientClosed,
 }
 
-/// What a client has received and could not use.
+/// Counts of received data that a client could not use.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ClientCounters {
-    /// Messages that do not read.
+    /// Messages that cannot be decoded.
     pub malformed: u64,
-    /// Statuses that cannot follow on the goal's state, or are none.
+    /// Statuses that cannot follow the state of the goal, or with an unknown code.
     pub invalid_transitions: u64,
     /// Results of goals that had ended already.
     pub late_results: u64,
-    /// Reports of progress of goals that had ended already.
+    /// Feedback of goals that had ended already.
     pub late_feedback: u64,
-    /// Reports of progress that gave way to newer ones, over all goals.
+    /// Feedback messages dropped in favour of newer messages, over all goals.
     pub feedback_dropped: u64,
     /// Messages of all topics that were lost because this process did not keep up.
     pub overrun: u64,
@@ -178,7 +181,7 @@ pub(super) enum Source {
     Result,
 }
 
-/// All goals that somebody still has a handle of, and the servers heard of.
+/// All goals that still have a handle, and the known servers.
 #[derive(Debug)]
 pub(super) struct ClientGoals {
     limits: Limits,
@@ -187,16 +190,16 @@ pub(super) struct ClientGoals {
     pub(super) counters: ClientCounters,
 }
 
-/// The connections to one node that publishes at least one of the action's topics.
+/// The connections to a node that publishes at least one topic of the action.
 #[derive(Debug, Default)]
 struct Server {
     status: usize,
     feedback: usize,
     result: usize,
     last_status: Option<Instant>,
-    /// Since when it has a connection for each of the three topics.
+    /// Start of the period with a connection for each of the three topics.
     complete: Option<Instant>,
-    /// Since when it has no connection for its status.
+    /// Start of the period without a connection for its status.
     gone: Option<Instant>,
 }
 
@@ -222,12 +225,12 @@ impl ClientGoals {
         }
     }
 
-    /// Takes a goal up that is being sent. Events ring `wake`.
+    /// Adds a goal that is being sent. Its events notify `wake`.
     pub(super) fn sent(&mut self, id: String, now: Instant, wake: Arc<Notify>) {
         self.goals.insert(id, Goal::new(now, wake));
     }
 
-    /// Ends the interest in a goal.
+    /// Removes a goal.
     pub(super) fn forget(&mut self, id: &str) {
         self.goals.remove(id);
     }
@@ -236,7 +239,7 @@ impl ClientGoals {
         self.goals.get(id)
     }
 
-    /// The ids of those that have not ended.
+    /// Returns the ids of the goals that have not ended.
     pub(super) fn open(&self) -> Vec<String> {
         let open = self.goals.iter().filter(|(_, goal)| !goal.state.is_end());
         open.map(|(id, _)| id.clone()).collect()
@@ -246,7 +249,8 @@ impl ClientGoals {
         self.goals.get_mut(id)?.next_event()
     }
 
-    /// Takes note of a request to cancel. False when it would be of no use: the goal has ended, or its server knows.
+    /// Records a cancel request. Returns false if the request would have no effect: the goal has
+    /// ended, or its server knows already.
     pub(super) fn cancel(&mut self, id: &str) -> bool {
         let Some(goal) = self.goals.get_mut(id) else {
             return false;
@@ -265,7 +269,7 @@ impl ClientGoals {
         }
     }
 
-    /// A server's list of the goals it knows.
+    /// Applies a server's list of the goals it knows.
     pub(super) fn status(&mut self, from: &str, list: &[StatusEntry], now: Instant) {
         self.server(from).last_status = Some(now);
         let by_id: HashMap<&str, &StatusEntry> = list
@@ -284,7 +288,7 @@ impl ClientGoals {
                     self.counters.invalid_transitions += 1;
                 }
             } else if goal.server.as_deref() == Some(from)
-                // A server may forget an ended goal while its result is on its way.
+                // A server may forget an ended goal before its result is received.
                 && goal.state != CommState::WaitingForResult
             {
                 let server = from.to_owned();
@@ -293,7 +297,7 @@ impl ClientGoals {
         }
     }
 
-    /// A result, which may come before the status that announces it.
+    /// Applies a result, which may be received before the status that announces it.
     pub(super) fn result(
         &mut self,
         entry: &StatusEntry,
@@ -337,7 +341,7 @@ impl ClientGoals {
         }
     }
 
-    /// A connection to a publisher of one of the action's topics was made or ended.
+    /// Records that a connection to a publisher of the action was made or ended.
     pub(super) fn connection(&mut self, node: &str, topic: Source, made: bool, now: Instant) {
         let server = self.server(node);
         let count = match topic {
@@ -356,7 +360,7 @@ impl ClientGoals {
         self.forget_servers();
     }
 
-    /// The connected server heard of last, or what there is not.
+    /// Returns the connected server with the latest status, or a description of the missing part.
     pub(super) fn ready_server(&self, now: Instant) -> Result<&str, &'static str> {
         let latest = self
             .servers
@@ -375,7 +379,7 @@ impl ClientGoals {
         }
     }
 
-    /// Ends the goals whose time is up.
+    /// Ends the goals after their time limits.
     pub(super) fn expire(&mut self, now: Instant) {
         for goal in self.goals.values_mut() {
             if let Some((_, result)) = goal.result.take_if(|(at, _)| *at <= now) {
@@ -389,7 +393,7 @@ impl ClientGoals {
         self.forget_servers();
     }
 
-    /// When [`Self::expire`] has something to do if nothing is received.
+    /// Returns the next time at which [`Self::expire`] has an effect if nothing is received.
     pub(super) fn deadline(&self) -> Option<Instant> {
         let goals = self.goals.values();
         let losses = goals
@@ -416,7 +420,7 @@ impl ClientGoals {
         self.servers.entry(node.to_owned()).or_default()
     }
 
-    /// Keeps the servers that are connected or have a goal of ours.
+    /// Removes the servers that are neither connected nor working on a goal of this client.
     fn forget_servers(&mut self) {
         let goals = &self.goals;
         self.servers.retain(|node, server| {
@@ -426,7 +430,7 @@ impl ClientGoals {
     }
 }
 
-/// When a goal counts as lost if nothing more is received, and why.
+/// Returns the time at which a goal is lost if nothing more is received, and the reason.
 fn next_loss(
     goal: &Goal,
     servers: &HashMap<String, Server>,
@@ -467,7 +471,7 @@ fn next_loss(
     .min_by_key(|(at, _)| *at)
 }
 
-/// A goal, from the moment it is sent.
+/// A goal from the moment it is sent.
 #[derive(Debug)]
 pub(super) struct Goal {
     pub(super) state: CommState,
@@ -475,11 +479,12 @@ pub(super) struct Goal {
     pub(super) text: String,
     pub(super) outcome: Option<Result<GoalResult, LostReason>>,
     sent: Instant,
-    /// The node that has listed it.
+    /// The node that has listed the goal.
     server: Option<String>,
-    /// Since when its result is awaited.
+    /// Start of the wait for the result.
     ended: Option<Instant>,
-    /// Its result, and until when feedback is waited for that was sent before it and comes on another connection.
+    /// The result, and the end of the wait for feedback that was sent before it on another
+    /// connection.
     result: Option<(Instant, GoalResult)>,
     events: VecDeque<GoalEvent>,
     feedback_messages: usize,
@@ -507,7 +512,8 @@ impl Goal {
         }
     }
 
-    /// Goes where a status of the server leads. False when it cannot lead anywhere from here.
+    /// Enters the states that a status of the server leads to. Returns false if the status cannot
+    /// follow the current state.
     fn follow(&mut self, entry: &StatusEntry, now: Instant) -> bool {
         let Some(status) = Status::from_code(entry.code) else {
             return false;
@@ -598,9 +604,10 @@ impl Goal {
     }
 }
 
-/// The states a goal goes through when its server reports `status`, none where that is no news. A status may skip
-/// others, as lists come a few times a second: the states between are passed through. `None` where the status cannot
-/// follow on the state, as when messages of different topics overtake one another.
+/// Returns the states that a goal enters when its server reports `status`; the list is empty if the
+/// status is not new. Statuses arrive a few times a second and may skip states: the goal enters the
+/// skipped states as well. Returns `None` if the status cannot follow the state, as when messages
+/// of different topics overtake each other.
 const fn path(state: CommState, status: Status) -> Option<&'static [CommState]> {
     use CommState as C;
     use Status as S;
@@ -687,7 +694,7 @@ mod tests {
         })
     }
 
-    /// One goal `g` sent at `start`, and a connected server.
+    /// Returns goals with a goal `g` sent at `start`, and a connected server.
     fn sent() -> (ClientGoals, Instant) {
         let start = clock::now();
         let mut goals = ClientGoals::new(LIMITS);
@@ -965,7 +972,7 @@ mod tests {
         assert_eq!(goals.ready_server(soon + SETTLES_WITHIN), Ok("/server"));
     }
 
-    /// What can come in, for a goal of ours or another.
+    /// Possible inputs, for a goal of this client or of another client.
     #[derive(Clone, Copy, Debug)]
     enum Input {
         Status(u8, bool),
@@ -1028,7 +1035,7 @@ mod tests {
                 let ended = goals.goal("g").unwrap().state.is_end();
                 prop_assert_eq!(goals.deadline().is_none(), ended);
             }
-            // Time alone ends it.
+            // Time alone ends the goal.
             goals.expire(now + 6 * SECOND);
             prop_assert!(goals.goal("g").unwrap().outcome.is_some());
             let states = states(&mut goals);

@@ -1,4 +1,4 @@
-//! What this module tells operators, one function per event.
+//! Log messages of this module, with a function per event.
 
 use std::fmt::Display;
 use std::time::Duration;
@@ -8,7 +8,7 @@ use tracing::warn;
 
 use crate::clock;
 
-/// What was received and could not be used, with one line per ten seconds.
+/// Rate limits for logs of unusable data: an entry per kind in ten seconds.
 #[derive(Debug)]
 pub(super) struct Faults {
     malformed: Throttle,

@@ -1,4 +1,4 @@
-//! The server: takes goals and requests to cancel, and publishes what becomes of them.
+//! The action server: receives goals and cancel requests, and publishes the state of the goals.
 
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -25,23 +25,25 @@ use crate::publisher::{Publisher, PublisherOptions};
 use crate::subscription::{SubscriberOptions, Subscription};
 use crate::time::RosClock;
 
-/// How a server reports its goals, in steady time, and how many it takes.
+/// Reporting periods, in steady time, and capacity of an [`ActionServer`].
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ActionServerOptions {
-    /// The serialized `XResult` with nothing in it, for goals that end without a result of yours: recalled before they
-    /// arrive, rejected, or dropped. Clients of the type have to be able to read it.
+    /// The serialized `XResult` without content, for goals that end without a result of the user:
+    /// recalled before they arrive, rejected, or dropped. Clients have to be able to decode it.
     pub empty_result: Bytes,
-    /// Between two statuses when nothing happens. Clients take five seconds without one for a lost server.
+    /// Period between two statuses when nothing happens. Clients treat a server without a status
+    /// for five seconds as lost.
     pub status_period: Duration,
-    /// How long a goal that has ended stays in the status.
+    /// Time for which an ended goal stays in the status.
     pub status_list_timeout: Duration,
-    /// How many goals the status holds. When it is full, ended goals leave it early; when all are open, goals are
-    /// rejected.
+    /// Maximum number of goals in the status. When it is full, ended goals leave it early; when all
+    /// goals are open, new goals are rejected.
     pub max_goals: usize,
 }
 
 impl ActionServerOptions {
-    /// A status five times a second, ended goals in it for five seconds, 1000 goals.
+    /// Returns options with five statuses a second, ended goals kept for five seconds, and 1000
+    /// goals.
     pub const fn new(empty_result: Bytes) -> Self {
         Self {
             empty_result,
@@ -52,16 +54,16 @@ impl ActionServerOptions {
     }
 }
 
-/// What clients want of a server.
+/// Request of a client to a server.
 #[derive(Debug)]
 pub enum ServerEvent {
     /// A new goal, to be accepted or rejected.
     Goal(ServerGoal),
-    /// The open goal of this id should be cancelled. What becomes of it is the server's decision.
+    /// A client requests to cancel the open goal with this id. The server decides.
     Cancel(GoalId),
 }
 
-/// Takes the goals of an action. Dropping it aborts the goals that have not ended.
+/// Receives the goals of an action. Dropping the server aborts the goals that have not ended.
 #[derive(Debug)]
 pub struct ActionServer {
     shared: Arc<Shared>,
@@ -70,11 +72,14 @@ pub struct ActionServer {
 }
 
 impl ActionServer {
-    /// Opens the action's topics and begins to publish its status.
+    /// Opens the topics of the action and starts to publish its status.
     ///
-    /// `name` is the action's, such as `arm/move`, and is resolved as a topic's. Must be called inside the node's
-    /// runtime. Fails when the name is no ROS name, when this node serves the action already, or when a type is
-    /// incomplete or not that of the message with goal id or status.
+    /// `name` is the name of the action, such as `arm/move`; it is resolved like the name of a
+    /// topic. Must be called inside the runtime of the node.
+    ///
+    /// # Errors
+    /// Fails if the name is not a valid ROS name, if this node serves the action already, or if a
+    /// type is incomplete or is not the wrapper message with goal id or status.
     pub fn new(
         node: &Node,
         name: &str,
@@ -131,7 +136,8 @@ impl ActionServer {
         })
     }
 
-    /// The next event. Cancel-safe. As many wait as there are open goals, twice over.
+    /// Waits for the next event. Cancel-safe. The queue holds at most twice as many events as there
+    /// are open goals.
     pub async fn recv(&mut self) -> ServerEvent {
         loop {
             if let Some(event) = self.try_recv() {
@@ -141,7 +147,7 @@ impl ActionServer {
         }
     }
 
-    /// The next event if there is one.
+    /// Returns the next event if an event is queued.
     pub fn try_recv(&mut self) -> Option<ServerEvent> {
         let mut state = lock(&self.shared.state);
         loop {
@@ -156,7 +162,7 @@ impl ActionServer {
                 }
                 Arrived::Cancel(key) => {
                     let status = state.goals.status(key);
-                    // It may have ended since.
+                    // The goal may have ended in the meantime.
                     if let Some(status) = status.filter(|status| !status.status.is_terminal()) {
                         return Some(ServerEvent::Cancel(status.goal_id.clone()));
                     }
@@ -165,12 +171,12 @@ impl ActionServer {
         }
     }
 
-    /// The action's resolved name.
+    /// Returns the resolved name of the action.
     pub fn name(&self) -> &str {
         &self.shared.name
     }
 
-    /// What was received so far and could not be used.
+    /// Returns the counts of received data that could not be used.
     pub fn counters(&self) -> ServerCounters {
         lock(&self.shared.state).goals.counters
     }
@@ -193,8 +199,8 @@ impl Drop for ActionServer {
     }
 }
 
-/// A goal to decide about. Its decisions are published at once and never wait. One that is dropped before its end is
-/// aborted.
+/// A goal to decide about. Decisions are published at once and never wait. A goal that is dropped
+/// before its end is aborted.
 #[derive(Debug)]
 pub struct ServerGoal {
     shared: Arc<Shared>,
@@ -204,24 +210,25 @@ pub struct ServerGoal {
 }
 
 impl ServerGoal {
-    /// The goal's id and when it was requested, by the clock of its client.
+    /// Returns the id of the goal and the time of the request, by the clock of its client.
     pub const fn goal_id(&self) -> &GoalId {
         &self.goal_id
     }
 
-    /// The serialized `XGoal`.
+    /// Returns the serialized `XGoal`.
     pub const fn body(&self) -> &Bytes {
         &self.body
     }
 
-    /// How far the goal is. `Lost` when it has ended and left the server's status.
+    /// Returns the status of the goal: `Lost` if the goal has ended and left the status of the
+    /// server.
     pub fn status(&self) -> Status {
         let state = lock(&self.shared.state);
         let status = state.goals.status(self.key);
         status.map_or(Status::Lost, |status| status.status)
     }
 
-    /// Begins work: from pending to active, from recalling to preempting.
+    /// Starts work: changes pending to active, and recalling to preempting.
     pub fn accept(&self, text: &str) -> Result<(), GoalError> {
         let mut guard = lock(&self.shared.state);
         let state = &mut *guard;
@@ -245,13 +252,14 @@ impl ServerGoal {
         self.end(Decision::Succeed, Some(result), text)
     }
 
-    /// Ends an accepted goal that failed, with the serialized `XResult` or, for `None`, the empty one.
+    /// Ends an accepted goal that failed, with the serialized `XResult` or, for `None`, the empty
+    /// result.
     pub fn abort(&self, result: Option<&[u8]>, text: &str) -> Result<(), GoalError> {
         self.end(Decision::Abort, result, text)
     }
 
-    /// Ends a goal as cancelled, asked for or not, with the serialized `XResult` or, for `None`, the empty one: as
-    /// preempted when it was accepted, else as recalled.
+    /// Ends a goal as cancelled, requested or not, with the serialized `XResult` or, for `None`,
+    /// the empty result. An accepted goal ends as preempted, any other goal as recalled.
     pub fn cancelled(&self, result: Option<&[u8]>, text: &str) -> Result<(), GoalError> {
         self.end(Decision::Cancelled, result, text)
     }
@@ -275,12 +283,12 @@ impl ServerGoal {
         Ok(())
     }
 
-    /// Whether a client asked to cancel the goal and it has not ended.
+    /// Returns whether a client requested to cancel the goal and the goal has not ended.
     pub fn is_cancel_requested(&self) -> bool {
         matches!(self.status(), Status::Recalling | Status::Preempting)
     }
 
-    /// Waits until a client asks to cancel the goal, or the goal has ended. Cancel-safe.
+    /// Waits until a client requests to cancel the goal, or the goal has ended. Cancel-safe.
     pub async fn cancel_requested(&self) {
         let mut changed = self.shared.changed.subscribe();
         while !self.is_cancel_requested() && !self.status().is_terminal() {
@@ -321,16 +329,16 @@ enum Source {
     Cancel,
 }
 
-/// What the server, its task and its goals share.
+/// State shared by the server, its task and its goals.
 #[derive(Debug)]
 struct Shared {
     name: String,
     node: String,
     clock: RosClock,
     state: Mutex<State>,
-    /// Rings for [`ActionServer::recv`].
+    /// Notifies [`ActionServer::recv`].
     arrival: Notify,
-    /// Tells all goals that one has changed.
+    /// Notifies all goals that a goal has changed.
     changed: watch::Sender<()>,
 }
 
@@ -375,7 +383,7 @@ impl State {
 }
 
 impl Shared {
-    /// An id and a stamp for a goal that came without.
+    /// Returns an id and a stamp for a goal that was received without them.
     fn new_id(&self) -> GoalId {
         static COUNT: AtomicU64 = AtomicU64::new(1);
         let stamp = self.clock.now();
@@ -445,7 +453,8 @@ impl Shared {
         Ok(())
     }
 
-    /// The result first, so that whoever sees the end in the status can expect it.
+    /// Publishes the result before the status, so that a client that reads the end in the status
+    /// can expect the result.
     fn publish_result(&self, state: &mut State, status: &GoalStatus, result: Option<&[u8]>) {
         if let Some(outputs) = &mut state.outputs {
             let seq = outputs.next_seq();
@@ -465,12 +474,12 @@ impl Shared {
     }
 }
 
-/// Takes goals and requests, and publishes the status, until aborted.
+/// Receives goals and cancel requests, and publishes the status, until aborted.
 async fn run(shared: Arc<Shared>, mut inbox: Inbox<Source>, period: Duration) {
     let mut next = clock::now();
     loop {
         tokio::select! {
-            // First, so that a flood of goals does not keep the status from clients.
+            // The status is first, so that a flood of goals does not delay it.
             biased;
             () = sleep_until(next) => {
                 shared.publish_status(&mut lock(&shared.state));
@@ -481,7 +490,7 @@ async fn run(shared: Arc<Shared>, mut inbox: Inbox<Source>, period: Duration) {
     }
 }
 
-/// Publishers count for themselves what slow subscribers lose.
+/// Publishes a message. Publishers count the losses of slow subscribers themselves.
 fn send(publisher: &Publisher, message: Bytes) {
     let _published = publisher.publish(message);
 }

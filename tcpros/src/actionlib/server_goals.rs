@@ -1,6 +1,8 @@
-//! The server's side of goals: which it knows, what a request to cancel means for each, and what may follow on what.
+//! The server's side of goals: the known goals, the effect of a cancel request on each goal, and
+//! the allowed transitions.
 //!
-//! No clock and no network: messages, decisions and time come in, the statuses to publish come out.
+//! This module uses no clock and no network. Its inputs are messages, decisions and time, its
+//! outputs are the statuses to publish.
 
 use std::time::Duration;
 
@@ -11,7 +13,7 @@ use super::types::{GoalId, GoalStatus, Status};
 use crate::clock;
 use crate::time::RosTime;
 
-/// What a server decides about a goal.
+/// Decision of a server about a goal.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Decision {
     Accept,
@@ -21,21 +23,21 @@ pub(super) enum Decision {
     Succeed,
 }
 
-/// Why a goal did not take a decision.
+/// Reason for which a goal refused a decision.
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
 #[non_exhaustive]
 pub enum GoalError {
-    /// It cannot follow on the goal's status.
+    /// The decision cannot follow the status of the goal.
     #[error("the goal {goal} is {from:?}: it cannot be {wanted}")]
     NotFrom {
-        /// The goal's id.
+        /// Id of the goal.
         goal: String,
-        /// Its status, which stays.
+        /// Status of the goal, which does not change.
         from: Status,
-        /// What was asked for.
+        /// Requested decision.
         wanted: &'static str,
     },
-    /// It has ended and left the server's status.
+    /// The goal has ended and left the status of the server.
     #[error("the goal has ended and is forgotten")]
     Forgotten,
     /// The server was dropped, which has ended its goals.
@@ -43,35 +45,35 @@ pub enum GoalError {
     Closed,
 }
 
-/// What a server has received and could not use.
+/// Counts of received data that a server could not use.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ServerCounters {
-    /// Messages that do not read.
+    /// Messages that cannot be decoded.
     pub malformed: u64,
-    /// Goals rejected and requests to cancel passed over because too many goals are open.
+    /// Goals rejected and cancel requests ignored because too many goals are open.
     pub refused: u64,
-    /// Ended goals that left the status early to make room.
+    /// Ended goals that left the status early because the list was full.
     pub forgotten: u64,
-    /// Goals and requests that were lost because this process did not keep up.
+    /// Goals and cancel requests that were lost because this process did not keep up.
     pub overrun: u64,
 }
 
-/// What becomes of a goal that arrives.
+/// Outcome of a received goal.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) enum Arrival {
-    /// It is the user's to decide.
+    /// A new goal, to be decided by the user.
     New(Key, GoalId),
-    /// It has ended before it began, with this result.
+    /// The goal has ended before its start, with this status.
     Ended(GoalStatus),
-    /// It has been here before.
+    /// A goal with this id was received before.
     Known,
 }
 
-/// Tells a goal from an earlier one of the same id that has left the status.
+/// Distinguishes a goal from an earlier goal of the same id that has left the status.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub(super) struct Key(u64);
 
-/// All goals of the status, in the order they came.
+/// All goals of the status, in the order of arrival.
 #[derive(Debug)]
 pub(super) struct ServerGoals {
     entries: Vec<Entry>,
@@ -83,17 +85,18 @@ pub(super) struct ServerGoals {
     pub(super) counters: ServerCounters,
 }
 
-/// A goal, or a request to cancel one that has not come yet: that one is recalling with an end.
+/// A goal, or a cancel request for a goal that was not received yet. The cancel request is an entry
+/// with the status recalling and an end time.
 #[derive(Debug)]
 struct Entry {
     key: Key,
     status: GoalStatus,
-    /// Since when nobody decides about it any more.
+    /// Start of the period in which no more decisions about the goal are made.
     ended: Option<Instant>,
 }
 
 impl ServerGoals {
-    /// Knows at most `most` goals, ended ones for as long as `linger`.
+    /// Creates a list of at most `most` goals that keeps ended goals for `linger`.
     pub(super) fn new(most: usize, linger: Duration) -> Self {
         Self {
             entries: Vec::new(),
@@ -105,7 +108,7 @@ impl ServerGoals {
         }
     }
 
-    /// A goal arrives; `fallback` gives the id and the stamp it came without.
+    /// Adds a received goal. `fallback` supplies a missing id or stamp.
     pub(super) fn goal(&mut self, mut id: GoalId, fallback: GoalId, now: Instant) -> Arrival {
         let mut entries = self.entries.iter_mut();
         let known = entries.find(|entry| entry.status.goal_id.id == id.id && !id.id.is_empty());
@@ -141,10 +144,12 @@ impl ServerGoals {
         }
     }
 
-    /// A request to cancel arrives. Returns the goals that have to be told of it.
+    /// Applies a cancel request. Returns the goals that have to be notified.
     ///
-    /// No id and no time: all goals. A time: all requested then or before, those that come later included. An id: that
-    /// goal, which may come later too.
+    /// - Without id and time, the request applies to all goals.
+    /// - A time selects all goals with this stamp or an earlier stamp, including goals received
+    ///   later.
+    /// - An id selects the goal with this id, which may be received later.
     pub(super) fn cancel(&mut self, request: &GoalId, now: Instant) -> Vec<Key> {
         let timed = request.stamp != RosTime::default();
         let all = request.id.is_empty() && !timed;
@@ -170,7 +175,7 @@ impl ServerGoals {
         told
     }
 
-    /// Applies a decision and returns the status that follows.
+    /// Applies a decision and returns the new status.
     pub(super) fn decide(
         &mut self,
         key: Key,
@@ -179,7 +184,7 @@ impl ServerGoals {
         now: Instant,
     ) -> Result<GoalStatus, GoalError> {
         let entry = self.entries.iter_mut().find(|entry| entry.key == key);
-        // One that has left the status had ended.
+        // A goal that has left the status had ended.
         let entry = entry.ok_or(GoalError::Forgotten)?;
         let from = entry.status.status;
         let to = follows(from, decision).ok_or_else(|| GoalError::NotFrom {
@@ -190,26 +195,26 @@ impl ServerGoals {
         Ok(entry.set(to, text, now))
     }
 
-    /// Ends a goal that nobody will decide about. `None` when it has ended.
+    /// Ends a goal that is not going to be decided. Returns `None` if it has ended already.
     pub(super) fn abandon(&mut self, key: Key, text: &str, now: Instant) -> Option<GoalStatus> {
         let mut entries = self.entries.iter_mut();
         let entry = entries.find(|entry| entry.key == key && entry.ended.is_none())?;
         Some(entry.set(Status::Aborted, text, now))
     }
 
-    /// The goals that have not ended.
+    /// Returns the goals that have not ended.
     pub(super) fn open(&self) -> Vec<Key> {
         let open = self.entries.iter().filter(|entry| entry.ended.is_none());
         open.map(|entry| entry.key).collect()
     }
 
-    /// A goal's status while it is known.
+    /// Returns the status of a goal while it is known.
     pub(super) fn status(&self, key: Key) -> Option<&GoalStatus> {
         let entry = self.entries.iter().find(|entry| entry.key == key)?;
         Some(&entry.status)
     }
 
-    /// What to publish, without what has ended long enough ago.
+    /// Returns the statuses to publish, without the goals beyond their retention time.
     pub(super) fn list(&mut self, now: Instant) -> impl Iterator<Item = &GoalStatus> {
         let linger = self.linger;
         self.entries
@@ -224,7 +229,8 @@ impl ServerGoals {
         key
     }
 
-    /// Makes room by forgetting what has ended first, which has been published. False when all are open.
+    /// Frees an entry by removing the goal that ended first; its end has been published. Returns
+    /// false if all goals are open.
     fn has_room(&mut self) -> bool {
         if self.entries.len() < self.most {
             return true;
@@ -245,7 +251,7 @@ impl ServerGoals {
 }
 
 impl Entry {
-    /// A goal with the id of this entry arrives.
+    /// Handles a received goal with the id of this entry.
     fn seen_again(&mut self, now: Instant) -> Arrival {
         if self.ended.is_none() {
             return Arrival::Known;
@@ -258,7 +264,7 @@ impl Entry {
         }
     }
 
-    /// True when the goal has to be told.
+    /// Returns true if the goal has to be notified.
     fn ask_to_cancel(&mut self, now: Instant) -> bool {
         if self.ended.is_some() {
             self.ended = Some(now);
@@ -300,7 +306,7 @@ impl Decision {
     }
 }
 
-/// The status that follows on a decision, `None` where it must not be made.
+/// Returns the status that follows a decision, or `None` if the decision is not allowed.
 const fn follows(from: Status, decision: Decision) -> Option<Status> {
     let waiting = matches!(from, Status::Pending | Status::Recalling);
     let at_work = matches!(from, Status::Active | Status::Preempting);
@@ -343,7 +349,7 @@ mod tests {
         id(99, "made")
     }
 
-    /// Goals with these ids, requested at seconds 1, 2, ...
+    /// Returns goals with these ids, requested at seconds 1, 2, ...
     fn with(ids: &[&str], now: Instant) -> ServerGoals {
         let mut goals = ServerGoals::new(10, LINGER);
         for (secs, text) in (1..).zip(ids) {
@@ -567,7 +573,7 @@ mod tests {
                         }
                     }
                     Input::Decide(n, decision) => {
-                        // Only who was given a goal decides about it.
+                        // Only the holder of a goal decides about it.
                         let given = key(&goals, &name(n)).filter(|key| told.contains_key(key));
                         if let Some(key) = given {
                             drop(goals.decide(key, decision, "", now));

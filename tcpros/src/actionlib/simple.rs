@@ -1,9 +1,10 @@
-//! A server that works on one goal at a time; a newer goal takes the place of an older one.
+//! A server that works on one goal at a time; a newer goal replaces an older goal.
 
 use super::server::{ActionServer, ServerEvent, ServerGoal};
 
-/// The policy of actionlib's `SimpleActionServer`: one goal is worked on and one waits. A goal with a later stamp than
-/// both takes the waiting one's place, and whoever works should give way to it.
+/// The policy of actionlib's `SimpleActionServer`: one goal is active and one goal waits. A goal
+/// with a later stamp than both replaces the waiting goal, and the active goal should give way to
+/// it.
 #[derive(Debug)]
 pub struct SimpleActionServer {
     server: ActionServer,
@@ -11,7 +12,7 @@ pub struct SimpleActionServer {
 }
 
 impl SimpleActionServer {
-    /// Takes the goals of `server` one at a time.
+    /// Creates a server that takes the goals of `server` one at a time.
     pub const fn new(server: ActionServer) -> Self {
         Self {
             server,
@@ -19,7 +20,8 @@ impl SimpleActionServer {
         }
     }
 
-    /// The next goal, accepted. It may carry a request to cancel already. Cancel-safe.
+    /// Waits for the next goal and accepts it. The goal may have a cancel request already.
+    /// Cancel-safe.
     pub async fn next(&mut self) -> ServerGoal {
         loop {
             while let Some(event) = self.server.try_recv() {
@@ -36,8 +38,9 @@ impl SimpleActionServer {
         }
     }
 
-    /// Waits until work on `current` should stop: a client asked to cancel it, or a newer goal waits. For a goal that
-    /// has ended it returns at once. Then call [`ServerGoal::cancelled`] and [`Self::next`]. Cancel-safe.
+    /// Waits until work on `current` should stop: a client requested to cancel the goal, or a newer
+    /// goal waits. Returns at once for a goal that has ended. Then call [`ServerGoal::cancelled`]
+    /// and [`Self::next`]. Cancel-safe.
     pub async fn preempted(&mut self, current: &ServerGoal) {
         loop {
             if self.waiting.is_some()
@@ -51,7 +54,8 @@ impl SimpleActionServer {
         }
     }
 
-    /// Keeps the goal with the latest stamp waiting. A request to cancel is in the status of its goal already.
+    /// Keeps the goal with the latest stamp waiting. A cancel request is already in the status of
+    /// its goal.
     fn take(&mut self, event: ServerEvent, current: Option<&ServerGoal>) {
         let ServerEvent::Goal(goal) = event else {
             return;
@@ -63,7 +67,7 @@ impl SimpleActionServer {
         } else {
             self.waiting.replace(goal)
         };
-        // It cannot have ended, except with the server.
+        // The goal cannot have ended, except with the server.
         if let Some(old) = superseded {
             let _closed = old.cancelled(None, SUPERSEDED).is_err();
         }

@@ -1,4 +1,4 @@
-//! The types of an action's topics, and what its messages say of goals.
+//! The types of an action's topics, and the status of goals in its messages.
 
 use thiserror::Error;
 
@@ -7,30 +7,33 @@ use crate::publisher::TopicType;
 use crate::subscription::Wanted;
 use crate::time::RosTime;
 
-/// The types of an action's own topics, such as `pkg/XActionGoal`, `pkg/XActionResult` and `pkg/XActionFeedback`.
+/// The types of an action's own topics, such as `pkg/XActionGoal`, `pkg/XActionResult` and
+/// `pkg/XActionFeedback`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ActionType {
-    /// Of the topic `goal`.
+    /// Type of the topic `goal`.
     pub goal: TopicType,
-    /// Of the topic `result`.
+    /// Type of the topic `result`.
     pub result: TopicType,
-    /// Of the topic `feedback`.
+    /// Type of the topic `feedback`.
     pub feedback: TopicType,
 }
 
-/// The types a client has to know: that of the goals it sends. What it receives may be left open.
+/// The types that a client has to know: the type of its goals. The types that it receives may be
+/// left open.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ClientType {
-    /// Of the topic `goal`.
+    /// Type of the topic `goal`.
     pub goal: TopicType,
-    /// Of the topic `result`.
+    /// Type of the topic `result`.
     pub result: Wanted,
-    /// Of the topic `feedback`.
+    /// Type of the topic `feedback`.
     pub feedback: Wanted,
 }
 
 impl ClientType {
-    /// Takes results and feedback of any type; the server's connection header tells which it is.
+    /// Returns a client type that accepts results and feedback of any type. The connection header
+    /// of the server contains their types.
     pub fn of_goal(goal: TopicType) -> Self {
         Self {
             goal,
@@ -50,7 +53,7 @@ impl From<ActionType> for ClientType {
     }
 }
 
-/// A subscriber's wish for exactly this type.
+/// Returns a subscription request for exactly this type.
 pub(super) fn wanted(topic_type: TopicType) -> Wanted {
     Wanted {
         type_name: Some(topic_type.name),
@@ -58,7 +61,7 @@ pub(super) fn wanted(topic_type: TopicType) -> Wanted {
     }
 }
 
-/// Refuses the type of a bare `XGoal` where that of the `XActionGoal` around it belongs.
+/// Refuses the type of a bare `XGoal` where the type of the `XActionGoal` around it is required.
 pub(super) fn check_wrapper(type_name: &str, ending: &'static str) -> Result<(), ActionError> {
     if type_name.ends_with(ending) {
         Ok(())
@@ -70,72 +73,72 @@ pub(super) fn check_wrapper(type_name: &str, ending: &'static str) -> Result<(),
     }
 }
 
-/// Why a client or a server could not begin.
+/// Reason for which a client or a server could not start.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ActionError {
-    /// A topic of the action could not be taken.
+    /// A topic of the action could not be advertised or subscribed to.
     #[error(transparent)]
     Node(#[from] NodeError),
-    /// The type of a topic is not that of the message with goal id or status.
+    /// The type of a topic is not the wrapper message with goal id or status.
     #[error(
         "the type `{type_name}` does not end in `{ending}`: give the wrapper's type, such as pkg/X{ending}"
     )]
     NotAWrapper {
-        /// The type given.
+        /// The given type.
         type_name: String,
-        /// What its name has to end in.
+        /// Required end of the type name.
         ending: &'static str,
     },
 }
 
-/// Which goal: `actionlib_msgs/GoalID`.
+/// Identity of a goal: `actionlib_msgs/GoalID`.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Hash)]
 pub struct GoalId {
-    /// When the goal was requested, by the clock of its client.
+    /// Time of the request, by the clock of the client.
     pub stamp: RosTime,
-    /// Unique among all goals of the action.
+    /// Id, unique among all goals of the action.
     pub id: String,
 }
 
-/// How far a goal is: `actionlib_msgs/GoalStatus`.
+/// Progress of a goal: `actionlib_msgs/GoalStatus`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct GoalStatus {
-    /// The goal.
+    /// Identity of the goal.
     pub goal_id: GoalId,
-    /// How far it is.
+    /// Status code.
     pub status: Status,
-    /// What the server says of it, for people.
+    /// Text of the server about the status, for people.
     pub text: String,
 }
 
 /// The codes of `actionlib_msgs/GoalStatus`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Status {
-    /// 0: received and not looked at.
+    /// 0: received and not decided.
     Pending,
-    /// 1: at work.
+    /// 1: active.
     Active,
-    /// 2, an end: cancelled at work.
+    /// 2, final: cancelled while active.
     Preempted,
-    /// 3, an end: reached.
+    /// 3, final: reached.
     Succeeded,
-    /// 4, an end: failed at work.
+    /// 4, final: failed while active.
     Aborted,
-    /// 5, an end: not taken on.
+    /// 5, final: rejected.
     Rejected,
-    /// 6: at work, with a request to cancel.
+    /// 6: active, with a cancel request.
     Preempting,
-    /// 7: not looked at, with a request to cancel.
+    /// 7: not decided, with a cancel request.
     Recalling,
-    /// 8, an end: cancelled before any work.
+    /// 8, final: cancelled before any work.
     Recalled,
-    /// 9, an end: the client's own conclusion, never sent.
+    /// 9, final: concluded by the client, never sent.
     Lost,
 }
 
 impl Status {
-    /// The code on the wire.
+    /// Returns the code on the wire.
     pub const fn code(self) -> u8 {
         match self {
             Self::Pending => 0,
@@ -151,7 +154,7 @@ impl Status {
         }
     }
 
-    /// The status of a code, `None` from 10 on.
+    /// Returns the status of a code, or `None` from 10 on.
     pub const fn from_code(code: u8) -> Option<Self> {
         Some(match code {
             0 => Self::Pending,
@@ -168,7 +171,7 @@ impl Status {
         })
     }
 
-    /// Whether a goal stays in this status.
+    /// Returns whether the status is final.
     pub const fn is_terminal(self) -> bool {
         match self {
             Self::Preempted
@@ -182,7 +185,7 @@ impl Status {
     }
 }
 
-/// The type of the topic `cancel`.
+/// Returns the type of the topic `cancel`.
 pub fn goal_id_type() -> TopicType {
     TopicType {
         name: "actionlib_msgs/GoalID".to_owned(),
@@ -191,7 +194,7 @@ pub fn goal_id_type() -> TopicType {
     }
 }
 
-/// The type of the topic `status`.
+/// Returns the type of the topic `status`.
 pub fn goal_status_array_type() -> TopicType {
     let separator = "=".repeat(80);
     let definition = format!(

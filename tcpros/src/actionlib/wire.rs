@@ -5,8 +5,9 @@
 //! - status: Header, count as UInt32, that many GoalStatus
 //! - feedback and result: Header, GoalStatus, body
 //!
-//! Header is seq, stamp (seconds, nanoseconds) and frame id; GoalID is stamp and id; GoalStatus is GoalID, a code
-//! byte and a text. Reading checks every length and never panics; a body is a slice of the message.
+//! Header is seq, stamp (seconds, nanoseconds) and frame id; GoalID is stamp and id; GoalStatus is
+//! GoalID, a code byte and a text. Reading checks every length and never panics; a body is a slice
+//! of the message.
 
 use bytes::Bytes;
 use thiserror::Error;
@@ -14,12 +15,13 @@ use thiserror::Error;
 use super::{GoalId, GoalStatus};
 use crate::time::RosTime;
 
-/// Why a message of an action could not be read: it ends within the field named, or the field is no UTF-8.
+/// Error for a message of an action that cannot be decoded: the message ends within the named
+/// field, or the field is not UTF-8.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Error)]
 #[error("the message's {0} is cut short or no text")]
 pub(super) struct Malformed(&'static str);
 
-/// A GoalStatus as it came, with the code unchecked.
+/// A received GoalStatus with an unchecked code.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct StatusEntry {
     pub(super) id: String,
@@ -27,7 +29,7 @@ pub(super) struct StatusEntry {
     pub(super) text: String,
 }
 
-/// Reads a goal. The id must be UTF-8, as it has to be given back unchanged.
+/// Reads a goal. The id must be UTF-8, because the server sends it back unchanged.
 pub(super) fn read_goal(message: &Bytes) -> Result<(GoalId, Bytes), Malformed> {
     let mut reader = Reader(message);
     reader.header()?;
@@ -35,7 +37,7 @@ pub(super) fn read_goal(message: &Bytes) -> Result<(GoalId, Bytes), Malformed> {
     Ok((id, rest(message, &reader)))
 }
 
-/// Reads a cancel request. The id must be UTF-8, as with the goal it names.
+/// Reads a cancel request. The id must be UTF-8, as in the goal that it names.
 pub(super) fn read_cancel(message: &[u8]) -> Result<GoalId, Malformed> {
     Reader(message).goal_id()
 }
@@ -45,7 +47,7 @@ pub(super) fn read_status_array(message: &[u8]) -> Result<Vec<StatusEntry>, Malf
     let mut reader = Reader(message);
     reader.header()?;
     let count = reader.u32("status count")?;
-    // Nothing is reserved for a count that the message may not hold.
+    // No memory is reserved for a count that may exceed the message.
     (0..count).map(|_| reader.status()).collect()
 }
 
@@ -118,7 +120,8 @@ fn put_time(out: &mut Vec<u8>, time: RosTime) {
 }
 
 fn put_string(out: &mut Vec<u8>, text: &str) {
-    // A text that has no length on the wire came from this process, where nobody needs it: it is left out.
+    // A text that is too long for the wire can only come from this process; it is sent as an empty
+    // text.
     let (len, text) = u32::try_from(text.len()).map_or((0, ""), |len| (len, text));
     out.extend_from_slice(&len.to_le_bytes());
     out.extend_from_slice(text.as_bytes());
@@ -135,7 +138,7 @@ fn put_status(out: &mut Vec<u8>, status: &GoalStatus) {
     put_string(out, &status.text);
 }
 
-/// What is left of a message.
+/// The rest of a message.
 struct Reader<'a>(&'a [u8]);
 
 impl<'a> Reader<'a> {
@@ -212,7 +215,8 @@ mod tests {
 
     #[test]
     fn a_goal_of_genpy_reads_to_its_id_and_body() {
-        // actionlib/TestActionGoal with seq 3, stamp 10.5, frame "map", id "/a-1-10.5" at 10.5 and goal 42, from genpy.
+        // actionlib/TestActionGoal with seq 3, stamp 10.5, frame "map", id "/a-1-10.5" at 10.5 and
+        // goal 42, from genpy.
         let wire = b"\x03\0\0\0\x0a\0\0\0\x00\x65\xcd\x1d\x03\0\0\0map\x0a\0\0\0\x00\x65\xcd\x1d\
             \x09\0\0\0/a-1-10.5\x2a\0\0\0";
         let (id, body) = read_goal(&Bytes::from_static(wire)).unwrap();

@@ -1,16 +1,17 @@
-//! The parameters of a master: a tree of namespaces, and who follows which part of it.
+//! The parameters of a master: a tree of namespaces, and the subscribers of its parts.
 //!
-//! `wiki.ros.org/ROS/Parameter Server API` says what the calls do; where it is silent, this does what `rosmaster` does.
+//! The calls are defined by `wiki.ros.org/ROS/Parameter Server API`. Cases that it leaves open
+//! behave as in `rosmaster`.
 
 use std::collections::BTreeMap;
 
 use crate::xmlrpc::Value;
 
-/// The tree, and the nodes that follow a part of it.
+/// The parameter tree and its subscribers.
 #[derive(Debug, Default)]
 pub(super) struct Tree {
     root: BTreeMap<String, Node>,
-    /// Nodes and their slave APIs by the name they follow, in canonical form.
+    /// Nodes and their slave APIs by the subscribed name, in canonical form.
     followers: BTreeMap<String, Vec<(String, String)>>,
 }
 
@@ -20,11 +21,11 @@ enum Node {
     Namespace(BTreeMap<String, Self>),
 }
 
-/// One `paramUpdate` to send: the slave API, the key and the value.
+/// A `paramUpdate` to send: the slave API, the key and the value.
 pub(super) type Update = (String, String, Value);
 
 impl Tree {
-    /// A parameter, or a namespace as a struct. `/` is all.
+    /// Returns a parameter, or a namespace as a struct. `/` is the whole tree.
     pub(super) fn get(&self, name: &str) -> Option<Value> {
         let mut parts = parts(name).peekable();
         let mut inside = &self.root;
@@ -38,8 +39,9 @@ impl Tree {
         Some(as_struct(inside))
     }
 
-    /// Sets a parameter, or a namespace to what a struct holds. What stood in the way becomes a namespace. Fails for
-    /// a root that is no struct. Tells all followers but the one who calls.
+    /// Sets a parameter, or a namespace to the members of a struct. A value on the path becomes a
+    /// namespace. Returns the updates for all subscribers except the caller, or `None` for a root
+    /// that is not a struct.
     pub(super) fn set(&mut self, name: &str, value: &Value, caller: &str) -> Option<Vec<Update>> {
         let node = as_node(value.clone());
         let path: Vec<&str> = parts(name).collect();
@@ -51,7 +53,8 @@ impl Tree {
         Some(self.updates(name, value, Some(caller)))
     }
 
-    /// Deletes a parameter or a namespace, and tells all followers. `None` when there is none.
+    /// Deletes a parameter or a namespace and returns the updates for all subscribers. Returns
+    /// `None` if it does not exist.
     pub(super) fn delete(&mut self, name: &str) -> Option<Vec<Update>> {
         let path: Vec<&str> = parts(name).collect();
         let (last, namespaces) = path.split_last()?;
@@ -66,7 +69,7 @@ impl Tree {
         Some(self.updates(name, &unset(), None))
     }
 
-    /// The full names of all parameters.
+    /// Returns the full names of all parameters.
     pub(super) fn names(&self) -> Vec<String> {
         let mut names = Vec::new();
         let mut open = vec![(String::new(), &self.root)];
@@ -83,7 +86,8 @@ impl Tree {
         names
     }
 
-    /// Looks for the first part of a name in a namespace and those above it, and gives the whole name there.
+    /// Searches for the first part of a name in a namespace and its parents. Returns the whole name
+    /// in the namespace that contains the first part.
     pub(super) fn search(&self, namespace: &str, name: &str) -> Option<String> {
         if name.starts_with('/') {
             return self.get(name).map(|_| name.to_owned());
@@ -99,7 +103,8 @@ impl Tree {
         }
     }
 
-    /// Adds a follower and gives the value now, an empty struct when there is none.
+    /// Adds a subscriber and returns the current value, or an empty struct if the parameter is not
+    /// set.
     pub(super) fn follow(&mut self, name: &str, caller: &str, api: &str) -> Value {
         let followers = self.followers.entry(name.to_owned()).or_default();
         if !followers
@@ -111,7 +116,7 @@ impl Tree {
         self.get(name).unwrap_or_else(unset)
     }
 
-    /// Removes a follower.
+    /// Removes a subscriber.
     pub(super) fn unfollow(&mut self, name: &str, caller: &str, api: &str) {
         if let Some(followers) = self.followers.get_mut(name) {
             followers.retain(|(node, known)| node != caller || known != api);
@@ -121,7 +126,7 @@ impl Tree {
         }
     }
 
-    /// Removes a node from all it follows.
+    /// Removes all subscriptions of a node.
     pub(super) fn forget(&mut self, caller: &str) {
         self.followers.retain(|_, nodes| {
             nodes.retain(|(node, _)| node != caller);
@@ -129,14 +134,15 @@ impl Tree {
         });
     }
 
-    /// Whether a node follows anything.
+    /// Returns whether a node has a subscription.
     pub(super) fn is_followed_by(&self, caller: &str) -> bool {
         let mut followers = self.followers.values().flatten();
         followers.any(|(node, _)| node == caller)
     }
 
-    /// What followers hear of a change: those of the name and of the namespaces above it the new value under the name
-    /// that was changed, those below it their own part of it. Keys end in a slash.
+    /// Returns the updates of a change. Subscribers of the name and of its parent namespaces
+    /// receive the new value under the changed name. Subscribers below the name receive their own
+    /// part of the value. Keys end in a slash.
     fn updates(&self, name: &str, value: &Value, ignored: Option<&str>) -> Vec<Update> {
         let changed = slashed(name);
         let mut updates = Vec::new();
@@ -207,12 +213,12 @@ fn as_struct(members: &BTreeMap<String, Node>) -> Value {
     Value::Struct(members.iter().map(member).collect())
 }
 
-/// How the API says that a parameter is not set.
+/// Returns the value with which the API reports a parameter that is not set.
 const fn unset() -> Value {
     Value::Struct(Vec::new())
 }
 
-/// What stands between the slashes of a name.
+/// Returns the parts between the slashes of a name.
 pub(super) fn parts(name: &str) -> impl Iterator<Item = &str> {
     name.split('/').filter(|part| !part.is_empty())
 }
@@ -250,7 +256,7 @@ mod tests {
             tree.names(),
             ["/gains/inner/d", "/gains/p", "/line/gains/p"]
         );
-        // A value gives way to a namespace, and a namespace to a value.
+        // A value is replaced by a namespace, and a namespace by a value.
         tree.set("/gains/p/x", &4.into(), "/x").unwrap();
         tree.set("/line", &5.into(), "/x").unwrap();
         assert_eq!(tree.names(), ["/gains/inner/d", "/gains/p/x", "/line"]);

@@ -1,9 +1,9 @@
-//! The value of `_name:=value` on a command line.
+//! Parses the value of `_name:=value` on a command line.
 //!
-//! Where roscpp and rospy read a plain word differently, roscpp's reading wins: `yes`, `on` and `1:30` are text, `010` is
-//! ten and `1e3` a number, all of which the YAML 1.1 of rospy reads otherwise. Only the numbers that are none follow
-//! rospy: `.inf` and `.nan` are such, `inf` and `nan` are text. Quotes, `[...]` and `{...}` are read as YAML, as rospy
-//! does. What is no YAML is text.
+//! If roscpp and rospy read a plain word differently, this module follows roscpp: `yes`, `on` and
+//! `1:30` are text, `010` is ten and `1e3` a number, all of which the YAML 1.1 of rospy reads
+//! otherwise. Only special numbers follow rospy: `.inf` and `.nan` are numbers, `inf` and `nan` are
+//! text. Quotes, `[...]` and `{...}` are read as YAML, as rospy does. Invalid YAML is text.
 
 use std::collections::BTreeMap;
 
@@ -11,7 +11,7 @@ use granit_parser::{Event, Parser, ScalarStyle};
 
 use crate::parameters::{ParamError, ParamValue};
 
-/// Reads the text behind `:=`. Fails for an integer past 32 bits.
+/// Parses the text after `:=`. Fails for an integer of more than 32 bits.
 pub(crate) fn value(text: &str) -> Result<ParamValue, ParamError> {
     if text.starts_with(['[', '{', '"', '\'']) {
         let read = yaml(text)?;
@@ -20,7 +20,7 @@ pub(crate) fn value(text: &str) -> Result<ParamValue, ParamError> {
     plain(text)
 }
 
-/// `None` for what is no YAML, or more of it than values.
+/// Parses YAML. Returns `None` for invalid YAML and for YAML with other constructs than values.
 fn yaml(text: &str) -> Result<Option<ParamValue>, ParamError> {
     let options = granit_parser::options! {
         emit_comments: false,
@@ -56,7 +56,7 @@ fn yaml(text: &str) -> Result<Option<ParamValue>, ParamError> {
             | Event::StreamEnd
             | Event::DocumentStart(..)
             | Event::DocumentEnd => continue,
-            // The enumeration is open: what this does not know is not simple.
+            // The enumeration is open: an unknown event is not a simple value.
             Event::Alias(_) | Event::UnresolvedAlias(_) | Event::Anchor(..) | _ => return Ok(None),
         };
         match open.last_mut() {
@@ -71,7 +71,7 @@ fn yaml(text: &str) -> Result<Option<ParamValue>, ParamError> {
     Ok(root)
 }
 
-/// A list or map whose end has not come.
+/// A list or map that is not complete yet.
 enum Open {
     List(Vec<ParamValue>),
     /// The members, and a name that waits for its value.
@@ -79,7 +79,8 @@ enum Open {
 }
 
 impl Open {
-    /// `None` when the name of a member is no text: there is none such on the parameter server.
+    /// Adds a value. Returns `None` if the name of a member is not text, which the parameter server
+    /// does not support.
     fn take(&mut self, value: ParamValue) -> Option<()> {
         match self {
             Self::List(items) => items.push(value),
@@ -120,7 +121,7 @@ fn plain(text: &str) -> Result<ParamValue, ParamError> {
     }
 }
 
-/// As deep as XML-RPC documents are read.
+/// Same limit as for XML-RPC documents.
 const MAX_DEPTH: usize = 32;
 
 #[cfg(test)]

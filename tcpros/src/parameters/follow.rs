@@ -1,7 +1,8 @@
-//! What the master should know of this node's parameters: those given on its command line, and those it follows.
+//! The parameters of this node at the master: parameters from the command line, and subscribed
+//! parameters.
 //!
-//! The registrar calls [`settle`] whenever something may have changed, so a master that starts late or restarts is
-//! the same case as a new subscription.
+//! The registrar calls [`settle`] whenever something may have changed. A master that starts late or
+//! restarts is thus handled like a new subscription.
 
 use std::collections::BTreeMap;
 use std::sync::Mutex;
@@ -17,20 +18,20 @@ use crate::outbox::lock;
 use crate::parameters::{ParamValue, exists, known, read, write};
 use crate::rpc::RpcError;
 
-/// What has been heard of a followed parameter.
+/// State of a subscribed parameter.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) enum Heard {
-    /// The master has not been asked yet.
+    /// The parameter was not read from the master yet.
     Nothing,
-    /// What it said last; `None` for a parameter that is not set.
+    /// The last value from the master, or `None` if the parameter is not set.
     Value(Option<ParamValue>),
 }
 
-/// The node's parameters as they should be at the master.
+/// The desired state of the node's parameters at the master.
 #[derive(Debug)]
 pub(crate) struct Params {
     table: Mutex<Table>,
-    /// The parameter that the clock hangs on.
+    /// The parameter that selects the clock.
     use_sim_time: String,
 }
 
@@ -46,30 +47,31 @@ struct Table {
 struct Given {
     name: String,
     value: ParamValue,
-    /// Whether this master has it.
+    /// Whether the current master has the parameter.
     told: bool,
-    /// Whether any has had it.
+    /// Whether any master has had the parameter.
     ever: bool,
 }
 
 #[derive(Debug)]
 struct Followed {
     holders: usize,
-    /// Whether a master was asked for it, answered or not: a call that timed out here may have been done there.
+    /// Whether a subscription was requested, with or without a reply: a call that timed out may
+    /// still have been executed by the master.
     told: bool,
     subscribed: bool,
-    /// Whether it changed since it was last read.
+    /// Whether the parameter has changed after its last read.
     stale: bool,
     heard: watch::Sender<Heard>,
 }
 
-/// One call to make.
+/// A call to make.
 #[derive(Debug)]
 enum Work {
     Set {
         name: String,
         value: ParamValue,
-        /// Another value that is there meanwhile stays.
+        /// Whether a value that is set in the meantime is kept.
         unless_set: bool,
     },
     Subscribe(String),
@@ -78,7 +80,8 @@ enum Work {
 }
 
 impl Params {
-    /// `given` by full name; `use_sim_time` is followed from the start.
+    /// Creates the state with the parameters in `given`, by full name. `use_sim_time` is subscribed
+    /// to from the start.
     pub(crate) fn new(given: Vec<(String, ParamValue)>, use_sim_time: String) -> Self {
         let given = given.into_iter().map(|(name, value)| Given {
             name,
@@ -95,12 +98,12 @@ impl Params {
             table: Mutex::new(table),
             use_sim_time,
         };
-        // The node holds this one for as long as it lives.
+        // The node holds this subscription for its whole life.
         drop(params.hold(&params.use_sim_time));
         params
     }
 
-    /// Follows a parameter until it is released as often as it was held.
+    /// Subscribes to a parameter until it is released as often as it was held.
     pub(crate) fn hold(&self, name: &str) -> watch::Receiver<Heard> {
         let mut table = lock(&self.table);
         if table.closed {
@@ -118,7 +121,7 @@ impl Params {
             });
         entry.holders += 1;
         let mut heard = entry.heard.subscribe();
-        // What was heard for another holder is news to this one.
+        // A value received for another holder is new to this holder.
         heard.mark_changed();
         heard
     }
@@ -129,7 +132,8 @@ impl Params {
         }
     }
 
-    /// Marks what has to be read anew because the parameter or namespace `name` changed.
+    /// Marks the subscriptions that have to be read again because the parameter or namespace `name`
+    /// changed.
     pub(crate) fn touch(&self, name: &str) {
         for (followed, entry) in &mut lock(&self.table).followed {
             if covers(followed, name) || covers(name, followed) {
@@ -138,7 +142,7 @@ impl Params {
         }
     }
 
-    /// The master knows nothing any more.
+    /// Records that the master has lost all state of this node.
     pub(crate) fn forget(&self) {
         let mut table = lock(&self.table);
         for given in &mut table.given {
@@ -149,13 +153,14 @@ impl Params {
         }
     }
 
-    /// Whether the master should know this node for a parameter it follows.
+    /// Returns whether the master should know this node because of a subscribed parameter.
     pub(crate) fn any_subscribed(&self) -> bool {
         let table = lock(&self.table);
         table.followed.values().any(|entry| entry.subscribed)
     }
 
-    /// Ends all subscriptions: [`settle`] withdraws them, and nobody hears of them any more.
+    /// Ends all subscriptions: [`settle`] unsubscribes them at the master, and they receive no more
+    /// values.
     pub(crate) fn close(&self) {
         let mut table = lock(&self.table);
         table.closed = true;
@@ -165,7 +170,7 @@ impl Params {
         }
     }
 
-    /// Gives up what could not be withdrawn, and names it.
+    /// Removes the subscriptions that could not be unsubscribed, and returns their names.
     pub(crate) fn abandon(&self) -> Vec<String> {
         let followed = std::mem::take(&mut lock(&self.table).followed);
         followed.into_keys().collect()
@@ -178,7 +183,7 @@ impl Params {
         given.map(|g| (g.name.clone(), g.value.clone())).collect()
     }
 
-    /// Whether everything is withdrawn.
+    /// Returns whether all subscriptions are unsubscribed.
     pub(crate) fn is_empty(&self) -> bool {
         lock(&self.table).followed.is_empty()
     }
@@ -252,13 +257,13 @@ impl Params {
     }
 }
 
-/// Brings the master and the subscriptions up to date. Fails only when the master does not answer; a parameter that
-/// it refuses, or that cannot be read, is tried again the next time.
+/// Updates the master and the subscriptions. Fails only if the master does not reply; a parameter
+/// that is refused or cannot be read is retried the next time.
 pub(crate) async fn settle(node: &Inner, refusals: &mut Throttle) -> Result<(), MasterError> {
     let params = &node.params;
     for work in params.work() {
         if !node.may_register() && !matches!(work, Work::Unsubscribe(_)) {
-            // The name may belong to another node now, and so do its private parameters.
+            // The name, and with it the private parameters, may belong to another node.
             params.failed(&work);
             continue;
         }
@@ -271,7 +276,7 @@ pub(crate) async fn settle(node: &Inner, refusals: &mut Throttle) -> Result<(), 
             Err(error) => {
                 params.failed(&work);
                 if let Work::Unsubscribe(name) = &work {
-                    // A master that does not know the subscription has nothing to forget.
+                    // A master that does not know the subscription has nothing to remove.
                     params.has_unsubscribed(name);
                 } else if refusals.admit(clock::now()).is_some() {
                     events::parameter_failed(work.name(), &error);
@@ -301,7 +306,7 @@ async fn perform(node: &Inner, work: &Work) -> Result<(), MasterError> {
                 "subscribeParam",
                 node.master.call("subscribeParam", params).await?,
             )?;
-            // An empty map is an empty namespace, or says that the parameter is not set.
+            // An empty map is an empty namespace, or a parameter that is not set.
             let value = if value.as_map().is_some_and(BTreeMap::is_empty) {
                 read(node, name).await?
             } else {
@@ -340,13 +345,13 @@ fn heard(node: &Inner, name: &str, value: Option<ParamValue>) {
     node.params.has_read(name, value);
 }
 
-/// Whether a name is the namespace of another, or the same.
+/// Returns whether the first name equals the second name or is its namespace.
 fn covers(namespace: &str, name: &str) -> bool {
     let rest = name.strip_prefix(namespace.trim_end_matches('/'));
     rest.is_some_and(|rest| rest.is_empty() || rest.starts_with('/'))
 }
 
-/// A value that cannot be read is no reason to think that the master is gone.
+/// Returns whether the master is unreachable. A value that cannot be read does not mean this.
 const fn is_unreachable(error: &MasterError) -> bool {
     match error {
         MasterError::Refused { .. } | MasterError::Shape(_) => false,
@@ -402,7 +407,7 @@ mod tests {
             drop(params.hold(name));
         }
         params.asks_for("/asked");
-        // The master was away meanwhile, and may be the same.
+        // The master was unreachable in the meantime, and may be the same.
         params.forget();
         assert!(!withdraws("/asked"));
         params.release("/asked");

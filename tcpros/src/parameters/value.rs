@@ -1,14 +1,15 @@
-//! Values as the parameter server keeps them.
+//! Values of the parameter server.
 
 use std::collections::BTreeMap;
 
 use crate::parameters::ParamError;
 use crate::xmlrpc::Value;
 
-/// The value of a parameter, or of a whole namespace of them (`wiki.ros.org/Parameter Server`, "Parameter Types").
+/// The value of a parameter, or of a whole namespace (`wiki.ros.org/Parameter Server`, "Parameter
+/// Types").
 #[derive(Clone, Debug, PartialEq)]
 pub enum ParamValue {
-    /// A truth value.
+    /// A boolean.
     Bool(bool),
     /// An integer; XML-RPC has 32 bits for it.
     Int(i32),
@@ -20,14 +21,14 @@ pub enum ParamValue {
     DateTime(String),
     /// Bytes.
     Binary(Vec<u8>),
-    /// Values in their order.
+    /// Values in order.
     List(Vec<Self>),
     /// A namespace: parameters by name.
     Map(BTreeMap<String, Self>),
 }
 
 impl ParamValue {
-    /// The truth value, if it is one.
+    /// Returns the value if it is a boolean.
     pub const fn as_bool(&self) -> Option<bool> {
         if let Self::Bool(flag) = self {
             Some(*flag)
@@ -36,7 +37,7 @@ impl ParamValue {
         }
     }
 
-    /// The integer, if it is one.
+    /// Returns the value if it is an integer.
     pub const fn as_int(&self) -> Option<i32> {
         if let Self::Int(number) = self {
             Some(*number)
@@ -45,7 +46,7 @@ impl ParamValue {
         }
     }
 
-    /// The number, if it is one; an integer counts, as people leave the `.0` away.
+    /// Returns the value if it is a number or an integer, as users often omit the `.0`.
     pub fn as_double(&self) -> Option<f64> {
         if let Self::Double(number) = self {
             Some(*number)
@@ -54,7 +55,7 @@ impl ParamValue {
         }
     }
 
-    /// The text, if it is one.
+    /// Returns the value if it is text.
     pub fn as_str(&self) -> Option<&str> {
         if let Self::String(text) = self {
             Some(text)
@@ -63,7 +64,7 @@ impl ParamValue {
         }
     }
 
-    /// The values of a list, if it is one.
+    /// Returns the values of a list.
     pub fn as_list(&self) -> Option<&[Self]> {
         if let Self::List(items) = self {
             Some(items)
@@ -72,7 +73,7 @@ impl ParamValue {
         }
     }
 
-    /// The parameters of a namespace, if it is one.
+    /// Returns the parameters of a namespace.
     pub const fn as_map(&self) -> Option<&BTreeMap<String, Self>> {
         if let Self::Map(members) = self {
             Some(members)
@@ -81,7 +82,8 @@ impl ParamValue {
         }
     }
 
-    /// `None` for a value that holds `<nil/>`, which no parameter is.
+    /// Converts a value from the wire. Returns `None` for a value that contains `<nil/>`, which is
+    /// not a valid parameter.
     pub(crate) fn from_wire(value: Value) -> Option<Self> {
         Some(match value {
             Value::Bool(flag) => Self::Bool(flag),

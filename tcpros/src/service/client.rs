@@ -1,4 +1,4 @@
-//! Calling a service: finding it, connecting, asking, and telling what went wrong.
+//! Calling a service: lookup, connection, request, response and errors.
 
 use std::fmt;
 use std::io;
@@ -23,24 +23,26 @@ use crate::link::prepare;
 use crate::master::{Master, MasterError};
 use crate::rpc;
 
-/// What a client asks for, and how long it waits.
+/// Type, connection and time limits of a service client.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ServiceClientOptions {
-    /// Checksum of the service's type. `None` sends `*`, which servers of roscpp, rospy and this crate take.
+    /// Checksum of the service's type. `None` sends `*`, which servers of roscpp, rospy and this
+    /// crate accept.
     pub md5sum: Option<String>,
-    /// Such as `std_srvs/SetBool`. Servers do not need it; it is for people who look at the wire.
+    /// Name, such as `std_srvs/SetBool`. Servers do not need it; it is for the analysis of traffic.
     pub type_name: Option<String>,
-    /// Keeps one connection for all calls, which are then made one after another. A server that closes it is looked
-    /// up and connected to again by the next call.
+    /// Keeps a connection for all calls, which are then made in sequence. If the server
+    /// closes the connection, the next call looks up the server and connects again.
     pub persistent: bool,
-    /// For a whole call: waiting for calls before it, lookup, connecting, request and answer.
+    /// Time limit of a whole call: waiting for earlier calls, lookup, connecting, request and
+    /// response.
     pub timeout: Duration,
-    /// Longest answer taken, in bytes. A longer one closes the connection.
+    /// Maximum length of a response, in bytes. A longer response closes the connection.
     pub max_response: usize,
 }
 
 impl Default for ServiceClientOptions {
-    /// Any type, a connection per call, 10 seconds, 64 MiB.
+    /// Returns options for any type, a connection per call, 10 seconds and 64 MiB.
     fn default() -> Self {
         Self {
             md5sum: None,
@@ -52,7 +54,8 @@ impl Default for ServiceClientOptions {
     }
 }
 
-/// Calls one service. Clones share the kept connection of a persistent client. It may outlive its node.
+/// Calls a service. Clones share the connection of a persistent client. The client may outlive
+/// its node.
 #[derive(Clone, Debug)]
 pub struct ServiceClient {
     shared: Arc<Shared>,
@@ -64,7 +67,8 @@ struct Shared {
     options: ServiceClientOptions,
     caller_id: String,
     master: Master,
-    /// Of a persistent client between two calls. Who calls takes it out, so that a call given up takes it along.
+    /// The connection of a persistent client between two calls. A call takes the connection out, so
+    /// that a dropped call also drops the connection.
     kept: Mutex<Option<Connection>>,
     /// Permits to look the service up, connect and exchange headers, see [`MOST_OPENING`].
     opening: Semaphore,
@@ -92,11 +96,11 @@ impl ServiceClient {
         }
     }
 
-    /// A client of one that is no node of the graph: the master at `uri` (`http://host:port`) tells it where the service is.
-    /// `service` is the full name.
+    /// Creates a client for a caller that is not a node of the graph. The master at `uri`
+    /// (`http://host:port`) resolves the address of the service. `service` is the full name.
     ///
     /// # Errors
-    /// The URI is none.
+    /// Fails if the URI is invalid.
     pub fn of_master(
         uri: &str,
         caller_id: &str,
@@ -107,20 +111,21 @@ impl ServiceClient {
         Ok(Self::new(service.to_owned(), options, caller_id, master))
     }
 
-    /// Returns how many requests were sent as a whole, answered or not.
+    /// Returns the number of requests that were sent as a whole, answered or not.
     pub fn requests_sent(&self) -> u64 {
         self.shared.sent.load(Ordering::Relaxed)
     }
 
-    /// The service's resolved name.
+    /// Returns the resolved name of the service.
     pub fn service(&self) -> &str {
         &self.shared.service
     }
 
-    /// Sends a serialized request, without its length, and returns the serialized answer.
+    /// Sends a serialized request, without its length, and returns the serialized response.
     ///
-    /// It is never sent twice: when it fails, [`ServiceError::may_have_run`] tells whether the server may have acted.
-    /// Dropping the future gives the call up and closes its connection; the server may still act.
+    /// The request is never sent twice. After an error, [`ServiceError::may_have_run`] returns
+    /// whether the server may have executed the call. Dropping the future aborts the call and
+    /// closes its connection; the server may still execute the call.
     pub async fn call(&self, request: Bytes) -> Result<Bytes, ServiceError> {
         let length = u32::try_from(request.len()).map_err(|_| ServiceError::RequestTooLong {
             service: self.service().to_owned(),
@@ -131,7 +136,7 @@ impl ServiceClient {
             request,
         };
         let deadline = self.shared.deadline();
-        // The futures are large: they stay out of the caller's.
+        // The futures are large: they are boxed to keep them out of the caller's future.
         if self.shared.options.persistent {
             Box::pin(self.shared.call_kept(&wire, deadline)).await
         } else {
@@ -139,8 +144,8 @@ impl ServiceClient {
         }
     }
 
-    /// Asks the server for its header, without calling it: `type`, `md5sum`, `callerid`, and from roscpp and this
-    /// crate also `request_type` and `response_type`.
+    /// Requests the header of the server without calling the service: `type`, `md5sum`, `callerid`,
+    /// and from roscpp and this crate also `request_type` and `response_type`.
     pub async fn probe(&self) -> Result<ConnectionHeader, ServiceError> {
         let deadline = self.shared.deadline();
         let probing = self.shared.connect(deadline, Purpose::Probe);
@@ -182,7 +187,8 @@ impl Shared {
                 *kept = connection.if_sound();
                 return answer;
             }
-            // The server has not had the whole request, so it has not acted on it: a new connection may.
+            // The server has not received the whole request, so it has not executed the call: a new
+            // connection may be used.
         }
         let (mut connection, _) = self.connect(deadline, Purpose::Call).await?;
         let answer = self.exchange(&mut connection, wire, deadline).await;
@@ -301,7 +307,7 @@ impl Shared {
         }
     }
 
-    /// One request and its answer on a connection.
+    /// Sends a request and receives its response on a connection.
     async fn exchange(
         &self,
         connection: &mut Connection,
@@ -377,7 +383,7 @@ struct Connection {
     stream: TcpStream,
     answers: u64,
     answered: Instant,
-    /// Whether the last exchange ended with its last byte, so that another may follow.
+    /// Whether the last exchange ended with its last byte, so that another exchange may follow.
     sound: bool,
 }
 
@@ -386,13 +392,15 @@ impl Connection {
         self.sound.then_some(self)
     }
 
-    /// Whether the server is still there and has said nothing out of turn.
+    /// Returns whether the connection is open and has no unexpected data.
     ///
-    /// One that does not grant a persistent connection closes it right after its first answer, and nothing in its
-    /// header says so: a second call that comes as quickly gives it a moment to do that.
+    /// A server that does not grant a persistent connection closes it right after its first
+    /// response, and its header does not announce this. A second call that follows quickly
+    /// therefore waits for a moment.
     async fn is_open(&mut self) -> bool {
         let mut byte = [MaybeUninit::uninit()];
-        // Asked of the system itself: the runtime may not have looked since the last answer.
+        // Read from the system itself: the runtime may not have polled the socket after the last
+        // response.
         match SockRef::from(&self.stream).peek(&mut byte) {
             Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
             Ok(_) | Err(_) => return false,
@@ -404,7 +412,7 @@ impl Connection {
         rest.is_zero() || timeout(rest, self.stream.peek(&mut [0])).await.is_err()
     }
 
-    /// The ok byte and the body of an answer.
+    /// Reads the ok byte and the body of a response.
     async fn answer(&mut self, limit: usize) -> Result<(bool, Bytes), AnswerError> {
         let ok = match self.stream.read_u8().await? {
             0 => false,
@@ -437,13 +445,13 @@ enum AnswerError {
     OkByte(u8),
 }
 
-/// What a call was at when it ended.
+/// Phase of a call at the time of its end.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum CallPhase {
     /// Waiting for earlier calls: for the persistent connection, or for a turn to connect.
     Queue,
-    /// Asking the master where the service is.
+    /// Looking up the service at the master.
     Lookup,
     /// Connecting to the server.
     Connect,
@@ -451,7 +459,7 @@ pub enum CallPhase {
     Handshake,
     /// Sending the request.
     Request,
-    /// The request is sent, the answer awaited.
+    /// Waiting for the response after the request was sent.
     Answer,
 }
 
@@ -470,28 +478,29 @@ impl fmt::Display for CallPhase {
     }
 }
 
-/// Why a call brought no answer.
+/// Error of a service call.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ServiceError {
-    /// The master knows no node that offers it.
+    /// The master knows no node that offers the service.
     #[error("no node offers {service}: `rosservice list` shows what the master knows")]
     NotAdvertised {
         /// The resolved service.
         service: String,
     },
-    /// The master could not be asked.
+    /// The call to the master failed.
     #[error("the ROS master at {uri} could not be asked where {service} is: {source}")]
     Master {
         /// The resolved service.
         service: String,
-        /// Where the master should be.
+        /// URI of the master.
         uri: String,
-        /// What went wrong there.
+        /// The error of the call.
         #[source]
         source: MasterError,
     },
-    /// Nobody listens where the master says the service is, or its host name does not resolve.
+    /// No server listens at the registered address of the service, or its host name does not
+    /// resolve.
     #[error(
         "no connection to {host}:{port}, where the master says {service} is: {source}. If that node is gone, \
          `rosnode cleanup` removes it from the master; if it runs, check that {host} resolves and is reached from here"
@@ -503,19 +512,20 @@ pub enum ServiceError {
         host: String,
         /// The server's port.
         port: u16,
-        /// What the system says.
+        /// The error of the system.
         #[source]
         source: io::Error,
     },
-    /// The server answered the connection header with `error=`: most often another type.
+    /// The server replied to the connection header with `error=`, most often because of another
+    /// type.
     #[error("the server of {service} refuses: {message}")]
     Refused {
         /// The resolved service.
         service: String,
-        /// The server's words.
+        /// The text of the server.
         message: String,
     },
-    /// The server took the connection, and its header names another type.
+    /// The server accepted the connection, and its header contains another type.
     #[error("{service} has the type {theirs}, and {ours} is wanted")]
     OtherType {
         /// The resolved service.
@@ -525,22 +535,22 @@ pub enum ServiceError {
         /// Name and checksum of the client's type.
         ours: String,
     },
-    /// The server ran the call and answers that it failed.
+    /// The server executed the call and reports that it failed.
     #[error("{service} failed: {message}")]
     Failed {
         /// The resolved service.
         service: String,
-        /// The server's words; U+FFFD stands for what is not UTF-8.
+        /// The text of the server; U+FFFD replaces bytes that are not UTF-8.
         message: String,
     },
-    /// The time for the call is over.
+    /// The time limit of the call has passed.
     #[error("{service}: the call was given up after {limit:?} while {phase}")]
     Timeout {
         /// The resolved service.
         service: String,
-        /// What took too long.
+        /// The phase that was not completed.
         phase: CallPhase,
-        /// The time given to the whole call.
+        /// The time limit of the whole call.
         limit: Duration,
     },
     /// The connection ended within the call.
@@ -548,13 +558,13 @@ pub enum ServiceError {
     Lost {
         /// The resolved service.
         service: String,
-        /// When it ended.
+        /// The phase of the call.
         phase: CallPhase,
-        /// What the system says.
+        /// The error of the system.
         #[source]
         source: io::Error,
     },
-    /// The request has no length on the wire.
+    /// The length of the request exceeds the wire format.
     #[error("a request of {bytes} bytes for {service} is longer than TCPROS can say")]
     RequestTooLong {
         /// The resolved service.
@@ -562,32 +572,32 @@ pub enum ServiceError {
         /// Length of the request.
         bytes: usize,
     },
-    /// The answer is longer than the options allow.
+    /// The response is longer than the options allow.
     #[error("the answer of {service} has {announced} bytes, more than the limit of {limit}")]
     AnswerTooLong {
         /// The resolved service.
         service: String,
-        /// Length of the answer.
+        /// Length of the response.
         announced: u32,
-        /// The limit it exceeds.
+        /// The limit that it exceeds.
         limit: usize,
     },
-    /// The master or the server broke the protocol.
+    /// The master or the server violated the protocol.
     #[error("{service}: {what}")]
     Malformed {
         /// The resolved service.
         service: String,
-        /// What the call was at.
+        /// The phase of the call.
         phase: CallPhase,
-        /// What is wrong.
+        /// Description of the violation.
         what: String,
     },
 }
 
 impl ServiceError {
-    /// Whether the server may have acted on the request though no answer tells so: the request was sent as a whole,
-    /// and the answer was lost or not taken. When this is false, the server either answered, with
-    /// [`ServiceError::Failed`], or never had the whole request.
+    /// Returns whether the server may have executed the call without a received response: the whole
+    /// request was sent, and the response was lost or not accepted. If false, the server either
+    /// responded with [`ServiceError::Failed`], or never received the whole request.
     pub const fn may_have_run(&self) -> bool {
         match self {
             Self::Timeout { phase, .. }
@@ -619,5 +629,5 @@ impl ServiceError {
 /// and of rosmaster hold five connections. The kernel drops the packets of further connections, and
 /// repeats them with growing pauses.
 const MOST_OPENING: usize = 4;
-/// How quickly a server that closes after its answer is expected to have closed.
+/// Time within which a server that closes after its response is expected to have closed.
 const CLOSING_TIME: Duration = Duration::from_millis(50);

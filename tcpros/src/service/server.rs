@@ -1,4 +1,4 @@
-//! Offering a service: who may call, reading requests, running the handler, answering.
+//! Offering a service: admission of clients, reading requests, running the handler, responding.
 
 use std::fmt;
 use std::pin::Pin;
@@ -26,19 +26,22 @@ use crate::node::Inner;
 use crate::outbox::lock;
 use crate::topic_server::{DRAIN_LIMIT, Ended, STALL_LIMIT, until_closed, write};
 
-/// What a service does for its clients, at most.
+/// Limits of a service.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ServiceOptions {
-    /// Longest request taken, in bytes. A longer one is answered with an error and closes its connection.
+    /// Maximum length of a request, in bytes. A longer request is answered with an error and closes
+    /// its connection.
     pub max_request: usize,
-    /// Clients connected at once, idle persistent ones included. One more is told so and turned away.
+    /// Maximum number of connected clients, including idle persistent clients. A further client is
+    /// refused with an error.
     pub max_clients: usize,
-    /// How long the handler may take for one request. Past that it is dropped and the client told.
+    /// Time limit of the handler for a request. Beyond it the handler is dropped and the client
+    /// receives an error.
     pub handler_timeout: Duration,
 }
 
 impl Default for ServiceOptions {
-    /// 64 MiB, 256 clients, one minute.
+    /// Returns limits of 64 MiB, 256 clients and 60 seconds.
     fn default() -> Self {
         Self {
             max_request: DEFAULT_MAX_BODY,
@@ -48,18 +51,18 @@ impl Default for ServiceOptions {
     }
 }
 
-/// One request, as the handler of a service gets it.
+/// A request, as passed to the handler of a service.
 #[derive(Clone, Debug)]
 pub struct ServiceRequest {
-    /// The serialized request without its length. Its type is the service's, unless the client came with the
-    /// checksum `*`.
+    /// The serialized request without its length. Its type is that of the service, unless the
+    /// client connected with the checksum `*`.
     pub bytes: Bytes,
-    /// Who asks.
+    /// The client.
     pub client: Arc<Peer>,
 }
 
-/// Offers one service. Dropping it withdraws the service: idle clients are disconnected at once, and one whose
-/// request is being handled gets its answer if that takes no more than a second.
+/// Offers a service. Dropping it withdraws the service: idle clients are disconnected at once,
+/// and a client with a request in progress gets its response if that takes no more than a second.
 #[derive(Debug)]
 pub struct ServiceServer {
     served: Arc<Served>,
@@ -71,37 +74,38 @@ impl ServiceServer {
         Self { served, node }
     }
 
-    /// The service's resolved name.
+    /// Returns the resolved name of the service.
     pub fn service(&self) -> &str {
         &self.served.service
     }
 
-    /// Requests taken so far, those that failed included.
+    /// Returns the number of received requests, including failed requests.
     pub fn calls(&self) -> u64 {
         self.served.counters.calls.load(Ordering::Relaxed)
     }
 
-    /// Requests that were answered with an error text.
+    /// Returns the number of requests that were answered with an error text.
     pub fn failures(&self) -> u64 {
         self.served.counters.failures.load(Ordering::Relaxed)
     }
 
-    /// Bytes of the requests so far, without their lengths.
+    /// Returns the number of received request bytes, without lengths.
     pub fn bytes_received(&self) -> u64 {
         self.served.counters.received.load(Ordering::Relaxed)
     }
 
-    /// Bytes of the answers so far, error texts included, without their lengths.
+    /// Returns the number of sent response bytes, including error texts, without lengths.
     pub fn bytes_sent(&self) -> u64 {
         self.served.counters.sent.load(Ordering::Relaxed)
     }
 
-    /// Clients turned away so far: for their checksum, for being too many, or for breaking the protocol.
+    /// Returns the number of refused clients: for their checksum, their number, or protocol
+    /// violations.
     pub fn refused(&self) -> u64 {
         self.served.counters.refused.load(Ordering::Relaxed)
     }
 
-    /// Clients connected now.
+    /// Returns the number of connected clients.
     pub fn clients(&self) -> usize {
         let free = self.served.places.available_permits();
         self.served.options.max_clients.saturating_sub(free)
@@ -120,21 +124,21 @@ type Answer = Pin<Box<dyn Future<Output = Result<Bytes, String>> + Send>>;
 /// An offered service, shared by its server and the tasks that serve its clients.
 pub(crate) struct Served {
     pub(crate) service: String,
-    /// Tells this registration from an earlier one of the same service.
+    /// Distinguishes this registration from earlier registrations of the same service.
     pub(crate) generation: u64,
     pub(crate) counters: Counters,
     service_type: ServiceType,
     options: ServiceOptions,
     handler: Box<dyn Fn(ServiceRequest) -> Answer + Send + Sync>,
     places: Arc<Semaphore>,
-    /// Of the log lines about requests given up.
+    /// Rate limit of the log entries about aborted requests.
     faults: Mutex<Throttle>,
     closed: watch::Sender<bool>,
-    /// The node's count of connections to others.
+    /// The node's count of connections to other nodes.
     draining: watch::Sender<usize>,
 }
 
-/// What a service has done.
+/// Counters of a service.
 #[derive(Debug, Default)]
 pub(crate) struct Counters {
     pub(crate) calls: AtomicU64,
@@ -144,12 +148,12 @@ pub(crate) struct Counters {
     pub(crate) refused: AtomicU64,
 }
 
-/// What a client that has introduced itself gets.
+/// Outcome of a client's handshake.
 #[derive(Debug)]
 pub(crate) enum Admitted {
-    /// It only wanted to see the header.
+    /// The client only requested the header.
     Probe,
-    /// Its requests are taken.
+    /// The client may send requests.
     Client(Session),
 }
 
@@ -175,7 +179,7 @@ impl Served {
             generation,
             counters: Counters::default(),
             service_type,
-            // The most that the places can count.
+            // Limits the number of clients to the maximum of the semaphore.
             options: ServiceOptions {
                 max_clients: options.max_clients.min(Semaphore::MAX_PERMITS),
                 ..options
@@ -190,12 +194,13 @@ impl Served {
         }
     }
 
-    /// Ends the connections of idle clients, and of the others once they are answered.
+    /// Ends the connections of idle clients, and the other connections once they have their
+    /// response.
     pub(crate) fn close(&self) {
         self.closed.send_replace(true);
     }
 
-    /// What a client is told of this service and gets, or why it is turned away.
+    /// Returns the reply header and the session of a client, or the reason for which it is refused.
     pub(crate) fn admit(
         self: &Arc<Self>,
         request: ConnectionHeader,
@@ -262,7 +267,7 @@ impl Served {
     }
 
     async fn withdrawn(&self) {
-        // An error would be the end as well, and cannot be: the sender is `self`'s.
+        // An error would be the end as well, and cannot occur: the sender belongs to `self`.
         let _end = self
             .closed
             .subscribe()
@@ -282,12 +287,12 @@ impl fmt::Debug for Served {
     }
 }
 
-/// The words of roscpp for a service that is not here.
+/// Returns the text of roscpp for an unknown service.
 pub(crate) fn nonexistent(service: &str) -> String {
     format!("received a tcpros connection for a nonexistent service [{service}]")
 }
 
-/// One client's place at a service, given up on drop.
+/// The session of a client of a service, which ends on drop.
 #[derive(Debug)]
 pub(crate) struct Session {
     served: Arc<Served>,
@@ -297,13 +302,13 @@ pub(crate) struct Session {
 }
 
 impl Session {
-    /// Takes requests and answers them until the client, or the service, has had enough.
+    /// Receives and answers requests until the client or the service ends the session.
     pub(crate) async fn serve(self, stream: &mut TcpStream) -> Result<(), ClientFault> {
         let served = &self.served;
         let (mut reader, mut writer) = stream.split();
         let mut frames = Frames::new(served.options.max_request);
         loop {
-            // What a client has sent ahead does not keep a withdrawn service up.
+            // Requests that a client has sent ahead do not delay the withdrawal of a service.
             if *served.closed.borrow() {
                 return Ok(());
             }
@@ -314,7 +319,8 @@ impl Session {
                     served.counters.refused.fetch_add(1, Ordering::Relaxed);
                     if let ClientFault::TooLong(_) = fault {
                         self.answer(&mut writer, Err(fault.to_string())).await?;
-                        // A client that is still writing would not read the answer of a connection that is reset.
+                        // A client that is still writing would not read the response of a
+                        // connection that is reset.
                         let gone = timeout(DRAIN_LIMIT, until_closed(&mut reader)).await;
                         tracing::trace!(?gone, "a client with too long a request has been told");
                     }
@@ -329,7 +335,7 @@ impl Session {
         }
     }
 
-    /// The next request, `None` when there will be none.
+    /// Returns the next request, or `None` at the end of the session.
     async fn request(
         &self,
         reader: &mut ReadHalf<'_>,
@@ -346,7 +352,7 @@ impl Session {
                     Ok(0) => return Ok(None),
                     Ok(read) => frames.filled(read),
                     Err(error) if begun => return Err(error.into()),
-                    // It leaves without having asked anything: no matter how.
+                    // The client disconnects without a request: the error does not matter.
                     Err(_) => return Ok(None),
                 },
                 () = sleep(STALL_LIMIT), if begun || !self.persistent => {
@@ -357,7 +363,8 @@ impl Session {
         }
     }
 
-    /// Runs the handler, in a task of its own: a panic ends that alone, and one that is given up ends with the set.
+    /// Runs the handler in a task of its own: a panic ends only this task, and an aborted handler
+    /// ends with the set.
     async fn handle(&self, bytes: Bytes) -> Result<Bytes, String> {
         let served = Arc::clone(&self.served);
         count(&served.counters.received, bytes.len());
@@ -399,7 +406,8 @@ impl Session {
             Err(text) => (0, Bytes::from(text)),
         };
         let counters = &self.served.counters;
-        // Counted before the client can know, so that whoever has an answer finds it counted.
+        // Counted before the response is sent, so that a client that has its response finds it
+        // counted.
         counters.calls.fetch_add(1, Ordering::Relaxed);
         counters
             .failures
@@ -414,7 +422,7 @@ impl Session {
             .map_err(ClientFault::Answer)
     }
 
-    /// Waits until the service has been withdrawn long enough for what was in progress then.
+    /// Waits until the service is withdrawn and the time limit for requests in progress has passed.
     async fn overdue(&self) {
         self.served.withdrawn().await;
         sleep(DRAIN_LIMIT).await;
@@ -431,7 +439,7 @@ fn count(counter: &AtomicU64, bytes: usize) {
     counter.fetch_add(u64::try_from(bytes).unwrap_or(u64::MAX), Ordering::Relaxed);
 }
 
-/// What a client did wrong, or could not do.
+/// Error of a client's connection.
 #[derive(Debug, Error)]
 pub(crate) enum ClientFault {
     #[error(transparent)]

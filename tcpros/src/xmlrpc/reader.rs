@@ -1,11 +1,11 @@
-//! From text to values.
+//! Decodes text to values.
 
 use std::borrow::Cow;
 
 use super::writer::BASE64;
 use super::{MAX_DEPTH, Value, XmlError};
 
-/// A document and how far it has been read.
+/// A document and the part that is not read yet.
 pub(super) struct Reader<'a> {
     document: &'a str,
     rest: &'a str,
@@ -53,7 +53,7 @@ impl<'a> Reader<'a> {
         }
     }
 
-    /// The next tag, which stays unread, and the text after it.
+    /// Returns the next tag without consuming it, and the text after it.
     fn peek(&mut self) -> Result<(Tag<'a>, &'a str), XmlError> {
         self.skip()?;
         let at = self.position();
@@ -124,7 +124,7 @@ impl<'a> Reader<'a> {
         }
     }
 
-    /// `<params>`, which a peer may leave out or leave empty.
+    /// Reads `<params>`, which a peer may omit or leave empty.
     pub(super) fn params(&mut self) -> Result<Vec<Value>, XmlError> {
         let mut params = Vec::new();
         let (tag, rest) = self.peek()?;
@@ -271,7 +271,7 @@ impl<'a> Reader<'a> {
         Ok(Value::Struct(members))
     }
 
-    /// Text up to the next tag, with references and CDATA resolved.
+    /// Reads text up to the next tag, with references and CDATA resolved.
     pub(super) fn text(&mut self) -> Result<Cow<'a, str>, XmlError> {
         let mut text = Cow::Borrowed("");
         loop {
@@ -303,7 +303,7 @@ impl<'a> Reader<'a> {
             expected: "a known reference",
             at: self.position(),
         };
-        // The longest is `&#x10FFFF;`; looking further would make hostile text quadratic.
+        // The longest reference is `&#x10FFFF;`; a longer search would make hostile text quadratic.
         let Some(end) = rest.bytes().take(12).position(|b| b == b';') else {
             return Err(unknown);
         };
@@ -329,7 +329,8 @@ impl<'a> Reader<'a> {
     }
 }
 
-/// White space is skipped (peers break lines); padding must be right where it is given and end the text.
+/// Decodes base64. White space is skipped, because peers break lines; padding must be correct if
+/// present and must end the text.
 fn base64_decode(text: &str) -> Option<Vec<u8>> {
     let mut out = Vec::with_capacity(text.len() / 4 * 3);
     let (mut word, mut bits, mut padding) = (0u32, 0u32, 0u32);

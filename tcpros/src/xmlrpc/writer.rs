@@ -1,4 +1,4 @@
-//! From values to text.
+//! Encodes values as text.
 
 use std::fmt::Write as _;
 
@@ -52,7 +52,7 @@ fn text_tag(tag: &str, text: &str, out: &mut String) {
     out.push('>');
 }
 
-/// XML has no way to write most control characters: they become U+FFFD.
+/// Escapes text. XML cannot represent most control characters: they become U+FFFD.
 pub(super) fn escape(text: &str, out: &mut String) {
     for c in text.chars() {
         match c {

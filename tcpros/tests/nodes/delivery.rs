@@ -1,4 +1,5 @@
-//! Messages from node to node: whole, in order, from others only, and what is lost by being late.
+//! Messages from node to node: complete, in order, not from the node itself, and counted when lost
+//! by a late consumer.
 
 use bytes::Bytes;
 use tcpros::{Inbox, InboxEvent, Node, PublisherOptions, SubscriberOptions, Wanted};
@@ -168,7 +169,8 @@ async fn a_publisher_with_our_name_under_another_address_is_not_heard() {
     assert_eq!(subscription.publishers(), 0);
 }
 
-/// Requirement: a node knows its own messages by its resolved name, namespace and `__name` included.
+/// Requirement: a node recognizes its own messages by its resolved name, including namespace and
+/// `__name`.
 #[tokio::test]
 async fn a_node_in_a_namespace_under_another_name_does_not_hear_itself_either() {
     let core = core();

@@ -1,4 +1,4 @@
-//! The node and its master: late, restarted, and told of everything that comes and goes.
+//! The node and its master: started late, restarted, and up to date with all topics and services.
 
 use std::time::Duration;
 
@@ -70,7 +70,8 @@ async fn after_a_restart_of_the_master_all_is_registered_again_and_links_have_st
     assert_eq!(message(&mut inbox).await.bytes, b"again".as_slice());
 }
 
-/// Requirement: what `rosnode cleanup` takes out of the master while it still knows the node is registered again.
+/// Requirement: registrations that `rosnode cleanup` removes from the master while the master still
+/// knows the node are registered again.
 #[tokio::test]
 async fn what_the_master_no_longer_lists_is_registered_again() {
     let core = core();
@@ -128,7 +129,8 @@ async fn what_the_master_no_longer_lists_is_registered_again() {
     .await;
 }
 
-/// Requirement: of two nodes with one name that start in the same instant one ends, and the other has all it registers.
+/// Requirement: if two nodes with the same name start in the same instant, one ends, and the other
+/// keeps all its registrations.
 #[tokio::test]
 async fn of_two_nodes_of_one_name_that_start_at_once_exactly_one_stays() {
     let core = core();
@@ -228,7 +230,7 @@ async fn a_dropped_publisher_leaves_the_graph_and_its_subscribers_learn_it() {
     })
     .await;
     assert_eq!(subscription.publishers(), 0);
-    // The topic may be taken again at once, as another type.
+    // The topic may be advertised again at once, with another type.
     let other = TopicType {
         name: "std_msgs/Other".to_owned(),
         ..string()
@@ -261,7 +263,7 @@ async fn a_topic_is_published_once_and_with_a_whole_type() {
 
 #[tokio::test]
 async fn two_hundred_topics_leave_no_file_descriptor_behind() {
-    // Descriptors are counted in a process without the other tests, which open and close some meanwhile.
+    // Descriptors are counted in a process without the other tests, which open and close files.
     if std::env::var_os(ALONE).is_none() {
         let name = "master::two_hundred_topics_leave_no_file_descriptor_behind";
         let alone = std::process::Command::new(std::env::current_exe().unwrap())
@@ -304,12 +306,12 @@ async fn two_hundred_topics_leave_no_file_descriptor_behind() {
     .await;
     assert!(open() >= files + 400);
     drop((publishers, subscriptions));
-    // Up to the few connections of the watchdogs, which come and go.
+    // Except for the few connections of the watchdogs, which open and close.
     eventually("the end of all links", || {
         open() <= files + 4 && alive() <= tasks + 4
     })
     .await;
 }
 
-/// The variable that tells a test that it is the only one of its process.
+/// Environment variable that marks the only test of its process.
 const ALONE: &str = "UA_TEST_ALONE";

@@ -1,4 +1,4 @@
-//! Peers that are slow, silent, or break the protocol.
+//! Peers that are slow, send nothing, or violate the protocol.
 
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
@@ -57,7 +57,7 @@ async fn garbage_at_the_topic_port_costs_only_itself() {
         stream.write_all(garbage).await.unwrap();
         stream.shutdown().await.unwrap();
         let mut answer = Vec::new();
-        // Closed, or reset because not all was read: either way it is over.
+        // Closed, or reset because not all data was read: the connection has ended in both cases.
         within("the end", stream.read_to_end(&mut answer))
             .await
             .ok();
@@ -109,7 +109,8 @@ async fn a_publisher_that_breaks_off_or_sends_nonsense_is_asked_again() {
     let (api, uri) = raw_publisher().await;
     registered(&listener_node).await;
     name_publisher(&listener_node, &uri).await;
-    // A message past the limit, then a connection that ends within a message, then one that works.
+    // A message past the limit, then a connection that ends within a message, then a working
+    // connection.
     answer_request_topic(&api, port).await;
     let mut first = accept_subscriber(&topics, "/raw").await;
     first.write_all(&1001u32.to_le_bytes()).await.unwrap();
@@ -124,7 +125,8 @@ async fn a_publisher_that_breaks_off_or_sends_nonsense_is_asked_again() {
     assert_eq!(message(&mut inbox).await.bytes, b"ok".as_slice());
 }
 
-/// Requirement: memory is bounded by the queue of the topic and not by how many subscribers are slow.
+/// Requirement: memory is bounded by the queue of the topic, independent of the number of slow
+/// subscribers.
 #[tokio::test]
 async fn many_slow_subscribers_hold_the_same_messages_once() {
     const SLOW: usize = 20;
@@ -149,11 +151,11 @@ async fn many_slow_subscribers_hold_the_same_messages_once() {
         tokio::task::yield_now().await;
         most = most.max(Arc::strong_count(&held) - 1);
     }
-    // The queue, and for each subscriber what is being written to it.
+    // The queue, and for each subscriber the message that is being written.
     assert!(most <= QUEUED + SLOW + 1, "{most} messages were held");
 }
 
-/// The content of a message that is counted as long as anybody holds it.
+/// The content of a message that is counted as long as a reference exists.
 struct Counted(
     Vec<u8>,
     #[expect(dead_code, reason = "it counts by being there")] Arc<()>,
@@ -165,7 +167,7 @@ impl AsRef<[u8]> for Counted {
     }
 }
 
-/// Requirement: a header is at most 1 MiB long, and what a peer says is not repeated at length.
+/// Requirement: a header is at most 1 MiB long, and a long text of a peer is not repeated in full.
 #[tokio::test]
 async fn a_header_past_the_limit_is_refused_and_a_long_one_answered_briefly() {
     let core = core();
@@ -195,7 +197,7 @@ async fn a_header_past_the_limit_is_refused_and_a_long_one_answered_briefly() {
     assert_eq!((taken.get("error"), publisher.subscribers()), (None, 1));
 }
 
-/// Requirement: peers that reset their connection within the handshake cost only themselves.
+/// Requirement: peers that reset their connection within the handshake affect only themselves.
 #[tokio::test]
 async fn twenty_resets_within_the_handshake_leave_the_topic_as_it_was() {
     let core = core();
@@ -225,7 +227,8 @@ async fn twenty_resets_within_the_handshake_leave_the_topic_as_it_was() {
     assert_eq!(&message, b"\x01\0\0\0x");
 }
 
-/// Requirement: a publisher that accepts and says nothing is given up after five seconds and asked again.
+/// Requirement: a publisher that accepts and sends nothing is abandoned after five seconds and
+/// retried.
 #[tokio::test]
 async fn a_publisher_that_accepts_and_says_nothing_is_asked_again() {
     let core = core();
@@ -248,8 +251,9 @@ async fn a_publisher_that_accepts_and_says_nothing_is_asked_again() {
     assert_eq!(message(&mut inbox).await.bytes, b"ok".as_slice());
 }
 
-/// Requirement: a publisher is asked for its address anew for each try, 0.1 s after the first failure and doubling,
-/// and at once when the master names it again: it may be back under its old address.
+/// Requirement: the address of a publisher is requested for each attempt, 0.1 s after the first
+/// failure and doubling. It is requested at once when the master lists the publisher again, which
+/// may have restarted under its old address.
 #[tokio::test]
 async fn tries_come_ever_later_until_the_master_names_the_publisher_again() {
     let core = core();
@@ -262,7 +266,7 @@ async fn tries_come_ever_later_until_the_master_names_the_publisher_again() {
     name_publisher(&listener, &uri).await;
     let mut tries = Vec::new();
     for _ in 0..6 {
-        // Nobody listens at port 1 of the cell.
+        // No server listens at port 1 of the cell.
         answer_request_topic(&api, 1).await;
         tries.push(Instant::now());
     }
@@ -271,7 +275,7 @@ async fn tries_come_ever_later_until_the_master_names_the_publisher_again() {
         let least = Duration::from_millis(90 << n);
         assert!(waited > least, "{waited:?} before try {}", n + 2);
     }
-    // The next try is due in 3.2 s.
+    // The next attempt is due in 3.2 s.
     let named = Instant::now();
     name_publisher(&listener, &uri).await;
     answer_request_topic(&api, topics.local_addr().unwrap().port()).await;
@@ -281,7 +285,7 @@ async fn tries_come_ever_later_until_the_master_names_the_publisher_again() {
     eventually("the link", || subscription.publishers() == 1).await;
 }
 
-/// Requirement: the master is answered at once, however slow the publishers are that it names.
+/// Requirement: the master gets its reply at once, however slow the listed publishers are.
 #[tokio::test]
 async fn an_update_is_answered_while_the_publishers_it_names_say_nothing() {
     let core = core();
@@ -292,12 +296,12 @@ async fn an_update_is_answered_while_the_publishers_it_names_say_nothing() {
     registered(&listener).await;
     let started = Instant::now();
     name_publisher(&listener, &uri).await;
-    // It would wait five seconds for an answer.
+    // It would wait five seconds for a reply.
     let (_silent, _) = within("requestTopic", api.accept()).await.unwrap();
     assert!(started.elapsed() < Duration::from_secs(4));
 }
 
-/// Requirement: a publisher the master no longer names is not tried any more.
+/// Requirement: a publisher that the master no longer lists is not retried.
 #[tokio::test]
 async fn a_publisher_that_is_no_longer_named_is_left_alone() {
     let core = core();
@@ -310,7 +314,7 @@ async fn a_publisher_that_is_no_longer_named_is_left_alone() {
     answer_request_topic(&api, 1).await;
     let (_, other) = raw_publisher().await;
     name_publisher(&listener, &other).await;
-    // A try may have been on its way; what it would wait at most before the next is 0.4 s.
+    // An attempt may have been on its way; the wait before the next attempt is at most 0.4 s.
     let mut tries = 0;
     while let Ok(accepted) = timeout(Duration::from_millis(600), api.accept()).await {
         accepted.unwrap();
@@ -319,7 +323,7 @@ async fn a_publisher_that_is_no_longer_named_is_left_alone() {
     assert!(tries <= 1, "{tries} more tries");
 }
 
-/// Requirement: what a peer says costs a bounded number of connections and of lines in the log.
+/// Requirement: the claims of a peer cost a bounded number of connections and log entries.
 #[tokio::test]
 async fn a_forged_list_of_publishers_is_followed_in_part_and_summed_up_in_the_log() {
     let log = Log::default();
@@ -333,7 +337,7 @@ async fn a_forged_list_of_publishers_is_followed_in_part_and_summed_up_in_the_lo
     let inbox = Inbox::new();
     let _subscription = subscribe(&listener, "/t", &inbox);
     registered(&listener).await;
-    // Nobody listens there, which each try finds out at once.
+    // No server listens there, which each attempt detects at once.
     let uris: String = (0..3000)
         .map(|n| format!("<value>http://127.0.0.1:1/{n}</value>"))
         .collect();
@@ -354,7 +358,7 @@ async fn a_forged_list_of_publishers_is_followed_in_part_and_summed_up_in_the_lo
     );
 }
 
-/// What is logged.
+/// The log output.
 #[derive(Clone, Default)]
 struct Log(Arc<Mutex<Vec<u8>>>);
 

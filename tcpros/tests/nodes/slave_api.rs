@@ -1,4 +1,4 @@
-//! What `rosnode` and the master ask of a node.
+//! The calls of `rosnode` and the master to a node.
 
 use std::time::Duration;
 
@@ -64,7 +64,8 @@ async fn the_shutdown_call_reaches_the_program() {
     assert_eq!(reason, "user request");
 }
 
-/// Requirement: a node is not ended by the word that another has its name, if the name is its own.
+/// Requirement: a report that another node has taken its name does not end a node that still owns
+/// the name.
 #[tokio::test]
 async fn a_node_that_has_its_name_still_goes_on_when_told_that_it_is_taken() {
     let core = core();
@@ -116,7 +117,7 @@ async fn two_calls_on_one_connection_are_both_answered() {
     }
 }
 
-/// Requirement: a caller that sends nothing, or half a call, keeps no other waiting.
+/// Requirement: a caller that sends nothing, or half a call, delays no other caller.
 #[tokio::test]
 async fn silent_callers_keep_no_other_waiting() {
     let core = core();

@@ -1,4 +1,4 @@
-//! Nodes, and peers made by hand.
+//! Nodes and hand-made peers.
 
 use std::future::Future;
 use std::net::SocketAddr;
@@ -88,7 +88,7 @@ pub(crate) async fn registered(node: &Node) {
     .unwrap();
 }
 
-/// The port of a node's topics, as any peer would ask for it.
+/// Returns the port of a node's topics, requested as by any peer.
 pub(crate) async fn topic_port(node: &Node, topic: &str) -> u16 {
     let answer = slave_call(
         node,
@@ -114,7 +114,7 @@ pub(crate) async fn slave_call(node: &Node, body: &str) -> String {
     raw_call(node.uri(), body).await
 }
 
-/// Calls a method, all of whose parameters are texts.
+/// Calls a method with text parameters only.
 pub(crate) async fn call(uri: &str, method: &str, params: &[&str]) -> String {
     let params: String = params
         .iter()
@@ -141,7 +141,7 @@ async fn raw_call(uri: &str, body: &str) -> String {
     answer
 }
 
-/// A subscriber made by hand, up to the publisher's header.
+/// Connects as a hand-made subscriber and reads the publisher's header.
 pub(crate) async fn raw_subscriber(
     port: u16,
     topic: &str,
@@ -159,14 +159,14 @@ pub(crate) async fn raw_subscriber(
     (stream, ConnectionHeader::parse(&header).unwrap())
 }
 
-/// The slave API of a publisher made by hand.
+/// Returns the slave API of a hand-made publisher.
 pub(crate) async fn raw_publisher() -> (TcpListener, String) {
     let api = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let uri = format!("http://{}/", api.local_addr().unwrap());
     (api, uri)
 }
 
-/// Tells a node, as a master does, that `/t` has one publisher.
+/// Notifies a node, as a master does, that `/t` has one publisher.
 pub(crate) async fn name_publisher(node: &Node, uri: &str) {
     let update = format!(
         "<methodCall><methodName>publisherUpdate</methodName><params><param><value>/master</value></param>\
