@@ -1,4 +1,4 @@
-//! An action as calls and values of the space: the same fields for the actions of both ROS.
+//! An action as calls and values of the space: the same fields for the actions of ROS 1 and ROS 2.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -8,10 +8,12 @@ use crate::resolve::Resolver;
 use crate::service::{ServiceDefinition, derived};
 use crate::{DefinitionError, Dialect, MessageType, ServiceType, TypeName};
 
-/// The three calls and two values that an action of the space is, made of its goal, result and feedback.
+/// The calls and the two values of an action in the space, built from its goal, result and
+/// feedback.
 ///
-/// A goal is told by 16 bytes in front of all else, so that a goal or feedback of either ROS is a message here when its id is
-/// put in front of it. Statuses and return codes are those of `action_msgs/GoalStatus` and `action_msgs/CancelGoal`.
+/// The first 16 bytes identify a goal. A goal or feedback of ROS 1 or ROS 2 thus becomes a message
+/// of this type when its id is put in front of it. Statuses and return codes are as in
+/// `action_msgs/GoalStatus` and `action_msgs/CancelGoal`.
 #[derive(Debug)]
 pub struct ActionCalls {
     goal: Arc<ServiceType>,
@@ -52,7 +54,7 @@ impl ActionCalls {
         let cancel = format!("{ID}{time} stamp\n---\nint8 return_code\nuint8[] goal_ids\n");
         let result = format!("{ID}---\nint8 status\nstring message\n{x}Result result\n");
         let outcome = format!("{ID}---\nint8 status\n{x}Result result\n");
-        // The goal first: of an action that is not known it is what is told.
+        // The goal first: it is reported as missing if the action is unknown.
         Ok(Self {
             goal: service(name, &goal)?,
             cancel: service(&derived(name, "_CancelCall")?, &cancel)?,
@@ -63,7 +65,8 @@ impl ActionCalls {
         })
     }
 
-    /// Whether a type is that of a value of an action, by its name: no graph has such messages by themselves.
+    /// Returns whether a type is a value of an action, by its name: no graph has such messages
+    /// themselves.
     #[must_use]
     pub fn is_value(name: &TypeName) -> bool {
         [FEEDBACK, STATUS]
@@ -71,53 +74,59 @@ impl ActionCalls {
             .any(|suffix| name.name().ends_with(suffix))
     }
 
-    /// Sends a goal, under the name of the action. Request: `goal_id` (16 bytes; all zero where who executes chooses) and `goal`;
-    /// response: `accepted`, `goal_id`, `stamp` (when it was accepted, by the clock of who executes) and `message`.
+    /// Returns the call that sends a goal, under the name of the action. Request: `goal_id` (16
+    /// bytes; all zero if the executor chooses) and `goal`. Response: `accepted`, `goal_id`,
+    /// `stamp` (time of acceptance, by the clock of the executor) and `message`.
     #[must_use]
     pub const fn goal(&self) -> &Arc<ServiceType> {
         &self.goal
     }
 
-    /// Cancels goals. Request: `goal_id` (all zero: any) and `stamp` (zero: any; else those accepted then or before); response:
-    /// `return_code` and `goal_ids`, 16 bytes of each goal that is being cancelled.
+    /// Returns the call that cancels goals. Request: `goal_id` (all zero: any) and `stamp` (zero:
+    /// any; else goals accepted then or before). Response: `return_code` and `goal_ids`, 16 bytes
+    /// of each goal that is being cancelled.
     #[must_use]
     pub const fn cancel(&self) -> &Arc<ServiceType> {
         &self.cancel
     }
 
-    /// Waits for a result. Request: `goal_id`; response: `status`, `message` (for people) and `result`.
+    /// Returns the call that waits for a result. Request: `goal_id`. Response: `status`, `message`
+    /// (for people) and `result`.
     #[must_use]
     pub const fn result(&self) -> &Arc<ServiceType> {
         &self.result
     }
 
-    /// As [`result`](Self::result) without the `message`: in ROS 2 the response is on the wire as `X_GetResult_Response` is.
+    /// Returns the call [`result`](Self::result) without the `message`: in ROS 2 the response has
+    /// the wire format of `X_GetResult_Response`.
     #[must_use]
     pub const fn outcome(&self) -> &Arc<ServiceType> {
         &self.outcome
     }
 
-    /// The value with the progress of a goal: `goal_id` and `feedback`.
+    /// Returns the value with the progress of a goal: `goal_id` and `feedback`.
     #[must_use]
     pub const fn feedback(&self) -> &Arc<MessageType> {
         &self.feedback
     }
 
-    /// The value with the goals there are: `goal_ids`, 16 bytes of each, and `statuses`, one byte of each.
+    /// Returns the value with all goals: `goal_ids`, 16 bytes of each, and `statuses`, one byte of
+    /// each.
     #[must_use]
     pub const fn status(&self) -> &Arc<MessageType> {
         &self.status
     }
 }
 
-/// What the types of an action's values have behind its name.
+/// Suffixes of the type names of an action's values.
 const FEEDBACK: &str = "_FeedbackValue";
 const STATUS: &str = "_StatusValue";
-/// Tells a goal.
+/// The field that identifies a goal.
 const ID: &str = "uint8[16] goal_id\n";
 
-/// Returns the reason why a goal was not reached, from the fields of its result that are texts, by their names. A server of
-/// ROS 2 has no other place for a reason: `error_msg` of Nav2, `error_string` of ros2_control, `message` of many robots.
+/// Returns the reason for which a goal was not reached, from the text fields of its result, by
+/// their names. A server of ROS 2 has no other field for a reason: `error_msg` of Nav2,
+/// `error_string` of ros2_control, `message` of many robots.
 #[must_use]
 pub fn reason_of<'a>(texts: impl IntoIterator<Item = (&'a str, &'a str)>) -> Option<&'a str> {
     let ranked = texts.into_iter().filter_map(|(name, text)| {

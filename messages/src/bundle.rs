@@ -1,8 +1,9 @@
-//! The common interfaces, one file per package.
+//! The common interfaces, with a file per package.
 //!
-//! A line `message Name` begins a definition of both dialects, `message Name 1` and `message Name 2` one of ROS 1 and of
-//! ROS 2, where they differ; a line `service Name` or `action Name`, with `1` or `2` likewise, begins a service or an action.
-//! Field names, types and constants only.
+//! A line `message Name` starts a definition for both dialects. `message Name 1` and `message Name
+//! 2` start a definition of ROS 1 or ROS 2 if the two differ. A line `service Name` or `action
+//! Name`, with `1` or `2` likewise, starts a service or an action. The files contain only field
+//! names, types and constants.
 
 use crate::{Dialect, TypeName};
 
@@ -71,7 +72,7 @@ const PACKAGES: [(&str, &str); 26] = [
     ),
 ];
 
-/// What a text of the bundle defines.
+/// The kind of a definition in the bundle.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Kind {
     Message,
@@ -79,7 +80,7 @@ pub(crate) enum Kind {
     Action,
 }
 
-/// Kind, name and text of each definition of the dialect.
+/// Returns kind, name and text of each definition of the dialect.
 pub(crate) fn texts(dialect: Dialect) -> Vec<(Kind, TypeName, String)> {
     let other = match dialect {
         Dialect::Ros1 => "2",

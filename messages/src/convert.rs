@@ -5,9 +5,10 @@ const UNIX_EPOCH: i64 = 116_444_736_000_000_000;
 const TICKS_PER_SECOND: i64 = 10_000_000;
 const NANOS_PER_SECOND: i64 = 1_000_000_000;
 
-/// A ROS time as DateTime, rounded down to 100 ns. Nothing a ROS time can say is out of range.
+/// Converts a ROS time to a DateTime, rounded down to 100 ns. No ROS time is out of range.
 ///
-/// `sec` counts from 1970-01-01 and is within `u32` (ROS 1) or `i32` (ROS 2); beyond 9·10^11 it saturates.
+/// `sec` counts from 1970-01-01 and is within `u32` (ROS 1) or `i32` (ROS 2); beyond 9·10^11 it
+/// saturates.
 pub fn time_to_date_time(sec: i64, nanosec: u32) -> DateTime {
     DateTime(
         sec.saturating_mul(TICKS_PER_SECOND)
@@ -16,9 +17,10 @@ pub fn time_to_date_time(sec: i64, nanosec: u32) -> DateTime {
     )
 }
 
-/// A DateTime as seconds and nanoseconds since 1970-01-01; the seconds are negative before.
+/// Converts a DateTime to seconds and nanoseconds since 1970-01-01; earlier seconds are negative.
 ///
-/// The null DateTime (0 or less, OPC 10000-6 5.2.2.5) is ROS's zero time, which also means "not set".
+/// The null DateTime (0 or less, OPC 10000-6 5.2.2.5) is ROS's zero time, which also means "not
+/// set".
 pub fn date_time_to_time(value: DateTime) -> (i64, u32) {
     if value.0 <= 0 {
         return (0, 0);
@@ -36,8 +38,9 @@ const DURATIONS: (i64, i64) = (
 /// The longest ROS duration in milliseconds: the nearest Double is 2^31 s.
 const LONGEST: f64 = 2_147_483_648_000.0;
 
-/// A DateTime as the seconds and nanoseconds of a ROS time with seconds from `earliest` to `latest`. A DateTime beyond that is
-/// the earliest or latest time there is (OPC 10000-6, 5.2.2.5).
+/// Converts a DateTime to the seconds and nanoseconds of a ROS time with seconds from `earliest` to
+/// `latest`. A DateTime out of this range becomes the earliest or latest time (OPC 10000-6,
+/// 5.2.2.5).
 pub(crate) fn date_time_within(value: DateTime, earliest: i64, latest: i64) -> (i64, u32) {
     match date_time_to_time(value) {
         (sec, _) if sec < earliest => (earliest, 0),
@@ -46,11 +49,12 @@ pub(crate) fn date_time_within(value: DateTime, earliest: i64, latest: i64) -> (
     }
 }
 
-/// A ROS duration in milliseconds.
+/// Converts a ROS duration to milliseconds.
 ///
-/// The nearest Double: up to 2^33 ms (99 days) [`millis_to_duration`] gives the same seconds and nanoseconds back;
-/// beyond that a Double does not tell all nanoseconds apart, and up to 2^31 s the error is at most 245 ns. Nanoseconds beyond
-/// a second that lead out of the range of a duration give its shortest or longest.
+/// The result is the nearest Double: up to 2^33 ms (99 days) [`millis_to_duration`] returns the
+/// same seconds and nanoseconds. Beyond that a Double does not distinguish all nanoseconds; up to
+/// 2^31 s the error is at most 245 ns. If nanoseconds beyond a second exceed the range of a
+/// duration, the result is the shortest or longest duration.
 pub fn duration_to_millis(sec: i32, nanosec: i64) -> f64 {
     let (shortest, longest) = DURATIONS;
     let nanos = i64::from(sec) * NANOS_PER_SECOND + nanosec;
@@ -60,8 +64,9 @@ pub fn duration_to_millis(sec: i32, nanosec: i64) -> f64 {
     lossless(whole) + lossless(rest) / 1e6
 }
 
-/// Milliseconds as seconds and 0..10^9 nanoseconds, to the nearest nanosecond; None when the seconds do not fit. 2^31 s is the
-/// Double of the longest duration, which it returns.
+/// Converts milliseconds to seconds and 0..10^9 nanoseconds, to the nearest nanosecond. Returns
+/// `None` if the seconds do not fit. 2^31 s is the Double of the longest duration, which is
+/// returned for it.
 pub fn millis_to_duration(millis: f64) -> Option<(i32, u32)> {
     if millis.total_cmp(&LONGEST).is_eq() {
         return Some((i32::MAX, 999_999_999));
@@ -79,7 +84,7 @@ pub fn millis_to_duration(millis: f64) -> Option<(i32, u32)> {
     Some((sec, u32::try_from(nanos.rem_euclid(NANOS_PER_SECOND)).ok()?))
 }
 
-/// `value` is below 2^53 in all uses.
+/// Converts to a Double without loss: `value` is below 2^53 in all uses.
 #[expect(
     clippy::cast_precision_loss,
     reason = "whole milliseconds of an i32 of seconds, and less than 10^6"
@@ -128,7 +133,7 @@ mod tests {
         assert_eq!(duration_to_millis(i32::MAX, 999_999_999), LONGEST);
         assert_eq!(millis_to_duration(LONGEST), longest);
         assert_eq!(millis_to_duration(LONGEST.next_up()), None);
-        // Nanoseconds that no sender should give.
+        // Nanoseconds that no sender should send.
         let beyond = duration_to_millis(i32::MAX, i64::from(u32::MAX));
         assert_eq!(millis_to_duration(beyond), longest);
         let below = duration_to_millis(i32::MIN, i64::from(i32::MIN));

@@ -8,7 +8,7 @@ use crate::name::is_identifier;
 use crate::resolve::MOST_FIELDS;
 use crate::{DefinitionError, Dialect, TypeName};
 
-/// A type that is no message.
+/// A type that is not a message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Primitive {
     Number(Number),
@@ -16,7 +16,7 @@ pub(crate) enum Primitive {
     Text(Text),
 }
 
-/// A type whose bytes, little endian, are those of its OPC UA value.
+/// A type with the same bytes, little endian, as its OPC UA value.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Number {
     Bool,
@@ -68,14 +68,14 @@ pub(crate) enum Arity {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Field {
     pub(crate) name: String,
-    /// The type as written, which is what the md5 is made of.
+    /// The type as written, which is input of the md5.
     pub(crate) written: String,
     pub(crate) kind: FieldType,
     pub(crate) arity: Arity,
 }
 
 impl Field {
-    /// Its type in the words of `.msg` files, `package/Name` with its package.
+    /// Returns the type in the notation of `.msg` files, with the package: `package/Name`.
     pub(crate) fn spelling(&self) -> String {
         let bounded = |word: &str, bound: u32| match bound {
             u32::MAX => word.to_owned(),
@@ -104,13 +104,13 @@ impl Field {
 /// A constant of a message type: `uint8 RED=1`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Constant {
-    /// The name, as `RED`.
+    /// The name, such as `RED`.
     pub name: String,
     /// The type of the value.
     pub builtin: BuiltinType,
-    /// The value as the definition has it, of a ROS 2 text without its quotes.
+    /// The value as in the definition; a ROS 2 text is without its quotes.
     pub value: String,
-    /// What the md5 is made of.
+    /// The line that is input of the md5.
     pub(crate) line: String,
 }
 
@@ -122,11 +122,11 @@ pub(crate) struct Definition {
     pub(crate) fields: Vec<Field>,
 }
 
-/// A line of a definition that another language has: the type in the words of `.msg` files, and the value if it is a
-/// constant.
+/// A line of a definition in another language: the type in the notation of `.msg` files, and the
+/// value if it is a constant.
 #[derive(Clone, Debug)]
 pub(crate) struct Line {
-    /// From 1, in the text it is of.
+    /// Line number in its text, from 1.
     pub(crate) number: usize,
     pub(crate) written: String,
     pub(crate) name: String,
@@ -143,8 +143,8 @@ impl Line {
 }
 
 impl Definition {
-    /// Of the constants and fields of a text in another language. The text it has then is the one of a `.msg` file that
-    /// says the same.
+    /// Creates a definition from the constants and fields of a text in another language. The text
+    /// of the definition is that of the equivalent `.msg` file.
     pub(crate) fn of_lines(
         dialect: Dialect,
         name: &TypeName,
@@ -207,7 +207,7 @@ impl Definition {
         Ok(parsed)
     }
 
-    /// `named`: the names of the fields so far.
+    /// Parses a line. `named`: the names of the previous fields.
     fn line(
         &mut self,
         dialect: Dialect,
@@ -222,7 +222,7 @@ impl Definition {
             .split_once(char::is_whitespace)
             .ok_or("a type and a name expected")?;
         let rest = rest.trim_start();
-        // rosidl takes it for `uint8`, and the `char` of IDL for a type of its own.
+        // rosidl treats `char` of `.msg` as `uint8`, and the `char` of IDL as a type of its own.
         let byte = written
             .strip_prefix("char")
             .filter(|arity| {
@@ -251,7 +251,7 @@ impl Definition {
         if arity != Arity::One {
             return Err("a constant is no array");
         }
-        // genmsg takes all of the line after the first `=`, a `#` included, as the text of a string.
+        // genmsg uses the whole line after the first `=`, including a `#`, as the text of a string.
         let value = match (dialect, primitive) {
             (Dialect::Ros1, Primitive::Text(_)) => line
                 .split_once('=')
@@ -304,7 +304,8 @@ impl Definition {
     }
 }
 
-/// The line without its comment and outer blanks. In ROS 2 a `#` within quotes of a default value is none.
+/// Returns the line without its comment and outer blanks. In ROS 2 a `#` within quotes of a default
+/// value does not start a comment.
 fn without_comment(dialect: Dialect, line: &str) -> &str {
     let mut quote = None;
     for (at, c) in line.char_indices() {
@@ -315,7 +316,8 @@ fn without_comment(dialect: Dialect, line: &str) -> &str {
             _ => {}
         }
     }
-    // An apostrophe of a comment opens no quote: the comment was met first. An unclosed quote is text.
+    // An apostrophe in a comment opens no quote, because the comment was found first. An unclosed
+    // quote is text.
     line.trim()
 }
 

@@ -1,4 +1,5 @@
-//! Descriptions of ROS 2 types, as nodes from Iron on tell them (`type_description_interfaces/msg/TypeDescription`).
+//! Descriptions of ROS 2 types, as sent by nodes since Iron
+//! (`type_description_interfaces/msg/TypeDescription`).
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -11,33 +12,33 @@ use crate::type_hash::{
 };
 use crate::{DefinitionError, Dialect, MessageType, Registry, TypeHash, TypeName};
 
-/// One type without those it needs.
+/// A type without the types it needs.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct DescribedType {
-    /// As `sensor_msgs/msg/JointState`.
+    /// Name, such as `sensor_msgs/msg/JointState`.
     pub name: String,
-    /// In their order.
+    /// Fields in order.
     pub fields: Vec<DescribedField>,
 }
 
 /// A field of a [`DescribedType`], without its default.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct DescribedField {
-    /// Its name.
+    /// Name of the field.
     pub name: String,
-    /// One of the constants of `type_description_interfaces/msg/FieldType`.
+    /// A constant of `type_description_interfaces/msg/FieldType`.
     pub type_id: u8,
     /// Length of an array, or bound of a sequence.
     pub capacity: u64,
     /// Bound of a string.
     pub string_capacity: u64,
-    /// As [`DescribedType::name`], of a message.
+    /// Name of the message type, as [`DescribedType::name`].
     pub nested: String,
 }
 
 impl DescribedType {
-    /// Of what somebody tells, the type `name` and what it needs: itself first, then the others in the order of their
-    /// names. What is not told is left out.
+    /// Selects the type `name` and the types it needs from a description: the type itself first,
+    /// then the others in the order of their names. Missing types are omitted.
     #[must_use]
     pub fn needed<'t>(name: &TypeName, types: &'t [Self]) -> Vec<&'t Self> {
         let mut told: BTreeMap<TypeName, &'t Self> = types
@@ -63,13 +64,13 @@ impl DescribedType {
 }
 
 impl Registry {
-    /// The type `name` as a description has it, with all it needs. Its type hash tells whether it is the one somebody
-    /// announced; the registry keeps the definitions of names new to it when it is `expected`. What the type does not need
-    /// is not looked at.
+    /// Adds the type `name` from a description, with all types it needs. The type hash decides
+    /// whether it is the announced type: the registry stores the definitions of new names only if
+    /// the hash is `expected`. Types that are not needed are ignored.
     ///
     /// # Errors
-    /// [`DefinitionError`], also for more than 512 types or 4096 fields in all; a hash that is not `expected` is
-    /// [`DefinitionError::OtherHash`], and nothing is kept.
+    /// [`DefinitionError`], also for more than 512 types or 4096 fields in all. A hash that is not
+    /// `expected` is [`DefinitionError::OtherHash`]; then nothing is stored.
     pub fn add_described(
         &mut self,
         name: &TypeName,
@@ -110,7 +111,8 @@ impl Registry {
         Ok(Arc::new(message_type))
     }
 
-    /// The description of a message type: itself first, then what it needs in the order of the names.
+    /// Returns the description of a message type: itself first, then the types it needs in the
+    /// order of the names.
     ///
     /// # Errors
     /// As [`Registry::get`].
@@ -118,7 +120,8 @@ impl Registry {
         crate::type_hash::describe(self, name)
     }
 
-    /// Likewise of a service, `package/srv/Name`: request, response and event are among what it needs.
+    /// Returns the description of a service, `package/srv/Name`; request, response and event are
+    /// among the types it needs.
     ///
     /// # Errors
     /// As [`Registry::service`].
@@ -126,10 +129,10 @@ impl Registry {
         crate::type_hash::describe_service(self, name)
     }
 
-    /// The description of an action of ROS 2 that was added, and what it needs, itself first.
+    /// Returns the description of an added ROS 2 action: itself first, then the types it needs.
     ///
     /// # Errors
-    /// As [`Registry::get`], of one of its messages.
+    /// As [`Registry::get`], for its messages.
     pub fn describe_action(&self, name: &TypeName) -> Result<Vec<DescribedType>, DefinitionError> {
         crate::type_hash::describe_action(self, name)
     }
@@ -171,7 +174,7 @@ fn definition(of: &TypeName, described: &DescribedType) -> Result<Definition, De
     Definition::of_lines(Dialect::Ros2, &name, Vec::new(), lines)
 }
 
-/// The type in the words of `.msg` files.
+/// Returns the type in the notation of `.msg` files.
 fn written(field: &DescribedField) -> Option<String> {
     let DescribedField {
         type_id,
@@ -213,9 +216,9 @@ fn written(field: &DescribedField) -> Option<String> {
     Some(base + &arity)
 }
 
-/// More types than any message needs.
+/// Limit of types, which exceeds the need of any message.
 const MOST_TYPES: usize = 512;
-/// More fields than they have together.
+/// Limit of fields over all types.
 const MOST_FIELDS: usize = 4096;
 
 #[cfg(test)]

@@ -2,7 +2,7 @@ use uadp::BuiltinType;
 
 use crate::{TypeHash, TypeName};
 
-/// A text that is no message type name.
+/// Error for a text that is not a message type name.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("`{text}` is no message type name: `package/Name` or `package/msg/Name` expected")]
 pub struct NameError {
@@ -10,7 +10,7 @@ pub struct NameError {
 }
 
 impl NameError {
-    /// Only the first 255 bytes or so of `text` are kept.
+    /// Creates the error. Only about the first 255 bytes of `text` are kept.
     pub(crate) fn new(text: &str) -> Self {
         Self {
             text: text.chars().take(255).collect(),
@@ -18,45 +18,47 @@ impl NameError {
     }
 }
 
-/// A message type cannot be made of the definitions at hand.
+/// Error while creating a message type from the available definitions.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum DefinitionError {
-    /// No definition of that name; [`Registry::suggest`](crate::Registry::suggest) has what may be meant.
+    /// No definition of that name; [`Registry::suggest`](crate::Registry::suggest) returns a
+    /// similar name.
     #[error("no definition of `{name}`{}", needed_by.as_ref().map(|by| format!(", which `{by}` needs")).unwrap_or_default())]
     Unknown {
         /// The missing type.
         name: TypeName,
-        /// The type with a field of it; none when it was asked for itself.
+        /// The type with a field of the missing type; `None` if the missing type was requested
+        /// itself.
         needed_by: Option<TypeName>,
     },
     /// The type contains itself.
     #[error("`{name}` contains itself")]
     Cyclic {
-        /// The type that is met again inside itself.
+        /// The type that occurs inside itself.
         name: TypeName,
     },
     /// Messages nested deeper than 32.
     #[error("`{name}` nests messages deeper than 32")]
     TooDeep {
-        /// The first type too deep.
+        /// The first type that is too deep.
         name: TypeName,
     },
     /// More than 4096 fields when flattened, or fixed arrays of more than 64 MiB.
     #[error("`{name}` is too big: {what}")]
     TooBig {
-        /// The type that passes the limit.
+        /// The type that exceeds the limit.
         name: TypeName,
         /// The limit.
         what: &'static str,
     },
-    /// A description of the type is not the one of the hash that was announced.
+    /// A description of the type does not match the announced hash.
     #[error("`{name}` is described with the type hash {found}, and {expected} was announced")]
     OtherHash {
         /// The type.
         name: TypeName,
-        /// By the description.
+        /// Hash of the description.
         found: TypeHash,
-        /// As announced.
+        /// Announced hash.
         expected: TypeHash,
     },
     /// A line of the text does not follow the dialect.
@@ -66,49 +68,49 @@ pub enum DefinitionError {
         name: TypeName,
         /// Line, from 1.
         line: usize,
-        /// What is wrong.
+        /// Description of the error.
         reason: &'static str,
         /// The line, cut at 200 characters.
         text: String,
     },
 }
 
-/// A plan cannot be compiled.
+/// Error while compiling a plan.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum PlanError {
-    /// The selected field is none of the type's.
+    /// The type has no field of the selected name.
     #[error("`{name}` has no field `{path}`; it has {}", if known.is_empty() { "none".to_owned() } else { known.join(", ") })]
     UnknownField {
         /// The message type.
         name: TypeName,
-        /// The path asked for.
+        /// The requested path.
         path: String,
-        /// The paths there are, in message order.
+        /// The available paths, in message order.
         known: Vec<String>,
     },
-    /// A constant that is no value of its field.
+    /// A constant that is not a value of its field.
     #[error("field `{path}` of `{name}`: `{text}` is not {expected}")]
     Constant {
         /// The message type.
         name: TypeName,
         /// The path of the field.
         path: String,
-        /// The text, cut at 64 characters, with `...` behind.
+        /// The text, cut at 64 characters with `...` appended.
         text: String,
-        /// What may stand there, with its article.
+        /// The expected value, with its article.
         expected: String,
     },
-    /// A constant of a length its field cannot have, or with something in it that cannot be written.
+    /// A constant with an invalid length for its field, or with content that cannot be written.
     #[error("field `{path}` of `{name}`: {fault}")]
     ConstantFault {
         /// The message type.
         name: TypeName,
         /// The path of the field.
         path: String,
-        /// What is wrong with it.
+        /// Description of the error.
         fault: WriteFault,
     },
-    /// A constant for the field that takes the value.
+    /// A constant for a field that takes the value.
     #[error("field `{path}` of `{name}` takes the value and cannot be a constant too")]
     ConstantOfField {
         /// The message type.
@@ -116,14 +118,14 @@ pub enum PlanError {
         /// The path of the field.
         path: String,
     },
-    /// A part the field has not, or a conversion that is none of its type.
+    /// A part that the field does not have, or a conversion that does not match its type.
     #[error("field `{path}` of `{name}` {what}")]
     Shape {
         /// The message type.
         name: TypeName,
         /// The path of the field.
         path: String,
-        /// Why not, as the rest of a sentence about the field.
+        /// The reason, as the rest of a sentence about the field.
         what: &'static str,
     },
     /// ROS 1 bytes of a ROS 2 type, or CDR of a ROS 1 type.
@@ -134,27 +136,28 @@ pub enum PlanError {
     },
 }
 
-/// What is wrong with the bytes of a message.
+/// Error in the bytes of a message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum Fault {
-    /// The payload ends inside the field, or a length says more than there is.
+    /// The payload ends inside the field, or a length exceeds the payload.
     #[error("the message ends too early")]
     Truncated,
-    /// The text is not UTF-8 (or, of a `wstring`, not UTF-16).
+    /// The text is not UTF-8 (or not UTF-16 for a `wstring`).
     #[error("the text is not valid Unicode")]
     Text,
     /// A CDR string without its terminating NUL.
     #[error("the string is not terminated where its length says")]
     Terminator,
-    /// More elements or characters than the type's bound.
+    /// More elements or characters than the bound of the type.
     #[error("{found} elements, the bound is {bound}")]
     Bound {
-        /// What the type allows.
+        /// The bound of the type.
         bound: u32,
-        /// What the payload has.
+        /// The number in the payload.
         found: u32,
     },
-    /// More elements that take no bytes, such as `std_msgs/Empty` on ROS 1, than are believed of one message.
+    /// More elements without bytes, such as `std_msgs/Empty` on ROS 1, than are accepted in one
+    /// message.
     #[error("{0} more elements without bytes are too many")]
     WithoutBytes(usize),
     /// Bytes after the last field of a ROS 1 message.
@@ -165,7 +168,7 @@ pub enum Fault {
     Encapsulation(u16),
 }
 
-/// A message is sound, and what is wanted of it is not there or cannot become what it should.
+/// Error for a valid message in which the selected value is missing or cannot be converted.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum ValueFault {
     /// The array is too short for the element.
@@ -173,26 +176,26 @@ pub enum ValueFault {
     Absent {
         /// The element, from 0.
         at: usize,
-        /// How many there are.
+        /// The number of elements.
         found: usize,
     },
     /// No element has that name.
     #[error("no element is named `{0}`")]
     NoName(String),
-    /// The type it is to become cannot hold the value.
+    /// The target type cannot hold the value.
     #[error("{value} does not fit {}", to.name())]
     OutOfRange {
         /// The value, scaled.
         value: String,
-        /// What it should become.
+        /// The target type.
         to: BuiltinType,
     },
-    /// The value is no number.
+    /// The value is not a number.
     #[error("a value that is no number cannot become one")]
     NoNumber,
 }
 
-/// [`Plan::read`](crate::Plan::read) stopped.
+/// Error of [`Plan::read`](crate::Plan::read).
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum ReadError<E> {
     /// The payload is not a message of the type.
@@ -202,15 +205,15 @@ pub enum ReadError<E> {
         field: String,
         /// Offset in the payload.
         at: usize,
-        /// What is wrong there.
+        /// Description of the error.
         fault: Fault,
     },
-    /// What is wanted of a field cannot be had.
+    /// The selected value of a field is not available.
     #[error("{}{fault}", in_field(field))]
     Value {
         /// Path of the field.
         field: String,
-        /// Why not.
+        /// The reason.
         fault: ValueFault,
     },
     /// The sink refused a value.
@@ -223,7 +226,7 @@ pub enum ReadError<E> {
     },
 }
 
-/// A [`Source`](crate::Source) has not what is asked for.
+/// Error of a [`Source`](crate::Source) without the requested value.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum SourceError {
     /// No field is left.
@@ -232,33 +235,33 @@ pub enum SourceError {
     /// The field has another type; `None` stands for a null value.
     #[error("{} expected, found {}", shape(Some(*expected), *expected_array), shape(*found, *found_array))]
     Type {
-        /// The builtin type asked for.
+        /// The requested builtin type.
         expected: BuiltinType,
-        /// Whether an array was asked for.
+        /// Whether an array was requested.
         expected_array: bool,
-        /// The builtin type there is.
+        /// The actual builtin type.
         found: Option<BuiltinType>,
-        /// Whether it is an array.
+        /// Whether the actual value is an array.
         found_array: bool,
     },
-    /// Fields after the last one asked for.
+    /// Fields after the last requested field.
     #[error("{0} fields too many")]
     LeftOver(usize),
-    /// The field's own bytes are wrong.
+    /// The field's own bytes are invalid.
     #[error("{0}")]
     Malformed(String),
-    /// The value cannot become what the field of the message holds.
+    /// The value cannot be converted to the type of the message field.
     #[error(transparent)]
     Value(ValueFault),
 }
 
-/// What is wrong with a value to be written.
+/// Error in a value to be written.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum WriteFault {
-    /// The source has it not.
+    /// The source does not have the value.
     #[error(transparent)]
     Source(#[from] SourceError),
-    /// An array of another length than the type's fixed one.
+    /// An array with another length than the fixed length of the type.
     #[error("{found} elements, the type has {expected}")]
     Length {
         /// The fixed length.
@@ -266,38 +269,38 @@ pub enum WriteFault {
         /// Elements in the value.
         found: usize,
     },
-    /// More elements or characters than the type's bound or than 32 bits count.
+    /// More elements or characters than the bound of the type or than 32 bits count.
     #[error("{found} elements, the bound is {bound}")]
     Bound {
-        /// What the type allows.
+        /// The bound of the type.
         bound: u32,
-        /// What the value has.
+        /// The number in the value.
         found: usize,
     },
-    /// More elements without a value, messages that are empty, than are believed of one message.
+    /// More elements without a value (empty messages) than are accepted in one message.
     #[error("{0} more elements without a value are too many")]
     WithoutValue(usize),
-    /// Part of an array: what stands in the rest of it, nobody says.
+    /// Part of an array: the rest of the array is unknown.
     #[error("a part of an array is read and cannot be written")]
     Part,
-    /// Several fields that do not follow each other as in the message, or of which one is in another.
+    /// Several fields in another order than in the message, or of which one contains another.
     #[error("fields in another order than that of the message are read and cannot be written")]
     Order,
     /// A text with a NUL, which CDR cannot carry.
     #[error("a NUL inside a text")]
     Nul,
-    /// A duration of more than 2^31 seconds, or no number.
+    /// A duration of more than 2^31 seconds, or not a number.
     #[error("the duration does not fit a ROS duration")]
     Duration,
 }
 
-/// [`Plan::write`](crate::Plan::write) stopped; nothing was appended.
+/// Error of [`Plan::write`](crate::Plan::write); nothing was appended.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{}{fault}", in_field(field))]
 pub struct WriteError {
     /// Path of the field, empty outside of any field.
     pub field: String,
-    /// What is wrong with it.
+    /// Description of the error.
     #[source]
     pub fault: WriteFault,
 }

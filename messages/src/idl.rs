@@ -1,16 +1,18 @@
-//! The parser of `.idl` texts, as far as rosidl writes and reads them: modules, structs, typedefs and constants.
+//! The parser of `.idl` texts, as far as rosidl writes and reads them: modules, structs, typedefs
+//! and constants.
 //!
-//! What is read is put into the words of `.msg` files, so both make the same definitions with the same hashes.
+//! Types are converted to the notation of `.msg` files, so that both languages give the same
+//! definitions with the same hashes.
 
 use std::collections::HashMap;
 
 use crate::definition::{Definition, Line};
 use crate::{DefinitionError, Dialect, TextKind, TypeName};
 
-/// The structs of a text that are of one type of ROS: a message, the two of a service, or the three of an action.
+/// Parses the structs of one ROS type: one of a message, two of a service, or three of an action.
 ///
 /// # Errors
-/// [`DefinitionError::Syntax`], also when one of the structs is not there.
+/// [`DefinitionError::Syntax`], also if a struct is missing.
 pub(crate) fn definitions<const N: usize>(
     kind: TextKind,
     name: &TypeName,
@@ -44,7 +46,7 @@ pub(crate) fn definitions<const N: usize>(
                 text: path,
             });
         };
-        // What rosidl puts into an empty message.
+        // The member that rosidl adds to an empty message.
         if let [only] = fields.as_slice()
             && only.name == "structure_needs_at_least_one_member"
         {
@@ -71,7 +73,7 @@ pub(crate) fn definitions<const N: usize>(
 struct Parser<'t> {
     tokens: Vec<Token<'t>>,
     at: usize,
-    /// The modules around.
+    /// The enclosing modules.
     scope: Vec<&'t str>,
     typedefs: HashMap<String, Type>,
     structs: HashMap<String, Vec<Line>>,
@@ -89,16 +91,16 @@ struct Token<'t> {
 enum TokenKind {
     Word,
     Number,
-    /// With its quotes.
+    /// Includes its quotes.
     Quoted,
     Mark,
 }
 
-/// A type in the words of `.msg` files, its base and its length parted.
+/// A type in the notation of `.msg` files, split into base and length.
 #[derive(Clone, Debug)]
 struct Type {
     base: String,
-    /// As `[3]`, `[]` or `[<=3]`.
+    /// The length, such as `[3]`, `[]` or `[<=3]`.
     arity: Option<String>,
 }
 
@@ -174,7 +176,7 @@ impl<'t> Parser<'t> {
         Ok(())
     }
 
-    /// `type name;` or `type one, two[3];`
+    /// Parses `type name;` or `type one, two[3];`.
     fn members(&mut self, fields: &mut Vec<Line>) -> Parsed<()> {
         let kind = self.type_spec()?;
         loop {
@@ -207,7 +209,7 @@ impl<'t> Parser<'t> {
         Ok(())
     }
 
-    /// Behind the name of a field or typedef: the length of a fixed array.
+    /// Parses the length of a fixed array after the name of a field or typedef.
     fn declarator(&mut self, kind: &Type) -> Parsed<Type> {
         let Some(token) = self.peek().filter(|token| token.text == "[") else {
             return Ok(kind.clone());
@@ -250,7 +252,7 @@ impl<'t> Parser<'t> {
             name: name.to_owned(),
             value: Some(value),
         };
-        // A constant of a message stands in a module named after it.
+        // The constants of a message are in a module named after the message.
         let of = self.scope.join("::");
         self.constants.entry(of).or_default().push(line);
         Ok(())
@@ -299,10 +301,11 @@ impl<'t> Parser<'t> {
         }
     }
 
-    /// Behind the word `sequence`.
+    /// Parses the rest of a type after the word `sequence`.
     fn sequence(&mut self, token: Token<'t>) -> Parsed<Type> {
         self.expect("<")?;
-        // Only one sequence can be in another, which is refused, so this goes no deeper than the text's first `<<`.
+        // A sequence in another sequence is refused here, so the recursion ends at the first `<<`
+        // of the text.
         if self.peek().is_some_and(|next| next.text == "sequence") {
             return Err(fault(token, "arrays of arrays are not known to ROS"));
         }
@@ -321,7 +324,8 @@ impl<'t> Parser<'t> {
         })
     }
 
-    /// A typedef, or a message as `package::msg::Name` or `Name` of the same module.
+    /// Parses the name of a typedef, or of a message as `package::msg::Name` or `Name` of the same
+    /// module.
     fn named(&mut self, first: Token<'t>) -> Parsed<Type> {
         let mut parts = vec![first.text];
         while self.takes("::") {
@@ -349,7 +353,7 @@ impl<'t> Parser<'t> {
         Ok(Type { base, arity: None })
     }
 
-    /// `@name`, and what is in parentheses behind it.
+    /// Skips `@name` and the parentheses after it.
     fn annotation(&mut self) -> Parsed<()> {
         self.at += 1;
         self.word()?;
@@ -445,7 +449,7 @@ fn fault(token: Token<'_>, reason: &'static str) -> Fault {
     }
 }
 
-/// Words, numbers, quoted texts and marks; comments and lines of the preprocessor left out.
+/// Returns words, numbers, quoted texts and marks, without comments and preprocessor lines.
 fn tokens(text: &str) -> Parsed<Vec<Token<'_>>> {
     let mut found = Vec::new();
     let mut rest = text;
@@ -487,7 +491,7 @@ fn tokens(text: &str) -> Parsed<Vec<Token<'_>>> {
     Ok(found)
 }
 
-/// Bytes of the token the text begins with; `None` when it does not end.
+/// Returns the length of the first token in bytes, or `None` if the token does not end.
 fn length(rest: &str, first: char) -> Option<usize> {
     let while_of = |keep: fn(char) -> bool| rest.find(|c: char| !keep(c)).or(Some(rest.len()));
     match first {
@@ -512,7 +516,7 @@ fn length(rest: &str, first: char) -> Option<usize> {
         _ if first.is_ascii_alphabetic() || first == '_' => {
             while_of(|c| c.is_ascii_alphanumeric() || c == '_')
         }
-        // The exponent's sign is a mark of its own; it is put together again with the rest of a constant.
+        // The sign of an exponent is a mark of its own; it is joined with the rest of a constant.
         _ if first.is_ascii_digit() || first == '.' => {
             while_of(|c| c.is_ascii_alphanumeric() || c == '.')
         }
@@ -520,9 +524,9 @@ fn length(rest: &str, first: char) -> Option<usize> {
     }
 }
 
-/// Modules in modules; those of ROS are two deep, and three for constants.
+/// Limit of nested modules; ROS uses two levels, and three for constants.
 const DEEPEST: usize = 16;
-/// Bytes of a name or number; file systems give the files of types no more.
+/// Limit of a name or number in bytes; file systems do not allow longer names for type files.
 const LONGEST: usize = 255;
 
 #[cfg(test)]

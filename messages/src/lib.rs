@@ -1,9 +1,10 @@
-//! ROS message definitions at run time, and ROS messages to and from OPC UA fields.
+//! ROS message definitions at run time, and conversion of ROS messages to and from OPC UA fields.
 //!
-//! A [`Registry`] holds `.msg` texts of one [`Dialect`] and makes [`MessageType`]s of them: the flattened list of
-//! [`Leaf`]s, and for ROS 1 the md5 and the full definition text a publisher advertises. A [`Plan`] is compiled once
-//! per message type, [`Selection`] and [`Wire`]; it then runs over the bytes of a message into a [`Sink`], or takes the
-//! fields of a [`Source`] and writes the bytes. No tree of values is built on either way.
+//! A [`Registry`] holds `.msg` texts of one [`Dialect`] and creates [`MessageType`]s from them: the
+//! flattened list of [`Leaf`]s, and for ROS 1 the md5 and the full definition text that a publisher
+//! announces. A [`Plan`] is compiled once per message type, [`Selection`] and [`Wire`]. It reads
+//! the bytes of a message into a [`Sink`], or takes the fields of a [`Source`] and writes the
+//! bytes. Neither direction builds a tree of values.
 //!
 //! ```
 //! use messages::{Dialect, Plan, Registry, Selection, Wire};
@@ -19,13 +20,14 @@
 //! ```
 //!
 //! # Definitions
-//! Both dialects are read by a parser of this crate: definition texts come from peers, and published parsers panic on
-//! hostile ones (an array length of twenty digits) or know one dialect only.
+//! A parser of this crate reads both dialects. Definition texts come from peers, and published
+//! parsers panic on hostile texts (an array length of twenty digits) or support one dialect only.
 //!
 //! # Services and actions
-//! A `.srv` text is two messages, `package/NameRequest` and `package/NameResponse`; an `.action` text of ROS 1 is seven, as
-//! genaction makes them, and one of ROS 2 those of [`ActionMessages`]. They are messages like any other, but those of a
-//! service are found only through it.
+//! A `.srv` text defines two messages, `package/NameRequest` and `package/NameResponse`. An
+//! `.action` text of ROS 1 defines seven messages, as in genaction, and a text of ROS 2 the
+//! messages of [`ActionMessages`]. They are messages like any other, except that the messages of a
+//! service are found only through the service.
 //!
 //! # Values
 //! | ROS | field |
@@ -43,13 +45,15 @@
 //! | message | its fields, named `outer.inner` |
 //! | array of messages | array of structures, one field; see [`Sink::structures`] |
 //!
-//! `seq` of a ROS 1 `std_msgs/Header` is no field: it is skipped when read and 0 when written. A ROS 2 topic whose type
-//! is `builtin_interfaces/Time` or `Duration` itself is one field named `data`.
+//! `seq` of a ROS 1 `std_msgs/Header` is not a field: it is skipped when read and 0 when written. A
+//! ROS 2 topic of the type `builtin_interfaces/Time` or `Duration` itself has a single field named
+//! `data`.
 //!
 //! # Bytes
-//! ROS 1 is packed little endian. CDR is plain XCDR version 1 (DDS-RTPS 10.2, DDS-XTypes 7.4.1): alignment counts from
-//! the byte after the 4 byte encapsulation header, a string's length counts its NUL, and an empty message is one byte.
-//! A `wstring` is a count of UTF-16 units, each written as 4 bytes, as `rmw_cyclonedds` and `rmw_fastrtps` do.
+//! ROS 1 is packed little endian. CDR is plain XCDR version 1 (DDS-RTPS 10.2, DDS-XTypes 7.4.1).
+//! Alignment counts from the byte after the 4 byte encapsulation header, a string's length includes
+//! its NUL, and an empty message is one byte. A `wstring` is a count of UTF-16 units, each written
+//! as 4 bytes, as in `rmw_cyclonedds` and `rmw_fastrtps`.
 
 mod action_calls;
 mod bundle;

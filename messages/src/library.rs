@@ -1,4 +1,5 @@
-//! Definitions of one ROS from several places, the nearest of which wins: files before what is built in.
+//! Definitions of a ROS version from several locations. The nearest location takes precedence:
+//! files before built-in definitions.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
@@ -10,7 +11,7 @@ use crate::{
     ServiceType, TypeName,
 };
 
-/// What a text defines.
+/// The kind of a definition text.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum TextKind {
     /// `.msg`
@@ -22,10 +23,11 @@ pub enum TextKind {
 }
 
 impl TextKind {
-    /// Each of them.
+    /// All kinds.
     pub const ALL: [Self; 3] = [Self::Message, Self::Service, Self::Action];
 
-    /// `msg`, `srv` or `action`: the folder in a package, and the ending of a file's name.
+    /// Returns `msg`, `srv` or `action`: the folder in a package, and the extension of a file's
+    /// name.
     #[must_use]
     pub const fn word(self) -> &'static str {
         match self {
@@ -45,37 +47,39 @@ impl fmt::Display for TextKind {
 /// The language of a definition text.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Language {
-    /// That of `.msg`, `.srv` and `.action` files.
+    /// The language of `.msg`, `.srv` and `.action` files.
     Ros,
-    /// OMG IDL as rosidl writes it, in `.idl` files of ROS 2.
+    /// OMG IDL as written by rosidl, in `.idl` files of ROS 2.
     Idl,
 }
 
-/// A text and where it is from.
+/// A text and its location.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct DefinitionText {
     /// The whole text.
     pub text: String,
     /// Its language.
     pub language: Language,
-    /// The file, as people are told of it.
+    /// The file, for messages to users.
     pub file: Arc<str>,
 }
 
-/// Where definition texts are that are not built in.
+/// A provider of definition texts beside the built-in definitions.
 pub trait DefinitionTexts {
-    /// The text of that name and kind for one ROS, of the nearest place that has one. It is asked for once.
+    /// Returns the text of that name and kind for a ROS version, from the nearest location that
+    /// has it. Called once per name.
     fn find(&mut self, dialect: Dialect, kind: TextKind, name: &TypeName)
     -> Option<DefinitionText>;
 
-    /// Names that can be found, for advice when one cannot.
+    /// Returns the available names, for suggestions when a name is missing.
     fn names(&mut self, dialect: Dialect, kind: TextKind) -> Vec<TypeName>;
 
-    /// Where is looked, for people: folders, files, variables of the environment. Empty when nowhere.
+    /// Returns the searched locations for users: folders, files, environment variables. Empty if
+    /// there are no locations.
     fn places(&self, dialect: Dialect) -> Vec<String>;
 }
 
-/// Nothing beside what is built in.
+/// A provider without texts, for built-in definitions only.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct NoTexts;
 
@@ -93,42 +97,43 @@ impl DefinitionTexts for NoTexts {
     }
 }
 
-/// What is worth telling of a text that was asked for.
+/// Event of a requested text, for the log.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Noted {
-    /// It counts.
+    /// The text is used.
     Read {
-        /// What it defines.
+        /// The defined type.
         name: TypeName,
         /// The file.
         file: Arc<str>,
     },
-    /// It does not parse, and counts as not there.
+    /// The text does not parse and is ignored.
     Refused {
-        /// What it is a text of.
+        /// The type that the text should define.
         name: TypeName,
         /// The file.
         file: Arc<str>,
-        /// Why.
+        /// The error.
         error: DefinitionError,
     },
-    /// It counts, and differs from what is built in under its name.
+    /// The text is used, and differs from the built-in definition of the same name.
     Differs {
-        /// What it defines.
+        /// The defined type.
         name: TypeName,
         /// The file.
         file: Arc<str>,
-        /// Fields, and in ROS 1 constants, that only the file has; in their order, a part of a service or action before its name.
+        /// Fields, and in ROS 1 constants, that only the file has, in order. The part of a service
+        /// or action precedes the name.
         only_file: Vec<String>,
-        /// Those that only the built-in definition has.
+        /// Fields and constants that only the built-in definition has.
         only_built_in: Vec<String>,
     },
 }
 
-/// Definitions of one ROS, those built in and those of texts, which are read as they are asked for.
+/// Definitions of a ROS version, built in or from texts, which are read on request.
 ///
-/// A text wins over a built-in definition of its name. What peers define is for the owner to add to the
-/// [`registry`](Self::registry_mut): a text found later replaces it.
+/// A text takes precedence over a built-in definition of the same name. The owner adds the
+/// definitions of peers to the [`registry`](Self::registry_mut): a text found later replaces them.
 #[derive(Clone, Debug)]
 pub struct Library {
     registry: Registry,
@@ -138,7 +143,7 @@ pub struct Library {
 }
 
 impl Library {
-    /// With the definitions of a registry as those built in.
+    /// Creates a library with the definitions of a registry as its built-in definitions.
     #[must_use]
     pub const fn new(registry: Registry) -> Self {
         Self {
@@ -149,18 +154,19 @@ impl Library {
         }
     }
 
-    /// What is known by now.
+    /// Returns the current definitions.
     #[must_use]
     pub const fn registry(&self) -> &Registry {
         &self.registry
     }
 
-    /// For definitions that come another way than by texts.
+    /// Returns the registry, for definitions from other sources than texts.
     pub const fn registry_mut(&mut self) -> &mut Registry {
         &mut self.registry
     }
 
-    /// Forgets what texts define, so that they are asked for again. What came another way stays.
+    /// Discards the definitions of texts, so that the texts are requested again. Definitions from
+    /// other sources stay.
     pub fn forget_texts(&mut self) {
         self.asked.clear();
         let files = std::mem::take(&mut self.files);
@@ -181,10 +187,10 @@ impl Library {
         }
     }
 
-    /// The type of that name with all it needs.
+    /// Returns the type of that name with all types it needs.
     ///
     /// # Errors
-    /// [`DefinitionError`]. A text that does not parse is noted, and counts as not there.
+    /// [`DefinitionError`]. A text that does not parse is noted, and is ignored.
     pub fn message(
         &mut self,
         name: &TypeName,
@@ -194,7 +200,7 @@ impl Library {
         self.registry.get(name)
     }
 
-    /// The service of that name with all it needs.
+    /// Returns the service of that name with all types it needs.
     ///
     /// # Errors
     /// As [`message`](Self::message).
@@ -207,10 +213,11 @@ impl Library {
         self.registry.service(name)
     }
 
-    /// The action of ROS 1 of that name, by its `.action` text or by the texts of its seven messages.
+    /// Returns the ROS 1 action of that name, from its `.action` text or from the texts of its
+    /// seven messages.
     ///
     /// # Errors
-    /// As [`message`](Self::message), of one of the messages.
+    /// As [`message`](Self::message), for its messages.
     pub fn action(
         &mut self,
         name: &TypeName,
@@ -220,10 +227,10 @@ impl Library {
         self.registry.action(name)
     }
 
-    /// The messages of the action of ROS 2 of that name.
+    /// Returns the messages of the ROS 2 action of that name.
     ///
     /// # Errors
-    /// As [`message`](Self::message), of one of the messages.
+    /// As [`message`](Self::message), for its messages.
     pub fn action_messages(
         &mut self,
         name: &TypeName,
@@ -233,10 +240,10 @@ impl Library {
         self.registry.action_messages(name)
     }
 
-    /// The action of that name, of either ROS, as calls and values of the space.
+    /// Returns the action of that name, of ROS 1 or ROS 2, as calls and values of the space.
     ///
     /// # Errors
-    /// As [`message`](Self::message), of one of the messages.
+    /// As [`message`](Self::message), for its messages.
     pub fn action_calls(
         &mut self,
         name: &TypeName,
@@ -246,18 +253,19 @@ impl Library {
         self.registry.action_calls(name)
     }
 
-    /// The file a definition is from; `None` of one that is built in, came from a peer, or is not known.
+    /// Returns the file of a definition, or `None` if the definition is built in, came from a peer,
+    /// or is unknown.
     #[must_use]
     pub fn file(&self, kind: TextKind, name: &TypeName) -> Option<&Arc<str>> {
         self.files.get(&(kind, name.clone()))
     }
 
-    /// What is to be told since this was asked last.
+    /// Returns the events after the previous call.
     pub fn take_noted(&mut self) -> Vec<Noted> {
         std::mem::take(&mut self.noted)
     }
 
-    /// The known name that is most like one that is not, built in or in a text.
+    /// Returns the known name, built in or in a text, that is most similar to an unknown name.
     pub fn suggest(
         &self,
         kind: TextKind,
@@ -275,7 +283,7 @@ impl Library {
         }
     }
 
-    /// Reads what is wanted and not read yet, and what that needs in turn.
+    /// Reads the requested texts that were not read yet, and recursively the texts that they need.
     fn gather(&mut self, mut wanted: Vec<(TextKind, TypeName)>, texts: &mut dyn DefinitionTexts) {
         let mut budget = MOST_TEXTS;
         let mut met = BTreeSet::new();
@@ -289,7 +297,8 @@ impl Library {
                 };
                 budget = left;
                 if self.asked.len() >= MOST_ASKED {
-                    // Peers can make up names without end; those there is no text of are asked for again.
+                    // Peers can invent any number of names; names without a text are requested
+                    // again.
                     let files = &self.files;
                     self.asked.retain(|asked| files.contains_key(asked));
                 }
@@ -311,7 +320,7 @@ impl Library {
                 let parts = self.registry.service_definitions(name);
                 parts.into_iter().flatten().flat_map(of).collect()
             }
-            // Those of them there are; of an action that was not defined by a text the messages are looked for.
+            // The existing messages; for an action without a text its messages are searched.
             TextKind::Action => {
                 let suffixes: &[&str] = match self.registry.dialect() {
                     Dialect::Ros1 => &ACTION_MESSAGES,
@@ -339,7 +348,8 @@ impl Library {
             return;
         }
         if kind == TextKind::Action {
-            // Its messages are those of this text, whatever files of their names there are.
+            // The messages of the action come from this text, even if there are files of their
+            // names.
             for made in self.needed(kind, &name) {
                 self.asked.insert((TextKind::Message, made));
             }
@@ -363,7 +373,7 @@ impl Library {
         self.noted.push(Noted::Read { name, file });
     }
 
-    /// What of a definition its peers must agree on.
+    /// Returns the lines of a definition that its peers must agree on.
     fn lines(&self, kind: TextKind, name: &TypeName) -> Option<Vec<String>> {
         match kind {
             TextKind::Message => Some(self.registry.definition(name)?.lines(self.dialect(), "")),
@@ -395,7 +405,7 @@ impl Library {
 }
 
 impl Definition {
-    /// The messages among its fields.
+    /// Returns the messages among its fields.
     pub(crate) fn needs(&self) -> impl Iterator<Item = &TypeName> {
         self.fields.iter().filter_map(|field| match &field.kind {
             crate::definition::FieldType::Message(name) => Some(name),
@@ -403,7 +413,8 @@ impl Definition {
         })
     }
 
-    /// Its fields as `prefix type name`, the types spelt in one way, and for ROS 1, whose md5 has them, its constants.
+    /// Returns its fields as `prefix type name`, with the types in a uniform notation, and for ROS
+    /// 1 its constants, which the md5 includes.
     pub(crate) fn lines(&self, dialect: Dialect, prefix: &str) -> Vec<String> {
         let constants = self.constants.iter().filter(|_| dialect == Dialect::Ros1);
         let constants = constants.map(|constant| format!("{prefix}{}", constant.line));
@@ -415,7 +426,7 @@ impl Definition {
     }
 }
 
-/// Checks a text by itself, without what it needs.
+/// Checks a text by itself, without the types it needs.
 ///
 /// # Errors
 /// [`DefinitionError::Syntax`].
@@ -434,7 +445,7 @@ pub fn check_text(
     }
 }
 
-/// What genaction puts behind the name of an action.
+/// Suffixes that genaction appends to the name of an action.
 const ACTION_MESSAGES: [&str; 7] = [
     "Action",
     "ActionGoal",
@@ -444,7 +455,7 @@ const ACTION_MESSAGES: [&str; 7] = [
     "Result",
     "Feedback",
 ];
-/// Names that were asked for and are remembered, beside those there is a text of.
+/// Limit of remembered names without a text.
 const MOST_ASKED: usize = 16_384;
-/// Texts looked for in one go: more types than any message needs.
+/// Limit of texts read for a request, which exceeds the need of any message.
 const MOST_TEXTS: usize = 512;

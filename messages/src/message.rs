@@ -6,7 +6,7 @@ use crate::definition::{Arity, Number, Primitive};
 use crate::resolve::{Shape, ShapeKind};
 use crate::{Constant, Dialect, TypeName};
 
-/// A message type with all it needs resolved.
+/// A message type with all nested types resolved.
 #[derive(Debug)]
 pub struct MessageType {
     pub(crate) name: TypeName,
@@ -29,8 +29,8 @@ pub struct Leaf {
 }
 
 impl Leaf {
-    /// The one field of a message that crosses as it is ([`Selection::Bytes`](crate::Selection::Bytes)): a ByteString
-    /// without a name.
+    /// Returns the only field of a message that is passed unchanged
+    /// ([`Selection::Bytes`](crate::Selection::Bytes)): a ByteString without a name.
     pub const fn bytes() -> Self {
         Self {
             path: String::new(),
@@ -39,7 +39,7 @@ impl Leaf {
         }
     }
 
-    /// Whether it is a field of the message at `path`.
+    /// Returns whether it is a field of the message at `path`.
     pub fn is_inside(&self, path: &str) -> bool {
         self.path
             .strip_prefix(path)
@@ -54,57 +54,59 @@ pub enum Rank {
     Scalar,
     /// An array of one dimension.
     Array {
-        /// The only length it may have.
+        /// The fixed length, if any.
         fixed: Option<u32>,
     },
 }
 
 impl MessageType {
-    /// Package and name.
+    /// Returns package and name.
     pub fn name(&self) -> &TypeName {
         &self.name
     }
 
-    /// Whether it is the same on the wire, by its fields and those of all messages in it.
+    /// Returns whether the wire format is the same, by the fields of the type and of all nested
+    /// messages.
     pub fn is_same(&self, other: &Self) -> bool {
         self.dialect == other.dialect && self.shape == other.shape
     }
 
-    /// The ROS whose bytes it describes.
+    /// Returns the ROS version whose bytes the type describes.
     pub fn dialect(&self) -> Dialect {
         self.dialect
     }
 
-    /// The 32 hex digits ROS 1 peers compare; empty for a ROS 2 type, which has none.
+    /// Returns the 32 hex digits that ROS 1 peers compare; empty for a ROS 2 type.
     pub fn md5(&self) -> &str {
         &self.md5
     }
 
-    /// The text of the type and, each after a line of `=` and a line `MSG: package/Name`, of the types it needs: what a
-    /// ROS 1 publisher puts into its connection header.
+    /// Returns the text of the type followed by the texts of the types it needs, each after a line
+    /// of `=` and a line `MSG: package/Name`. A ROS 1 publisher puts it into its connection header.
     pub fn definition(&self) -> &str {
         &self.definition
     }
 
-    /// The fields in message order.
+    /// Returns the fields in message order.
     pub fn leaves(&self) -> &[Leaf] {
         &self.leaves
     }
 
-    /// The constants of the message itself, in the order of its text; those of messages in it are theirs.
+    /// Returns the constants of the message itself, without those of nested messages, in the order
+    /// of its text.
     pub fn constants(&self) -> &[Constant] {
         &self.shape.constants
     }
 
-    /// The constant of that name.
+    /// Returns the constant of that name.
     pub fn constant(&self, name: &str) -> Option<&Constant> {
         self.constants()
             .iter()
             .find(|constant| constant.name == name)
     }
 
-    /// How many bytes the array of bytes at that path has in every message; `None` where it may have another number, or
-    /// is none.
+    /// Returns the fixed length of the byte array at that path, or `None` if its length varies or
+    /// the field is not a byte array.
     pub(crate) fn fixed_bytes(&self, path: &str) -> Option<u32> {
         let mut shape = &self.shape;
         let mut parts = path.split('.').peekable();
@@ -125,17 +127,19 @@ impl MessageType {
         }
     }
 
-    /// The field of that path.
+    /// Returns the field of that path.
     pub fn leaf(&self, path: &str) -> Option<&Leaf> {
         self.leaves.iter().find(|leaf| leaf.path == path)
     }
 }
 
-/// The type of one field `data` that carries a value of the builtin type, where nothing else says the type.
+/// Returns the ROS type with the single field `data` for a value of the builtin type, as the
+/// default type.
 ///
 /// DateTime is `std_msgs/Time`, which only ROS 1 has; ROS 2 has `builtin_interfaces/Time`, see
-/// [`Registry::standard_type`](crate::Registry::standard_type). None for arrays and ByteStrings: the `MultiArray` types
-/// of std_msgs have a layout beside their data, so they are more than one field. None too for what ROS has no type for.
+/// [`Registry::standard_type`](crate::Registry::standard_type). Returns `None` for arrays and
+/// ByteStrings: the `MultiArray` types of std_msgs have a layout beside their data, so they have
+/// more than one field. Also returns `None` for builtin types without a ROS type.
 pub fn standard_type(builtin: BuiltinType, array: bool) -> Option<TypeName> {
     let name = match builtin {
         _ if array => return None,

@@ -4,7 +4,8 @@ use std::sync::Arc;
 
 use crate::NameError;
 
-/// Which rules a definition text follows: `time`, `Header` and `byte` mean different things in the two.
+/// The rules of a definition text: `time`, `Header` and `byte` differ in meaning between the
+/// dialects.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum Dialect {
     /// `.msg` files of ROS 1 (genmsg).
@@ -15,8 +16,9 @@ pub enum Dialect {
 
 /// The name of a message type: package and name.
 ///
-/// `std_msgs/Bool` (ROS 1) and `std_msgs/msg/Bool` (ROS 2) are the same name; it prints as the former. A name is at most
-/// 255 bytes of ASCII letters, digits and underscores, each part starting with a letter.
+/// `std_msgs/Bool` (ROS 1) and `std_msgs/msg/Bool` (ROS 2) are the same name; it prints as the
+/// former. A name is at most 255 bytes of ASCII letters, digits and underscores, each part starting
+/// with a letter.
 #[derive(Clone, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct TypeName {
     text: Arc<str>,
@@ -26,7 +28,7 @@ pub struct TypeName {
 const LONGEST: usize = 255;
 
 impl TypeName {
-    /// `package` without slashes, `name` likewise.
+    /// Creates a name from `package` and `name`, both without slashes.
     pub fn new(package: &str, name: &str) -> Result<Self, NameError> {
         if package.len() + name.len() >= LONGEST || !is_identifier(package) || !is_identifier(name)
         {
@@ -38,32 +40,33 @@ impl TypeName {
         })
     }
 
-    /// `std_msgs/Bool`.
+    /// Returns the whole name, such as `std_msgs/Bool`.
     pub fn as_str(&self) -> &str {
         &self.text
     }
 
-    /// `std_msgs` of `std_msgs/Bool`.
+    /// Returns the package, such as `std_msgs` of `std_msgs/Bool`.
     pub fn package(&self) -> &str {
         self.text.get(..self.slash).unwrap_or_default()
     }
 
-    /// `Bool` of `std_msgs/Bool`.
+    /// Returns the name without the package, such as `Bool` of `std_msgs/Bool`.
     pub fn name(&self) -> &str {
         self.text.get(self.slash + 1..).unwrap_or_default()
     }
 
-    /// The ROS 2 spelling, `std_msgs/msg/Bool`.
+    /// Returns the ROS 2 notation, such as `std_msgs/msg/Bool`.
     pub fn ros2(&self) -> String {
         format!("{}/msg/{}", self.package(), self.name())
     }
 
-    /// The DDS type name ROS 2 announces, `std_msgs::msg::dds_::Bool_`.
+    /// Returns the DDS type name of ROS 2, such as `std_msgs::msg::dds_::Bool_`.
     pub fn dds(&self) -> String {
         format!("{}::msg::dds_::{}_", self.package(), self.name())
     }
 
-    /// Reads what [`TypeName::dds`] prints; names of services and actions are not message types and err.
+    /// Parses the result of [`TypeName::dds`]. Fails for names of services and actions, which are
+    /// not message types.
     pub fn from_dds(text: &str) -> Result<Self, NameError> {
         let parts = text
             .split_once("::msg::dds_::")

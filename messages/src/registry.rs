@@ -13,9 +13,9 @@ use crate::{
     TextKind, TypeName,
 };
 
-/// Message definitions of one dialect by name.
+/// Message definitions of a dialect by name.
 ///
-/// Definitions may be added in any order: what a type needs is looked for when it is asked for.
+/// Definitions may be added in any order: the types that a type needs are resolved on request.
 #[derive(Clone, Debug)]
 pub struct Registry {
     dialect: Dialect,
@@ -24,7 +24,7 @@ pub struct Registry {
 }
 
 impl Registry {
-    /// Without any definition.
+    /// Creates a registry without definitions.
     pub fn empty(dialect: Dialect) -> Self {
         Self {
             dialect,
@@ -33,12 +33,16 @@ impl Registry {
         }
     }
 
-    /// With the common interfaces built in: std_msgs, geometry_msgs, sensor_msgs, nav_msgs, trajectory_msgs,
-    /// diagnostic_msgs, actionlib_msgs, tf2_msgs, rosgraph_msgs, shape_msgs, visualization_msgs, stereo_msgs, the
-    /// services of std_srvs and ua_msgs (the skills of OPC UA, `ros/ua_msgs`), the actions of actionlib, the MoveBase of
-    /// move_base_msgs and the Fibonacci of the tutorials of both ROS, for ROS 1 also roscpp and their services,
-    /// and for ROS 2 builtin_interfaces, action_msgs, unique_identifier_msgs, lifecycle_msgs and rcl_interfaces with the
-    /// services of action_msgs and rcl_interfaces.
+    /// Creates a registry with the built-in common interfaces:
+    ///
+    /// - std_msgs, geometry_msgs, sensor_msgs, nav_msgs, trajectory_msgs, diagnostic_msgs,
+    ///   actionlib_msgs, tf2_msgs, rosgraph_msgs, shape_msgs, visualization_msgs and stereo_msgs
+    /// - the services of std_srvs and ua_msgs (the skills of OPC UA, `ros/ua_msgs`)
+    /// - the actions of actionlib, the MoveBase of move_base_msgs, and the Fibonacci of the
+    ///   tutorials of ROS 1 and ROS 2
+    /// - for ROS 1 also roscpp, and the services of these packages
+    /// - for ROS 2 also builtin_interfaces, action_msgs, unique_identifier_msgs, lifecycle_msgs and
+    ///   rcl_interfaces with the services of action_msgs and rcl_interfaces
     pub fn bundle(dialect: Dialect) -> Self {
         let mut registry = Self::empty(dialect);
         for (kind, name, text) in bundle::texts(dialect) {
@@ -47,23 +51,23 @@ impl Registry {
                 bundle::Kind::Service => registry.add_service(&name, &text),
                 bundle::Kind::Action => registry.add_action(&name, &text),
             };
-            // A test asks for each of them.
+            // A test checks each of them.
             debug_assert!(added.is_ok(), "every text of the bundle parses");
         }
         registry
     }
 
-    /// The dialect of the definitions.
+    /// Returns the dialect of the definitions.
     pub const fn dialect(&self) -> Dialect {
         self.dialect
     }
 
-    /// The names there are, in order.
+    /// Returns the names of the definitions, in order.
     pub fn names(&self) -> impl Iterator<Item = &TypeName> {
         self.definitions.keys()
     }
 
-    /// Puts the message of that name as `other` has it in the place of the one there is.
+    /// Replaces the message of that name by the definition of `other`.
     pub(crate) fn restore(&mut self, name: &TypeName, other: &Self) {
         match other.definitions.get(name) {
             Some(definition) => self
@@ -73,7 +77,7 @@ impl Registry {
         };
     }
 
-    /// Likewise the service.
+    /// Replaces the service of that name by the definition of `other`.
     pub(crate) fn restore_service(&mut self, name: &TypeName, other: &Self) {
         match other.services.get(name) {
             Some(definition) => self.services.insert(name.clone(), Arc::clone(definition)),
@@ -84,18 +88,21 @@ impl Registry {
     /// Adds the text of a `.msg` file; it replaces a definition of the same name.
     ///
     /// # Errors
-    /// [`DefinitionError::Syntax`]. What the text needs may be added later, so only [`Registry::get`] finds it missing.
+    /// [`DefinitionError::Syntax`]. Needed types may be added later, so a missing type is an error
+    /// of [`Registry::get`] only.
     pub fn add(&mut self, name: &TypeName, text: &str) -> Result<(), DefinitionError> {
         let definition = Definition::parse(self.dialect, name, text)?;
         self.definitions.insert(name.clone(), Arc::new(definition));
         Ok(())
     }
 
-    /// The type a ROS 1 publisher means by the `message_definition` of its connection header: the text of the type,
-    /// then each type it needs, headed by a line of `=` and a line `MSG: package/Name`.
+    /// Adds the type of a ROS 1 publisher from the `message_definition` of its connection header:
+    /// the text of the type, followed by each type it needs. Each needed type follows a line of `=`
+    /// and a line `MSG: package/Name`.
     ///
-    /// The type returned is made of this text alone, but for types it needs and does not hold, which are taken from the
-    /// registry. The registry keeps the definitions of names new to it, and never lets a peer replace one it has.
+    /// The returned type is created from this text alone, except for missing types, which are taken
+    /// from the registry. The registry stores the definitions of new names, and never lets a peer
+    /// replace an existing definition.
     pub fn add_ros1_definition(
         &mut self,
         name: &TypeName,
@@ -106,8 +113,9 @@ impl Registry {
         Ok(found)
     }
 
-    /// As [`add_ros1_definition`](Self::add_ros1_definition), but nothing is kept. The definitions are for
-    /// [`keep`](Self::keep): those of the text that the type needs.
+    /// Reads a definition like [`add_ros1_definition`](Self::add_ros1_definition), but stores
+    /// nothing. The returned definitions of the text that the type needs can be passed to
+    /// [`keep`](Self::keep).
     ///
     /// # Errors
     /// [`DefinitionError`].
@@ -134,7 +142,7 @@ impl Registry {
         Ok((Arc::new(found), PeerDefinitions { needed }))
     }
 
-    /// Adds the definitions of a peer, but for names that there are already.
+    /// Adds the definitions of a peer, except for existing names.
     pub fn keep(&mut self, definitions: &PeerDefinitions) {
         for (name, definition) in &definitions.needed {
             if !self.definitions.contains_key(name) {
@@ -144,7 +152,8 @@ impl Registry {
         }
     }
 
-    /// Takes away the definitions of a peer, but for those that were not kept or have been replaced.
+    /// Removes the definitions of a peer, except for definitions that were not kept or have been
+    /// replaced.
     pub fn forget(&mut self, definitions: &PeerDefinitions) {
         for (name, definition) in &definitions.needed {
             let known = self.definitions.get(name);
@@ -154,7 +163,7 @@ impl Registry {
         }
     }
 
-    /// The type of that name with all it needs.
+    /// Returns the type of that name with all types it needs.
     pub fn get(&self, name: &TypeName) -> Result<Arc<MessageType>, DefinitionError> {
         Resolver::new(self.dialect, &[&self.definitions])
             .message_type(name, None)
@@ -165,38 +174,38 @@ impl Registry {
         self.definitions.get(name)
     }
 
-    /// The text of a message definition, as its file has it.
+    /// Returns the text of a message definition, as in its file.
     pub fn text(&self, name: &TypeName) -> Option<&str> {
         Some(&self.definitions.get(name)?.text)
     }
 
-    /// Request and response of a service.
+    /// Returns request and response of a service.
     pub(crate) fn service_definitions(&self, name: &TypeName) -> Option<[&Arc<Definition>; 2]> {
         self.services.get(name).map(|service| service.parts())
     }
 
-    /// The names of the services there are, in order.
+    /// Returns the names of the services, in order.
     pub fn services(&self) -> impl Iterator<Item = &TypeName> {
         self.services.keys()
     }
 
-    /// Adds the text of a `.srv` file, request and response parted by a line `---`; it replaces a service of the same
-    /// name. A message may have that name too.
+    /// Adds the text of a `.srv` file, request and response separated by a line `---`. It replaces
+    /// a service of the same name. A message may have the same name.
     ///
     /// # Errors
-    /// [`DefinitionError::Syntax`]. What the text needs may be added later, so only [`Registry::service`] finds it
-    /// missing.
+    /// [`DefinitionError::Syntax`]. Needed types may be added later, so a missing type is an error
+    /// of [`Registry::service`] only.
     pub fn add_service(&mut self, name: &TypeName, text: &str) -> Result<(), DefinitionError> {
         let definition = ServiceDefinition::parse(self.dialect, name, text)?;
         self.services.insert(name.clone(), Arc::new(definition));
         Ok(())
     }
 
-    /// The service of that name with all it needs.
+    /// Returns the service of that name with all types it needs.
     ///
     /// # Errors
-    /// As [`Registry::get`]. [`DefinitionError::Unknown`] is of the service itself where nothing needs it, and else of a
-    /// message.
+    /// As [`Registry::get`]. [`DefinitionError::Unknown`] refers to the service itself if
+    /// `needed_by` is `None`, otherwise to a message.
     pub fn service(&self, name: &TypeName) -> Result<Arc<ServiceType>, DefinitionError> {
         let Some(definition) = self.services.get(name) else {
             return Err(DefinitionError::Unknown {
@@ -210,8 +219,9 @@ impl Registry {
         definition.resolve(name, &mut resolver).map(Arc::new)
     }
 
-    /// Adds the text of an `.action` file, goal, result and feedback parted by two lines `---`, in place of messages of the
-    /// same names: for ROS 1 the seven messages genaction makes of it, for ROS 2 those of [`ActionMessages`].
+    /// Adds the text of an `.action` file: goal, result and feedback, separated by two lines `---`.
+    /// It replaces messages of the same names: for ROS 1 the seven messages of genaction, for ROS 2
+    /// the messages of [`ActionMessages`].
     ///
     /// # Errors
     /// [`DefinitionError::Syntax`]; then nothing is added.
@@ -221,11 +231,12 @@ impl Registry {
         Ok(())
     }
 
-    /// Adds what a `.idl` text of ROS 2 defines under that name: a struct in the modules of its package and kind, of a service
-    /// two (`_Request`, `_Response`), of an action three (`_Goal`, `_Result`, `_Feedback`). Other structs are left alone.
+    /// Adds the definitions of a ROS 2 `.idl` text under that name: a struct in the modules of its
+    /// package and kind. A service has two structs (`_Request`, `_Response`), an action three
+    /// (`_Goal`, `_Result`, `_Feedback`). Other structs are ignored.
     ///
     /// # Errors
-    /// [`DefinitionError::Syntax`]; then nothing is added. In ROS 1 there are no such texts.
+    /// [`DefinitionError::Syntax`]; then nothing is added. ROS 1 has no such texts.
     pub fn add_idl(
         &mut self,
         kind: TextKind,
@@ -259,37 +270,38 @@ impl Registry {
         Ok(())
     }
 
-    /// The action of ROS 1 of that name. Its messages suffice, wherever they are from: a package that was built has a `.msg` file
-    /// of each beside the `.action` file.
+    /// Returns the ROS 1 action of that name. Its messages suffice, from any source: a built
+    /// package has a `.msg` file for each message beside the `.action` file.
     ///
     /// # Errors
-    /// As [`Registry::get`], of one of the messages.
+    /// As [`Registry::get`], for its messages.
     pub fn action(&self, name: &TypeName) -> Result<Arc<ActionType>, DefinitionError> {
         ActionType::of(name, |name| self.get(name)).map(Arc::new)
     }
 
-    /// The action of ROS 2 of that name, which was added.
+    /// Returns the added ROS 2 action of that name.
     ///
     /// # Errors
-    /// As [`Registry::get`], of one of the messages.
+    /// As [`Registry::get`], for its messages.
     pub fn action_messages(&self, name: &TypeName) -> Result<ActionMessages, DefinitionError> {
         ActionMessages::of(name, |name| self.get(name))
     }
 
-    /// The action of that name, of either ROS, as calls and values of the space.
+    /// Returns the action of that name, of ROS 1 or ROS 2, as calls and values of the space.
     ///
     /// # Errors
-    /// As [`Registry::get`], of one of its messages.
+    /// As [`Registry::get`], for its messages.
     pub fn action_calls(&self, name: &TypeName) -> Result<ActionCalls, DefinitionError> {
         ActionCalls::of((self.dialect, name), &self.definitions)
     }
 
-    /// As [`Registry::suggest`], among the services.
+    /// Returns a similar name as [`Registry::suggest`] does, among the services.
     pub fn suggest_service(&self, name: &TypeName) -> Option<TypeName> {
         resolve::suggest(name, self.services.keys())
     }
 
-    /// As [`standard_type`](crate::standard_type), but with the type this dialect has for a DateTime.
+    /// Returns the type of [`standard_type`](crate::standard_type), with this dialect's type for a
+    /// DateTime.
     pub fn standard_type(&self, builtin: BuiltinType, array: bool) -> Option<TypeName> {
         match (self.dialect, builtin, array) {
             (Dialect::Ros2, BuiltinType::DateTime, false) => {
@@ -299,21 +311,21 @@ impl Registry {
         }
     }
 
-    /// The name there is that is most like `name`, if one is near: the same name in another package, or at most a third
-    /// of its letters different.
+    /// Returns the known name that is most similar to `name`, if any is close: the same name in
+    /// another package, or with at most a third of the letters different.
     pub fn suggest(&self, name: &TypeName) -> Option<TypeName> {
         resolve::suggest(name, self.definitions.keys())
     }
 }
 
-/// What a peer says its type is: definitions by name, the type itself first.
+/// The type definitions of a peer by name, the type itself first.
 #[derive(Clone, Debug)]
 pub struct PeerDefinitions {
     needed: Vec<(TypeName, Arc<Definition>)>,
 }
 
 impl PeerDefinitions {
-    /// How many there are, at least one.
+    /// Returns the number of definitions, at least one.
     #[expect(clippy::len_without_is_empty, reason = "the type itself is among them")]
     #[must_use]
     pub const fn len(&self) -> usize {
@@ -321,7 +333,7 @@ impl PeerDefinitions {
     }
 }
 
-/// The parts of a connection header's definition, the type itself first.
+/// Returns the parts of a connection header's definition, the type itself first.
 fn sections<'t>(
     name: &TypeName,
     text: &'t str,

@@ -1,4 +1,4 @@
-//! From definitions to a message type: dependencies, md5, full text, flattened fields.
+//! Converts definitions to a message type: dependencies, md5, full text, flattened fields.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -14,17 +14,17 @@ const DEEPEST: usize = 32;
 pub(crate) const MOST_FIELDS: usize = 4096;
 const BIGGEST: usize = 64 << 20;
 
-/// A message with the messages in it, as the plan compiler walks it.
+/// A message with its nested messages, as the plan compiler traverses it.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) struct Shape {
     pub(crate) name: TypeName,
     pub(crate) fields: Vec<ShapeField>,
     pub(crate) constants: Vec<Constant>,
-    /// Fields when flattened, those of array elements included.
+    /// Number of flattened fields, including the fields of array elements.
     weight: usize,
-    /// The least number of bytes it takes on any wire, counting 1 for an empty message.
+    /// Minimum size in bytes on any wire, counting 1 for an empty message.
     size: usize,
-    /// Levels of messages in it, itself included.
+    /// Levels of nested messages, including itself.
     height: usize,
 }
 
@@ -52,7 +52,7 @@ impl Primitive {
         }
     }
 
-    /// Bytes of one on the wire, of a string its length alone.
+    /// Returns the size of a value on the wire; for a string only the size of its length.
     pub(crate) const fn size(self) -> usize {
         match self {
             Self::Number(number) => number.size(),
@@ -98,7 +98,7 @@ impl Clock {
     }
 }
 
-/// Looks names up in several sets of definitions, the first that has one wins.
+/// Looks up names in several sets of definitions; the first set with the name takes precedence.
 pub(crate) struct Resolver<'r> {
     dialect: Dialect,
     sets: &'r [&'r BTreeMap<TypeName, Arc<Definition>>],
@@ -143,7 +143,7 @@ impl<'r> Resolver<'r> {
             }
             _ => self.shape(name, &mut Vec::new())?,
         };
-        // Only now, as the shape has shown that nothing contains itself.
+        // After the shape, which has proven that no type contains itself.
         let md5 = match self.dialect {
             Dialect::Ros1 => self.md5(name)?,
             Dialect::Ros2 => String::new(),
@@ -190,7 +190,7 @@ impl<'r> Resolver<'r> {
             })
     }
 
-    /// `above`: the types this one is nested in.
+    /// Returns the shape of a type. `above`: the enclosing types.
     fn shape(
         &mut self,
         name: &TypeName,
@@ -246,7 +246,8 @@ impl<'r> Resolver<'r> {
         self.dialect == Dialect::Ros1 && definition.name.is("std_msgs", "Header") && field == "seq"
     }
 
-    /// As genmsg makes it: constants first, then the fields, a message's type replaced by its md5.
+    /// Returns the md5 as genmsg does: constants first, then the fields, with the md5 of a message
+    /// in place of its type.
     fn md5(&mut self, name: &TypeName) -> Result<String, DefinitionError> {
         if let Some(known) = self.md5s.get(name) {
             return Ok(known.clone());
@@ -257,7 +258,8 @@ impl<'r> Resolver<'r> {
         Ok(sum)
     }
 
-    /// What the md5 of a type is made of, and with that of its response the md5 of a service.
+    /// Returns the input of the md5 of a type. The inputs of request and response form the md5 of a
+    /// service.
     pub(crate) fn md5_text(&mut self, name: &TypeName) -> Result<String, DefinitionError> {
         let definition = self.find(name, None)?;
         let mut text = String::new();
@@ -278,7 +280,7 @@ impl<'r> Resolver<'r> {
         Ok(text.trim().to_owned())
     }
 
-    /// The text and the texts of all it needs, in the order of `gendeps --cat`.
+    /// Returns the text with the texts of all needed types, in the order of `gendeps --cat`.
     fn full_text(&self, name: &TypeName) -> Result<String, DefinitionError> {
         let mut needed = Vec::new();
         self.dependencies(name, &mut needed)?;
@@ -291,7 +293,7 @@ impl<'r> Resolver<'r> {
         Ok(text)
     }
 
-    /// What a type needs, depth first, each once.
+    /// Collects the types that a type needs, depth first, each once.
     fn dependencies(
         &self,
         name: &TypeName,
@@ -312,7 +314,7 @@ impl<'r> Resolver<'r> {
     }
 }
 
-/// The known name that is most like `name`, if one is near.
+/// Returns the known name that is most similar to `name`, if any is close.
 pub(crate) fn suggest<'k>(
     name: &TypeName,
     known: impl Iterator<Item = &'k TypeName>,
@@ -325,7 +327,7 @@ pub(crate) fn suggest<'k>(
                 return Some((1, known));
             }
             let known_text = known.to_string();
-            // As many letters differ at least.
+            // A lower bound of the number of different letters.
             let longer = known_text.len().abs_diff(wanted.len());
             let distance = (longer <= furthest).then(|| distance(&wanted, &known_text))?;
             Some((distance, known))
@@ -335,7 +337,7 @@ pub(crate) fn suggest<'k>(
     Some(nearest.clone())
 }
 
-/// Lower case digits.
+/// Returns lower case hexadecimal digits.
 pub(crate) fn hex(bytes: &[u8]) -> String {
     let mut text = String::with_capacity(bytes.len() * 2);
     for byte in bytes {
@@ -418,7 +420,7 @@ fn rank(arity: Arity) -> Rank {
     }
 }
 
-/// Letters to change, add or remove.
+/// Returns the number of letters to change, add or remove.
 fn distance(a: &str, b: &str) -> usize {
     let b: Vec<char> = b.chars().collect();
     let mut row: Vec<usize> = (0..=b.len()).collect();

@@ -1,4 +1,4 @@
-//! Services and actions: texts of several messages, parted by lines that begin with `---`.
+//! Services and actions: texts of several messages, separated by lines that begin with `---`.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -10,7 +10,7 @@ use crate::idl;
 use crate::resolve::{self, Resolver};
 use crate::{DefinitionError, Dialect, MessageType, TextKind, TypeName};
 
-/// A service type with all it needs resolved.
+/// A service type with all types it needs resolved.
 #[derive(Debug)]
 pub struct ServiceType {
     name: TypeName,
@@ -20,27 +20,28 @@ pub struct ServiceType {
 }
 
 impl ServiceType {
-    /// Package and name.
+    /// Returns package and name.
     pub fn name(&self) -> &TypeName {
         &self.name
     }
 
-    /// The 32 hex digits ROS 1 peers compare, as gensrv makes them; empty for a ROS 2 type, which has none.
+    /// Returns the 32 hex digits that ROS 1 peers compare, as in gensrv; empty for a ROS 2 type.
     pub fn md5(&self) -> &str {
         &self.md5
     }
 
-    /// Whether requests and answers are the same on the wire, by their fields and those of all messages in them.
+    /// Returns whether requests and responses have the same wire format, by their fields and the
+    /// fields of all nested messages.
     pub fn is_same(&self, other: &Self) -> bool {
         self.request.is_same(&other.request) && self.response.is_same(&other.response)
     }
 
-    /// What a caller sends, `package/NameRequest`.
+    /// Returns the request of a caller, `package/NameRequest`.
     pub fn request(&self) -> &Arc<MessageType> {
         &self.request
     }
 
-    /// What the service answers, `package/NameResponse`.
+    /// Returns the response of the service, `package/NameResponse`.
     pub fn response(&self) -> &Arc<MessageType> {
         &self.response
     }
@@ -77,50 +78,51 @@ impl ActionType {
         })
     }
 
-    /// Package and name.
+    /// Returns package and name.
     pub fn name(&self) -> &TypeName {
         &self.name
     }
 
-    /// `NameAction`: the three below in one. It never travels; its md5 is that of the action.
+    /// Returns `NameAction`, the three messages below in one. It is never sent; its md5 is that of
+    /// the action.
     pub fn action(&self) -> &Arc<MessageType> {
         &self.action
     }
 
-    /// `NameActionGoal`, the type of the topic `goal`.
+    /// Returns `NameActionGoal`, the type of the topic `goal`.
     pub fn action_goal(&self) -> &Arc<MessageType> {
         &self.action_goal
     }
 
-    /// `NameActionResult`, the type of the topic `result`.
+    /// Returns `NameActionResult`, the type of the topic `result`.
     pub fn action_result(&self) -> &Arc<MessageType> {
         &self.action_result
     }
 
-    /// `NameActionFeedback`, the type of the topic `feedback`.
+    /// Returns `NameActionFeedback`, the type of the topic `feedback`.
     pub fn action_feedback(&self) -> &Arc<MessageType> {
         &self.action_feedback
     }
 
-    /// `NameGoal`, the first part of the text.
+    /// Returns `NameGoal`, the first part of the text.
     pub fn goal(&self) -> &Arc<MessageType> {
         &self.goal
     }
 
-    /// `NameResult`, the second part.
+    /// Returns `NameResult`, the second part.
     pub fn result(&self) -> &Arc<MessageType> {
         &self.result
     }
 
-    /// `NameFeedback`, the third part.
+    /// Returns `NameFeedback`, the third part.
     pub fn feedback(&self) -> &Arc<MessageType> {
         &self.feedback
     }
 }
 
-/// The messages in which an action of ROS 2, `package/Name`, says what only it says (design.ros2.org, "Actions"). Goals and
-/// feedback travel behind the 16 bytes of an id; a result travels in a message of its own, as what comes behind its
-/// status is aligned otherwise than by itself.
+/// The messages that are specific to a ROS 2 action, `package/Name` (design.ros2.org, "Actions").
+/// Goals and feedback follow the 16 bytes of an id on the wire. A result has a message of its own,
+/// because the alignment after its status differs from that of the result alone.
 #[derive(Debug)]
 pub struct ActionMessages {
     goal: Arc<MessageType>,
@@ -141,18 +143,18 @@ impl ActionMessages {
         })
     }
 
-    /// `Name_Goal`, the first part of the text.
+    /// Returns `Name_Goal`, the first part of the text.
     pub fn goal(&self) -> &Arc<MessageType> {
         &self.goal
     }
 
-    /// `Name_GetResult_Response`: the field `status`, of `action_msgs/GoalStatus`, and the fields of `Name_Result`, the
-    /// second part of the text, below `result`.
+    /// Returns `Name_GetResult_Response`: the field `status`, of `action_msgs/GoalStatus`, and
+    /// below `result` the fields of `Name_Result`, the second part of the text.
     pub fn result_response(&self) -> &Arc<MessageType> {
         &self.result_response
     }
 
-    /// `Name_Feedback`, the third part of the text.
+    /// Returns `Name_Feedback`, the third part of the text.
     pub fn feedback(&self) -> &Arc<MessageType> {
         &self.feedback
     }
@@ -194,7 +196,7 @@ impl ServiceDefinition {
         })
     }
 
-    /// Request and response.
+    /// Returns request and response.
     pub(crate) fn parts(&self) -> [&Arc<Definition>; 2] {
         [&self.request, &self.response]
     }
@@ -231,7 +233,7 @@ impl ServiceDefinition {
     }
 }
 
-/// Goal, result and feedback of an `.action` text.
+/// Parses goal, result and feedback of an `.action` text.
 pub(crate) fn action_parts(
     dialect: Dialect,
     name: &TypeName,
@@ -248,7 +250,8 @@ pub(crate) fn action_parts(
 const RESULT_RESPONSE: &str = "_GetResult_Response";
 const ACTION_PARTS: &str = "two lines `---` expected, between goal, result and feedback";
 
-/// The messages genaction makes of an `.action` text, or those rosidl makes that are not alike for all actions.
+/// Returns the messages that genaction creates from an `.action` text, or the messages of rosidl
+/// that differ between actions.
 pub(crate) fn action(
     dialect: Dialect,
     name: &TypeName,
@@ -258,7 +261,7 @@ pub(crate) fn action(
     with_made(dialect, name, goal_result_feedback)
 }
 
-/// As [`action`], of a `.idl` text.
+/// Returns the messages of a `.idl` text, as [`action`].
 pub(crate) fn idl_action(
     name: &TypeName,
     text: &str,
@@ -272,7 +275,7 @@ pub(crate) fn idl_action(
     with_made(Dialect::Ros2, name, found.map(Arc::new))
 }
 
-/// Goal, result and feedback, and the messages that are made around them.
+/// Returns goal, result and feedback with the messages derived from them.
 fn with_made(
     dialect: Dialect,
     name: &TypeName,
@@ -294,7 +297,7 @@ fn with_made(
     Ok(named.collect())
 }
 
-/// `XAction` and what it consists of.
+/// Returns `XAction` and its parts.
 fn wrappers(x: &str) -> Vec<(&'static str, String)> {
     let status =
         |part| format!("std_msgs/Header header\nactionlib_msgs/GoalStatus status\n{x}{part}");
@@ -314,14 +317,14 @@ fn wrappers(x: &str) -> Vec<(&'static str, String)> {
     ]
 }
 
-/// A piece of a text, and how many lines of it come before.
+/// A part of a text, and the number of lines before it.
 struct Part {
     before: usize,
     text: String,
 }
 
 impl Part {
-    /// A fault is told with its line in the whole text.
+    /// Parses the part. An error contains the line number in the whole text.
     fn parse(&self, dialect: Dialect, name: &TypeName) -> Result<Arc<Definition>, DefinitionError> {
         match Definition::parse(dialect, name, &self.text) {
             Ok(definition) => Ok(Arc::new(definition)),
@@ -341,7 +344,8 @@ impl Part {
     }
 }
 
-/// The `N` pieces of a text. As in genmsg and genaction whatever follows the three dashes belongs to the line.
+/// Splits a text into `N` parts. As in genmsg and genaction, text after the three dashes belongs to
+/// the separator line.
 fn parts<const N: usize>(
     name: &TypeName,
     text: &str,

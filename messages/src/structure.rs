@@ -1,4 +1,4 @@
-//! Message types as the structures they are in OPC UA.
+//! Message types as structures of OPC UA.
 
 use uadp::BuiltinType;
 
@@ -6,44 +6,45 @@ use crate::definition::{Arity, Number, Primitive};
 use crate::resolve::{Shape, ShapeKind, flatten};
 use crate::{Leaf, MessageType, Rank, TypeName};
 
-/// A message type as a structure: its fields in the order they are encoded in, one after the other (OPC 10000-6, 5.2.6).
+/// A message type as a structure: its fields in the order of their encoding (OPC 10000-6, 5.2.6).
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Structure<'m> {
     /// The message type.
     pub name: &'m TypeName,
-    /// Its fields, messages in it as one each.
+    /// Its fields; a nested message is one field.
     pub fields: Vec<StructureMember<'m>>,
 }
 
-/// One field of a [`Structure`].
+/// A field of a [`Structure`].
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct StructureMember<'m> {
     /// Its name in the message definition.
     pub name: &'m str,
-    /// What it is, or its elements are.
+    /// Type of the field or of its elements.
     pub kind: MemberKind<'m>,
-    /// Single or array.
+    /// Single value or array.
     pub rank: Rank,
 }
 
-/// What a [`StructureMember`] is.
+/// Type of a [`StructureMember`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum MemberKind<'m> {
     /// A value of a builtin type.
     Value(BuiltinType),
-    /// A message, which stands inline.
+    /// A nested message, encoded inline.
     Message(&'m TypeName),
 }
 
 impl MessageType {
-    /// The type of the message, or of the messages in the array, at a path; of the empty path the type itself.
+    /// Returns the type of the message, or of the messages in the array, at a path; for the empty
+    /// path the type itself.
     #[must_use]
     pub fn message_at(&self, path: &str) -> Option<&TypeName> {
         self.shape_at(path).map(|shape| &shape.name)
     }
 
-    /// The message at a path, as in [`message_at`](Self::message_at), as a structure, and behind it those nested in it,
-    /// each once. Empty where no message is.
+    /// Returns the message at a path, as in [`message_at`](Self::message_at), as a structure,
+    /// followed by its nested structures, each once. Empty if the path has no message.
     #[must_use]
     pub fn structures(&self, path: &str) -> Vec<Structure<'_>> {
         let mut found = Vec::new();
@@ -53,14 +54,14 @@ impl MessageType {
         found
     }
 
-    /// The field at a path in each message of an array.
+    /// Returns the field at a path in each message of an array.
     #[must_use]
     pub fn leaf_inside(&self, array: &str, field: &str) -> Option<Leaf> {
         let (_, leaves) = self.element_leaves(array)?;
         leaves.into_iter().find(|leaf| leaf.path == field)
     }
 
-    /// The fields of one message of the array at a path, flattened as those of a message are.
+    /// Returns the flattened fields of a message of the array at a path.
     pub(crate) fn element_leaves(&self, path: &str) -> Option<(&TypeName, Vec<Leaf>)> {
         let leaf = self.leaf(path)?;
         if leaf.builtin != BuiltinType::ExtensionObject {
@@ -84,7 +85,7 @@ impl MessageType {
     }
 }
 
-/// Types nest no deeper than definitions may.
+/// Collects nested structures. The recursion is limited by the nesting limit of definitions.
 fn collect<'m>(shape: &'m Shape, found: &mut Vec<Structure<'m>>) {
     if found.iter().any(|known| *known.name == shape.name) {
         return;
@@ -100,7 +101,7 @@ fn collect<'m>(shape: &'m Shape, found: &mut Vec<Structure<'m>>) {
     }
 }
 
-/// `None` for what is not carried.
+/// Returns the member of a field, or `None` for a field that is not transferred.
 fn member(field: &crate::resolve::ShapeField) -> Option<StructureMember<'_>> {
     let rank = match field.arity {
         Arity::One => Rank::Scalar,

@@ -1,8 +1,8 @@
-//! Type hashes of ROS 2: the SHA-256 of a type's description in JSON (REP-2016, "Type Version Hash"; the description is
-//! `type_description_interfaces/msg/TypeDescription`).
+//! Type hashes of ROS 2: the SHA-256 of a type's description in JSON (REP-2016, "Type Version
+//! Hash"; the description is `type_description_interfaces/msg/TypeDescription`).
 //!
-//! The description is of names and types of fields alone: constants, defaults and comments are no part of it. It holds
-//! the descriptions of all types needed, in the order of their names.
+//! The description contains only names and types of fields, without constants, defaults and
+//! comments. It includes the descriptions of all needed types, in the order of their names.
 
 use std::collections::BTreeMap;
 use std::fmt::{self, Write as _};
@@ -15,12 +15,13 @@ use crate::definition::{Arity, Definition, Field, FieldType, Number, Primitive, 
 use crate::resolve::hex;
 use crate::{DefinitionError, DescribedField, DescribedType, Dialect, Registry, TypeName};
 
-/// The hash of a ROS 2 type, as nodes from Iron on announce it. Prints as `RIHS01_` and 64 hex digits.
+/// The hash of a ROS 2 type, as announced by nodes since Iron. Prints as `RIHS01_` and 64 hex
+/// digits.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct TypeHash([u8; 32]);
 
 impl TypeHash {
-    /// The SHA-256 itself.
+    /// Returns the SHA-256 itself.
     pub fn as_bytes(&self) -> &[u8; 32] {
         &self.0
     }
@@ -49,12 +50,12 @@ impl FromStr for TypeHash {
     }
 }
 
-/// A text that is no type hash of the version known here.
+/// Error for a text that is not a type hash of the supported version.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("`RIHS01_` and 64 hex digits expected")]
 pub struct NoTypeHash;
 
-/// The description of a message and of what it needs.
+/// Returns the description of a message and of the types it needs.
 pub(crate) fn describe(
     registry: &Registry,
     name: &TypeName,
@@ -65,7 +66,7 @@ pub(crate) fn describe(
     Ok(types.with_needed(&name.ros2()))
 }
 
-/// The description of a service and of what it needs.
+/// Returns the description of a service and of the types it needs.
 pub(crate) fn describe_service(
     registry: &Registry,
     name: &TypeName,
@@ -74,7 +75,7 @@ pub(crate) fn describe_service(
     Ok(types.with_needed(&full))
 }
 
-/// The description of an action of ROS 2 that was added, and of what it needs.
+/// Returns the description of an added ROS 2 action and of the types it needs.
 pub(crate) fn describe_action(
     registry: &Registry,
     name: &TypeName,
@@ -83,57 +84,59 @@ pub(crate) fn describe_action(
     Ok(types.with_needed(&full))
 }
 
-/// The hashes of a service and its parts, each by its ROS 2 name, such as `std_srvs/srv/SetBool_Request`.
+/// The hashes of a service and its parts, with ROS 2 names such as `std_srvs/srv/SetBool_Request`.
 ///
-/// The endpoints of a service announce those of `_Request` and `_Response`.
+/// The endpoints of a service announce the hashes of `_Request` and `_Response`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ServiceTypeHashes {
-    /// The service.
+    /// Hash of the service.
     pub service: TypeHash,
-    /// `_Request`.
+    /// Hash of `_Request`.
     pub request: TypeHash,
-    /// `_Response`.
+    /// Hash of `_Response`.
     pub response: TypeHash,
-    /// `_Event`, the message of service introspection.
+    /// Hash of `_Event`, the message of service introspection.
     pub event: TypeHash,
 }
 
-/// The hashes of an action and its parts, by names such as `nav2_msgs/action/NavigateToPose_Goal`.
+/// The hashes of an action and its parts, with names such as
+/// `nav2_msgs/action/NavigateToPose_Goal`.
 ///
-/// What the endpoints of an action announce are those of the two services' requests and responses, and of the feedback
-/// message.
+/// The endpoints of an action announce the hashes of the two services' requests and responses, and
+/// of the feedback message.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ActionTypeHashes {
-    /// The action.
+    /// Hash of the action.
     pub action: TypeHash,
-    /// `_Goal`, the first part of the text.
+    /// Hash of `_Goal`, the first part of the text.
     pub goal: TypeHash,
-    /// `_Result`, the second part.
+    /// Hash of `_Result`, the second part.
     pub result: TypeHash,
-    /// `_Feedback`, the third part.
+    /// Hash of `_Feedback`, the third part.
     pub feedback: TypeHash,
-    /// `_SendGoal`.
+    /// Hashes of `_SendGoal`.
     pub send_goal: ServiceTypeHashes,
-    /// `_GetResult`.
+    /// Hashes of `_GetResult`.
     pub get_result: ServiceTypeHashes,
-    /// `_FeedbackMessage`.
+    /// Hash of `_FeedbackMessage`.
     pub feedback_message: TypeHash,
 }
 
 impl Registry {
-    /// The type hash of a message. Definitions are taken for ROS 2's; of a registry of ROS 1 it means nothing.
+    /// Returns the type hash of a message. Definitions are treated as ROS 2 definitions; the hash
+    /// has no meaning for a registry of ROS 1.
     ///
     /// # Errors
     /// As [`Registry::get`].
     pub fn type_hash(&self, name: &TypeName) -> Result<TypeHash, DefinitionError> {
-        // It knows whether a type contains itself, which is not looked at any more below.
+        // Checks for types that contain themselves, which the code below assumes to be absent.
         self.get(name)?;
         let mut types = Described::new(self);
         types.message(name)?;
         Ok(types.hash(&name.ros2()))
     }
 
-    /// The type hashes of a service and of the messages rosidl makes of it.
+    /// Returns the type hashes of a service and of the messages that rosidl derives from it.
     ///
     /// # Errors
     /// As [`Registry::service`].
@@ -145,11 +148,12 @@ impl Registry {
         Ok(types.service_hashes(&full))
     }
 
-    /// The type hashes of an action, given by the definitions of its goal, result and feedback, and of the messages and
-    /// services rosidl makes of it (design.ros2.org, "Actions").
+    /// Returns the type hashes of an action, given by its goal, result and feedback, and of the
+    /// messages and services that rosidl derives from it (design.ros2.org, "Actions").
     ///
     /// # Errors
-    /// As [`Registry::get`], and [`DefinitionError::Syntax`] for a text that has not three parts.
+    /// As [`Registry::get`], and [`DefinitionError::Syntax`] for a text without exactly three
+    /// parts.
     pub fn action_type_hashes(
         &self,
         name: &TypeName,
@@ -160,10 +164,11 @@ impl Registry {
         Ok(types.action_hashes(&full))
     }
 
-    /// The type hashes of an action of ROS 2 that was added, as [`action_type_hashes`](Self::action_type_hashes).
+    /// Returns the type hashes of an added ROS 2 action, as
+    /// [`action_type_hashes`](Self::action_type_hashes).
     ///
     /// # Errors
-    /// As [`Registry::get`], of one of its messages.
+    /// As [`Registry::get`], for its messages.
     pub fn added_action_type_hashes(
         &self,
         name: &TypeName,
@@ -185,7 +190,7 @@ struct FieldDescription {
     type_id: u8,
     capacity: u32,
     string_capacity: u32,
-    /// Empty unless it is a message.
+    /// Empty unless the field is a message.
     nested: String,
 }
 
@@ -197,7 +202,7 @@ impl<'r> Described<'r> {
         }
     }
 
-    /// A service with all it needs, and its ROS 2 name.
+    /// Returns a service with all types it needs, and its ROS 2 name.
     fn of_service(
         registry: &'r Registry,
         name: &TypeName,
@@ -213,7 +218,7 @@ impl<'r> Described<'r> {
         Ok((types, full))
     }
 
-    /// An action of these three parts with all it needs, and its ROS 2 name.
+    /// Returns an action of these three parts with all types it needs, and its ROS 2 name.
     fn of_action(
         registry: &'r Registry,
         name: &TypeName,
@@ -247,7 +252,7 @@ impl<'r> Described<'r> {
         Self::of_action(registry, name, &[goal?, result?, feedback?])
     }
 
-    /// A type first, then what it needs in the order of the names.
+    /// Returns a type, followed by the types it needs in the order of the names.
     fn with_needed(&self, full: &str) -> Vec<DescribedType> {
         let mut needed = BTreeMap::new();
         self.needs(full, &mut needed);
@@ -270,7 +275,8 @@ impl<'r> Described<'r> {
         }
     }
 
-    /// Describes a message and what it needs. The depth is bounded, as the message has been resolved before.
+    /// Describes a message and the types it needs. The depth is bounded, as the message was
+    /// resolved before.
     fn definition(
         &mut self,
         full: &str,
@@ -285,7 +291,7 @@ impl<'r> Described<'r> {
             .map(|field| FieldDescription::of(field, dialect))
             .collect();
         if fields.is_empty() {
-            // What rosidl puts into an empty message, as C has no empty struct.
+            // The member that rosidl adds to an empty message, because C has no empty struct.
             fields.push(FieldDescription::new(
                 "structure_needs_at_least_one_member",
                 Number::UInt8.type_id(),
@@ -298,7 +304,7 @@ impl<'r> Described<'r> {
         Ok(())
     }
 
-    /// Describes a service of that name, whose request and response are described already.
+    /// Describes the service of that name. Its request and response have to be described already.
     fn service(&mut self, full: &str) {
         let part = |suffix: &str| format!("{full}_{suffix}");
         let (request, response, event) = (part("Request"), part("Response"), part("Event"));
@@ -321,7 +327,8 @@ impl<'r> Described<'r> {
         );
     }
 
-    /// Describes an action of that name, whose goal, result and feedback are described already.
+    /// Describes the action of that name. Its goal, result and feedback have to be described
+    /// already.
     fn action(&mut self, full: &str) {
         let part = |suffix: &str| format!("{full}_{suffix}");
         self.known();
@@ -372,7 +379,7 @@ impl<'r> Described<'r> {
         }
     }
 
-    /// The messages that services and actions are made with, whatever the registry has.
+    /// Describes the messages that all services and actions use, regardless of the registry.
     fn known(&mut self) {
         let field = |name: &str, number: Number| FieldDescription::new(name, number.type_id());
         let fixed = |name: &str| FieldDescription {
@@ -394,7 +401,7 @@ impl<'r> Described<'r> {
                 vec![
                     field("event_type", Number::UInt8),
                     FieldDescription::nested("stamp", TIME),
-                    // A `char[16]`, which rosidl takes for `uint8[16]`.
+                    // A `char[16]`, which rosidl treats as `uint8[16]`.
                     fixed("client_gid"),
                     field("sequence_number", Number::Int64),
                 ],
@@ -419,7 +426,8 @@ impl<'r> Described<'r> {
         TypeHash(Sha256::digest(self.json(full)).into())
     }
 
-    /// The description as Python's `json.dumps` writes it. All names are identifiers, so nothing is to be escaped.
+    /// Returns the description as Python's `json.dumps` writes it. All names are identifiers and
+    /// need no escapes.
     fn json(&self, full: &str) -> String {
         let mut needed = BTreeMap::new();
         self.needs(full, &mut needed);
@@ -514,7 +522,7 @@ impl FieldDescription {
     fn of(field: &Field, dialect: Dialect) -> Self {
         let mut found = match &field.kind {
             FieldType::Message(name) => Self::nested(&field.name, &name.ros2()),
-            // The parser takes it for `uint8`, whose values and bytes are the same.
+            // The parser treats it as `uint8`, which has the same values and bytes.
             FieldType::Primitive(_) if base(&field.written) == "byte" => {
                 Self::new(&field.name, BYTE)
             }
@@ -557,7 +565,7 @@ impl FieldDescription {
 }
 
 impl Number {
-    /// The constants of `type_description_interfaces/msg/FieldType`.
+    /// Returns the constant of `type_description_interfaces/msg/FieldType`.
     const fn type_id(self) -> u8 {
         match self {
             Self::Int8 => 2,
@@ -575,16 +583,17 @@ impl Number {
     }
 }
 
-/// A type as written without the length of an array.
+/// Returns a type as written, without the length of an array.
 fn base(written: &str) -> &str {
     written.split('[').next().unwrap_or(written)
 }
 
-/// What an action is made of, in the order of its text.
+/// The parts of an action, in the order of its text.
 const ACTION_PARTS: [&str; 3] = ["Goal", "Result", "Feedback"];
 const TIME: &str = "builtin_interfaces/msg/Time";
 const UUID: &str = "unique_identifier_msgs/msg/UUID";
-// `type_description_interfaces/msg/FieldType`, whose arrays of a type are numbered as far behind it as this:
+// Constants of `type_description_interfaces/msg/FieldType`. The arrays of a type have the number of
+// the type plus one of the last three constants.
 pub(crate) const NESTED: u8 = 1;
 /// The `char` of IDL.
 pub(crate) const CHAR: u8 = 13;

@@ -1,4 +1,4 @@
-//! What becomes of definitions: flattened, incomplete, hostile, or a peer's.
+//! Definitions that are flattened, incomplete, hostile, or from a peer.
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
@@ -488,7 +488,7 @@ fn an_action_of_ros_2_has_its_status_before_its_result() {
     let plan = Plan::compile(result, &nothing, Wire::Cdr).unwrap();
     let mut empty = Vec::new();
     plan.write(&mut NoFields, &mut empty).unwrap();
-    // The count of the sequence is aligned behind the status.
+    // The count of the sequence is aligned after the status.
     assert_eq!(empty, [0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0]);
     let error = registry
         .action_messages(&name("demo_msgs/Fibonaci"))
@@ -499,7 +499,7 @@ fn an_action_of_ros_2_has_its_status_before_its_result() {
     );
 }
 
-/// `ros/ua_msgs` is what people build who want these types in their own nodes.
+/// `ros/ua_msgs` is the package of these types for nodes of users.
 #[test]
 fn the_package_people_build_has_the_skill_messages_that_are_built_in() {
     let folder = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../ros/ua_msgs");
@@ -527,7 +527,7 @@ fn the_package_people_build_has_the_skill_messages_that_are_built_in() {
             .filter(|known| known.package() == "ua_msgs")
             .collect();
         assert_eq!(files.names().collect::<Vec<_>>(), of_ours);
-        // What actionlib wraps around the parts of an action is of other packages.
+        // The wrappers of actionlib around the parts of an action belong to other packages.
         let parts = of_ours
             .iter()
             .filter(|name| !name.name().contains("Action"));

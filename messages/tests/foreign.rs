@@ -1,6 +1,8 @@
-//! Messages there and back between this crate and other serializers, live: what `data/judge.py` says.
+//! Messages in both directions between this crate and other serializers, live, by means of
+//! `data/judge.py`.
 //!
-//! `UA_JUDGE_MESSAGES` sets how many messages of each type go each way, `UA_JUDGE_SEED` which.
+//! `UA_JUDGE_MESSAGES` sets the number of messages of each type per direction, `UA_JUDGE_SEED`
+//! their seed.
 use crate::inventor;
 use crate::support;
 
@@ -16,7 +18,8 @@ use proptest::test_runner::{RngAlgorithm, TestRng};
 use serde_json::json;
 use support::{Event, Player, Recorder, Value};
 
-/// Every kind of field, alone, in arrays of each kind, and in messages in arrays. No type of the bundle has all.
+/// Every kind of field: alone, in arrays of each kind, and in messages in arrays. No type of the
+/// bundle has all of them.
 const ROS1: &str = "bool t\nint8 a\nuint8 b\nint16 c\nuint16 d\nint32 e\nuint32 f\nint64 g\nuint64 h\nfloat32 i\nfloat64 j\n\
     string k\ntime l\nduration m\nchar n\nbyte o\nstd_msgs/Empty p\nstd_msgs/Header q\nbool[] ta\nint8[] aa\nuint8[] ba\n\
     int16[] ca\nuint16[] da\nint32[] ea\nuint32[] fa\nint64[] ga\nuint64[] ha\nfloat32[] ia\nfloat64[] ja\nstring[] ka\n\
@@ -41,7 +44,7 @@ struct Judge {
 }
 
 impl Judge {
-    /// Starts it, or says why the test is skipped.
+    /// Starts the judge, or prints the reason for which the test is skipped.
     fn start(library: &str, python: &Path, module: &str) -> Option<Self> {
         let has = Command::new(python)
             .args(["-c", &format!("import {module}")])
@@ -85,7 +88,7 @@ impl Judge {
         frame
     }
 
-    /// Messages and what is in them.
+    /// Returns messages with their fields.
     fn answers(&mut self) -> Vec<(Vec<u8>, Vec<u8>)> {
         let frame = self.hear();
         let mut rest = &frame[..];
@@ -114,7 +117,7 @@ impl Drop for Judge {
     }
 }
 
-/// As `packed` of `data/fields.py` has it.
+/// Packs events in the format of `packed` in `data/fields.py`.
 fn packed(events: &[Event]) -> Vec<u8> {
     let mut out = Vec::new();
     for event in events {
@@ -151,7 +154,7 @@ fn number(variable: &str, default: usize) -> usize {
     std::env::var(variable).map_or(default, |text| text.parse().unwrap())
 }
 
-/// What CDR pads, and others do not.
+/// Pads a message as CDR does; other formats have no padding.
 fn padded(mut bytes: Vec<u8>, wire: Wire) -> Vec<u8> {
     if wire == Wire::Cdr {
         bytes.resize(bytes.len().next_multiple_of(4), 0);
@@ -166,7 +169,7 @@ fn read(plan: &Plan, bytes: &[u8], what: &str) -> Vec<Event> {
     recorder.events
 }
 
-/// Messages the judge made: the same fields are read of them, and they are written as it wrote them.
+/// Checks messages of the judge: this crate reads the same fields, and writes the same bytes.
 fn theirs_to_ours(judge: &mut Judge, (name, plan, wire): (&TypeName, &Plan, Wire), count: usize) {
     for (at, (message, fields)) in judge.answers().into_iter().enumerate() {
         let what = format!("{name}, message {at} of {count}");
@@ -185,7 +188,7 @@ fn theirs_to_ours(judge: &mut Judge, (name, plan, wire): (&TypeName, &Plan, Wire
     }
 }
 
-/// Messages this crate made: the judge reads the same fields of them and writes them alike.
+/// Checks messages of this crate: the judge reads the same fields, and writes the same bytes.
 fn ours_to_theirs(
     judge: &mut Judge,
     (name, plan, wire): (&TypeName, &Plan, Wire),
@@ -221,7 +224,8 @@ fn ours_to_theirs(
     }
 }
 
-/// Asks about every type of the bundle and the made ones; the md5s the judge knows.
+/// Compares every type of the bundle and the test's own types, including the md5s that the judge
+/// knows.
 fn all_types(judge: &mut Judge, dialect: Dialect, made: &[(&str, &str)], least: usize) {
     let wire = match dialect {
         Dialect::Ros1 => Wire::Ros1,
@@ -235,7 +239,8 @@ fn all_types(judge: &mut Judge, dialect: Dialect, made: &[(&str, &str)], least: 
         .names()
         .map(|name| registry.get(name).unwrap())
         .collect();
-    // Of types the judge cannot know it gets the plain text; genpy wants that of what they need too.
+    // For types that the judge cannot know it gets the plain text; genpy also needs the texts of
+    // nested types.
     let text =
         |name: &TypeName, whole| match made.iter().find(|(made, _)| name.to_string() == *made) {
             Some((_, text)) if dialect == Dialect::Ros2 => *text,
@@ -282,7 +287,7 @@ fn all_types(judge: &mut Judge, dialect: Dialect, made: &[(&str, &str)], least: 
     eprintln!("{judged} types, {count} messages of each, both ways");
 }
 
-/// Messages in a frame.
+/// Number of messages in a frame.
 const BATCH: usize = 500;
 
 fn debian() -> PathBuf {

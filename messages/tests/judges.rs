@@ -1,4 +1,4 @@
-//! What other implementations say: md5 sums, field lists, and messages they wrote. See `data/make.py`.
+//! Results of other implementations: md5 sums, field lists, and messages. See `data/make.py`.
 use crate::support;
 
 use std::collections::HashMap;
@@ -79,7 +79,7 @@ fn the_md5_of_every_ros_1_type_of_the_bundle_is_the_one_others_compute() {
     assert!(table.is_empty(), "the bundle lacks {table:?}");
 }
 
-/// Type name and md5 per line.
+/// Parses a table with a type name and an md5 per line.
 fn table(text: &str) -> HashMap<String, String> {
     text.lines()
         .filter_map(|line| line.split_once(' '))
@@ -159,7 +159,8 @@ fn the_services_and_actions_of_a_real_robot_have_the_md5s_genmsg_computes() {
     }
 }
 
-/// Compares the md5s of all services and actions of a folder with those of genmsg, and says how many there are.
+/// Compares the md5s of all services and actions of a folder with the md5s of genmsg, and returns
+/// their number.
 fn judged(robot: &Path) -> Option<usize> {
     let here = Path::new(env!("CARGO_MANIFEST_DIR"));
     let genmsg = Command::new("/usr/bin/python3")
@@ -363,7 +364,7 @@ fn every_action_of_the_bundle_is_the_same_calls_and_values_in_both_ros() {
         Some(name(&format!("{}/{action}", goal.package())))
     });
     let mut judged = 0;
-    // nav_msgs/GetMap is one of ROS 1 alone.
+    // nav_msgs/GetMap exists only in ROS 1.
     for action in goals.filter(|action| ACTION_PACKAGES.contains(&action.package())) {
         let [one, two] = registries.each_ref().map(|registry| {
             let calls = registry.action_calls(&action).unwrap();

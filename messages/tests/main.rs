@@ -1,4 +1,4 @@
-//! The tests of definitions and values, one program so that they are linked once.
+//! The tests of definitions and values, in a single program so that they are linked once.
 #![expect(
     clippy::cast_possible_truncation,
     clippy::indexing_slicing,

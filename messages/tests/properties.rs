@@ -1,4 +1,4 @@
-//! Random values there and back, and bytes that are no message.
+//! Random values in both directions, and bytes that are not a message.
 use crate::inventor;
 use crate::support;
 
@@ -110,7 +110,7 @@ fn a_field_alone_is_what_it_is_in_the_whole_and_the_rest_is_zero() {
                 paths
             };
             let each = paths(|leaf| &leaf.path);
-            // A name without a dot is a field of the message itself: a value, or a message of its own.
+            // A name without a dot is a field of the message itself: a value, or a nested message.
             let outer = paths(|leaf| leaf.path.split('.').next().unwrap());
             for paths in [each, outer] {
                 let pieces = paths.into_iter().flat_map(|path| {
@@ -124,7 +124,8 @@ fn a_field_alone_is_what_it_is_in_the_whole_and_the_rest_is_zero() {
     }
 }
 
-/// What `plan` reads of a message, once it has been written and read again on its own, with zeros around it.
+/// Returns the fields that `plan` reads from a message, after they were written and read again on
+/// their own, with zeros around them.
 fn alone(plan: &Plan, whole: &Plan, bytes: &[u8], what: &str) -> Vec<Event> {
     let read = |plan: &Plan, bytes: &[u8]| {
         let mut recorder = Recorder::default();
@@ -141,7 +142,7 @@ fn alone(plan: &Plan, whole: &Plan, bytes: &[u8], what: &str) -> Vec<Event> {
     one
 }
 
-/// Whether all of `events` outside of one run of `carried` are zeros.
+/// Returns whether all of `events` outside of one run of `carried` are zeros.
 fn is_zero_but(events: &[Event], carried: &[Event]) -> bool {
     let epoch = 116_444_736_000_000_000i64.to_le_bytes();
     let zero = |event: &Event| match event {

@@ -1,4 +1,4 @@
-//! Parts of arrays and converted values, on both wires.
+//! Parts of arrays and converted values, in both wire formats.
 use crate::support;
 
 use messages::{
@@ -53,7 +53,7 @@ fn doubles(values: &[f64]) -> Event {
     Event::Packed(BuiltinType::Double, values.len(), bytes.collect())
 }
 
-/// Names after the values too, as one message or another has them.
+/// Names before and after the values, as the order varies between messages.
 const JOINTS: &str = "float64[] before\nstring[] name\nuint8 gap\nfloat64[] position\nbool[] on\nuint8[] raw\nduration[] late";
 
 fn joints(dialect: Dialect, wire: Wire) -> (Arc<MessageType>, Vec<u8>) {

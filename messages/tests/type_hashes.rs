@@ -1,4 +1,5 @@
-//! Type hashes beside those of rosbags (`data/make.py hashes`), and beside published ones of services and actions.
+//! Type hashes compared with the hashes of rosbags (`data/make.py hashes`), and with published
+//! hashes of services and actions.
 use std::collections::BTreeSet;
 
 use messages::{Dialect, Registry, TextKind, TypeName};
@@ -28,8 +29,8 @@ fn name(text: &str) -> TypeName {
     text.parse().unwrap()
 }
 
-/// rosbags counts `char` as a type of its own. To rosidl it is `uint8`: that is what makes of the `char[16]` in
-/// `service_msgs/ServiceEventInfo` the hashes of services that were seen.
+/// rosbags treats `char` as a type of its own. rosidl treats it as `uint8`: the observed hashes of
+/// services follow from `uint8[16]` in place of the `char[16]` in `service_msgs/ServiceEventInfo`.
 fn has_char(store: &[&str], type_name: &str) -> bool {
     store
         .iter()
@@ -101,7 +102,7 @@ fn the_messages_of_the_bundle_have_the_hashes_of_jazzy() {
     }
 }
 
-/// With the services others publish the hashes of.
+/// Returns a registry with the services of published hashes.
 fn services() -> Registry {
     let mut registry = Registry::bundle(Dialect::Ros2);
     let texts = [
@@ -156,8 +157,9 @@ fn services() -> Registry {
 
 #[test]
 fn services_have_the_hashes_that_nodes_of_ros_2_were_seen_to_announce() {
-    // rmw_zenoh puts the hash of a service into its keys: AddTwoInts is from its design document, the others are what
-    // projects that speak to it without ROS hold as observed (Jazzy).
+    // rmw_zenoh puts the hash of a service into its keys. AddTwoInts is from its design document,
+    // the other hashes are recorded as observed (Jazzy) in projects that communicate with it
+    // without ROS.
     let registry = services();
     for (service, hash) in [
         (
@@ -223,7 +225,8 @@ fn services_have_the_hashes_that_nodes_of_ros_2_were_seen_to_announce() {
 
 #[test]
 fn the_messages_of_an_action_have_the_hashes_rosidl_generates() {
-    // example_interfaces/action/Fibonacci as SwiftROS2 holds them, checked there against rosidl's generated files.
+    // example_interfaces/action/Fibonacci from SwiftROS2, where it was checked against rosidl's
+    // generated files.
     let text = "int32 order\n---\nint32[] sequence\n---\nint32[] sequence\n";
     let fibonacci = name("example_interfaces/Fibonacci");
     let mut registry = Registry::bundle(Dialect::Ros2);
@@ -288,7 +291,8 @@ fn what_is_missing_or_contains_itself_is_an_error_as_elsewhere() {
     assert!(unknown.to_string().contains("a/ActGoal"), "{unknown}");
 }
 
-/// The hash is the SHA-256 that Python computes of the description, in which such a field has FIELD_TYPE_CHAR (13).
+/// The hash is the SHA-256 that Python computes of the description, in which such a field has
+/// FIELD_TYPE_CHAR (13).
 #[test]
 fn a_char_of_idl_is_a_type_of_its_own_and_comes_back_from_its_description() {
     let idl = "module robot_msgs { module msg {

@@ -231,7 +231,7 @@ fn an_error_names_the_field_and_the_byte() {
     );
 }
 
-/// Seconds and nanoseconds, little endian.
+/// Returns seconds and nanoseconds, little endian.
 fn clock(sec: i64, nanosec: u32) -> Vec<u8> {
     let [a, b, c, d, ..] = sec.to_le_bytes();
     [[a, b, c, d], nanosec.to_le_bytes()].concat()
@@ -256,7 +256,7 @@ fn the_longest_shortest_and_negative_durations_and_times_of_each_ros_reach_the_o
             ros1(clock(-1, 500_000_000)),
             clock(-1, 500_000_000),
         ),
-        // ROS 1 has signed nanoseconds; neither ROS should have a second of them.
+        // ROS 1 has signed nanoseconds; in neither ROS version should they reach a second.
         ("duration", ros1(clock(0, u32::MAX)), clock(-1, 999_999_999)),
         ("duration", ros2(clock(most, u32::MAX)), longest),
         ("time", ros1(clock(unsigned, 999_999_999)), latest(most)),
@@ -418,7 +418,7 @@ fn a_message_may_cross_as_it_is() {
         let message = message(dialect, "bool b\nstring s");
         let plan = Plan::compile(&message, &Selection::Bytes, wire).unwrap();
         assert_eq!(plan.leaves(), [Leaf::bytes()]);
-        // No message of the type: nobody looks.
+        // Not a message of the type: the bytes are not checked.
         let payload = [9, 8, 7];
         assert_eq!(read(&plan, &payload).unwrap(), ["scalar ByteString 090807"]);
         let events = [scalar(Scalar::ByteString(Some(&payload)))];

@@ -1,5 +1,6 @@
-//! Measures the way of ROS messages to UADP fields and back: without arguments wall time, with `count CASE N` just work
-//! for an instruction counter, with `dump` the messages in hexadecimal for serializers of others.
+//! Measures the conversion of ROS messages to UADP fields and back. Without arguments it prints
+//! wall time, with `count CASE N` it only does the work for an instruction counter, and with `dump`
+//! it prints the messages in hexadecimal for other serializers.
 
 mod payload;
 mod tree;
@@ -17,15 +18,15 @@ use uadp::{
     PublisherId,
 };
 
-/// Of so many rounds the fastest counts: what is slower was disturbed.
+/// Number of rounds, of which the fastest counts: slower rounds were disturbed.
 const ROUNDS: u32 = 15;
-/// Of one round and case.
+/// Duration of a round of a case.
 const ROUND: Duration = Duration::from_millis(8);
 
-/// What is measured, by a name for tables and the command line.
+/// A measured case, with a name for tables and the command line.
 struct Case {
     name: String,
-    /// Whether it is measured by an instruction counter.
+    /// Whether the case is measured by an instruction counter.
     counted: bool,
     work: Box<dyn FnMut(u32)>,
 }
@@ -70,7 +71,7 @@ fn usage() -> ExitCode {
 
 const WIRES: [(Dialect, &str); 2] = [(Dialect::Ros1, "ROS 1"), (Dialect::Ros2, "CDR")];
 
-/// Of each payload: type, wire, name and bytes.
+/// Prints type, wire, name and bytes of each payload.
 fn dump() {
     for payload in payload::ALL {
         for (dialect, wire) in WIRES {
@@ -92,7 +93,7 @@ fn cases() -> Vec<Case> {
     cases
 }
 
-/// From the bytes of ROS into a NetworkMessage.
+/// Adds the cases from ROS bytes to a NetworkMessage.
 fn there(cases: &mut Vec<Case>, payload: Payload, dialect: Dialect, wire: &str) {
     let (plan, message) = payload.make(dialect);
     let mut datagram = Vec::new();
@@ -121,7 +122,7 @@ fn there(cases: &mut Vec<Case>, payload: Payload, dialect: Dialect, wire: &str) 
         false,
         Box::new(move |messages| copy(&bytes, &mut datagram, messages)),
     );
-    // A tree of structures in arrays would need the schema to come back: it has none here.
+    // A tree of structures in arrays needs the schema for the way back, which this benchmark lacks.
     if payload.large {
         return;
     }
@@ -140,7 +141,7 @@ fn there(cases: &mut Vec<Case>, payload: Payload, dialect: Dialect, wire: &str) 
     );
 }
 
-/// From the fields of a DataSetMessage into the bytes of ROS.
+/// Adds the cases from the fields of a DataSetMessage to ROS bytes.
 fn back(cases: &mut Vec<Case>, payload: Payload, dialect: Dialect, wire: &str) {
     let (plan, message) = payload.make(dialect);
     let mut datagram = Vec::new();
@@ -204,7 +205,7 @@ fn encode(plan: &Plan, message: &[u8], datagram: &mut Vec<u8>) {
     });
 }
 
-/// With the headers the bridges send.
+/// Encodes a NetworkMessage with the headers of the bridges.
 fn into_datagram(datagram: &mut Vec<u8>, fill: impl FnOnce(&mut uadp::FieldEncoder<'_>)) {
     let time = uadp::DateTime(134_234_948_967_890_123);
     let network = black_box(NetworkHeader {
@@ -237,7 +238,7 @@ fn fields(datagram: &[u8]) -> Fields<'_> {
     message.fields().unwrap()
 }
 
-/// The cases in turn, so that all of them see the same machine.
+/// Measures the cases in turn, so that all cases have the same conditions.
 fn wall(cases: &mut [Case]) {
     let counts: Vec<u32> = cases.iter_mut().map(count).collect();
     let mut best = vec![Duration::MAX; cases.len()];
@@ -254,7 +255,7 @@ fn wall(cases: &mut [Case]) {
     }
 }
 
-/// How many messages fill a round.
+/// Returns the number of messages that fill a round.
 fn count(case: &mut Case) -> u32 {
     let mut count = 1;
     loop {

@@ -1,15 +1,15 @@
-//! The messages, as a robot sends them.
+//! The messages of the benchmark, as sent by a robot.
 
 use messages::{Dialect, Plan, Registry, Selection, Source, SourceError, Wire};
 use uadp::{BuiltinType, DateTime, Scalar};
 
-/// A type, and how long its arrays are, in their order.
+/// A type, and the lengths of its arrays in order.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Payload {
     pub(crate) name: &'static str,
     of: &'static str,
     lengths: &'static [usize],
-    /// Whether an instruction counter has to wait for it too long.
+    /// Whether the message is too large for an instruction counter.
     pub(crate) large: bool,
 }
 
@@ -39,7 +39,7 @@ const fn payload(name: &'static str, of: &'static str, lengths: &'static [usize]
 }
 
 impl Payload {
-    /// The plan of its type and a message.
+    /// Returns the plan of the type and a message.
     pub(crate) fn make(&self, dialect: Dialect) -> (Plan, Vec<u8>) {
         let wire = match dialect {
             Dialect::Ros1 => Wire::Ros1,
@@ -59,7 +59,7 @@ impl Payload {
     }
 }
 
-/// Plausible values of whatever is asked for.
+/// A source of plausible values.
 struct Filler(std::slice::Iter<'static, usize>);
 
 static BYTES: [u8; 1_000_000] = [0x3F; 1_000_000];

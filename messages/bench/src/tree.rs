@@ -1,9 +1,10 @@
-//! The same with a tree of owned values between message and fields, as bridges without a plan have it.
+//! The same conversion with a tree of owned values between message and fields, as in bridges
+//! without a plan.
 
 use messages::{Plan, Sink, Source, SourceError, TypeName};
 use uadp::{BuiltinType, DateTime, FieldEncoder, NodeId, Scalar};
 
-/// A value and all in it. Arrays of numbers are one buffer, which is kind to the tree.
+/// A value with all nested values. Arrays of numbers are one buffer, which favours the tree.
 #[derive(Debug, Clone)]
 enum Value {
     Number(Number),

@@ -1,14 +1,14 @@
-//! Numbers and Booleans made others on the way.
+//! Conversion of numbers and Booleans between a field and OPC UA.
 
 use uadp::{BuiltinType, Scalar};
 
 use crate::ValueFault;
 
-/// What a value goes through between its field and OPC UA: there `value * scale + offset`, back `(value - offset) / scale`,
-/// each time rounded to the nearest where the type it becomes is an integer.
+/// The conversion of a value between its field and OPC UA: `value * scale + offset` towards OPC UA,
+/// `(value - offset) / scale` back. The result is rounded to the nearest integer for integer types.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
 pub struct Conversion {
-    /// None where nothing is scaled, so that whole numbers stay exact.
+    /// `None` without scaling, so that whole numbers stay exact.
     linear: Option<(Real, Real)>,
     invert: bool,
     to: Option<BuiltinType>,
@@ -33,41 +33,44 @@ enum Number {
 }
 
 impl Conversion {
-    /// Scaled and moved. `scale` is finite and not 0, `offset` finite: else nothing could come back.
+    /// Adds scaling and an offset. `scale` has to be finite and not 0, and `offset` finite;
+    /// otherwise the way back would not exist.
     #[must_use]
     pub const fn scaled(mut self, scale: f64, offset: f64) -> Self {
         self.linear = Some((Real(scale.to_bits()), Real(offset.to_bits())));
         self
     }
 
-    /// True becomes false, both ways.
+    /// Inverts Booleans in both directions.
     #[must_use]
     pub const fn inverted(mut self) -> Self {
         self.invert = true;
         self
     }
 
-    /// The builtin type on the side of OPC UA; without it that of the field.
+    /// Sets the builtin type in OPC UA; the default is that of the field.
     #[must_use]
     pub const fn to(mut self, builtin: BuiltinType) -> Self {
         self.to = Some(builtin);
         self
     }
 
-    /// What the type cannot hold becomes the nearest it can; without it, it is refused.
+    /// Replaces values out of the range of the type by the nearest limit; by default they are
+    /// refused.
     #[must_use]
     pub const fn clamped(mut self) -> Self {
         self.clamp = true;
         self
     }
 
-    /// Whether every value stays what it is.
+    /// Returns whether every value is unchanged.
     #[must_use]
     pub const fn is_none(&self) -> bool {
         self.linear.is_none() && !self.invert && self.to.is_none()
     }
 
-    /// What a field of that type is in OPC UA, or why it cannot go through this.
+    /// Returns the OPC UA type of a field of that type, or the reason for which it cannot be
+    /// converted.
     pub(super) fn outside(&self, field: BuiltinType) -> Result<BuiltinType, &'static str> {
         let to = self.to.unwrap_or(field);
         if self.is_none() {
@@ -85,13 +88,13 @@ impl Conversion {
         Ok(to)
     }
 
-    /// From the field to OPC UA.
+    /// Converts from the field to OPC UA.
     pub(super) fn there(&self, value: Scalar<'_>) -> Result<Scalar<'static>, ValueFault> {
         let to = self.to.unwrap_or_else(|| value.builtin_type());
         self.apply(value, to, |value, scale, offset| value * scale + offset)
     }
 
-    /// From OPC UA to a field of that type.
+    /// Converts from OPC UA to a field of that type.
     pub(super) fn back(
         &self,
         value: Scalar<'_>,
@@ -116,7 +119,8 @@ impl Conversion {
             None => number,
             Some((scale, offset)) => {
                 let moved = linear(number.real(), scale.get(), offset.get());
-                // Infinity comes of infinity; else it is more than even a Double holds.
+                // The infinity of an infinite value stays; any other infinity exceeds the range of
+                // a Double.
                 match moved.is_infinite() && number.real().is_finite() {
                     true if self.clamp => Number::Real(f64::MAX.copysign(moved)),
                     true => return Err(Number::Real(moved).out_of(to)),
@@ -128,7 +132,7 @@ impl Conversion {
     }
 }
 
-/// Whether all values of the one are values of the other too.
+/// Returns whether all values of the first type are values of the second type.
 #[expect(
     clippy::wildcard_enum_match_arm,
     reason = "numbers are told apart, and all else is none"
@@ -168,7 +172,7 @@ pub const fn is_lossless(from: BuiltinType, to: BuiltinType) -> bool {
     }
 }
 
-/// Whether values of the type can be scaled and become other numbers.
+/// Returns whether values of the type can be scaled and converted to other numbers.
 #[must_use]
 pub const fn is_number(builtin: BuiltinType) -> bool {
     is_lossless(builtin, builtin)
@@ -255,7 +259,7 @@ impl Number {
         Ok(value.clamp(least, most))
     }
 
-    /// Infinity and NaN are values of a Float.
+    /// Converts to a Float. Infinity and NaN are valid values of a Float.
     fn float(self, clamp: bool) -> Result<f32, ValueFault> {
         let value = self.real();
         #[expect(

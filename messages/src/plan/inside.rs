@@ -1,4 +1,4 @@
-//! A field of one message of an array.
+//! A field of a message in an array.
 
 use std::convert::Infallible;
 
@@ -8,11 +8,11 @@ use super::shaped::{ShapingSink, Stop, wide};
 use super::{Op, Part, Plan, read};
 use crate::{Leaf, MessageType, PlanError, Rank, ReadError, Sink, TypeName, ValueFault};
 
-/// Which field of which message of an array.
+/// Selects a field of a message in an array.
 #[derive(Clone, Debug)]
 pub(super) struct Inside {
     which: Which,
-    /// How many values of the message stand before the field.
+    /// Number of values of the message before the field.
     target: usize,
     /// The field in its message.
     pub(super) leaf: Leaf,
@@ -23,7 +23,7 @@ pub(super) struct Inside {
 #[derive(Clone, Debug)]
 enum Which {
     At(usize),
-    /// The message in which the text is the value of that number.
+    /// The message whose value with the index `by` is the text `name`.
     Named {
         by: usize,
         name: String,
@@ -74,7 +74,7 @@ impl Inside {
                 return Err(fault("gives a field of one message, and not of several"));
             }
         };
-        // The values of messages in the message would be counted among its own.
+        // The values of messages in the message would be counted among its own values.
         let mut before = leaves.iter().take(last + 1);
         if before.any(|leaf| leaf.builtin == BuiltinType::ExtensionObject) {
             return Err(fault("has an array of messages in each, before the field"));
@@ -87,7 +87,7 @@ impl Inside {
         })
     }
 
-    /// Which message it is in this payload.
+    /// Returns the index of the message in this payload.
     pub(super) fn find<E>(
         &self,
         plan: &Plan,
@@ -116,7 +116,7 @@ impl Inside {
         })
     }
 
-    /// A sink that hands on the field of that message alone.
+    /// Returns a sink that passes on only the field of that message.
     pub(super) fn picking<'p, 's, S: Sink>(
         &self,
         at: usize,
@@ -132,20 +132,20 @@ impl Inside {
     }
 }
 
-/// Counts messages and the values in them, and shows one value of each.
+/// Counts messages and their values, and passes on one value of each message.
 struct Counting<W> {
-    /// The value that is shown.
+    /// Index of the value that is passed on.
     wanted: usize,
-    /// The message.
+    /// Index of the message.
     at: usize,
-    /// The value that comes next in it.
+    /// Index of the next value in the message.
     value: usize,
-    /// Whether the elements that come are of the value that is shown.
+    /// Whether the next elements belong to the value that is passed on.
     taken: bool,
     with: W,
 }
 
-/// What is done with the one value of each message.
+/// The use of the selected value of each message.
 trait Shown {
     type Error;
     fn count(&mut self, _messages: usize) -> Result<(), Self::Error> {
@@ -222,7 +222,7 @@ impl<W: Shown> Sink for Counting<W> {
     }
 }
 
-/// Looks for the message with a text.
+/// Finds the message with a text.
 struct Finder<'n> {
     name: &'n str,
     found: Option<usize>,
@@ -256,7 +256,7 @@ impl Shown for Finder<'_> {
     }
 }
 
-/// Hands on the value of one message.
+/// Passes on the value of a message.
 struct Picker<'p, 's, S> {
     at: usize,
     sink: &'p mut ShapingSink<'s, S>,

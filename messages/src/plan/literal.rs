@@ -1,4 +1,4 @@
-//! Constants of a template: from texts to values of their fields.
+//! Constants of a template: conversion of texts to values of their fields.
 
 use uadp::{BuiltinType, Scalar};
 
@@ -7,24 +7,25 @@ use crate::definition::{Clock, Constant, Number, Primitive};
 use crate::resolve::{Shape, ShapeKind};
 use crate::{MessageType, PlanError, Source, SourceError, TypeName, millis_to_duration};
 
-/// A value as people write it.
+/// A value as written by users.
 ///
-/// A number is decimal, or hexadecimal after `0x`; a Boolean is `true` or `false`; a duration has its unit: `500ms`, `2s`,
-/// `1.5min`, `1h`. The name of a constant of the message, or of a message around it, stands for its value.
+/// A number is decimal, or hexadecimal after `0x`. A Boolean is `true` or `false`. A duration has
+/// its unit: `500ms`, `2s`, `1.5min`, `1h`. The name of a constant of the message, or of an
+/// enclosing message, stands for its value.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Literal {
-    /// Of a field that is one value.
+    /// The value of a field that is not an array.
     One(String),
-    /// Of a field that is an array, bytes included.
+    /// The elements of a field that is an array, including bytes.
     List(Vec<String>),
 }
 
-/// A constant and where it belongs.
+/// A constant and its field.
 pub(super) struct Given<'m> {
     message: &'m TypeName,
     path: &'m str,
     literal: &'m Literal,
-    /// What may be named, innermost first.
+    /// The constants that may be named, innermost first.
     names: Vec<&'m Constant>,
 }
 
@@ -100,7 +101,7 @@ impl<'m> Given<'m> {
         Ok(packed)
     }
 
-    /// The text, or what the constant it names has.
+    /// Returns the text, or the value of the constant that it names.
     fn said<'t>(&'t self, primitive: Primitive, text: &'t str) -> &'t str {
         let named = self.names.iter().find(|constant| {
             let texts = constant.builtin == BuiltinType::String;
@@ -109,7 +110,7 @@ impl<'m> Given<'m> {
         named.map_or(text, |constant| &constant.value)
     }
 
-    /// With its article.
+    /// Returns the expected value with its article.
     fn expected(&self, primitive: Primitive) -> String {
         let told = match primitive {
             Primitive::Number(number) => expected(number).to_owned(),
@@ -145,7 +146,7 @@ impl<'m> Given<'m> {
     }
 }
 
-/// At most 64 characters of a text; `...` stands where it was cut.
+/// Returns at most 64 characters of a text; `...` marks a cut.
 fn short(text: &str) -> String {
     let mut short: String = text.chars().take(64).collect();
     if short.len() < text.len() {
@@ -154,7 +155,7 @@ fn short(text: &str) -> String {
     short
 }
 
-/// Most names of constants an error tells.
+/// Maximum number of constant names in an error.
 const TOLD: usize = 12;
 
 const fn expected(number: Number) -> &'static str {
@@ -173,7 +174,7 @@ const fn expected(number: Number) -> &'static str {
     }
 }
 
-/// The constant of one field.
+/// The constant of a field.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) enum Typed {
     One(Value),
@@ -208,10 +209,10 @@ impl Typed {
     }
 }
 
-/// Gives a constant as if it crossed.
+/// Supplies a constant like a received value.
 pub(super) struct Player<'t> {
     typed: &'t Typed,
-    /// The element that comes next.
+    /// Index of the next element.
     next: usize,
 }
 
@@ -274,7 +275,7 @@ fn parse(primitive: Primitive, text: &str) -> Option<Value> {
     }
 }
 
-/// A number and its bytes, little endian.
+/// Returns a number and its bytes, little endian.
 fn number(number: Number, text: &str) -> Option<(Scalar<'static>, Vec<u8>)> {
     macro_rules! whole {
         ($variant:ident, $type:ty) => {{
@@ -329,7 +330,7 @@ fn whole(text: &str) -> Option<i128> {
     Some(sign * value.filter(|_| plain)?)
 }
 
-/// A number that overflows to infinity is none.
+/// Parses a number; a number that overflows to infinity is invalid.
 fn float(text: &str) -> Option<f64> {
     match text {
         ".inf" | "inf" | "+.inf" => Some(f64::INFINITY),
@@ -339,7 +340,7 @@ fn float(text: &str) -> Option<f64> {
     }
 }
 
-/// A duration in milliseconds, that fits a ROS duration.
+/// Parses a duration that fits a ROS duration, in milliseconds.
 fn millis(text: &str) -> Option<f64> {
     const UNITS: [(&str, f64); 4] = [("ms", 1.0), ("s", 1e3), ("min", 60e3), ("h", 3600e3)];
     if text == "0" {

@@ -1,4 +1,4 @@
-//! A message type compiled for one wire and selection.
+//! A message type compiled for one wire format and selection.
 
 mod conversion;
 mod inside;
@@ -28,81 +28,84 @@ use crate::{
     Dialect, Leaf, MessageType, PlanError, Rank, ReadError, Sink, Source, TypeName, WriteError,
 };
 
-/// What the bytes of a message are.
+/// The wire format of a message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Wire {
     /// The body of a ROS 1 message, without its 4 byte length. Read to its last byte.
     Ros1,
-    /// The 4 byte encapsulation header and the CDR. Both byte orders are read; little endian is written, padded with
-    /// zeros to a multiple of 4. Whatever follows the last field is ignored, as DDS readers do.
+    /// The 4 byte encapsulation header and the CDR. Both byte orders are read; little endian is
+    /// written, padded with zeros to a multiple of 4. Bytes after the last field are ignored, as in
+    /// DDS readers.
     Cdr,
 }
 
-/// Which fields of a message cross.
+/// The fields of a message that are transferred.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
 pub enum Selection {
-    /// All of them.
+    /// All fields.
     Whole,
-    /// The one of that path; where that is a message of its own, all fields of it.
+    /// The field of that path, or all fields of the message at that path.
     Field(String),
-    /// The one field of that path, which is no message: a part of it, where it is an array, and converted.
+    /// The field of that path, which is not a message: converted, and for an array optionally a
+    /// part of it.
     Value {
         /// The path.
         field: String,
-        /// What of an array crosses; `None`: all of it.
+        /// The part of an array; `None` for the whole field.
         part: Option<Part>,
-        /// What each value goes through.
+        /// The conversion of each value.
         conversion: Conversion,
     },
-    /// Several fields, in that order; where a message is written all others are zero or empty.
+    /// Several fields, in that order; all other fields of a written message are zero or empty.
     Fields(Vec<Selected>),
-    /// The message, or the one at that path, as one structure.
+    /// The message, or the message at that path, as a structure.
     Structure(Option<String>),
-    /// A message of constants, to be written: `fields` take the value, or without any no value crosses; the fields of
-    /// `rest` have what stands there, all others are zero or empty. Read, it is as [`Selection::Fields`].
+    /// A message of constants, to be written: `fields` take the value; without `fields` no value is
+    /// transferred. The fields of `rest` have the given constants, all others are zero or empty.
+    /// Reading is as with [`Selection::Fields`].
     Template {
-        /// The fields that hold the value; none where the message is the same each time.
+        /// The fields that hold the value; empty if the message is always the same.
         fields: Vec<Selected>,
-        /// Path of a field -> its value.
+        /// Values by path of the field.
         rest: BTreeMap<String, Literal>,
     },
-    /// The message as it is on the wire, as one ByteString: no field of it is looked at, so whoever writes it says what
-    /// is in it. Of CDR the encapsulation header is part of it.
+    /// The message as on the wire, as one ByteString. No field is checked, so the writer is
+    /// responsible for the content. For CDR the encapsulation header is part of it.
     Bytes,
 }
 
-/// Reads and writes the messages of one type on one wire.
+/// Reads and writes the messages of one type in one wire format.
 ///
-/// Compile once, then share: it keeps nothing from message to message.
+/// Compile once, then share: a plan keeps no state between messages.
 #[derive(Clone, Debug)]
 pub struct Plan {
     wire: Wire,
     body: Body,
     leaves: Vec<Leaf>,
-    /// Paths of all fields, for errors; `Op::leaf` counts in it.
+    /// Paths of all fields, for errors; `Op::leaf` is an index into it.
     paths: Vec<String>,
 }
 
 #[derive(Clone, Debug)]
 enum Body {
     Steps(Vec<Op>),
-    /// Fields that do not all cross as they are, or not in their order.
+    /// Selected fields, unless all are transferred unchanged and in message order.
     Several(Box<Several>),
-    /// A message as one structure.
+    /// A message as a structure.
     Structure(TypeName, Vec<Op>),
-    /// One field, of which a part crosses or which is converted.
+    /// A field that is converted or of which a part is transferred.
     Shaped(Box<Shaped>),
-    /// The message crosses as it is.
+    /// The message is transferred unchanged.
     Bytes,
 }
 
-/// One step. The steps of a message in an array follow its [`What::Messages`].
+/// A step. The steps of a message in an array follow its [`What::Messages`].
 #[derive(Clone, Debug)]
 struct Op {
     what: What,
-    /// Whether the value crosses; else it is skipped when read and zero when written.
+    /// Whether the value is transferred; otherwise it is skipped when read and zero when written.
     carry: bool,
-    /// What stands there when it is written and does not cross.
+    /// The written constant of a field that is not transferred.
     constant: Option<Box<Typed>>,
     /// Index of the field in the flattened message.
     leaf: usize,
@@ -111,9 +114,10 @@ struct Op {
 #[derive(Clone, Debug)]
 enum What {
     One(Primitive),
-    /// The next so many steps are each one number of that kind, and all cross: they may be moved at once.
+    /// The given number of steps after this step are single numbers of that kind, and all are
+    /// transferred: they may be moved at once.
     Run(Number, u16),
-    /// Array of elements that are on the wire as in OPC UA.
+    /// Array of elements with the same format on the wire and in OPC UA.
     Packed(Number, Len),
     /// Array of `uint8`: a ByteString.
     Bytes(Len),
@@ -126,14 +130,16 @@ enum What {
         steps: usize,
         least: usize,
     },
-    /// Bytes without meaning: `seq`, the byte of an empty message, and on ROS 1 what is not selected.
+    /// Bytes without meaning: `seq`, the byte of an empty message, and on ROS 1 all unselected
+    /// bytes.
     Skip {
         align: usize,
         bytes: usize,
     },
 }
 
-/// Elements of a message, all its arrays together, that take no byte: as many as the sender says, and nothing shows it.
+/// Limit of elements without bytes over all arrays of a message: their number cannot be checked
+/// against the length of the message.
 const MAX_WITHOUT_BYTES: usize = 65_536;
 
 #[derive(Clone, Copy, Debug)]
@@ -143,8 +149,11 @@ enum Len {
 }
 
 impl Plan {
+    /// Compiles a plan.
+    ///
     /// # Errors
-    /// A path the type has not, a constant that is no value of its field, or a wire of the other ROS.
+    /// A path that the type does not have, a constant that is not a value of its field, or the wire
+    /// format of the other ROS version.
     pub fn compile(
         message: &Arc<MessageType>,
         selection: &Selection,
@@ -225,15 +234,15 @@ impl Plan {
         }
     }
 
-    /// The fields that cross, in the order they do.
+    /// Returns the transferred fields in order.
     pub fn leaves(&self) -> &[Leaf] {
         &self.leaves
     }
 
-    /// Reads a message and hands each field to `sink`.
+    /// Reads a message and passes each field to `sink`.
     ///
-    /// A length is believed only after it was compared with the bytes that are left. When it errs the sink may have
-    /// taken some fields already.
+    /// A length is used only after comparison with the remaining bytes. After an error the sink may
+    /// have received some fields already.
     pub fn read<S: Sink>(&self, payload: &[u8], sink: &mut S) -> Result<(), ReadError<S::Error>> {
         match &self.body {
             Body::Steps(ops) => read::read(self, ops, payload, sink),
@@ -249,7 +258,8 @@ impl Plan {
         }
     }
 
-    /// Takes the fields from `source` and appends the message to `out`; on error `out` is as it was.
+    /// Takes the fields from `source` and appends the message to `out`; on error `out` is
+    /// unchanged.
     pub fn write<'a, S: Source<'a>>(
         &self,
         source: &mut S,
@@ -271,7 +281,7 @@ impl Plan {
     }
 }
 
-/// The steps of the whole message or one field, and the fields that cross.
+/// Returns the steps of the whole message or one field, and the transferred fields.
 fn steps(
     message: &Arc<MessageType>,
     selection: &Selection,
@@ -291,7 +301,7 @@ fn steps(
     Ok((ops, leaves))
 }
 
-/// The steps of a message of which some fields cross, and others are constants.
+/// Returns the steps of a message with transferred fields and constants.
 fn ops(
     message: &MessageType,
     (carried, given): (Vec<Range<usize>>, BTreeMap<usize, Given<'_>>),
@@ -316,7 +326,7 @@ fn ops(
     Ok(ops)
 }
 
-/// The fields of a path: one, or those of a message, which follow each other.
+/// Returns the fields of a path: one field, or the consecutive fields of a message.
 fn range(message: &MessageType, path: &str) -> Result<Range<usize>, PlanError> {
     let leaves = message.leaves();
     let inside = |leaf: &Leaf| leaf.is_inside(path);
@@ -345,7 +355,7 @@ fn index(message: &MessageType, path: &str) -> Result<usize, PlanError> {
         })
 }
 
-/// The constants by the index of their field.
+/// Returns the constants by the index of their field.
 fn given<'m>(
     message: &'m MessageType,
     (fields, rest): (&[Selected], &'m BTreeMap<String, Literal>),
@@ -362,7 +372,7 @@ fn given<'m>(
                 path: path.clone(),
             });
         }
-        // No messages stand there without a constant as well.
+        // An array of messages is empty even without a constant.
         let is_open = leaf.is_some_and(|leaf| {
             leaf.builtin == BuiltinType::ExtensionObject && leaf.rank == Rank::Array { fixed: None }
         });
@@ -372,7 +382,7 @@ fn given<'m>(
     each.filter_map(Result::transpose).collect()
 }
 
-/// The steps with a [`What::Run`] before those that may be moved at once.
+/// Inserts a [`What::Run`] before steps that may be moved at once.
 fn coalesced(mut ops: &[Op]) -> Vec<Op> {
     let mut all = Vec::with_capacity(ops.len());
     while let Some((op, after)) = ops.split_first() {
@@ -419,14 +429,14 @@ fn coalesced(mut ops: &[Op]) -> Vec<Op> {
 
 struct Compiler<'m> {
     wire: Wire,
-    /// Which fields cross.
+    /// Ranges of transferred fields.
     carried: Vec<Range<usize>>,
     given: BTreeMap<usize, Given<'m>>,
     leaf: usize,
     ops: Vec<Op>,
-    /// Where the steps of the innermost message in an array begin.
+    /// Start of the steps of the innermost message in an array.
     body: usize,
-    /// The first that was met.
+    /// The first error.
     fault: Option<PlanError>,
 }
 
@@ -443,7 +453,8 @@ impl Compiler<'_> {
         }
     }
 
-    /// Returns the least number of bytes the message takes. `element`: it is one of an array.
+    /// Adds the steps of a message and returns its minimum length in bytes. `element`: whether the
+    /// message is an element of an array.
     fn message(&mut self, shape: &Shape, element: bool) -> usize {
         if shape.fields.is_empty() && self.wire == Wire::Cdr {
             self.push(What::Skip { align: 1, bytes: 1 });
@@ -484,7 +495,8 @@ impl Compiler<'_> {
         });
         let outer = std::mem::replace(&mut self.body, head + 1);
         let each = self.message(inner, true);
-        // What follows is no part of the element, so no skip of the element may grow by it.
+        // The following steps are not part of the element, so no skip of the element may be
+        // extended.
         self.body = outer.max(self.ops.len());
         let all = self.ops.len() - head - 1;
         if let Some(Op {
@@ -555,7 +567,8 @@ impl Compiler<'_> {
         }
     }
 
-    /// On ROS 1, where nothing is aligned, joins the last step, of `bytes` bytes, with the skip before it.
+    /// On ROS 1, which has no alignment, joins the last step, of `bytes` bytes, with the previous
+    /// skip.
     fn shorten(&mut self, bytes: usize) {
         let skips = |op: &Op| {
             let passed = !op.carry && op.constant.is_none();
@@ -594,7 +607,7 @@ fn length(arity: Arity) -> Option<Len> {
 }
 
 impl Primitive {
-    /// What one is aligned to in CDR.
+    /// Returns the alignment of a value in CDR.
     const fn align(self) -> usize {
         match self {
             Self::Number(number) => number.size(),

@@ -1,4 +1,4 @@
-//! From bytes into a sink.
+//! Decodes bytes into a sink.
 
 use std::marker::PhantomData;
 
@@ -8,7 +8,7 @@ use super::{Len, MAX_WITHOUT_BYTES, Op, Plan, What, Wire};
 use crate::definition::{Clock, Number, Primitive};
 use crate::{Fault, ReadError, Sink, TypeName, duration_to_millis, time_to_date_time};
 
-/// How numbers lie in the payload.
+/// The layout of numbers in the payload.
 trait Layout {
     const ALIGNED: bool;
     const SWAPPED: bool;
@@ -41,15 +41,15 @@ impl<E> From<Fault> for Stop<E> {
 }
 
 struct Reader<'p, 's, L, S> {
-    /// The payload after the encapsulation header: offset 0 of the alignment.
+    /// The payload after the encapsulation header, which is offset 0 of the alignment.
     data: &'p [u8],
     at: usize,
     /// The field being read.
     leaf: Option<usize>,
     sink: &'s mut S,
-    /// Elements put right for the sink: swapped numbers, Booleans that are neither 0 nor 1.
+    /// Normalized elements for the sink: swapped numbers, and Booleans that were neither 0 nor 1.
     scratch: Vec<u8>,
-    /// Elements without bytes that may still come.
+    /// Number of elements without bytes that are still accepted.
     without_bytes: usize,
     layout: PhantomData<L>,
 }
@@ -63,7 +63,7 @@ pub(super) fn read<S: Sink>(
     as_wire(plan, (ops, false), payload, sink)
 }
 
-/// Reads a message as one structure.
+/// Reads a message as a structure.
 pub(super) fn structure<S: Sink>(
     plan: &Plan,
     (of, ops): (&TypeName, &[Op]),
@@ -79,7 +79,7 @@ pub(super) fn structure<S: Sink>(
     sink.end_structure().map_err(refused)
 }
 
-/// `inside`: the fields are those of a structure.
+/// Reads a message. `inside`: whether the fields belong to a structure.
 fn as_wire<S: Sink>(
     plan: &Plan,
     (ops, inside): (&[Op], bool),
@@ -104,7 +104,7 @@ fn as_wire<S: Sink>(
     }
 }
 
-/// `offset`: where in the payload `data` begins.
+/// Runs the steps. `offset`: the start of `data` in the payload.
 fn run<L: Layout, S: Sink>(
     plan: &Plan,
     (ops, inside): (&[Op], bool),
@@ -141,7 +141,7 @@ fn run<L: Layout, S: Sink>(
 }
 
 impl<'p, L: Layout, S: Sink> Reader<'p, '_, L, S> {
-    /// `inside`: the steps are those of an element.
+    /// Runs steps. `inside`: whether the steps belong to an element.
     fn steps(&mut self, mut ops: &[Op], inside: bool) -> Result<(), Stop<S::Error>> {
         while let Some((op, after)) = ops.split_first() {
             ops = after;
@@ -185,7 +185,8 @@ impl<'p, L: Layout, S: Sink> Reader<'p, '_, L, S> {
         Ok(())
     }
 
-    /// `carry`: whether within an element already, if the value crosses at all.
+    /// Reads an array of messages. `carry`: whether the reader is within an element already, or
+    /// `None` if the value is skipped.
     fn messages(
         &mut self,
         of: &TypeName,
@@ -212,8 +213,8 @@ impl<'p, L: Layout, S: Sink> Reader<'p, '_, L, S> {
         }
     }
 
-    /// Reads one value and hands it to `give`, a method of the sink. Each kind is handed over where it is read: a
-    /// Scalar that only passes through registers is what makes small messages cheap.
+    /// Reads a value and passes it to `give`, a method of the sink. Each kind is passed on where
+    /// it is read: a Scalar that only passes through registers makes small messages cheap.
     #[inline]
     fn one<G>(&mut self, primitive: Primitive, give: G) -> Result<(), Stop<S::Error>>
     where
@@ -263,7 +264,8 @@ impl<'p, L: Layout, S: Sink> Reader<'p, '_, L, S> {
         given.map_err(Stop::Sink)
     }
 
-    /// Hands over `count` numbers at once, or none: then they are read one by one, and what is wrong is found where it is.
+    /// Passes on `count` numbers at once. If this is not possible, nothing is consumed; then the
+    /// numbers are read individually, which locates errors.
     #[inline]
     fn run(&mut self, number: Number, count: u16) -> Result<bool, S::Error> {
         if L::SWAPPED {
@@ -296,7 +298,7 @@ impl<'p, L: Layout, S: Sink> Reader<'p, '_, L, S> {
 
     fn packed(&mut self, number: Number, len: Len, carry: bool) -> Result<(), Stop<S::Error>> {
         let count = self.count(len)?;
-        // Elements that are not there are not aligned to.
+        // An empty array has no alignment.
         let align = if count == 0 { 1 } else { number.size() };
         let bytes = self.take(align, product(count, number.size())?)?;
         if !carry {
@@ -353,7 +355,7 @@ impl<'p, L: Layout, S: Sink> Reader<'p, '_, L, S> {
     fn narrow(&mut self, bound: u32) -> Result<&'p str, Fault> {
         let said = self.u32()?;
         let mut bytes = self.take(1, length(said)?)?;
-        // Some writers give an empty CDR string the length 0 instead of a NUL.
+        // Some writers encode an empty CDR string with the length 0 instead of a NUL.
         if L::ALIGNED && !bytes.is_empty() {
             bytes = bytes.strip_suffix(&[0]).ok_or(Fault::Terminator)?;
         }
@@ -379,7 +381,7 @@ impl<'p, L: Layout, S: Sink> Reader<'p, '_, L, S> {
         String::from_utf16(&units).map_err(|_| Fault::Text)
     }
 
-    /// The length of an array, within its bound.
+    /// Returns the length of an array, within its bound.
     fn count(&mut self, len: Len) -> Result<usize, Fault> {
         match len {
             Len::Fixed(count) => length(count),
@@ -391,7 +393,8 @@ impl<'p, L: Layout, S: Sink> Reader<'p, '_, L, S> {
         }
     }
 
-    /// Errs when `count` elements of at least `least` bytes cannot be there, or are too many where they have none.
+    /// Fails if `count` elements of at least `least` bytes exceed the payload, or if there are too
+    /// many elements without bytes.
     fn room(&mut self, count: usize, least: usize) -> Result<(), Fault> {
         if least == 0 {
             let left = self.without_bytes.checked_sub(count);

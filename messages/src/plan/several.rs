@@ -1,4 +1,4 @@
-//! Several fields of one message, each perhaps with a part and a conversion of its own.
+//! Several fields of a message, each with an optional part and conversion.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -11,19 +11,19 @@ use crate::{
     Leaf, MessageType, PlanError, ReadError, Sink, Source, SourceError, WriteError, WriteFault,
 };
 
-/// One of several fields.
+/// A selected field, of several.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
 pub struct Selected {
-    /// The path of a field, or of a message in the message.
+    /// The path of a field, or of a nested message.
     pub field: String,
-    /// What of an array crosses; `None`: all of it.
+    /// The part of an array; `None` for the whole field.
     pub part: Option<Part>,
-    /// What each value goes through.
+    /// The conversion of each value.
     pub conversion: Conversion,
 }
 
 impl Selected {
-    /// The field as it is.
+    /// Selects a whole field without conversion.
     #[must_use]
     pub fn whole(field: &str) -> Self {
         Self {
@@ -33,7 +33,7 @@ impl Selected {
         }
     }
 
-    /// Whether it crosses as it is.
+    /// Returns whether the field is transferred unchanged.
     #[must_use]
     pub fn is_plain(&self) -> bool {
         self.part.is_none() && self.conversion.is_none()
@@ -51,19 +51,20 @@ impl Selected {
     }
 }
 
-/// Fields that are read one after the other, in whatever order they stand in the message.
+/// Fields that are read in the given order, independent of their order in the message.
 #[derive(Clone, Debug)]
 pub(super) struct Several {
     plans: Vec<Plan>,
-    /// The fields that are written, and what becomes of each; or why none is.
+    /// The steps and conversions of the written fields, or the reason for which nothing can be
+    /// written.
     write: Result<(Vec<Op>, Vec<Shaping>), WriteFault>,
 }
 
-/// What becomes of one field, and its builtin type in OPC UA where it is converted.
+/// The conversion of a field with its builtin type in OPC UA, if it is converted.
 type Shaping = Option<(Conversion, BuiltinType)>;
 
-/// The body of a plan, and the fields that cross, in the order given. Where the message is written, the fields of `rest`
-/// are what stands there.
+/// Returns the body of a plan, and the transferred fields in the given order. In a written message
+/// the fields of `rest` have these constants.
 pub(super) fn compile(
     message: &Arc<MessageType>,
     (selected, rest): (&[Selected], &BTreeMap<String, Literal>),
@@ -107,7 +108,7 @@ pub(super) fn compile(
     Ok((body, leaves))
 }
 
-/// Has what is converted come one by one, as what is not the same on the wire.
+/// Changes the steps of converted arrays, so that their elements are passed on individually.
 fn convert(ops: &mut [Op], message: &MessageType, leaves: &[Leaf], shapings: &[Shaping]) {
     let converted: Vec<&str> = leaves
         .iter()
@@ -168,19 +169,19 @@ impl Several {
     }
 }
 
-/// A source of which each field goes through a conversion of its own.
+/// A source that applies a separate conversion to each field.
 struct ConvertingSource<'s, S> {
     source: &'s mut S,
-    /// Of the fields that are still to come.
+    /// Conversions of the remaining fields.
     shapings: std::slice::Iter<'s, Shaping>,
-    /// That of the field being read.
+    /// Conversion of the current field.
     now: Shaping,
-    /// Whether within a structure, of which nothing is converted.
+    /// Whether the source is within a structure, in which nothing is converted.
     inside: bool,
 }
 
 impl<S> ConvertingSource<'_, S> {
-    /// The next field, if it is one.
+    /// Advances to the next field, unless within a structure.
     fn step(&mut self) {
         if !self.inside {
             self.now = self.shapings.next().copied().flatten();

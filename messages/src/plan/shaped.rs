@@ -1,4 +1,5 @@
-//! One field of which a part crosses, or which is converted: a sink and a source around those of the caller.
+//! A field that is converted or of which a part is transferred: a sink and a source around the
+//! caller's.
 
 use std::convert::Infallible;
 
@@ -12,38 +13,39 @@ use crate::{
     WriteError,
 };
 
-/// What of an array crosses. It is read only: the rest of the array has no value that could be written.
+/// A part of an array. It can only be read: the values of the rest of the array are unknown.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
 pub enum Part {
-    /// One element, from 0: `position[2]`.
+    /// An element, from 0: `position[2]`.
     Element(u32),
-    /// The element that stands where another array of the same message has this text: `position[name=joint_3]`.
+    /// The element at the index at which another array of the same message has this text:
+    /// `position[name=joint_3]`.
     Named {
         /// The field with the names, beside the array.
         by: String,
         /// The text.
         name: String,
     },
-    /// The elements from the one to before the other, as many of them as there are: `ranges[0:90]`.
+    /// The elements of a range, as far as they exist: `ranges[0:90]`.
     Slice {
-        /// The first.
+        /// Index of the first element.
         from: u32,
-        /// The one after the last; greater than `from`.
+        /// Index after the last element; greater than `from`.
         to: u32,
     },
-    /// A field of one message of an array: `points[2].x`, or `status[name=lidar].level`, where the name stands in the
-    /// message itself.
+    /// A field of a message of an array: `points[2].x`, or `status[name=lidar].level` with the
+    /// name in the message itself.
     Inside {
-        /// Which message: [`Part::Element`] or [`Part::Named`].
+        /// The message: [`Part::Element`] or [`Part::Named`].
         of: Box<Self>,
-        /// The path of the field in it.
+        /// The path of the field in the message.
         field: String,
     },
 }
 
 impl Part {
-    /// Splits `position[2]` into the field and its part; of a field alone there is none. `None` where the brackets hold
-    /// something else.
+    /// Splits `position[2]` into the field and its part; a field without brackets has no part.
+    /// Returns `None` if the brackets contain anything else.
     #[must_use]
     pub fn split(text: &str) -> Option<(&str, Option<Self>)> {
         let Some((field, rest)) = text.split_once('[') else {
@@ -97,14 +99,14 @@ fn number(text: &str) -> Option<u32> {
     text.parse().ok().filter(|_| digits)
 }
 
-/// The one field, and what becomes of it.
+/// The field with its part and conversion.
 #[derive(Clone, Debug)]
 pub(super) struct Shaped {
     ops: Vec<Op>,
-    /// The steps that read the names, where a name says which element.
+    /// The steps that read the names, if the element is selected by name.
     names: Option<Vec<Op>>,
     part: Option<Part>,
-    /// Where in the messages of an array the value is.
+    /// Location of the value in the messages of an array.
     inside: Option<Inside>,
     conversion: Conversion,
     /// Path of the field, for errors.
@@ -114,7 +116,7 @@ pub(super) struct Shaped {
 }
 
 impl Shaped {
-    /// The steps, and the field as it is in OPC UA. `steps` compiles a selection.
+    /// Returns the steps, and the field in OPC UA. `steps` compiles a selection.
     pub(super) fn compile(
         message: &MessageType,
         (field, part, conversion): (&str, &Option<Part>, &Conversion),
@@ -162,7 +164,7 @@ impl Shaped {
         }
         let mut ops = steps(&Selection::Field(field.to_owned()))?;
         if !conversion.is_none() {
-            // Converted one by one, as what is not the same on the wire.
+            // Converted elements are passed on individually.
             for op in &mut ops {
                 if let What::Packed(number, len) = op.what
                     && op.carry
@@ -234,7 +236,7 @@ impl Shaped {
         })
     }
 
-    /// Where the name stands.
+    /// Returns the index of the name.
     fn find<E>(&self, plan: &Plan, payload: &[u8], name: &str) -> Result<usize, ReadError<E>> {
         let mut finder = Finder {
             name,
@@ -274,7 +276,7 @@ impl Shaped {
     }
 }
 
-/// The field of that name in the message that `field` is in.
+/// Returns the path of the field `name` in the message that contains `field`.
 fn beside(field: &str, name: &str) -> String {
     match field.rsplit_once('.') {
         Some((outer, _)) => format!("{outer}.{name}"),
@@ -282,7 +284,8 @@ fn beside(field: &str, name: &str) -> String {
     }
 }
 
-/// What the part of a field is, before it is converted. `bytes`: how many an array of bytes always has.
+/// Returns the type of a part of a field before its conversion. `bytes`: the fixed length of a byte
+/// array.
 fn shape((leaf, bytes): (&Leaf, Option<u32>), part: Option<&Part>) -> Result<Leaf, &'static str> {
     let Some(part) = part else {
         return Ok(leaf.clone());
@@ -315,7 +318,7 @@ fn shape((leaf, bytes): (&Leaf, Option<u32>), part: Option<&Part>) -> Result<Lea
         return Err("has fewer elements, always");
     }
     let (builtin, rank) = match (part, leaf.rank) {
-        // Told apart before.
+        // Handled by the caller.
         (Part::Inside { .. }, rank) => (element, rank),
         (Part::Element(_) | Part::Named { .. }, _) => (element, Rank::Scalar),
         (Part::Slice { .. }, Rank::Scalar) => (leaf.builtin, Rank::Scalar),
@@ -332,7 +335,7 @@ pub(super) fn wide(number: u32) -> usize {
     usize::try_from(number).unwrap_or(usize::MAX)
 }
 
-/// Which elements of an array cross.
+/// The transferred elements of an array.
 #[derive(Clone, Copy)]
 enum Pick {
     All,
@@ -340,7 +343,7 @@ enum Pick {
     Some(usize, usize),
 }
 
-/// Why a value goes no further.
+/// Reason for which a value is not passed on.
 pub(super) enum Stop<E> {
     Sink(E),
     Value(ValueFault),
@@ -351,7 +354,7 @@ pub(super) struct ShapingSink<'s, S> {
     conversion: Conversion,
     outside: BuiltinType,
     pick: Pick,
-    /// The element that comes next.
+    /// Index of the next element.
     at: usize,
 }
 
@@ -455,13 +458,13 @@ impl<S: Sink> Sink for ShapingSink<'_, S> {
     }
 }
 
-/// As much of that as there is.
+/// Returns the existing bytes of a range.
 fn cut(bytes: &[u8], from: usize, to: usize) -> &[u8] {
     let to = to.min(bytes.len());
     bytes.get(from.min(to)..to).unwrap_or_default()
 }
 
-/// A number out of a packed array.
+/// Returns a number of a packed array.
 #[expect(
     clippy::wildcard_enum_match_arm,
     reason = "numbers are told apart, and all else is none"
@@ -488,7 +491,7 @@ fn fixed(element: BuiltinType, bytes: &[u8]) -> Option<Scalar<'static>> {
     })
 }
 
-/// Looks for a text in an array of texts.
+/// Finds a text in an array of texts.
 struct Finder<'n> {
     name: &'n str,
     at: usize,

@@ -1,4 +1,4 @@
-//! From a source into bytes.
+//! Encodes the fields of a source as bytes.
 
 use uadp::{BuiltinType, Scalar};
 
@@ -10,11 +10,11 @@ use crate::{Source, SourceError, WriteError, WriteFault, millis_to_duration};
 
 struct Writer<'o, 's, S> {
     out: &'o mut Vec<u8>,
-    /// Where the alignment counts from; none on ROS 1.
+    /// Origin of the alignment; `None` on ROS 1.
     origin: Option<usize>,
     leaf: Option<usize>,
     source: &'s mut S,
-    /// Elements without a value that may still come.
+    /// Number of elements without a value that are still accepted.
     without_value: usize,
 }
 
@@ -27,7 +27,7 @@ pub(super) fn write<'a, S: Source<'a>>(
     message(plan, (ops, false), source, out)
 }
 
-/// Writes a message that is one structure.
+/// Writes a message that is a structure.
 pub(super) fn structure<'a, S: Source<'a>>(
     plan: &Plan,
     ops: &[Op],
@@ -37,7 +37,7 @@ pub(super) fn structure<'a, S: Source<'a>>(
     message(plan, (ops, true), source, out)
 }
 
-/// `structure`: the fields are those of one structure.
+/// Writes a message. `structure`: whether the fields belong to a structure.
 fn message<'a, S: Source<'a>>(
     plan: &Plan,
     (ops, structure): (&[Op], bool),
@@ -71,7 +71,8 @@ fn message<'a, S: Source<'a>>(
     })
 }
 
-/// Errs with the field whose constant cannot be written, for its length or what is in it.
+/// Fails with the first field of a constant that cannot be written because of its length or
+/// content.
 pub(super) fn try_constants(wire: Wire, ops: &[Op]) -> Result<(), (usize, WriteFault)> {
     let mut out = Vec::new();
     let origin = (wire == Wire::Cdr).then_some(0);
@@ -100,12 +101,12 @@ fn constant_of(
         What::Packed(number, len) => writer.packed(*number, *len, true),
         What::Bytes(len) => writer.bytes(*len, true),
         What::Many(primitive, len) => writer.many(*primitive, *len, true),
-        // None of them has a constant.
+        // These steps have no constants.
         What::Messages { .. } | What::Skip { .. } | What::Run(..) => Ok(()),
     }
 }
 
-/// A message that crosses as it is.
+/// Writes a message that is transferred unchanged.
 pub(super) fn bytes<'a, S: Source<'a>>(
     source: &mut S,
     out: &mut Vec<u8>,
@@ -136,7 +137,7 @@ impl<'a, S: Source<'a>> Writer<'_, '_, S> {
         Ok(())
     }
 
-    /// `inside`: the steps are those of an element.
+    /// Runs steps. `inside`: whether the steps belong to an element.
     fn steps(&mut self, mut ops: &[Op], inside: bool) -> Result<(), WriteFault> {
         while let Some((op, after)) = ops.split_first() {
             ops = after;
@@ -174,7 +175,8 @@ impl<'a, S: Source<'a>> Writer<'_, '_, S> {
         self.one(primitive, value)
     }
 
-    /// `carry`: whether within an element already, if the value crosses at all.
+    /// Writes an array of messages. `carry`: whether the writer is within an element already, or
+    /// `None` if the value is not transferred.
     fn messages(&mut self, len: Len, body: &[Op], carry: Option<bool>) -> Result<(), WriteFault> {
         let count = match carry {
             None => self.zero_count(len),
@@ -183,7 +185,7 @@ impl<'a, S: Source<'a>> Writer<'_, '_, S> {
         };
         if carry.is_some() {
             if body.iter().all(|op| matches!(op.what, What::Skip { .. })) {
-                // Inline they are not on the wire, whatever their number.
+                // Inline they take no bytes, for any number of elements.
                 let left = self.without_value.checked_sub(count);
                 self.without_value = left.ok_or(WriteFault::WithoutValue(count))?;
             }
@@ -218,7 +220,7 @@ impl<'a, S: Source<'a>> Writer<'_, '_, S> {
                     (i64::from(i32::MIN), i64::from(i32::MAX))
                 };
                 let (sec, nanosec) = date_time_within(value, earliest, latest);
-                // The low half of either is what the field holds.
+                // The field holds the low half of each value.
                 let [a, b, c, d, ..] = sec.to_le_bytes();
                 self.put([a, b, c, d]);
                 self.put(nanosec.to_le_bytes());
@@ -307,7 +309,7 @@ impl<'a, S: Source<'a>> Writer<'_, '_, S> {
         (0..count).try_for_each(|_| {
             let value = self.source.element(primitive.builtin())?;
             match (primitive, value) {
-                // What names of joints are.
+                // The common case, such as names of joints.
                 (Primitive::Text(text), Scalar::String(value)) if !text.wide => {
                     self.narrow(text.bound, value.unwrap_or_default())
                 }
@@ -342,7 +344,7 @@ impl<'a, S: Source<'a>> Writer<'_, '_, S> {
         Ok(())
     }
 
-    /// Checks the length of a value and writes it where the type leaves it open.
+    /// Checks the length of a value, and writes it if the type leaves it open.
     fn count(&mut self, len: Len, found: usize) -> Result<(), WriteFault> {
         match len {
             Len::Fixed(expected)
@@ -359,7 +361,7 @@ impl<'a, S: Source<'a>> Writer<'_, '_, S> {
         }
     }
 
-    /// The number of elements an array of zeros has; writes it where the type leaves it open.
+    /// Returns the length of an array of zeros, and writes it if the type leaves it open.
     fn zero_count(&mut self, len: Len) -> usize {
         match len {
             Len::Fixed(count) => usize::try_from(count).unwrap_or(usize::MAX),

@@ -1,4 +1,4 @@
-//! A source that makes up whatever is asked for.
+//! A source of random values.
 use std::collections::HashMap;
 use std::sync::OnceLock;
 
@@ -9,11 +9,11 @@ use uadp::{BuiltinType, DateTime, Scalar};
 
 use crate::support::{Event, Value};
 
-/// Makes up whatever is asked for and remembers it.
+/// Supplies random values and records them.
 struct Inventor<'r> {
     rng: &'r mut TestRng,
     made: Vec<Event>,
-    /// Lengths the type wants, by the number of the array they are for.
+    /// Lengths that the type requires, by the index of the array.
     lengths: &'r HashMap<usize, usize>,
     arrays: usize,
 }
@@ -42,9 +42,9 @@ impl Inventor<'_> {
         let signed = random.cast_signed();
         match builtin {
             BuiltinType::String => Scalar::String(Some(TEXTS[(random % 6) as usize])),
-            // Any Double may be a duration, so each is one that a nanosecond tells apart.
+            // Any Double may be a duration, so each is exact to the nanosecond.
             BuiltinType::Double => Scalar::Double((random % 16_000_000) as f64 / 8.0 - 1_000_000.0),
-            // From 1970 to 2037, in both ROS.
+            // From 1970 to 2037, the range of both ROS versions.
             BuiltinType::DateTime => Scalar::DateTime(DateTime(
                 116_444_736_000_000_000 + (random % 21_000_000_000_000_000).cast_signed(),
             )),
@@ -65,7 +65,8 @@ impl Inventor<'_> {
         }
     }
 
-    /// So many bytes that are numbers of that type, none of them a NaN: what it holds beside that is not kept by all.
+    /// Returns the given number of bytes as numbers of that type, without any NaN: not every
+    /// serializer keeps the payload of a NaN.
     fn pool(&mut self, builtin: BuiltinType, bytes: usize) -> &'static [u8] {
         const SIZE: usize = 1 << 16;
         static POOLS: OnceLock<[Vec<u8>; 2]> = OnceLock::new();
@@ -137,7 +138,8 @@ impl Source<'static> for Inventor<'_> {
     }
 }
 
-/// Values of the plan's fields and the message they make. A fixed length is learnt from the refusal of another.
+/// Returns values of the plan's fields and the message they form. A fixed length is learned from
+/// the refusal of another length.
 pub(crate) fn invent(plan: &Plan, rng: &TestRng) -> (Vec<Event>, Vec<u8>) {
     let mut lengths = HashMap::new();
     for _ in 0..1000 {
@@ -166,7 +168,7 @@ pub(crate) fn invent(plan: &Plan, rng: &TestRng) -> (Vec<Event>, Vec<u8>) {
     panic!("no values found");
 }
 
-/// Structures of an inventor have no name.
+/// Removes the names of structures, because structures of an inventor have no name.
 pub(crate) fn unnamed(events: Vec<Event>) -> Vec<Event> {
     let strip = |event| match event {
         Event::Structures(_, count) => Event::Structures(String::new(), count),

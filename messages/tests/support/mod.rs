@@ -1,4 +1,4 @@
-//! A sink that records, and a source that plays back what was recorded.
+//! A sink that records fields, and a source that replays them.
 use std::fmt;
 
 use messages::{Sink, Source, SourceError, TypeName};
@@ -180,7 +180,7 @@ impl Sink for Recorder {
     }
 }
 
-/// Plays recorded events back.
+/// Replays recorded events.
 pub(crate) struct Player<'e>(pub(crate) std::slice::Iter<'e, Event>);
 
 impl<'e> Player<'e> {
