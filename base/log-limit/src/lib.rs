@@ -1,7 +1,9 @@
-//! Limits how often a message is logged whose cause comes from outside: a peer in a loop must not fill the log.
+//! Limits how often a message with an external cause is logged: a peer in a loop must not fill the
+//! log.
 //!
-//! [`Throttle`] limits one message, [`LogLimit`] one message for each of many causes. Both count the suppressed messages, and
-//! give the count with the next one that is logged. Time is a parameter; there is no clock.
+//! [`Throttle`] limits a message, [`LogLimit`] a message for each of many causes. Both count
+//! the suppressed messages, and return the count with the next logged message. Time is a parameter;
+//! there is no clock.
 
 use std::collections::HashMap;
 use std::time::{Duration, Instant};
@@ -11,19 +13,19 @@ use std::time::{Duration, Instant};
 pub struct Throttle {
     period: Duration,
     most: u32,
-    /// When the period began, and how many messages it has admitted.
+    /// Start of the period, and the number of messages admitted in it.
     began: Option<(Instant, u32)>,
     suppressed: u64,
 }
 
 impl Throttle {
-    /// Admits one message per period.
+    /// Creates a throttle that admits one message per period.
     #[must_use]
     pub const fn new(period: Duration) -> Self {
         Self::several(1, period)
     }
 
-    /// Admits that many messages per period.
+    /// Creates a throttle that admits that many messages per period.
     #[must_use]
     pub const fn several(most: u32, period: Duration) -> Self {
         Self {
@@ -34,8 +36,8 @@ impl Throttle {
         }
     }
 
-    /// Returns the number of messages suppressed since the last admitted one if this message is to be logged, or `None` if
-    /// it is suppressed too.
+    /// Returns the number of messages suppressed after the last admitted message if this message is
+    /// to be logged, or `None` if it is suppressed too.
     pub fn admit(&mut self, now: impl Into<Instant>) -> Option<u64> {
         let now = now.into();
         let (began, used) = match self.began {
@@ -53,7 +55,7 @@ impl Throttle {
         }
     }
 
-    /// Returns the number of messages suppressed since the last admitted one.
+    /// Returns the number of messages suppressed after the last admitted message.
     #[must_use]
     pub const fn suppressed(&self) -> u64 {
         self.suppressed
@@ -65,7 +67,8 @@ impl Throttle {
     }
 }
 
-/// Admits a message once per period for each cause, for at most [`MOST`] causes. Further causes share one more message.
+/// Admits a message once per period for each cause, for at most [`MOST`] causes. Further causes
+/// share another message.
 #[derive(Debug)]
 pub struct LogLimit {
     every: Duration,
@@ -74,7 +77,7 @@ pub struct LogLimit {
 }
 
 impl LogLimit {
-    /// Admits one message of each cause in that time.
+    /// Creates a limit that admits one message of each cause in that time.
     #[must_use]
     pub fn every(every: Duration) -> Self {
         Self {
@@ -84,8 +87,8 @@ impl LogLimit {
         }
     }
 
-    /// Returns the number of messages of this cause that were suppressed since the last admitted one if this message is to be
-    /// logged, or `None` if it is suppressed too.
+    /// Returns the number of messages of this cause that were suppressed after the last admitted
+    /// message if this message is to be logged, or `None` if it is suppressed too.
     pub fn admit(&mut self, cause: &str, now: impl Into<Instant>) -> Option<u64> {
         let now = now.into();
         if let Some(known) = self.causes.get_mut(cause) {
@@ -111,7 +114,7 @@ impl LogLimit {
     }
 }
 
-/// The number of causes that are told apart.
+/// Maximum number of distinguished causes.
 pub const MOST: usize = 256;
 
 #[cfg(test)]

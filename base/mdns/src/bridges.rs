@@ -1,7 +1,8 @@
-//! Programs that carry a space and are no OPC UA servers, by mDNS: `_uadp._udp.local.`
+//! Announcements by mDNS of bridges, which carry a space but are not OPC UA servers:
+//! `_uadp._udp.local.`
 //!
-//! OPC 10000-12 has a service for servers alone. A bridge has no server; it tells under a service of its own which space it
-//! carries, and in which group.
+//! The service of OPC 10000-12 is for servers only. A bridge has no server; it announces its space
+//! and its PubSub group under a service of its own.
 
 use std::fmt;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
@@ -35,39 +36,39 @@ pub struct TellingArguments {
     pub telling: Telling,
 }
 
-/// A program that carries a space.
+/// A bridge of a space.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Bridge {
-    /// What it is called, as `bridge-ros1`.
+    /// Name of the program, such as `bridge-ros1`.
     pub program: String,
-    /// Its ApplicationUri.
+    /// ApplicationUri of the bridge.
     pub uri: String,
-    /// The space it carries.
+    /// Number of the space.
     pub space: u16,
-    /// The group it speaks in.
+    /// PubSub group of the bridge.
     pub group: SocketAddr,
 }
 
-/// A bridge that was heard of.
+/// A bridge announced on the network.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct HeardBridge {
-    /// Its name on the network.
+    /// Instance name on the network.
     pub name: String,
-    /// Where it is.
+    /// Address of the host.
     pub host: Ipv4Addr,
-    /// What it says of itself.
+    /// Announced properties.
     pub bridge: Bridge,
 }
 
-/// On which network a program tells of itself.
+/// The network on which a bridge is announced.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub enum Telling {
-    /// On that of its PubSub group; of none that is said, within this host.
+    /// The network of the PubSub group; without a group, only this host.
     #[default]
     Group,
-    /// On none.
+    /// No network.
     Nowhere,
-    /// On this one.
+    /// The network of this interface.
     On(Interface),
 }
 
@@ -83,11 +84,11 @@ impl FromStr for Telling {
     }
 }
 
-/// Tells of a bridge for as long as it is kept.
+/// An announcement of a bridge, which is withdrawn on drop.
 pub struct ToldBridge {
     daemon: ServiceDaemon,
     fullname: String,
-    /// Looks whether anything goes out.
+    /// Checks that the announcement is sent.
     looking: JoinHandle<()>,
 }
 
@@ -99,8 +100,9 @@ impl fmt::Debug for ToldBridge {
     }
 }
 
-/// Tells of a bridge on the network that is chosen; `group` is the interface of its PubSub group. `None` where it is to be told
-/// of on none, or cannot be, which is logged. Needs a tokio runtime.
+/// Announces a bridge on the selected network; `group` is the interface of its PubSub group.
+/// Returns `None` if no network is selected, or if the bridge cannot be announced, which is logged.
+/// Needs a tokio runtime.
 #[must_use]
 pub fn tell_bridge(bridge: &Bridge, telling: &Telling, group: Option<&str>) -> Option<ToldBridge> {
     let interface = match telling {
@@ -151,7 +153,7 @@ fn info_of(
     } = bridge;
     let instance = label(&format!("{program} space {space} on {}", host_name()));
     let host = first.to_string().replace('.', "-");
-    // Of its own, as that of a server is.
+    // A host name of its own, like the host name of a server.
     let host = format!("ua-{host}-space-{space}-{}.local.", std::process::id());
     let addresses: Vec<IpAddr> = addresses.iter().copied().map(IpAddr::V4).collect();
     let texts = [
@@ -177,7 +179,7 @@ fn info_of(
     Ok(info)
 }
 
-/// Tells once where nothing goes out, as on a network without multicast.
+/// Logs a warning if nothing is sent, as on a network without multicast.
 async fn look(monitor: Receiver<DaemonEvent>, interface: Interface) {
     let why = match timeout(ANNOUNCED_WITHIN, announced(&monitor)).await {
         Ok(Ok(name)) => return info!(?name, "announced by mDNS on {interface}"),
@@ -187,10 +189,10 @@ async fn look(monitor: Receiver<DaemonEvent>, interface: Interface) {
     warn!(
         "nobody is told of this bridge by mDNS on {interface}: {why} (`--mdns none` does without)"
     );
-    // Whoever does not listen any more is told nothing; the channel is bounded by the daemon.
+    // The dropped receiver gets no more events; the daemon bounds the channel.
 }
 
-/// Under which name something has gone out, or why nothing does.
+/// Returns the name of the first announcement, or the reason for which nothing is sent.
 async fn announced(monitor: &Receiver<DaemonEvent>) -> Result<String, String> {
     loop {
         match monitor.recv_async().await {
@@ -206,17 +208,17 @@ impl Drop for ToldBridge {
     fn drop(&mut self) {
         self.looking.abort();
         if let Ok(told) = self.daemon.unregister(&self.fullname) {
-            // The goodbye is out by then, or is not to be waited for.
+            // The goodbye is sent by then; otherwise it is not waited for.
             let _told = told.recv_timeout(GOODBYE);
         }
         drop(self.daemon.shutdown());
     }
 }
 
-/// The bridges that are told of on an interface, and answer within the limit.
+/// Returns the bridges announced on an interface that answer within the limit.
 ///
 /// # Errors
-/// No mDNS daemon can be started.
+/// Fails if no mDNS daemon can be started.
 #[expect(
     clippy::wildcard_enum_match_arm,
     reason = "the crate tells more, and two say who is there"
@@ -251,7 +253,7 @@ pub async fn heard_bridges(
             }
         }
     };
-    // It ends by the limit.
+    // The limit ends the search.
     let _over = timeout(limit, all).await;
     drop(daemon.shutdown());
     Ok(bridges)

@@ -1,5 +1,6 @@
-//! Goodbyes as they are said: mDNS keeps what is taken back for a second more (RFC 6762, 10.1), in case that another host
-//! still has it. A server has a name of its own, so nobody else has, and a second is half of what there is.
+//! Goodbyes without delay. mDNS keeps a withdrawn record for another second (RFC 6762, 10.1), in
+//! case another host still has it. The name of a server is its own, so no other host has it, and a
+//! second is half of the available time.
 
 use std::net::{Ipv4Addr, SocketAddrV4};
 
@@ -9,14 +10,15 @@ use tokio::net::UdpSocket;
 
 use crate::interface::Interface;
 
-/// Hears what is said to the group of mDNS on one interface.
+/// Opens a socket for the packets of the mDNS group on one interface.
 pub fn listen(interface: &Interface) -> std::io::Result<UdpSocket> {
     let socket = Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP))?;
     socket.set_reuse_address(true)?;
     socket.set_reuse_port(true)?;
-    // Not what other programs have joined on other interfaces.
+    // Excludes the groups that other programs have joined on other interfaces.
     socket.set_multicast_all_v4(false)?;
-    // On the group alone: what is sent to this host is for the one that asked.
+    // Binds to the group only: unicast packets to this host are for the program that sent the
+    // query.
     socket.bind(&GROUP.into())?;
     for address in interface.addresses() {
         socket.join_multicast_v4(GROUP.ip(), &address)?;
@@ -25,12 +27,12 @@ pub fn listen(interface: &Interface) -> std::io::Result<UdpSocket> {
     UdpSocket::from_std(socket.into())
 }
 
-/// The instances of our service that a packet takes back.
+/// Returns the instances of the OPC UA service that a packet withdraws.
 pub fn goodbyes(packet: &[u8]) -> Vec<String> {
     taken_back(packet).unwrap_or_default()
 }
 
-/// `None` for a packet that ends too early.
+/// Returns the withdrawn instances, or `None` for a packet that ends too early.
 fn taken_back(packet: &[u8]) -> Option<Vec<String>> {
     let number = |at: usize| Some(u16::from_be_bytes(packet.get(at..at + 2)?.try_into().ok()?));
     let is_response = packet.get(2)? & 0x80 != 0;
@@ -69,11 +71,11 @@ fn is_service(labels: &[&[u8]]) -> bool {
     labels.len() == SERVICE.len() && labels.iter().zip(&SERVICE).all(same)
 }
 
-/// A name, which may go on elsewhere (RFC 1035, 4.1.4), and where what follows it is.
+/// Returns a name, which may contain a pointer (RFC 1035, 4.1.4), and the position after the name.
 fn name(packet: &[u8], mut at: usize) -> Option<(Vec<&[u8]>, usize)> {
     let mut labels = Vec::new();
     let mut after = None;
-    // Each turn takes a label or follows a pointer, and no name has so many.
+    // Each turn reads a label or follows a pointer; no valid name has more.
     for _ in 0..MOST_LABELS {
         let length = usize::from(*packet.get(at)?);
         match length {
@@ -102,7 +104,7 @@ const SERVICE: [&[u8]; 3] = [b"_opcua-tcp", b"_tcp", b"local"];
 mod tests {
     use super::*;
 
-    /// A response with one PTR record whose target goes on in its owner.
+    /// Returns a response with a PTR record. Its target points to its owner.
     fn packet(lifetime: u8) -> Vec<u8> {
         [
             &[0, 0, 0x84, 0, 0, 0, 0, 1, 0, 0, 0, 0][..],
@@ -130,7 +132,7 @@ mod tests {
                 assert!(goodbyes(&changed).len() <= 1);
             }
         }
-        // A name that goes on in itself.
+        // A name that points to itself.
         let mut around = whole;
         around.truncate(12);
         around.extend([0xC0, 12]);

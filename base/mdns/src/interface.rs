@@ -1,4 +1,4 @@
-//! The network interface on which servers are announced and heard.
+//! The network interface on which servers are announced and discovered.
 
 use std::net::{IpAddr, Ipv4Addr};
 use std::time::Duration;
@@ -10,8 +10,8 @@ use tokio::time::timeout;
 use crate::range::Range;
 use crate::url::Url;
 
-/// One network interface, by name or by an address it has. One level of a plant is one network: what is announced on one
-/// does not appear on another.
+/// A network interface, by name or by an address it has. Each level of a plant is a network of its
+/// own: announcements on a network do not appear on another network.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct Interface {
     which: Which,
@@ -26,7 +26,7 @@ enum Which {
 }
 
 impl Interface {
-    /// The host with itself.
+    /// The loopback interface, for this host only.
     pub const LOOPBACK: Self = Self::of(Which::Address(IpAddr::V4(Ipv4Addr::LOCALHOST)));
 
     const fn of(which: Which) -> Self {
@@ -36,7 +36,7 @@ impl Interface {
         }
     }
 
-    /// By an address, or else by name.
+    /// Parses an address, or else a name.
     #[must_use]
     pub fn parse(text: &str) -> Self {
         Self::of(match text.parse() {
@@ -45,15 +45,16 @@ impl Interface {
         })
     }
 
-    /// Accepts announcements of addresses in these networks, too. Without them only addresses in the subnets of the
-    /// interface are accepted, since anyone on the network can announce any address.
+    /// Accepts announcements of addresses in these networks, too. Without them only addresses in
+    /// the subnets of the interface are accepted, since any host on the network can announce any
+    /// address.
     #[must_use]
     pub fn with_networks(mut self, networks: impl IntoIterator<Item = Range>) -> Self {
         self.beyond.extend(networks);
         self
     }
 
-    /// All of this host that have an IPv4 address.
+    /// Returns all interfaces of this host that have an IPv4 address.
     #[must_use]
     pub fn all() -> Vec<Self> {
         let all = if_addrs::get_if_addrs().unwrap_or_default();
@@ -64,7 +65,7 @@ impl Interface {
             .collect()
     }
 
-    /// Whether it is this one.
+    /// Returns whether an interface of the system is this interface.
     fn is(&self, interface: &if_addrs::Interface) -> bool {
         match &self.which {
             Which::Name(name) => interface.name == *name,
@@ -72,7 +73,7 @@ impl Interface {
         }
     }
 
-    /// Its IPv4 addresses, which is what is announced and heard by.
+    /// Returns the IPv4 addresses of the interface, which are used for mDNS.
     #[must_use]
     pub fn addresses(&self) -> Vec<Ipv4Addr> {
         let all = if_addrs::get_if_addrs().unwrap_or_default();
@@ -85,7 +86,7 @@ impl Interface {
             .collect()
     }
 
-    /// Whether only this host is on it.
+    /// Returns whether only this host is on the interface.
     pub fn is_loopback(&self) -> bool {
         match &self.which {
             Which::Address(address) => address.is_loopback(),
@@ -93,8 +94,9 @@ impl Interface {
         }
     }
 
-    /// Returns whether a URL is that of a server in the subnets of the interface, or in a network that is accepted too. For URLs
-    /// that someone on the network has named: a name is looked up, and all of its addresses have to be there.
+    /// Returns whether a URL is that of a server in the subnets of the interface, or in a network
+    /// that is accepted too. For URLs that were named by other hosts: a name is resolved, and all
+    /// of its addresses have to be in these networks.
     pub async fn accepts(&self, url: &str) -> bool {
         let Some(place) = Url::parse(url) else {
             return false;
@@ -127,7 +129,7 @@ impl Interface {
         }
     }
 
-    /// For the mDNS daemon.
+    /// Returns the interface for the mDNS daemon.
     pub fn kind(&self) -> IfKind {
         let this = self.clone();
         let is =
@@ -136,7 +138,8 @@ impl Interface {
     }
 }
 
-/// The networks from which announcements are accepted: the subnets of an interface, and those that the operator adds.
+/// The networks from which announcements are accepted: the subnets of an interface, and the
+/// networks added by the operator.
 #[derive(Debug, Clone)]
 pub struct Subnets {
     is_loopback: bool,

@@ -1,7 +1,9 @@
-//! mDNS of a cell: OPC UA servers that are announced, heard, and said goodbye to, and bridges, on one interface.
+//! mDNS of a cell on one interface: announcements and goodbyes of OPC UA servers, and announcements
+//! of bridges.
 //!
-//! Reading order: `url`, `range` and `interface` (where), `servers` and `goodbye` (announcements of OPC UA servers,
-//! OPC 10000-12, Annex C), `bridges` (programs that carry a space).
+//! Reading order: `url`, `range` and `interface` (addresses), `servers` and `goodbye`
+//! (announcements of OPC UA servers, OPC 10000-12, Annex C), `bridges` (programs that carry a
+//! space).
 
 mod bridges;
 mod goodbye;
@@ -19,7 +21,7 @@ pub use range::{Range, RangeFault};
 pub use servers::{Aside, Heard, Mdns, MdnsFault, Ours, SERVICE, heard, is_own, same_place};
 pub use url::Url;
 
-/// The name of this host, without a domain.
+/// Returns the name of this host, without a domain.
 #[must_use]
 pub fn host_name() -> String {
     let name = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();

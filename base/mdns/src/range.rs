@@ -3,27 +3,27 @@
 use std::net::Ipv4Addr;
 use std::str::FromStr;
 
-/// IPv4 addresses that are tried: those of hosts in a network.
+/// The IPv4 host addresses of a network, which are tried in turn.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Range {
     first: u32,
     count: u32,
 }
 
-/// Why a range is none.
+/// Error for an invalid range.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum RangeFault {
-    /// It is not written as one.
+    /// The text is not a range.
     #[error("`{0}` is no range of IPv4 addresses, as 192.168.0.0/24")]
     Malformed(String),
-    /// There are more addresses in it than are tried.
+    /// The range has more addresses than are tried.
     #[error("/{0} is more than 65536 addresses, which are not tried: /16 is the widest")]
     Wide(u8),
 }
 
 impl Range {
-    /// How many addresses it has.
+    /// Returns the number of addresses.
     #[must_use]
     pub const fn hosts(self) -> u32 {
         self.count
@@ -36,7 +36,7 @@ impl Range {
         at.is_some_and(|at| at < self.count)
     }
 
-    /// All of its addresses, in order.
+    /// Returns all addresses in order.
     pub fn addresses(self) -> impl Iterator<Item = Ipv4Addr> {
         (0..self.count).map(move |at| Ipv4Addr::from_bits(self.first.saturating_add(at)))
     }
@@ -45,8 +45,8 @@ impl Range {
 impl FromStr for Range {
     type Err = RangeFault;
 
-    /// An address, or a network as `192.168.0.0/24`. The addresses of the network itself and of all its hosts are no hosts
-    /// where it has more than two.
+    /// Parses an address, or a network such as `192.168.0.0/24`. The network address and the
+    /// broadcast address are excluded if the network has more than two addresses.
     fn from_str(text: &str) -> Result<Self, RangeFault> {
         let malformed = || RangeFault::Malformed(text.to_owned());
         let (address, prefix) = text.split_once('/').unwrap_or((text, "32"));

@@ -1,7 +1,8 @@
-//! Announcements by mDNS and DNS-SD (OPC 10000-12, Annex C): `_opcua-tcp._tcp.local.`, on one interface.
+//! Announcements by mDNS and DNS-SD (OPC 10000-12, Annex C): `_opcua-tcp._tcp.local.`, on one
+//! interface.
 //!
-//! What is heard comes from whoever is on the network, so it is bounded and held against what a URL and a capability may
-//! look like; what does not fit is not heard, and counted.
+//! Any host on the network can send announcements, so their number is bounded, and URLs and
+//! capabilities are validated. Invalid announcements are ignored and counted.
 
 use std::collections::BTreeMap;
 use std::net::{IpAddr, Ipv4Addr};
@@ -23,7 +24,7 @@ use crate::host_name;
 use crate::interface::{Interface, Subnets};
 use crate::url::Url;
 
-/// No mDNS daemon can be started.
+/// Error of starting the mDNS daemon.
 #[derive(Debug, thiserror::Error)]
 #[error("nobody can be announced or heard on {interface}: {source}")]
 pub struct MdnsFault {
@@ -41,50 +42,50 @@ impl MdnsFault {
     }
 }
 
-/// What is heard on the network.
+/// Event on the network.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Heard {
-    /// Of a server, for the first time or with something new.
+    /// A server was announced for the first time or with changes.
     Announced {
-        /// What the server announces.
+        /// Announcement of the server.
         announcement: Announcement,
-        /// What programs of this project tell beside it.
+        /// Additional properties of programs of this project.
         aside: Aside,
     },
-    /// Of the end of a server: a goodbye, or what was heard has run out.
+    /// A server has ended: a goodbye was received, or its announcement has expired.
     Withdrawn {
         /// The instance name of the server.
         instance: String,
     },
-    /// That somebody else has the name of what we announce, which is called so from now on.
+    /// Another host has the name of an announced server, which is renamed.
     Renamed {
-        /// The instance name until now.
+        /// The previous instance name.
         from: String,
-        /// The instance name from now on.
+        /// The new instance name.
         to: String,
     },
 }
 
-/// What is announced.
+/// An announcement of this program.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Ours {
-    /// What every reader of mDNS understands.
+    /// The standard part of the announcement.
     pub announcement: Announcement,
     /// The keys that programs of this project add.
     pub aside: Aside,
 }
 
-/// What programs of this project tell in keys of their own, which others pass over.
+/// Additional properties of programs of this project, in TXT keys that other programs ignore.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Aside {
-    /// When the program started, in 100 ns since 1601.
+    /// Start time of the program, in 100 ns since 1601.
     pub start_time: Option<i64>,
-    /// Its number in the space: the namespace of what it produces there.
+    /// Number of the program in the space: the namespace of its values there.
     pub number: Option<NonZeroU16>,
 }
 
 impl Aside {
-    /// That of a program without a number.
+    /// Returns the properties of a program without a number.
     pub const fn of_start(start_time: i64) -> Self {
         Self {
             start_time: Some(start_time),
@@ -93,7 +94,7 @@ impl Aside {
     }
 }
 
-/// One interface, with a thread of its own that answers and asks.
+/// mDNS on one interface, with a thread of its own for queries and responses.
 pub struct Mdns {
     interface: Interface,
     daemon: ServiceDaemon,
@@ -101,23 +102,27 @@ pub struct Mdns {
     monitor: Option<Receiver<DaemonEvent>>,
     ours: BTreeMap<String, Announced>,
     announce_at: Instant,
-    /// Hears goodbyes before the daemon tells of them; without it they come a second later.
+    /// Receives goodbyes before the daemon reports them; without this socket they are a second
+    /// late.
     goodbyes: Option<UdpSocket>,
     packet: Vec<u8>,
-    /// Goodbyes that have not been told of yet.
+    /// Goodbyes that have not been reported yet.
     left: Vec<String>,
-    /// Instances that are there, as they were heard last: a new one has not heard of ours.
+    /// Instances on the network, as announced last. A new instance has not received the
+    /// announcements of this program.
     there: BTreeMap<String, (Announcement, Aside)>,
-    /// What a goodbye was heard of that the daemon has not taken yet, and when it must have. A goodbye may be that of another
-    /// host to a name that two had, or the server is back at once: what stays in the daemon's cache is told by nobody.
+    /// Instances with a goodbye that the daemon has not reported yet, with a deadline for its
+    /// report. The goodbye may be that of another host with the same name, or the server may be
+    /// back at once. The daemon reports no event for a record that stays in its cache.
     doubted: BTreeMap<String, (Announcement, Aside, Instant)>,
-    /// What the daemon holds for outdated though no goodbye was heard, and when that is told. It takes a clock that is set
-    /// forward for a sleep of the machine, forgets whom it knew, and hears of them anew in a moment.
+    /// Instances that the daemon reports as outdated without a goodbye, with the time at which they
+    /// are reported. The daemon treats a clock that is set forward as a sleep of the machine,
+    /// clears its cache, and receives the announcements again in a moment.
     outdated: BTreeMap<String, (Announcement, Aside, Instant)>,
-    /// Where announced servers may be, and when that was read.
+    /// Networks of announced servers, and the time at which they were read.
     subnets: (Subnets, Instant),
     ignored: u64,
-    /// Ignored announcements in the log.
+    /// Rate limit of log entries about ignored announcements.
     ignored_log: LogLimit,
 }
 
@@ -125,14 +130,14 @@ pub struct Mdns {
 struct Announced {
     ours: Ours,
     fullname: String,
-    /// The URL that is heard of it: an address where it has a name for its host.
+    /// The URL in the received announcement: with an address in place of a host name.
     place: String,
-    /// How often another was heard under its name that was to give way.
+    /// Number of announcements of another server under this name that had to give way.
     contested: u32,
 }
 
 impl Mdns {
-    /// Starts to hear at once.
+    /// Opens an interface and starts to receive announcements at once.
     pub fn open(interface: &Interface) -> Result<Self, MdnsFault> {
         Self::open_at(interface, MDNS_PORT)
     }
@@ -163,7 +168,7 @@ impl Mdns {
         })
     }
 
-    /// Announces a server at once, in the place of what was announced under its name.
+    /// Announces a server at once, in place of the previous announcement of its name.
     pub fn put(&mut self, ours: Ours) {
         let Some(info) = self.info(&ours) else {
             warn!(
@@ -191,22 +196,22 @@ impl Mdns {
         self.ours.insert(instance, announced);
     }
 
-    /// Takes back what is announced under a name. The goodbye has been sent when the answer comes.
+    /// Withdraws the announcement of a name. The future completes after the goodbye was sent.
     pub fn take_back(&mut self, instance: &str) -> Option<impl Future<Output = ()> + Send + use<>> {
         let announced = self.ours.remove(instance)?;
         let told = self.daemon.unregister(&announced.fullname).ok()?;
         Some(async move {
-            // An error is the end of the daemon, which says goodbye for all.
+            // An error is the end of the daemon, which sends all goodbyes.
             let _told = told.recv_async().await;
         })
     }
 
-    /// How much was heard that is no announcement of a server.
+    /// Returns the number of received announcements that were ignored.
     pub fn ignored(&self) -> u64 {
         self.ignored
     }
 
-    /// What is heard next. Whoever drops it before loses nothing.
+    /// Returns the next event. Cancel-safe.
     pub async fn next(&mut self) -> Heard {
         loop {
             while let Some(instance) = self.left.pop() {
@@ -217,7 +222,7 @@ impl Mdns {
                     && let Some((announcement, aside)) = self.there.remove(&instance)
                 {
                     let until = Instant::now() + DOUBT;
-                    // Of more than that, whoever is back is heard with its next change.
+                    // Beyond the limit, a server that is back is reported with its next change.
                     if self.doubted.len() < MOST {
                         self.doubted
                             .insert(instance.clone(), (announcement, aside, until));
@@ -268,7 +273,7 @@ impl Mdns {
         }
     }
 
-    /// A server to which a goodbye was heard and that the daemon has kept for longer than it keeps one that left.
+    /// Returns a server with a goodbye that the daemon has kept for longer than a server that left.
     fn still_there(&mut self) -> Option<Heard> {
         let now = Instant::now();
         let mut due = self
@@ -284,7 +289,7 @@ impl Mdns {
         })
     }
 
-    /// A server that is outdated, and was not heard since.
+    /// Returns an outdated server that was not announced again.
     fn not_heard_again(&mut self) -> Option<Heard> {
         let now = Instant::now();
         let mut due = self
@@ -307,7 +312,7 @@ impl Mdns {
         }
     }
 
-    /// The crate closes the channel of whoever was slow, without a word.
+    /// Opens the channel again, which the crate closes without notice for a slow receiver.
     async fn browse_again(&mut self) {
         debug!("hearing on {} anew", self.interface);
         match self.daemon.browse(SERVICE) {
@@ -319,8 +324,9 @@ impl Mdns {
         }
     }
 
-    /// Late starters that ask from another port than that of mDNS are answered to that port, where some never look: they
-    /// need to be told without having asked.
+    /// Repeats the announcements. A late starter that sends its query from another port than that
+    /// of mDNS gets the response at that port. Some programs do not listen there, and need
+    /// announcements without a query.
     fn announce_again(&mut self) {
         self.announce_at = Instant::now() + ANNOUNCE_EVERY;
         self.follow_renames();
@@ -337,7 +343,7 @@ impl Mdns {
         }
     }
 
-    /// A conflict that the daemon itself resolved.
+    /// Logs the conflicts that the daemon itself resolved.
     fn follow_renames(&mut self) {
         let changes = self.monitor.iter().flat_map(Receiver::try_iter);
         for event in changes {
@@ -352,7 +358,7 @@ impl Mdns {
     }
 
     fn register(&self, info: ServiceInfo) {
-        // A full queue is emptied in a moment: what is announced comes again.
+        // A full queue is emptied in a moment, and announcements are repeated.
         if let Err(error) = self.daemon.register(info) {
             debug!(%error, "not announced this time");
         }
@@ -388,7 +394,8 @@ impl Mdns {
                     self.there.insert(announcement.instance.clone(), heard);
                 }
                 if !is_known && self.there.len() < MOST {
-                    // At once, but not for each of many that appear together: a record is sent once a second at most.
+                    // At once, but not for each of many that appear together: a record is sent at
+                    // most once a second.
                     self.announce_at = self.announce_at.min(Instant::now() + SETTLE);
                 }
                 let is_as_before = outdated.is_some_and(|(before, beside, _)| {
@@ -411,14 +418,15 @@ impl Mdns {
                     self.outdated.insert(instance, (announcement, aside, until));
                     return None;
                 }
-                // Ours is announced still: the goodbye is of another of that name.
+                // If this program still announces the name, the goodbye is that of another server
+                // of the same name.
                 (!self.ours.contains_key(&instance)).then_some(Heard::Withdrawn { instance })
             }
             _ => None,
         }
     }
 
-    /// Reads the subnets of the interface, which may have got another address.
+    /// Reads the subnets of the interface, because its address may have changed.
     fn read_subnets(&mut self) {
         let now = Instant::now();
         if now.saturating_duration_since(self.subnets.1) >= READ_SUBNETS_EVERY {
@@ -451,8 +459,9 @@ impl Mdns {
         }
     }
 
-    /// Somebody else has one of our names (RFC 6762, 9). Of two programs of this project the one whose URL comes later gives
-    /// way; who does not, though told of ours again and again, is of another make, and keeps it.
+    /// Resolves a conflict for a name of this program (RFC 6762, 9). Of two programs of this
+    /// project, the program with the later URL gives way. A program that does not give way in spite
+    /// of repeated announcements is of another manufacturer, and keeps the name.
     fn conflict(&mut self, from: &str, theirs: &str) -> Option<Heard> {
         let announced = self.ours.get_mut(from)?;
         announced.contested += 1;
@@ -476,7 +485,8 @@ impl Mdns {
         })
     }
 
-    /// For the daemon. `None` where the server listens on no address of the interface.
+    /// Returns an announcement for the daemon, or `None` if the server listens on no address of the
+    /// interface.
     fn info(&self, ours: &Ours) -> Option<ServiceInfo> {
         let Announcement {
             instance,
@@ -490,14 +500,15 @@ impl Mdns {
             }
             Some(IpAddr::V4(ip)) if !ip.is_unspecified() => vec![ip],
             Some(IpAddr::V6(ip)) if !ip.is_unspecified() => return None,
-            // Where another host is, is not ours to say.
+            // The address of another host is unknown to this program.
             None if !is_own(&url.host) => return None,
             _ => self.interface.addresses(),
         };
         let first = addresses.first()?;
-        // Of its own: the goodbye of one server takes the host's address away from all that share the name. And no other
-        // program of this host has it. A server that gave way to another has a new one: the goodbye to its name before
-        // goes out twice, and an address is told once a second at most.
+        // A unique host name: the goodbye of a server removes the host's address from all servers
+        // that share the name. No other program of this host has this name. A server that was
+        // renamed after a conflict gets a new host name. The reason is that the goodbye to its
+        // previous name is sent twice, and an address is sent at most once a second.
         let host = first.to_string().replace('.', "-");
         let number = instance
             .strip_suffix(')')
@@ -529,7 +540,7 @@ impl Drop for Mdns {
         for announced in self.ours.values() {
             drop(self.daemon.unregister(&announced.fullname));
         }
-        // The thread ends in any case: nobody can command it any more.
+        // The thread ends in any case: it has no more senders of commands.
         drop(self.daemon.shutdown());
     }
 }
@@ -543,7 +554,7 @@ fn hear_goodbyes(interface: &Interface) -> Option<UdpSocket> {
     socket.ok()
 }
 
-/// Whether a name is that of this host, with or without a domain.
+/// Returns whether a name is that of this host, with or without a domain.
 pub fn is_own(name: &str) -> bool {
     let first = |name: &str| {
         name.split('.')
@@ -555,12 +566,12 @@ pub fn is_own(name: &str) -> bool {
     name == "localhost" || name == first(&host_name())
 }
 
-/// Whether two URLs are of one endpoint.
+/// Returns whether two URLs have the same endpoint.
 pub fn same_place(one: &str, other: &str) -> bool {
     one.trim_end_matches('/') == other.trim_end_matches('/')
 }
 
-/// An announcement as the registry takes it.
+/// Converts a received announcement for the registry.
 pub fn heard(service: &ResolvedService, subnets: &Subnets) -> Option<(Announcement, Aside)> {
     let instance = instance(&service.fullname)?;
     let text = |key| service.get_property_val(key).flatten();
@@ -597,24 +608,26 @@ pub fn heard(service: &ResolvedService, subnets: &Subnets) -> Option<(Announceme
     Some((announcement, aside))
 }
 
-/// Returns the address to try. Loopback addresses of a network and addresses outside its subnets are left out.
+/// Returns the address to try. Loopback addresses of a network and addresses outside its subnets
+/// are excluded.
 fn address(all: impl IntoIterator<Item = Ipv4Addr>, subnets: &Subnets) -> Option<Ipv4Addr> {
     let loopback = subnets.is_loopback();
     let usable = |ip: &Ipv4Addr| {
         let one = !(ip.is_unspecified() || ip.is_multicast() || ip.is_broadcast());
         one && (loopback || !ip.is_loopback()) && subnets.contains(*ip)
     };
-    // The one that says more first: of a host with several, its loopback address means this host only.
+    // The more specific address first: a loopback address among several addresses is valid on its
+    // own host only.
     let all = all.into_iter().filter(usable);
     all.min_by_key(|ip| (ip.is_loopback() != loopback, ip.is_link_local(), *ip))
 }
 
-/// A code of OPC 10000-12, Annex D, or of a maker.
+/// Returns whether a text is a code of OPC 10000-12, Annex D, or of a manufacturer.
 fn is_code(text: &str) -> bool {
     !text.is_empty() && text.len() <= 32 && text.bytes().all(|byte| byte.is_ascii_graphic())
 }
 
-/// The name in front of the service; `None` where it is no name to be shown.
+/// Returns the name before the service, or `None` if the name cannot be displayed.
 fn instance(fullname: &str) -> Option<String> {
     let at = fullname.len().checked_sub(SERVICE.len() + 1)?;
     let (name, service) = fullname.split_at_checked(at)?;
@@ -628,23 +641,24 @@ fn instance(fullname: &str) -> Option<String> {
 
 /// The service of OPC UA servers over TCP (OPC 10000-12, Annex C).
 pub const SERVICE: &str = "_opcua-tcp._tcp.local.";
-/// The key of the TXT record that tells one run of a program from the next. Ours alone; others pass over it.
+/// The key of the TXT record with the start time, which distinguishes the runs of a program. Only
+/// programs of this project use it.
 const START: &str = "start";
-/// The key of the number in the space. Likewise.
+/// The key of the TXT record with the number in the space. Only programs of this project use it.
 const NUMBER: &str = "ns";
 const ANNOUNCE_EVERY: Duration = Duration::from_secs(5);
 const SETTLE: Duration = Duration::from_millis(200);
-/// The daemon keeps a server that left for a second (RFC 6762, 10.1).
+/// Exceeds the second for which the daemon keeps a server that left (RFC 6762, 10.1).
 const DOUBT: Duration = Duration::from_millis(2500);
 /// The largest packet of mDNS (RFC 6762, 17).
 const PACKET: usize = 9000;
-/// Instances that are kept in mind.
+/// Maximum number of stored instances.
 const MOST: usize = 4096;
 const MOST_CAPABILITIES: usize = 32;
-/// Characters of a name in the log.
+/// Maximum number of characters of a name in the log.
 const MOST_NAME: usize = 256;
 const READ_SUBNETS_EVERY: Duration = Duration::from_secs(1);
-/// Announcements that are ignored for one cause are logged once in this time.
+/// Period in which ignored announcements with the same cause are logged once.
 const LOG_EVERY: Duration = Duration::from_secs(60);
 const MOST_CONTESTED: u32 = 4;
 

@@ -1,20 +1,20 @@
-//! Where a server is: `opc.tcp://host:port/path`.
+//! The URL of a server: `opc.tcp://host:port/path`.
 
 use std::net::IpAddr;
 
 /// The parts of a URL of OPC UA over TCP.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Url {
-    /// A name or an address, that of IPv6 without brackets.
+    /// Name or address of the host; an IPv6 address is without brackets.
     pub host: String,
-    /// The TCP port, 4840 where the text has none.
+    /// The TCP port, 4840 by default.
     pub port: u16,
-    /// With its slash, or empty.
+    /// The path with its slash, or empty.
     pub path: String,
 }
 
 impl Url {
-    /// `None` for any other kind of URL.
+    /// Parses a URL. Returns `None` for any other kind of URL.
     pub fn parse(url: &str) -> Option<Self> {
         let rest = url.strip_prefix("opc.tcp://")?;
         let (authority, path) = match rest.find('/') {
@@ -34,7 +34,7 @@ impl Url {
             None => return None,
         };
         let strange = |c: char| c.is_control() || c.is_whitespace();
-        // Only an address of IPv6 has colons, and it stands in brackets.
+        // Only an IPv6 address has colons, and it is in brackets.
         let is_literal = authority.starts_with('[');
         if host.is_empty()
             || host.contains(['[', ']'])
@@ -50,7 +50,7 @@ impl Url {
         })
     }
 
-    /// Of an address.
+    /// Creates the URL of an address.
     pub fn of(ip: IpAddr, port: u16, path: &str) -> Self {
         Self {
             host: ip.to_string(),
@@ -59,7 +59,7 @@ impl Url {
         }
     }
 
-    /// The address, where the host is one.
+    /// Returns the address if the host is an address.
     pub fn ip(&self) -> Option<IpAddr> {
         self.host.parse().ok()
     }
@@ -75,7 +75,7 @@ impl std::fmt::Display for Url {
     }
 }
 
-/// Where OPC UA over TCP is when a URL does not say it (OPC 10000-6, 7.2).
+/// The default port of OPC UA over TCP (OPC 10000-6, 7.2).
 const PORT: u16 = 4840;
 
 #[cfg(test)]

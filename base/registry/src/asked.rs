@@ -1,4 +1,4 @@
-//! What a server asks for when it registers (OPC 10000-4, 5.5.5 and 5.5.6), and why it may be refused.
+//! The registration request of a server (OPC 10000-4, 5.5.5 and 5.5.6), and its errors.
 
 use std::net::IpAddr;
 
@@ -26,30 +26,30 @@ pub struct Asked {
     pub product_uri: String,
     /// Names as (locale, text).
     pub names: Vec<(String, String)>,
-    /// What it is.
+    /// Type of the application.
     pub application_type: ApplicationType,
-    /// Of a gateway; empty otherwise.
+    /// The URI of a gateway; empty otherwise.
     pub gateway_server_uri: String,
-    /// Where its endpoints are asked for.
+    /// URLs for GetEndpoints requests.
     pub discovery_urls: Vec<String>,
-    /// A file that is there while the server is installed; empty for none.
+    /// A file that exists while the server is installed; empty without such a file.
     pub semaphore_file_path: String,
-    /// `false` takes the registration back.
+    /// `false` withdraws the registration.
     pub is_online: bool,
-    /// How it wants to be announced on the network; RegisterServer alone has none.
+    /// Requested announcement on the network; not available in RegisterServer.
     pub mdns: Option<MdnsConfiguration>,
 }
 
 /// MdnsDiscoveryConfiguration of OPC 10000-4, 7.13.1.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct MdnsConfiguration {
-    /// The mDNS name it wants.
+    /// The requested mDNS name.
     pub name: String,
-    /// Codes of OPC 10000-12, Annex D, as `DA`.
+    /// Codes of OPC 10000-12, Annex D, such as `DA`.
     pub capabilities: Vec<String>,
 }
 
-/// How the request came.
+/// The channel of the request.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Channel {
     /// Whether the SecureChannel signs.
@@ -60,7 +60,7 @@ pub struct Channel {
     pub peer: Option<IpAddr>,
 }
 
-/// Why a registration is refused. Nothing of it was taken.
+/// Error of a registration, which has no effect then.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
 #[non_exhaustive]
 pub enum RegisterFault {
@@ -70,12 +70,12 @@ pub enum RegisterFault {
     /// BadServerUriInvalid.
     #[error("the server URI is empty or too long")]
     NoUri,
-    /// BadServerUriInvalid: what is registered is not who registers it.
+    /// BadServerUriInvalid: the server URI differs from the certificate of the client.
     #[error("the server URI is {asked}, the certificate is of {certificate}")]
     OtherUri {
-        /// What it asked for.
+        /// The requested URI.
         asked: String,
-        /// What the certificate says.
+        /// The URI of the certificate.
         certificate: String,
     },
     /// BadServerNameMissing.
@@ -87,28 +87,29 @@ pub enum RegisterFault {
     /// BadSempahoreFileMissing.
     #[error("the semaphore file is not there")]
     NoSemaphore,
-    /// BadInvalidArgument: a client does not register, and no text or list is so long.
+    /// BadInvalidArgument: a client cannot register, or a text or list is too long.
     #[error("{what}")]
     Invalid {
-        /// What it is.
+        /// Description of the error.
         what: &'static str,
     },
     /// BadResourceUnavailable.
     #[error("{most} servers are registered, and there is no room for more")]
     Full {
-        /// How many there may be.
+        /// Maximum number of servers.
         most: usize,
     },
-    /// BadSecurityModeInsufficient: whoever registered by a certificate is not replaced by one without.
+    /// BadSecurityModeInsufficient: a registration without a certificate cannot replace a
+    /// registration with a certificate.
     #[error("{asked} is registered by its certificate, and is changed by it alone")]
     Certified {
-        /// What it asked for.
+        /// The requested URI.
         asked: String,
     },
 }
 
 impl RegisterFault {
-    /// The StatusCode of OPC 10000-6, Annex A.
+    /// Returns the StatusCode of OPC 10000-6, Annex A.
     #[must_use]
     pub fn status(&self) -> u32 {
         match self {
@@ -124,7 +125,7 @@ impl RegisterFault {
 }
 
 impl Asked {
-    /// Holds a request against the rules, in the order of Part 4.
+    /// Validates a request, in the order of Part 4.
     pub(crate) fn check(
         &self,
         channel: &Channel,
@@ -145,7 +146,7 @@ impl Asked {
             });
         }
         if !self.is_online {
-            // What is taken back needs no more than to be found; some leave the rest out.
+            // A withdrawal only needs the URI; some servers omit the rest.
             return Ok(());
         }
         if self.application_type == ApplicationType::Client {

@@ -1,6 +1,8 @@
-//! Levels of a plant: which discovery server is the right one, who is on a level, and what its place is called.
+//! Levels of a plant: the selection of a discovery server, the servers of a level, and the names of
+//! locations.
 //!
-//! Reading order: `choice` (the discovery server to register with), `roster` (who is there, whoever tells of it), `place`.
+//! Reading order: `choice` (the discovery server to register with), `roster` (the servers of a
+//! level, from all sources), `place`.
 
 mod choice;
 mod place;

@@ -1,12 +1,15 @@
-//! Which OPC UA servers are there: the knowledge of a Local Discovery Server (OPC 10000-12, 4) without its sockets.
+//! The available OPC UA servers: the state of a Local Discovery Server (OPC 10000-12, 4) without
+//! its sockets.
 //!
-//! A [`Registry`] hears of servers in two ways. They register ([`Registry::register`]; FindServers lists those), and they are
-//! announced by mDNS ([`Registry::announced`]; FindServersOnNetwork lists those and the ones that registered with a name for
-//! it). Whoever was heard of is looked after: [`Registry::poll_probe`] says whose endpoint to try, and who does not answer is
-//! lost within [`Settings::lost_after`], with a goodbye or without.
+//! A [`Registry`] has two sources of servers. Servers register ([`Registry::register`]; FindServers
+//! lists them), or they are announced by mDNS ([`Registry::announced`]). FindServersOnNetwork lists
+//! announced servers, and registered servers with an mDNS name. All of them are supervised:
+//! [`Registry::poll_probe`] returns the endpoint to probe, and a server that does not answer is
+//! lost within [`Settings::lost_after`], with or without a goodbye.
 //!
 //! Time is a parameter, and there is no socket, no clock and no randomness. After every call drain
-//! [`Registry::poll_event`]; when [`Registry::poll_timeout`] has passed, call [`Registry::handle_timeout`].
+//! [`Registry::poll_event`]; when [`Registry::poll_timeout`] has passed, call
+//! [`Registry::handle_timeout`].
 
 mod asked;
 pub mod hierarchy;

@@ -1,26 +1,26 @@
-//! How it is known that a server is gone.
+//! Reasons for the loss of a server.
 
-/// Why a server is no longer there.
+/// Reason for the loss of a server.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Loss {
-    /// It took its registration back.
+    /// The server withdrew its registration.
     Unregistered,
-    /// It said so by mDNS, or its announcement ran out.
+    /// The server sent a goodbye by mDNS, or its announcement expired.
     Goodbye,
-    /// It registered no more.
+    /// The server did not repeat its registration.
     Expired,
-    /// Its semaphore file is gone.
+    /// The semaphore file of the server was removed.
     SemaphoreGone,
-    /// It does not answer.
+    /// The server does not answer.
     Unreachable,
-    /// Its host takes connections, and it does not answer.
+    /// The host accepts connections, and the server does not answer.
     Hanging,
-    /// It was never verified, and gave way to another one.
+    /// The server was never verified, and was displaced by another server.
     Displaced,
 }
 
 impl Loss {
-    /// For logs and counters.
+    /// Returns the label for logs and counters.
     #[must_use]
     pub fn label(self) -> &'static str {
         match self {

@@ -1,14 +1,15 @@
 //! Instance names of DNS-SD (RFC 6763, 4.1.1).
 
-/// A name that no other server takes without being told to, so that it can be announced at once, without the three probes
-/// of RFC 6762, 8.1, which take 0.75 s: the wish, the host and the port.
+/// Returns a unique name from the requested name, the host and the port. It can be announced at
+/// once, without the three probes of RFC 6762, 8.1, which take 0.75 s.
 #[must_use]
 pub fn instance_name(wish: &str, host: &str, port: u16) -> String {
     let tail = format!("-{}-{port}", cut(&clean(host), MAX_HOST));
     format!("{}{tail}", cut(&clean(wish), MAX_LABEL - tail.len()))
 }
 
-/// The name to take when another host has that one (RFC 6762, 9): `arm (2)` after `arm`, `arm (3)` after `arm (2)`.
+/// Returns the next name after a conflict with another host (RFC 6762, 9): `arm (2)` after `arm`,
+/// `arm (3)` after `arm (2)`.
 #[must_use]
 pub fn renamed(name: &str) -> String {
     let counted = name.strip_suffix(')').and_then(|rest| {
@@ -20,18 +21,18 @@ pub fn renamed(name: &str) -> String {
     format!("{}{tail}", cut(base, MAX_LABEL - tail.len()))
 }
 
-/// A text as one label of DNS: without control characters, and of at most 63 bytes.
+/// Returns a text as one label of DNS: without control characters, and of at most 63 bytes.
 #[must_use]
 pub fn label(text: &str) -> String {
     cut(&clean(text), MAX_LABEL).to_owned()
 }
 
-/// Without control characters, which no page and no log shall show.
+/// Removes control characters, which must not appear on pages and in logs.
 fn clean(text: &str) -> String {
     text.chars().filter(|letter| !letter.is_control()).collect()
 }
 
-/// The beginning of at most so many bytes, in whole characters.
+/// Returns the longest prefix of whole characters within a number of bytes.
 fn cut(text: &str, most: usize) -> &str {
     let end = (0..=most.min(text.len()))
         .rev()
@@ -39,7 +40,7 @@ fn cut(text: &str, most: usize) -> &str {
     text.get(..end.unwrap_or(0)).unwrap_or_default()
 }
 
-/// A label of DNS.
+/// Maximum length of a label of DNS.
 const MAX_LABEL: usize = 63;
 const MAX_HOST: usize = 32;
 

@@ -1,42 +1,42 @@
-//! What FindServersOnNetwork lists (OPC 10000-4, 5.5.3).
+//! The records of FindServersOnNetwork (OPC 10000-4, 5.5.3).
 
 use std::collections::BTreeMap;
 use std::time::Instant;
 
-/// A server as mDNS tells of it, resolved to a URL.
+/// A server as announced by mDNS, resolved to a URL.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Announcement {
     /// The instance name, without the service and the domain.
     pub instance: String,
-    /// `opc.tcp://host:port/path`, of the SRV record and the key `path` of the TXT record.
+    /// `opc.tcp://host:port/path`, from the SRV record and the key `path` of the TXT record.
     pub url: String,
-    /// Of the key `caps`.
+    /// Capabilities, from the key `caps`.
     pub capabilities: Vec<String>,
 }
 
 /// A ServerOnNetwork of OPC 10000-4, 7.38.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct NetworkRecord {
-    /// Rises with each record and is never given again, so that a client can go on where it stopped.
+    /// Ascending and never reused, so that a client can continue after the last record.
     pub record_id: u32,
-    /// What mDNS tells.
+    /// The announcement.
     pub announcement: Announcement,
 }
 
-/// Records by instance name in small letters: names of DNS differ by more than their case.
+/// Records by instance name in lower case: names of DNS that differ only in case are equal.
 #[derive(Debug, Default)]
 pub(crate) struct Network {
     records: BTreeMap<String, NetworkRecord>,
-    /// When each name was announced first.
+    /// First announcement of each name.
     arrivals: BTreeMap<String, Arrival>,
     last_arrival: u64,
     last_id: u32,
 }
 
-/// When a name was announced first, and where its server is.
+/// First announcement of a name, and the endpoint of its server.
 #[derive(Debug)]
 pub(crate) struct Arrival {
-    /// Ascends with each name.
+    /// Ascending with each name.
     pub(crate) order: u64,
     pub(crate) since: Instant,
     /// The [`place`] of its URL.
@@ -44,8 +44,8 @@ pub(crate) struct Arrival {
 }
 
 impl Network {
-    /// Takes a record in. One that changed gets a new id. Gives the record it takes the place of, or itself where nothing
-    /// is new.
+    /// Adds a record. A changed record gets a new id. Returns the replaced record, or the record
+    /// itself if it is unchanged.
     pub(crate) fn put(
         &mut self,
         announcement: Announcement,
@@ -88,7 +88,7 @@ impl Network {
         self.records.values().zip(self.arrivals.values())
     }
 
-    /// Returns whether a name is not the first one that was announced for its endpoint.
+    /// Returns whether a name is not the first announced name of its endpoint.
     pub(crate) fn is_further(&self, instance: &str) -> bool {
         let own = self.arrivals.get(&instance.to_ascii_lowercase());
         own.is_some_and(|own| {
@@ -109,7 +109,8 @@ impl Network {
         self.records.values()
     }
 
-    /// Records from an id on that have all capabilities, whatever their case, in the order of their ids; `most` 0 for all.
+    /// Returns the records from an id on that have all capabilities, regardless of case, in the
+    /// order of their ids. `most` limits their number; 0 selects all.
     pub(crate) fn find(&self, from: u32, most: u32, capabilities: &[&str]) -> Vec<&NetworkRecord> {
         let mut found: Vec<_> = self
             .records
@@ -133,7 +134,8 @@ impl NetworkRecord {
     }
 }
 
-/// Returns the endpoint that a URL is served at: scheme, host in small letters and port, without the path.
+/// Returns the endpoint that a URL is served at: scheme, host in lower case and port, without the
+/// path.
 pub(crate) fn place(url: &str) -> String {
     let (scheme, rest) = url.split_once("://").unwrap_or(("", url));
     let authority = rest.split('/').next().unwrap_or_default();
@@ -153,7 +155,7 @@ pub(crate) fn host(place: &str) -> &str {
     place.rsplit_once(':').map_or(place, |(host, _)| host)
 }
 
-/// The port of OPC UA over TCP (OPC 10000-6, 7.2).
+/// The default port of OPC UA over TCP (OPC 10000-6, 7.2).
 const DEFAULT_PORT: u16 = 4840;
 
 #[cfg(test)]

@@ -1,4 +1,5 @@
-//! The registry itself: what is heard goes in, who is there comes out.
+//! The registry itself: registrations and announcements are inputs, the available servers are
+//! outputs.
 
 mod room;
 
@@ -11,23 +12,29 @@ use crate::name::{label, renamed};
 use crate::network::{Announcement, Network, NetworkRecord, place};
 use crate::watch::{Outcome, Patience, Probe, Sign, Watch};
 
-/// How careful and how patient a registry is.
+/// Limits and time limits of a registry.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Settings {
-    /// Whether a server may register over a channel that is not secured. The standard has it refused (OPC 10000-12, 4.2.2).
+    /// Whether a server may register over a channel that is not secured. The standard requires a
+    /// refusal (OPC 10000-12, 4.2.2).
     pub allow_unsecured: bool,
-    /// How long a registration without semaphore file counts: twice the period in which servers repeat it.
+    /// Lifetime of a registration without semaphore file: twice the period in which servers repeat
+    /// it.
     pub forget_after: Duration,
-    /// How often each endpoint is tried. Where there are more than 500 they are tried less often, 500 in a second.
+    /// Period of the probes of an endpoint. With more than 500 endpoints they are probed less
+    /// often, 500 in a second.
     pub probe_every: Duration,
-    /// How long one that gives no answer at all still counts as there.
+    /// Time after which a server without any answer is lost.
     pub lost_after: Duration,
-    /// How long a server that answers during calls may be silent while its host takes connections: longer than `lost_after`,
-    /// since a program that computes is not gone. Ten times as long where it has never answered, since it may be starting.
+    /// Time limit for a server that answers during calls and is silent while its host accepts
+    /// connections. It exceeds `lost_after`, since a program that computes is not lost. It is ten
+    /// times as long for a server that has never answered, since it may be starting.
     pub hangs_after: Duration,
-    /// How long any other server may be: many serve one request at a time, and answer nothing while they execute a method.
+    /// The same time limit for any other server: many serve one request at a time, and do not
+    /// answer while they execute a method.
     pub busy_for: Duration,
-    /// Servers that may be registered, and records of the network, each. What is more is refused or not taken in.
+    /// Maximum number of registered servers, and of records of the network. More are refused or
+    /// ignored.
     pub most: usize,
 }
 
@@ -45,66 +52,67 @@ impl Default for Settings {
     }
 }
 
-/// What a registration was.
+/// Effect of a registration.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Registered {
-    /// Of a server that was not registered.
+    /// The server was not registered before.
     New,
-    /// Of one that was, with something else than before.
+    /// The server was registered, with other properties.
     Changed,
     /// A repetition.
     Again,
-    /// The end of one, or of none.
+    /// A withdrawal, of an existing registration or without effect.
     Withdrawn,
 }
 
-/// What has happened.
+/// Event of a registry.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Event {
-    /// A server registered, or registered otherwise than before.
+    /// A server registered, or changed its registration.
     Registered {
         /// Its ApplicationUri.
         server_uri: String,
-        /// Where its endpoints are asked for.
+        /// Its URLs for GetEndpoints requests.
         discovery_urls: Vec<String>,
     },
     /// A server appeared on the network, or its record changed.
     Seen(NetworkRecord),
-    /// The program behind a URL was started anew: what was learned of it counts no more.
+    /// The program behind a URL was restarted: cached information about it is invalid.
     Restarted {
-        /// The URL that was tried.
+        /// The probed URL.
         url: String,
     },
-    /// A server that was registered is gone.
+    /// A registered server is lost.
     Gone {
         /// Its ApplicationUri.
         server_uri: String,
-        /// How that is known.
+        /// Reason of the loss.
         loss: Loss,
     },
-    /// A server that was seen on the network is gone.
+    /// A server on the network is lost.
     Vanished {
-        /// What was known of it.
+        /// Its record.
         record: NetworkRecord,
-        /// How that is known.
+        /// Reason of the loss.
         loss: Loss,
     },
-    /// This server asks us to announce it.
+    /// A server requests to be announced by this program.
     Announce(Announcement),
-    /// What we announced is to be taken back: a goodbye.
+    /// An announcement of this program has to be withdrawn with a goodbye.
     Withdraw {
         /// The instance name.
         instance: String,
     },
 }
 
-/// Who is there. See the crate's page for how it is driven.
+/// The available servers. The page of the crate describes its use.
 #[derive(Debug)]
 pub struct Registry {
     settings: Settings,
     servers: BTreeMap<String, Server>,
-    /// Registered, and not to be reached: listed again when they answer before their registration has run out.
+    /// Registered and unreachable servers. They are listed again if they answer before their
+    /// registration expires.
     away: BTreeMap<String, Server>,
     network: Network,
     watch: Watch,
@@ -117,11 +125,12 @@ pub struct Registry {
 #[derive(Debug, Clone)]
 struct Server {
     asked: Asked,
-    /// What we announce for it: what it asked for, under another name where that one was taken.
+    /// The announcement of this program for the server: the requested announcement, with another
+    /// name if the requested name was taken.
     announced: Option<Announcement>,
-    /// Whether a certificate said who registers it.
+    /// Whether the registration was made with a certificate.
     certified: bool,
-    /// The address that it is registered from.
+    /// The address that sent the registration.
     sender: String,
     /// Host and port of its first endpoint.
     place: String,
@@ -132,7 +141,7 @@ struct Server {
 }
 
 impl Registry {
-    /// A registry that knows nobody.
+    /// Creates an empty registry.
     #[must_use]
     pub fn new(settings: Settings) -> Self {
         Self {
@@ -148,11 +157,11 @@ impl Registry {
         }
     }
 
-    /// RegisterServer and RegisterServer2. Whether a semaphore file is there is the caller's to look up, `None` where the
-    /// request names none.
+    /// Handles RegisterServer and RegisterServer2. The caller checks whether the semaphore file
+    /// exists; `None` if the request has no such file.
     ///
     /// # Errors
-    /// [`RegisterFault`], with the status to answer; what was registered before stays.
+    /// [`RegisterFault`], with the status of the response; a previous registration stays.
     pub fn register(
         &mut self,
         asked: Asked,
@@ -206,7 +215,8 @@ impl Registry {
         Ok(registered)
     }
 
-    /// Who came with a certificate is changed by it alone, for as long as the registration counts.
+    /// Refuses to change a registration with a certificate without this certificate, as long as the
+    /// registration is valid.
     fn check_certified(&self, asked: &Asked, certified: bool) -> Result<(), RegisterFault> {
         let known = self.servers.get(&asked.server_uri);
         let known = known.or_else(|| self.away.get(&asked.server_uri));
@@ -218,7 +228,7 @@ impl Registry {
         }
     }
 
-    /// Takes a server in, in the place of what it registered before.
+    /// Adds a server, in place of its previous registration.
     fn take(&mut self, server: Server, now: Instant) {
         let server_uri = server.asked.server_uri.clone();
         let discovery_urls = server.asked.discovery_urls.clone();
@@ -254,11 +264,11 @@ impl Registry {
         }
     }
 
-    /// mDNS has told of a server, for the first time or again.
+    /// Handles an announcement by mDNS, new or repeated.
     pub fn announced(&mut self, announcement: Announcement, now: Instant) {
         let instance = &announcement.instance;
         if self.is_ours(instance) {
-            // What comes back of our own announcements.
+            // An announcement of this program itself.
             return;
         }
         let known = self.network.get(instance);
@@ -278,20 +288,20 @@ impl Registry {
         self.events.extend(record.map(Event::Seen));
     }
 
-    /// mDNS has told that a server leaves, or what it told has run out.
+    /// Handles a goodbye by mDNS, or the expiry of an announcement.
     pub fn withdrawn(&mut self, instance: &str) {
         if !self.is_ours(instance) {
             self.vanish(instance, Loss::Goodbye);
         }
     }
 
-    /// The semaphore file of a registered server is gone.
+    /// Handles the removal of a registered server's semaphore file.
     pub fn semaphore_gone(&mut self, server_uri: &str) {
         self.forget_away(server_uri);
         self.end(server_uri, Loss::SemaphoreGone);
     }
 
-    /// What we announce for a server is called otherwise from now on: another host has that name (RFC 6762, 9).
+    /// Renames an announcement of this program: another host has the name (RFC 6762, 9).
     pub fn renamed(&mut self, from: &str, to: &str, now: Instant) {
         let mut announced = self
             .servers
@@ -306,19 +316,20 @@ impl Registry {
         self.network.put(ours, now);
     }
 
-    /// Whether an endpoint is looked after.
+    /// Returns whether an endpoint is supervised.
     #[must_use]
     pub fn watches(&self, url: &str) -> bool {
         self.watch.contains(url)
     }
 
-    /// Something says that a server may have ended, as a connection that broke off: it is tried at once.
+    /// Probes an endpoint at once, because its server may have ended, for example after a lost
+    /// connection.
     pub fn suspect(&mut self, url: &str) {
         self.watch.hasten(url);
     }
 
-    /// The program did not run for some time, so that no answer and no repeated registration could come: that time does not
-    /// count.
+    /// Excludes a time in which the program did not run, so that no answer and no repeated
+    /// registration could be received.
     pub fn stood_still(&mut self, how_long: Duration) {
         self.watch.stood_still(how_long);
         let servers = self.servers.values_mut().chain(self.away.values_mut());
@@ -327,18 +338,20 @@ impl Registry {
         }
     }
 
-    /// The endpoint to try now, if any is due. To be asked until there is none.
+    /// Returns the next endpoint to probe, if any is due. Has to be called until it returns `None`.
     pub fn poll_probe(&mut self, now: Instant) -> Option<Probe> {
         self.watch.next(self.settings.probe_every, now)
     }
 
-    /// When the run of the program that is known started, as it is told another way than before: a program says when it was
-    /// announced, and its server when that began. Nobody is told of a restart.
+    /// Sets the start time of the known run of a program, from a source with another definition of
+    /// it. A program announces its own start, while its server reports the start of the server.
+    /// This is not reported as a restart.
     pub fn started(&mut self, url: &str, start_time: i64) {
         self.watch.started(url, start_time);
     }
 
-    /// The server at this URL answers while it executes methods, so that silence is a sign that it hangs.
+    /// Records that the server at this URL answers while it executes methods, so that silence means
+    /// that it hangs.
     pub fn answers_during_calls(&mut self, url: &str) {
         self.watch.answers_during_calls(url);
     }
@@ -349,8 +362,8 @@ impl Registry {
         self.watch.is_concurrent(url)
     }
 
-    /// An announcement by `instance` says when its program started. It is no proof that the program runs; another start time
-    /// than before is a restart, unless the name is a further one of an endpoint that has others.
+    /// Handles the start time in an announcement of `instance`. It does not prove that the program
+    /// runs. A changed start time is a restart, unless the name is a further name of an endpoint.
     pub fn announced_start(&mut self, instance: &str, start_time: i64) {
         let Some(record) = self.network.get(instance) else {
             return;
@@ -370,7 +383,7 @@ impl Registry {
         self.watch.has_answered(url)
     }
 
-    /// Returns whether probes of an endpoint failed lately, so that it is left alone for a while.
+    /// Returns whether recent probes of an endpoint failed, so that it is not probed for a while.
     #[must_use]
     pub fn is_paused(&self, url: &str, now: Instant) -> bool {
         self.watch.is_paused(url, now)
@@ -390,12 +403,12 @@ impl Registry {
             .extend(urls.into_iter().map(|url| Event::Restarted { url }));
     }
 
-    /// What came of a try.
+    /// Handles the result of a probe.
     pub fn probed(&mut self, url: &str, outcome: Outcome, now: Instant) {
         match outcome {
             Outcome::Alive { .. } => self.welcome_back(url, now),
-            // The host is there and the program is not: another run of it registers anew, and whoever else
-            // gets its port is not it.
+            // The host is available and the program has ended: its next run registers again, and
+            // another program that gets its port is not the same server.
             Outcome::Refused => self.forget_away_at(url),
             Outcome::Silent | Outcome::Hanging | Outcome::Untried => {}
         }
@@ -412,7 +425,7 @@ impl Registry {
         }
     }
 
-    /// Forgets who has not registered again.
+    /// Removes expired registrations.
     pub fn handle_timeout(&mut self, now: Instant) {
         let away = self
             .away
@@ -433,7 +446,8 @@ impl Registry {
         }
     }
 
-    /// When [`handle_timeout`](Self::handle_timeout) and [`poll_probe`](Self::poll_probe) are wanted next.
+    /// Returns the time at which [`handle_timeout`](Self::handle_timeout) or
+    /// [`poll_probe`](Self::poll_probe) has to be called next.
     #[must_use]
     pub fn poll_timeout(&self) -> Option<Instant> {
         let expiring = self.servers.values().filter(|server| server.expires());
@@ -441,12 +455,13 @@ impl Registry {
         expiry.into_iter().chain(self.watch.due()).min()
     }
 
-    /// What has happened, oldest first.
+    /// Returns the next event, oldest first.
     pub fn poll_event(&mut self) -> Option<Event> {
         self.events.pop_front()
     }
 
-    /// The registered servers, of all or of these URIs, with since when: FindServers.
+    /// Returns the registered servers with their time of registration, all or with these URIs:
+    /// FindServers.
     pub fn find_servers(&self, uris: &[&str]) -> impl Iterator<Item = (&Asked, Instant)> {
         self.servers
             .values()
@@ -454,7 +469,8 @@ impl Registry {
             .map(|server| (&server.asked, server.since))
     }
 
-    /// Records from an id on that have all of the capabilities, at most so many (0: all): FindServersOnNetwork.
+    /// Returns the records from an id on that have all of the capabilities, with a maximum number
+    /// (0: all): FindServersOnNetwork.
     #[must_use]
     pub fn find_servers_on_network(
         &self,
@@ -465,19 +481,20 @@ impl Registry {
         self.network.find(from, most, capabilities)
     }
 
-    /// How often a server was refused for want of room: in the whole table, or in the share of its endpoint or sender.
+    /// Returns the number of servers refused for lack of space: in the whole table, or in the share
+    /// of the endpoint or sender.
     #[must_use]
     pub fn refused(&self) -> u64 {
         self.refused
     }
 
-    /// How often an unverified server gave way to another one.
+    /// Returns the number of unverified servers that were displaced by another server.
     #[must_use]
     pub fn displaced(&self) -> u64 {
         self.displaced
     }
 
-    /// Nobody answers at the endpoint of a URL: all that was said of it goes.
+    /// Removes all registrations and records of the endpoint of a URL, which does not answer.
     fn lose(&mut self, url: &str, loss: Loss, ended: bool, now: Instant) {
         let place_of_url = place(url);
         let is_there = |known: &String| place(known) == place_of_url;
@@ -496,12 +513,13 @@ impl Registry {
             .map(|record| record.announcement.instance.clone())
             .collect();
         for (uri, certified) in servers {
-            // One that has another endpoint is looked after there, and announced with it.
+            // A server with another endpoint is supervised there, and announced with it.
             let Some(server) = self.servers.get_mut(&uri) else {
                 continue;
             };
             if server.asked.discovery_urls.iter().all(is_there) {
-                // What was never verified is not kept for its return. A program that hangs accepts connections, so it exists.
+                // An unverified server is not kept for its return. A program that hangs accepts
+                // connections, so it exists.
                 let is_verified = had_answered || certified || loss == Loss::Hanging;
                 self.leave(&uri, loss, ended || !is_verified);
                 continue;
@@ -529,8 +547,8 @@ impl Registry {
         }
     }
 
-    /// A registered server is not to be reached. Unless it has ended its program may run on behind a cable that is cut,
-    /// and registers again in some minutes only.
+    /// Removes an unreachable registered server. Unless it has ended, its program may still run
+    /// behind a disconnected cable, and would register again only after some minutes.
     fn leave(&mut self, server_uri: &str, loss: Loss, ended: bool) {
         let server = self.servers.get(server_uri).cloned();
         self.end(server_uri, loss);
@@ -562,7 +580,7 @@ impl Registry {
         away.map(|(uri, _)| uri.clone()).collect()
     }
 
-    /// Who was not to be reached at a URL answers there again.
+    /// Lists the unreachable servers of a URL again, which has answered.
     fn welcome_back(&mut self, url: &str, now: Instant) {
         for uri in self.away_at(url) {
             let Some(server) = self.away.remove(&uri) else {
@@ -594,7 +612,7 @@ impl Registry {
         }
         for url in &server.asked.discovery_urls {
             self.unwatch(url);
-            // Where it is announced on the network as well, that is held against it at once.
+            // If it is announced on the network as well, its record is checked at once.
             self.watch.hasten(url);
         }
         self.events.push_back(Event::Gone {
@@ -610,7 +628,7 @@ impl Registry {
         }
     }
 
-    /// Looks no longer after a URL that nobody is known by any more.
+    /// Ends the supervision of a URL that no server has any more.
     fn unwatch(&mut self, url: &str) {
         let registered = self.servers.values().chain(self.away.values());
         let mut urls = registered
@@ -622,7 +640,7 @@ impl Registry {
         }
     }
 
-    /// Whether we announce that name for a registered server.
+    /// Returns whether this program announces that name for a registered server.
     fn is_ours(&self, instance: &str) -> bool {
         let mut announced = self
             .servers
@@ -631,8 +649,9 @@ impl Registry {
         announced.any(|ours| ours.instance.eq_ignore_ascii_case(instance))
     }
 
-    /// What to announce for a server: its wish, counted on where another server has that name (RFC 6762, 9). Nothing
-    /// where the wish is heard on the network already with the same URL: then the server does it itself.
+    /// Returns the announcement for a server: the requested name, with a number if another server
+    /// has that name (RFC 6762, 9). Returns `None` if the server already announces itself with this
+    /// name and URL.
     fn free(&self, asked: &Asked) -> Option<Announcement> {
         let mut wish = asked.announcement()?;
         let others = |name: &str| {
@@ -642,7 +661,7 @@ impl Registry {
                 .filter_map(|server| server.announced.as_ref())
                 .any(|announced| announced.instance.eq_ignore_ascii_case(name))
         };
-        // Each turn passes by one of the names there are.
+        // Each turn skips one of the existing names.
         for _ in 0..=self.servers.len() + self.network.len() {
             let heard = self
                 .network
@@ -659,14 +678,15 @@ impl Registry {
 }
 
 impl Server {
-    /// With a semaphore file it stays as long as the file does.
+    /// Returns whether the registration expires. With a semaphore file it stays as long as the file
+    /// exists.
     fn expires(&self) -> bool {
         self.asked.semaphore_file_path.is_empty()
     }
 }
 
 impl Asked {
-    /// How it is to be announced, if it is.
+    /// Returns the requested announcement, if any.
     fn announcement(&self) -> Option<Announcement> {
         let mdns = self.mdns.as_ref()?;
         let instance = label(&mdns.name);
@@ -681,5 +701,5 @@ impl Asked {
     }
 }
 
-/// ProductUris of servers that serve many requests at a time begin like this.
+/// Prefix of the ProductUris of servers that serve many requests at a time.
 const CONCURRENT_PRODUCTS: &str = "urn:ua-bridge:";

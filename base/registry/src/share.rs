@@ -1,12 +1,13 @@
-//! Which entry of a full table gives way to a new one.
+//! Selects the entry of a full table that is displaced by a new entry.
 //!
-//! Anyone on the network can announce names, and any program of the host can register them. A table therefore has a share
-//! for each endpoint and for each sender, and an entry that nothing verifies gives way first.
+//! Any host on the network can announce names, and any program of the host can register servers. A
+//! table therefore has a share for each endpoint and for each sender, and unverified entries are
+//! displaced first.
 
 use std::collections::HashMap;
 use std::time::{Duration, Instant};
 
-/// An entry of a table, as far as it matters who gives way.
+/// The properties of an entry that decide about its displacement.
 #[derive(Debug)]
 pub(crate) struct Entry<'e> {
     /// The name of the entry.
@@ -30,12 +31,12 @@ pub(crate) struct Newcomer<'e> {
     pub(crate) sender: &'e str,
 }
 
-/// Whether a new entry is accepted.
+/// Decision about a new entry.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) enum Verdict {
-    /// There is room.
+    /// The entry is accepted.
     Room,
-    /// In the place of this entry.
+    /// The entry is accepted and displaces this entry.
     InsteadOf(String),
     /// The new entry is refused.
     Full,
@@ -56,7 +57,7 @@ pub(crate) fn admit(
     if at_place < PLACE_SHARE && !is_nearly_full {
         return Verdict::Room;
     }
-    // The first entry of a live endpoint is verified; the others there are further names of it.
+    // The first entry of a live endpoint is verified; further names of the endpoint are not.
     let mut firsts: HashMap<&str, u64> = HashMap::new();
     let mut senders: HashMap<&str, usize> = HashMap::new();
     for entry in entries {
@@ -79,7 +80,7 @@ pub(crate) fn admit(
         found.map_or(Verdict::Full, |(key, _)| Verdict::InsteadOf(key))
     };
     if at_place >= PLACE_SHARE {
-        // A flood of names for one endpoint exchanges them slowly.
+        // A flood of names for an endpoint exchanges them slowly.
         let found = oldest(&|entry| entry.place == newcomer.place);
         return instead(found.filter(|(_, since)| now.duration_since(*since) >= EXCHANGE_AFTER));
     }
@@ -90,7 +91,7 @@ pub(crate) fn admit(
             false => Verdict::Room,
         };
     }
-    // The sender with the largest share gives way.
+    // The sender with the largest share loses an entry.
     let largest = entries
         .iter()
         .filter(|entry| !is_kept(entry))
@@ -101,9 +102,9 @@ pub(crate) fn admit(
     }))
 }
 
-/// Entries without a certificate for one endpoint.
+/// Maximum number of entries without a certificate for an endpoint.
 const PLACE_SHARE: usize = 16;
-/// How long an entry of an endpoint stays at least.
+/// Minimum time for which an entry of an endpoint stays.
 const EXCHANGE_AFTER: Duration = Duration::from_secs(2);
 
 #[cfg(test)]

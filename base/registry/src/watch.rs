@@ -1,4 +1,4 @@
-//! Who still answers: endpoints that are tried again and again.
+//! Supervision: endpoints that are probed periodically.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -6,70 +6,74 @@ use std::time::{Duration, Instant};
 use crate::loss::Loss;
 use crate::network::place;
 
-/// An endpoint to try now: open a connection to it, and tell [`Registry::probed`](crate::Registry::probed) what came of it.
+/// An endpoint to probe: open a connection to it, and pass the result to
+/// [`Registry::probed`](crate::Registry::probed).
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Probe {
-    /// The URL as it was told.
+    /// The URL as registered or announced.
     pub url: String,
 }
 
-/// What came of a try.
+/// Result of a probe.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Outcome {
-    /// It answers. With the StartTime of its ServerStatus where that was read, in 100 ns since 1601.
+    /// The server answers, with the StartTime of its ServerStatus if it was read, in 100 ns since
+    /// 1601.
     Alive {
-        /// `None` where only the connection was tried.
+        /// `None` if only the connection was probed.
         start_time: Option<i64>,
     },
-    /// The host says that nobody listens there: the program is gone.
+    /// The host refuses the connection: the program has ended.
     Refused,
-    /// Nothing came back.
+    /// The host does not answer.
     Silent,
-    /// The host takes the connection, and the program behind it says nothing: it hangs, or is stopped.
+    /// The host accepts the connection, and the program does not answer: it hangs or is stopped.
     Hanging,
-    /// It could not be tried, as when the name of the host is not known here: that says nothing of the server.
+    /// The probe was not possible, for example because the host name cannot be resolved: the state
+    /// of the server is unknown.
     Untried,
 }
 
-/// What a try says of a server.
+/// Conclusion from a probe.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Sign {
-    /// Nothing that is new.
+    /// Nothing new.
     Nothing,
-    /// It is another run of the program.
+    /// The program was restarted.
     Restarted,
-    /// It is not there, or has not answered for too long.
+    /// The server has ended, or has not answered for too long.
     Lost(Loss),
 }
 
-/// How patient a watch is.
+/// Time limits of the supervision.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Patience {
-    /// How often an endpoint is tried, while there are few.
+    /// Period of the probes of an endpoint, while there are few endpoints.
     pub(crate) every: Duration,
-    /// How long a host may be silent.
+    /// Time limit for a silent host.
     pub(crate) silent: Duration,
-    /// How long a program that answers during calls may be silent while its host is there.
+    /// Time limit for a silent program that answers during calls, while its host is available.
     pub(crate) hanging: Duration,
-    /// How long any other program may be.
+    /// Time limit for any other silent program.
     pub(crate) busy: Duration,
 }
 
-/// The endpoints under watch, by host and port: URLs that differ in their path only are one endpoint, which is probed once.
+/// The supervised endpoints, by host and port: URLs that differ only in their path are one
+/// endpoint, which is probed once.
 #[derive(Debug, Default)]
 pub(crate) struct Watch {
     endpoints: BTreeMap<String, Watched>,
     pauses: BTreeMap<String, Pause>,
-    /// Until when the tries that were made take up what may be tried.
+    /// End of the time that is used by the previous probes.
     taken_until: Option<Instant>,
 }
 
-/// How long a host and port is left alone after failed probes. The pause outlives its records, so that a record that is
-/// repeated under other names does not reset it.
+/// Time without probes of a host and port after failed probes. The pause outlives its records, so
+/// that a record that is repeated under other names does not reset it.
 #[derive(Debug, Clone, Copy)]
 struct Pause {
     failures: u32,
-    /// When the last probe ended.
+    /// End of the last probe.
     probed: Instant,
     until: Instant,
     has_answered: bool,
@@ -80,9 +84,10 @@ struct Watched {
     /// The URL that is probed.
     url: String,
     answered: Instant,
-    /// Whether it ever did; before, `answered` is when it was heard of.
+    /// Whether the endpoint has ever answered; before that, `answered` is the time of its first
+    /// announcement or registration.
     has_answered: bool,
-    /// Whether an announcement named its start time: the program was running then.
+    /// Whether an announcement contained its start time: the program was running then.
     has_announced: bool,
     try_at: Instant,
     start_time: Option<i64>,
@@ -91,8 +96,8 @@ struct Watched {
 }
 
 impl Watch {
-    /// Watches the endpoint of a URL. What is heard of a server is a sign of life only the first time: an announcement
-    /// outlives its server. Many that appear together are not tried together.
+    /// Supervises the endpoint of a URL. An announcement is a sign of life only the first time,
+    /// because it outlives its server. The first probes of many new endpoints are spread.
     pub(crate) fn add(&mut self, url: &str, every: Duration, now: Instant) {
         let first_try = now + every.mul_f64(spread(url));
         let watched = || Watched {
@@ -105,7 +110,7 @@ impl Watch {
             answers_during_calls: false,
         };
         let place = place(url);
-        // A server that comes back is found soon; forged records cause one probe per `every` there.
+        // A server that is back is found soon; forged records cause a probe per `every` there.
         if let Some(pause) = self.pauses.get_mut(&place)
             && pause.has_answered
         {
@@ -118,12 +123,12 @@ impl Watch {
         self.endpoints.contains_key(&place(url))
     }
 
-    /// Returns whether the endpoint has answered a probe since it is under watch.
+    /// Returns whether the endpoint has answered a probe during its supervision.
     pub(crate) fn has_answered(&self, url: &str) -> bool {
         self.has_answered_at(&place(url))
     }
 
-    /// The same by host and port.
+    /// Returns the same by host and port.
     pub(crate) fn has_answered_at(&self, place: &str) -> bool {
         let watched = self.endpoints.get(place);
         watched.is_some_and(|watched| watched.has_answered)
@@ -135,8 +140,8 @@ impl Watch {
         pause.is_some_and(|pause| pause.failures > 0 && pause.until > now)
     }
 
-    /// How often each of them is tried: less often where there are many. Endpoints that never answered do not slow down
-    /// the probes of live ones.
+    /// Returns the period of the probes, which is longer with many endpoints. Endpoints that never
+    /// answered do not slow down the probes of live endpoints.
     fn pace(&self, every: Duration) -> Duration {
         let live = self.endpoints.values().filter(|one| one.has_answered);
         let count = u32::try_from(live.count()).unwrap_or(u32::MAX);
@@ -147,8 +152,8 @@ impl Watch {
         self.endpoints.remove(&place(url));
     }
 
-    /// The endpoint whose turn it is, if any; its next turn is after `every`, or later where there are many. Live endpoints
-    /// come first.
+    /// Returns the next endpoint to probe, if any is due; its next probe is after `every`, or later
+    /// with many endpoints. Live endpoints come first.
     pub(crate) fn next(&mut self, every: Duration, now: Instant) -> Option<Probe> {
         let every = self.pace(every);
         if self.taken_until.is_some_and(|until| until > now + BURST) {
@@ -168,14 +173,14 @@ impl Watch {
         Some(Probe { url })
     }
 
-    /// Has a URL tried at the next opportunity.
+    /// Schedules the probe of a URL for the next opportunity.
     pub(crate) fn hasten(&mut self, url: &str) {
         if let Some(watched) = self.endpoints.get_mut(&place(url)) {
             watched.try_at = watched.answered;
         }
     }
 
-    /// Nobody could have answered meanwhile.
+    /// Excludes a time in which no answer could be received.
     pub(crate) fn stood_still(&mut self, how_long: Duration) {
         for watched in self.endpoints.values_mut() {
             watched.answered += how_long;
@@ -192,14 +197,14 @@ impl Watch {
         Some(free.map_or(due, |free| free.max(due)))
     }
 
-    /// The run that is known started then, as it is told another way: that is no other run.
+    /// Sets the start time of the known run, from another source: this is not a restart.
     pub(crate) fn started(&mut self, url: &str, start_time: i64) {
         if let Some(watched) = self.endpoints.get_mut(&place(url)) {
             watched.start_time = Some(start_time);
         }
     }
 
-    /// The server at this URL answers while it executes methods.
+    /// Records that the server at this URL answers while it executes methods.
     pub(crate) fn answers_during_calls(&mut self, url: &str) {
         if let Some(watched) = self.endpoints.get_mut(&place(url)) {
             watched.answers_during_calls = true;
@@ -211,8 +216,8 @@ impl Watch {
         watched.is_some_and(|watched| watched.answers_during_calls)
     }
 
-    /// An announcement names a start time. It proves nothing, but another start time than before is another run, which is
-    /// probed at once.
+    /// Handles the start time in an announcement. It proves nothing, but a changed start time is
+    /// another run, which is probed at once.
     pub(crate) fn announced_start(&mut self, url: &str, start_time: i64) -> Sign {
         let Some(watched) = self.endpoints.get_mut(&place(url)) else {
             return Sign::Nothing;
@@ -227,7 +232,7 @@ impl Watch {
         }
     }
 
-    /// Takes note of what came of a try.
+    /// Handles the result of a probe.
     pub(crate) fn probed(
         &mut self,
         url: &str,
@@ -241,7 +246,7 @@ impl Watch {
             .endpoints
             .get(&place)
             .is_some_and(|watched| watched.has_answered);
-        // A live endpoint is tried twice before it is lost.
+        // A live endpoint is probed twice before it is lost.
         if is_alive || !had_answered {
             self.pause(&place, is_alive, patience.every, now);
         }
@@ -261,7 +266,7 @@ impl Watch {
             }
             Outcome::Refused => Sign::Lost(Loss::Unreachable),
             Outcome::Silent => {
-                // Tried again soon, so that two tries that wait fit into the time.
+                // Probed again soon, so that two probes that time out fit into the time limit.
                 let again = patience.every / 10;
                 watched.waits(
                     patience.silent,
@@ -274,22 +279,24 @@ impl Watch {
                 let is_running = watched.has_answered || watched.has_announced;
                 let (most, again) = match (watched.answers_during_calls, is_running) {
                     (true, true) => (patience.hanging, patience.every / 10),
-                    // Who has never answered may be starting: it listens, and serves a while later.
+                    // A server that has never answered may be starting: it listens, and serves a
+                    // while later.
                     (true, false) => (patience.hanging * STARTING, patience.every / 10),
-                    // A busy server accepts no connections, and its queue has room for few.
+                    // A busy server accepts no connections, and its queue is short.
                     (false, _) => (patience.busy, patience.every),
                 };
                 watched.waits(most, Loss::Hanging, (patience.every, again), now)
             }
             Outcome::Untried => {
-                // A name that nobody knows is not asked for each second.
+                // An unknown name is not resolved each second.
                 watched.try_at = now + patience.every * UNTRIED;
                 Sign::Nothing
             }
         }
     }
 
-    /// Doubles the pause of a host and port with each failure after the first ones, and ends it with an answer.
+    /// Doubles the pause of a host and port with each failure after the first failures, and ends it
+    /// with an answer.
     fn pause(&mut self, place: &str, is_alive: bool, every: Duration, now: Instant) {
         let before = self.pauses.get(place).copied();
         if before.is_none() && self.pauses.len() >= MOST_PAUSES {
@@ -323,13 +330,14 @@ impl Watch {
 }
 
 impl Watched {
-    /// When it may be tried next.
+    /// Returns the time of the next probe.
     fn due(&self, pause: Option<&Pause>) -> Instant {
         let pause = pause.filter(|pause| pause.failures > 0);
         pause.map_or(self.try_at, |pause| pause.until.max(self.try_at))
     }
 
-    /// No answer came, which may last so long; the server is tried again a while later.
+    /// Handles a missing answer, which is accepted within a time limit; the server is probed again
+    /// later.
     fn waits(
         &mut self,
         most: Duration,
@@ -337,7 +345,8 @@ impl Watched {
         (every, again): (Duration, Duration),
         now: Instant,
     ) -> Sign {
-        // A try that ends a moment before counts: the next one would take its time once more.
+        // A probe that ends shortly before the limit counts: the next probe would take its time
+        // once more.
         if now.saturating_duration_since(self.answered) + every / 4 >= most {
             return Sign::Lost(loss);
         }
@@ -346,8 +355,8 @@ impl Watched {
     }
 }
 
-/// A share of a time for each URL, of a tenth to all of it, the same each time (FNV-1a): what many do at the same time
-/// otherwise is done one after the other.
+/// Returns a fraction for each URL, from a tenth to one, always the same (FNV-1a). It spreads
+/// actions of many servers that would otherwise happen at the same time.
 #[must_use]
 pub fn spread(url: &str) -> f64 {
     let mix = |hash: u32, byte: u8| (hash ^ u32::from(byte)).wrapping_mul(16_777_619);
@@ -355,20 +364,20 @@ pub fn spread(url: &str) -> f64 {
     0.1 + 0.9 * f64::from(hash >> 8) / f64::from(u32::MAX >> 8)
 }
 
-/// 500 tries a second are made at most.
+/// Limits the probes to 500 a second.
 const LEAST_APART: Duration = Duration::from_millis(2);
-/// How many may be made at once: ten.
+/// Number of probes at once, as a time: ten.
 const BURST: Duration = Duration::from_millis(20);
 const UNTRIED: u32 = 10;
 const STARTING: u32 = 10;
-/// Failures in a row that cause no pause. The probes of a server that fails before it has answered are made in time to
-/// miss it as soon as one that has: silent after two, hanging after three of them.
+/// Number of consecutive failures without a pause. A server that fails before its first answer is
+/// thus lost as soon as a server that has answered: silent after two probes, hanging after three.
 const FAILURES_WITHOUT_PAUSE: u32 = 2;
 /// The longest pause, as a power of two of the time between probes: 64 s.
 const LONGEST_PAUSE: u32 = 6;
 /// The longest pause of an endpoint that has answered before: 2 s.
 const LONGEST_PAUSE_KNOWN: u32 = 1;
-/// Pauses that are remembered; the one that ends first gives way.
+/// Maximum number of stored pauses; the pause that ends first is removed.
 const MOST_PAUSES: usize = 4096;
-/// An endpoint that is left alone for that long after its pause starts anew.
+/// Time after a pause without probes, after which the failures are counted from zero.
 const FORGET_PAUSE: Duration = Duration::from_secs(300);

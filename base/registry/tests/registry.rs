@@ -1,4 +1,4 @@
-//! A registry told of servers by hand, on a clock of its own.
+//! A registry with hand-made servers and a simulated clock.
 #![expect(
     clippy::disallowed_methods,
     reason = "a test needs some instant to count from"
@@ -232,7 +232,8 @@ fn a_killed_server_is_lost_within_two_seconds_without_a_goodbye() {
     let (mut registry, now) = start();
     registry.announced(robot(), now);
     assert!(matches!(&*events(&mut registry), [Event::Seen(_)]));
-    // Each second it is tried; it is killed right after the first answer, and its host is gone, too.
+    // It is probed each second. It is killed right after the first answer, and its host disappears,
+    // too.
     let mut lost_after = None;
     for tenth in 1..100_u32 {
         let time = now + SECOND / 10 * tenth;
@@ -292,7 +293,7 @@ fn a_server_that_may_be_busy_with_a_method_is_kept_while_its_host_accepts_connec
         registry.probed(&url, Outcome::Hanging, now + SECOND * second);
         assert_eq!(registry.poll_event(), None, "after {second} s");
     }
-    // Its host is gone: that is noticed as fast as for any other server.
+    // Its host has disappeared: that is detected as fast as for any other server.
     let answered = now + SECOND * 59;
     registry.probed(&url, Outcome::Alive { start_time: None }, answered);
     registry.probed(&url, Outcome::Silent, answered + SECOND * 2);
@@ -592,7 +593,8 @@ fn nobody_takes_the_record_of_another_by_registering_under_its_name() {
             .collect()
     };
     let before = urls(&registry);
-    // Of one that is heard on the network, and of one that is registered; the case of names says nothing.
+    // The name of an announced server, and the name of a registered server; the case of names does
+    // not matter.
     for (uri, name, counted) in [
         ("urn:a", "ROBOT-pc-4842", "ROBOT-pc-4842 (2)"),
         ("urn:b", "gripper-PC-4841", "gripper-PC-4841 (2)"),
@@ -623,7 +625,7 @@ fn nobody_takes_the_record_of_another_by_registering_under_its_name() {
         before.iter().all(|record| after.contains(record)),
         "{after:?}"
     );
-    // Whoever announces itself is not announced a second time, and leaves by its own goodbye.
+    // A server that announces itself is not announced a second time, and leaves by its own goodbye.
     let itself = named("urn:robot", &robot().instance, &robot().url);
     registry
         .register(itself, &secured("urn:robot"), None, now)
@@ -687,7 +689,7 @@ fn who_was_behind_a_cut_cable_is_listed_again_and_who_ended_is_not() {
             .poll_probe(now + SECOND * 4)
             .expect("it is tried on");
         registry.probed(&again.url, then, now + SECOND * 4);
-        // Who has the port of one that ended is not it.
+        // A program at the port of an ended server is not the same server.
         registry.probed(&again.url, alive, now + SECOND * 5);
         assert_eq!(registry.find_servers(&[]).count(), back, "{what}");
         let announced = |event: &Event| matches!(event, Event::Announce(_));
@@ -734,7 +736,7 @@ fn what_a_certificate_registered_nobody_changes_without_one() {
         assert_eq!(fault.status(), 0x80E6_0000, "{fault}");
     }
     assert_eq!(registry.find_servers(&[]).count(), 1);
-    // Who takes its registration back says who it is, and some say no more.
+    // A withdrawal contains the URI, and some servers send nothing else.
     let bare = Asked {
         names: Vec::new(),
         discovery_urls: Vec::new(),

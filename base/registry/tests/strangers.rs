@@ -1,4 +1,4 @@
-//! A registry on a network where anyone can announce and register anything, on a clock of its own.
+//! A registry on a network with hosts that announce and register anything, with a simulated clock.
 #![expect(
     clippy::disallowed_methods,
     clippy::panic,
@@ -25,13 +25,13 @@ fn announcement(instance: &str, url: &str) -> Announcement {
     }
 }
 
-/// A small registry, whose floods take little time.
+/// Settings of a small registry, for short floods.
 const SETTINGS: fn() -> Settings = || Settings {
     most: 128,
     ..Settings::default()
 };
 
-/// A registry with a robot that has answered.
+/// Returns a registry with a robot that has answered.
 fn start() -> (Registry, Instant) {
     let (mut registry, now) = (Registry::new(SETTINGS()), Instant::now());
     registry.announced(announcement("robot", ROBOT), now);
@@ -46,7 +46,7 @@ fn names(registry: &Registry) -> Vec<String> {
         .collect()
 }
 
-/// Lets time pass. What is probed gets its outcome at once. Returns the probed URLs.
+/// Advances the time. Each probe gets its result at once. Returns the probed URLs.
 fn pass(
     registry: &mut Registry,
     (from, to): (Instant, Instant),
@@ -255,7 +255,8 @@ fn a_url_that_no_server_is_at_cannot_be_registered() {
     }
 }
 
-/// Lets the probes of an endpoint fail, each after a second, until an event of its loss. Returns that event and its time.
+/// Lets the probes of an endpoint fail, each after a second, until its loss. Returns the event of
+/// the loss and its time.
 fn lost(registry: &mut Registry, from: Instant, outcome: Outcome) -> (Event, Instant) {
     let mut now = from;
     while now < from + SECOND * 10 {

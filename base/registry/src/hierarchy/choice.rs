@@ -1,31 +1,31 @@
-//! The right discovery server among several.
+//! The selection of a discovery server.
 
 use std::fmt;
 use std::str::FromStr;
 
-/// Which discovery server is wanted.
+/// Selection of a discovery server.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Choice {
-    /// The only one that there is.
+    /// The only discovery server of the network.
     Any,
-    /// The one at this URL, announced or not.
+    /// The discovery server at this URL, announced or not.
     At(String),
     /// By its ApplicationUri.
     Uri(Pattern),
     /// By its mDNS instance name.
     Name(Pattern),
-    /// The one whose address space has this node, as `nsu=urn:cell;s=Marker`.
+    /// The discovery server whose address space has this node, such as `nsu=urn:cell;s=Marker`.
     Marker(String),
 }
 
-/// A text, or how it begins.
+/// A text, or a prefix.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Pattern {
     text: String,
     is_prefix: bool,
 }
 
-/// What is no choice.
+/// Error for an invalid choice.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(
     "`{0}` names no discovery server: an opc.tcp:// URL, any, uri=<ApplicationUri>, name=<mDNS name> (both may end with *) \
@@ -33,32 +33,33 @@ pub struct Pattern {
 )]
 pub struct ChoiceFault(String);
 
-/// A discovery server that is there.
+/// An available discovery server.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Candidate {
     /// Its mDNS instance name.
     pub name: String,
-    /// Where it is.
+    /// Its URL.
     pub url: String,
-    /// What it says it is; `None` where it says nothing.
+    /// Its ApplicationUri; `None` if unknown.
     pub application_uri: Option<String>,
     /// Whether it has the node of [`Choice::Marker`].
     pub is_marked: bool,
 }
 
-/// What a choice came to.
+/// Result of a choice.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Chosen {
-    /// None of them fits.
+    /// No candidate matches.
     Nobody,
-    /// Where the right one is.
+    /// URL of the selected discovery server.
     At(String),
-    /// Several fit, and one alone may be meant: their names.
+    /// Names of several matching candidates, of which only one may be meant.
     Several(Vec<String>),
 }
 
 impl Choice {
-    /// Chooses. One that is heard of at several addresses is one, and taken at the first of them.
+    /// Selects a candidate. A discovery server with several addresses counts once, and is used at
+    /// the first of its addresses.
     #[must_use]
     pub fn among(&self, candidates: &[Candidate]) -> Chosen {
         if let Self::At(url) = self {

@@ -1,13 +1,14 @@
-//! Where a component is in the plant: names from the top down, as `plant/cell-1/station-a`.
+//! The location of a component in the plant: names from the top down, such as
+//! `plant/cell-1/station-a`.
 
 use std::fmt;
 use std::str::FromStr;
 
-/// A place. There is at least one name, and none is empty or has a slash.
+/// A location: names without slashes. Neither the list nor a name is empty.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Place(String);
 
-/// What is no place.
+/// Error for an invalid location.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(
     "`{0}` is no place: names with slashes between them, as cell-1/station-a, at most {MOST_NAMES} of 64 letters"
@@ -15,10 +16,11 @@ pub struct Place(String);
 pub struct PlaceFault(String);
 
 impl Place {
-    /// The place of something here, under a name of which the slashes and what cannot be printed are left out.
+    /// Returns the location of an object at this location. Slashes in its name are replaced, and
+    /// control characters removed.
     ///
     /// # Errors
-    /// There is no room for one more name, or nothing is left of it.
+    /// Fails if the location has too many names, or if no character of the name is left.
     pub fn of(&self, name: &str) -> Result<Self, PlaceFault> {
         let name: String = name
             .chars()
@@ -29,7 +31,7 @@ impl Place {
         format!("{self}/{}", name.trim()).parse()
     }
 
-    /// The last name.
+    /// Returns the last name.
     #[must_use]
     pub fn name(&self) -> &str {
         self.0.rsplit('/').next().unwrap_or_default()

@@ -1,17 +1,18 @@
-//! Who is on a level, whoever tells of it: a server may be registered, announced by itself, and announced by others.
+//! The servers of a level, from all sources: a server may be registered, announce itself, and be
+//! announced by other programs.
 
 use std::collections::BTreeMap;
 
-/// What has changed.
+/// Change of the roster.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Change {
-    /// Somebody is at this URL.
+    /// A server is available at this URL.
     Joined(String),
-    /// Nobody is there any more.
+    /// The server at this URL is no longer available.
     Left(String),
 }
 
-/// The servers of a level by who tells of them. URLs that differ by a slash at the end alone are one.
+/// The servers of a level by source. URLs that differ only by a trailing slash are equal.
 #[derive(Debug)]
 pub struct Roster {
     told: BTreeMap<String, String>,
@@ -19,7 +20,7 @@ pub struct Roster {
 }
 
 impl Roster {
-    /// Nobody is there. No more than `most` are taken in.
+    /// Creates an empty roster with at most `most` servers.
     #[must_use]
     pub fn new(most: usize) -> Self {
         Self {
@@ -28,7 +29,8 @@ impl Roster {
         }
     }
 
-    /// A source, as an ApplicationUri or an mDNS name, tells of a server at a URL, and of the one before no longer.
+    /// Sets the server of a source, such as an ApplicationUri or an mDNS name, in place of its
+    /// previous server.
     pub fn put(&mut self, source: &str, url: &str) -> Vec<Change> {
         let url = url.trim_end_matches('/').to_owned();
         if self.told.get(source) == Some(&url) {
@@ -44,7 +46,7 @@ impl Roster {
         changes
     }
 
-    /// A source tells of nobody any more.
+    /// Removes the server of a source.
     pub fn remove(&mut self, source: &str) -> Vec<Change> {
         let Some(url) = self.told.remove(source) else {
             return Vec::new();

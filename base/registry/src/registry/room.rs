@@ -1,4 +1,4 @@
-//! Room for new servers and names: unverified entries give way.
+//! Space for new servers and names: unverified entries are displaced.
 
 use std::collections::BTreeSet;
 use std::time::Instant;
@@ -10,7 +10,8 @@ use crate::network::{Announcement, host, place};
 use crate::share::{Entry, Newcomer, Verdict, admit};
 
 impl Registry {
-    /// Makes room for a server that is not registered. A registration that nothing verifies gives way.
+    /// Makes space for a server that is not registered. An unverified registration may be
+    /// displaced.
     pub(super) fn make_room(
         &mut self,
         asked: &Asked,
@@ -19,7 +20,7 @@ impl Registry {
         now: Instant,
     ) -> Result<(), RegisterFault> {
         let most = self.settings.most;
-        // The share of an endpoint does not bind a server with a certificate.
+        // A server with a certificate is not limited by the share of an endpoint.
         let place = match certified {
             true => String::new(),
             false => place_of(asked),
@@ -60,7 +61,8 @@ impl Registry {
         urls.any(|url| self.watch.has_answered(url))
     }
 
-    /// Makes room for a name that was not announced. Names that we announce and the URLs of registered servers stay.
+    /// Makes space for a name that was not announced. Names announced by this program and the URLs
+    /// of registered servers stay.
     pub(super) fn make_room_on_network(
         &mut self,
         announcement: &Announcement,
