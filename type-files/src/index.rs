@@ -1,4 +1,4 @@
-//! Which definition files there are.
+//! Index of the definition files.
 
 use std::collections::BTreeMap;
 use std::io;
@@ -8,7 +8,7 @@ use messages::{Dialect, TextKind, TypeName};
 
 use crate::package::{MANIFEST, Package};
 
-/// Files, or what is in them, by what they define; the first of a name counts.
+/// Files, or their contents, by their definitions; the first file of a name counts.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Index<F> {
     files: BTreeMap<(Dialect, TextKind, TypeName), F>,
@@ -40,7 +40,7 @@ impl<F> Index<F> {
         self.files.entry(key).or_insert(file);
     }
 
-    /// In place of what it may have of that name.
+    /// Sets the file of a name, replacing any previous file.
     pub(crate) fn set(&mut self, key: (Dialect, TextKind, TypeName), file: F) {
         self.files.insert(key, file);
     }
@@ -65,18 +65,18 @@ impl<F> Index<F> {
     }
 }
 
-/// A file by its place: `<package>/msg/<Name>.msg`.
+/// A definition file, classified by its path: `<package>/msg/<Name>.msg`.
 #[derive(Debug, Clone)]
 pub(crate) struct DefinitionFile {
     pub(crate) path: PathBuf,
     pub(crate) kind: TextKind,
     package: String,
-    /// The only ROS it is of.
+    /// The only ROS version of the file, if it is limited to one.
     only: Option<Dialect>,
 }
 
 impl DefinitionFile {
-    /// `None` when it has no ending of a definition.
+    /// Classifies a file. Returns `None` if its extension is not that of a definition.
     fn of_path(path: PathBuf, package: &Package, folder: Option<TextKind>) -> Option<Self> {
         let ending = path.extension()?.to_str()?;
         let own = TextKind::ALL.into_iter().find(|kind| kind.word() == ending);
@@ -102,13 +102,13 @@ impl DefinitionFile {
     }
 }
 
-/// Looks through folders, of which there may be only so many.
+/// A directory walk with a limited number of folders.
 pub(crate) struct Walk<'s> {
     folders: usize,
     files: usize,
-    /// Folders that cannot be listed, and why.
+    /// Folders that cannot be listed, with the reason.
     unlisted: Vec<(PathBuf, String)>,
-    /// Told of each folder and file before it is looked at.
+    /// Callback for each folder and file before it is read.
     see: &'s mut dyn FnMut(&Path),
 }
 
@@ -126,7 +126,7 @@ impl<'s> Walk<'s> {
         (self.see)(path);
     }
 
-    /// Folders that could not be listed since this was asked last, and why.
+    /// Returns the folders that could not be listed after the previous call, with the reason.
     pub(crate) fn take_unlisted(&mut self) -> Vec<(PathBuf, String)> {
         std::mem::take(&mut self.unlisted)
     }
@@ -136,8 +136,8 @@ impl<'s> Walk<'s> {
         Package::of(folder)
     }
 
-    /// The definitions at or below a path: of packages, and of files that lie beside a `package.xml` or in a folder named
-    /// after their package.
+    /// Returns the definitions at or below a path: of packages, and of files beside a `package.xml`
+    /// or in a folder named after their package.
     pub(crate) fn all(&mut self, path: &Path) -> io::Result<Vec<DefinitionFile>> {
         self.see(path);
         if path.metadata()?.is_file() {
@@ -152,7 +152,7 @@ impl<'s> Walk<'s> {
             return Ok(file.into_iter().collect());
         }
         let mut found = Vec::new();
-        // Of a path to the `msg` folder itself the package is the folder around.
+        // For a path to the `msg` folder itself the package is the parent folder.
         match (kind_of(path), path.parent()) {
             (Some(kind), Some(around)) => {
                 let package = self.package(&around.canonicalize()?);
@@ -163,14 +163,14 @@ impl<'s> Walk<'s> {
         Ok(found)
     }
 
-    /// The definitions of the packages at or below a folder. Packages hold no packages.
+    /// Returns the definitions of the packages at or below a folder. Packages contain no packages.
     pub(crate) fn packages(&mut self, root: &Path, depth: usize) -> Vec<DefinitionFile> {
         let mut found = Vec::new();
         self.walk(root, (depth, false), None, &mut found);
         found
     }
 
-    /// `only` is the only ROS that looks at the folder.
+    /// Walks a folder. `only`: the only ROS version for which the folder counts.
     fn walk(
         &mut self,
         folder: &Path,
@@ -256,12 +256,13 @@ impl<'s> Walk<'s> {
             .filter(|file| is_file_or_unknown(&file.path));
         let mut files: Vec<DefinitionFile> = files.take(self.files).collect();
         self.files -= files.len().min(self.files);
-        // rosidl installs an .idl made of each .msg beside it.
+        // rosidl installs an .idl file derived from each .msg file beside it.
         files.sort_by_key(|file| file.path.extension().is_some_and(|ending| ending == "idl"));
         found.append(&mut files);
     }
 
-    /// In order; `None` when it cannot be read, or when enough were.
+    /// Returns the entries in order, or `None` if the folder cannot be read or the limit is
+    /// reached.
     fn entries(&mut self, folder: &Path) -> Option<Vec<PathBuf>> {
         self.folders = self.folders.checked_sub(1)?;
         self.see(folder);
@@ -283,7 +284,8 @@ impl<'s> Walk<'s> {
     }
 }
 
-/// A folder that is no link, as links may lead in circles; or what cannot be looked at, which is told when it is listed.
+/// Returns whether a path is a folder and not a link, since links may form cycles. A path that
+/// cannot be read counts as a folder; the error is reported when it is listed.
 fn is_real_folder(path: &Path) -> bool {
     match path.symlink_metadata() {
         Ok(found) => found.is_dir(),
@@ -291,7 +293,8 @@ fn is_real_folder(path: &Path) -> bool {
     }
 }
 
-/// A file, or what cannot be looked at, which is told when it is read.
+/// Returns whether a path is a file. A path that cannot be read counts as a file; the error is
+/// reported when it is read.
 fn is_file_or_unknown(path: &Path) -> bool {
     match path.metadata() {
         Ok(found) => found.is_file(),
@@ -304,13 +307,14 @@ fn is_hidden(path: &Path) -> bool {
     name.is_some_and(|name| name.starts_with('.'))
 }
 
-/// What the folder `msg`, `srv` or `action` of a package holds.
+/// Returns the kind of the definitions in the folder `msg`, `srv` or `action` of a package.
 fn kind_of(folder: &Path) -> Option<TextKind> {
     let name = folder.file_name()?.to_str()?;
     TextKind::ALL.into_iter().find(|kind| kind.word() == name)
 }
 
-/// Files that say to the tools of one ROS that a folder is not to be looked at, and nothing below it.
+/// Returns the marker files with which the tools of a ROS version ignore a folder and its
+/// subfolders.
 const fn ignored(dialect: Dialect) -> &'static [&'static str] {
     match dialect {
         Dialect::Ros1 => &["CATKIN_IGNORE"],
@@ -318,7 +322,7 @@ const fn ignored(dialect: Dialect) -> &'static [&'static str] {
     }
 }
 
-/// Folders looked at; a large installation has some thousands.
+/// Limit of folders; a large installation has some thousands.
 const MOST_FOLDERS: usize = 20_000;
-/// Definitions; a large installation has some thousands.
+/// Limit of definitions; a large installation has some thousands.
 const MOST_FILES: usize = 20_000;

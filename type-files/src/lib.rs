@@ -1,8 +1,9 @@
-//! Definition files of ROS types: where they are, and what is wrong with them.
+//! Definition files of ROS types: their locations and their errors.
 //!
-//! The files of a mapping's `type_paths` are all read at one moment, so that everything wrong with them is told at once,
-//! and kept: what is changed later is seen when they are read again. A ROS installation has thousands: its folders are
-//! listed when something is looked for the first time, and a file is read when its type is wanted.
+//! The files of a mapping's `type_paths` are all read at the same time, so that all their errors
+//! are reported at once. The files are kept; later changes take effect when they are read again. A
+//! ROS installation has thousands of files: its folders are listed with the first lookup, and a
+//! file is read when its type is needed.
 
 mod index;
 mod package;
@@ -20,26 +21,26 @@ use tracing::warn;
 use self::index::{Index, Walk};
 pub use self::paths::TypePaths;
 
-/// Definitions in files, for one program.
+/// Definitions in files, for a program.
 #[derive(Debug, Clone)]
 pub struct TypeFiles {
     own: Arc<TypePaths>,
     environment: Environment,
-    /// What the installations have, once it was asked for.
+    /// The files of the installations, after the first lookup.
     installed: [Option<Index<PathBuf>>; 2],
 }
 
-/// The ROS installations the program was started in.
+/// The ROS installations in the environment of the program.
 #[derive(Debug, Clone, Default)]
 pub struct Environment {
-    /// Folders with packages somewhere below them, as `ROS_PACKAGE_PATH` lists them.
+    /// Folders with packages at any depth, as in `ROS_PACKAGE_PATH`.
     pub ros1: Vec<PathBuf>,
-    /// Folders with `share/<package>`, as `AMENT_PREFIX_PATH` lists them.
+    /// Folders with `share/<package>`, as in `AMENT_PREFIX_PATH`.
     pub ros2: Vec<PathBuf>,
 }
 
 impl Environment {
-    /// As the variables of the environment say.
+    /// Reads the environment variables.
     #[must_use]
     pub fn from_env() -> Self {
         let list = |variable: &str| {
@@ -54,7 +55,8 @@ impl Environment {
     }
 }
 
-/// What is beside a mapping on this host: files, definitions, and the environment of this process.
+/// The surroundings of a mapping on this host: files, definitions, and the environment of this
+/// process.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Disk;
 
@@ -84,7 +86,7 @@ impl Surroundings for Disk {
     }
 }
 
-/// As the mode of the file says.
+/// Returns the readers according to the mode of the file.
 #[cfg(unix)]
 fn readers(file: &Path) -> Option<Readers> {
     use std::os::unix::fs::PermissionsExt as _;
@@ -106,10 +108,10 @@ fn read_mapping(file: &str) -> Result<String, String> {
     read_text(file)
 }
 
-/// A text that is no longer than a mapping may be, or its beginning, which has a finding (M002).
+/// Reads a text up to the limit of a mapping. A longer text is cut, which gives a finding (M002).
 ///
 /// # Errors
-/// Why it cannot be read, for people.
+/// Returns the reason for users if the text cannot be read.
 pub fn read_text(from: impl Read) -> Result<String, String> {
     let mut text = Vec::new();
     let length = from
@@ -117,7 +119,7 @@ pub fn read_text(from: impl Read) -> Result<String, String> {
         .read_to_end(&mut text)
         .map_err(|error| error.to_string())?;
     if u64::try_from(length).is_ok_and(|length| length == MOST_OF_A_MAPPING) {
-        // It may end within a character.
+        // The cut may be within a character.
         return Ok(String::from_utf8_lossy(&text).into_owned());
     }
     utf8(text)
@@ -126,7 +128,7 @@ pub fn read_text(from: impl Read) -> Result<String, String> {
 /// Reads a file of any kind, such as a pipe, within a bound.
 ///
 /// # Errors
-/// The reason, for people: the file cannot be read, or it has more than `most` bytes.
+/// Returns the reason for users: the file cannot be read, or it has more than `most` bytes.
 pub fn read_bounded(file: &Path, most: u64) -> Result<Vec<u8>, String> {
     let mut bytes = Vec::new();
     File::open(file)
@@ -144,7 +146,7 @@ pub fn read_bounded(file: &Path, most: u64) -> Result<Vec<u8>, String> {
 /// Reads a file of text, such as the YAML of a program, within the bound of a mapping.
 ///
 /// # Errors
-/// The reason, for people: the file cannot be read, has more than 8 MiB, or is not UTF-8.
+/// Returns the reason for users: the file cannot be read, has more than 8 MiB, or is not UTF-8.
 pub fn read_text_file(file: &Path) -> Result<String, String> {
     utf8(read_bounded(file, MOST_OF_A_MAPPING)?)
 }
@@ -157,7 +159,7 @@ fn utf8(bytes: Vec<u8>) -> Result<String, String> {
 }
 
 impl TypeFiles {
-    /// Those that were read, and those of the installations.
+    /// Creates the definitions from the files of `own`, and from the installations.
     #[must_use]
     pub const fn new(own: Arc<TypePaths>, environment: Environment) -> Self {
         Self {
@@ -167,13 +169,13 @@ impl TypeFiles {
         }
     }
 
-    /// Those that were read.
+    /// Returns the files of the `type_paths`.
     #[must_use]
     pub fn paths(&self) -> &TypePaths {
         &self.own
     }
 
-    /// Takes others in place of those that were read. What the installations have stays as it was listed.
+    /// Replaces the files of the `type_paths`. The lists of the installations stay unchanged.
     pub fn replace(&mut self, own: Arc<TypePaths>) {
         self.own = own;
     }
@@ -254,7 +256,7 @@ fn definition(text: String, path: &Path) -> DefinitionText {
     }
 }
 
-/// A regular file, or a link to one: opening a pipe would wait for whoever writes into it.
+/// Opens a regular file or a link to a regular file: opening a pipe would wait for its writer.
 pub(crate) fn open(path: &Path) -> std::io::Result<File> {
     if path.metadata()?.is_file() {
         File::open(path)
@@ -268,17 +270,17 @@ pub(crate) fn open(path: &Path) -> std::io::Result<File> {
 fn read(path: &Path) -> std::io::Result<String> {
     let mut bytes = Vec::new();
     open(path)?.take(MOST_BYTES).read_to_end(&mut bytes)?;
-    // Comments are in any encoding; what counts is ASCII.
+    // Comments have any encoding; the definitions are ASCII.
     Ok(String::from_utf8_lossy(&bytes).into_owned())
 }
 
 const ROS_PACKAGE_PATH: &str = "ROS_PACKAGE_PATH";
 const AMENT_PREFIX_PATH: &str = "AMENT_PREFIX_PATH";
-/// More than a mapping may have.
+/// Exceeds the limit of a mapping.
 const MOST_OF_A_MAPPING: u64 = 8 << 20;
-/// More than any definition has.
+/// Exceeds the size of any definition.
 const MOST_BYTES: u64 = 1 << 20;
-/// How deep a package may lie in a workspace.
+/// Maximum depth of a package in a workspace.
 const DEEPEST: usize = 8;
 
 #[cfg(test)]

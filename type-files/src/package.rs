@@ -1,4 +1,4 @@
-//! What `package.xml` says of a package.
+//! The properties of a package in `package.xml`.
 
 use std::io::Read as _;
 use std::path::Path;
@@ -9,12 +9,12 @@ use messages::Dialect;
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Package {
     pub(crate) name: String,
-    /// The ROS it is for, where it says so.
+    /// The ROS version of the package, if `package.xml` names it.
     pub(crate) dialect: Option<Dialect>,
 }
 
 impl Package {
-    /// By its `package.xml`, or without one by the name of its folder.
+    /// Reads the `package.xml` of a folder; without it, the package has the name of the folder.
     pub(crate) fn of(folder: &Path) -> Self {
         let named = folder.file_name().map(|name| name.to_string_lossy());
         let mut package = Self {

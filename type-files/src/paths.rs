@@ -1,4 +1,4 @@
-//! What the `type_paths` of a mapping have.
+//! The definitions in the `type_paths` of a mapping.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::hash::{DefaultHasher, Hash as _, Hasher as _};
@@ -20,33 +20,34 @@ pub struct TypePaths {
     pub(crate) paths: Vec<PathBuf>,
     pub(crate) index: Index<Arc<DefinitionText>>,
     faults: Vec<Fault>,
-    /// Folders below them that cannot be listed, and why.
+    /// Subfolders that cannot be listed, with the reason.
     unlisted: Vec<(PathBuf, String)>,
-    /// What is wrong where the definitions of before count.
+    /// Errors in files and folders for which the previous definitions are kept.
     kept: Vec<String>,
-    /// Whether a folder is among that.
+    /// Whether a folder is among them.
     without_folder: bool,
-    /// Of all texts.
+    /// Size of all texts.
     bytes: usize,
 }
 
-/// The texts of each file, and what they define.
+/// The texts of each file, with the types that they define.
 type Texts<'t> =
     BTreeMap<&'t Path, Vec<(&'t (Dialect, TextKind, TypeName), &'t Arc<DefinitionText>)>>;
 
 #[derive(Debug, Clone, PartialEq, Eq)]
 struct Fault {
-    /// Which of the paths, from 0.
+    /// Index of the path.
     path: usize,
-    /// The file that does not count; `None` where the path itself is at fault.
+    /// The invalid file; `None` if the path itself is invalid.
     file: Option<String>,
-    /// Which line of which file and why, for people.
+    /// Location and reason for users.
     why: String,
 }
 
 impl TypePaths {
-    /// Reads all files of `paths`, which are folders with packages at or below them, or single files. `see` is told of
-    /// each file and folder before it is looked at: as long as all of them stay what they are, so does what was read.
+    /// Reads all files of `paths`, which are folders with packages at or below them, or single
+    /// files. `see` is called for each file and folder before it is read: while all of them are
+    /// unchanged, the result is unchanged, too.
     #[must_use]
     pub fn read(paths: &[PathBuf], see: &mut dyn FnMut(&Path)) -> Self {
         let mut read = Self {
@@ -60,13 +61,13 @@ impl TypePaths {
         read
     }
 
-    /// Whether there are no `type_paths`.
+    /// Returns whether there are no `type_paths`.
     #[must_use]
     pub const fn is_none(&self) -> bool {
         self.paths.is_empty()
     }
 
-    /// What is wrong with them, up to a bound.
+    /// Returns the errors, up to a limit.
     pub(crate) fn faults(&self) -> Vec<PathFault> {
         let told = self.faults.iter().take(MOST_FAULTS);
         told.map(|fault| PathFault {
@@ -79,8 +80,9 @@ impl TypePaths {
         .collect()
     }
 
-    /// Takes over from `before` what counted there and cannot be had: the texts of files that are faulty, and those below
-    /// folders that cannot be listed or have none left. What is wrong with them is then [`kept`](Self::kept), and no fault.
+    /// Keeps the definitions of `before` that are now unavailable: the texts of invalid files, and
+    /// the texts below folders that cannot be listed or have no definitions left. Their errors then
+    /// belong to [`kept`](Self::kept) and are not faults.
     pub fn keep(&mut self, before: &Self) {
         let mut texts = Texts::new();
         for (key, text) in before.index.all() {
@@ -107,7 +109,8 @@ impl TypePaths {
         }
     }
 
-    /// Takes over from `before` a type and all it needs, where it is of a file and that does not do.
+    /// Keeps the definitions of `before` for a type and all types it needs, if the type is in a
+    /// file and its current definition is incomplete.
     pub fn keep_whole(&mut self, before: &Self, dialect: Dialect, kind: TextKind, name: &TypeName) {
         let Some(file) = self.file(dialect, kind, name) else {
             return;
@@ -120,14 +123,14 @@ impl TypePaths {
             found: Vec::new(),
         };
         let mut library = Library::new(Registry::bundle(dialect));
-        // What it is does not matter, only what was looked for.
+        // The result does not matter, only the requested names.
         let _known = match kind {
             TextKind::Message => library.message(name, &mut asked).is_ok(),
             TextKind::Service => library.service(name, &mut asked).is_ok(),
             TextKind::Action => library.action_messages(name, &mut asked).is_ok(),
         };
         for (kind, name) in asked.found {
-            // A file counts in both.
+            // A file counts in both ROS versions.
             for dialect in [Dialect::Ros1, Dialect::Ros2] {
                 if let Some(text) = before.index.get(dialect, kind, &name) {
                     let key = (dialect, kind, name.clone());
@@ -137,26 +140,27 @@ impl TypePaths {
         }
     }
 
-    /// What is wrong, for people, where the definitions of before count.
+    /// Returns the errors for which the previous definitions are kept, for users.
     #[must_use]
     pub fn kept(&self) -> &[String] {
         &self.kept
     }
 
-    /// Whether folders are among that, which may be back while all that can be seen of them is the same.
+    /// Returns whether folders are among these errors. A folder may become available again without
+    /// a visible change of the watched files.
     #[must_use]
     pub const fn is_without_folder(&self) -> bool {
         self.without_folder
     }
 
-    /// The file a definition is from.
+    /// Returns the file of a definition.
     #[must_use]
     pub fn file(&self, dialect: Dialect, kind: TextKind, name: &TypeName) -> Option<&str> {
         let text = self.index.get(dialect, kind, name)?;
         Some(&text.file)
     }
 
-    /// How many definitions only one of both has, or both have otherwise.
+    /// Returns the number of definitions that are different or missing in one of the two.
     #[must_use]
     pub fn differing(&self, other: &Self) -> usize {
         let mut differing = BTreeSet::new();
@@ -170,7 +174,8 @@ impl TypePaths {
         differing.len()
     }
 
-    /// A number that is another one where anything in them is, for as long as the program runs.
+    /// Returns a hash that changes with any content of the files. It is valid within one run of the
+    /// program.
     #[must_use]
     pub fn fingerprint(&self) -> u64 {
         let mut all = DefaultHasher::new();
@@ -184,7 +189,7 @@ impl TypePaths {
         all.finish()
     }
 
-    /// Whether there was something at or below that place that is taken over.
+    /// Keeps the texts at or below a path, and returns whether there were any.
     fn take_over(&mut self, before: &Texts<'_>, place: &Path) -> bool {
         let mut any = false;
         let below = before.range(place..);
@@ -197,7 +202,7 @@ impl TypePaths {
             self.bytes = bytes;
             for (key, text) in texts {
                 let (dialect, kind, name) = key;
-                // It may have been read by another of the paths.
+                // It may have been read by another path.
                 if self.file(*dialect, *kind, name).map(Path::new) != Some(*file) {
                     self.index.set((*key).clone(), Arc::clone(text));
                     any = true;
@@ -238,7 +243,7 @@ impl TypePaths {
         self.faults.push(Fault { path, file, why });
     }
 
-    /// Reads one file, which counts in each ROS that it is a definition of.
+    /// Reads a file, which counts in each ROS version in which it is a valid definition.
     fn add(&mut self, file: &DefinitionFile) -> Result<(), String> {
         let path = file.path.display();
         let name = file.name().ok_or_else(|| {
@@ -275,7 +280,7 @@ impl TypePaths {
     }
 }
 
-/// Notes what is looked for and found.
+/// Records the requested names that are found.
 struct Asked<'t> {
     of: &'t TypePaths,
     found: Vec<(TextKind, TypeName)>,
@@ -302,7 +307,7 @@ impl DefinitionTexts for Asked<'_> {
     }
 }
 
-/// `file:line: why`
+/// Formats `file:line: why`.
 fn told(file: &Path, error: &DefinitionError) -> String {
     match error {
         DefinitionError::Syntax {
@@ -316,7 +321,8 @@ fn told(file: &Path, error: &DefinitionError) -> String {
     }
 }
 
-/// Faults that are told; more are of one cause.
+/// Maximum number of reported errors; further errors have the same cause.
 const MOST_FAULTS: usize = 100;
-/// Bytes of all definitions, which are kept: a large installation has some ten million.
+/// Limit of the size of all definitions, which are kept in memory: a large installation has some
+/// ten million bytes.
 const MOST_TOGETHER: usize = 64 << 20;

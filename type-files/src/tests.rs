@@ -5,7 +5,7 @@ use messages::{Library, Registry};
 
 use super::*;
 
-/// A folder of its own that goes away with it.
+/// A temporary folder that is removed on drop.
 struct Folder(PathBuf);
 
 impl Folder {
@@ -257,7 +257,7 @@ fn a_single_file_is_of_the_package_around_its_folder() {
     }
 }
 
-/// A robot's definitions in two folders, and two of the tutorials whose checksums everybody knows.
+/// Definitions of a robot in two folders, and two of the tutorials with well-known checksums.
 const ROBOT: [(&str, &str); 8] = [
     (
         "a/robot_msgs/msg/Joint.msg",
@@ -287,7 +287,7 @@ const ROBOT: [(&str, &str); 8] = [
     ),
 ];
 
-/// Name and md5 of each service of the folders, and of each message of each action.
+/// Returns name and md5 of each service of the folders, and of each message of each action.
 fn md5s(paths: &[PathBuf]) -> BTreeMap<String, String> {
     let mut files = open(paths, Environment::default());
     assert_eq!(files.faults(), []);

@@ -1,14 +1,16 @@
-//! Decodes XML documents (XML 1.0, 4.3.3 and appendix F): the byte order mark decides, then the declaration, then UTF-8.
+//! Decodes XML documents (XML 1.0, 4.3.3 and appendix F). The encoding is that of the byte order
+//! mark, or else of the declaration, or else UTF-8.
 //!
-//! Engineering tools export UTF-16 and ISO-8859-1 as well as UTF-8. The parsers of the workspace read text only.
+//! Engineering tools export UTF-16 and ISO-8859-1 as well as UTF-8. The parsers of the workspace
+//! read text only.
 
 use std::borrow::Cow;
 
-/// A document that cannot be decoded.
+/// Error of decoding a document.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum EncodingError {
-    /// The bytes do not fit the encoding that the document names.
+    /// The bytes do not match the declared encoding.
     #[error("line {line}: the bytes are not {encoding}; save the file as UTF-8")]
     Malformed {
         /// Line of the first wrong byte, from 1.
@@ -21,10 +23,10 @@ pub enum EncodingError {
     Unsupported(String),
 }
 
-/// Decodes a document. The byte order mark is left out, the declaration stays as it is.
+/// Decodes a document. The byte order mark is omitted, the declaration stays unchanged.
 ///
 /// # Errors
-/// [`EncodingError`] if the encoding is unknown, or the bytes do not fit it.
+/// [`EncodingError`] if the encoding is unknown, or the bytes do not match it.
 pub fn decode(bytes: &[u8]) -> Result<Cow<'_, str>, EncodingError> {
     let (encoding, bytes) = detect(bytes)?;
     let malformed = |before: usize| EncodingError::Malformed {
@@ -88,7 +90,7 @@ impl Encoding {
     }
 }
 
-/// Returns the encoding, and the bytes behind the byte order mark.
+/// Returns the encoding, and the bytes after the byte order mark.
 fn detect(bytes: &[u8]) -> Result<(Encoding, &[u8]), EncodingError> {
     Ok(match bytes {
         [0xEF, 0xBB, 0xBF, rest @ ..] => (Encoding::Utf8, rest),
@@ -101,7 +103,7 @@ fn detect(bytes: &[u8]) -> Result<(Encoding, &[u8]), EncodingError> {
     })
 }
 
-/// The encoding that the declaration of a document in an ASCII-compatible encoding names.
+/// Returns the encoding in the declaration of a document in an ASCII-compatible encoding.
 fn declared(bytes: &[u8]) -> Result<Encoding, EncodingError> {
     let start = bytes.get(..LONGEST_DECLARATION.min(bytes.len()));
     let start = String::from_utf8_lossy(start.unwrap_or_default());
@@ -118,7 +120,7 @@ fn declared(bytes: &[u8]) -> Result<Encoding, EncodingError> {
         return Ok(Encoding::Utf8);
     };
     match name.to_ascii_lowercase().as_str() {
-        // A document that was converted often keeps the name of the encoding it had.
+        // A document that was converted often keeps the name of its previous encoding.
         "utf-8" | "utf8" | "us-ascii" | "ascii" | "utf-16" | "utf16" => Ok(Encoding::Utf8),
         "iso-8859-1" | "iso8859-1" | "latin1" | "latin-1" => Ok(Encoding::Latin1),
         "windows-1252" | "cp1252" => Ok(Encoding::Windows1252),
@@ -126,20 +128,20 @@ fn declared(bytes: &[u8]) -> Result<Encoding, EncodingError> {
     }
 }
 
-/// The character of a byte in windows-1252, which differs from ISO-8859-1 in 32 bytes.
+/// Returns the character of a byte in windows-1252, which differs from ISO-8859-1 in 32 bytes.
 fn windows(byte: u8) -> char {
     let at = usize::from(byte).checked_sub(0x80);
     let special = at.and_then(|at| WINDOWS.get(at));
     special.copied().unwrap_or_else(|| char::from(byte))
 }
 
-/// The characters of 0x80 to 0x9F. Five bytes have none.
+/// The characters of 0x80 to 0x9F. Five bytes have no character.
 const WINDOWS: [char; 32] = [
     '€', '\u{FFFD}', '‚', 'ƒ', '„', '…', '†', '‡', 'ˆ', '‰', 'Š', '‹', 'Œ', '\u{FFFD}', 'Ž',
     '\u{FFFD}', '\u{FFFD}', '‘', '’', '“', '”', '•', '–', '—', '˜', '™', 'š', '›', 'œ', '\u{FFFD}',
     'ž', 'Ÿ',
 ];
-/// Bytes in which a declaration ends.
+/// Limit of the length of a declaration, in bytes.
 const LONGEST_DECLARATION: usize = 200;
 
 #[cfg(test)]
