@@ -1,4 +1,4 @@
-//! CAEX (IEC 62424): the tree of elements in the file, without a word on what they mean.
+//! CAEX (IEC 62424): the tree of elements in the file, without their meaning.
 
 use std::borrow::Cow;
 
@@ -8,33 +8,33 @@ use quick_xml::events::{BytesStart, Event};
 use quick_xml::reader::Reader;
 use thiserror::Error;
 
-/// Why a file is no manifest.
+/// Error of reading a manifest.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
 #[non_exhaustive]
 pub enum ManifestError {
-    /// More than this reads.
+    /// The file exceeds the limit.
     #[error("the file has {length} bytes, more than the {most} that are read")]
     TooLarge {
-        /// What it has.
+        /// Size of the file.
         length: usize,
-        /// What is read.
+        /// The limit.
         most: usize,
     },
-    /// It is not XML, or only half of it.
+    /// The file is not XML, or incomplete.
     #[error("line {line}: {what}")]
     Xml {
-        /// Where, counted from 1.
+        /// Line, from 1.
         line: usize,
-        /// What is wrong.
+        /// Description of the error.
         what: String,
     },
-    /// The encoding of the text is not supported, or the text does not fit it.
+    /// The encoding of the text is not supported, or the text does not match it.
     #[error(transparent)]
     Encoding(#[from] xml_text::EncodingError),
     /// The file is a ZIP container without a readable manifest.
     #[error("the container cannot be used: {0}")]
     Container(String),
-    /// It is XML of something else.
+    /// The file is XML of another format.
     #[error(
         "there is no element with the role MTPSUCLib/ModuleTypePackage: this is no manifest of an MTP"
     )]
@@ -52,7 +52,7 @@ pub(crate) struct Element {
     pub(crate) children: Vec<Self>,
 }
 
-/// An Attribute of an element. Those inside others, which translate them, are left out.
+/// An Attribute of an element. Nested attributes, which are translations, are omitted.
 #[derive(Debug, Default)]
 pub(crate) struct Attribute {
     pub(crate) name: String,
@@ -98,7 +98,7 @@ impl Element {
                     return Err(fault(what.to_owned()));
                 }
                 Event::Eof => break,
-                // An empty element is told as its start and its end.
+                // An empty element is reported as its start and its end.
                 Event::Empty(_) | Event::Comment(_) | Event::Decl(_) | Event::PI(_) => {}
             }
         }
@@ -108,7 +108,7 @@ impl Element {
         })
     }
 
-    /// Itself and all below it, each before what it holds.
+    /// Returns the element and all elements below it, parents before children.
     pub(crate) fn all(&self) -> impl Iterator<Item = &Self> {
         let mut waiting = vec![self];
         std::iter::from_fn(move || {
@@ -118,12 +118,13 @@ impl Element {
         })
     }
 
-    /// The last part of its path, as `Procedure` of `MTPServiceSUCLib/Service/Procedure`.
+    /// Returns the last part of its path, such as `Procedure` of
+    /// `MTPServiceSUCLib/Service/Procedure`.
     pub(crate) fn kind(&self) -> &str {
         self.path.rsplit('/').next().unwrap_or_default()
     }
 
-    /// The value of its attribute of one of these names, the first that is there.
+    /// Returns the value of the first existing attribute with one of these names.
     pub(crate) fn value(&self, names: &[&str]) -> Option<&str> {
         names
             .iter()
@@ -137,7 +138,7 @@ impl Element {
     }
 }
 
-/// What is open while the file is read.
+/// The open elements while the file is read.
 #[derive(Debug, Default)]
 struct Building {
     open: Vec<Part>,
@@ -202,7 +203,7 @@ impl Building {
     }
 
     fn close(&mut self) {
-        // The reader has seen to it that what ends has begun.
+        // The reader has checked that each end has a start.
         let Some(part) = self.open.pop() else {
             return;
         };
@@ -224,7 +225,7 @@ impl Building {
         }
     }
 
-    /// The whole, if it is one.
+    /// Returns the root element if it is complete.
     fn root(self) -> Option<Element> {
         self.root.filter(|_| self.open.is_empty())
     }
@@ -238,7 +239,7 @@ fn line(file: &str, position: u64) -> usize {
     before.iter().filter(|byte| **byte == b'\n').count() + 1
 }
 
-/// The largest of the manifests at hand has 0.8 MB.
+/// The largest of the available manifests has 0.8 MB.
 pub(crate) const MAX_FILE: usize = 64 << 20;
 const MAX_DEPTH: usize = 64;
 const MAX_ELEMENTS: usize = 1 << 20;

@@ -1,4 +1,5 @@
-//! The ZIP containers of manifests: `.mtp` (VDI/VDE/NAMUR 2658) and `.amlx` (AutomationML container, IEC 62714-1).
+//! The ZIP containers of manifests: `.mtp` (VDI/VDE/NAMUR 2658) and `.amlx` (AutomationML
+//! container, IEC 62714-1).
 
 use miniz_oxide::inflate::TINFLStatus;
 use quick_xml::XmlVersion;
@@ -8,13 +9,13 @@ use rawzip::{CompressionMethod, ZipArchive, ZipArchiveEntryWayfinder, ZipVerific
 
 use crate::caex::{MAX_FILE, ManifestError};
 
-/// Whether a file is a ZIP archive.
+/// Returns whether a file is a ZIP archive.
 pub(crate) fn is_container(file: &[u8]) -> bool {
     file.starts_with(b"PK\x03\x04")
 }
 
-/// Returns the AutomationML document of a container: `manifest.aml`, else the root document that the container names, else
-/// its only document.
+/// Returns the AutomationML document of a container: `manifest.aml`, else the root document that
+/// the container names, else its only document.
 ///
 /// # Errors
 /// [`ManifestError::Container`] without such a document, and if the archive is damaged.
@@ -80,7 +81,7 @@ fn members(file: &[u8]) -> Result<Vec<Member>, ManifestError> {
     Ok(members)
 }
 
-/// Unpacks a file, at most [`MAX_FILE`] bytes of it, and compares its check sum.
+/// Unpacks a file up to a limit of [`MAX_FILE`] bytes, and verifies its checksum.
 fn unpack(file: &[u8], member: &Member) -> Result<Vec<u8>, ManifestError> {
     let path = &member.path;
     let damaged = |error: &dyn std::fmt::Display| fault(format!("{path} is damaged: {error}"));
@@ -121,7 +122,7 @@ fn unpack(file: &[u8], member: &Member) -> Result<Vec<u8>, ManifestError> {
     Ok(unpacked)
 }
 
-/// The path of the document that the relationships of an AutomationML container name as its root.
+/// Returns the path of the root document in the relationships of an AutomationML container.
 fn root_document(file: &[u8], members: &[Member]) -> Result<Option<String>, ManifestError> {
     let Some(relations) = members.iter().find(|one| one.path == "_rels/.rels") else {
         return Ok(None);
@@ -154,7 +155,7 @@ fn fault(what: impl Into<String>) -> ManifestError {
     ManifestError::Container(what.into())
 }
 
-/// Most files of an archive.
+/// Limit of files in an archive.
 const MAX_MEMBERS: usize = 10_000;
 
 #[cfg(test)]
@@ -165,7 +166,7 @@ mod tests {
 
     use super::*;
 
-    /// An archive of files, deflated where the path does not begin with `stored`.
+    /// Returns an archive of files, deflated unless the path begins with `stored`.
     fn archive(files: &[(&str, &[u8])]) -> Vec<u8> {
         let mut out = Vec::new();
         let mut archive = ZipArchiveWriter::new(&mut out);
@@ -181,7 +182,7 @@ mod tests {
                 .compression_method(method)
                 .start()
                 .unwrap();
-            // The writer counts what is written to it before it is packed.
+            // The writer counts the bytes before compression.
             let mut writer = config.wrap(Vec::new());
             writer.write_all(content).unwrap();
             let (plain, descriptor) = writer.finish().unwrap();
@@ -238,7 +239,7 @@ mod tests {
         for at in 0..whole.len() {
             let mut other = whole.clone();
             other[at] ^= 0xFF;
-            // A changed byte is found, or does not matter.
+            // A changed byte is detected, or has no effect.
             if let Ok(text) = document(&other) {
                 assert_eq!(text, [b'x'; 1000], "{at}");
             }

@@ -1,15 +1,17 @@
-//! Module Type Packages: what a process module can do, as its maker wrote it down (VDI/VDE/NAMUR 2658).
+//! Module Type Packages: descriptions of process modules by their manufacturers (VDI/VDE/NAMUR
+//! 2658).
 //!
-//! [`Module::from_bytes`] reads a manifest as it is handed over, in its container and its encoding.
-//! [`Module::read`] makes a typed model of a manifest, the AutomationML file in an MTP: the services of the module, their
-//! procedures and parameters, and the OPC UA nodes by which each is asked, commanded and watched. Files of 2018 to 2026 differ
-//! in what they call things (`ServiceStrategy`, `ServiceProcedure`, `Service/Procedure`; `CommandEn`, `CommandEnable`,
-//! `ControlEnable`), in the version of CAEX (2.15, 3.0) and in how parts refer to each other (by RefID or by ID); the model has
-//! one name for each thing. What a file says that does not hold together is a [`Finding`], and the rest of it counts.
+//! [`Module::from_bytes`] reads a manifest in its container and its encoding. [`Module::read`]
+//! creates a typed model of a manifest, the AutomationML file in an MTP: the services of the
+//! module, their procedures and parameters, and the OPC UA nodes for requests, commands and
+//! monitoring. Files of 2018 to 2026 differ in names (`ServiceStrategy`, `ServiceProcedure`,
+//! `Service/Procedure`; `CommandEn`, `CommandEnable`, `ControlEnable`), in the version of CAEX
+//! (2.15, 3.0) and in references (by RefID or by ID). The model has a single name for each concept.
+//! An inconsistency in a file is a [`Finding`], and the rest of the file is used.
 //!
-//! [`Module::triples`] tells the same as RDF, in the terms of [`vocabulary`].
+//! [`Module::triples`] returns the same as RDF, in the terms of [`vocabulary`].
 //!
-//! No file is opened here and no server is asked.
+//! This crate opens no file and calls no server.
 
 mod caex;
 mod container;

@@ -1,4 +1,4 @@
-//! What a manifest says, under one name for each thing.
+//! The model of a manifest, with a single name for each concept.
 
 use std::collections::BTreeMap;
 
@@ -7,79 +7,79 @@ use std::collections::BTreeMap;
 pub struct Module {
     /// The name of its ModuleTypePackage.
     pub name: String,
-    /// Its version; empty where none is told.
+    /// Its version; empty if unknown.
     pub version: String,
     /// The endpoints of its OPC UA servers.
     pub endpoints: Vec<String>,
-    /// What it offers, in the order of the file.
+    /// Its services, in the order of the file.
     pub services: Vec<Service>,
-    /// What in the file does not hold together.
+    /// Inconsistencies in the file.
     pub findings: Vec<Finding>,
 }
 
-/// Something that does not hold together; what it is about is left out of the model.
+/// An inconsistency; its element is not in the model.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Finding {
-    /// The element, as `Dosing/volume_based`.
+    /// The element, such as `Dosing/volume_based`.
     pub about: String,
-    /// What is wrong with it.
+    /// Description of the inconsistency.
     pub what: String,
 }
 
 /// A service, which runs one of its procedures at a time (VDI/VDE/NAMUR 2658-4).
 #[derive(Debug, Clone, PartialEq)]
 pub struct Service {
-    /// Unique in the file; two services may have one name.
+    /// Unique in the file; two services may have the same name.
     pub id: String,
     /// Its name.
     pub name: String,
-    /// How it is commanded and watched.
+    /// Nodes for commands and monitoring.
     pub control: Control,
     /// Parameters of the service itself.
     pub parameters: Vec<Parameter>,
-    /// What it can do.
+    /// Its procedures.
     pub procedures: Vec<Procedure>,
 }
 
-/// A procedure, which earlier drafts call strategy.
+/// A procedure, called strategy in earlier drafts.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Procedure {
     /// Unique in the file.
     pub id: String,
     /// Its name.
     pub name: String,
-    /// The number by which it is asked for.
+    /// The number for requesting the procedure.
     pub number: u32,
-    /// Whether it is taken when none is asked for.
+    /// Whether it runs if no procedure is requested.
     pub is_default: bool,
-    /// Whether it ends by itself, or has to be told to complete.
+    /// Whether it ends by itself, or needs the command to complete.
     pub is_self_completing: bool,
-    /// What it needs to know.
+    /// Its parameters.
     pub parameters: Vec<Parameter>,
 }
 
-/// A value to be given to a service or procedure.
+/// An input value of a service or procedure.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Parameter {
     /// Unique in the file.
     pub id: String,
     /// Its name.
     pub name: String,
-    /// What it is.
+    /// Its kind.
     pub kind: ValueKind,
-    /// The least it may be.
+    /// Minimum value.
     pub min: Option<Bound>,
-    /// The most it may be.
+    /// Maximum value.
     pub max: Option<Bound>,
-    /// The number of its unit in VDI/VDE/NAMUR 2658-3, or the node that tells it.
+    /// The number of its unit in VDI/VDE/NAMUR 2658-3, or the node with that number.
     pub unit: Option<Bound>,
-    /// Where it is written from outside (VExt).
+    /// The node for writing from outside (VExt).
     pub write: Option<Node>,
-    /// Where the value that counts is read (VOut).
+    /// The node for reading the effective value (VOut).
     pub read: Option<Node>,
 }
 
-/// What a parameter is.
+/// The kind of a parameter.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum ValueKind {
     /// AnaServParam: a REAL.
@@ -92,51 +92,51 @@ pub enum ValueKind {
     Text,
 }
 
-/// A number the file tells, or the node that tells it while the module runs.
+/// A number in the file, or a node with the number while the module runs.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Bound {
-    /// The file does.
+    /// A number in the file.
     Constant(f64),
-    /// A node does.
+    /// A node.
     Node(Node),
 }
 
-/// The nodes of a ServiceControl that the file names.
+/// The nodes of a ServiceControl in the file.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Control(pub BTreeMap<Role, Node>);
 
-/// What a node of a ServiceControl is for. In brackets what other drafts call it.
+/// The role of a node of a ServiceControl, with the names of other drafts in brackets.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Role {
     /// CommandExt (ControlExt): commands from outside.
     Command,
-    /// CommandEn (CommandEnable, ControlEnable): the commands that are taken now.
+    /// CommandEn (CommandEnable, ControlEnable): the currently enabled commands.
     CommandEnabled,
     /// StateCur (CurrentState, State).
     State,
-    /// ProcedureExt (StrategyExt): the procedure that is asked for.
+    /// ProcedureExt (StrategyExt): the requested procedure.
     ProcedureWanted,
-    /// ProcedureReq: the one that was taken over from there.
+    /// ProcedureReq: the accepted request.
     ProcedureRequested,
-    /// ProcedureCur (CurrentStrategy): the one that runs.
+    /// ProcedureCur (CurrentStrategy): the running procedure.
     ProcedureCurrent,
     /// OpMode of early drafts: one word of all modes.
     OperationMode,
-    /// StateAutAct: it is in automatic mode.
+    /// StateAutAct: automatic mode is active.
     AutomaticActive,
-    /// StateAutOp: an operator puts it there.
+    /// StateAutOp: an operator selects automatic mode.
     AutomaticByOperator,
-    /// StateAutAut: the orchestrating system does.
+    /// StateAutAut: the orchestrating system selects automatic mode.
     AutomaticByAutomation,
-    /// StateOpAct: it is in operator mode.
+    /// StateOpAct: operator mode is active.
     OperatorActive,
-    /// SrcExtAct: values and commands from outside count.
+    /// SrcExtAct: values and commands from outside are effective.
     ExternalActive,
-    /// SrcExtOp: an operator has it so.
+    /// SrcExtOp: an operator selects values and commands from outside.
     ExternalByOperator,
-    /// SrcExtAut: the orchestrating system has.
+    /// SrcExtAut: the orchestrating system selects values and commands from outside.
     ExternalByAutomation,
-    /// WQC: how good what it says is.
+    /// WQC: the quality of the values.
     Quality,
 }
 
@@ -145,11 +145,11 @@ pub enum Role {
 pub struct Node {
     /// The endpoint of its server.
     pub endpoint: String,
-    /// The URI of its namespace, or the bare index that some files have in its place.
+    /// The URI of its namespace, or the namespace index that some files have in its place.
     pub namespace: String,
-    /// Its identifier there.
+    /// Its identifier in the namespace.
     pub identifier: Identifier,
-    /// What may be done with it.
+    /// Access rights.
     pub access: Access,
 }
 
@@ -158,21 +158,21 @@ pub struct Node {
 pub enum Identifier {
     /// A number.
     Numeric(u32),
-    /// A text, also of GUIDs and opaque ones: as the file has it.
+    /// A text, including GUIDs and opaque identifiers as written in the file.
     Text(String),
 }
 
 /// OPCUAItem's Access: 1 reads, 2 writes, 3 both.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Access {
-    /// It can be read.
+    /// Whether the node can be read.
     pub reads: bool,
-    /// It can be written.
+    /// Whether the node can be written.
     pub writes: bool,
 }
 
 impl Control {
-    /// The node for something.
+    /// Returns the node with a role.
     #[must_use]
     pub fn node(&self, role: Role) -> Option<&Node> {
         self.0.get(&role)

@@ -1,8 +1,9 @@
-//! From the model to RDF: what a module can do, in the terms of CSS and CaSk.
+//! Converts the model to RDF, in the terms of CSS and CaSk.
 //!
-//! A module is a resource, each of its procedures a skill, and each of its services a capability that its procedures realise.
-//! IRIs are made of the base that the importing side gives and of the IDs in the file, never of names alone: two modules of
-//! one name, and two services or procedures of one name in one module, stay apart.
+//! A module is a resource, each of its procedures a skill, and each of its services a capability
+//! that its procedures realise. IRIs consist of the base given by the importer and of the IDs in
+//! the file, never of names alone. Two modules of the same name, and two services or procedures of
+//! the same name in a module, are therefore distinct.
 
 use std::collections::{BTreeMap, HashSet};
 use std::fmt::Write as _;
@@ -17,16 +18,16 @@ use crate::vocabulary as v;
 pub struct Triple {
     /// An IRI.
     pub subject: String,
-    /// An IRI, of [`vocabulary`](crate::vocabulary) as a rule.
+    /// An IRI, usually of [`vocabulary`](crate::vocabulary).
     pub predicate: String,
-    /// What is said.
+    /// The object of the statement.
     pub object: Object,
 }
 
-/// What a statement says of its subject.
+/// The object of a statement.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Object {
-    /// Another thing, by its IRI.
+    /// Another resource, by its IRI.
     Iri(String),
     /// An xsd:string.
     Text(String),
@@ -36,16 +37,18 @@ pub enum Object {
     Number(f64),
     /// An xsd:boolean.
     Boolean(bool),
-    /// An xsd:dateTime, as it is written there.
+    /// An xsd:dateTime in its lexical form.
     Time(String),
 }
 
 impl Module {
-    /// What the module is and can do. `base` is an IRI that no other module of the plant has; all others begin with it.
+    /// Returns the module and its capabilities as statements. `base` is an IRI that no other module
+    /// of the plant has; all other IRIs begin with it.
     ///
-    /// A manifest does not say in which words of the plant its services are capabilities. Each has one of its own,
-    /// `<base>/service/<ID>/capability`, of which an ontology can say what it is a subclass of. `capabilities` says it here: IRIs of classes
-    /// by the name of a service, or by `service/procedure`.
+    /// A manifest does not relate its services to the capabilities of the plant. Each service has a
+    /// capability class of its own, `<base>/service/<ID>/capability`, which an ontology can declare
+    /// as a subclass. `capabilities` does so here: IRIs of classes by the name of a service, or by
+    /// `service/procedure`.
     #[must_use]
     pub fn triples(&self, base: &str, capabilities: &BTreeMap<String, Vec<String>>) -> Vec<Triple> {
         let mut graph = Graph {
@@ -59,7 +62,8 @@ impl Module {
     }
 }
 
-/// Makes any text a part of an IRI: all but letters, digits, `-`, `.`, `_` and `~` of ASCII becomes `%XX`.
+/// Escapes a text for a part of an IRI: all characters except ASCII letters, digits, `-`, `.`, `_`
+/// and `~` become `%XX`.
 #[must_use]
 pub fn escaped(text: &str) -> String {
     let mut escaped = String::with_capacity(text.len());
@@ -76,7 +80,8 @@ pub fn escaped(text: &str) -> String {
 }
 
 impl Node {
-    /// Its NodeId as OPC 10000-6, 5.1.12 writes it, as `nsu=urn:module;s=Dosing.StateCur`; `ns=` where the file has an index only.
+    /// Returns its NodeId in the notation of OPC 10000-6, 5.1.12, such as
+    /// `nsu=urn:module;s=Dosing.StateCur`. It starts with `ns=` if the file has only an index.
     #[must_use]
     pub fn id(&self) -> String {
         let is_index = self.namespace.bytes().all(|byte| byte.is_ascii_digit());
@@ -160,7 +165,7 @@ impl Graph<'_> {
         }
     }
 
-    /// The commands that a procedure takes: a number each, written to one node.
+    /// Adds the commands of a procedure: a number for each command, written to the same node.
     fn commands(&mut self, service_iri: &str, service: &Service) -> Vec<String> {
         let Some(node) = service.control.node(Role::Command) else {
             return Vec::new();
@@ -245,7 +250,7 @@ impl Graph<'_> {
         self.text(&iri, v::RDFS_LABEL, &format!("{about}.{}", parameter.name));
         self.text(&iri, v::HAS_VARIABLE_NAME, &parameter.name);
         self.text(&iri, v::HAS_VARIABLE_TYPE, parameter.kind.data_type());
-        // The module keeps the value it was given last, and starts with one.
+        // The module keeps the last given value, and starts with an initial value.
         self.say(&iri, v::IS_REQUIRED, Object::Boolean(false));
         for (bound, predicate) in [(&parameter.min, v::MIN), (&parameter.max, v::MAX)] {
             if let Some(Bound::Constant(number)) = bound {
@@ -297,11 +302,12 @@ impl Graph<'_> {
         self.text(of, v::NODE_ID, &node.id());
     }
 
-    /// An IRI that nothing else has: by its ID, by its name where it has none, and with a number where that is taken.
+    /// Returns a unique IRI: from the ID, or from the name if there is no ID, with a number if it
+    /// is taken.
     fn name(&mut self, of: &str, kind: &str, id: &str, name: &str) -> String {
         let part = escaped(if id.is_empty() { name } else { id });
         let mut iri = format!("{of}/{kind}/{part}");
-        // A part never has a comma of its own.
+        // A part never contains a comma.
         for number in 2.. {
             if self.taken.insert(iri.clone()) {
                 break;
@@ -342,7 +348,7 @@ fn bound_node(bound: Option<&Bound>) -> Option<&Node> {
 }
 
 impl ValueKind {
-    /// The OPC UA DataType of such values.
+    /// Returns the OPC UA DataType of such values.
     #[must_use]
     pub fn data_type(self) -> &'static str {
         match self {
@@ -368,7 +374,7 @@ const COMMANDS: &[(&str, i64)] = &[
     ("Complete", 1024),
 ];
 
-/// The units in use most (VDI/VDE/NAMUR 2658-3, table 10). Of others only the code is told.
+/// The most common units (VDI/VDE/NAMUR 2658-3, table 10). Other units have only their code.
 const UNITS: &[(u16, &str)] = &[
     (1000, "K"),
     (1001, "°C"),

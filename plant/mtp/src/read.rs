@@ -1,4 +1,4 @@
-//! From the tree of elements to the model.
+//! Converts the tree of elements to the model.
 
 use std::borrow::Cow;
 use std::collections::HashMap;
@@ -11,11 +11,11 @@ use crate::model::{
 };
 
 impl Module {
-    /// Reads a manifest as it is handed over: an `.aml` file in any encoding of [`xml_text`], or a ZIP container of one, an
-    /// `.mtp` or an `.amlx` file.
+    /// Reads a manifest as delivered: an `.aml` file in any encoding of [`xml_text`], or a ZIP
+    /// container with such a file (`.mtp` or `.amlx`).
     ///
     /// # Errors
-    /// [`ManifestError`] if the file is no manifest.
+    /// [`ManifestError`] if the file is not a manifest.
     pub fn from_bytes(file: &[u8]) -> Result<Self, ManifestError> {
         let unpacked = match container::is_container(file) {
             true => Cow::Owned(container::document(file)?),
@@ -27,7 +27,8 @@ impl Module {
     /// Reads a manifest, the text of the `.aml` file of an MTP.
     ///
     /// # Errors
-    /// [`ManifestError`] where the file is not one. What is wrong inside one is in [`findings`](Self::findings).
+    /// [`ManifestError`] if the file is not a manifest. Inconsistencies in a manifest are in
+    /// [`findings`](Self::findings).
     pub fn read(manifest: &str) -> Result<Self, ManifestError> {
         let root = Element::read(manifest)?;
         let of_module = |element: &&Element| element.path == "MTPSUCLib/ModuleTypePackage";
@@ -48,11 +49,12 @@ impl Module {
     }
 }
 
-/// What the parts of a file refer to.
+/// Index of the elements that are referenced in a file.
 struct Reading<'a> {
     /// OPCUAItems by their ID.
     nodes: HashMap<&'a str, Node>,
-    /// DataAssemblies by their RefID and, for files whose services name that, by their ID.
+    /// DataAssemblies by their RefID, and by their ID for files with services that reference the
+    /// ID.
     assemblies: HashMap<&'a str, &'a Element>,
     /// All elements by their ID.
     elements: HashMap<&'a str, &'a Element>,
@@ -80,7 +82,7 @@ impl<'a> Reading<'a> {
                 matches!(element.kind(), "ServiceControl") || kind_of(element).is_some();
             if is_assembly {
                 reading.assemblies.entry(&element.id).or_insert(element);
-                // There may be two: what is referred to is the last in the files that have them.
+                // There may be two: in the files that have two, the last attribute is referenced.
                 for attribute in element
                     .attributes
                     .iter()
@@ -149,7 +151,7 @@ impl<'a> Reading<'a> {
             .filter(|child| is_procedure(child))
             .filter_map(|child| self.procedure(&element.name, child))
             .collect();
-        // What one of the strategies names is its parameter and not the service's.
+        // Parameters that a strategy references belong to the strategy and not to the service.
         let required: Vec<&str> = element
             .children
             .iter()
@@ -226,7 +228,7 @@ impl<'a> Reading<'a> {
         Control(roles.collect())
     }
 
-    /// What a service, procedure or parameter refers to by its RefID.
+    /// Returns the element that a service, procedure or parameter references by its RefID.
     fn assembly(&self, element: &Element) -> Option<&'a Element> {
         self.assemblies.get(element.value(&["RefID"])?).copied()
     }
@@ -257,7 +259,8 @@ impl<'a> Reading<'a> {
     }
 }
 
-/// The IDs in RequiredParameters, with which strategies name the parameters of their service.
+/// Returns the IDs in RequiredParameters, by which strategies reference the parameters of their
+/// service.
 fn required(strategy: &Element) -> impl Iterator<Item = &str> {
     let ids = strategy.value(&["RequiredParameters"]).unwrap_or_default();
     ids.split_whitespace()
@@ -285,7 +288,7 @@ fn kind_of(assembly: &Element) -> Option<ValueKind> {
         "StringServParam" => Some(ValueKind::Text),
         // A draft of 2018.
         "ServAnaParam" | "StrategyAnaParam" => Some(ValueKind::Analog),
-        // Before there were kinds of their own, parameters were operations from outside.
+        // Before parameters had kinds of their own, they were operations from outside.
         "ExtAnaOp" | "ExtIntAnaOp" | "AdvAnaOp" => Some(ValueKind::Analog),
         "ExtDigOp" | "ExtIntDigOp" | "AdvDigOp" => Some(ValueKind::Integer),
         "ExtBinOp" | "ExtIntBinOp" | "AdvBinOp" => Some(ValueKind::Binary),
@@ -323,7 +326,8 @@ impl Identifier {
 }
 
 impl Access {
-    /// Of the number in the file; what says nothing is not kept from anybody here, the server decides.
+    /// Converts the number in the file. Without a number all access is allowed here; the server
+    /// decides.
     fn of(text: Option<&str>) -> Self {
         let bits: u8 = text.and_then(|text| text.parse().ok()).unwrap_or(3);
         Self {
@@ -333,7 +337,7 @@ impl Access {
     }
 }
 
-/// What the nodes of a ServiceControl are called, by newest first.
+/// The names of the nodes of a ServiceControl, newest first.
 const ROLES: &[(Role, &[&str])] = &[
     (Role::Command, &["CommandExt", "ControlExt"]),
     (

@@ -1,9 +1,10 @@
-//! The IRIs by which the plant is described: the one table of them.
+//! The table of the IRIs that describe the plant.
 //!
-//! CSS (capabilities, skills, services) and CaSk are ontologies of the research groups that made the terms; what they have no
-//! word for (nodes of OPC UA, numbers in the space, limits) is in a namespace of ours.
+//! CSS (capabilities, skills, services) and CaSk are ontologies of the research groups that created
+//! the terms. Other terms (nodes of OPC UA, numbers in the space, limits) are in a namespace of
+//! this project.
 
-/// What an IRI of the table is used as.
+/// The use of an IRI of the table.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum TermKind {
     /// After `rdf:type`.
@@ -14,12 +15,12 @@ pub enum TermKind {
     DataProperty,
 }
 
-/// An IRI of an ontology that others made.
+/// An IRI of an external ontology.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Term {
-    /// The whole of it.
+    /// The whole IRI.
     pub iri: &'static str,
-    /// What it is used as.
+    /// Its use.
     pub kind: TermKind,
 }
 
@@ -119,19 +120,19 @@ terms!(STANDARD, "",
     DataProperty RDFS_COMMENT = "http://www.w3.org/2000/01/rdf-schema#comment",
 );
 
-/// All terms of CSS and CaSk that are used, to be compared with the ontologies.
+/// Returns all used terms of CSS and CaSk, for comparison with the ontologies.
 pub fn foreign() -> impl Iterator<Item = Term> {
     CSS.iter().chain(CASK).copied()
 }
 
-/// All terms there are.
+/// Returns all terms.
 pub fn all() -> impl Iterator<Item = Term> {
     foreign()
         .chain(OURS.iter().copied())
         .chain(STANDARD.iter().copied())
 }
 
-/// The prefixes by which questions shorten the IRIs.
+/// The prefixes with which questions abbreviate the IRIs.
 pub const PREFIXES: [(&str, &str); 5] = [
     ("css", "http://www.w3id.org/hsu-aut/css#"),
     ("cask", "http://www.w3id.org/hsu-aut/cask#"),

@@ -1,15 +1,15 @@
-//! Manifests of our own and of six makers, and what is wrong with some.
+//! Manifests of this project and of six manufacturers, and their inconsistencies.
 #![expect(clippy::unwrap_used, reason = "a test may")]
 
 use mtp::{Bound, Identifier, ManifestError, Module, Procedure, Role, Service, ValueKind};
 use test_data::{read_foreign, read_own};
 
-/// The module of a manifest of our own.
+/// Returns the module of a manifest of this project.
 fn own(file: &str) -> Module {
     Module::read(&read_own(&format!("mtp/{file}"))).unwrap()
 }
 
-/// The text of a manifest of another maker.
+/// Returns the text of a manifest of another manufacturer.
 fn manifest(file: &str) -> Option<String> {
     read_foreign(&format!("mtp/{file}"))
 }
@@ -30,15 +30,15 @@ fn procedure<'a>(service: &'a Service, name: &str) -> &'a Procedure {
         .unwrap()
 }
 
-/// Our own, counted by hand.
+/// Manifests of this project, counted by hand.
 const OWN: [(&str, &str, usize, usize, usize); 2] = [
     ("stage.aml", "Stage:1.0.0", 2, 6, 4),
     ("mixer.aml", "Mixer", 1, 2, 4),
 ];
 
 const ALL: [(&str, &str, usize, usize, usize); 8] = [
-    // File, name, services, procedures, parameters, as another XML library counts them; one that two strategies require is
-    // counted with each.
+    // File, name, services, procedures and parameters, as counted by another XML library. A
+    // parameter that two strategies require counts for each of them.
     (
         "cps-edp-mixing-1.1.2/Manifest.aml",
         "Mixing.(1.1.2)",
@@ -85,7 +85,7 @@ const ALL: [(&str, &str, usize, usize, usize); 8] = [
     ),
 ];
 
-/// The name, and how many services, procedures and parameters there are.
+/// Returns the name and the numbers of services, procedures and parameters.
 fn counts(module: &Module) -> (&str, usize, usize, usize) {
     let of_services = module
         .services
@@ -105,7 +105,7 @@ fn counts(module: &Module) -> (&str, usize, usize, usize) {
     )
 }
 
-/// How many services can be commanded and watched.
+/// Returns the number of services with nodes for commands and monitoring.
 fn commanded(module: &Module) -> usize {
     let roles = [
         Role::Command,

@@ -1,4 +1,4 @@
-//! Manifests of our own and of other makers as RDF, and two modules of one name.
+//! Manifests of this project and of other manufacturers as RDF, and two modules of the same name.
 #![expect(clippy::unwrap_used, reason = "a test may")]
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -7,12 +7,12 @@ use mtp::vocabulary as v;
 use mtp::{Module, Object, Triple};
 use test_data::{read_foreign, read_own};
 
-/// The module of a manifest of our own.
+/// Returns the module of a manifest of this project.
 fn own(file: &str) -> Module {
     Module::read(&read_own(&format!("mtp/{file}"))).unwrap()
 }
 
-/// The module of a manifest of another maker.
+/// Returns the module of a manifest of another manufacturer.
 fn manifest(name: &str) -> Option<Module> {
     Some(Module::read(&read_foreign(&format!("mtp/{name}"))?).unwrap())
 }
@@ -58,7 +58,7 @@ fn each_procedure_of_eight_manifests_is_a_skill_with_a_capability_and_a_node() {
     }
 }
 
-/// Each procedure of a module is.
+/// Checks that each procedure of a module is a skill.
 fn are_skills(module: &Module, (file, services, procedures): (&str, usize, usize)) {
     let all = module.triples("urn:example:module", &BTreeMap::new());
     let skills: BTreeSet<_> = about(&all, v::RDF_TYPE, v::SKILL).into_iter().collect();
