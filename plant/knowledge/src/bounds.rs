@@ -1,8 +1,10 @@
-//! What a query may not be, as far as it shows before it runs.
+//! Limits of queries that can be checked before the query runs.
 //!
-//! The evaluator looks for cancellation whenever it reads a statement. What takes time or memory without reading any is bounded
-//! here: tables written into the query (`VALUES`) that are joined with each other, texts put together of themselves, and as many
-//! patterns as keep the optimizer busy for minutes. And no query makes this program ask another server.
+//! The evaluator checks for cancellation whenever it reads a statement. This module limits
+//! operations that take time or memory without reading statements. Examples are joins of tables in
+//! the query (`VALUES`), texts concatenated from themselves, and enough patterns to keep the
+//! optimizer busy for minutes. Queries with `SERVICE`, which would call another server, are
+//! refused.
 
 use spargebra::Query;
 use spargebra::algebra::{
@@ -12,7 +14,8 @@ use spargebra::algebra::{
 
 use crate::query::QueryFault;
 
-/// Whether the text nests no deeper than the parser is let go. Brackets in texts and IRIs count too.
+/// Checks that the nesting of the text is within the limit for the parser. Brackets in texts and
+/// IRIs count too.
 pub(crate) fn nests(query: &str) -> Result<(), QueryFault> {
     let mut depth = 0_usize;
     for byte in query.bytes() {
@@ -30,7 +33,7 @@ pub(crate) fn nests(query: &str) -> Result<(), QueryFault> {
     Ok(())
 }
 
-/// Whether the query may run.
+/// Checks whether the query may run.
 pub(crate) fn check(query: &Query) -> Result<(), QueryFault> {
     let (Query::Select { pattern, .. }
     | Query::Construct { pattern, .. }
@@ -62,7 +65,7 @@ struct Bounds {
     has_service: bool,
     patterns: usize,
     expressions: usize,
-    /// By how much texts can become longer at most.
+    /// Upper limit of the growth of texts.
     growth: f64,
 }
 
@@ -78,7 +81,7 @@ impl Default for Bounds {
 }
 
 impl Bounds {
-    /// How many rows the pattern makes at most for each that it makes of statements.
+    /// Returns the maximum number of rows of the pattern for each row from statements.
     fn rows(&mut self, pattern: &GraphPattern) -> f64 {
         self.patterns += 1;
         match pattern {
@@ -159,7 +162,7 @@ impl Bounds {
         }
     }
 
-    /// How many rows the patterns inside an expression make for one row.
+    /// Returns the maximum number of rows from the patterns inside an expression for one row.
     fn expression(&mut self, expression: &Expression) -> f64 {
         self.expressions += 1;
         match expression {
@@ -200,7 +203,7 @@ impl Bounds {
     }
 }
 
-/// By how much the text that a function makes may be longer than those it is made of.
+/// Returns the maximum ratio of the length of a function's result to the length of its arguments.
 fn growth(function: &Function, all: &[Expression]) -> f64 {
     if *function == Function::Concat {
         let parts = all
@@ -219,7 +222,8 @@ fn growth(function: &Function, all: &[Expression]) -> f64 {
     }
 }
 
-/// Exact below 2^53, and larger than any limit above.
+/// Converts a number; the result is exact below 2^32, and larger numbers become the maximum, which
+/// exceeds every limit.
 fn count(number: usize) -> f64 {
     u32::try_from(number).map_or(f64::MAX, f64::from)
 }
@@ -228,6 +232,6 @@ const MAX_DEPTH: usize = 200;
 const MAX_PATTERNS: usize = 300;
 const MAX_EXPRESSIONS: usize = 1000;
 const MAX_ROWS: f64 = 100_000.0;
-/// Of what is a query in 16 kB at most, to 64 MB.
+/// Allows up to 64 MB from a query of at most 16 kB.
 const MAX_GROWTH: f64 = 4096.0;
 const UNKNOWN_GROWTH: f64 = 256.0;

@@ -1,21 +1,21 @@
-//! What is known of a component: a server with skills, as statements.
+//! Facts about a component, a server with skills, as statements.
 
 use mtp::{Object, Triple, escaped};
 
 use crate::vocabulary as v;
 
-/// A component, as its server tells it. Plain data: nothing here knows how it was asked.
+/// A component as described by its server. Plain data, independent of the way it was read.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct ComponentFacts {
-    /// Its ApplicationUri, which is its IRI too.
+    /// Its ApplicationUri, which is also its IRI.
     pub application_uri: String,
     /// Its name.
     pub name: String,
-    /// Where its server is.
+    /// Endpoint of its server.
     pub endpoint: String,
     /// Its number in the space.
     pub namespace: Option<u16>,
-    /// What it can do.
+    /// Its skills.
     pub skills: Vec<SkillFacts>,
 }
 
@@ -24,15 +24,15 @@ pub struct ComponentFacts {
 pub struct SkillFacts {
     /// Its name.
     pub name: String,
-    /// Which it is of its component: 1, 2, ...
+    /// Its number within the component: 1, 2, ...
     pub number: Option<u32>,
     /// Its node.
     pub node: NodeName,
-    /// Its type, and the types above it in their order.
+    /// Its type, followed by the supertypes in order.
     pub types: Vec<TypeFacts>,
-    /// The classes of capability it realises, as IRIs.
+    /// The classes of capability that it realises, as IRIs.
     pub capabilities: Vec<String>,
-    /// What it needs to know, and what it tells in the end.
+    /// Its input and output parameters.
     pub parameters: Vec<ParameterFacts>,
 }
 
@@ -50,17 +50,17 @@ pub struct TypeFacts {
 pub struct ParameterFacts {
     /// Its name.
     pub name: String,
-    /// Whether it is told by the skill and not to it.
+    /// Whether it is an output of the skill.
     pub is_output: bool,
-    /// The name of its DataType, with `[]` where it is an array.
+    /// The name of its DataType, with `[]` for an array.
     pub data_type: String,
-    /// Whether it has to be given.
+    /// Whether it is required.
     pub is_required: bool,
-    /// What it is when it is not given, as JSON.
+    /// Its default value, as JSON.
     pub default: Option<String>,
-    /// The least it may be.
+    /// Minimum value.
     pub min: Option<f64>,
-    /// The most it may be.
+    /// Maximum value.
     pub max: Option<f64>,
     /// The symbol of its unit.
     pub unit: Option<String>,
@@ -73,12 +73,13 @@ pub struct ParameterFacts {
 pub struct NodeName {
     /// The URI of its namespace.
     pub namespace: String,
-    /// Its identifier there, as `i=100` or `s=Grasp`.
+    /// Its identifier in the namespace, such as `i=100` or `s=Grasp`.
     pub identifier: String,
 }
 
 impl NodeName {
-    /// From `nsu=urn:example:gripper;i=100`. The namespace of OPC UA itself where there is none in it.
+    /// Parses a text such as `nsu=urn:example:gripper;i=100`. The default namespace is that of OPC
+    /// UA itself.
     #[must_use]
     pub fn parse(node_id: &str) -> Option<Self> {
         let (namespace, identifier) = match node_id.strip_prefix("nsu=") {
@@ -94,14 +95,15 @@ impl NodeName {
         })
     }
 
-    /// Its NodeId as OPC 10000-6, 5.1.12 writes it.
+    /// Returns its NodeId in the notation of OPC 10000-6, 5.1.12.
     #[must_use]
     pub fn id(&self) -> String {
         let namespace = self.namespace.replace('%', "%25").replace(';', "%3B");
         format!("nsu={namespace};{}", self.identifier)
     }
 
-    /// Its IRI where it is the same node in every server, as types are: the namespace URI, and the identifier as its fragment.
+    /// Returns the IRI of a node that is the same in every server, such as a type: the namespace
+    /// URI with the identifier as its fragment.
     #[must_use]
     pub fn iri(&self) -> String {
         let fragment = fragment(&self.identifier);
@@ -115,7 +117,7 @@ impl NodeName {
 }
 
 impl ComponentFacts {
-    /// Its IRI: the ApplicationUri, if that is an IRI.
+    /// Returns its IRI: the ApplicationUri, if that is an IRI.
     #[must_use]
     pub fn iri(&self) -> String {
         if is_iri(&self.application_uri) && !self.application_uri.contains('#') {
@@ -125,8 +127,8 @@ impl ComponentFacts {
         }
     }
 
-    /// The IRI of one of its skills. Two components of one maker may have nodes of one name in one namespace; their skills are
-    /// apart by the component.
+    /// Returns the IRI of one of its skills. Two components of one manufacturer may have nodes with
+    /// equal names in one namespace; the component distinguishes their skills.
     #[must_use]
     pub fn skill_iri(&self, node: &NodeName) -> String {
         let iri = self.iri();
@@ -141,7 +143,8 @@ impl ComponentFacts {
         }
     }
 
-    /// All of it as statements. Capabilities that are no IRIs are left out and returned beside.
+    /// Returns all facts as statements. Capabilities that are not IRIs are omitted and returned
+    /// separately.
     #[must_use]
     pub fn triples(&self) -> (Vec<Triple>, Vec<String>) {
         let mut graph = Graph::default();
@@ -189,7 +192,7 @@ impl Graph {
         for of_nodes in &skill.types {
             let iri = of_nodes.node.iri();
             self.link(&iri, v::RDF_TYPE, v::RDFS_CLASS);
-            // Also where nothing is above it: each class is below itself.
+            // Even without a supertype: each class is a subclass of itself.
             self.link(&iri, v::RDFS_SUB_CLASS_OF, &iri);
             self.text(&iri, v::BROWSE_NAME, &of_nodes.browse_name);
             self.text(&iri, v::NODE_NAMESPACE, &of_nodes.node.namespace);
@@ -276,13 +279,13 @@ impl Graph {
     }
 }
 
-/// Whether it is an IRI as a whole.
+/// Returns whether the whole text is an IRI.
 #[must_use]
 pub fn is_iri(text: &str) -> bool {
     oxigraph::model::NamedNode::new(text).is_ok()
 }
 
-/// What may stand after the `#` of an IRI, and the `=` of identifiers.
+/// Escapes an identifier for the fragment of an IRI, and keeps the `=` of identifiers.
 fn fragment(identifier: &str) -> String {
     match identifier.split_once('=') {
         Some((kind, rest)) => format!("{}={}", escaped(kind), escaped(rest)),

@@ -1,4 +1,5 @@
-//! Questions over HTTP on loopback: the SPARQL 1.1 protocol (query only), named questions, the statements themselves.
+//! Queries over HTTP on loopback: the SPARQL 1.1 protocol (query only), named questions, and the
+//! statements themselves.
 
 use std::convert::Infallible;
 use std::io;
@@ -25,10 +26,10 @@ use crate::query::{Asked, Dataset, Formats, Limits, Queries, QueryFault, Results
 use crate::question::{QUESTIONS, Question, QuestionFault};
 use crate::store::Knowledge;
 
-/// More pages, by their path: JSON, or nothing where there is no such page.
+/// Additional pages by their path: JSON, or `None` for an unknown page.
 pub type Page = Arc<dyn Fn(&str) -> Option<String> + Send + Sync>;
 
-/// A listener that answers until it is dropped.
+/// A listener that serves requests until it is dropped.
 #[derive(Debug)]
 pub struct Endpoint {
     address: SocketAddr,
@@ -36,10 +37,10 @@ pub struct Endpoint {
 }
 
 impl Endpoint {
-    /// Listens at an address of loopback; with port 0 at any free port.
+    /// Listens at a loopback address; port 0 selects a free port.
     ///
     /// # Errors
-    /// When the address is in use, or not one of loopback.
+    /// Fails if the address is in use, or is not a loopback address.
     pub async fn bind(
         address: SocketAddr,
         knowledge: Arc<Knowledge>,
@@ -65,7 +66,7 @@ impl Endpoint {
         })
     }
 
-    /// Where it listens.
+    /// Returns the address of the listener.
     #[must_use]
     pub fn address(&self) -> SocketAddr {
         self.address
@@ -87,7 +88,7 @@ struct Site {
 async fn accept(listener: TcpListener, site: Site) {
     let places = Arc::new(Semaphore::new(MAX_CONNECTIONS));
     loop {
-        // Who comes to a full house waits in the listener's queue.
+        // Beyond the limit a connection waits in the listener's queue.
         let Ok(place) = Arc::clone(&places).acquire_owned().await else {
             return;
         };
@@ -177,7 +178,7 @@ impl Site {
                 "application/sparql-query" => {
                     pairs.push(("query".to_owned(), body(request, most).await?))
                 }
-                // Three bytes for each that is escaped.
+                // Three bytes for each escaped byte.
                 "application/x-www-form-urlencoded" => {
                     pairs.extend(form(&body(request, most.saturating_mul(3)).await?)?)
                 }
@@ -233,7 +234,7 @@ impl Site {
         let question = Question::of(name)?;
         let sparql = question.with(&pairs)?;
         let formats = Formats::of(&accepted);
-        // What is named first of the two forms.
+        // The first accepted of the two formats.
         let wanted = accepted
             .iter()
             .find(|media| QueryResultsFormat::from_media_type(media).is_some());
@@ -274,7 +275,8 @@ impl Site {
 }
 
 impl Formats {
-    /// The first that is accepted of each kind; JSON and N-Triples where all is.
+    /// Selects the first accepted format of each kind; JSON and N-Triples if all formats are
+    /// accepted.
     fn of(accepted: &[String]) -> Self {
         let is_any = accepted.is_empty()
             || accepted
@@ -293,7 +295,7 @@ impl Formats {
     }
 }
 
-/// Why a request is not answered.
+/// Reason for refusing a request.
 #[derive(Debug)]
 struct Refusal {
     status: StatusCode,
@@ -383,7 +385,8 @@ impl From<QuestionFault> for Refusal {
     }
 }
 
-/// A page of another site in somebody's browser reaches loopback by a name that leads there; only names of loopback are served.
+/// Refuses all names except loopback names: a page of another site in a user's browser can reach
+/// loopback by a name that resolves to it.
 fn is_local(request: &Request<Incoming>) -> Result<(), Refusal> {
     let Some(host) = request.headers().get(HOST) else {
         return Ok(());
@@ -409,7 +412,7 @@ fn is_local(request: &Request<Incoming>) -> Result<(), Refusal> {
     }
 }
 
-/// The media types that are accepted, in their order, without those that are refused (q=0).
+/// Returns the accepted media types in order, without refused types (q=0).
 fn accepted(request: &Request<Incoming>) -> Vec<String> {
     let all = request
         .headers()
@@ -449,7 +452,7 @@ async fn body(request: Request<Incoming>, most: usize) -> Result<String, Refusal
     String::from_utf8(bytes.into()).map_err(|_| Refusal::malformed("the request is not in UTF-8"))
 }
 
-/// The pairs of a form or of the query of a URL.
+/// Returns the pairs of a form or of the query of a URL.
 fn form(text: &str) -> Result<Vec<(String, String)>, Refusal> {
     let pairs: Vec<&str> = text.split('&').filter(|pair| !pair.is_empty()).collect();
     if pairs.len() > MAX_PAIRS {
@@ -485,7 +488,7 @@ fn digit(byte: u8) -> Option<u8> {
         .and_then(|digit| u8::try_from(digit).ok())
 }
 
-/// All questions with what they can be narrowed down by.
+/// Returns all questions with their parameters.
 fn catalogue() -> serde_json::Value {
     let questions = QUESTIONS.iter().map(|question| {
         json!({
@@ -520,5 +523,5 @@ const MAX_MEDIA: usize = 32;
 const ACCEPT_AGAIN: Duration = Duration::from_millis(100);
 const HEADER_TIME: Duration = Duration::from_secs(5);
 const BODY_TIME: Duration = Duration::from_secs(5);
-/// Above the time of any query.
+/// Exceeds the time limit of any query.
 const CONNECTION_TIME: Duration = Duration::from_secs(60);

@@ -1,14 +1,17 @@
-//! What is known of the plant, as RDF, and questions about it.
+//! The knowledge of the plant as RDF, and queries on it.
 //!
-//! [`Knowledge`] is a store in memory with one named graph per [`Source`]: a component that was found ([`ComponentFacts`]), a
-//! manifest of an MTP, a NodeSet ([`nodeset`]), a file of Turtle, a run of a process. Each is replaced as a whole when its source
-//! changes, and goes when the source goes. Questions are SPARQL ([`QUESTIONS`] have names); [`Endpoint`] answers them over HTTP, with
-//! limits in time, memory and size.
+//! [`Knowledge`] is a store in memory with a named graph per [`Source`]: a discovered component
+//! ([`ComponentFacts`]), a manifest of an MTP, a NodeSet ([`nodeset`]), a file of Turtle, a run of
+//! a process. Each graph is replaced as a whole when its source changes, and removed with its
+//! source. Queries are SPARQL ([`QUESTIONS`] are named queries); [`Endpoint`] serves them over
+//! HTTP, with limits of time, memory and size.
 //!
-//! No server is asked here and nothing is discovered: facts come as plain data with the name of their source.
+//! This crate calls no server and discovers nothing: facts are plain data with the name of their
+//! source.
 //!
-//! Reading order: `source` (whose graph), `store` (replaced and derived), `component` and `nodeset` (facts to statements), `question` (by name),
-//! `query` and `bounds` (any SPARQL, within limits), `http`.
+//! Reading order: `source` (the named graphs), `store` (replacement and derivation), `component`
+//! and `nodeset` (facts to statements), `question` (named queries), `query` and `bounds` (any
+//! SPARQL, within limits), `http`.
 
 mod bounds;
 mod component;

@@ -1,6 +1,8 @@
-//! NodeSets (OPC 10000-6, annex F) as statements: types, what is above them, and the nodes that types declare.
+//! NodeSets (OPC 10000-6, annex F) as statements: types, their supertypes, and the nodes that types
+//! declare.
 //!
-//! Of HasSubtype come direct `rdfs:subClassOf` statements; the store's rule makes the rest of them.
+//! HasSubtype references become direct `rdfs:subClassOf` statements; the rule of the store derives
+//! the indirect statements.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -14,38 +16,38 @@ use thiserror::Error;
 use crate::component::{NodeName, OPC_UA};
 use crate::vocabulary as v;
 
-/// A NodeSet that was read.
+/// The contents of a NodeSet.
 #[derive(Debug, Clone, PartialEq)]
 pub struct NodeSet {
     /// The URI of its model, which is that of its namespace.
     pub namespace: String,
-    /// The version of its model; empty where none is told.
+    /// The version of its model; empty if unknown.
     pub version: String,
-    /// What it says.
+    /// Its statements.
     pub triples: Vec<Triple>,
 }
 
-/// Why a file is no NodeSet.
+/// Error of reading a NodeSet.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
 #[non_exhaustive]
 pub enum NodeSetFault {
-    /// More than is read.
+    /// The file exceeds the limit.
     #[error("the file has {length} bytes, more than the {most} that are read")]
     TooLarge {
-        /// What it has.
+        /// Size of the file.
         length: usize,
-        /// What is read.
+        /// The limit.
         most: usize,
     },
-    /// It is not XML, or only half of it.
+    /// The file is not XML, or incomplete.
     #[error("line {line}: {what}")]
     Xml {
-        /// Where, counted from 1.
+        /// Line, from 1.
         line: usize,
-        /// What is wrong.
+        /// Description of the error.
         what: String,
     },
-    /// It is XML of something else.
+    /// The file is XML of another format.
     #[error("there is no <UANodeSet> with a <Model ModelUri=..>: this is no NodeSet2")]
     NoModel,
 }
@@ -102,7 +104,7 @@ pub fn read(xml: &str) -> Result<NodeSet, NodeSetFault> {
 
 #[derive(Debug, Default)]
 struct Reading {
-    /// The names of the elements that are open.
+    /// The names of the open elements.
     open: Vec<String>,
     text: String,
     namespaces: Vec<String>,
@@ -201,7 +203,8 @@ impl Reading {
         self.open.pop();
     }
 
-    /// A node as the file writes it, with an alias or an index of its namespace table.
+    /// Resolves a node from its notation in the file, with an alias or an index of the namespace
+    /// table.
     fn node(&self, written: &str) -> Option<NodeName> {
         let written = self.aliases.get(written).map_or(written, String::as_str);
         let (namespace, identifier) = match written.strip_prefix("ns=") {
@@ -293,7 +296,7 @@ impl Graph<'_> {
                 waiting.push(iri);
             }
         }
-        // What types declare, and what that holds.
+        // The nodes that types declare, and their components.
         let mut told = BTreeSet::new();
         while let Some(iri) = waiting.pop() {
             for child in below.get(iri).into_iter().flatten() {
@@ -382,7 +385,7 @@ const HAS_PROPERTY: &str = "i=46";
 const HAS_COMPONENT: &str = "i=47";
 const HAS_ORDERED_COMPONENT: &str = "i=49";
 
-/// The largest that is published has 13 MB.
+/// The largest published file has 13 MB.
 const MAX_FILE: usize = 64 << 20;
 const MAX_DEPTH: usize = 64;
 const MAX_NODES: usize = 200_000;

@@ -1,7 +1,8 @@
 //! Any query, within limits of time, memory, size and number.
 //!
-//! Each query has a thread of its own: the evaluator does not give way, and a parser that nests needs a stack. A query whose
-//! time is over is cancelled, answered with that, and keeps its place until its thread has ended.
+//! Each query has a thread of its own, because the evaluator never yields, and the parser needs a
+//! stack for nesting. A query beyond its time limit is cancelled and reported as such; it counts as
+//! running until its thread has ended.
 
 use std::io::{self, Write};
 use std::sync::Arc;
@@ -22,20 +23,20 @@ use crate::bounds;
 use crate::question::{Answer, Question};
 use crate::store::Knowledge;
 
-/// How much one query may take.
+/// Limits of a query.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Limits {
-    /// Its time.
+    /// Time limit.
     pub time: Duration,
-    /// How many run at a time.
+    /// Maximum number of concurrent queries.
     pub parallel: usize,
-    /// Rows or statements of a result.
+    /// Maximum number of rows or statements in a result.
     pub rows: usize,
-    /// Bytes of a result.
+    /// Maximum size of a result in bytes.
     pub bytes: usize,
-    /// Bytes of a query.
+    /// Maximum size of a query in bytes.
     pub query: usize,
-    /// By how many bytes the program may become larger while it runs.
+    /// Maximum growth of the program in bytes while the query runs.
     pub memory: u64,
 }
 
@@ -52,16 +53,17 @@ impl Default for Limits {
     }
 }
 
-/// What a query is asked of: `default-graph-uri` and `named-graph-uri` of the SPARQL protocol. Empty: all there is.
+/// The dataset of a query: `default-graph-uri` and `named-graph-uri` of the SPARQL protocol. Empty
+/// for all graphs.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(crate) struct Dataset {
-    /// What the default graph is made of.
+    /// The graphs of the default graph.
     pub(crate) default: Vec<String>,
     /// The named graphs.
     pub(crate) named: Vec<String>,
 }
 
-/// How results are to be written; where there is nothing, that kind of result is not wanted.
+/// Result formats; `None` if the client does not accept that kind of result.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Formats {
     /// SELECT and ASK.
@@ -70,83 +72,83 @@ pub(crate) struct Formats {
     pub(crate) triples: Option<RdfFormat>,
 }
 
-/// What a query found.
+/// Result of a query.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Results {
-    /// SELECT, ASK, CONSTRUCT and DESCRIBE, with the media type of what is written there.
+    /// Encoded result of SELECT, ASK, CONSTRUCT or DESCRIBE, with its media type.
     Written(&'static str, Vec<u8>),
-    /// A named question.
+    /// Result of a named question.
     Answer(Answer),
 }
 
-/// Why a query has no result.
+/// Error of a query.
 #[derive(Debug, Clone, PartialEq, Error)]
 #[non_exhaustive]
 pub(crate) enum QueryFault {
-    /// It is no SPARQL.
+    /// The text is not SPARQL.
     #[error("the query cannot be read: {0}")]
     Malformed(String),
-    /// It is an update.
+    /// The text is an update.
     #[error(
         "only SELECT, ASK, CONSTRUCT and DESCRIBE are answered; what is known is changed by its sources alone"
     )]
     NotAQuery,
-    /// It asks another server.
+    /// The query calls another server.
     #[error("SERVICE is not answered: no other server is asked from here")]
     Service,
-    /// A name of a graph is no IRI.
+    /// The name of a graph is not an IRI.
     #[error("`{0}` is no IRI of a graph")]
     Graph(String),
-    /// It is too long.
+    /// The query is too long.
     #[error("the query has more than {most} bytes")]
     TooLong {
-        /// What is read.
+        /// The limit.
         most: usize,
     },
-    /// It would not end, or not in this memory.
+    /// The query would exceed time or memory.
     #[error("the query is not run: {0}")]
     TooComplex(String),
-    /// Its time is over.
+    /// The time limit has passed.
     #[error("the query took longer than {} s and was stopped; narrow it down", limit.as_secs_f64())]
     Time {
-        /// What it had.
+        /// The limit.
         limit: Duration,
     },
-    /// It took too much memory.
+    /// The query used too much memory.
     #[error("the query took more than {} MiB of memory and was stopped; narrow it down", limit >> 20)]
     Memory {
-        /// What it had.
+        /// The limit.
         limit: u64,
     },
-    /// Too many run.
+    /// Too many queries are running.
     #[error("{0} queries run at this time, and no more are taken; ask again")]
     Busy(usize),
-    /// It found too much.
+    /// The result is too large.
     #[error("the result is larger than {rows} rows or {bytes} bytes; add a LIMIT")]
     Result {
-        /// Rows it may have.
+        /// Limit of rows.
         rows: usize,
-        /// Bytes it may have.
+        /// Limit of bytes.
         bytes: usize,
     },
-    /// Nobody wants results of this kind.
+    /// The client accepts no format for this kind of result.
     #[error("no format that is accepted can hold the result of {0}")]
     NotAcceptable(&'static str),
-    /// The evaluator gave up.
+    /// The evaluator failed.
     #[error("the query fails: {0}")]
     Failed(String),
 }
 
-/// What is asked.
+/// A query or question.
 #[derive(Debug, Clone)]
 pub(crate) enum Asked {
-    /// A query from outside.
+    /// A query of a client.
     Sparql(String, Dataset, Formats),
-    /// A question with its parameters in it, to be answered as plain JSON.
+    /// A question with its parameters filled in, for an answer in plain JSON.
     Question(Question, String),
 }
 
-/// The queries that run.
+/// The running queries.
 #[derive(Debug, Clone)]
 pub(crate) struct Queries {
     knowledge: Arc<Knowledge>,
@@ -171,7 +173,7 @@ impl Queries {
         &self.knowledge
     }
 
-    /// Runs a query. Dropping the future stops it.
+    /// Runs a query. Dropping the future stops the query.
     pub(crate) async fn run(&self, asked: Asked) -> Result<Results, QueryFault> {
         let limits = self.limits;
         if let Asked::Sparql(query, ..) = &asked
@@ -196,7 +198,7 @@ impl Queries {
             .stack_size(STACK);
         let started = thread.spawn(move || {
             let _place: OwnedSemaphorePermit = place;
-            // Nobody may be left who waits.
+            // The receiver may have been dropped.
             let _told = tell.send(work.run());
         });
         if started.is_err() {
@@ -224,7 +226,7 @@ impl Queries {
     }
 }
 
-/// Stops the query when nobody waits for it any more.
+/// Stops the query when its future is dropped.
 struct Stopping(CancellationToken);
 
 impl Drop for Stopping {
@@ -276,7 +278,7 @@ impl Work {
                 .into_iter()
                 .map(Into::into)
                 .collect();
-            // What the protocol says wins over FROM in the query.
+            // The dataset of the protocol takes precedence over FROM in the query.
             prepared.dataset_mut().set_default_graph(default);
             prepared.dataset_mut().set_available_named_graphs(named);
         }
@@ -391,7 +393,7 @@ impl Work {
     }
 }
 
-/// Takes no more than so many bytes.
+/// A writer with a limit of bytes.
 struct Bounded {
     bytes: Vec<u8>,
     most: usize,
@@ -411,7 +413,7 @@ impl Write for Bounded {
     }
 }
 
-/// The bytes of memory that this program has, where the system tells.
+/// Returns the memory of this program in bytes, if the system provides it.
 fn resident() -> Option<u64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;
     let line = status
@@ -421,7 +423,7 @@ fn resident() -> Option<u64> {
     Some(kilobytes << 10)
 }
 
-/// How often memory is looked at.
+/// Period of the memory checks.
 const LOOK: Duration = Duration::from_millis(50);
-/// Only what is used of it is taken.
+/// Memory is allocated only for the used part.
 const STACK: usize = 256 << 20;

@@ -15,7 +15,8 @@ use crate::store::Knowledge;
 pub struct Question {
     /// Its name.
     pub name: &'static str,
-    /// Its SPARQL, which can be asked as it stands anywhere. Lines that begin with `#:` say what is special about it.
+    /// Its SPARQL, a complete query for any SPARQL endpoint. Lines that begin with `#:` contain its
+    /// description.
     pub sparql: &'static str,
 }
 
@@ -24,22 +25,22 @@ pub struct Question {
 pub struct Answer {
     /// The name of the question.
     pub question: String,
-    /// The names of the columns, in their order.
+    /// The names of the columns in order.
     pub columns: Vec<String>,
-    /// The rows. A value is a text, a number, a truth value, nothing, or a list of texts.
+    /// The rows. A value is a text, a number, a boolean, null, or a list of texts.
     pub rows: Vec<BTreeMap<String, Value>>,
 }
 
-/// Why a question has no answer.
+/// Error of a question.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum QuestionFault {
     /// There is no question of this name.
     #[error("there is no question `{name}`; there are {known}")]
     Unknown {
-        /// What was asked for.
+        /// The requested name.
         name: String,
-        /// What there is.
+        /// The available names.
         known: String,
     },
     /// The question has no such parameter.
@@ -47,27 +48,27 @@ pub enum QuestionFault {
     Parameter {
         /// The question.
         question: &'static str,
-        /// What was given.
+        /// The given parameter.
         parameter: String,
-        /// What there is.
+        /// The available parameters.
         known: String,
     },
-    /// A parameter is no IRI.
+    /// A parameter is not an IRI.
     #[error("`{parameter}` is to be an IRI, and `{value}` is none: {why}")]
     Iri {
         /// The parameter.
         parameter: String,
-        /// What was given.
+        /// The given value.
         value: String,
-        /// What is wrong with it.
+        /// Description of the error.
         why: String,
     },
-    /// The question itself.
+    /// The query of the question is invalid.
     #[error("the question `{question}` cannot be asked: {why}")]
     Sparql {
-        /// Which.
+        /// The question.
         question: &'static str,
-        /// What is wrong with it.
+        /// Description of the error.
         why: String,
     },
 }
@@ -129,7 +130,7 @@ pub const QUESTIONS: &[Question] = &[
 ];
 
 impl Question {
-    /// The question of a name.
+    /// Returns the question of a name.
     ///
     /// # Errors
     /// [`QuestionFault::Unknown`].
@@ -151,23 +152,23 @@ impl Question {
             })
     }
 
-    /// What it asks, in a sentence.
+    /// Returns the description of the question in a single sentence.
     #[must_use]
     pub fn about(self) -> &'static str {
         self.told("about").next().unwrap_or_default()
     }
 
-    /// The names of what it can be narrowed down by.
+    /// Returns the names of its parameters.
     pub fn parameters(self) -> impl Iterator<Item = &'static str> {
         self.told("parameter").chain(self.told("text"))
     }
 
-    /// The columns that are lists of texts.
+    /// Returns the columns that are lists of texts.
     pub fn lists(self) -> impl Iterator<Item = &'static str> {
         self.told("list").flat_map(str::split_whitespace)
     }
 
-    /// Its SPARQL with values for some of its parameters.
+    /// Returns its SPARQL with values for some of its parameters.
     ///
     /// # Errors
     /// [`QuestionFault::Parameter`] and [`QuestionFault::Iri`].
@@ -196,7 +197,7 @@ impl Question {
                 };
                 NamedNode::new(value).map_err(why)?.into()
             };
-            // The printed form of a term has escapes for all that could end it.
+            // The printed form of a term escapes all characters that could end it.
             sparql = sparql.replace(
                 &format!("VALUES ?for_{name} {{ UNDEF }}"),
                 &format!("VALUES ?for_{name} {{ {term} }}"),
@@ -213,7 +214,8 @@ impl Question {
         lines.filter_map(move |line| line.strip_prefix(key)?.strip_prefix(' '))
     }
 
-    /// Makes the answer of what was found. Stops with the first error, as of a cancelled question.
+    /// Converts solutions to the answer. Stops at the first error, such as that of a cancelled
+    /// query.
     pub(crate) fn answer(
         self,
         solutions: QuerySolutionIter<'_>,
@@ -258,7 +260,8 @@ impl Question {
 }
 
 impl Knowledge {
-    /// Asks a question in this thread, without a limit in time: for the questions of this crate, on what this crate let in.
+    /// Evaluates a question in this thread, without a time limit: for the questions of this crate
+    /// on data accepted by this crate.
     ///
     /// # Errors
     /// [`QuestionFault`].
@@ -289,13 +292,13 @@ impl Knowledge {
 }
 
 impl Answer {
-    /// The text in a row; empty where there is none.
+    /// Returns the text in a row; empty if missing.
     #[must_use]
     pub fn text<'a>(row: &'a BTreeMap<String, Value>, column: &str) -> &'a str {
         row.get(column).and_then(Value::as_str).unwrap_or_default()
     }
 
-    /// The list of texts in a row; empty where there is none.
+    /// Returns the list of texts in a row; empty if missing.
     #[must_use]
     pub fn texts(row: &BTreeMap<String, Value>, column: &str) -> Vec<String> {
         let all = row
@@ -316,7 +319,7 @@ fn plain(term: Option<&Term>) -> Value {
     }
 }
 
-/// A number or a truth value, if the literal is one.
+/// Returns the number or boolean of a literal, if any.
 fn number(literal: &Literal) -> Option<Value> {
     let of = literal
         .datatype()
@@ -353,9 +356,10 @@ fn list(term: Option<&Term>) -> Value {
     all.into()
 }
 
-/// What rows are ordered by: numbers as numbers, then texts.
+/// Returns the sort key of rows: numbers by value, then texts.
 fn key(value: &Value) -> (u64, String) {
-    // Of two positive doubles the larger has the larger bits; with the sign turned over, all of them.
+    // The larger of two positive doubles has the larger bits; inverting negative doubles extends
+    // this to all doubles.
     let order = |number: f64| {
         let bits = number.to_bits();
         if number.is_sign_negative() {

@@ -1,26 +1,26 @@
-//! Where statements come from: each source has a named graph of its own.
+//! The sources of statements: each source has a named graph of its own.
 
 use std::fmt;
 
 use mtp::escaped;
 use serde::Serialize;
 
-/// A source of statements, by which its graph is named.
+/// A source of statements, which names its graph.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Source {
-    /// What it is.
+    /// Its kind.
     pub kind: SourceKind,
-    /// Which one: an ApplicationUri, a namespace URI, the name of a file.
+    /// Its name: an ApplicationUri, a namespace URI, or the name of a file.
     pub name: String,
 }
 
-/// What a source is.
+/// The kind of a source.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum SourceKind {
-    /// A component that was found, by its ApplicationUri.
+    /// A discovered component, by its ApplicationUri.
     Component,
-    /// A manifest of an MTP, by the name that the importing side gives it.
+    /// A manifest of an MTP, by the name given by the importer.
     Mtp,
     /// A NodeSet, by its namespace URI.
     NodeSet,
@@ -30,12 +30,12 @@ pub enum SourceKind {
     Process,
     /// A run of a process.
     Run,
-    /// What rules made of all others; nobody can write it.
+    /// The results of the rules, which are read-only.
     Derived,
 }
 
 impl Source {
-    /// Of a kind and a name.
+    /// Creates a source of a kind with a name.
     #[must_use]
     pub fn new(kind: SourceKind, name: &str) -> Self {
         Self {
@@ -44,7 +44,7 @@ impl Source {
         }
     }
 
-    /// The IRI of its graph.
+    /// Returns the IRI of its graph.
     #[must_use]
     pub fn graph(&self) -> String {
         if self.kind == SourceKind::Derived {
@@ -68,5 +68,5 @@ impl fmt::Display for SourceKind {
     }
 }
 
-/// The graph of what rules made.
+/// The graph of derived statements.
 pub(crate) const DERIVED: &str = "urn:ua-bridge:graph:derived";

@@ -1,4 +1,4 @@
-//! The store: a named graph per source, and the merge of them all as the default graph.
+//! The store: a named graph per source, and the merge of all graphs as the default graph.
 
 use std::collections::{BTreeMap, BTreeSet, HashSet};
 use std::sync::{Mutex, PoisonError};
@@ -18,72 +18,73 @@ use tokio::sync::watch;
 use crate::source::{DERIVED, Source, SourceKind};
 use crate::vocabulary;
 
-/// Why something is not taken into the store.
+/// Error of adding data to the store.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum KnowledgeFault {
-    /// Something that is to be an IRI is none.
+    /// A required IRI is invalid.
     #[error("`{text}` is no IRI: {why}")]
     Iri {
-        /// What was given.
+        /// The given text.
         text: String,
-        /// What is wrong with it.
+        /// Description of the error.
         why: String,
     },
-    /// More than is taken from one source.
+    /// The source has too many statements.
     #[error("the source says more than the {most} statements that are kept of one")]
     TooMany {
-        /// What is kept.
+        /// The limit.
         most: usize,
     },
     /// There are too many sources.
     #[error("there are {most} sources already, and no more are kept")]
     TooManySources {
-        /// How many are kept.
+        /// The limit.
         most: usize,
     },
-    /// It is no Turtle.
+    /// The text is not Turtle.
     #[error("{0}")]
     Turtle(String),
-    /// What rules make is not written by anybody else.
+    /// The graph of derived statements is read-only.
     #[error("the derived graph is made by rules and cannot be written")]
     Derived,
-    /// The store itself.
+    /// The store itself failed.
     #[error("the store fails: {0}")]
     Store(#[from] StorageError),
 }
 
-/// What is known of the plant. Reading and writing are safe from any thread; who reads sees a source as a whole, before or
-/// after it is replaced.
+/// The knowledge of the plant. Reading and writing are safe from any thread; readers see a source
+/// as a whole, before or after its replacement.
 ///
-/// The default graph holds each statement that some source makes, once: the merge that SPARQL means, as counting needs it.
+/// The default graph contains each statement of any source once: the merge as defined by SPARQL,
+/// which counting requires.
 pub struct Knowledge {
     store: Store,
-    /// Writers one after the other.
+    /// Serializes the writers.
     sources: Mutex<BTreeMap<Source, SourceStatus>>,
     changed: watch::Sender<u64>,
 }
 
-/// What there is of a source.
+/// Status of a source.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct SourceStatus {
     /// The IRI of its graph.
     pub graph: String,
-    /// What it is.
+    /// Its kind.
     pub kind: SourceKind,
-    /// Which one.
+    /// Its name.
     pub name: String,
-    /// How many statements it makes.
+    /// Number of its statements.
     pub statements: usize,
-    /// When it came, in milliseconds since 1970; a source that is replaced keeps it.
+    /// Time of its first addition in milliseconds since 1970; a replacement keeps it.
     pub since_ms: u64,
 }
 
 impl Knowledge {
-    /// An empty store in memory.
+    /// Creates an empty store in memory.
     ///
     /// # Errors
-    /// When there is no memory for it.
+    /// Fails if memory is not available.
     pub fn new() -> Result<Self, KnowledgeFault> {
         Ok(Self {
             store: Store::new()?,
@@ -92,7 +93,8 @@ impl Knowledge {
         })
     }
 
-    /// Puts what a source says in the place of what it said before, at once for all who read. `at` is in milliseconds since 1970.
+    /// Replaces the statements of a source atomically for all readers. `at` is in milliseconds
+    /// since 1970.
     ///
     /// # Errors
     /// [`KnowledgeFault`]; then nothing has changed.
@@ -114,7 +116,7 @@ impl Knowledge {
         self.put(source, &statements, at)
     }
 
-    /// Puts what a Turtle file says in the place of what it said before.
+    /// Replaces the statements of a source by the statements of a Turtle file.
     ///
     /// # Errors
     /// [`KnowledgeFault`]; then nothing has changed.
@@ -140,7 +142,7 @@ impl Knowledge {
         self.put(source, &triples, at)
     }
 
-    /// Forgets a source, at once for all who read. Tells whether it was there.
+    /// Removes a source atomically for all readers. Returns whether it existed.
     ///
     /// # Errors
     /// [`KnowledgeFault::Store`]; then nothing has changed.
@@ -155,7 +157,7 @@ impl Knowledge {
         Ok(true)
     }
 
-    /// What there is, and since when.
+    /// Returns the sources with their times.
     pub fn sources(&self) -> Vec<SourceStatus> {
         self.sources
             .lock()
@@ -165,15 +167,16 @@ impl Knowledge {
             .collect()
     }
 
-    /// A number that rises with each change.
+    /// Returns a number that increases with each change.
     pub fn changes(&self) -> watch::Receiver<u64> {
         self.changed.subscribe()
     }
 
-    /// All named graphs, or one of them, as N-Quads. `None` where there is no such graph.
+    /// Writes all named graphs, or one of them, as N-Quads. Returns `None` if there is no such
+    /// graph.
     ///
     /// # Errors
-    /// When the store or the writer fails.
+    /// Fails if the store or the writer fails.
     pub fn write_quads(&self, graph: Option<&str>, to: impl io::Write) -> io::Result<Option<()>> {
         let graph = match graph.map(NamedNodeRef::new) {
             Some(Ok(graph))
@@ -231,7 +234,7 @@ impl Knowledge {
         Ok(())
     }
 
-    /// Counts the derived graph anew, and tells who waits.
+    /// Updates the count of derived statements, and notifies the receivers of changes.
     fn tell(&self, sources: &mut BTreeMap<Source, SourceStatus>) {
         let derived = NamedNodeRef::new_unchecked(DERIVED);
         let statements = self
@@ -256,7 +259,8 @@ impl Knowledge {
         self.changed.send_modify(|changes| *changes += 1);
     }
 
-    /// Makes `triples` the whole of a graph, and the default and derived graphs follow, in one transaction.
+    /// Replaces the contents of a graph by `triples`, and updates the default graph and the derived
+    /// graph, in a single transaction.
     fn write(&self, graph: &str, triples: &HashSet<Triple>) -> Result<(), KnowledgeFault> {
         let graph = named(graph)?;
         let sub_class = NamedNodeRef::new_unchecked(vocabulary::RDFS_SUB_CLASS_OF);
@@ -284,7 +288,7 @@ impl fmt::Debug for Knowledge {
     }
 }
 
-/// What is to be added to a graph and removed from it to make it so.
+/// Returns the statements to add to a graph and to remove from it.
 fn difference(
     transaction: &Transaction<'_>,
     graph: &NamedNode,
@@ -305,8 +309,8 @@ fn apply(
     added: &[Triple],
     removed: &[Triple],
 ) -> Result<(), StorageError> {
-    // The store keeps literals in their canonical form: `.120Z` is added again where `.12Z` is removed. Statements are
-    // therefore removed before others are added.
+    // The store keeps literals in their canonical form: `.120Z` is added again while `.12Z` is
+    // removed. Statements are therefore removed before others are added.
     for triple in removed {
         transaction.remove(triple.as_ref().in_graph(graph));
     }
@@ -332,7 +336,7 @@ fn apply(
         transaction.insert(triple.as_ref().in_graph(graph));
         transaction.insert(triple.as_ref().in_graph(GraphNameRef::DefaultGraph));
     }
-    // A graph without statements is none.
+    // A graph without statements does not exist.
     let is_empty = transaction
         .quads_for_pattern(None, None, None, Some(graph.into()))
         .next()
@@ -343,8 +347,9 @@ fn apply(
     Ok(())
 }
 
-/// The rule: who is below whom, through any number of classes between, and each class below itself. Questions never need a
-/// path (`rdfs:subClassOf*`), which the evaluator would follow last and for everything.
+/// Applies the rule for subclasses: transitive through any number of classes, and reflexive.
+/// Questions never need a path (`rdfs:subClassOf*`), which the evaluator would follow last and for
+/// all classes.
 fn closure(
     transaction: &Transaction<'_>,
     sub_class: NamedNodeRef<'_>,
@@ -414,7 +419,7 @@ fn named(iri: &str) -> Result<NamedNode, KnowledgeFault> {
     })
 }
 
-/// The base NodeSet, the largest that is published, makes some 40 000.
+/// The base NodeSet, the largest published NodeSet, results in some 40 000.
 const MAX_STATEMENTS: usize = 200_000;
 const MAX_SOURCES: usize = 2000;
 const MAX_DERIVED: usize = 500_000;
@@ -451,7 +456,7 @@ mod tests {
                 assert_eq!(found, at, "{literal}");
             }
         }
-        // A statement that is left out is removed, in whichever form its literal was written.
+        // A statement that is no longer in the file is removed, for any form of its literal.
         knowledge
             .replace_turtle(&source, "<urn:a> <urn:b> <urn:c> .", 0)
             .unwrap();

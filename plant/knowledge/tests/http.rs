@@ -1,4 +1,4 @@
-//! Questions over HTTP, and what a query may not do to those who ask beside it.
+//! Queries over HTTP, and the isolation of concurrent queries.
 #![expect(
     clippy::unwrap_used,
     clippy::panic,
@@ -14,7 +14,7 @@ use knowledge::{Endpoint, Knowledge, Limits, Source, SourceKind};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
 
-/// A store in which no join of three patterns ends.
+/// Returns a store in which no join of three patterns ends.
 async fn site(limits: Limits) -> (Endpoint, Arc<Knowledge>) {
     let knowledge = Arc::new(Knowledge::new().unwrap());
     let many: String = (0..300)
@@ -95,7 +95,7 @@ async fn query(at: SocketAddr, sparql: &str) -> Answered {
     post(at, "application/sparql-query", sparql).await
 }
 
-/// Reads statements for longer than anybody waits, and keeps none of them.
+/// Reads statements for longer than any time limit, and keeps none of them.
 const ENDLESS: &str = "SELECT (COUNT(*) AS ?n) { ?a ?p ?b . ?c ?p ?d . ?e ?p ?f . ?g ?p ?h }";
 const COUNT: &str = "SELECT (COUNT(*) AS ?n) { ?s ?p ?o }";
 
@@ -117,7 +117,7 @@ async fn a_query_that_never_ends_is_stopped_while_others_are_answered() {
     let (endpoint, _) = site(limits).await;
     let at = endpoint.address();
     let endless = tokio::spawn(async move { query(at, ENDLESS).await });
-    // Both places are taken in between, so some are told to come again; all others have their answer.
+    // Both slots are in use at times, so some queries are refused as busy; all others are answered.
     let mut answered = 0;
     while !endless.is_finished() {
         let other = query(at, COUNT).await;
@@ -130,11 +130,11 @@ async fn a_query_that_never_ends_is_stopped_while_others_are_answered() {
     assert_eq!(stopped.code(), (503, "time_limit".to_owned()));
     assert!(stopped.body.contains("1.5 s"), "{}", stopped.body);
     assert!(answered > 0);
-    // Its place is free again: as many as there are places can run.
+    // Its slot is free again: as many queries as there are slots can run.
     free(at).await;
 }
 
-/// Until two queries at a time are answered.
+/// Waits until two concurrent queries are answered.
 async fn free(at: SocketAddr) {
     let deadline = tokio::time::Instant::now() + Duration::from_secs(10);
     loop {
@@ -407,7 +407,8 @@ async fn named_questions_are_listed_shown_and_answered_in_two_forms() {
     assert_eq!(standard["results"]["bindings"][0]["kind"]["value"], "file");
 }
 
-/// What nests, repeats and grows as far as its length lets it: each is answered, the program goes on.
+/// Nested, repeated and growing queries of the maximum length: each gets a response, and the
+/// program continues.
 #[tokio::test]
 async fn monstrous_queries_of_full_length_are_refused() {
     let limits = Limits {
@@ -459,7 +460,7 @@ async fn monstrous_queries_of_full_length_are_refused() {
             &query_text[..80]
         );
     }
-    // As much as is let in.
+    // Queries of the largest accepted size.
     let large = [
         format!("SELECT * {{ ?s ?p ?o FILTER(1{} = 2) }}", "+1".repeat(400)),
         format!(

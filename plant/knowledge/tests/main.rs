@@ -1,4 +1,4 @@
-//! The tests of the graph and its stores, one program so that they are linked once.
+//! The tests of the graph and its stores, in a single program so that they are linked once.
 
 mod http;
 mod memory;

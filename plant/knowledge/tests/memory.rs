@@ -1,4 +1,5 @@
-//! A query that takes all memory. In a program of its own: the memory of a program is that of all its queries.
+//! A query that uses all memory. It is in a program of its own, because all queries of a program
+//! share its memory.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -7,7 +8,7 @@ use knowledge::{Endpoint, Knowledge, Limits, Source, SourceKind};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
 
-/// Keeps all there is with all else there is, to put it in order.
+/// Sorts the cross product of all statements, which has to be in memory as a whole.
 const GROWING: &str = "SELECT%20*%20%7B%20?a%20?b%20?c%20.%20?d%20?e%20?f%20.%20?g%20?h%20?i%20%7D%20ORDER%20BY%20?c%20?f%20?i";
 
 #[tokio::test]

@@ -1,4 +1,4 @@
-//! What is kept of sources, and what questions find in it.
+//! Storage of the statements of sources, and the results of questions on them.
 #![expect(clippy::unwrap_used, reason = "a test may")]
 
 use std::collections::BTreeMap;
@@ -33,7 +33,7 @@ fn grasp_type() -> TypeFacts {
     of_type(OURS, "i=1200", "GraspSkillType")
 }
 
-/// A gripper whose Grasp is of these types, most special first.
+/// Returns a gripper whose Grasp is of these types, most special first.
 fn gripper(uri: &str, types: Vec<TypeFacts>, capability: &str) -> ComponentFacts {
     ComponentFacts {
         application_uri: uri.into(),
@@ -475,7 +475,7 @@ fn a_node_set_tells_types_below_a_type_and_what_they_declare() {
     if load("Opc.Ua.NodeSet2.xml").is_none() {
         return;
     }
-    // BaseEventType, with as many types below it as another library counts.
+    // BaseEventType, with the number of subtypes as counted by another library.
     let events = ask(
         &knowledge,
         "types",

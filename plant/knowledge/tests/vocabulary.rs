@@ -1,4 +1,4 @@
-//! The terms that are used are those that the ontologies have.
+//! Checks the used terms against the ontologies.
 use std::collections::BTreeSet;
 
 use knowledge::vocabulary::{self, TermKind};
