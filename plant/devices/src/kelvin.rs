@@ -1,8 +1,9 @@
-//! The Kelvin tool changer: a robot takes tools out of their docks and puts them back by its own motion, and a voltage says which
-//! tool is locked.
+//! The Kelvin tool changer: a robot takes tools out of their docks and puts them back by its own
+//! motion, and a voltage identifies the locked tool.
 //!
-//! The changer has no motor: its ring is turned by the robot that turns the flange in a dock. So it is a component that runs the
-//! skills of a robot, and reads an analog input between two of them.
+//! The changer has no motor: the robot turns its ring by turning the flange in a dock. The changer
+//! is therefore a component that runs the skills of a robot, and reads an analog input between two
+//! of them.
 
 pub mod simulator;
 mod volts;
@@ -22,50 +23,50 @@ pub use self::volts::{Detector, LEVELS, Reading, volts};
 use crate::line::Line;
 use crate::modbus::Modbus;
 
-/// How the changer is built in.
+/// The installation of the changer.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Settings {
     /// The analog converter.
     pub converter: Converter,
-    /// The tools and where their docks are.
+    /// The tools and the positions of their docks.
     pub tools: Vec<Tool>,
-    /// How long each move of the robot may take.
+    /// Time limit of each move of the robot.
     pub within: Duration,
 }
 
 /// An analog input by Modbus: an input register in mV.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Converter {
-    /// Where.
+    /// The line to the converter.
     pub at: Line,
-    /// Which unit.
+    /// Unit of the converter.
     pub unit: u8,
-    /// Which register.
+    /// The input register.
     pub register: u16,
     /// The resistors of the divider between changer and converter: in line, to ground.
     pub divider: (f64, f64),
 }
 
-/// The divider of the maker.
+/// The divider of the manufacturer.
 pub const DIVIDER: (f64, f64) = (10_000.0, 1_500.0);
 
-/// One tool.
+/// A tool.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Tool {
     /// Its number at the changer, from 1 to 10.
     pub number: u8,
     /// The ApplicationUri of its component.
     pub uri: String,
-    /// Where the flange is when the tool stands in its dock, before it is locked: m and rad.
+    /// Pose of the flange when the tool is in its dock, before it is locked: m and rad.
     pub dock: [f64; 6],
 }
 
-/// Who moves the flange.
+/// The component that moves the flange.
 #[derive(Clone)]
 pub enum Mover {
     /// A component with PtpMoveSkillType and LinearMoveSkillType.
     Endpoint(String),
-    /// These.
+    /// Skills of the same program.
     Skills {
         /// PtpMoveSkillType
         ptp: Arc<dyn Runs>,
@@ -83,7 +84,7 @@ impl fmt::Debug for Mover {
     }
 }
 
-/// One changer.
+/// A changer.
 #[derive(Debug, Clone)]
 pub struct Changer {
     settings: Arc<Settings>,
@@ -92,7 +93,7 @@ pub struct Changer {
 }
 
 impl Changer {
-    /// That one.
+    /// Creates a changer.
     #[must_use]
     pub fn new(settings: Settings, mover: Mover) -> Self {
         let Converter { at, unit, .. } = &settings.converter;
@@ -125,7 +126,7 @@ impl Device for Changer {
     }
 }
 
-/// What is to be done.
+/// The action of a skill.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum What {
     Attach,
@@ -139,17 +140,18 @@ struct Change {
     what: What,
 }
 
-/// One way of the flange: what it is called, whether it is straight, where to.
+/// A move of the flange: its name, whether it is linear, and its target.
 type Way = (&'static str, bool, [f64; 6]);
 
 impl Tool {
-    /// Where the flange is beside the dock: so far along y and z, its ring turned by so many degrees.
+    /// Returns a pose beside the dock, with an offset along y and z in m and a rotation in degrees.
     fn beside(&self, (y, z): (f64, f64), degrees: f64) -> [f64; 6] {
         let [at_x, at_y, at_z, a, b, c] = self.dock;
         [at_x, at_y + y, at_z + z, a, b, c + degrees.to_radians()]
     }
 
-    /// From behind into the dock, the ring locked a little too far and turned back, and out in front.
+    /// Returns the moves to take the tool: from behind into the dock, the ring locked a little too
+    /// far and turned back, and out in front.
     fn take(&self) -> [Way; 5] {
         [
             ("BackDoor", false, self.beside((0.0, BACK), 0.0)),
@@ -160,7 +162,7 @@ impl Tool {
         ]
     }
 
-    /// The other way round.
+    /// Returns the moves to put the tool back, in the reverse direction.
     fn put(&self) -> [Way; 6] {
         [
             ("Approach", false, self.beside((FRONT, APPROACH), LOCKED)),
@@ -303,7 +305,7 @@ fn attached_tool(tool: Option<&Tool>) -> Results {
     vec![("Tool".to_owned(), uri.into())]
 }
 
-/// Looks at the voltage.
+/// Reads the voltage.
 struct Look<'c> {
     changer: &'c Changer,
     detector: Detector,
@@ -322,7 +324,7 @@ impl Look<'_> {
             .feed(f64::from(millivolts) / 1000.0 * (line + ground) / ground)
     }
 
-    /// What two looks one after the other say alike.
+    /// Returns the reading of two equal consecutive measurements.
     async fn steady(&mut self) -> Result<Reading, String> {
         let mut last = self.once().await?;
         for _ in 0..MOST_LOOKS {
@@ -356,7 +358,7 @@ impl Look<'_> {
     }
 }
 
-/// The skills of the robot, and the connection they are reached by.
+/// The skills of the robot, and the connection to them.
 struct Connected {
     ptp: Arc<dyn Runs>,
     linear: Arc<dyn Runs>,
@@ -440,16 +442,16 @@ impl Connected {
     }
 }
 
-/// How the flange goes in and out of a dock, m.
+/// Offsets for moving into and out of a dock, in m.
 const BACK: f64 = 0.045;
 const FRONT: f64 = 0.15;
 const APPROACH: f64 = 0.1;
 const OVERSHOOT: f64 = 0.001;
-/// How the ring is turned, degrees.
+/// Rotations of the ring, in degrees.
 const LOCKED: f64 = -63.0;
 const OVERTURN: f64 = 2.0;
 const UNLOCKED: f64 = 4.0;
-/// A position that a client says may be that far from the dock, m or rad.
+/// Tolerance between a position from a client and the dock, in m or rad.
 const TOLERANCE: f64 = 0.005;
 const POLL: Duration = Duration::from_millis(100);
 const MOST_LOOKS: u32 = 20;

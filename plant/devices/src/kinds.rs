@@ -1,4 +1,4 @@
-//! What the YAML of a component says of its device.
+//! Reads the device of a component from YAML.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -62,7 +62,7 @@ fn read_schmalz(node: &Node, reader: &mut Reader<'_>) -> Option<Arc<dyn Device>>
     Some(Arc::new(schmalz::Gripper::new(master?, alias?, timing)))
 }
 
-/// As the name of a device stands in a path.
+/// Reads the name of a device as it is used in a path.
 fn read_alias<'n>(node: &'n Node, reader: &mut Reader<'_>) -> Option<&'n str> {
     let text = reader.text(node, "the alias of a device")?;
     let fits = !text.is_empty()
@@ -77,7 +77,7 @@ fn read_alias<'n>(node: &'n Node, reader: &mut Reader<'_>) -> Option<&'n str> {
     reader.refuse(node, Code::WrongValue, message)
 }
 
-/// `host:port`
+/// Reads `host:port`.
 fn read_address<'n>(node: &'n Node, reader: &mut Reader<'_>) -> Option<&'n str> {
     let text = reader.text(node, "host:port")?;
     if format!("tcp://{text}").parse::<Line>().is_ok() {

@@ -1,10 +1,11 @@
-//! Devices that do the work of skills, each with a simulator of its protocol.
+//! Devices that execute skills, each with a simulator of its protocol.
 //!
-//! A device is one file: its bytes, its driver, what is told when it does not answer. Below it stands a simulator that speaks
-//! the same protocol, so that others can try theirs with it (`ua-component simulate`).
+//! The code of a device is a single file with its bytes, its driver, and the errors of a missing
+//! answer. A submodule contains a simulator of the same protocol, so that other projects can test
+//! their software with it (`ua-component simulate`).
 //!
-//! Reading order: [`line`](Line) (where a device is), `modbus` (asking one), [`robotiq`], [`schmalz`],
-//! [`ur`], [`kelvin`] (which moves a robot).
+//! Reading order: [`line`](Line) (the address of a device), `modbus` (the client), [`robotiq`],
+//! [`schmalz`], [`ur`], [`kelvin`] (which moves a robot).
 
 pub mod kelvin;
 mod kinds;

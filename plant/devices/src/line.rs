@@ -1,13 +1,14 @@
-//! Where a device is.
+//! The address of a device.
 
 use std::fmt;
 use std::path::PathBuf;
 use std::str::FromStr;
 
-/// The way to a device that speaks Modbus.
+/// The connection to a Modbus device.
 ///
-/// As text `tcp://host:port` (Modbus TCP), `rtu+tcp://host:port` (RTU frames over TCP, as converters and robots pass a serial
-/// line on) or `serial:path[@baud]` (RTU, 8 bits, no parity, 115 200 baud if not said).
+/// As text `tcp://host:port` (Modbus TCP), `rtu+tcp://host:port` (RTU frames over TCP, as forwarded
+/// by converters and robots for a serial line) or `serial:path[@baud]` (RTU, 8 bits, no parity, 115
+/// 200 baud by default).
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Line {
     /// Modbus TCP at a host and port.
@@ -16,14 +17,14 @@ pub enum Line {
     RtuOverTcp(String),
     /// RTU over a serial line.
     Serial {
-        /// The device file, of a serial port or a pseudo-terminal.
+        /// The device file of a serial port or a pseudo-terminal.
         path: PathBuf,
         /// Bits per second.
         baud: u32,
     },
 }
 
-/// No way to a device.
+/// Error for an invalid connection.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("expected tcp://host:port, rtu+tcp://host:port or serial:path[@baud], found `{0}`")]
 pub struct NoLine(pub String);

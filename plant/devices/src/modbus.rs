@@ -1,4 +1,4 @@
-//! Asking a device that speaks Modbus (Application Protocol V1.1b3): bounded waits, a new connection after each fault.
+//! Modbus client (Application Protocol V1.1b3): bounded waits, a new connection after each fault.
 
 pub(crate) mod server;
 
@@ -16,54 +16,54 @@ use tokio_modbus::{Request, Response, Slave};
 use crate::line::Line;
 use crate::tty::Tty;
 
-/// How long a device may take to answer. Halt leaves a driver a second, in which it asks twice.
+/// Time limit of an answer. Halt leaves a driver a second, enough for two requests.
 const ANSWER: Duration = Duration::from_millis(300);
 
-/// One device behind a line. The connection is made when it is needed, and anew after each fault: an answer that comes too late
-/// is never taken for that of another question.
+/// A device behind a line. The connection is opened on request, and opened again after each
+/// fault: a late answer is never used for another request.
 pub(crate) struct Modbus {
     line: Line,
     unit: u8,
     context: Mutex<Option<Context>>,
 }
 
-/// Why there is no answer.
+/// Error of a request.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum Fault {
     /// There is no connection.
     #[error("{line} cannot be reached: {why}")]
     Unreachable {
-        /// Where.
+        /// The line.
         line: String,
-        /// What the system says.
+        /// The error of the system.
         why: String,
     },
-    /// It does not answer.
+    /// The device does not answer.
     #[error("no answer from unit {unit} at {line} within {} ms", ANSWER.as_millis())]
     Silent {
-        /// Where.
+        /// The line.
         line: String,
-        /// Which.
+        /// The unit.
         unit: u8,
     },
-    /// Something came that is no answer to what was asked.
+    /// The response does not match the request.
     #[error("the answer of unit {unit} at {line} is damaged: {why}")]
     Damaged {
-        /// Where.
+        /// The line.
         line: String,
-        /// Which.
+        /// The unit.
         unit: u8,
-        /// What is wrong with it.
+        /// Description of the error.
         why: String,
     },
-    /// It answered that it will not.
+    /// The device responded with an exception.
     #[error("unit {unit} at {line} refuses: {exception}")]
     Refused {
-        /// Where.
+        /// The line.
         line: String,
-        /// Which.
+        /// The unit.
         unit: u8,
-        /// As `Illegal data address`.
+        /// The exception, such as `Illegal data address`.
         exception: String,
     },
 }
@@ -89,7 +89,7 @@ impl Modbus {
         }
     }
 
-    /// Holding registers (function 3).
+    /// Reads holding registers (function 3).
     pub(crate) async fn holding(&self, address: u16, count: u16) -> Result<Vec<u16>, Fault> {
         let answer = self
             .ask(Request::ReadHoldingRegisters(address, count))
@@ -102,7 +102,7 @@ impl Modbus {
         Err(self.damaged("not as many registers as were asked for"))
     }
 
-    /// Input registers (function 4).
+    /// Reads input registers (function 4).
     pub(crate) async fn input(&self, address: u16, count: u16) -> Result<Vec<u16>, Fault> {
         let answer = self
             .ask(Request::ReadInputRegisters(address, count))
@@ -121,10 +121,11 @@ impl Modbus {
         self.ask(request).await.map(drop)
     }
 
-    /// Asks once; once more on a new connection where the first one had been there before and may have been stale.
+    /// Sends a request. If it fails on an existing connection, which may be stale, the request is
+    /// repeated once on a new connection.
     async fn ask(&self, request: Request<'static>) -> Result<Response, Fault> {
         let mut kept = self.context.lock().await;
-        // What is dropped on the way leaves no connection behind on which its answer would come.
+        // A dropped future leaves no connection behind that could still receive its answer.
         if let Some(context) = kept.take()
             && let Ok((context, response)) = self.once(context, request.clone()).await
         {
@@ -137,7 +138,8 @@ impl Modbus {
         response
     }
 
-    /// What it answered, also that it refuses, and the connection; a fault that ends the connection.
+    /// Sends a request once. Returns the response or exception with the connection, or a fault that
+    /// ends the connection.
     async fn once(
         &self,
         mut context: Context,
@@ -204,7 +206,7 @@ pub(crate) async fn connected(address: &str) -> io::Result<TcpStream> {
     Ok(stream)
 }
 
-/// Whether the connection is at fault rather than what came over it.
+/// Returns whether an error is that of the connection and not that of a received response.
 fn is_broken(error: &io::Error) -> bool {
     use io::ErrorKind as Kind;
     !matches!(

@@ -1,6 +1,7 @@
 //! The parallel gripper 2F-85 of Robotiq, by its registers (Modbus, unit 9 from the factory).
 //!
-//! Three registers from 1000 on say what to do, three from 2000 on what is: two bytes each, the first one high.
+//! Three registers from 1000 on are commands, three from 2000 on are the state: two bytes each, the
+//! high byte first.
 
 pub mod simulator;
 
@@ -14,23 +15,23 @@ use tokio::time::{Instant, sleep};
 use crate::line::Line;
 use crate::modbus::Modbus;
 
-/// Where the registers are that say what to do: action, reserved; reserved, position; speed, force.
+/// Address of the command registers: action, reserved; reserved, position; speed, force.
 pub const ACTION: u16 = 0x03E8;
-/// Where those are that say what is: status, reserved; fault, position wanted; position, current.
+/// Address of the state registers: status, reserved; fault, requested position; position, current.
 pub const STATUS: u16 = 0x07D0;
-/// The number of the unit from the factory.
+/// The unit number from the factory.
 pub const UNIT: u8 = 9;
-/// How far apart the fingers are at position 0, m.
+/// Distance of the fingers at position 0, m.
 pub const STROKE: f64 = 0.085;
 
-/// One gripper.
+/// A gripper.
 #[derive(Debug, Clone)]
 pub struct Gripper {
     modbus: Arc<Modbus>,
 }
 
 impl Gripper {
-    /// That of a number behind a line.
+    /// Creates a gripper with a unit number behind a line.
     #[must_use]
     pub fn new(line: Line, unit: u8) -> Self {
         Self {
@@ -60,18 +61,18 @@ impl Device for Gripper {
     }
 }
 
-/// What the gripper says of itself.
+/// State of the gripper.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Status {
     /// gACT: it was activated.
     active: bool,
     /// gSTA: 0 reset, 1 being activated, 3 activated.
     activation: u8,
-    /// gOBJ: 0 moving, 1 stopped by a thing while opening, 2 while closing, 3 at the position.
+    /// gOBJ: 0 moving, 1 stopped by an object while opening, 2 while closing, 3 at the position.
     object: u8,
     /// gFLT
     fault: u8,
-    /// gPR: the position that was asked for, as it understood.
+    /// gPR: the requested position, as received by the gripper.
     wanted: u8,
     /// gPO: from 0, open, to 255, closed.
     position: u8,
@@ -95,7 +96,7 @@ impl Status {
         })
     }
 
-    /// Faults that a motion does not go on with, in words.
+    /// Returns the description of a fault that prevents a motion.
     fn broken(self) -> Option<&'static str> {
         match self.fault {
             0x05 => Some("it has to be activated first"),
@@ -112,23 +113,23 @@ impl Status {
     }
 }
 
-/// Opening or closing it.
+/// A motion that opens or closes the gripper.
 #[derive(Debug)]
 struct Motion {
     modbus: Arc<Modbus>,
     what: What,
 }
 
-/// Where the fingers are to go.
+/// Target of the fingers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum What {
     Close,
     Open,
-    /// As far apart as the parameter Width says.
+    /// The distance of the parameter Width.
     Width,
 }
 
-/// Where the fingers should be, and how.
+/// Target position, speed and force.
 #[derive(Debug, Clone, Copy)]
 struct Goal {
     position: u8,
@@ -196,7 +197,8 @@ impl Motion {
         Ok(self.modbus.write(ACTION, &words).await?)
     }
 
-    /// Activates it where it is not: after it was switched on, or after a fault that only that ends.
+    /// Activates the gripper if it is not active: after power-on, or after a fault that only a new
+    /// activation clears.
     async fn activate(&self, work: &Work) -> Result<(), String> {
         let still = Goal {
             position: 0,
@@ -231,7 +233,7 @@ impl Motion {
         }
     }
 
-    /// Moves the fingers until they stand.
+    /// Moves the fingers until they stop.
     async fn go(&self, goal: Goal, work: &Work) -> Result<Status, String> {
         let from = self.status().await?.position;
         self.act(GO, goal).await?;
@@ -272,7 +274,7 @@ impl Motion {
     }
 }
 
-/// The force of a run, N, in the gripper's own unit: 0 is 20 N, 255 is 235 N.
+/// Converts the force of a run in N to the gripper's unit: 0 is 20 N, 255 is 235 N.
 fn force(parameters: &Parameters) -> u8 {
     let newton = parameters.number("Force").unwrap_or(WEAKEST);
     let share = ((newton - WEAKEST) / (STRONGEST - WEAKEST)).clamp(0.0, 1.0);
@@ -285,7 +287,7 @@ fn force(parameters: &Parameters) -> u8 {
     force
 }
 
-/// The position in which the fingers are as far apart as the parameter Width says.
+/// Returns the position for the finger distance of the parameter Width.
 fn position(parameters: &Parameters) -> u8 {
     let apart = parameters.number("Width").unwrap_or(STROKE);
     let closed = (1.0 - apart / STROKE).clamp(0.0, 1.0);
@@ -298,7 +300,7 @@ fn position(parameters: &Parameters) -> u8 {
     position
 }
 
-/// How far apart the fingers are in a position, m.
+/// Returns the finger distance of a position, m.
 fn width(position: u8) -> f64 {
     (1.0 - f64::from(position) / 255.0) * STROKE
 }

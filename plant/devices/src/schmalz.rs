@@ -1,8 +1,9 @@
-//! The vacuum gripper ECBPi of Schmalz behind an IO-Link master, by the JSON interface of IO-Link over HTTP.
+//! The vacuum gripper ECBPi of Schmalz behind an IO-Link master, by the JSON interface of IO-Link
+//! over HTTP.
 //!
-//! Process data in, 4 bytes: bit 0 part present, 1 vacuum in the range of control, 5 part detached, 6 and 7 state of the device;
-//! then two values of which the second, the vacuum in mbar, has two bytes, the high one first. Process data out, 2 bytes: bit 0
-//! vacuum, bit 1 blow off.
+//! Process data in, 4 bytes: bit 0 part present, 1 vacuum in the range of control, 5 part detached,
+//! 6 and 7 state of the device. Two values follow. The second value, the vacuum in mbar, has two
+//! bytes, the high byte first. Process data out, 2 bytes: bit 0 vacuum, bit 1 blow off.
 
 mod http;
 pub mod simulator;
@@ -17,19 +18,19 @@ use tokio::time::{Instant, sleep};
 
 use self::http::Master;
 
-/// One gripper.
+/// A gripper.
 #[derive(Debug, Clone)]
 pub struct Gripper {
     port: Arc<Port>,
     timing: Timing,
 }
 
-/// How long it may take.
+/// Time limits of the gripper.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Timing {
-    /// To hold a part.
+    /// Time limit for holding a part.
     pub grasp: Duration,
-    /// To be rid of it.
+    /// Time limit for releasing a part.
     pub release: Duration,
 }
 
@@ -43,7 +44,7 @@ impl Default for Timing {
 }
 
 impl Gripper {
-    /// The device of an alias, as `master1port1`, at the master at `host:port`.
+    /// Creates the device of an alias, such as `master1port1`, at the master at `host:port`.
     #[must_use]
     pub fn new(master: &str, alias: &str, timing: Timing) -> Self {
         let port = Port {
@@ -87,13 +88,13 @@ struct Port {
     alias: String,
 }
 
-/// What the gripper says.
+/// State of the gripper.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Status {
     part_present: bool,
     in_control_range: bool,
     part_detached: bool,
-    /// 0 works, 1 with warnings, 2 with severe ones, 3 does not.
+    /// 0 works, 1 works with warnings, 2 with severe warnings, 3 does not work.
     health: u8,
     /// mbar
     vacuum: u16,
@@ -121,7 +122,7 @@ impl Port {
             DEVICES, self.alias
         );
         let answer = self.master.ask("GET", &path, None).await?;
-        // Both spellings are alive.
+        // Both spellings are in use.
         let data = answer.get("ioLink").or_else(|| answer.get("iolink"));
         let data = data.ok_or_else(|| self.damaged("it has no process data"))?;
         if data.get("valid").and_then(Value::as_bool) == Some(false) {
@@ -154,7 +155,7 @@ impl Port {
     }
 }
 
-/// To take a part or to let it go.
+/// Grasping or releasing a part.
 #[derive(Debug)]
 struct Motion {
     port: Arc<Port>,
@@ -176,7 +177,7 @@ impl Driver for Motion {
         match (self.holds, waited) {
             (true, Ok(())) => Ok(vec![("Gripped".to_owned(), true.into())]),
             (_, waited) => {
-                // A pump that holds nothing is switched off, and so is the air after blowing.
+                // The vacuum is switched off if no part is held, and so is the air after blowing.
                 let off = self.port.set(0).await;
                 waited.and(off).map(|()| Vec::new())
             }
@@ -226,10 +227,11 @@ impl Motion {
 const DEVICES: &str = "/iolink/v1/devices";
 const VACUUM: u8 = 1;
 const BLOW_OFF: u8 = 2;
-/// Less than this holds nothing, mbar.
+/// A lower vacuum holds no part, mbar.
 const DETACHED: u16 = 10;
 const POLL: Duration = Duration::from_millis(20);
-/// What was asked for before may still be in the process data until a cycle of IO-Link and one of the master are over.
+/// Process data may contain the state before the request until a cycle of IO-Link and a cycle of
+/// the master have passed.
 const SETTLED: Duration = Duration::from_millis(30);
 
 #[cfg(test)]

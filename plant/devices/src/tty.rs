@@ -10,23 +10,23 @@ use serial2::SerialPort;
 use tokio::io::unix::AsyncFd;
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 
-/// One end of a serial line.
+/// An end of a serial line.
 #[derive(Debug)]
 pub(crate) struct Tty(AsyncFd<SerialPort>);
 
-/// A pseudo-terminal: what is written to one end is read at the other.
+/// A pseudo-terminal: data written to one end is read at the other.
 #[derive(Debug)]
 pub(crate) struct Pty {
-    /// The end of who made it.
+    /// The end of the creator.
     pub(crate) own: Tty,
-    /// Where the other end is opened.
+    /// Path for opening the other end.
     pub(crate) path: PathBuf,
-    /// The other end is open for as long as this is, so that reading does not fail between those who open it.
+    /// Keeps the other end open, so that reading does not fail between two programs that open it.
     _held: SerialPort,
 }
 
 impl Tty {
-    /// Opens a port: 8 bits, no parity, one stop bit, nothing of what waits in it.
+    /// Opens a port with 8 bits, no parity and one stop bit, and discards buffered data.
     pub(crate) fn open(path: &Path, baud: u32) -> io::Result<Self> {
         let port = SerialPort::open(path, baud)?;
         port.discard_buffers()?;
@@ -35,7 +35,7 @@ impl Tty {
 }
 
 impl Pty {
-    /// A new one.
+    /// Creates a pseudo-terminal.
     pub(crate) fn new() -> io::Result<Self> {
         let (own, other) = SerialPort::pair()?;
         let path = std::fs::read_link(format!("/proc/self/fd/{}", other.as_raw_fd()))?;

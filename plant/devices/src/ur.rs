@@ -1,7 +1,9 @@
-//! A robot of Universal Robots: programs go to its secondary interface, what it does is heard over RTDE.
+//! A robot of Universal Robots: programs are sent to its secondary interface, its state is received
+//! over RTDE.
 //!
-//! A run is a program of a few lines. Its beginning and end are told by two registers, so that a program of somebody else is
-//! never taken for ours. Suspending sets the speed slider to nothing, halting brakes along the way.
+//! A run is a program of a few lines. It sets two registers at its beginning and end, so that a
+//! program of another client is never mistaken for it. Suspending sets the speed slider to zero,
+//! halting brakes along the path.
 
 mod pose;
 mod rtde;
@@ -23,24 +25,24 @@ use self::rtde::Rtde;
 use self::wire::Value;
 use crate::modbus::connected;
 
-/// The port that takes programs.
+/// The port for programs.
 pub const SECONDARY: u16 = 30_002;
-/// How far a UR5 reaches, m.
+/// Reach of a UR5, m.
 pub const REACH: f64 = 0.85;
 
-/// Where a robot is.
+/// Address and reach of a robot.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Settings {
     /// Host and port of RTDE.
     pub rtde: String,
     /// Host and port of the secondary interface.
     pub secondary: String,
-    /// How far it reaches, m.
+    /// Reach, m.
     pub reach: f64,
 }
 
 impl Settings {
-    /// The usual ports of a host.
+    /// Returns the settings of a host with the default ports.
     #[must_use]
     pub fn of_host(host: &str) -> Self {
         Self {
@@ -51,14 +53,14 @@ impl Settings {
     }
 }
 
-/// One robot.
+/// A robot.
 #[derive(Debug, Clone)]
 pub struct Robot {
     settings: Arc<Settings>,
 }
 
 impl Robot {
-    /// That one.
+    /// Creates a robot.
     #[must_use]
     pub fn new(settings: Settings) -> Self {
         Self {
@@ -85,14 +87,14 @@ impl Device for Robot {
     }
 }
 
-/// One move.
+/// A move.
 #[derive(Debug)]
 struct Motion {
     settings: Arc<Settings>,
     linear: bool,
 }
 
-/// What the robot tells.
+/// State of the robot.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct State {
     pose: [f64; 6],
@@ -101,7 +103,7 @@ struct State {
     safety: i32,
     /// Whether a program runs.
     program: bool,
-    /// Where the speed slider is, from 0 to 1.
+    /// Position of the speed slider, from 0 to 1.
     slider: f64,
     started: i32,
     done: i32,
@@ -146,7 +148,7 @@ impl State {
         })
     }
 
-    /// Why it cannot move, if it cannot.
+    /// Returns the reason for which the robot cannot move, if any.
     fn fit(&self) -> Result<(), String> {
         let why = match (self.safety, self.mode) {
             (1 | 2, 7) => return Ok(()),
@@ -188,7 +190,7 @@ impl Driver for Motion {
         let mut session = Session::open(&self.settings).await?;
         let at = session.state().await?;
         at.fit()?;
-        // Not that of the last program, whoever's it was.
+        // Differs from the token of the last program of any client.
         let token = at.started.wrapping_add(1) & i32::MAX;
         work.step("Move").await;
         let program = self.program(work.parameters(), token)?;
@@ -208,7 +210,8 @@ impl Motion {
         let (speed, acceleration) = (number("MaxVelocity")?, number("MaxAcceleration")?);
         let [x, y, z, rx, ry, rz] = to_robot(target);
         let pose = format!("p[{x:.6}, {y:.6}, {z:.6}, {rx:.6}, {ry:.6}, {rz:.6}]");
-        // The speed of a free way is that of the joints. Three of them may add up at the full reach before the tool is too fast.
+        // The speed of a PTP move is that of the joints. At full reach three joints may add up
+        // before the tool is too fast.
         let (verb, by) = match self.linear {
             true => ("movel", 1.0),
             false => ("movej", 3.0 * self.settings.reach),
@@ -220,7 +223,7 @@ impl Motion {
         ))
     }
 
-    /// The connection has to stay until the program is taken.
+    /// Sends a program. The connection has to stay open until the robot has accepted the program.
     async fn send(&self, program: &str) -> Result<TcpStream, String> {
         let address = &self.settings.secondary;
         let unreachable = |error| format!("{address} cannot be reached: {error}");
@@ -233,7 +236,7 @@ impl Motion {
     }
 }
 
-/// What is heard of the robot during a run.
+/// The RTDE connection of a run.
 struct Session {
     rtde: Rtde,
 }
@@ -253,7 +256,8 @@ impl Session {
         self.rtde.tell(&[Value::U32(1), Value::F64(fraction)]).await
     }
 
-    /// Until the program is done. Nothing here is dropped on the way: the robot tells often enough to look at the run between.
+    /// Follows the run until the program is done. No future is dropped on the way: the robot sends
+    /// its state often enough to check the run in between.
     async fn follow(&mut self, motion: &Motion, work: &Work, token: i32) -> Result<State, String> {
         let asked = Instant::now();
         let mut standing = None;
@@ -291,7 +295,7 @@ impl Session {
         }
     }
 
-    /// Brakes, and says where it stands then.
+    /// Brakes, and returns the position of the robot after that.
     async fn halt(&mut self, motion: &Motion, slider: Option<f64>) -> Result<String, String> {
         let _program = motion.send("def ua_halt():\n  stopl(3.0)\nend\n").await?;
         let asked = Instant::now();
@@ -310,25 +314,25 @@ impl Session {
     }
 }
 
-/// One who hears where the tool of a robot is.
+/// A client that receives the tool position of a robot.
 #[derive(Debug)]
 pub struct Follower(Rtde);
 
 impl Follower {
-    /// Of the robot whose RTDE is at `host:port`.
+    /// Connects to the robot with RTDE at `host:port`.
     ///
     /// # Errors
-    /// It does not answer, for people.
+    /// Returns the reason for users if the robot does not answer.
     pub async fn open(rtde: &str) -> Result<Self, String> {
         Rtde::open(rtde, FOLLOWED, &["actual_TCP_pose"], &[])
             .await
             .map(Self)
     }
 
-    /// The next position: m, and rotations about x, y and z in rad. Not to be dropped on the way.
+    /// Returns the next position: m, and rotations about x, y and z in rad. Not cancel-safe.
     ///
     /// # Errors
-    /// It is lost, or silent for a second.
+    /// Fails if the connection is lost, or silent for a second.
     pub async fn position(&mut self) -> Result<[f64; 6], String> {
         match self.0.next().await?.as_slice() {
             [Value::Vector(pose)] => Ok(of_robot(*pose)),
@@ -337,7 +341,7 @@ impl Follower {
     }
 }
 
-/// Whether something is ready now.
+/// Returns whether a future is ready now.
 async fn is(ready: impl Future<Output = ()>) -> bool {
     tokio::select! {
         biased;
@@ -346,14 +350,14 @@ async fn is(ready: impl Future<Output = ()>) -> bool {
     }
 }
 
-/// `runtime_state` of a program that runs.
+/// `runtime_state` of a running program.
 const PLAYING: u32 = 2;
 const HERTZ: f64 = 50.0;
 const FOLLOWED: f64 = 500.0;
 const TAKEN: Duration = Duration::from_secs(2);
 const SETTLED: Duration = Duration::from_millis(60);
 const BRAKED: Duration = Duration::from_millis(700);
-/// Slower than this it stands, m/s.
+/// Below this speed the robot counts as stopped, m/s.
 const STILL: f64 = 0.001;
 
 #[cfg(test)]

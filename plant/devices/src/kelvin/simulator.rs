@@ -1,4 +1,5 @@
-//! A tool changer at a robot's flange, and the converter that its voltage is read by: it hears over RTDE where the flange is.
+//! Simulates a tool changer at a robot's flange, and the converter that measures its voltage. The
+//! position of the flange is received over RTDE.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -11,16 +12,16 @@ use super::{DIVIDER, Reading, volts};
 use crate::modbus::server::{Registers, Table};
 use crate::ur::Follower;
 
-/// A tool that stands in its dock at first.
+/// A tool that is in its dock at first.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Docked {
     /// Its number at the changer, from 1 to 10.
     pub number: u8,
-    /// Where the flange is before it is locked: m and rad.
+    /// Pose of the flange before the tool is locked: m and rad.
     pub dock: [f64; 6],
 }
 
-/// One changer; clones are of the same.
+/// A simulated changer; clones share the same changer.
 #[derive(Debug, Clone)]
 pub struct Simulator {
     changer: Arc<Mutex<Changer>>,
@@ -34,14 +35,14 @@ struct Changer {
     cut: bool,
 }
 
-/// One that follows a robot. It stands still when this is dropped.
+/// A changer that follows a robot. It stops following on drop.
 #[derive(Debug)]
 pub struct Following {
     _tasks: JoinSet<()>,
 }
 
 impl Simulator {
-    /// One without a tool.
+    /// Creates a changer without an attached tool.
     #[must_use]
     pub fn new(tools: Vec<Docked>) -> Self {
         let changer = Changer {
@@ -55,7 +56,8 @@ impl Simulator {
         }
     }
 
-    /// Follows the robot whose RTDE is at `host:port`, also when that is not there for a while. Needs a tokio runtime.
+    /// Follows the robot with RTDE at `host:port`, and reconnects after a loss. Needs a tokio
+    /// runtime.
     #[must_use]
     pub fn follow(&self, rtde: &str) -> Following {
         let (simulator, rtde) = (self.clone(), rtde.to_owned());
@@ -77,17 +79,17 @@ impl Simulator {
         }
     }
 
-    /// What a position of the flange does to it: m and rad.
+    /// Applies a pose of the flange: m and rad.
     pub fn flange_at(&self, at: [f64; 6]) {
         self.lock().flange_at(at);
     }
 
-    /// Cuts the wire to the converter, or mends it.
+    /// Cuts or repairs the wire to the converter.
     pub fn set_cut(&self, cut: bool) {
         self.lock().cut = cut;
     }
 
-    /// What is at it.
+    /// Returns the state of the changer.
     #[must_use]
     pub fn reading(&self) -> Reading {
         self.lock().reading
@@ -102,7 +104,7 @@ impl Registers for Simulator {
     fn read(&self, table: Table, address: u16, count: u16) -> Option<Vec<u16>> {
         let changer = self.lock();
         let (line, ground) = DIVIDER;
-        // A wire that is cut is drawn above all that the changer says.
+        // A cut wire gives a voltage above all valid levels.
         let volts = if changer.cut {
             23.0
         } else {

@@ -120,7 +120,7 @@ async fn tools_are_taken_changed_and_put_back() {
     let done = Ok((true, String::new()));
     assert_eq!(bench.run("AttachToolSkillType", Some(URIS[0])).await, done);
     assert_eq!(bench.simulator.reading(), Reading::Tool(1));
-    // One that is there already moves nothing.
+    // A tool that is already attached causes no motion.
     let at = bench.robot.pose();
     assert_eq!(bench.run("ChangeToolSkillType", Some(URIS[0])).await, done);
     assert_eq!(bench.robot.pose(), at);
@@ -166,7 +166,7 @@ async fn its_drivers_are_as_drivers_should_be() {
     let mut uris = URIS;
     let parameters = || {
         uris.rotate_left(1);
-        // A run that was stopped on the way leaves the ring wherever it was.
+        // A run that was stopped on the way leaves the ring in an unknown position.
         bench.robot.reset([0.0, 0.3, 0.5, 0.0, 0.0, 0.0]);
         given(uris[0])
     };

@@ -1,17 +1,17 @@
-//! What the voltage of the tool changer means.
+//! The voltage levels of the tool changer.
 
 use std::fmt;
 
-/// What is at the changer.
+/// State of the changer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Reading {
-    /// Its ring is open, and no tool in it.
+    /// The ring is open, without a tool.
     Ready,
-    /// Its ring is on its way.
+    /// The ring is between open and locked.
     Intermediate,
-    /// Nothing.
+    /// No tool is attached.
     NoTool,
-    /// The tool of a number, from 1 to 10, is locked.
+    /// The tool with this number, from 1 to 10, is locked.
     Tool(u8),
 }
 
@@ -26,7 +26,7 @@ impl fmt::Display for Reading {
     }
 }
 
-/// The voltages at the changer, V, rising.
+/// The voltages at the changer in V, ascending.
 pub const LEVELS: [(f64, Reading); 13] = [
     (0.0, Reading::Ready),
     (2.1, Reading::Intermediate),
@@ -43,7 +43,7 @@ pub const LEVELS: [(f64, Reading); 13] = [
     (14.1, Reading::Tool(10)),
 ];
 
-/// The voltage of a reading.
+/// Returns the voltage of a reading.
 #[must_use]
 pub fn volts(of: Reading) -> f64 {
     LEVELS
@@ -52,18 +52,18 @@ pub fn volts(of: Reading) -> f64 {
         .map_or(0.0, |(volts, _)| *volts)
 }
 
-/// Tells readings from voltages. One that is near the border of two stays what it was.
+/// Converts voltages to readings. Near the border of two readings the previous reading stays.
 #[derive(Debug, Clone, Default)]
 pub struct Detector {
-    /// The place of the last one in the table.
+    /// Index of the last reading in the table.
     now: Option<usize>,
 }
 
 impl Detector {
-    /// What a voltage means after those before it.
+    /// Returns the reading of a voltage, which depends on the previous voltages.
     ///
     /// # Errors
-    /// It is none of the changer's.
+    /// Fails if the voltage is not a valid level of the changer.
     pub fn feed(&mut self, volts: f64) -> Result<Reading, String> {
         if !(LOWEST..=HIGHEST).contains(&volts) {
             self.now = None;
@@ -91,7 +91,7 @@ fn border(pair: &[(f64, Reading)]) -> f64 {
     pair.iter().map(|(volts, _)| volts / 2.0).sum()
 }
 
-/// Less than half of the least distance of two levels, which is 0.35 V.
+/// Less than half of the smallest distance of two levels, which is 0.35 V.
 const HYSTERESIS: f64 = 0.15;
 const LOWEST: f64 = -0.5;
 const HIGHEST: f64 = 15.0;
@@ -117,7 +117,7 @@ mod tests {
     #[test]
     fn a_voltage_that_flutters_at_a_border_tells_one_reading() {
         let mut detector = Detector::default();
-        // The border of no tool and tool 1 is at 5.3 V.
+        // The border between no tool and tool 1 is at 5.3 V.
         assert_eq!(detector.feed(5.7), Ok(Reading::Tool(1)));
         for volts in [5.31, 5.29, 5.2, 5.44, 5.16] {
             assert_eq!(detector.feed(volts), Ok(Reading::Tool(1)), "{volts}");
@@ -125,7 +125,7 @@ mod tests {
         assert_eq!(detector.feed(5.14), Ok(Reading::NoTool));
         assert_eq!(detector.feed(5.4), Ok(Reading::NoTool));
         assert_eq!(detector.feed(5.46), Ok(Reading::Tool(1)));
-        // Far away is far away.
+        // Hysteresis has no effect on a distant level.
         assert_eq!(detector.feed(13.7), Ok(Reading::Tool(10)));
     }
 }

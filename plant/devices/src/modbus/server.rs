@@ -1,4 +1,4 @@
-//! The other side: registers that clients read and write, for simulators.
+//! Modbus server: registers that clients read and write, for simulators.
 
 use std::io;
 use std::path::PathBuf;
@@ -15,25 +15,27 @@ use tracing::debug;
 use crate::line::Line;
 use crate::tty::Pty;
 
-/// Which registers.
+/// The kind of registers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Table {
-    /// Read and written.
+    /// Registers for reading and writing.
     Holding,
-    /// Only read.
+    /// Registers for reading only.
     Input,
 }
 
 /// The registers of a device.
 pub trait Registers: Send + Sync {
-    /// What stands in so many registers from an address on; `None` where one of them is not there.
+    /// Returns the contents of `count` registers from an address on, or `None` if one of them does
+    /// not exist.
     fn read(&self, table: Table, address: u16, count: u16) -> Option<Vec<u16>>;
 
-    /// Writes holding registers. False where one of them is not there or cannot be written; then none is.
+    /// Writes holding registers. Returns false without writing if one of them does not exist or is
+    /// read-only.
     fn write(&self, address: u16, words: &[u16]) -> bool;
 }
 
-/// What a line does to answers. Clones are of the same line.
+/// Faults of a line. Clones share the same line.
 #[derive(Debug, Clone, Default)]
 pub struct Faults {
     silent: Arc<AtomicBool>,
@@ -41,12 +43,12 @@ pub struct Faults {
 }
 
 impl Faults {
-    /// Whether nothing is answered.
+    /// Sets whether all requests remain without response.
     pub fn set_silent(&self, silent: bool) {
         self.silent.store(silent, Ordering::SeqCst);
     }
 
-    /// Damages the next so many answers.
+    /// Damages the given number of next responses.
     pub fn damage(&self, answers: u32) {
         self.damaged.store(answers, Ordering::SeqCst);
     }
@@ -60,7 +62,7 @@ impl Faults {
     }
 }
 
-/// A device that is served. It is gone when this is dropped.
+/// A device that is served, until it is dropped.
 #[derive(Debug)]
 pub struct Serving {
     line: Line,
@@ -69,11 +71,12 @@ pub struct Serving {
 }
 
 impl Serving {
-    /// Serves registers as the device of a number. Port 0 is any that is free; a serial line is a new pseudo-terminal, and its
-    /// path, if one is given, a symbolic link to it. Needs a tokio runtime.
+    /// Serves registers as the device with a unit number. Port 0 selects a free port. A serial line
+    /// is a new pseudo-terminal; its path, if given, becomes a symbolic link to it. Needs a tokio
+    /// runtime.
     ///
     /// # Errors
-    /// The address cannot be used, or the link cannot be made.
+    /// Fails if the address cannot be used, or if the link cannot be created.
     pub async fn start(
         line: &Line,
         unit: u8,
@@ -107,7 +110,7 @@ impl Serving {
                     std::os::unix::fs::symlink(&target, link)?;
                 }
                 tasks.spawn(async move {
-                    // All of it, also what holds the other end.
+                    // Captures the whole value, including the handle that keeps the other end open.
                     let mut pty = pty;
                     let ended = rtu(&mut pty.own, &device).await;
                     debug!("the line has ended: {ended:?}");
@@ -123,7 +126,7 @@ impl Serving {
         })
     }
 
-    /// Where clients find it.
+    /// Returns the line for clients.
     #[must_use]
     pub fn line(&self) -> &Line {
         &self.line
@@ -157,7 +160,7 @@ async fn accept(listener: TcpListener, device: Device, framing: Framing) {
     let mut clients = JoinSet::new();
     loop {
         let Ok((stream, from)) = listener.accept().await else {
-            // Out of file descriptors: others close theirs meanwhile.
+            // Out of file descriptors: wait until other connections are closed.
             tokio::time::sleep(GAP).await;
             continue;
         };
@@ -182,7 +185,8 @@ async fn serve(mut stream: TcpStream, device: &Device, framing: Framing) -> io::
     }
 }
 
-/// Frames with a header of transaction, protocol, length and unit (Modbus Messaging on TCP/IP, 3.1.3).
+/// Serves frames with a header of transaction, protocol, length and unit (Modbus Messaging on
+/// TCP/IP, 3.1.3).
 async fn tcp(stream: &mut TcpStream, device: &Device) -> io::Result<()> {
     loop {
         let transaction = stream.read_u16().await?;
@@ -210,7 +214,8 @@ async fn tcp(stream: &mut TcpStream, device: &Device) -> io::Result<()> {
     }
 }
 
-/// Frames of unit, question and checksum, one after the other with a gap between them (Modbus over Serial Line V1.02, 2.5.1).
+/// Serves frames of unit, request and checksum with a gap between them (Modbus over Serial Line
+/// V1.02, 2.5.1).
 async fn rtu(line: &mut (impl AsyncRead + AsyncWrite + Unpin), device: &Device) -> io::Result<()> {
     let mut frame: Vec<u8> = Vec::new();
     let mut bytes = [0; LONGEST];
@@ -218,7 +223,7 @@ async fn rtu(line: &mut (impl AsyncRead + AsyncWrite + Unpin), device: &Device) 
         let read = match timeout(GAP, line.read(&mut bytes)).await {
             Ok(read) => read?,
             Err(_) => {
-                // What is not whole after a gap never will be.
+                // A frame that is incomplete after a gap stays incomplete.
                 frame.clear();
                 continue;
             }
@@ -255,7 +260,8 @@ async fn rtu(line: &mut (impl AsyncRead + AsyncWrite + Unpin), device: &Device) 
     }
 }
 
-/// How long a question is with unit and checksum, by its function; `None` while that is not known.
+/// Returns the length of a request with unit and checksum, by its function, or `None` while it is
+/// unknown.
 fn frame_length(frame: &[u8]) -> Option<usize> {
     match frame.get(1)? {
         0x10 => frame.get(6).map(|bytes| usize::from(*bytes) + 9),
@@ -264,7 +270,7 @@ fn frame_length(frame: &[u8]) -> Option<usize> {
     }
 }
 
-/// The checksum of RTU: CRC-16 with the polynomial 0xA001, low byte first on the line.
+/// Returns the checksum of RTU: CRC-16 with the polynomial 0xA001, low byte first on the line.
 fn crc(bytes: &[u8]) -> u16 {
     bytes.iter().fold(0xFFFF, |sum, byte| {
         (0..8).fold(sum ^ u16::from(*byte), |sum, _| {
@@ -278,7 +284,7 @@ fn crc(bytes: &[u8]) -> u16 {
 }
 
 impl Device {
-    /// The answer to a question: of the function, or an exception of it.
+    /// Returns the response to a request: of the function, or an exception.
     fn answer(&self, pdu: &[u8]) -> Vec<u8> {
         let function = pdu.first().copied().unwrap_or_default();
         self.answered(pdu)
@@ -348,7 +354,7 @@ fn word(fields: &mut &[u8]) -> Result<u16, u8> {
     Ok(u16::from_be_bytes(*bytes))
 }
 
-/// So many words behind the number of their bytes.
+/// Reads words that follow their length in bytes.
 fn counted(fields: &mut &[u8], count: u16) -> Result<Vec<u16>, u8> {
     let (bytes, rest) = fields.split_first().ok_or(ILLEGAL_VALUE)?;
     let fits = usize::from(*bytes) == rest.len() && usize::from(count) * 2 == rest.len();

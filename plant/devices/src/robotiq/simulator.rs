@@ -1,4 +1,4 @@
-//! The registers of a 2F-85 that holds nothing real.
+//! Simulates the registers of a 2F-85 without a real gripper.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -8,12 +8,12 @@ use tokio::time::Instant;
 use super::{ACTION, STATUS, STROKE};
 use crate::modbus::server::{Registers, Table};
 
-/// How the gripper is.
+/// Settings of the simulated gripper.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Settings {
-    /// How wide the thing between the fingers is, m, if there is one.
+    /// Width of the object between the fingers in m, if any.
     pub object: Option<f64>,
-    /// How many times faster than time it works.
+    /// Speed factor of the simulated time.
     pub time_scale: f64,
 }
 
@@ -26,7 +26,7 @@ impl Default for Settings {
     }
 }
 
-/// One gripper; clones are of the same.
+/// A simulated gripper; clones share the same gripper.
 #[derive(Debug, Clone)]
 pub struct Simulator {
     gripper: Arc<Mutex<Gripper>>,
@@ -35,9 +35,9 @@ pub struct Simulator {
 #[derive(Debug)]
 struct Gripper {
     settings: Settings,
-    /// The three registers as they were written last.
+    /// The three command registers as written last.
     written: [u16; 3],
-    /// When activation is over.
+    /// End of the activation.
     active_at: Option<Instant>,
     /// From 0, open, to 255, closed.
     position: f64,
@@ -47,7 +47,7 @@ struct Gripper {
 }
 
 impl Simulator {
-    /// One that was just switched on, its fingers open.
+    /// Creates a gripper that was just switched on, with open fingers.
     #[must_use]
     pub fn new(settings: Settings) -> Self {
         let gripper = Gripper {
@@ -63,7 +63,7 @@ impl Simulator {
         }
     }
 
-    /// Switches it off and on again: it keeps where its fingers are, and nothing else.
+    /// Switches the gripper off and on again: it keeps only the position of its fingers.
     pub fn reboot(&self) {
         let mut gripper = self.lock();
         gripper.advance();
@@ -71,14 +71,14 @@ impl Simulator {
         gripper.active_at = None;
     }
 
-    /// Puts the fingers to a position from 0, open, to 255, closed.
+    /// Sets the position of the fingers, from 0, open, to 255, closed.
     pub fn put(&self, position: u8) {
         let mut gripper = self.lock();
         gripper.advance();
         gripper.position = f64::from(position);
     }
 
-    /// Where the fingers are.
+    /// Returns the position of the fingers.
     #[must_use]
     pub fn position(&self) -> u8 {
         let mut gripper = self.lock();
@@ -98,7 +98,7 @@ impl Registers for Simulator {
         let status = gripper.status();
         (address..address.checked_add(count)?)
             .map(|address| match (table, address) {
-                // It answers both functions for both ranges, as the manual has it.
+                // The gripper answers both functions for both ranges, as in the manual.
                 (Table::Holding | Table::Input, STATUS..) => {
                     status.get(usize::from(address - STATUS)).copied()
                 }
@@ -165,13 +165,13 @@ impl Gripper {
         action & 0x08 != 0 && self.active()
     }
 
-    /// The position in which the thing stops fingers that close.
+    /// Returns the position at which the object stops closing fingers.
     fn stop(&self) -> f64 {
         let object = self.settings.object.unwrap_or(0.0);
         (1.0 - object / STROKE).clamp(0.0, 1.0) * CLOSED
     }
 
-    /// Moves the fingers by the time that has passed.
+    /// Moves the fingers by the elapsed time.
     fn advance(&mut self) {
         let now = Instant::now();
         let passed = now.duration_since(self.moved).as_secs_f64() * self.settings.time_scale;
@@ -187,7 +187,7 @@ impl Gripper {
         self.settle();
     }
 
-    /// Whether the fingers stand, and why.
+    /// Determines whether the fingers have stopped, and the reason.
     fn settle(&mut self) {
         let [_, _, _, wanted, ..] = self.bytes();
         let wanted = f64::from(wanted);
@@ -208,7 +208,7 @@ impl Gripper {
             (true, false) => 1,
             (true, true) => 3,
         };
-        // Told to go before it is activated.
+        // A motion was requested before the activation.
         let fault = if action & 0x08 != 0 && !self.active() {
             if self.activates() { 0x05 } else { 0x07 }
         } else {
@@ -239,5 +239,5 @@ fn whole(position: f64) -> u8 {
 }
 
 const CLOSED: f64 = 255.0;
-/// The gripper opens and closes once meanwhile; that is left out.
+/// The gripper opens and closes once during the activation; the simulator omits this.
 const ACTIVATION: Duration = Duration::from_millis(1500);

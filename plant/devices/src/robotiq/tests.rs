@@ -125,7 +125,7 @@ async fn silence_damaged_frames_and_a_reboot_are_told_and_do_not_last() {
         bench.faults.damage(1);
         let (succeeded, why) = bench.run("GraspSkillType").await;
         assert!(!succeeded, "{line}: {why}");
-        // One who listens to RTU waits for a frame with a good checksum.
+        // An RTU receiver waits for a frame with a valid checksum.
         assert!(
             why.contains("is damaged: ") || why.starts_with("no answer"),
             "{line}: {why}"

@@ -1,4 +1,4 @@
-//! Questions to an IO-Link master: one connection each, answers bounded in time and size.
+//! Requests to an IO-Link master: one connection per request, responses bounded in time and size.
 
 use std::fmt;
 use std::time::Duration;
@@ -33,7 +33,7 @@ impl Master {
         }
     }
 
-    /// The answer to a question; nothing for one without a body.
+    /// Sends a request and returns its response; null for a response without a body.
     pub(super) async fn ask(
         &self,
         method: &str,
@@ -57,7 +57,7 @@ impl Master {
         let (mut send, connection) = hyper::client::conn::http1::handshake(TokioIo::new(stream))
             .await
             .map_err(|error| unreachable(&error))?;
-        // Ends with this question.
+        // Ends with this request.
         let mut driving = JoinSet::new();
         driving.spawn(connection);
         let body = body.map(Value::to_string).unwrap_or_default();
@@ -96,6 +96,6 @@ impl Master {
     }
 }
 
-/// Halt leaves a driver a second, in which it asks twice.
+/// Halt leaves a driver a second, enough for two requests.
 const ANSWER: Duration = Duration::from_millis(400);
 const LONGEST: usize = 64 * 1024;

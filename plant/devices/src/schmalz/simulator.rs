@@ -1,4 +1,4 @@
-//! An IO-Link master with a vacuum gripper at one port that holds nothing real.
+//! Simulates an IO-Link master with a vacuum gripper at a port.
 
 use std::convert::Infallible;
 use std::io;
@@ -20,14 +20,14 @@ use tracing::debug;
 
 use super::{BLOW_OFF, DEVICES, VACUUM};
 
-/// How the gripper is.
+/// Settings of the simulated gripper.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Settings {
     /// The alias of its port.
     pub alias: String,
     /// Whether there is a part below its cups.
     pub part: bool,
-    /// How many times faster than time it works.
+    /// Speed factor of the simulated time.
     pub time_scale: f64,
 }
 
@@ -41,7 +41,7 @@ impl Default for Settings {
     }
 }
 
-/// One master with its gripper; clones are of the same.
+/// A simulated master with its gripper; clones share the same master.
 #[derive(Debug, Clone)]
 pub struct Simulator {
     gripper: Arc<Mutex<Gripper>>,
@@ -59,21 +59,21 @@ struct Gripper {
     faults: Faults,
 }
 
-/// What is wrong with it.
+/// Faults of the simulator.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Faults {
     /// The master does not answer.
     pub silent: bool,
-    /// Its answers are no JSON.
+    /// Its responses are not JSON.
     pub damaged: bool,
     /// The gripper is not connected to its port.
     pub unplugged: bool,
-    /// The gripper says that it does not work.
+    /// The gripper reports that it does not work.
     pub broken: bool,
 }
 
 impl Simulator {
-    /// One that holds nothing.
+    /// Creates a gripper without a held part.
     #[must_use]
     pub fn new(settings: Settings) -> Self {
         let gripper = Gripper {
@@ -90,12 +90,12 @@ impl Simulator {
         }
     }
 
-    /// What is wrong with it from now on.
+    /// Sets the faults.
     pub fn set_faults(&self, faults: Faults) {
         self.lock().faults = faults;
     }
 
-    /// Switches it off and on: the vacuum is gone, and so is what it was told.
+    /// Switches the gripper off and on: the vacuum and all commands are lost.
     pub fn reboot(&self) {
         let mut gripper = self.lock();
         gripper.out = [0; 2];
@@ -103,7 +103,7 @@ impl Simulator {
         gripper.held = false;
     }
 
-    /// Whether it holds a part.
+    /// Returns whether the gripper holds a part.
     #[must_use]
     pub fn holds(&self) -> bool {
         self.lock().held
@@ -186,7 +186,7 @@ impl Gripper {
         self.seen = now;
         let [flags, _] = self.out;
         let (aim, within) = match (flags & VACUUM != 0, flags & BLOW_OFF != 0) {
-            // Blowing off comes before sucking.
+            // Blowing off takes precedence over suction.
             (_, true) => (0.0, 0.05),
             (true, false) if self.settings.part => (600.0, 0.3),
             (true, false) => (40.0, 0.1),
@@ -230,7 +230,7 @@ fn refused(status: StatusCode, code: u16, message: &str) -> (StatusCode, Option<
     (status, Some(json!({"code": code, "message": message})))
 }
 
-/// A master that is served. It is gone when this is dropped.
+/// A master that is served, until it is dropped.
 #[derive(Debug)]
 pub struct Serving {
     address: SocketAddr,
@@ -238,10 +238,10 @@ pub struct Serving {
 }
 
 impl Serving {
-    /// Serves a master; port 0 is any that is free. Needs a tokio runtime.
+    /// Serves a master; port 0 selects a free port. Needs a tokio runtime.
     ///
     /// # Errors
-    /// The address cannot be used.
+    /// Fails if the address cannot be used.
     pub async fn start(simulator: &Simulator, address: &str) -> io::Result<Self> {
         let listener = TcpListener::bind(address).await?;
         let address = listener.local_addr()?;
@@ -253,7 +253,7 @@ impl Serving {
         })
     }
 
-    /// Where.
+    /// Returns the address of the server.
     #[must_use]
     pub fn address(&self) -> SocketAddr {
         self.address

@@ -1,12 +1,12 @@
-//! Orientations: as the space says them, as the robot says them, and halfway between two.
+//! Orientations: in the notation of the space, in the notation of the robot, and interpolated.
 //!
-//! The space says rotations about the fixed x, y and z of the base, one after the other; the robot says a rotation vector: the
-//! axis, as long as the angle.
+//! The space uses rotations about the fixed x, y and z of the base, in sequence. The robot
+//! uses a rotation vector: the axis, with the angle as its length.
 
 /// A unit quaternion: w, x, y, z.
 pub(crate) type Quaternion = [f64; 4];
 
-/// From rotations about x, y and z, rad.
+/// Converts rotations about x, y and z, rad.
 pub(crate) fn of_angles([a, b, c]: [f64; 3]) -> Quaternion {
     let (sa, ca) = (a / 2.0).sin_cos();
     let (sb, cb) = (b / 2.0).sin_cos();
@@ -19,7 +19,7 @@ pub(crate) fn of_angles([a, b, c]: [f64; 3]) -> Quaternion {
     ]
 }
 
-/// To rotations about x, y and z, rad.
+/// Converts to rotations about x, y and z, rad.
 pub(crate) fn to_angles([w, x, y, z]: Quaternion) -> [f64; 3] {
     let a = (2.0 * (w * x + y * z)).atan2(1.0 - 2.0 * (x * x + y * y));
     let b = (2.0 * (w * y - z * x)).clamp(-1.0, 1.0).asin();
@@ -27,16 +27,16 @@ pub(crate) fn to_angles([w, x, y, z]: Quaternion) -> [f64; 3] {
     [a, b, c]
 }
 
-/// From a rotation vector, rad.
+/// Converts a rotation vector, rad.
 pub(crate) fn of_vector([x, y, z]: [f64; 3]) -> Quaternion {
     let angle = (x * x + y * y + z * z).sqrt();
     let (sine, cosine) = (angle / 2.0).sin_cos();
-    // Near no rotation the sine is as long as half the angle.
+    // Near the zero rotation the sine equals half the angle.
     let of = if angle > 1e-12 { sine / angle } else { 0.5 };
     [cosine, x * of, y * of, z * of]
 }
 
-/// To a rotation vector, rad, of at most half a turn.
+/// Converts to a rotation vector, rad, of at most half a turn.
 pub(crate) fn to_vector([w, x, y, z]: Quaternion) -> [f64; 3] {
     let sign = if w < 0.0 { -1.0 } else { 1.0 };
     let length = (x * x + y * y + z * z).sqrt();
@@ -45,12 +45,12 @@ pub(crate) fn to_vector([w, x, y, z]: Quaternion) -> [f64; 3] {
     [x * of, y * of, z * of]
 }
 
-/// The angle from one to the other, rad.
+/// Returns the angle between two orientations, rad.
 pub(crate) fn angle(from: Quaternion, to: Quaternion) -> f64 {
     2.0 * dot(from, to).abs().min(1.0).acos()
 }
 
-/// A share of the way from one to the other, at constant speed.
+/// Returns the orientation at a fraction of the way between two orientations, at constant speed.
 pub(crate) fn between(from: Quaternion, to: Quaternion, share: f64) -> Quaternion {
     let cosine = dot(from, to);
     let (to, cosine) = if cosine < 0.0 {
@@ -80,14 +80,14 @@ fn dot(a: Quaternion, b: Quaternion) -> f64 {
     a.iter().zip(b).map(|(a, b)| a * b).sum()
 }
 
-/// A position with rotations about x, y and z as one with a rotation vector.
+/// Converts a position with rotations about x, y and z to a position with a rotation vector.
 #[must_use]
 pub fn to_robot([x, y, z, a, b, c]: [f64; 6]) -> [f64; 6] {
     let [rx, ry, rz] = to_vector(of_angles([a, b, c]));
     [x, y, z, rx, ry, rz]
 }
 
-/// A position with a rotation vector as one with rotations about x, y and z.
+/// Converts a position with a rotation vector to a position with rotations about x, y and z.
 #[must_use]
 pub fn of_robot([x, y, z, rx, ry, rz]: [f64; 6]) -> [f64; 6] {
     let [a, b, c] = to_angles(of_vector([rx, ry, rz]));

@@ -1,4 +1,4 @@
-//! One who is told by the robot, and tells it.
+//! RTDE client, which receives values from the robot and sends values to it.
 
 use std::io;
 use std::time::Duration;
@@ -10,22 +10,22 @@ use tokio::time::timeout;
 use super::wire::{Kind, Type, VERSION, Value, chunk, next, package};
 use crate::modbus::connected;
 
-/// How long the robot may be silent: it tells 50 times a second.
+/// Time limit for a silent robot, which sends 50 times a second.
 const ANSWER: Duration = Duration::from_secs(1);
 
-/// A connection whose recipes are agreed.
+/// A connection with agreed recipes.
 #[derive(Debug)]
 pub(crate) struct Rtde {
     stream: BufReader<TcpStream>,
     address: String,
     outputs: (u8, Vec<Kind>),
-    /// The recipe of what the robot is told, where nobody else tells it that.
+    /// The recipe of the inputs, unless another client has them.
     inputs: Option<u8>,
 }
 
 impl Rtde {
-    /// Connects, and has the robot tell some values so many times a second. Inputs that another client has already are not there
-    /// then.
+    /// Connects, and requests some values at a rate in Hz. Inputs that belong to another client are
+    /// not available then.
     pub(crate) async fn open(
         address: &str,
         hertz: f64,
@@ -93,13 +93,13 @@ impl Rtde {
         Ok((recipe, kinds.split(',').map(str::to_owned).collect()))
     }
 
-    /// Asks, and takes the next package of that type for the answer.
+    /// Sends a request, and returns the next package of that type as its response.
     async fn ask(&mut self, of: Type, body: &[u8]) -> Result<Vec<u8>, String> {
         self.write(of, body).await?;
         self.package(of).await
     }
 
-    /// The next values, in the order of the recipe. Not to be dropped on the way.
+    /// Returns the next values, in the order of the recipe. Not cancel-safe.
     pub(crate) async fn next(&mut self) -> Result<Vec<Value>, String> {
         let body = self.package(Type::Data).await?;
         let mut rest = body.as_slice();
@@ -110,12 +110,12 @@ impl Rtde {
         values.ok_or_else(|| self.damaged("values of another recipe"))
     }
 
-    /// Whether the robot takes the inputs from here.
+    /// Returns whether the robot accepts inputs from this client.
     pub(crate) fn may_tell(&self) -> bool {
         self.inputs.is_some()
     }
 
-    /// Tells the robot the values of the inputs.
+    /// Sends the values of the inputs to the robot.
     pub(crate) async fn tell(&mut self, values: &[Value]) -> Result<(), String> {
         let Some(recipe) = self.inputs else {
             return Err(format!(
@@ -128,7 +128,8 @@ impl Rtde {
         self.write(Type::Data, &body).await
     }
 
-    /// The next package of a type; whoever says other things only is silent, too.
+    /// Returns the next package of a type. A robot that sends only other types counts as silent,
+    /// too.
     async fn package(&mut self, of: Type) -> Result<Vec<u8>, String> {
         let wanted = async {
             loop {
@@ -176,7 +177,7 @@ mod tests {
             let (mut stream, _) = listener.accept().await.unwrap();
             let text = package(Type::Text, b"still here").unwrap();
             let mut pause = tokio::time::interval(Duration::from_millis(20));
-            // Until the other side has gone.
+            // Until the other side has disconnected.
             while stream.write_all(&text).await.is_ok() {
                 pause.tick().await;
             }

@@ -1,6 +1,6 @@
-//! A few statements of URScript, as the simulator understands them.
+//! The statements of URScript that the simulator supports.
 
-/// One statement.
+/// A statement.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Statement {
     /// `movel` or `movej` to a pose: x, y, z and a rotation vector.
@@ -16,12 +16,12 @@ pub(crate) enum Statement {
     Register { number: usize, value: i32 },
     /// `sleep`, s
     Sleep(f64),
-    /// What does nothing here: `textmsg`, `set_tcp`, `set_payload`.
+    /// A statement without effect here: `textmsg`, `set_tcp`, `set_payload`.
     Nothing,
 }
 
-/// Takes whole programs from the front of what has come: those between `def` and `end`, and single lines. What is not
-/// understood is told by its line.
+/// Removes complete programs from the front of the received text: programs between `def` and `end`,
+/// and single lines. A program with an unknown statement is returned as an error with its line.
 pub(crate) fn programs(text: &mut String) -> Vec<Result<Vec<Statement>, String>> {
     let mut programs = Vec::new();
     while let Some((program, length)) = first(text) {
@@ -34,7 +34,7 @@ pub(crate) fn programs(text: &mut String) -> Vec<Result<Vec<Statement>, String>>
     programs
 }
 
-/// The lines of the first program without its frame, and how long its text is.
+/// Returns the lines of the first program without its frame, and the length of its text.
 fn first(text: &str) -> Option<(Vec<String>, usize)> {
     let mut lines = Vec::new();
     let mut length = 0;

@@ -1,8 +1,8 @@
-//! A robot that moves nothing real, behind the two interfaces that drivers use.
+//! Simulates a robot, behind the two interfaces that drivers use.
 //!
-//! It has no joints: the tool goes straight to each pose, with the speed and acceleration that it was told, and joints stand
-//! still in what it tells. Programs are those of a few statements: movel, movej (to a pose), stopl, stopj, sleep,
-//! write_output_integer_register.
+//! The robot has no joints: the tool moves straight to each pose with the given speed and
+//! acceleration, and reported joint values do not change. Programs consist of a few statements:
+//! movel, movej (to a pose), stopl, stopj, sleep, write_output_integer_register.
 
 mod motion;
 mod served;
@@ -19,12 +19,12 @@ use self::motion::Motion;
 use super::pose::{of_vector, to_vector};
 use super::script::Statement;
 
-/// How the robot is.
+/// Settings of the simulated robot.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Settings {
-    /// How many times faster than time it works.
+    /// Speed factor of the simulated time.
     pub time_scale: f64,
-    /// Where its tool is when it is switched on: x, y, z and a rotation vector.
+    /// Pose of the tool after power-on: x, y, z and a rotation vector.
     pub home: [f64; 6],
 }
 
@@ -37,7 +37,7 @@ impl Default for Settings {
     }
 }
 
-/// One robot; clones are of the same.
+/// A simulated robot; clones share the same robot.
 #[derive(Debug, Clone)]
 pub struct Simulator {
     robot: Arc<Mutex<Robot>>,
@@ -54,7 +54,7 @@ struct Robot {
     slider: f64,
     safety: i32,
     silent: bool,
-    /// How often it was switched on: connections of before have ended.
+    /// Number of power-ons; connections of earlier power-ons have ended.
     life: u32,
 }
 
@@ -66,7 +66,7 @@ struct Running {
 }
 
 impl Simulator {
-    /// One that stands at home.
+    /// Creates a robot at its home pose.
     #[must_use]
     pub fn new(settings: Settings) -> Self {
         let now = Instant::now();
@@ -87,25 +87,25 @@ impl Simulator {
         }
     }
 
-    /// Where its tool is.
+    /// Returns the pose of the tool.
     #[must_use]
     pub fn pose(&self) -> [f64; 6] {
         self.lock().pose
     }
 
-    /// Puts its tool somewhere; what it did has ended.
+    /// Sets the pose of the tool and ends the running program.
     pub fn reset(&self, pose: [f64; 6]) {
         let mut robot = self.lock();
         robot.program = None;
         robot.pose = pose;
     }
 
-    /// Whether it says nothing.
+    /// Sets whether the robot sends nothing.
     pub fn set_silent(&self, silent: bool) {
         self.lock().silent = silent;
     }
 
-    /// Stops it as when it has touched something, or lets it go again.
+    /// Sets or clears a protective stop, as after a contact.
     pub fn set_protective_stop(&self, stopped: bool) {
         let mut robot = self.lock();
         robot.safety = if stopped { PROTECTIVE_STOP } else { NORMAL };
@@ -114,7 +114,8 @@ impl Simulator {
         }
     }
 
-    /// Switches it off and on: connections end, and so does what it did; its tool is where it was.
+    /// Switches the robot off and on: connections and the running program end; its tool stays in
+    /// place.
     pub fn reboot(&self) {
         let mut robot = self.lock();
         robot.program = None;
@@ -129,8 +130,8 @@ impl Simulator {
         if robot.safety != NORMAL {
             return;
         }
-        // A program takes the place of the one that runs; its motion goes on until the new one says otherwise, as it would take
-        // a moment to come to a stand.
+        // A new program replaces the running program. The current motion brakes, because the robot
+        // takes a moment to stop.
         let motion = robot.program.take().and_then(|program| program.motion);
         robot.program = Some(Running {
             waiting: statements.into(),
@@ -163,7 +164,7 @@ impl Robot {
         })
     }
 
-    /// Goes on by the time that has passed.
+    /// Advances by the elapsed time.
     fn advance(&mut self) {
         let now = Instant::now();
         let passed = now.duration_since(self.seen).min(LONGEST);
@@ -193,7 +194,7 @@ impl Robot {
         }
     }
 
-    /// Begins the next statement; false where there is none.
+    /// Starts the next statement; returns false at the end of the program.
     fn next(&mut self) -> bool {
         let Some(program) = &mut self.program else {
             return false;
@@ -222,18 +223,18 @@ impl Robot {
     }
 }
 
-/// The same orientation is never told in two ways.
+/// Normalizes a pose, so that equal orientations have equal values.
 fn tidy([x, y, z, rx, ry, rz]: [f64; 6]) -> [f64; 6] {
     let [rx, ry, rz] = to_vector(of_vector([rx, ry, rz]));
     [x, y, z, rx, ry, rz]
 }
 
-/// `robot_mode` of one that is ready.
+/// `robot_mode` of a robot that is ready.
 const RUNNING: i32 = 7;
 /// `safety_mode`
 const NORMAL: i32 = 1;
 const PROTECTIVE_STOP: i32 = 3;
-/// Steps in which motions are added up, s.
+/// Time step of motions, s.
 const STEP: f64 = 0.002;
-/// More time than this does not pass unseen.
+/// Limit of the elapsed time of a step.
 const LONGEST: Duration = Duration::from_secs(10);

@@ -1,6 +1,7 @@
-//! The bytes of RTDE, the Real-Time Data Exchange of Universal Robots, version 2 of the protocol.
+//! The wire format of RTDE, the Real-Time Data Exchange of Universal Robots, protocol version 2.
 //!
-//! A package is its length with the header (UInt16), a letter for its type, and what belongs to that; all numbers big-endian.
+//! A package is its length including the header (UInt16), a letter for its type, and a body; all
+//! numbers are big-endian.
 
 use std::io;
 
@@ -8,27 +9,27 @@ use tokio::io::{AsyncRead, AsyncReadExt as _};
 
 /// The port of the robot.
 pub const PORT: u16 = 30_004;
-/// The protocol that is spoken.
+/// The supported protocol version.
 pub const VERSION: u16 = 2;
 
-/// What a package is about: its letter.
+/// The type of a package, with its letter.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Type {
-    /// V: which protocol
+    /// V: request of a protocol version
     Protocol,
-    /// v: which controller
+    /// v: request of the controller version
     Controller,
     /// M: a text for people
     Text,
     /// U: values of a recipe
     Data,
-    /// O: a recipe of what the robot tells
+    /// O: a recipe of outputs of the robot
     Outputs,
-    /// I: a recipe of what it is told
+    /// I: a recipe of inputs of the robot
     Inputs,
-    /// S: tell from now on
+    /// S: start of the outputs
     Start,
-    /// P: tell no more
+    /// P: pause of the outputs
     Pause,
 }
 
@@ -62,9 +63,9 @@ impl Type {
 /// The type of a value.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
-    /// One byte, 0 or 1.
+    /// A byte, 0 or 1.
     Bool,
-    /// One byte.
+    /// A byte.
     U8,
     /// Four bytes.
     U32,
@@ -74,11 +75,11 @@ pub enum Kind {
     I32,
     /// Eight bytes of IEEE 754.
     F64,
-    /// Six of those.
+    /// Six values of [`Kind::F64`].
     Vector,
-    /// Three of those.
+    /// Three values of [`Kind::F64`].
     Triple,
-    /// Six of four bytes with a sign.
+    /// Six values of [`Kind::I32`].
     Whole,
 }
 
@@ -95,7 +96,7 @@ impl Kind {
         (Self::Whole, "VECTOR6INT32"),
     ];
 
-    /// That of a name.
+    /// Returns the type with a name.
     #[must_use]
     pub fn of(name: &str) -> Option<Self> {
         Self::ALL
@@ -104,7 +105,7 @@ impl Kind {
             .map(|(of, _)| *of)
     }
 
-    /// As `VECTOR6D`.
+    /// Returns the name, such as `VECTOR6D`.
     #[must_use]
     pub fn name(self) -> &'static str {
         Self::ALL
@@ -113,7 +114,7 @@ impl Kind {
             .map_or("NOT_FOUND", |(_, name)| name)
     }
 
-    /// Zero of it.
+    /// Returns the zero value of the type.
     #[must_use]
     pub fn zero(self) -> Value {
         match self {
@@ -129,7 +130,7 @@ impl Kind {
         }
     }
 
-    /// Takes a value of it from the front of some bytes; `None` where they are too few.
+    /// Reads a value of the type from the front of some bytes; returns `None` if they are too few.
     pub fn take(self, bytes: &mut &[u8]) -> Option<Value> {
         Some(match self {
             Self::Bool => Value::Bool(u8::from_be_bytes(chunk(bytes)?) != 0),
@@ -163,7 +164,7 @@ impl Kind {
     }
 }
 
-/// So many bytes from the front.
+/// Reads `N` bytes from the front.
 pub fn chunk<const N: usize>(bytes: &mut &[u8]) -> Option<[u8; N]> {
     let (first, rest) = bytes.split_first_chunk::<N>()?;
     *bytes = rest;
@@ -173,28 +174,28 @@ pub fn chunk<const N: usize>(bytes: &mut &[u8]) -> Option<[u8; N]> {
 /// A value of a recipe.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Value {
-    /// As [`Kind::Bool`].
+    /// Value of [`Kind::Bool`].
     Bool(bool),
-    /// As [`Kind::U8`].
+    /// Value of [`Kind::U8`].
     U8(u8),
-    /// As [`Kind::U32`].
+    /// Value of [`Kind::U32`].
     U32(u32),
-    /// As [`Kind::U64`].
+    /// Value of [`Kind::U64`].
     U64(u64),
-    /// As [`Kind::I32`].
+    /// Value of [`Kind::I32`].
     I32(i32),
-    /// As [`Kind::F64`].
+    /// Value of [`Kind::F64`].
     F64(f64),
-    /// As [`Kind::Vector`].
+    /// Value of [`Kind::Vector`].
     Vector([f64; 6]),
-    /// As [`Kind::Triple`].
+    /// Value of [`Kind::Triple`].
     Triple([f64; 3]),
-    /// As [`Kind::Whole`].
+    /// Value of [`Kind::Whole`].
     Whole([i32; 6]),
 }
 
 impl Value {
-    /// Appends its bytes.
+    /// Appends the bytes of the value.
     pub fn put(self, bytes: &mut Vec<u8>) {
         match self {
             Self::Bool(value) => bytes.push(u8::from(value)),
@@ -210,10 +211,10 @@ impl Value {
     }
 }
 
-/// A package as bytes.
+/// Returns a package as bytes.
 ///
 /// # Errors
-/// It is longer than a package can be.
+/// Fails if the package is too long.
 pub fn package(of: Type, body: &[u8]) -> io::Result<Vec<u8>> {
     let length = u16::try_from(body.len() + HEADER).map_err(|_| io::ErrorKind::InvalidInput)?;
     let mut package = length.to_be_bytes().to_vec();
@@ -222,10 +223,10 @@ pub fn package(of: Type, body: &[u8]) -> io::Result<Vec<u8>> {
     Ok(package)
 }
 
-/// Reads the next package. What is in one of a letter that is not known is left out. Not to be dropped on the way.
+/// Reads the next package. Packages with an unknown letter are skipped. Not cancel-safe.
 ///
 /// # Errors
-/// The connection has ended, or what comes is no package.
+/// Fails if the connection has ended, or if the data is not a package.
 pub async fn next(stream: &mut (impl AsyncRead + Unpin)) -> io::Result<(Type, Vec<u8>)> {
     loop {
         let length = usize::from(stream.read_u16().await?);
@@ -250,7 +251,7 @@ mod tests {
 
     #[tokio::test]
     async fn a_package_is_as_the_guide_of_the_maker_writes_it() {
-        // To ask for version 2: five bytes, V, 2.
+        // The request for version 2: five bytes, V, 2.
         let asked = package(Type::Protocol, &VERSION.to_be_bytes()).unwrap();
         assert_eq!(asked, [0, 5, b'V', 0, 2]);
         let mut bytes: &[u8] = &[0, 4, b'?', 7, 0, 4, b'S', 1];

@@ -1,4 +1,4 @@
-//! One motion of the tool: it gains speed, keeps it and loses it, along a straight line.
+//! A motion of the tool: it accelerates, keeps its speed and decelerates, along a straight line.
 
 use super::tidy;
 use crate::ur::pose::{Quaternion, angle, between, of_vector, to_vector};
@@ -8,7 +8,7 @@ pub(super) struct Motion {
     from: [f64; 6],
     to: [f64; 6],
     turn: (Quaternion, Quaternion),
-    /// How long the way is: of the tool in m, or of its turning in rad where that is longer.
+    /// Length of the path: of the tool in m, or of its rotation in rad if that is larger.
     length: f64,
     done: f64,
     speed: f64,
@@ -36,14 +36,14 @@ impl Motion {
         }
     }
 
-    /// The same, braking from now on.
+    /// Returns the same motion, braking from now on.
     pub(super) fn interrupted(mut self) -> Self {
         self.stops = true;
         self.acceleration = self.acceleration.max(BRAKES);
         self
     }
 
-    /// Goes on by so many seconds. True at its end.
+    /// Advances by some seconds. Returns true at the end.
     pub(super) fn step(&mut self, seconds: f64) -> bool {
         let left = self.length - self.done;
         let brakes = self.speed * self.speed / (2.0 * self.acceleration);
@@ -85,7 +85,7 @@ impl Motion {
         [x, y, z, rx, ry, rz]
     }
 
-    /// Of the tool, m/s; turning is left out.
+    /// Returns the velocity of the tool, m/s, without rotation.
     pub(super) fn velocity(&self) -> [f64; 6] {
         if self.length <= 0.0 {
             return [0.0; 6];
@@ -116,7 +116,7 @@ mod tests {
             assert!(x <= 0.25 + 1e-9);
             assert!(steps < 2000, "it does not arrive: {motion:?}");
         }
-        // 0.25 s to gain the speed, 0.25 s to lose it, 1.75 s between.
+        // 0.25 s to accelerate, 0.25 s to decelerate, 1.75 s between.
         assert!((f64::from(steps) * 0.002 - 2.25).abs() < 0.02, "{steps}");
         assert_eq!(motion.pose(), to);
     }

@@ -1,4 +1,4 @@
-//! The interfaces of the robot: RTDE, and the secondary one.
+//! The interfaces of the robot: RTDE, and the secondary interface.
 
 use std::io;
 use std::net::SocketAddr;
@@ -17,7 +17,7 @@ use super::super::script::programs;
 use super::super::wire::{Kind, Type, VERSION, Value, chunk, next, package};
 use super::{Simulator, variables};
 
-/// A robot that is served. It is gone when this is dropped.
+/// A robot that is served, until it is dropped.
 #[derive(Debug)]
 pub struct Serving {
     rtde: SocketAddr,
@@ -26,10 +26,10 @@ pub struct Serving {
 }
 
 impl Serving {
-    /// Serves a robot; port 0 is any that is free. Needs a tokio runtime.
+    /// Serves a robot; port 0 selects a free port. Needs a tokio runtime.
     ///
     /// # Errors
-    /// An address cannot be used.
+    /// Fails if an address cannot be used.
     pub async fn start(simulator: &Simulator, rtde: &str, secondary: &str) -> io::Result<Self> {
         let (told, programs) = (
             TcpListener::bind(rtde).await?,
@@ -47,20 +47,20 @@ impl Serving {
         })
     }
 
-    /// Where RTDE is.
+    /// Returns the address of RTDE.
     #[must_use]
     pub fn rtde(&self) -> SocketAddr {
         self.rtde
     }
 
-    /// Where the secondary interface is.
+    /// Returns the address of the secondary interface.
     #[must_use]
     pub fn secondary(&self) -> SocketAddr {
         self.secondary
     }
 }
 
-/// Inputs that a client has: no other one may.
+/// Inputs that belong to a client and are refused to all other clients.
 type Taken = Arc<Mutex<Vec<String>>>;
 
 async fn accept(listener: TcpListener, simulator: Simulator, taken: Option<Taken>) {
@@ -101,7 +101,7 @@ async fn switched_off(simulator: &Simulator, life: u32) {
     }
 }
 
-/// Takes programs, and tells the state of the robot ten times a second.
+/// Accepts programs, and sends the state of the robot ten times a second.
 async fn secondary(stream: TcpStream, simulator: &Simulator) -> io::Result<()> {
     let (mut reads, mut writes) = stream.into_split();
     let mut ticks = interval(Duration::from_millis(100));
@@ -136,7 +136,8 @@ async fn secondary(stream: TcpStream, simulator: &Simulator) -> io::Result<()> {
 }
 
 impl Simulator {
-    /// A robot state message of type 16: mode and tool position. Nothing while it is silent.
+    /// Returns a robot state message of type 16: mode and tool position. Returns `None` while the
+    /// robot is silent.
     fn state_message(&self) -> Option<Vec<u8>> {
         let robot = self.lock();
         if robot.silent {
@@ -171,14 +172,14 @@ impl Simulator {
     }
 }
 
-/// One client of RTDE.
+/// A client of RTDE.
 struct Client<'s> {
     simulator: &'s Simulator,
     taken: Taken,
-    /// The inputs it has.
+    /// The inputs of the client.
     has: Vec<String>,
     outputs: Vec<(String, Kind)>,
-    /// Its recipes of inputs; the number of a recipe is its place from 1.
+    /// Its recipes of inputs; the number of a recipe is its index plus 1.
     inputs: Vec<Vec<(String, Kind)>>,
     hertz: f64,
     started: bool,
@@ -346,7 +347,7 @@ impl Drop for Client<'_> {
     }
 }
 
-/// The names of a list; a comma behind the last one, as some clients write it, says nothing.
+/// Returns the names of a list. Some clients append a comma, which is ignored.
 fn listed(names: &str) -> impl Iterator<Item = &str> {
     names.strip_suffix(',').unwrap_or(names).split(',')
 }
@@ -367,7 +368,7 @@ async fn read(mut reads: OwnedReadHalf, send: mpsc::Sender<(Type, Vec<u8>)>) {
     }
 }
 
-/// Major, minor, bug fix and build of a controller that knows all of this.
+/// Major, minor, bug fix and build of a controller that supports all of this.
 const CONTROLLER: [u32; 4] = [5, 12, 0, 0];
 const LATER: Duration = Duration::from_millis(50);
 const MOST_CLIENTS: usize = 16;

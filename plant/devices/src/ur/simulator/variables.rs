@@ -1,9 +1,10 @@
-//! What the robot tells and is told over RTDE, by name and type, as the guide of the maker lists them.
+//! The outputs and inputs of the robot over RTDE, by name and type, as listed in the guide of the
+//! manufacturer.
 
 use super::super::wire::{Kind, Value};
 use super::{Robot, Simulator};
 
-/// The type of a value that the robot tells.
+/// Returns the type of an output.
 pub(super) fn output(name: &str) -> Option<Kind> {
     if let Some(kind) = register(name, "output_") {
         return Some(kind);
@@ -34,7 +35,7 @@ pub(super) fn output(name: &str) -> Option<Kind> {
     }
 }
 
-/// The type of a value that it is told.
+/// Returns the type of an input.
 pub(super) fn input(name: &str) -> Option<Kind> {
     if let Some(kind) = register(name, "input_") {
         return Some(kind);
@@ -57,7 +58,8 @@ pub(super) fn input(name: &str) -> Option<Kind> {
     }
 }
 
-/// General purpose registers: 48 whole numbers, 48 real ones, 64 bits in two words and from 64 on one by one.
+/// Returns the type of a general purpose register: 48 integers, 48 doubles, 64 bits in two words
+/// and from 64 on single bits.
 fn register(name: &str, direction: &str) -> Option<Kind> {
     let rest = name.strip_prefix(direction)?;
     if rest == "bit_registers0_to_31" || rest == "bit_registers32_to_63" {
@@ -74,7 +76,7 @@ fn register(name: &str, direction: &str) -> Option<Kind> {
 }
 
 impl Robot {
-    /// What it tells now; what is not simulated is nothing.
+    /// Returns the current value of an output; outputs that are not simulated are zero.
     pub(super) fn tells(&self, name: &str, kind: Kind) -> Value {
         let number = name.strip_prefix("output_int_register_");
         if let Some(register) = number
@@ -104,7 +106,7 @@ impl Robot {
 }
 
 impl Simulator {
-    /// Takes what it was told by the recipe of a client.
+    /// Applies inputs in the order of a client's recipe.
     pub(super) fn told(&self, values: &[(String, Value)]) {
         let named = |wanted: &str| values.iter().find(|(name, _)| name == wanted);
         let mask = named("speed_slider_mask").map(|(_, value)| *value);
