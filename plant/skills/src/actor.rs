@@ -1,4 +1,4 @@
-//! The task that owns a skill: what is called and how its work ends goes through here, one thing after the other.
+//! The task that owns a skill. It processes calls and the end of the work sequentially.
 
 use std::any::Any;
 use std::collections::VecDeque;
@@ -21,15 +21,15 @@ use crate::shown::{Diagnostic, LastCall, Observer, Outcome, Shown, Told, Transit
 use crate::skill::{Facts, Pending, lock};
 use crate::value::Value;
 
-/// What waits for the task.
+/// A message to the task.
 #[derive(Debug)]
 pub(crate) enum Order {
     Call(Call),
-    /// The component ends: what runs is halted, whoever has the lease.
+    /// Closes the component: a run in progress is halted, regardless of the holder of the lease.
     Close(oneshot::Sender<()>),
 }
 
-/// A call on its way to the task.
+/// A call of a method, waiting for the task.
 #[derive(Debug)]
 pub(crate) struct Call {
     pub(crate) by: Owner,
@@ -38,14 +38,14 @@ pub(crate) struct Call {
     pub(crate) reply: oneshot::Sender<Result<u32, Refusal>>,
 }
 
-/// What comes with a Start.
+/// The arguments of a Start call.
 #[derive(Debug, Default)]
 pub(crate) struct Given {
-    /// The parameters; `None` for those that were written before.
+    /// The parameters; `None` uses the parameters that the caller wrote before.
     pub(crate) parameters: Option<Vec<(String, Value)>>,
-    /// How long the run may take, where that is shorter than what the skill allows.
+    /// Time limit of the run. It applies if it is shorter than the limit of the skill.
     pub(crate) within: Option<Duration>,
-    /// Whether a Halted skill is made ready first.
+    /// Whether a Halted skill is reset first.
     pub(crate) readies: bool,
 }
 
@@ -60,47 +60,49 @@ pub(crate) struct Actor {
     shown: watch::Sender<Arc<Shown>>,
     now: Shown,
     work: Option<Running>,
-    /// What was said of the run that goes on.
+    /// Trace lines of the current run.
     trace: Vec<String>,
-    /// Of its refusals one is told at a time: a client that asks again and again must not fill the log.
+    /// Rate limit of log messages about refused calls, so that a client that retries in a loop
+    /// cannot flood the log.
     refusals: LogLimit,
 }
 
-/// The work of a run, until it has really ended.
+/// The work of a run, kept until the work has ended.
 struct Running {
     run: RunId,
     task: JoinHandle<Result<Results, String>>,
     reins: Reins,
-    /// How long it may take.
+    /// Time limit of the run.
     within: Option<Duration>,
     began: Instant,
-    /// When it has to be done, while it may go on.
+    /// Time at which the run times out, while it is Running and has a limit.
     deadline: Option<Instant>,
-    /// How long it may take from then on, while it is suspended.
+    /// Remaining time of the run, measured when it was suspended.
     left: Option<Duration>,
-    /// How it ended, while that cannot be told: what is suspended ends only when it is resumed.
+    /// Result of work that ended while the run was suspended. It is applied when the run is
+    /// resumed.
     ended: Option<Result<Results, String>>,
-    /// It was told to stop, is done elsewhere, and its end is awaited.
+    /// Set after a stop request to work that is done elsewhere, until that work ends.
     halting: Option<Halting>,
-    /// Why its end is not known, and may never be.
+    /// Reason why the end of the work is unknown. The end may never become known.
     unknown: Option<String>,
 }
 
-/// The way of a run that is done elsewhere to its end, after it was told to stop.
+/// State of a run that is done elsewhere between the stop request and the end of its work.
 struct Halting {
-    /// Who had it stopped, for people.
+    /// Reason of the stop, as text for the outcome.
     message: String,
     then: Then,
-    /// From when on a second Halt ends the run with an unknown outcome.
+    /// From this time on, a second Halt ends the run with an unknown outcome.
     over: Instant,
 }
 
-/// The transition after the end of a run that was told to stop.
+/// The transition after the end of a stopped run.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Then {
-    /// To Halted, whatever it came to.
+    /// To Halted, regardless of the result.
     Halt,
-    /// As every end of a run, which has failed where its work is not done.
+    /// The usual transition at the end of a run. The run fails if its work is not done.
     End,
 }
 
@@ -161,7 +163,7 @@ impl Actor {
                     Some(Order::Call(call)) => Happened::Call(call),
                     Some(Order::Close(closed)) => {
                         self.close().await;
-                        // Whoever had it closed may not wait for it.
+                        // The caller of the close may not wait for the reply.
                         let _told = closed.send(());
                         return;
                     }
@@ -177,7 +179,7 @@ impl Actor {
                 Happened::Late => self.late().await,
             }
         }
-        // Nobody is left who could ask: what moves comes to a stand.
+        // All handles are dropped: the machine is stopped.
         self.close().await;
     }
 
@@ -191,7 +193,7 @@ impl Actor {
         if self.is_halting().is_none() {
             return;
         }
-        // The run loop of the component carries what is asked of others meanwhile.
+        // The run loop of the component forwards the requests to other components meanwhile.
         let ended = timeout(PENDING_AT_END, async {
             while self.work.is_some() {
                 match happens(&mut self.work).await {
@@ -238,13 +240,14 @@ impl Actor {
                 untold, "{method} by {by} is refused: {refusal}"
             );
         }
-        // Whoever called may be gone; what was done is done.
+        // The caller may have gone; the call has taken effect.
         let _told = reply.send(answer);
     }
 
     async fn call(&mut self, by: &Owner, method: Method, given: Given) -> Result<u32, Refusal> {
         self.authority.claim(by)?;
-        // Mode before capability: what cannot be suspended is refused as such only where it runs.
+        // The state is checked before the capability: a skill without Suspend refuses it with
+        // BadNotSupported only while it is Running.
         let is_running = self.program.state() == State::Running;
         let is_its_capability = method == Method::Suspend && is_running;
         let is_made_ready = given.readies && self.program.state() == State::Halted;
@@ -318,7 +321,8 @@ impl Actor {
             transition,
             format!("run {} is started by {by}", run.number()),
         );
-        // Only now: a driver that is done at once ends a run that everybody has seen begin.
+        // The work starts after the transition is published, so that observers see the start of a
+        // run before its end, even if the driver finishes immediately.
         let (work, reins) = Work::new(run.number(), parameters);
         let driver = Arc::clone(&self.driver);
         self.work = Some(Running {
@@ -336,7 +340,7 @@ impl Actor {
         Ok(())
     }
 
-    /// The transition to Running, from Halted by way of Ready.
+    /// Performs the transition to Running, from Halted by way of Ready.
     async fn begin(
         &mut self,
         by: &Owner,
@@ -359,7 +363,7 @@ impl Actor {
                 if over {
                     self.give_up(&message);
                 }
-                // Its cancellation is on its way.
+                // The work is being cancelled already.
                 return Ok(());
             }
             match self.stop_work().await {
@@ -368,7 +372,7 @@ impl Actor {
                     return Ok(());
                 }
                 Stop::Refused(why) => return Err(Refusal::new(Code::RequestNotAllowed, why)),
-                // It was done before it could be stopped.
+                // The work finished before it could be stopped.
                 Stop::Done(result) if self.program.state() == State::Running => {
                     self.settle(Ok(result))
                 }
@@ -384,7 +388,7 @@ impl Actor {
 
     async fn reset(&mut self, by: &Owner) -> Result<(), Refusal> {
         if self.program.state() == State::Suspended {
-            // Drops what stands still.
+            // Cancels the suspended work.
             let _stopped = self.stop_work().await;
             if self.work.is_none() {
                 self.end_without_work(format!("reset by {by} while it was suspended"));
@@ -399,7 +403,7 @@ impl Actor {
         self.take(Method::Reset, &format!("reset by {by}"))
     }
 
-    /// The run has taken longer than it may.
+    /// Handles a run that exceeded its time limit.
     async fn late(&mut self) {
         let within = self.work.as_ref().and_then(|work| work.within);
         let within = within.unwrap_or_default();
@@ -424,7 +428,7 @@ impl Actor {
         }
     }
 
-    /// Stops the work and waits until it has ended, a bounded while; after that it is broken off.
+    /// Stops the work and waits up to [`TIME_TO_STOP`] for its end; then the work is aborted.
     async fn stop_work(&mut self) -> Stop {
         self.signal(Signal::Stop);
         let Some(work) = &mut self.work else {
@@ -454,7 +458,8 @@ impl Actor {
         Stop::BrokenOff(how)
     }
 
-    /// Waits a moment for the end of work that is done elsewhere, which is never broken off.
+    /// Waits up to [`TIME_TO_STOP`] for the end of work that is done elsewhere. Such work is never
+    /// aborted.
     async fn stop_elsewhere(&mut self) -> Stop {
         let until = Instant::now() + TIME_TO_STOP;
         loop {
@@ -499,7 +504,7 @@ impl Actor {
         }
     }
 
-    /// Has the run go on until the end of its work is known.
+    /// Keeps the run going until the end of its work is known.
     fn await_end(&mut self, message: String, then: Then) {
         let limit = self.driver.halt_timeout().unwrap_or_default();
         let Some(work) = &mut self.work else {
@@ -520,14 +525,15 @@ impl Actor {
         self.pends(why);
     }
 
-    /// Whether a Halt is on its way, and if so whether the next one ends the run with an unknown outcome.
+    /// Returns `None` if no Halt is in progress, otherwise whether the next Halt ends the run with
+    /// an unknown outcome.
     fn is_halting(&self) -> Option<bool> {
         let work = self.work.as_ref()?;
         let halting = work.halting.as_ref()?;
         Some(work.unknown.is_some() || halting.over <= Instant::now())
     }
 
-    /// Ends a run whose work goes on elsewhere, or may: its outcome is unknown.
+    /// Ends a run whose work goes on elsewhere, or may go on. Its outcome is unknown.
     fn give_up(&mut self, message: &str) {
         let Some(work) = self.work.take() else {
             return;
@@ -544,14 +550,14 @@ impl Actor {
         }
     }
 
-    /// Shows why a run that was told to stop goes on.
+    /// Publishes the reason why a stopped run has not ended.
     fn pends(&mut self, why: String) {
         self.now.step.clone_from(&why);
         self.now.pending = Some(why.clone());
         self.tell(Told::Pending(&why));
     }
 
-    /// The work of a run that was told to stop has ended.
+    /// Handles the end of the work of a run that was asked to stop.
     fn settle_halted(&mut self, halting: Halting, result: Result<Results, String>) {
         let Halting { message, then, .. } = halting;
         match (result, then) {
@@ -577,7 +583,7 @@ impl Actor {
         }
     }
 
-    /// The work has ended by itself.
+    /// Handles the end of work that was not asked to stop.
     fn settle(&mut self, result: Result<Results, String>) {
         self.take_steps();
         let work = self.work.as_mut();
@@ -594,7 +600,7 @@ impl Actor {
                     work.ended = Some(result);
                 }
             }
-            // It was halted, and could not be broken off then.
+            // The run was halted, but its task could not be aborted then.
             (State::Halted | State::Ready, _) => self.work = None,
         }
     }
@@ -634,7 +640,7 @@ impl Actor {
         }
     }
 
-    /// The outcome of a run whose work was stopped; its transition is the caller's.
+    /// Records the outcome of a run whose work was stopped. The caller performs the transition.
     fn end_without_work(&mut self, message: String) {
         let Some(run) = self.program.run() else {
             return;
@@ -661,7 +667,7 @@ impl Actor {
         self.tell(Told::Outcome(&outcome));
     }
 
-    /// The results that the type has, in its order.
+    /// Returns the results that the type declares, in the order of the type.
     fn in_order(&self, results: Results) -> Results {
         let mut ordered = Vec::new();
         for declared in &self.facts.results {
@@ -756,7 +762,7 @@ impl Actor {
         self.tell(Told::Progress);
     }
 
-    /// Steps that were said before the work ended.
+    /// Processes steps that were reported before the work ended.
     fn take_steps(&mut self) {
         let mut lines = Vec::new();
         if let Some(work) = &mut self.work {
@@ -791,21 +797,21 @@ enum Happened {
     Late,
 }
 
-/// How work that was told to stop ended.
+/// The reaction of work to a stop request.
 enum Stop {
-    /// It was done.
+    /// The work finished.
     Done(Results),
-    /// It stopped.
+    /// The work stopped.
     Stopped,
-    /// It did not.
+    /// The work did not stop and was aborted.
     BrokenOff(String),
-    /// It is done elsewhere, and its end is not known yet.
+    /// The work is done elsewhere, and its end is not known yet.
     Pending,
-    /// Whoever does it refuses to cancel it.
+    /// The executor of the work refuses to cancel it.
     Refused(String),
 }
 
-/// The message of a run that was told to stop, with the reason that its work gave.
+/// Returns the message of a stopped run, with the reason that its work gave.
 fn with(message: String, why: &str) -> String {
     match why == Stopped.to_string() {
         true => message,
@@ -813,7 +819,7 @@ fn with(message: String, why: &str) -> String {
     }
 }
 
-/// The next thing that the work does. Pends where there is none.
+/// Returns the next event of the work. Pends while there is no work.
 async fn happens(work: &mut Option<Running>) -> Happened {
     let Some(Running {
         task,
@@ -885,16 +891,16 @@ fn still_at_work(run: RunId) -> Refusal {
     Refusal::new(Code::InvalidState, text)
 }
 
-/// So long the work may take to end after it was stopped.
+/// Time that the work has to end after it was stopped.
 const TIME_TO_STOP: Duration = Duration::from_secs(1);
-/// And so long its future to be dropped after that; what blocks its thread takes longer.
+/// Time that the aborted future has to be dropped; a future that blocks its thread takes longer.
 const TIME_TO_BREAK_OFF: Duration = Duration::from_millis(100);
-/// So many lines of a run are traced, of so many characters at most.
+/// Maximum number of trace lines of a run, and the maximum length of each in characters.
 const MOST_TRACED: usize = 256;
 const LONGEST_TRACED: usize = 240;
-/// Of refused calls of a skill one is told in this time, with the number of those before it that were not.
+/// Interval in which one refused call of a skill is logged, with the number of suppressed messages.
 const TOLD_EVERY: Duration = Duration::from_secs(1);
-/// How long the end of the component waits for work elsewhere that it has cancelled.
+/// Time that a closing component waits for the end of work that it has cancelled elsewhere.
 const PENDING_AT_END: Duration = Duration::from_millis(4_500);
-/// The outcomes of so many runs can be asked for.
+/// Number of runs whose outcomes are kept.
 const MOST_OUTCOMES: usize = 64;

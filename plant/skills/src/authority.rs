@@ -1,4 +1,4 @@
-//! Who may have a component do something, and that it does one thing at a time.
+//! Controls which client may command a component, and that only one skill of it runs at a time.
 
 use std::fmt;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -10,15 +10,15 @@ use tokio::time::Instant;
 
 use crate::refusal::{Code, Refusal};
 
-/// Who writes parameters and calls methods.
+/// A client that writes parameters and calls methods.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub enum Owner {
-    /// A session of the OPC UA server, by the server's number for it. Holds the lease until it closes, or has had nothing done
-    /// for a while.
+    /// A session of the OPC UA server, by the server's number of the session. It holds the lease
+    /// until it closes or is idle for the lease time.
     Session(u32),
-    /// A space that asked for a call. Holds the lease while a run that it began goes on.
+    /// A space that sent a call. It holds the lease during the run that it started.
     Space(u16),
-    /// Something in this program, likewise.
+    /// A caller within this program. It holds the lease during the run that it started.
     Local(&'static str),
 }
 
@@ -32,7 +32,7 @@ impl fmt::Display for Owner {
     }
 }
 
-/// Shared by the skills of one component.
+/// The lease of a component, shared by its skills.
 #[derive(Debug, Clone)]
 pub struct Authority {
     inner: Arc<Mutex<Inner>>,
@@ -42,16 +42,16 @@ pub struct Authority {
 #[derive(Debug)]
 struct Inner {
     lease: Lease<Owner>,
-    /// The skill whose run goes on.
+    /// The name of the running skill.
     running: Option<String>,
-    /// When its holder last had something done, or the last run ended.
+    /// Time of the holder's last action or of the end of the last run.
     used: Instant,
-    /// Whether the holder keeps it without having anything done: it is locked.
+    /// Whether the lease is locked: the holder keeps it while idle.
     locked: bool,
 }
 
 impl Authority {
-    /// Of a component that nobody has used.
+    /// Creates the authority of a component without a holder of the lease.
     #[must_use]
     pub fn new() -> Self {
         let inner = Inner {
@@ -67,10 +67,10 @@ impl Authority {
         }
     }
 
-    /// Takes the lease, or keeps it.
+    /// Acquires or renews the lease.
     ///
     /// # Errors
-    /// BadLocked when it is somebody else's.
+    /// BadLocked if another owner holds the lease.
     pub fn claim(&self, by: &Owner) -> Result<(), Refusal> {
         let mut inner = self.lock();
         inner
@@ -82,17 +82,17 @@ impl Authority {
         Ok(())
     }
 
-    /// Takes the lease, or keeps it, and for as long as it is not given back even where nothing is done.
+    /// Acquires or renews the lease, and keeps it while idle until it is released.
     ///
     /// # Errors
-    /// BadLocked when it is somebody else's.
+    /// BadLocked if another owner holds the lease.
     pub fn lock_for(&self, by: &Owner) -> Result<(), Refusal> {
         self.claim(by)?;
         self.lock().locked = true;
         Ok(())
     }
 
-    /// For how long its holder has had nothing done by now; `None` while a run goes on.
+    /// Returns how long the component has been idle; `None` during a run.
     #[must_use]
     pub fn idle(&self, now: Instant) -> Option<Duration> {
         let inner = self.lock();
@@ -100,13 +100,14 @@ impl Authority {
         inner.running.is_none().then_some(idle)
     }
 
-    /// Gives back the lease of a session that by now had nothing done for so long, unless it is locked. Says whose that was.
+    /// Releases the lease of a session that has been idle for `idle`, unless the lease is locked.
+    /// Returns the previous holder.
     pub fn release_idle(&self, idle: Duration, now: Instant) -> Option<Owner> {
         let mut inner = self.lock();
         let since = now.saturating_duration_since(inner.used);
         let is_idle = inner.running.is_none() && !inner.locked && since >= idle;
         let holder = inner.lease.holder().filter(|holder| {
-            // Others give it back with the end of their run.
+            // Other owners release the lease at the end of their run.
             is_idle && matches!(holder, Owner::Session(_))
         });
         let holder = holder.cloned()?;
@@ -115,10 +116,10 @@ impl Authority {
         Some(holder)
     }
 
-    /// Whether the lease is theirs, or nobody's.
+    /// Checks that the lease is free or held by this owner.
     ///
     /// # Errors
-    /// BadLocked when it is somebody else's.
+    /// BadLocked if another owner holds the lease.
     pub fn allows(&self, by: &Owner) -> Result<(), Refusal> {
         match self.lock().lease.holder() {
             Some(holder) if holder != by => Err(locked(holder)),
@@ -126,7 +127,7 @@ impl Authority {
         }
     }
 
-    /// Gives the lease back, as when a session closes. A run that goes on does so.
+    /// Releases the lease, for example when a session closes. A run in progress continues.
     pub fn release(&self, by: &Owner) {
         let mut inner = self.lock();
         if inner.lease.release(by) {
@@ -135,7 +136,7 @@ impl Authority {
         self.show(&inner);
     }
 
-    /// Gives back the lease of who holds it for a run only, where none goes on.
+    /// Releases the lease of an owner that holds it during a run only, if no run is in progress.
     pub fn settle(&self) {
         let mut inner = self.lock();
         if inner.running.is_some() {
@@ -152,16 +153,16 @@ impl Authority {
         self.show(&inner);
     }
 
-    /// Who holds the lease, and each change of it.
+    /// Returns the holder of the lease and its changes.
     #[must_use]
     pub fn holder(&self) -> watch::Receiver<Option<Owner>> {
         self.holder.subscribe()
     }
 
-    /// A run of the skill begins.
+    /// Records the start of a run of the skill.
     ///
     /// # Errors
-    /// BadInvalidState while one of another skill goes on: a component does one thing at a time.
+    /// BadInvalidState while another skill of the component runs.
     pub(crate) fn begin(&self, skill: &str) -> Result<(), Refusal> {
         let mut inner = self.lock();
         if let Some(running) = &inner.running {
@@ -172,7 +173,7 @@ impl Authority {
         Ok(())
     }
 
-    /// The run of the skill has ended.
+    /// Records the end of the run of the skill.
     pub(crate) fn end(&self, skill: &str) {
         let mut inner = self.lock();
         if inner.running.as_deref() == Some(skill) {
@@ -195,7 +196,7 @@ impl Authority {
     }
 
     fn lock(&self) -> MutexGuard<'_, Inner> {
-        // Each change is whole before the lock is given back.
+        // Each change is complete before the mutex is released, so a poisoned mutex is usable.
         self.inner.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

@@ -1,7 +1,14 @@
-//! The skills of other components: found by their types, run to their end.
+//! Client of the skills of other components: finds skills by their types and runs them.
 //!
-//! Reading order: this, `packed` (structures that are numbers), `find` (which skills a server has), `handle` (one of them), `mirror` (those of a server as if they were
-//! executed here), `detector` (those of all servers), `remote` (a composite of several).
+//! Reading order:
+//!
+//! - this module
+//! - `packed`: structures that hold numbers
+//! - `find`: the skills of a server
+//! - `handle`: one skill
+//! - `mirror`: the skills of a server, presented like local skills
+//! - `detector`: the skills of all servers
+//! - `remote`: a composite of the skills of several servers
 
 mod detector;
 mod find;
@@ -25,16 +32,16 @@ pub use remote::Remote;
 use crate::parameters::TypeName;
 use crate::runs::SkillFault;
 
-/// Who a client is.
+/// Identity and settings of a client.
 #[derive(Debug, Clone)]
 pub struct ClientOptions {
-    /// Its ApplicationUri.
+    /// The ApplicationUri of the client.
     pub application_uri: String,
-    /// Its name for people.
+    /// The ApplicationName of the client.
     pub application_name: String,
-    /// The directory of certificates; without one nothing is secured.
+    /// The directory of certificates; without it, connections are not secured.
     pub pki: Option<PathBuf>,
-    /// How long a server may take to answer.
+    /// Time limit for a response of the server.
     pub within: Duration,
 }
 
@@ -49,10 +56,11 @@ impl Default for ClientOptions {
     }
 }
 
-/// A connection to one server. It comes back by itself; clones are of the same one.
+/// A connection to one server. It reconnects by itself. Clones share the connection.
 ///
-/// The first write or call of a session takes the lease of the component until that session closes; looking takes none.
-/// So whoever only looks and whoever runs something has one of its own, and closes it.
+/// The first write or call of a session acquires the lease of the component until that session
+/// closes. Reading does not acquire the lease. Use separate connections for observing and for
+/// running skills, and close the connection that runs skills when it is done.
 #[derive(Clone)]
 pub struct SkillClient {
     client: Client,
@@ -60,10 +68,10 @@ pub struct SkillClient {
 }
 
 impl SkillClient {
-    /// Connects.
+    /// Connects to the server at `endpoint`.
     ///
     /// # Errors
-    /// [`SkillFault::Lost`] where there is no connection in time.
+    /// [`SkillFault::Lost`] if the connection is not established in time.
     pub async fn connect(endpoint: &str, options: &ClientOptions) -> Result<Self, SkillFault> {
         let config = ClientConfig {
             pki: options.pki.clone(),
@@ -81,7 +89,8 @@ impl SkillClient {
         })
     }
 
-    /// Over a client that somebody else has, and that is not closed with this one.
+    /// Uses an existing client and shares its connection. Dropping the result keeps the connection
+    /// open; [`close`](Self::close) closes it for all clones.
     #[must_use]
     pub fn over(client: &Client, endpoint: &str) -> Self {
         Self {
@@ -90,13 +99,13 @@ impl SkillClient {
         }
     }
 
-    /// Where.
+    /// Returns the URL of the endpoint.
     #[must_use]
     pub fn endpoint(&self) -> &str {
         &self.endpoint
     }
 
-    /// The ApplicationUri of the server; empty while there is no connection.
+    /// Returns the ApplicationUri of the server; empty while disconnected.
     #[must_use]
     pub fn application_uri(&self) -> String {
         match &*self.client.link().borrow() {
@@ -107,39 +116,43 @@ impl SkillClient {
         }
     }
 
-    /// All skills of the server: instances of SkillType and its subtypes, of whatever namespace.
+    /// Returns all skills of the server: instances of SkillType and its subtypes, in any namespace.
+    ///
+    /// A server without SkillType has no skills.
     ///
     /// # Errors
-    /// No answer. A server that does not know SkillType has none.
+    /// No response.
     pub async fn skills(&self) -> Result<Vec<FoundSkill>, SkillFault> {
         self.skills_of(&TypeName::own(crate::model::SKILL_TYPE))
             .await
     }
 
-    /// All Programs of the server, whether or not they are skills.
+    /// Returns all Programs of the server, including Programs that are not skills.
     ///
     /// # Errors
-    /// No answer.
+    /// No response.
     pub async fn programs(&self) -> Result<Vec<FoundSkill>, SkillFault> {
         find::all_programs(&self.client).await
     }
 
-    /// Those of a type and its subtypes. A type of the earlier system ([`alias`](crate::model::alias)) is the one here, and the
-    /// other way round.
+    /// Returns the skills of a type and its subtypes. A type of the earlier system
+    /// ([`alias`](crate::model::alias)) and its equivalent in this crate match each other.
+    ///
+    /// A server without the type has no such skills.
     ///
     /// # Errors
-    /// No answer. A server that does not know the type has none.
+    /// No response.
     pub async fn skills_of(&self, wanted: &TypeName) -> Result<Vec<FoundSkill>, SkillFault> {
         find::skills(&self.client, wanted).await
     }
 
-    /// A skill to run.
+    /// Returns a handle to run a skill.
     #[must_use]
     pub fn handle(&self, found: &FoundSkill) -> SkillHandle {
         SkillHandle::new(self.client.clone(), found.clone())
     }
 
-    /// Ready when there is no connection, with the reason.
+    /// Completes when the connection is lost, with the reason.
     pub async fn lost(&self) -> String {
         let mut link = self.client.link();
         let down = link
@@ -151,7 +164,7 @@ impl SkillClient {
         }
     }
 
-    /// Ends the session, and with it the lease.
+    /// Closes the session, which releases the lease.
     pub async fn close(&self) {
         self.client.close().await;
     }
@@ -334,7 +347,8 @@ mod tests {
             .unwrap_err();
         assert_eq!(status(strange), "BadInvalidArgument");
         assert_eq!(mine.state().await.unwrap().state, State::Ready);
-        // The run goes on when the session that began it is gone, and its outcome is there for the next.
+        // The run continues after its session has closed, and its outcome is available to the next
+        // session.
         mine.start(vec![("Force".to_owned(), 9.0.into())])
             .await
             .unwrap();
@@ -394,7 +408,8 @@ mod tests {
             ),
             ("parallel-gripper", "urn:example:gripper")
         );
-        // Who knows no vacuum gripper finds one, by what it does or by who it is.
+        // A client that does not know the vacuum gripper finds it by its capability or by its
+        // identity.
         let by_vacuum = |one: &Detected| {
             let mut capabilities = one.skill.capabilities.iter();
             capabilities.any(|iri| iri.ends_with(":hold-by-vacuum"))
@@ -525,7 +540,7 @@ mod tests {
             | SkillFault::NotHalted(_)
             | SkillFault::Unexpected(_) => panic!("{fault}"),
         };
-        // What is refused leaves a Halted skill Halted.
+        // A refused call leaves a Halted skill Halted.
         let force = |force: f64| vec![("Force".to_owned(), Value::from(force))];
         let strong = mine.execute(force(1e9), None).await.unwrap_err();
         assert_eq!(code(strong), "BadInvalidArgument");
@@ -614,7 +629,7 @@ mod tests {
                 .unwrap()
                 .unwrap();
         }
-        // Who has one of them for himself is not disturbed, and nothing moves.
+        // A person who has locked one of the components is not disturbed, and nothing moves.
         let other = client(&gripper).await;
         let theirs = other.handle(&other.skills().await.unwrap()[0]);
         assert!(theirs.lock("a person").await.unwrap());

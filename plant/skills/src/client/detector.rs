@@ -1,4 +1,4 @@
-//! Skills wherever they are: found by their types in all servers that somebody tells of.
+//! Finds skills by their types in all known servers.
 
 use std::collections::{BTreeMap, HashMap};
 use std::fmt;
@@ -16,10 +16,11 @@ use crate::parameters::TypeName;
 use crate::runs::SkillFault;
 use crate::skill::lock;
 
-/// Knows the skills of the servers it is told of, and asks each as often as it has to until that has answered. Clones are of
-/// the same one. It holds no connection: who runs a skill opens it.
+/// An index of the skills of known servers. It reads the skills of each server and retries until
+/// the server responds. Clones share the index. It keeps no connection open: a caller that runs a
+/// skill connects with [`open`](Self::open).
 ///
-/// Who looks for servers, by discovery or otherwise, tells it of them with [`seen`](Self::seen) and [`gone`](Self::gone).
+/// The discovery of servers reports them with [`seen`](Self::seen) and [`gone`](Self::gone).
 #[derive(Clone)]
 pub struct Detector {
     shared: Arc<Shared>,
@@ -27,9 +28,9 @@ pub struct Detector {
 
 struct Shared {
     options: ClientOptions,
-    /// What servers have said, by what they are told apart by.
+    /// The skills of the servers, by the identifier of the server.
     servers: Mutex<BTreeMap<String, Told>>,
-    /// Who is being asked.
+    /// Running queries, by the identifier of the server.
     looks: Mutex<HashMap<String, JoinHandle<()>>>,
     changes: watch::Sender<u64>,
 }
@@ -40,12 +41,12 @@ struct Told {
     skills: Vec<FoundSkill>,
 }
 
-/// A skill and the server it is of.
+/// A skill and its server.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Detected {
     /// The ApplicationUri of the server.
     pub application_uri: String,
-    /// Where clients connect.
+    /// The URL of the server.
     pub endpoint: String,
     /// The skill.
     pub skill: FoundSkill,
@@ -59,7 +60,8 @@ impl fmt::Debug for Detector {
 }
 
 impl FoundSkill {
-    /// Whether it is of that type or a subtype, under the name here or that of the earlier system.
+    /// Returns whether the skill is of this type or a subtype. Names of the earlier system match
+    /// their equivalents.
     #[must_use]
     pub fn is_of(&self, wanted: &TypeName) -> bool {
         let known = alias::of(wanted).map(|known| TypeName::own(known.name));
@@ -69,7 +71,8 @@ impl FoundSkill {
 }
 
 impl Detector {
-    /// One that knows nobody yet, and asks servers as this client. Needs a tokio runtime when it is told of one.
+    /// Creates a detector without servers. It queries servers with these client options.
+    /// [`seen`](Self::seen) needs a tokio runtime.
     #[must_use]
     pub fn new(options: ClientOptions) -> Self {
         Self {
@@ -82,8 +85,8 @@ impl Detector {
         }
     }
 
-    /// A server is there, or says something else of itself, or was started anew: it is asked for its skills. `server` is what
-    /// it is told apart by, as its name in discovery.
+    /// Reads the skills of a server that appeared, changed or restarted. `server` identifies the
+    /// server, for example by its name in discovery.
     pub fn seen(&self, server: &str, endpoint: &str) {
         let mut looks = lock(&self.shared.looks);
         if !looks.contains_key(server) && looks.len() >= MOST_SERVERS {
@@ -100,7 +103,7 @@ impl Detector {
         }
     }
 
-    /// A server is gone, and its skills with it.
+    /// Removes a server and its skills.
     pub fn gone(&self, server: &str) {
         if let Some(look) = lock(&self.shared.looks).remove(server) {
             look.abort();
@@ -110,7 +113,7 @@ impl Detector {
         }
     }
 
-    /// All skills that are known, by server and in the order of each.
+    /// Returns all known skills, ordered by server and then as the server lists them.
     #[must_use]
     pub fn all(&self) -> Vec<Detected> {
         let servers = lock(&self.shared.servers);
@@ -125,7 +128,7 @@ impl Detector {
         servers.values().flat_map(of).collect()
     }
 
-    /// Those of a type and its subtypes, whoever made them.
+    /// Returns the skills of a type and its subtypes, from any vendor.
     #[must_use]
     pub fn of_type(&self, wanted: &TypeName) -> Vec<Detected> {
         let mut all = self.all();
@@ -133,10 +136,10 @@ impl Detector {
         all
     }
 
-    /// The first of a type or a subtype that `fits`, waiting for one to come.
+    /// Waits for a skill of a type or a subtype that `fits`, and returns the first.
     ///
     /// # Errors
-    /// [`SkillFault::Unexpected`] when there is none `within` that time.
+    /// [`SkillFault::Unexpected`] if no such skill is found `within` that time.
     pub async fn one(
         &self,
         wanted: &TypeName,
@@ -151,7 +154,7 @@ impl Detector {
                 if let Some(found) = found {
                     return found;
                 }
-                // The sender is our own.
+                // The sender is owned by this detector.
                 let _changed = changes.changed().await;
             }
         };
@@ -162,17 +165,15 @@ impl Detector {
         })
     }
 
-    /// Connects to run it: with a session of its own, which has the lease of its component until it is closed.
-    ///
-    /// # Errors
-    /// [`SkillFault::Lost`].
+    /// Connects to the server of a skill to run it. The new session holds the lease of the
+    /// component until it is closed.
     pub async fn open(&self, of: &Detected) -> Result<(SkillClient, SkillHandle), SkillFault> {
         let client = SkillClient::connect(&of.endpoint, &self.shared.options).await?;
         let handle = client.handle(&of.skill);
         Ok((client, handle))
     }
 
-    /// Counts whenever skills have come or gone.
+    /// Returns a counter that is incremented when the known skills change.
     #[must_use]
     pub fn changes(&self) -> watch::Receiver<u64> {
         self.shared.changes.subscribe()
@@ -194,7 +195,7 @@ impl Drop for Shared {
     }
 }
 
-/// Asks a server until it has answered.
+/// Queries a server until it responds.
 async fn look(shared: Arc<Shared>, server: String, endpoint: String) {
     let mut again = AGAIN;
     let weak = Arc::downgrade(&shared);
@@ -233,5 +234,5 @@ async fn ask(
 
 const AGAIN: Duration = Duration::from_millis(100);
 const AGAIN_AT_MOST: Duration = Duration::from_secs(5);
-/// So many servers are asked; what there are more is not.
+/// Maximum number of servers; further servers are not queried.
 const MOST_SERVERS: usize = 4_096;

@@ -1,4 +1,4 @@
-//! Which skills a server has, by their types.
+//! Finds the skills of a server by their types.
 
 use std::collections::{HashMap, HashSet};
 
@@ -21,26 +21,27 @@ use crate::variant::{builtin_of, from_variant};
 /// A skill of a server.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FoundSkill {
-    /// The name of the component it is of.
+    /// The name of its component.
     pub component: String,
-    /// The number of that in the space, where it says so.
+    /// The number of the component in the space, if the server provides it.
     pub namespace: Option<u16>,
-    /// Its own number there, from 1.
+    /// The number of the skill in the component, from 1.
     pub number: Option<u16>,
-    /// What its component calls it.
+    /// The name of the skill in its component.
     pub name: String,
     /// Its node, as `nsu=<namespace uri>;i=100`.
     pub node: String,
-    /// Its type and all supertypes up to SkillType, nearest first. Those of the earlier system are followed by the types here
-    /// that they are; a Program that is no skill ends with ProgramStateMachineType.
+    /// Its type and all supertypes up to SkillType, nearest first. Types of the earlier system are
+    /// followed by their equivalents of this crate. The types of a Program that is not a skill end
+    /// with ProgramStateMachineType.
     pub types: Vec<FoundType>,
-    /// What a run is told.
+    /// The parameters of a run.
     pub parameters: Vec<FoundParameter>,
-    /// What a run says at its end.
+    /// The results of a run.
     pub results: Vec<FoundParameter>,
     /// The IRIs of the capabilities it provides.
     pub capabilities: Vec<String>,
-    /// What of its parameters and results is not among those, and why.
+    /// Parameters and results that cannot be used, with the reasons.
     pub strange: Vec<String>,
     pub(super) nodes: Nodes,
 }
@@ -61,19 +62,20 @@ pub struct FoundParameter {
     pub name: String,
     /// Type and rank.
     pub shape: Shape,
-    /// What it shows: of a parameter what counts where nothing is written; without it something must be.
+    /// The current value of the variable. For a parameter it is the default; a parameter without a
+    /// value is mandatory.
     pub default: Option<Value>,
     /// Its unit, by the symbol.
     pub unit: Option<String>,
     /// Its node, as `nsu=<namespace uri>;i=1000017`.
     pub node: String,
     pub(super) id: NodeId,
-    /// How the server has its numbers, where they are a structure there.
+    /// The structure that the server uses for the numbers, if any.
     pub(super) packed: Option<Packed>,
 }
 
 impl FoundParameter {
-    /// What its variable shows; `None` where that is no value of it.
+    /// Converts a value of the variable; `None` if it does not match.
     pub(super) fn shown(&self, variant: &Variant) -> Option<Value> {
         match self.packed {
             Some(packed) => packed.unpack(variant),
@@ -82,13 +84,13 @@ impl FoundParameter {
     }
 }
 
-/// The nodes that a skill is run by.
+/// The nodes that are needed to run a skill.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub(super) struct Nodes {
     pub(super) skill: NodeId,
     /// The object of its component; null where there is none.
     pub(super) component: NodeId,
-    /// Children by name, those of CurrentState and FinalResultData by paths.
+    /// Children by name; the children of CurrentState and FinalResultData by path.
     pub(super) children: Vec<(String, NodeId)>,
 }
 
@@ -101,7 +103,8 @@ impl Nodes {
     }
 }
 
-/// All instances of a type and its subtypes, by the names here or those of the earlier system.
+/// Returns all instances of a type and its subtypes, by the names of this crate or of the earlier
+/// system.
 pub(super) async fn skills(
     client: &Client,
     wanted: &TypeName,
@@ -130,7 +133,7 @@ pub(super) async fn skills(
     all(client, &types, &roots).await
 }
 
-/// All Programs, skills or not.
+/// Returns all Programs, including Programs that are not skills.
 pub(super) async fn all_programs(client: &Client) -> Result<Vec<FoundSkill>, SkillFault> {
     let root: NodeId = ObjectTypeId::ProgramStateMachineType.into();
     let types = programs(client).await?.into_iter().map(|of| of.id);
@@ -153,11 +156,11 @@ async fn all(
     stream::iter(reads).buffered(AT_ONCE).try_collect().await
 }
 
-/// What skills have in common, asked for once.
+/// Data that several skills share and that is read once.
 struct Shared {
-    /// By the nodes of types: each with those above it.
+    /// The supertypes of each type, by NodeId.
     chains: HashMap<NodeId, Vec<FoundType>>,
-    /// By the objects above the folders of skills: name, and number in the space.
+    /// Name and number in the space of each component, by the NodeId of its object.
     components: HashMap<NodeId, (String, Option<u16>)>,
 }
 
@@ -190,18 +193,19 @@ impl Shared {
     }
 }
 
-/// The type here that it is, where it has another name.
+/// Returns the type of this crate that is the equivalent of a type of the earlier system.
 fn known_as(name: &TypeName) -> Option<TypeName> {
     alias::of(name).map(|known| TypeName::own(known.name))
 }
 
-/// A type of Programs.
+/// A subtype of ProgramStateMachineType.
 struct ProgramType {
     id: NodeId,
     name: Option<TypeName>,
 }
 
-/// ProgramStateMachineType and what is below it. A server that does not know it has none.
+/// Returns ProgramStateMachineType and its subtypes. The list is empty if the server does not have
+/// the type.
 async fn programs(client: &Client) -> Result<Vec<ProgramType>, SkillFault> {
     let root: NodeId = ObjectTypeId::ProgramStateMachineType.into();
     let class = client
@@ -243,7 +247,7 @@ struct Instance {
     above: Vec<(NodeId, String)>,
 }
 
-/// The objects of those types below Objects, in the order in which the server has them, level by level.
+/// Returns the objects of these types below Objects, level by level, in the order of the server.
 async fn instances(client: &Client, types: &HashSet<NodeId>) -> Result<Vec<Instance>, SkillFault> {
     let mut found = Vec::new();
     let mut seen: HashSet<NodeId> = HashSet::from([ObjectId::Server.into()]);
@@ -285,7 +289,7 @@ async fn instances(client: &Client, types: &HashSet<NodeId>) -> Result<Vec<Insta
     Ok(found)
 }
 
-/// By number where it has one.
+/// Returns the sort key of a node: its numeric identifier, if it has one, then its text.
 fn order(id: &NodeId) -> (u16, u32, String) {
     (
         id.namespace,
@@ -364,12 +368,12 @@ async fn read(
     })
 }
 
-/// The object above the folder Skills, and its name.
+/// Returns the object above the folder Skills, and its name.
 fn component_of(above: &[(NodeId, String)]) -> Option<&(NodeId, String)> {
     above.iter().rev().find(|(_, name)| name != "Skills")
 }
 
-/// What a component says is its number in the space.
+/// Reads the number of a component in the space.
 async fn number_of(client: &Client, component: &NodeId) -> Result<Option<u16>, SkillFault> {
     let Some(index) = client.namespace(NAMESPACE) else {
         return Ok(None);
@@ -377,7 +381,7 @@ async fn number_of(client: &Client, component: &NodeId) -> Result<Option<u16>, S
     let path = [QualifiedName::new(index, "NamespaceNumber")];
     let number = match client.translate(component, &path).await {
         Ok(node) => value(client, &node).await?,
-        // Another maker's component has none.
+        // Components of other vendors do not have this property.
         Err(_) => None,
     };
     Ok(match number {
@@ -404,7 +408,7 @@ async fn chain(
         })
     };
     let mut types: Vec<FoundType> = ids.iter().zip(names).filter_map(found).collect();
-    // One of the earlier system is what the type here is that it is known as.
+    // A type of the earlier system also has the types of its equivalent in this crate.
     let known = types.iter().find_map(|of| alias::of(&of.name));
     types.extend(known.into_iter().flat_map(SkillType::chain).map(own_type));
     Ok(types)
@@ -417,7 +421,7 @@ fn own_type(of: &'static SkillType) -> FoundType {
     }
 }
 
-/// The variables of a group, with what they show.
+/// Reads the variables of a group with their current values.
 async fn group(
     client: &Client,
     node: Option<&NodeId>,
@@ -537,7 +541,7 @@ fn name_of(reference: &ReferenceDescription) -> String {
     reference.browse_name.name.as_ref().to_owned()
 }
 
-/// A node with the URI of its namespace.
+/// Formats a NodeId with the URI of its namespace.
 fn text_of(client: &Client, node: &NodeId) -> String {
     match client.namespaces().get(usize::from(node.namespace)) {
         Some(uri) => format!("nsu={uri};{}", node.identifier),
@@ -545,16 +549,16 @@ fn text_of(client: &Client, node: &NodeId) -> String {
     }
 }
 
-/// The namespace of a server's own nodes: the one with index 1.
+/// Returns the namespace of a server's own nodes, which has index 1.
 fn uri(client: &Client) -> String {
     client.namespaces().into_iter().nth(1).unwrap_or_default()
 }
 
-/// Identifiers of a skill.
+/// Number of identifiers per skill.
 const IDS_PER_SKILL: u32 = 100;
-/// Skills that are read side by side: servers commonly take more requests of a session than that.
+/// Number of skills that are read concurrently; servers commonly accept more requests per session.
 const AT_ONCE: usize = 8;
-/// So many levels below Objects skills are looked for.
+/// Maximum depth of the search for skills below Objects.
 const DEEPEST: usize = 8;
-/// And among so many objects.
+/// Maximum number of objects that are searched.
 const MOST_OBJECTS: usize = 4_096;

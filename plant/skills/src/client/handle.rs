@@ -1,4 +1,4 @@
-//! One skill of another component.
+//! Handle of one skill of another component.
 
 use std::time::Duration;
 
@@ -15,23 +15,24 @@ use crate::shown::Outcome;
 use crate::value::Value;
 use crate::variant::{from_pairs, from_variant, to_pairs, to_variant};
 
-/// A skill of another component, to be run. Clones are of the same one.
+/// A skill of another component that can be run. Clones share the connection.
 #[derive(Clone)]
 pub struct SkillHandle {
     client: Client,
     found: FoundSkill,
 }
 
-/// How a skill is now.
+/// The current state of a skill of another component.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RemoteState {
-    /// Its state.
+    /// The state of its state machine.
     pub state: State,
-    /// Its newest run; 0 before the first, or where it has no numbers.
+    /// The number of the newest run; 0 before the first run, or if the skill does not number its
+    /// runs.
     pub run: u32,
-    /// How much of that is done, 0 to 1.
+    /// The progress of that run, 0 to 1.
     pub progress: f32,
-    /// What that is about.
+    /// The current step of that run.
     pub step: String,
 }
 
@@ -40,21 +41,21 @@ impl SkillHandle {
         Self { client, found }
     }
 
-    /// What it is.
+    /// Returns the description of the skill.
     #[must_use]
     pub fn found(&self) -> &FoundSkill {
         &self.found
     }
 
-    /// How it is now.
+    /// Reads the current state.
     ///
     /// # Errors
-    /// No answer, or it is no Program.
+    /// No response, or the object is not a Program.
     pub async fn state(&self) -> Result<RemoteState, SkillFault> {
         Ok(self.seen().await?.0)
     }
 
-    /// How it is, and when it came to that state by the clock of its server.
+    /// Reads the current state and the time at which it was entered, by the clock of the server.
     pub(super) async fn seen(&self) -> Result<(RemoteState, Option<i64>), SkillFault> {
         let [id, name, kind] = STATE_PATHS;
         let paths = [id, name, kind, "RunId", "Progress", "SkillStep"];
@@ -77,12 +78,12 @@ impl SkillHandle {
         Ok((state, since))
     }
 
-    /// Whether its runs have numbers.
+    /// Returns whether the skill numbers its runs.
     pub(super) fn numbers_runs(&self) -> bool {
         self.found.nodes.get("RunId").is_some()
     }
 
-    /// The number of its newest run; 0 where there is none, or no answer.
+    /// Reads the number of the newest run; 0 if there is no run or no response.
     pub(super) async fn run_id(&self) -> u32 {
         match self.read(["RunId"]).await {
             Ok([run]) => run.as_ref().map_or(0, number),
@@ -90,7 +91,7 @@ impl SkillHandle {
         }
     }
 
-    /// What its parameters show; nothing without an answer.
+    /// Reads the current values of the parameters; empty if there is no response.
     pub(super) async fn parameters(&self) -> Vec<(String, Value)> {
         let declared = &self.found.parameters;
         let ids: Vec<NodeId> = declared.iter().map(|of| of.id.clone()).collect();
@@ -101,11 +102,11 @@ impl SkillHandle {
         shown.collect()
     }
 
-    /// Takes the lease of its component before anything is done, and has it until the session closes (OPC 10000-100, 7). Says
-    /// whether the component knows locks; without them the first call takes the lease.
+    /// Locks the component until the session closes (OPC 10000-100, 7). Returns whether the
+    /// component supports locking; otherwise the first call acquires the lease.
     ///
     /// # Errors
-    /// BadLocked when it is somebody else's, or no answer.
+    /// BadLocked if another owner holds the lease, or no response.
     pub async fn lock(&self, what_for: &str) -> Result<bool, SkillFault> {
         let Some(index) = self.client.namespace(DEVICES) else {
             return Ok(false);
@@ -135,7 +136,7 @@ impl SkillHandle {
     /// Calls a method.
     ///
     /// # Errors
-    /// A refusal, or no answer.
+    /// A refusal, or no response.
     pub async fn call(&self, method: Method) -> Result<(), SkillFault> {
         let node = self.found.nodes.get(method.name());
         let node = node.ok_or_else(|| self.unexpected(&format!("it has no {method}")))?;
@@ -149,10 +150,12 @@ impl SkillHandle {
         }
     }
 
-    /// Writes parameters and starts a run: gives its number, 0 where the skill has none. What is not written is as before.
+    /// Writes parameters and starts a run. Returns the number of the run, 0 if the skill does not
+    /// number its runs. Parameters that are not given keep their values.
     ///
     /// # Errors
-    /// A refusal, or no answer. With [`SkillFault::Lost`] nobody knows whether it has begun.
+    /// A refusal, or no response. After [`SkillFault::Lost`] it is unknown whether the run has
+    /// started.
     pub async fn start(&self, parameters: Vec<(String, Value)>) -> Result<u32, SkillFault> {
         self.write(parameters).await?;
         self.call(Method::Start).await?;
@@ -160,11 +163,13 @@ impl SkillHandle {
         Ok(run.as_ref().map_or(0, number))
     }
 
-    /// Begins a run in one call, a Halted skill being made ready first: by Execute where the skill has it, else step by step.
-    /// Gives the number of the run, 0 where the skill has none.
+    /// Starts a run in one call; a Halted skill is reset first. Uses Execute if the skill has it,
+    /// otherwise Reset, writes and Start. Returns the number of the run, 0 if the skill does not
+    /// number its runs.
     ///
     /// # Errors
-    /// A refusal, or no answer. With [`SkillFault::Lost`] nobody knows whether it has begun.
+    /// A refusal, or no response. After [`SkillFault::Lost`] it is unknown whether the run has
+    /// started.
     pub async fn execute(
         &self,
         parameters: Vec<(String, Value)>,
@@ -190,7 +195,7 @@ impl SkillHandle {
     async fn step_by_step(&self, parameters: Vec<(String, Value)>) -> Result<u32, SkillFault> {
         if self.state().await?.state == State::Halted {
             let reset = self.call(Method::Reset).await;
-            // One that was given up before may have come first.
+            // The Reset of a caller that gave up earlier may have taken effect first.
             if reset.is_err() && self.state().await?.state != State::Ready {
                 reset?;
             }
@@ -198,10 +203,11 @@ impl SkillHandle {
         self.start(parameters).await
     }
 
-    /// How a run ended, whoever began it; `None` while it goes on. Run 0 is the newest.
+    /// Returns the outcome of a run of any client; `None` while the run is in progress. Run 0 is
+    /// the newest run.
     ///
     /// # Errors
-    /// BadNotFound for one of which nothing is known any more, no answer, or a skill without ReadOutcome.
+    /// BadNotFound for an unknown run, no response, or a skill without ReadOutcome.
     pub async fn outcome_of(&self, run: u32) -> Result<Option<Outcome>, SkillFault> {
         let node = self.found.nodes.get("ReadOutcome");
         let node = node.ok_or_else(|| self.unexpected("it has no ReadOutcome"))?;
@@ -227,11 +233,12 @@ impl SkillHandle {
         }))
     }
 
-    /// Waits for the end of a run that was begun before, also by another session; while its component is away, until that is
-    /// back. A component that was started anew knows nothing of it.
+    /// Waits for the end of a run, which another session may have started. While the component is
+    /// disconnected, it waits for the reconnection. A restarted component does not know runs from
+    /// before the restart.
     ///
     /// # Errors
-    /// As [`outcome_of`](Self::outcome_of), and [`SkillFault::TimedOut`]; the run is left alone.
+    /// As [`outcome_of`](Self::outcome_of), and [`SkillFault::TimedOut`]; the run is not stopped.
     pub async fn wait(&self, run: u32, within: Duration) -> Result<Outcome, SkillFault> {
         let ended = async {
             let mut look = tokio::time::interval(PUBLISHING);
@@ -241,7 +248,7 @@ impl SkillHandle {
                 match self.outcome_of(run).await {
                     Ok(Some(outcome)) => return Ok(outcome),
                     Ok(None) => {}
-                    // It comes back, or it does not.
+                    // The component may reconnect within the time limit.
                     Err(SkillFault::Lost(why)) => {
                         if self.client.up(within).await.is_err() {
                             return Err(SkillFault::Lost(why));
@@ -257,7 +264,7 @@ impl SkillHandle {
         }
     }
 
-    /// A parameter by its name, and the value as it has it.
+    /// Returns the declared parameter of this name, and the value in its type.
     fn taken(&self, name: &str, value: Value) -> Result<(&FoundParameter, Value), SkillFault> {
         let wrong = |status: &str, text: String| SkillFault::Refused {
             status: status.to_owned(),
@@ -335,7 +342,7 @@ impl SkillHandle {
                 why = &mut gone => return Err(SkillFault::Lost(why)),
             };
             if matches!(state, State::Ready | State::Halted) {
-                // What a subscription tells may be older than the run.
+                // A notification may be older than the run.
                 let now = self.state().await?.state;
                 if matches!(now, State::Ready | State::Halted) {
                     return Ok(now);
@@ -364,7 +371,7 @@ impl SkillHandle {
         let values = self.client.read(&ids).await.map_err(|error| lost(&error))?;
         let succeeded = match succeeded {
             Some(Variant::Boolean(succeeded)) => succeeded,
-            // Where nothing says so, it has failed if a Reset must come first.
+            // Without a value, the run counts as failed if the skill needs a Reset.
             _ => state == State::Ready,
         };
         let results = self.found.results.iter().zip(values);
@@ -384,7 +391,7 @@ impl SkillHandle {
         })
     }
 
-    /// What variables show; `None` for those that are not there.
+    /// Reads the values of variables; `None` for variables that do not exist.
     async fn read<const N: usize>(
         &self,
         paths: [&str; N],
@@ -392,7 +399,7 @@ impl SkillHandle {
         Ok(self.read_all(paths).await?.map(|value| value.value))
     }
 
-    /// The same with their times; without any where they are not there.
+    /// Reads the values of variables with their timestamps; empty for variables that do not exist.
     async fn read_all<const N: usize>(
         &self,
         paths: [&str; N],
@@ -450,14 +457,14 @@ impl Runs for SkillHandle {
             if matches!(self.state().await?.state, State::Ready | State::Halted) {
                 return Ok(());
             }
-            // What it has its work done by has not ended.
+            // The work of the skill has not ended.
             let ended = tokio::time::timeout(HALTS_WITHIN, self.ended()).await;
             return match ended {
                 Ok(ended) => ended.map(drop),
                 Err(_) => Err(goes_on(&self.name())),
             };
         };
-        // It may be Halted already, which is all that is wanted.
+        // The skill may be Halted already, which is the wanted state.
         match &error {
             CallError::Refused { .. } if self.state().await?.state == State::Halted => Ok(()),
             CallError::Client(ClientError::Lost(_))
@@ -482,7 +489,7 @@ fn why(link: Option<&Link>) -> String {
     }
 }
 
-/// The state that a variable says: by the node of namespace 0, by its name or by its number.
+/// Returns the state that a variable holds: as a NodeId of namespace 0, as a name or as a number.
 pub(super) fn state_in(said: &Variant) -> Option<State> {
     let mut all = State::ALL.into_iter();
     if let Variant::NodeId(id) = said {
@@ -516,11 +523,11 @@ fn text(value: &Variant) -> String {
         .to_owned()
 }
 
-/// What says the state of a skill, best first.
+/// The variables that hold the state of a skill, in order of preference.
 pub(super) const STATE_PATHS: [&str; 3] =
     ["CurrentState/Id", "CurrentState", "CurrentState/Number"];
-/// How often a server tells of changes.
+/// Publishing interval of the subscription.
 const PUBLISHING: Duration = Duration::from_millis(20);
-/// How often it is asked, in case it does not.
+/// Interval in which the state is polled, in case the server does not notify changes.
 const LOOK: Duration = Duration::from_millis(500);
 const QUEUE: usize = 16;

@@ -1,7 +1,8 @@
-//! The skills of another server as they are seen from outside: what happens to each is told as of one that is executed here.
+//! Mirrors of the skills of another server: reports their events like events of local skills.
 //!
-//! A server that knows Programs of OPC 10000-10 and nothing more says in what state each is. The transitions, the runs and their
-//! ends follow from that: where it has numbers for runs these are told, else they are counted here.
+//! A server that implements only the Programs of OPC 10000-10 publishes the state of each. The
+//! transitions, the runs and their ends are derived from the state. Run numbers are the server's if
+//! it has them; otherwise they are counted here.
 
 mod seen;
 
@@ -27,7 +28,7 @@ use crate::shown::{Observer, Outcome, Shown};
 use crate::skill::{Facts, lock};
 use crate::value::Value;
 
-/// A skill of another server. Clones are of the same one.
+/// A skill of another server. Clones share the skill.
 #[derive(Clone)]
 pub struct Mirror {
     facts: Arc<Facts>,
@@ -43,7 +44,7 @@ impl fmt::Debug for Mirror {
     }
 }
 
-/// A call on its way to the server.
+/// A call that waits to be sent to the server.
 #[derive(Debug)]
 struct Order {
     method: Method,
@@ -51,7 +52,7 @@ struct Order {
     reply: oneshot::Sender<Result<u32, SkillFault>>,
 }
 
-/// The skills of one server for as long as there is one connection; dropped, nothing is told of them any more.
+/// The skills of one server for the lifetime of one connection. Dropping it ends the reports.
 #[derive(Debug)]
 pub struct Mirrors {
     skills: Vec<Mirror>,
@@ -59,7 +60,8 @@ pub struct Mirrors {
     _tasks: JoinSet<()>,
 }
 
-/// The Programs of a server, skills or not, that can be watched over the connection that they were found by.
+/// The Programs of a server, including Programs that are not skills, with the connection over which
+/// they were found.
 #[derive(Clone)]
 pub struct Watchable {
     client: SkillClient,
@@ -73,10 +75,10 @@ impl fmt::Debug for Watchable {
 }
 
 impl Watchable {
-    /// All that the server has.
+    /// Reads all Programs of the server.
     ///
     /// # Errors
-    /// No answer.
+    /// No response.
     pub async fn of(client: SkillClient) -> Result<Self, SkillFault> {
         let found = client.programs().await?;
         let states = states(&client, &found).await?;
@@ -84,25 +86,25 @@ impl Watchable {
         Ok(Self { client, found })
     }
 
-    /// What was found.
+    /// Returns the Programs that were found.
     pub fn found(&self) -> impl Iterator<Item = &FoundSkill> {
         self.found.iter().map(|(found, _)| found)
     }
 
-    /// What of a skill cannot be used, and why, for people; by its place.
+    /// Returns the reasons why the skill at index `at` cannot be used fully, as text for people.
     #[must_use]
     pub fn faults(&self, at: usize) -> Vec<String> {
         let found = self.found.get(at);
         found.map_or_else(Vec::new, |(found, state)| found.faults(state.is_some()))
     }
 
-    /// Whether it can be told in what state a skill is; by its place.
+    /// Returns whether the state of the skill at index `at` can be observed.
     #[must_use]
     pub fn is_watchable(&self, at: usize) -> bool {
         self.found.get(at).is_some_and(|(_, state)| state.is_some())
     }
 
-    /// Whether another look has found the same.
+    /// Returns whether another query found the same skills.
     #[must_use]
     pub fn is_as(&self, other: &Self) -> bool {
         let same = |((one, state), (other, others)): (&Found, &Found)| {
@@ -115,8 +117,9 @@ impl Watchable {
 type Found = (FoundSkill, Option<NodeId>);
 
 impl Mirrors {
-    /// Watches skills over the connection that they were found by. `observers` are asked for those of each, by its place.
-    /// Runs of skills that do not number them count from `first_run`. Needs a tokio runtime.
+    /// Observes skills over the connection over which they were found. `observers` provides the
+    /// observers of each skill, by its index. Runs of skills that do not number them are counted
+    /// from `first_run`. Needs a tokio runtime.
     #[must_use]
     pub fn begin(
         of: &Watchable,
@@ -169,7 +172,7 @@ impl Mirrors {
                     && let Some((part, way)) = ways.get(watch)
                     && way.send((*part, value)).await.is_err()
                 {
-                    // It has been lost meanwhile.
+                    // The mirror has been lost meanwhile.
                     continue;
                 }
             }
@@ -181,48 +184,49 @@ impl Mirrors {
         }
     }
 
-    /// In the order in which they were given.
+    /// Returns the skills in the order of the [`Watchable`].
     #[must_use]
     pub fn skills(&self) -> &[Mirror] {
         &self.skills
     }
 
-    /// The connection is lost: whoever hears of runs is told, and no call is taken any more.
+    /// Reports the loss of the connection to the observers; further calls are refused.
     pub fn lose(&self, why: &str) {
         self.gone.send_replace(Some(why.to_owned()));
     }
 }
 
 impl Mirror {
-    /// What it is.
+    /// Returns the description of the skill.
     #[must_use]
     pub fn facts(&self) -> &Arc<Facts> {
         &self.facts
     }
 
-    /// The methods that it has.
+    /// Returns the methods of the skill.
     #[must_use]
     pub fn methods(&self) -> &[Method] {
         &self.methods
     }
 
-    /// How it is now.
+    /// Returns the current state of the skill.
     #[must_use]
     pub fn shown(&self) -> Arc<Shown> {
         self.shown.borrow().clone()
     }
 
-    /// How a run ended, of the newest ones that were seen.
+    /// Returns the outcome of a run, if it is one of the newest observed runs.
     #[must_use]
     pub fn outcome(&self, run: u32) -> Option<Arc<Outcome>> {
         let outcomes = lock(&self.outcomes);
         outcomes.iter().find(|one| one.run == run).cloned()
     }
 
-    /// Calls a method; Start is given these parameters first. Gives the number of the newest run.
+    /// Calls a method; the parameters are written before Start. Returns the number of the newest
+    /// run.
     ///
     /// # Errors
-    /// What the state machine of OPC 10000-10 or the server refuses, or that the server is lost.
+    /// A refusal by the state machine of OPC 10000-10 or by the server, or the loss of the server.
     pub async fn call(
         &self,
         method: Method,
@@ -253,7 +257,7 @@ fn is_lost() -> SkillFault {
 }
 
 impl FoundSkill {
-    /// What it is, as far as its server says.
+    /// Returns the description of the skill, as far as its server provides it.
     #[must_use]
     pub fn facts(&self) -> Facts {
         let declared = |of: &[FoundParameter]| of.iter().map(parameter).collect();
@@ -268,14 +272,14 @@ impl FoundSkill {
         }
     }
 
-    /// The methods that it has, of those of a Program.
+    /// Returns the methods of a Program that the skill has.
     #[must_use]
     pub fn methods(&self) -> Vec<Method> {
         let has = |method: &Method| self.nodes.get(method.name()).is_some();
         Method::ALL.into_iter().filter(has).collect()
     }
 
-    /// What of it cannot be used, and why.
+    /// Returns the reasons why the skill cannot be used fully.
     fn faults(&self, tells_state: bool) -> Vec<String> {
         let mut faults = self.strange.clone();
         if !tells_state {
@@ -293,7 +297,7 @@ impl FoundSkill {
     }
 }
 
-/// The variable of each skill by which its state is known, where there is one.
+/// Returns the variable that holds the state of each skill, if there is one.
 async fn states(
     client: &SkillClient,
     found: &[FoundSkill],
@@ -339,7 +343,8 @@ fn parameter(of: &FoundParameter) -> Parameter {
     }
 }
 
-/// The transitions that lead from one state to another, the fewest there are: what lies between them was not seen.
+/// Returns the shortest sequence of transitions from one state to another, for states that were not
+/// observed in between.
 fn way(from: State, to: State) -> Vec<&'static Transition> {
     let mut ways: VecDeque<(State, Vec<&'static Transition>)> =
         VecDeque::from([(from, Vec::new())]);
@@ -359,7 +364,7 @@ fn way(from: State, to: State) -> Vec<&'static Transition> {
     Vec::new()
 }
 
-/// Where a method leads from a state, if it leads anywhere.
+/// Returns the state to which a method leads from a state, if the method is possible there.
 fn leads_to(from: State, method: Method) -> Option<State> {
     let mut transitions = TRANSITIONS.iter();
     let found = transitions.find(|one| {
@@ -372,15 +377,15 @@ fn leads_to(from: State, method: Method) -> Option<State> {
     found.map(|one| one.to)
 }
 
-/// Without these nobody runs a skill.
+/// Methods without which a skill cannot be run.
 const NEEDED: [&str; 3] = ["Start", "Halt", "Reset"];
-/// How often a server looks and tells of changes.
+/// Sampling and publishing interval.
 const PUBLISHING: Duration = Duration::from_millis(20);
-/// Changes that it keeps until it tells them.
+/// Queue size of a monitored item.
 const QUEUE: u32 = 64;
-/// So many calls of one skill may wait.
+/// Maximum number of waiting calls of a skill.
 const MOST_ORDERS: usize = 16;
-/// And so many changes of it.
+/// Maximum number of waiting notifications of a skill.
 const MOST_NOTICES: usize = 256;
 
 #[cfg(test)]

@@ -1,5 +1,6 @@
-//! Structures of OPC UA that are a few numbers, as these: the frame that a robot of the earlier system is told is the six
-//! numbers of a position here.
+//! Conversion of OPC UA structures that hold a few numbers into arrays of numbers. A frame
+//! (ThreeDFrame) of a robot of the earlier system corresponds to the six numbers of a position in
+//! this crate.
 
 use plant_opcua::types::{
     Array, DataTypeId, ExtensionObject, NodeId, Range, ThreeDCartesianCoordinates, ThreeDFrame,
@@ -8,11 +9,11 @@ use plant_opcua::types::{
 
 use crate::value::{Builtin, Value};
 
-/// How the numbers of a variable are packed.
+/// The structure that holds the numbers of a variable.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Packed {
     what: What,
-    /// Whether it is an array of these structures.
+    /// Whether the variable is an array of these structures.
     many: bool,
 }
 
@@ -32,7 +33,7 @@ enum What {
 }
 
 impl Packed {
-    /// Of a variable of that data type.
+    /// Returns the structure of a variable of this data type, if it is supported.
     pub(super) fn of(data_type: &NodeId, many: bool) -> Option<Self> {
         let known = [
             (DataTypeId::ThreeDVector, What::Vector),
@@ -46,7 +47,7 @@ impl Packed {
         Some(Self { what, many })
     }
 
-    /// How many numbers it always is; `None` of an array.
+    /// Returns the number of numbers; `None` for an array.
     pub(super) const fn length(self) -> Option<u32> {
         if self.many {
             return None;
@@ -58,7 +59,7 @@ impl Packed {
         })
     }
 
-    /// The numbers of what a variable shows; `None` where it shows something else.
+    /// Returns the numbers of a value; `None` if the value has another type.
     pub(super) fn unpack(self, shown: &Variant) -> Option<Value> {
         let mut numbers = Vec::new();
         let mut take = |one: &Variant| {
@@ -76,10 +77,10 @@ impl Packed {
         Some(Value::Array(Builtin::Double, numbers.collect()))
     }
 
-    /// What a variable is to be told.
+    /// Returns the value to write to the variable.
     ///
     /// # Errors
-    /// How many numbers it wants, for people.
+    /// The expected number of numbers, as text for people.
     pub(super) fn pack(self, value: &Value) -> Result<Variant, String> {
         let numbers = value.as_f64s().unwrap_or_default();
         let each = self.what.names().len();
@@ -150,7 +151,7 @@ impl What {
         })
     }
 
-    /// Of as many numbers as it has names.
+    /// Creates the structure from its numbers.
     fn object(self, numbers: &[f64]) -> ExtensionObject {
         let at = |place: usize| numbers.get(place).copied().unwrap_or_default();
         let [x, y, z] = [at(0), at(1), at(2)];

@@ -1,4 +1,4 @@
-//! Pick and place by the skills of two servers.
+//! Pick and place with the skills of two servers.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -13,8 +13,8 @@ use crate::model::SKILL_TYPE;
 use crate::parameters::{Parameters, TypeName};
 use crate::runs::COMPOSITE_HALT_TIMEOUT;
 
-/// The driver of PickAndPlaceSkillType that runs the skills of a robot and a gripper, each a server of its own. It has their
-/// leases for as long as a run takes.
+/// The driver of PickAndPlaceSkillType that runs the skills of a robot and a gripper on separate
+/// servers. It holds their leases during a run.
 #[derive(Debug, Clone)]
 pub struct Remote {
     partners: Partners,
@@ -22,7 +22,8 @@ pub struct Remote {
 }
 
 impl Remote {
-    /// One of these two; those that are called by their ApplicationUri are found by the detector.
+    /// Creates a driver for these partners. The detector finds partners that are named by their
+    /// ApplicationUri.
     #[must_use]
     pub fn new(partners: Partners, detector: Option<Detector>) -> Self {
         Self { partners, detector }
@@ -31,7 +32,7 @@ impl Remote {
 
 #[async_trait]
 impl Driver for Remote {
-    /// Halt waits for the skills that the work is done with.
+    /// Halt waits for the end of the skills that do the work.
     fn halt_timeout(&self) -> Option<Duration> {
         Some(COMPOSITE_HALT_TIMEOUT)
     }
@@ -55,7 +56,7 @@ impl Driver for Remote {
         let gripper_at = self.place(&self.partners.gripper, &work).await?;
         let robot = connect(&robot_at).await?;
         if robot_at == gripper_at {
-            // A component has one lease, and so one session for both.
+            // A component has one lease, so one session is used for both.
             let done = self.with(&robot, &robot, &work).await;
             robot.close().await;
             return done;
@@ -74,7 +75,7 @@ impl Driver for Remote {
 }
 
 impl Remote {
-    /// The endpoint of a partner, once it is there.
+    /// Waits for a partner and returns its endpoint.
     async fn place(&self, partner: &Partner, work: &Work) -> Result<String, String> {
         match (partner, &self.detector) {
             (Partner::At(endpoint), _) => Ok(endpoint.clone()),
@@ -102,7 +103,8 @@ impl Remote {
             one(robot, "PtpMoveSkillType").await?,
             one(gripper, "GraspSkillType").await?,
         );
-        // Both or nothing: whoever waits for one of them at work does not take the other away.
+        // Both components are locked before the work starts, so that a waiting client cannot
+        // acquire one of them during the work.
         let apart = robot.endpoint() != gripper.endpoint();
         for first in [Some(&ptp), apart.then_some(&grasp)].into_iter().flatten() {
             let locked = first.lock("pick and place").await;
@@ -129,7 +131,7 @@ async fn connect(endpoint: &str) -> Result<SkillClient, String> {
     connected.map_err(|fault| format!("{endpoint}: {fault}"))
 }
 
-/// The first skill of a type.
+/// Returns the first skill of a type.
 async fn one(client: &SkillClient, of: &str) -> Result<SkillHandle, String> {
     let found = client
         .skills_of(&TypeName::own(of))
@@ -141,5 +143,5 @@ async fn one(client: &SkillClient, of: &str) -> Result<SkillHandle, String> {
     Ok(client.handle(first))
 }
 
-/// How long a partner that is not there is waited for.
+/// Time limit to find a partner.
 const FOUND_WITHIN: Duration = Duration::from_secs(10);

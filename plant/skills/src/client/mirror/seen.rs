@@ -1,4 +1,4 @@
-//! One skill of another server: what is seen of it, and what is called there.
+//! The task of one skill of another server: processes its notifications and calls.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex};
@@ -19,7 +19,7 @@ use crate::skill::lock;
 use crate::value::Value;
 use crate::variant::from_variant;
 
-/// What a variable says of a skill.
+/// The aspect of a skill that a variable holds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Part {
     State,
@@ -34,11 +34,12 @@ pub(super) struct Seen {
     shown: watch::Sender<Arc<Shown>>,
     now: Shown,
     next_run: u32,
-    /// When the server came to the state that is shown, by its own clock: what it says of before is old.
+    /// Time at which the server entered the shown state, by its clock. Older notifications are
+    /// ignored.
     since: Option<i64>,
-    /// A run was begun from here, and the server has not shown yet that it goes on.
+    /// Whether a run was started from here that the server does not show yet.
     begun: bool,
-    /// When it is looked at next while it is at work.
+    /// Time of the next poll during a run.
     look_at: Instant,
 }
 
@@ -84,7 +85,7 @@ impl Seen {
         (seen, watched)
     }
 
-    /// Tells what happens until the connection is gone.
+    /// Reports events until the connection is lost.
     pub(super) async fn run(
         mut self,
         mut notices: mpsc::Receiver<(Part, DataValue)>,
@@ -119,7 +120,7 @@ impl Seen {
         }
     }
 
-    /// How it is before anything is seen to happen.
+    /// Reads the initial state.
     async fn first(&mut self) {
         loop {
             match self.handle.seen().await {
@@ -129,7 +130,7 @@ impl Seen {
                     self.now.progress = state.progress;
                     self.now.step = state.step;
                     self.now.run = match (state.run, is_work(self.now.state)) {
-                        // One goes on that has no number.
+                        // A run without a number is in progress.
                         (0, true) => self.number(),
                         (run, _) => run,
                     };
@@ -160,7 +161,7 @@ impl Seen {
             Part::Progress => {
                 let progress = from_variant(said).and_then(|value| value.as_f64());
                 if let Some(progress) = progress.filter(|progress| !progress.is_nan()) {
-                    // Between 0 and 1, for which there is room.
+                    // Between 0 and 1, so the conversion is safe.
                     #[expect(clippy::cast_possible_truncation, reason = "a share of 1")]
                     let progress = progress.clamp(0.0, 1.0) as f32;
                     self.now.progress = progress;
@@ -194,7 +195,7 @@ impl Seen {
             return;
         }
         if self.begun && at.is_none() {
-            // It may be of before the run, and be told only now.
+            // The value may be from before the run and arrive late.
             self.look().await;
             return;
         }
@@ -211,10 +212,10 @@ impl Seen {
         } = order;
         let called = self.call(method, parameters).await;
         let begun = called.is_ok() && is_work(self.now.state);
-        // Whoever asked may wait no longer.
+        // The caller may have stopped waiting.
         let _told = reply.send(called);
         if begun {
-            // Who looks only when it is answered is told too.
+            // Observers that read the state after the reply are notified too.
             self.tell(Told::Step);
         }
     }
@@ -224,7 +225,8 @@ impl Seen {
         method: Method,
         parameters: Vec<(String, Value)>,
     ) -> Result<u32, SkillFault> {
-        // What the server takes that it should not, such as a Start of what is suspended, is not asked for.
+        // The state machine is checked here, because some servers accept invalid calls, for example
+        // Start of a suspended skill.
         self.look().await;
         let from = self.now.state;
         let Some(to) = leads_to(from, method) else {
@@ -236,7 +238,7 @@ impl Seen {
         if method == Method::Start {
             self.handle.start(parameters).await?;
             self.look_at = Instant::now() + LOOK;
-            // The server shows it before or after.
+            // The server may show the state before or after its response.
             self.go(to).await;
             match self.handle.seen().await {
                 Ok((state, at)) if at > self.since || is_work(state.state) => {
@@ -257,7 +259,7 @@ impl Seen {
         Ok(self.now.run)
     }
 
-    /// Tells all that lies between the state that is shown and this one.
+    /// Reports all transitions between the shown state and this state.
     async fn go(&mut self, to: State) {
         for transition in way(self.now.state, to) {
             self.pass(transition).await;
@@ -303,7 +305,7 @@ impl Seen {
         self.tell(Told::Transition(&happened));
     }
 
-    /// How the run ended, that the server has left for this state.
+    /// Reads the outcome of the run that the server left for this state.
     async fn ended(&self, state: State) -> Outcome {
         let run = self.now.run;
         let numbered = if self.handle.numbers_runs() { run } else { 0 };
@@ -322,7 +324,7 @@ impl Seen {
         outcome
     }
 
-    /// The number of a run that the server gives none.
+    /// Returns the number of a run that the server does not number.
     fn number(&mut self) -> u32 {
         let number = self.next_run;
         self.next_run = number.wrapping_add(1).max(1);
@@ -349,7 +351,7 @@ fn clock() -> SystemTime {
     SystemTime::now()
 }
 
-/// How often a skill at work is looked at, in case its server does not tell.
+/// Interval in which a running skill is polled, in case its server does not notify changes.
 const LOOK: Duration = Duration::from_secs(1);
-/// Outcomes that are kept of one skill.
+/// Number of outcomes that are kept of a skill.
 const MOST_OUTCOMES: usize = 64;
