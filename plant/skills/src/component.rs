@@ -1,4 +1,4 @@
-//! A component: what it is called, where it is, and which skills it has.
+//! Describes a component: its name, its address and its skills.
 
 mod device;
 mod document;
@@ -20,78 +20,79 @@ use crate::driver::Driver;
 use crate::parameters::TypeName;
 use crate::yaml::Place;
 
-/// A component as its YAML says it, or as a program makes it.
+/// A component, read from YAML or created by a program.
 #[derive(Debug, Clone)]
 pub struct Component {
-    /// Its name in the space and in the address space.
+    /// The name of the component in the space and in the address space.
     pub name: String,
-    /// The ApplicationUri of its server, and the URI of the namespace of its nodes.
+    /// The ApplicationUri of the server, and the URI of the namespace of its nodes.
     pub application_uri: String,
-    /// Its number in the space: the WriterGroupId of its values.
+    /// The number of the component in the space: the WriterGroupId of its values.
     pub namespace: u16,
-    /// Where clients connect; port 0 is any that is free.
+    /// The URL of the endpoint; port 0 selects a free port.
     pub endpoint: String,
-    /// The security policies clients may choose from.
+    /// The security policies that clients can choose.
     pub security: Vec<Security>,
-    /// NodeSet files with types beyond ours.
+    /// NodeSet files with additional types.
     pub nodesets: Vec<PathBuf>,
-    /// Where it registers.
+    /// The discovery server at which the component registers.
     pub lds: Lds,
-    /// Whether calls are taken from other hosts, though nothing secures them.
+    /// Whether calls from other hosts are accepted without security.
     pub open: bool,
-    /// After this time the lease of a session that has nothing done is free for others.
+    /// Idle time after which the lease of a session is released.
     pub lease: Duration,
     /// The number of clients that its server serves.
     pub limits: ClientLimits,
-    /// What does the work of the skills whose driver is [`DriverSetup::Device`].
+    /// The device that does the work of the skills with [`DriverSetup::Device`].
     pub device: Option<Arc<dyn Device>>,
-    /// The robot that it is to clients of OPC 40010-1.
+    /// The robot description for clients of OPC 40010-1.
     pub robot: Option<Robot>,
-    /// Its skills, by their numbers from 1.
+    /// The skills, by their numbers from 1.
     pub skills: Vec<SkillSetup>,
 }
 
-/// What OPC 40010-1 wants to know of a robot, beside what its skills say.
+/// Data of a robot that OPC 40010-1 requires and that its skills do not contain.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Robot {
-    /// Who makes it.
+    /// The manufacturer.
     pub manufacturer: String,
-    /// Which one of those.
+    /// The model.
     pub model: String,
-    /// The ProductCode; empty where it is not told.
+    /// The ProductCode; empty if unknown.
     pub product_code: String,
-    /// The SerialNumber; empty where it is not told.
+    /// The SerialNumber; empty if unknown.
     pub serial_number: String,
     /// A value of MotionDeviceCategoryEnumeration (OPC 40010-1, 7.2.3).
     pub category: i32,
-    /// Where the document says so.
+    /// The location in the document.
     pub place: Place,
 }
 
 /// A security policy.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Security {
-    /// Nothing is signed or encrypted.
+    /// No signing and no encryption.
     None,
-    /// Both are.
+    /// Signing and encryption.
     Basic256Sha256,
 }
 
-/// The local discovery server.
+/// The discovery server (LDS) at which a component registers.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Lds {
-    /// On this host, at the port kept for it.
+    /// The LDS of this host, at its well-known port.
     Local,
-    /// None.
+    /// No discovery server.
     Nowhere,
-    /// At this URL, or as programs choose one that is heard of.
+    /// The LDS at this URL, or a discovered LDS, as programs select it.
     At(String),
-    /// Of this host, at this URL or else at the port kept for it; the component is it itself while there is none.
+    /// The LDS of this host, at this URL or at its well-known port. If there is none, the component
+    /// serves as LDS itself.
     Embed(Option<String>),
 }
 
 impl Lds {
-    /// As the option `--lds` of programs is written.
+    /// Parses the option `--lds` of programs.
     #[must_use]
     pub fn written(text: &str) -> Self {
         match (text, text.strip_prefix("embed=")) {
@@ -102,7 +103,8 @@ impl Lds {
         }
     }
 
-    /// The same backwards; `None` for none, and `local` for the one at the port kept for it.
+    /// Returns the option for this setting: `None` for no LDS, and `local` for the LDS at the
+    /// well-known port.
     #[must_use]
     pub fn option(&self, local: &str) -> Option<String> {
         match self {
@@ -118,32 +120,32 @@ impl Lds {
 /// One skill of a component.
 #[derive(Debug, Clone)]
 pub struct SkillSetup {
-    /// What the component calls it.
+    /// The name of the skill in its component.
     pub name: String,
-    /// Its type.
+    /// The type of the skill.
     pub skill_type: TypeName,
-    /// Who does the work.
+    /// The driver that does the work.
     pub driver: DriverSetup,
     /// The IRIs of the capabilities it provides.
     pub capabilities: Vec<String>,
-    /// How long a run may take; `None` for as long as it likes.
+    /// Time limit of a run; `None` for no limit.
     pub timeout: Option<Duration>,
-    /// Where the document says its type.
+    /// The location of the type in the document.
     pub place: Place,
 }
 
-/// Who does the work of a skill.
+/// Selects the driver of a skill.
 #[derive(Clone)]
 pub enum DriverSetup {
-    /// This one.
+    /// This driver.
     Given(Arc<dyn Driver>),
-    /// A simulation of what the type is of.
+    /// A simulation that matches the type.
     Simulated(Simulation),
     /// The skills of a robot and a gripper.
     PickAndPlace(Partners),
     /// The device of the component.
     Device,
-    /// A call or action of the space, which the program that has the component asks.
+    /// A call or action of the space, which the program that runs the component sends.
     Space(Box<SpaceWork>),
 }
 
@@ -159,38 +161,38 @@ impl fmt::Debug for DriverSetup {
     }
 }
 
-/// How a simulation is, where it is not as usual.
+/// Settings of a simulation; `None` for the default.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Simulation {
-    /// How long a gripper takes, or a change of tools.
+    /// Duration of a motion of the gripper or of a tool change.
     pub duration: Option<Duration>,
-    /// Whether there is a thing to grasp.
+    /// Whether there is an object to grasp.
     pub object: Option<bool>,
-    /// How far a robot reaches, m.
+    /// Reach of the robot, m.
     pub reach: Option<f64>,
-    /// How many times faster than time it works.
+    /// Factor by which the simulation is faster than real time.
     pub time_scale: Option<f64>,
-    /// Below which height of a robot's tool something pushes back, m.
+    /// Height of the tool below which a contact force acts, m.
     pub contact: Option<f64>,
 }
 
 /// The servers whose skills a composite runs.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Partners {
-    /// That of the robot.
+    /// The server of the robot.
     pub robot: Partner,
-    /// That of the gripper.
+    /// The server of the gripper.
     pub gripper: Partner,
-    /// How long each of their runs may take.
+    /// Time limit of each run.
     pub within: Duration,
 }
 
 /// A server whose skills a composite runs.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Partner {
-    /// The one behind this endpoint.
+    /// The server at this endpoint.
     At(String),
-    /// The one with this ApplicationUri, wherever it is: a [`Detector`](crate::Detector) knows.
+    /// The server with this ApplicationUri, found by a [`Detector`](crate::Detector).
     Called(String),
 }
 
@@ -203,7 +205,7 @@ impl fmt::Display for Partner {
 }
 
 impl Component {
-    /// Whether one of its skills needs others that have to be looked for.
+    /// Returns whether a skill needs partners that have to be discovered.
     #[must_use]
     pub fn looks_for_others(&self) -> bool {
         self.skills.iter().any(|skill| match &skill.driver {
@@ -219,8 +221,8 @@ impl Component {
     }
 }
 
-/// How long a session has the lease without having anything done, where nothing else is said.
+/// Default idle time after which the lease of a session is released.
 pub const LEASE: Duration = Duration::from_secs(60);
 
-/// Most skills of a component: the identifiers of its nodes from 1 000 000 on are others'.
+/// Maximum number of skills of a component: node identifiers from 1 000 000 on are used otherwise.
 pub const MOST_SKILLS: usize = 1_000;

@@ -1,4 +1,4 @@
-//! Pick and place: one skill made of those of a robot and a gripper.
+//! Pick and place: one skill composed of the skills of a robot and a gripper.
 
 use std::future::Future;
 use std::sync::Arc;
@@ -13,7 +13,7 @@ use crate::part::{PartEnd, run_part};
 use crate::runs::{COMPOSITE_HALT_TIMEOUT, Runs, SkillFault};
 use crate::value::Value;
 
-/// Skills of other components that together bring a thing from one place to another.
+/// Skills of other components that together move an object from one pose to another.
 #[derive(Clone)]
 pub struct PickAndPlace {
     /// PtpMoveSkillType of the robot.
@@ -24,48 +24,48 @@ pub struct PickAndPlace {
     pub grasp: Arc<dyn Runs>,
     /// ReleaseSkillType of the same gripper.
     pub release: Arc<dyn Runs>,
-    /// How long each of their runs may take.
+    /// Time limit of each run.
     pub within: Duration,
 }
 
-/// What to bring where.
+/// A pick and place job.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Job {
-    /// Where the thing is: m, m, m, rad, rad, rad.
+    /// The pose of the object: m, m, m, rad, rad, rad.
     pub pick: [f64; 6],
-    /// Where it is to be.
+    /// The target pose of the object.
     pub place: [f64; 6],
-    /// How far above both the straight moves begin and end, m.
+    /// Height above both poses at which the straight moves start and end, m.
     pub approach: f64,
 }
 
-/// Why the thing is not where it should be.
+/// The failure of a job.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{step}: {why}; {}", match retreated {
     Ok(()) => "the robot has retreated".to_owned(),
     Err(why) => format!("the robot has not retreated: {why}"),
 })]
 pub struct Broken {
-    /// In which step.
+    /// The failed step.
     pub step: &'static str,
-    /// What happened there.
+    /// The reason.
     pub why: String,
-    /// Whether the robot is away from the place, or why not.
+    /// Whether the robot has retreated, or why not.
     pub retreated: Result<(), String>,
 }
 
-/// Who is told of the steps, and may want them to stop.
+/// Receives the steps of a job, and can stop it.
 #[async_trait]
 pub trait Teller: Send + Sync {
-    /// A step begins.
+    /// Reports the start of a step.
     async fn step(&self, step: &'static str);
 
-    /// A part of the step has come to its end.
+    /// Reports the end of a part of the step.
     async fn did(&self, what: &str) {
         debug!("{what}");
     }
 
-    /// Reports why the work has not ended although it was told to stop.
+    /// Reports the reason why the work has not ended after it was halted.
     async fn pending(&self, why: &str) {
         debug!("{why}");
     }
@@ -75,7 +75,7 @@ pub trait Teller: Send + Sync {
         warn!("{why}");
     }
 
-    /// Ready when nothing more is to be done.
+    /// Completes when the job is to be stopped.
     async fn stopped(&self) {
         std::future::pending().await
     }
@@ -111,10 +111,10 @@ impl<F: Fn(&'static str) + Send + Sync> Teller for F {
     }
 }
 
-/// A way back: what it is called, who moves, and where to.
+/// A retreat move: its name, the skill and the target pose.
 type Retreat<'s> = (&'static str, &'s Arc<dyn Runs>, [f64; 6]);
 
-/// A step: what it is called, who does it, where to if it is a move, and the way back from there.
+/// A step: its name, the skill, the target pose of a move, and the retreat from there.
 type Step<'s> = (
     &'static str,
     &'s Arc<dyn Runs>,
@@ -122,11 +122,11 @@ type Step<'s> = (
     Retreat<'s>,
 );
 
-/// How a step went wrong.
+/// The reason why a step failed.
 enum Fault {
-    /// Halt: everything stands still where it is.
+    /// Halt: everything stops where it is.
     Stopped(String),
-    /// There is no robot any more that could retreat, or whether it moves is unknown.
+    /// The robot is lost, so it cannot retreat, or its movement is unknown.
     RobotLost(String),
     Other(String),
 }
@@ -144,8 +144,8 @@ impl Fault {
 }
 
 impl PickAndPlace {
-    /// Does the job. When a step fails, or a component is lost, what moves is halted and the robot retreats from the place
-    /// where it is.
+    /// Runs the job. When a step fails or a component is lost, moving skills are halted and the
+    /// robot retreats.
     ///
     /// # Errors
     /// [`Broken`].
@@ -155,7 +155,7 @@ impl PickAndPlace {
             [x, y, z + job.approach, a, b, c]
         };
         let (over_pick, over_place) = (above(job.pick), above(job.place));
-        // The step, who does it, where to, and where the robot retreats to from there.
+        // Name, skill and target of each step, and the retreat from there.
         let at_pick = ("MovePickApproachError", &self.linear, over_pick);
         let between = ("MovePlaceApproachError", &self.ptp, over_place);
         let at_place = ("MovePlaceApproachError", &self.linear, over_place);
@@ -254,7 +254,7 @@ impl PickAndPlace {
     }
 }
 
-/// How the run of one skill did not end well.
+/// The reason why the run of a skill did not succeed.
 enum Ran<T> {
     Lost(String),
     NotHalted(String),
@@ -304,7 +304,7 @@ fn lost(skill: &dyn Runs, why: &str) -> String {
 
 #[async_trait]
 impl Driver for PickAndPlace {
-    /// Halt waits for the skills that the work is done with.
+    /// Halt waits for the end of the skills that do the work.
     fn halt_timeout(&self) -> Option<Duration> {
         Some(COMPOSITE_HALT_TIMEOUT)
     }

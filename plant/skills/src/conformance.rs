@@ -1,4 +1,4 @@
-//! What every driver has to keep to, as a check that takes any: simulated, of a device, of ROS, of an MTP.
+//! A conformance test for drivers of any kind: simulations, devices, ROS and MTPs.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -16,11 +16,12 @@ use crate::value::Value;
 const BY: Owner = Owner::Local("the conformance check");
 const WAIT: Duration = Duration::from_secs(10);
 
-/// Runs a driver of a type of the table through what a skill asks of it. With the `parameters`, which are asked for before each
-/// run, its work has to succeed each time and to take some 20 ms at least, so that it can be stopped and suspended on the way.
+/// Tests a driver of a skill type of the table. With the `parameters`, which are requested before
+/// each run, each run must succeed and must take at least 20 ms, so that it can be stopped and
+/// suspended.
 ///
 /// # Errors
-/// The first thing in which the driver differs, for people.
+/// The first deviation of the driver, as text for people.
 pub async fn check(
     skill_type: &str,
     driver: Arc<dyn Driver>,
@@ -70,7 +71,7 @@ pub async fn check(
     if can_suspend {
         start(&skill, &parameters()).await?;
         call(&skill, Method::Suspend).await?;
-        // Twice as long as what is not suspended takes to say something.
+        // Twice the time in which work that is not suspended reports progress.
         tokio::time::sleep(Duration::from_millis(60)).await;
         let before = skill.shown().progress;
         tokio::time::sleep(Duration::from_millis(60)).await;
@@ -104,10 +105,10 @@ pub async fn check(
     Ok(())
 }
 
-/// Runs a driver of a type of the table once.
+/// Runs a driver of a skill type of the table once.
 ///
 /// # Errors
-/// Why there is no outcome, for people; a refusal with its code.
+/// The reason why there is no outcome, as text for people; a refusal with its code.
 pub async fn run_once(
     skill_type: &str,
     driver: Arc<dyn Driver>,

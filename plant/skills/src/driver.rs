@@ -1,4 +1,4 @@
-//! Who does the work of a skill.
+//! The interface of drivers, which do the work of skills.
 
 use std::time::Duration;
 
@@ -8,49 +8,54 @@ use tokio::sync::{mpsc, watch};
 use crate::parameters::Parameters;
 use crate::value::Value;
 
-/// What a run says at its end: the results of the skill's type by their names.
+/// The results of a run, by their names in the skill type.
 pub type Results = Vec<(String, Value)>;
 
 /// Does the work of one skill: a device, a simulation, or a composite of other skills.
 ///
-/// What keeps to this is checked by [`conformance`](crate::conformance).
+/// [`conformance`](crate::conformance) tests the requirements.
 #[async_trait]
 pub trait Driver: Send + Sync + 'static {
-    /// Whether the work can stand still and go on. Without it Suspend is refused.
+    /// Returns whether the work can be suspended and resumed. Otherwise Suspend is refused.
     fn can_suspend(&self) -> bool {
         false
     }
 
-    /// How long the end of work that is done elsewhere is waited for after Halt. Such work is never broken off before: the
-    /// skill stays Running until its end is known, and a second Halt after this time ends it with an unknown outcome. `None`
-    /// for work that is done here, which ends with its future.
+    /// Returns the time after Halt during which the end of work that is done elsewhere is awaited.
+    /// Such work is never aborted: the skill stays Running until the end is known. A second Halt
+    /// after this time ends the run with an unknown outcome.
+    ///
+    /// `None` for work that is done here, which ends when its future ends.
     fn halt_timeout(&self) -> Option<Duration> {
         None
     }
 
-    /// Looks at parameters that fit the type, before anything moves.
+    /// Checks parameters that match the type, before anything moves.
     ///
     /// # Errors
-    /// What is wrong with them, beginning with the name of one: the client is refused with BadInvalidArgument.
+    /// A message that starts with the name of an invalid parameter. The client receives
+    /// BadInvalidArgument.
     fn check(&self, parameters: &Parameters) -> Result<(), String> {
         let _any = parameters;
         Ok(())
     }
 
-    /// The skills of other components that its work is done with, as `<endpoint> <type>`, for people to see.
+    /// Returns the skills of other components that do the work, as `<endpoint> <type>`, for
+    /// display.
     fn uses(&self) -> Vec<String> {
         Vec::new()
     }
 
-    /// Does the work of one run. It is told of Halt by [`Work::stopped`], and has a second to bring the machine to a stand;
-    /// then the future is dropped, unless there is a [`halt_timeout`](Self::halt_timeout).
+    /// Does the work of one run. [`Work::stopped`] completes on Halt. The driver then has one
+    /// second to stop the machine; after that, the future is dropped unless there is a
+    /// [`halt_timeout`](Self::halt_timeout).
     ///
     /// # Errors
-    /// Why the work is not done, for people.
+    /// The reason why the work is not done, as text for people.
     async fn run(&self, work: Work) -> Result<Results, String>;
 }
 
-/// One run, as its driver sees it.
+/// A run, as its driver sees it.
 #[derive(Debug, Clone)]
 pub struct Work {
     run: u32,
@@ -60,21 +65,21 @@ pub struct Work {
     progress: watch::Sender<f32>,
 }
 
-/// What is said of the way of a run.
+/// A report of the driver during a run.
 #[derive(Debug)]
 pub(crate) enum Line {
     Step(String),
-    /// Of a part of the step, for the trace only.
+    /// A part of the step, for the trace only.
     Note(String),
-    /// The work was cancelled, and has not ended.
+    /// The work was cancelled and has not ended.
     Pending(String),
-    /// Whoever does the work refuses to cancel it.
+    /// The executor of the work refuses to cancel it.
     Refused(String),
-    /// How the work ends, or has ended, is not known.
+    /// The end of the work, past or future, is unknown.
     Unknown(String),
 }
 
-/// The work was stopped by Halt, Reset, or the end of the program.
+/// The work was stopped by Halt, by Reset or by the end of the program.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("stopped")]
 pub struct Stopped;
@@ -92,7 +97,7 @@ pub(crate) enum Signal {
     Stop,
 }
 
-/// The other end of a [`Work`].
+/// The actor's end of a [`Work`].
 #[derive(Debug)]
 pub(crate) struct Reins {
     pub(crate) signal: watch::Sender<Signal>,
@@ -120,24 +125,25 @@ impl Work {
         (work, reins)
     }
 
-    /// The number of the run.
+    /// Returns the number of the run.
     #[must_use]
     pub fn run(&self) -> u32 {
         self.run
     }
 
-    /// What it was started with, complete and checked.
+    /// Returns the parameters of the run, complete and checked.
     #[must_use]
     pub fn parameters(&self) -> &Parameters {
         &self.parameters
     }
 
-    /// Says what the run is about now. Waits while too much of that is not told yet; no step is left out.
+    /// Reports the current step of the run. Waits while the queue of reports is full; no step is
+    /// dropped.
     pub async fn step(&self, step: impl Into<String>) {
         self.say(Line::Step(step.into())).await;
     }
 
-    /// Puts something that was done on the way into the trace of the run.
+    /// Adds a line to the trace of the run.
     pub async fn note(&self, what: impl Into<String>) {
         self.say(Line::Note(what.into())).await;
     }
@@ -147,17 +153,18 @@ impl Work {
         self.say(Line::Pending(why.into())).await;
     }
 
-    /// Reports that whoever does the work refuses to cancel it: the work goes on.
+    /// Reports that the executor refuses to cancel the work: the work goes on.
     pub async fn cancel_refused(&self, why: impl Into<String>) {
         self.say(Line::Refused(why.into())).await;
     }
 
-    /// Reports that the end of the work is not known, and may never be. The skill is not started again before a Reset.
+    /// Reports that the end of the work is unknown and may stay unknown. The skill cannot be
+    /// started before a Reset.
     pub async fn unknown(&self, why: impl Into<String>) {
         self.say(Line::Unknown(why.into())).await;
     }
 
-    /// Whether the run is to end without its work being done.
+    /// Returns whether the run is to end without finishing its work.
     #[must_use]
     pub fn is_stopped(&self) -> bool {
         *self.signal.borrow() == Signal::Stop
@@ -166,13 +173,13 @@ impl Work {
     async fn say(&self, line: Line) {
         tokio::select! {
             biased;
-            // Nobody is left to be told where the skill is gone, and `stopped` says so.
+            // The receiver is dropped with the skill; `stopped` completes then too.
             _told = self.steps.send(line) => {}
             () = self.stopped() => {}
         }
     }
 
-    /// Says how much is done, from 0 to 1. Of several the newest counts.
+    /// Reports the progress, from 0 to 1. Newer values replace older values.
     pub fn progress(&self, done: f32) {
         let done = if done.is_finite() {
             done.clamp(0.0, 1.0)
@@ -182,14 +189,14 @@ impl Work {
         self.progress.send_replace(done);
     }
 
-    /// Ready when the run is to end without its work being done.
+    /// Completes when the run is to end without finishing its work.
     pub async fn stopped(&self) {
-        // Without the skill there is nobody who could want it to go on.
+        // Without the skill, the run is stopped too.
         let mut signal = self.signal.clone();
         let _stopped_or_alone = signal.wait_for(|signal| *signal == Signal::Stop).await;
     }
 
-    /// Ready while the work may go on: at once, or when a suspended run is resumed.
+    /// Completes while the work may go on: immediately, or when a suspended run is resumed.
     ///
     /// # Errors
     /// [`Stopped`].
@@ -204,7 +211,7 @@ impl Work {
         }
     }
 
-    /// Waits while work goes on: time in which the run is suspended does not count.
+    /// Waits for `time`, not counting the time in which the run is suspended.
     ///
     /// # Errors
     /// [`Stopped`].
@@ -223,13 +230,13 @@ impl Work {
         }
     }
 
-    /// Ready when the run is suspended or stopped: what moves has to be brought to a stand. [`going`](Self::going) then says
-    /// which of the two it is.
+    /// Completes when the run is suspended or stopped: the machine has to stop.
+    /// [`going`](Self::going) then distinguishes the two cases.
     pub async fn held(&self) {
         let mut signal = self.signal.clone();
         let _held_or_alone = signal.wait_for(|signal| *signal != Signal::Go).await;
     }
 }
 
-/// So many steps may wait to be told.
+/// Maximum number of waiting reports.
 const MOST_STEPS: usize = 64;

@@ -1,7 +1,8 @@
-//! Skills: the types of OPC UA programs that robots and tools run by, served and asked for.
+//! Skills: OPC UA Programs that robots and tools execute, as server and as client.
 //!
-//! A [`Skill`] is executed here: one task owns it, keeps the parameters of a run, shows each transition before the work
-//! begins, and has a [`Driver`] do the work. It knows no OPC UA server.
+//! A [`Skill`] is executed in this process. One task owns it, stores the parameters of the next
+//! run, publishes each transition before the work starts, and runs a [`Driver`]. It does not depend
+//! on an OPC UA server.
 
 mod actor;
 mod authority;

@@ -1,4 +1,4 @@
-//! The skill types of namespace [`NAMESPACE`], out of one table.
+//! The skill types of namespace [`NAMESPACE`], defined by one table.
 
 pub mod alias;
 mod nodeset;
@@ -14,45 +14,46 @@ use crate::value::{Builtin, Shape, Value};
 
 /// The URI of the types' namespace.
 pub const NAMESPACE: &str = "urn:ua-bridge:skills";
-/// The type all skills are of.
+/// The base type of all skills.
 pub const SKILL_TYPE: &str = "SkillType";
-/// The event of each transition.
+/// The type of the events of transitions.
 pub const EVENT_TYPE: &str = "SkillTransitionEventType";
-/// The interface of a component, which has the folder `Skills`.
+/// The interface of a component, with the folder `Skills`.
 pub const CONTROLLER_TYPE: &str = "ISkillControllerType";
-/// The namespace of OPC 10000-100, whose locks components have.
+/// The namespace of OPC 10000-100, which defines the locks of components.
 pub(crate) const DEVICES: &str = "http://opcfoundation.org/UA/DI/";
 
-/// The reference from a skill to one that its work is done with.
+/// The reference from a skill to a skill that does part of its work.
 pub const USES_SKILL: &str = "UsesSkill";
-/// What that leads to.
+/// The type of the target of that reference.
 pub const USED_SKILL_TYPE: &str = "UsedSkillType";
 
-/// A type of the table by its BrowseName.
+/// Returns a type of the table by its BrowseName.
 #[must_use]
 pub fn find(name: &str) -> Option<&'static SkillType> {
     TYPES.iter().find(|known| known.name == name)
 }
 
 impl SkillType {
-    /// The type it is a subtype of; `None` for SkillType, whose supertype is ProgramStateMachineType of namespace 0.
+    /// Returns the supertype; `None` for SkillType, whose supertype is ProgramStateMachineType of
+    /// namespace 0.
     #[must_use]
     pub fn supertype(&self) -> Option<&'static Self> {
         find(self.base?)
     }
 
-    /// Itself and all its supertypes of the table, nearest first.
+    /// Returns the type and all its supertypes in the table, nearest first.
     pub fn chain(&'static self) -> impl Iterator<Item = &'static Self> {
         std::iter::successors(Some(self), |of| of.supertype())
     }
 
-    /// Its parameters, those of its supertypes first.
+    /// Returns the parameters, with the supertypes' parameters first.
     #[must_use]
     pub fn parameters(&'static self) -> Vec<Parameter> {
         self.inherited(|of| of.parameters)
     }
 
-    /// Its results, those of its supertypes first.
+    /// Returns the results, with the supertypes' results first.
     #[must_use]
     pub fn results(&'static self) -> Vec<Parameter> {
         self.inherited(|of| of.results)
@@ -85,7 +86,7 @@ impl Variable {
         }
     }
 
-    /// What counts where nothing is given.
+    /// Returns the default value.
     #[must_use]
     pub fn default_value(&self) -> Option<Value> {
         match self.preset {
@@ -94,7 +95,7 @@ impl Variable {
                 Shape::scalar(Builtin::Double)
                     .take(number.into())
                     .and_then(|value| {
-                        // All numbers of the table are of the type they stand for.
+                        // All numbers of the table match their types.
                         self.shape.read_json(&value.to_json()).ok()
                     })
             }

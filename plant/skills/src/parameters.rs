@@ -1,4 +1,4 @@
-//! What a skill is told before it starts, and what it says at its end.
+//! Parameters and results of skills.
 
 use std::fmt;
 use std::str::FromStr;
@@ -7,19 +7,20 @@ use crate::model;
 use crate::refusal::{Code, Refusal};
 use crate::value::{Shape, Value};
 
-/// A type by the URI of its namespace and its BrowseName.
+/// A type, identified by the URI of its namespace and its BrowseName.
 ///
-/// As text `nsu=<uri>;<BrowseName>`; a name without a URI is one of the types of [`NAMESPACE`](crate::NAMESPACE).
+/// Its text is `nsu=<uri>;<BrowseName>`; a name without a URI is a type of
+/// [`NAMESPACE`](crate::NAMESPACE).
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct TypeName {
-    /// The URI.
+    /// The URI of the namespace.
     pub namespace: String,
     /// The BrowseName.
     pub name: String,
 }
 
 impl TypeName {
-    /// A type of ours.
+    /// Returns the name of a type of [`NAMESPACE`](crate::NAMESPACE).
     #[must_use]
     pub fn own(name: &str) -> Self {
         Self {
@@ -35,7 +36,7 @@ impl fmt::Display for TypeName {
     }
 }
 
-/// No name of a type.
+/// A text that is not the name of a type.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("expected a type as GraspSkillType or nsu=<namespace uri>;<BrowseName>, found `{0}`")]
 pub struct NoTypeName(pub String);
@@ -66,31 +67,32 @@ impl FromStr for TypeName {
 
 const LONGEST_NAME: usize = 512;
 
-/// One parameter or result of a skill type.
+/// A parameter or result of a skill type.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Parameter {
-    /// Its BrowseName.
+    /// The BrowseName.
     pub name: String,
     /// Type and rank.
     pub shape: Shape,
-    /// How many elements an array has, where the type says so.
+    /// The number of elements of an array, if the type defines it.
     pub length: Option<u32>,
-    /// What counts where nothing is given. A parameter without it must be given.
+    /// The default value. A parameter without a default is mandatory.
     pub default: Option<Value>,
-    /// The unit by its symbol, as `m/s`.
+    /// The symbol of the unit, as `m/s`.
     pub unit: Option<String>,
-    /// The lowest and the highest of a number.
+    /// The lowest and the highest value of a number.
     pub range: Option<(f64, f64)>,
-    /// What it means, for people.
+    /// Description for people.
     pub about: String,
 }
 
 impl Parameter {
-    /// Takes a value for it.
+    /// Converts a value to the type of the parameter and checks it.
     ///
     /// # Errors
-    /// BadTypeMismatch for one of another type, BadInvalidArgument for a number out of range or none at all, or an array of
-    /// another length.
+    /// - BadTypeMismatch for a value of another type
+    /// - BadInvalidArgument for a number that is NaN, infinite or out of range, or an array of
+    ///   another length
     pub fn take(&self, value: Value) -> Result<Value, Refusal> {
         let Self { name, shape, .. } = self;
         let given = value.shape();
@@ -127,11 +129,12 @@ impl Parameter {
 pub struct Parameters(Vec<(String, Value)>);
 
 impl Parameters {
-    /// Completes what was given with the defaults of the type.
+    /// Completes the given parameters with the defaults of the type.
     ///
     /// # Errors
-    /// BadArgumentsMissing with the names of those that must be given and are not, BadInvalidArgument for a name that the
-    /// type does not have or that is given twice, and as [`Parameter::take`].
+    /// - BadArgumentsMissing with the names of the missing mandatory parameters
+    /// - BadInvalidArgument for a name that the type does not have or that is given twice
+    /// - As [`Parameter::take`]
     pub fn complete(declared: &[Parameter], given: Vec<(String, Value)>) -> Result<Self, Refusal> {
         let mut values: Vec<Option<Value>> = vec![None; declared.len()];
         for (name, value) in given {
@@ -171,12 +174,12 @@ impl Parameters {
         Ok(Self(complete.into_iter().filter_map(named).collect()))
     }
 
-    /// As another server shows them, which has checked them.
+    /// Creates parameters from the values of another server, which has checked them.
     pub(crate) const fn shown(of: Vec<(String, Value)>) -> Self {
         Self(of)
     }
 
-    /// A value by the name of its parameter.
+    /// Returns the value of a parameter.
     #[must_use]
     pub fn get(&self, name: &str) -> Option<&Value> {
         self.0
@@ -185,38 +188,38 @@ impl Parameters {
             .map(|(_, value)| value)
     }
 
-    /// A number.
+    /// Returns the value of a numeric parameter.
     #[must_use]
     pub fn number(&self, name: &str) -> Option<f64> {
         self.get(name)?.as_f64()
     }
 
-    /// Numbers of an array.
+    /// Returns the elements of an array of numbers.
     #[must_use]
     pub fn numbers(&self, name: &str) -> Option<Vec<f64>> {
         self.get(name)?.as_f64s()
     }
 
-    /// Six numbers of an array, as of a position with its orientation.
+    /// Returns the elements of an array of six numbers, for example a pose.
     #[must_use]
     pub fn six(&self, name: &str) -> Option<[f64; 6]> {
         self.numbers(name)?.try_into().ok()
     }
 
-    /// A text.
+    /// Returns the value of a text parameter.
     #[must_use]
     pub fn text(&self, name: &str) -> Option<&str> {
         self.get(name)?.as_str()
     }
 
-    /// Names and values, in the order of the type.
+    /// Returns all names and values, in the order of the type.
     #[must_use]
     pub fn all(&self) -> &[(String, Value)] {
         &self.0
     }
 }
 
-/// At most 64 characters of a name from outside.
+/// Returns at most 64 characters of an external name, with control characters replaced.
 pub(crate) fn shortened(name: &str) -> String {
     name.chars()
         .take(64)

@@ -1,34 +1,34 @@
-//! Why something is not done; nothing has changed then.
+//! Refusals of calls. A refused call changes nothing.
 
 use std::fmt;
 
-/// What kind of refusal: a StatusCode of OPC 10000-4.
+/// The kind of a refusal: a StatusCode of OPC 10000-4.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Code {
-    /// Somebody else has the lease of the component.
+    /// Another owner holds the lease of the component.
     Locked,
-    /// The state machine has no such transition now.
+    /// The state machine does not have this transition in the current state.
     InvalidState,
-    /// The skill cannot do that at all.
+    /// The skill does not support the method.
     NotSupported,
-    /// A parameter that must be given is not.
+    /// A mandatory parameter is missing.
     ArgumentsMissing,
-    /// A parameter has another type.
+    /// A parameter has the wrong type.
     TypeMismatch,
-    /// A parameter has a value that is not taken.
+    /// A parameter has an invalid value.
     InvalidArgument,
-    /// What is asked for is not known, or not any more.
+    /// The requested object is unknown or has been removed.
     NotFound,
-    /// The component ends.
+    /// The component is shutting down.
     Shutdown,
-    /// Too much waits already.
+    /// Too many calls are waiting.
     TooManyOperations,
     /// The executor of the work refuses the request.
     RequestNotAllowed,
 }
 
 impl Code {
-    /// Its name in OPC 10000-4.
+    /// Returns its name in OPC 10000-4.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -45,7 +45,7 @@ impl Code {
         }
     }
 
-    /// Its number (OPC 10000-6, A.2).
+    /// Returns its number (OPC 10000-6, A.2).
     #[must_use]
     pub const fn number(self) -> u32 {
         match self {
@@ -63,12 +63,12 @@ impl Code {
     }
 }
 
-/// A refusal with its reason for people. As text `BadInvalidState: <reason>`.
+/// A refusal with its reason for people. Its text is `BadInvalidState: <reason>`.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub struct Refusal {
-    /// What kind.
+    /// The kind.
     pub code: Code,
-    /// Why, in a sentence.
+    /// The reason, in a sentence.
     pub text: String,
 }
 

@@ -1,4 +1,4 @@
-//! To run a skill to its end, wherever it is executed.
+//! Runs a local or remote skill to its end.
 
 use std::future::pending;
 use std::time::Duration;
@@ -12,57 +12,58 @@ use crate::shown::Outcome;
 use crate::skill::Skill;
 use crate::value::Value;
 
-/// A skill that can be run: of another component, or of this program.
+/// A skill that can be run: a skill of another component or of this program.
 #[async_trait]
 pub trait Runs: Send + Sync {
-    /// What to call it in a message, as `parallel-gripper.Grasp`.
+    /// Returns the name for messages, as `parallel-gripper.Grasp`.
     fn name(&self) -> String;
 
-    /// Makes it ready if it has to be, starts it and waits for the end of the run. A run that failed is an [`Outcome`] too.
-    /// When `within` is over, the run is halted.
+    /// Resets the skill if necessary, starts it and waits for the end of the run. The run is halted
+    /// when the time `within` has passed. A failed run has an [`Outcome`] too.
     ///
     /// # Errors
-    /// Why there is no outcome.
+    /// The reason why there is no outcome.
     async fn run(
         &self,
         parameters: Vec<(String, Value)>,
         within: Duration,
     ) -> Result<Outcome, SkillFault>;
 
-    /// Halts it, where it is anything but Halted, and waits until its run has ended: a run whose work is done elsewhere may go
-    /// on for a while.
+    /// Halts the skill unless it is Halted, and waits until its run has ended. Work that is done
+    /// elsewhere may take a while to end.
     ///
     /// # Errors
-    /// Why it may not have come to a stand.
+    /// The reason why the skill may not have stopped.
     async fn halt(&self) -> Result<(), SkillFault>;
 
-    /// Ready, with the reason, when its component is not there any more. Pends for as long as it is.
+    /// Completes with the reason when the component is lost. Pends while the component is
+    /// available.
     async fn lost(&self) -> String {
         pending().await
     }
 }
 
-/// Why a skill did not do what it was asked for.
+/// The reason why a request to a skill failed.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum SkillFault {
-    /// Its component does not answer: what has become of the run is not known.
+    /// The component does not respond: the state of the run is unknown.
     #[error("its component is lost: {0}")]
     Lost(String),
-    /// It refused, and nothing has changed.
+    /// The component refused the request; nothing has changed.
     #[error("{status}: {text}")]
     Refused {
         /// The name of the StatusCode, as `BadInvalidState`.
         status: String,
-        /// Why, for people.
+        /// The reason, for people.
         text: String,
     },
-    /// The run did not end in time, and was told to halt.
+    /// The run did not end in time and was halted.
     #[error("it did not end within {0:?} and was halted")]
     TimedOut(Duration),
-    /// It was told to halt, and its end was not confirmed: whether its machine moves is unknown.
+    /// The skill was halted, and its end was not confirmed: the movement of its machine is unknown.
     #[error("{0}")]
     NotHalted(String),
-    /// It is not what it should be.
+    /// The skill does not have the expected form.
     #[error("{0}")]
     Unexpected(String),
 }
@@ -76,12 +77,12 @@ impl From<Refusal> for SkillFault {
     }
 }
 
-/// A skill of this program, run by one who has the lease under that name.
+/// A skill of this program, run by an owner of the lease.
 #[derive(Debug, Clone)]
 pub struct LocalRun {
-    /// Which.
+    /// The skill.
     pub skill: Skill,
-    /// Who runs it.
+    /// The owner of the lease.
     pub by: Owner,
 }
 
@@ -108,7 +109,7 @@ impl Runs for LocalRun {
         }
         if shown.state == State::Halted {
             let reset = self.skill.call(self.by.clone(), Method::Reset).await;
-            // One that was given up before may have come first.
+            // The Reset of a caller that gave up earlier may have taken effect first.
             if self.skill.shown().state != State::Ready {
                 reset?;
             }
@@ -146,14 +147,14 @@ impl Runs for LocalRun {
     }
 }
 
-/// Why a skill that was told to halt may not have come to a stand.
+/// Returns the reason why a halted skill may not have stopped.
 pub(crate) fn goes_on(name: &str) -> SkillFault {
     SkillFault::NotHalted(format!(
         "{name} was told to halt, and its run has not ended within {HALTS_WITHIN:?}: whether it moves is unknown"
     ))
 }
 
-/// How long the end of a run that was told to halt is waited for.
+/// Time limit for the end of a run after Halt.
 pub(crate) const HALTS_WITHIN: Duration = Duration::from_secs(10);
-/// How long after Halt a composite waits for the ends of the runs that it is made of.
+/// Time after Halt during which a composite waits for the ends of the runs of its skills.
 pub const COMPOSITE_HALT_TIMEOUT: Duration = Duration::from_secs(12);

@@ -1,8 +1,16 @@
-//! A component as an OPC UA server: its skills as instances of their types, with methods, events and parameters.
+//! The OPC UA server of a component: its skills as instances of their types, with methods, events
+//! and parameters.
 //!
-//! Reading order: this, `place` (where it is in the plant), `types` (what a skill is, from the instance of its type), `show`
-//! (what clients see), `methods` (what they have it do), `lock` (the lease, as OPC 10000-100 has it), `robot` (what it is to
-//! clients of OPC 40010-1), `uses` (what composites are made of).
+//! Reading order:
+//!
+//! - this module
+//! - `place`: the location of the component in the plant
+//! - `types`: the description of a skill from the instance of its type
+//! - `show`: values and events for clients
+//! - `methods`: methods and writes of clients
+//! - `lock`: the lease as a lock of OPC 10000-100
+//! - `robot`: the robot for clients of OPC 40010-1
+//! - `uses`: the skills that composites use
 
 mod lock;
 mod methods;
@@ -41,36 +49,37 @@ use crate::shown::Observer;
 use crate::skill::{Facts, Skill};
 use crate::yaml::{Code, Finding, Findings};
 
-/// What the server of a component needs beside the component.
+/// Settings of the server of a component, beside the component.
 #[derive(Debug, Clone, Default)]
 pub struct ServeSettings {
-    /// Finds the components that composites name by their ApplicationUris.
+    /// Finds the components that composites identify by their ApplicationUris.
     pub detector: Option<Detector>,
-    /// The directory of certificates, which Basic256Sha256 needs.
+    /// The directory of certificates, required for Basic256Sha256.
     pub pki: Option<PathBuf>,
-    /// Trusts every client's certificate. For tests and demonstrations only.
+    /// Trusts the certificates of all clients. For tests and demonstrations only.
     pub trust_any_client: bool,
-    /// The number of each skill's first run, above those it had before the program was started anew; 0 counts as 1.
+    /// The number of each skill's first run, above the numbers used before a restart; 0 counts as
+    /// 1.
     pub first_run: u32,
-    /// The supervisor that the component is registered with.
+    /// The supervisor at which the component is registered.
     pub supervision: Supervision,
 }
 
-/// Why a component is not served.
+/// The reason why a component cannot be served.
 #[derive(Debug, thiserror::Error)]
 pub enum ServeFault {
-    /// What is wrong with what the component says of its skills.
+    /// Errors in the description of the skills.
     #[error("the component's skills cannot be made")]
     Findings(Findings),
-    /// A NodeSet cannot be used, or the server cannot be built.
+    /// A NodeSet cannot be used, or the server cannot be created.
     #[error(transparent)]
     Server(#[from] ServerError),
-    /// The address space cannot be made.
+    /// The address space cannot be created.
     #[error("the address space cannot be made: {0}")]
     Space(String),
 }
 
-/// A component that is served, until [`stop`](Self::stop).
+/// A served component, until [`stop`](Self::stop).
 pub struct ComponentServer {
     server: Server,
     authority: Authority,
@@ -79,12 +88,14 @@ pub struct ComponentServer {
 }
 
 impl ComponentServer {
-    /// Builds the address space and listens; nobody is served until [`start`](Self::start). Each skill is Halted. `observers`
-    /// are asked for by the number of a skill, from 1, and what it is. Needs a tokio runtime.
+    /// Creates the address space and binds the port; clients are served after
+    /// [`start`](Self::start). Each skill is Halted. `observers` provides the observers of each
+    /// skill, by its number from 1 and its description. Needs a tokio runtime.
     ///
     /// # Errors
-    /// Types that are not there or drivers that do not fit them, all of them at once; NodeSets, certificates or an address
-    /// that cannot be used.
+    /// - Missing types, and drivers that do not match their types; all of them are reported
+    ///   together
+    /// - NodeSets, certificates or an address that cannot be used
     pub fn build(
         component: &Component,
         settings: &ServeSettings,
@@ -170,12 +181,12 @@ impl ComponentServer {
         })
     }
 
-    /// Serves clients from now on.
+    /// Starts serving clients.
     pub fn start(&self) {
         self.server.start();
     }
 
-    /// Halts what runs, closes all connections and stops listening. Takes 4 s at most.
+    /// Halts running skills, closes all connections and stops listening. Takes at most 4 s.
     pub async fn stop(mut self) {
         self.tasks.abort_all();
         let closing = self.skills.iter().map(Skill::close);
@@ -183,26 +194,27 @@ impl ComponentServer {
         self.server.stop().await;
     }
 
-    /// Where clients connect, with the port that is listened on.
+    /// Returns the URL of the endpoint, with the bound port.
     #[must_use]
     pub fn url(&self) -> &str {
         self.server.url()
     }
 
-    /// The skills, by their numbers from 1.
+    /// Returns the skills, by their numbers from 1.
     #[must_use]
     pub fn skills(&self) -> &[Skill] {
         &self.skills
     }
 
-    /// Who may have it do something.
+    /// Returns the authority, which controls the lease.
     #[must_use]
     pub fn authority(&self) -> &Authority {
         &self.authority
     }
 }
 
-/// The users in the certificate store. Users without a name may have the skills run, as long as they hold the lease.
+/// Returns the users of the certificate store. Anonymous users may run skills while they hold the
+/// lease.
 fn users_of(settings: &ServeSettings) -> Result<Arc<Access>, ServeFault> {
     let anonymous = Roles::of(&[Role::Observer, Role::Operator]);
     let users = Access::of_store(settings.pki.as_deref(), anonymous);
@@ -242,7 +254,7 @@ fn server_of(
     Ok(builder.build()?)
 }
 
-/// The object of the component, below Objects.
+/// Creates the object of the component, below Objects.
 fn root(server: &Server, component: &Component, ids: &mut IdRange) -> Result<Instance, ServeFault> {
     let space = |why: &dyn std::fmt::Display| ServeFault::Space(why.to_string());
     let controller = server
@@ -275,7 +287,7 @@ struct Made {
     nodes: Arc<Nodes>,
 }
 
-/// The instance of a skill's type, and what it is.
+/// Creates the instance of a skill's type, and its description.
 fn make(
     server: &Server,
     (number, setup): (u32, &SkillSetup),
@@ -362,7 +374,7 @@ fn make(
     })
 }
 
-/// The identifier of a node that has its own place within the skill's hundred.
+/// Returns the offset of a node with a fixed identifier within the skill's hundred.
 fn kept(path: &str) -> Option<u32> {
     Some(match path {
         "CurrentState" => 1,
@@ -379,7 +391,7 @@ fn kept(path: &str) -> Option<u32> {
     })
 }
 
-/// What goes with the leases of sessions.
+/// Releases the leases of sessions.
 struct Leases {
     server: Server,
     served: Vec<(Skill, Arc<Nodes>)>,
@@ -387,12 +399,12 @@ struct Leases {
 }
 
 impl Leases {
-    /// Frees them. A session that is gone has none any more, nor has one that had nothing done for so long; what they wrote
-    /// counts for nothing then.
+    /// Releases the lease of a session that closes or is idle for `idle`. Parameters that the
+    /// session wrote are discarded.
     async fn free(self, idle: Duration) {
         let (closed, mut told) = mpsc::channel(MOST_CLOSED);
         self.server.on_session_closed(move |session| {
-            // The server has fewer sessions than this has room for.
+            // The queue is longer than the maximum number of sessions of the server.
             if let Err(error) = closed.try_send(session) {
                 tracing::warn!(session, "the end of a session is not taken up: {error}");
             }
@@ -433,7 +445,7 @@ async fn show_holder(server: Server, node: NodeId, mut holder: watch::Receiver<O
             .as_ref()
             .map(ToString::to_string)
             .unwrap_or_default();
-        // The node is ours for as long as the server is there.
+        // The node exists as long as the server.
         let _shown = server.show(&node, text);
         if holder.changed().await.is_err() {
             return;
@@ -441,15 +453,15 @@ async fn show_holder(server: Server, node: NodeId, mut holder: watch::Receiver<O
     }
 }
 
-/// The namespace of the instances: that of the ApplicationUri.
+/// The namespace of the instances: the namespace of the ApplicationUri.
 const OWN: u16 = 1;
 const COMPONENT_ID: u32 = 1;
 const IDS_PER_SKILL: u32 = 100;
 const FIRST_FREE_ID: u32 = 1_000_000;
-/// How often is looked for a lease that nobody uses, within the time after which it is free.
+/// Number of checks for an idle lease within the idle time.
 const LOOKS: u32 = 10;
 const SHORTEST_LOOK: Duration = Duration::from_millis(10);
-/// So many sessions may end at once.
+/// Maximum number of sessions whose end waits to be processed.
 const MOST_CLOSED: usize = 1_024;
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! What a skill shows of itself, and to whom.
+//! The visible state of a skill and its observers.
 
 use std::sync::Arc;
 use std::time::SystemTime;
@@ -10,110 +10,112 @@ use crate::parameters::Parameters;
 use crate::refusal::Refusal;
 use crate::value::Value;
 
-/// Everything that can be seen of a skill at one moment. It outlives whoever had the run begin.
+/// A snapshot of a skill. It outlives the client that started the run.
 #[derive(Debug, Clone)]
 pub struct Shown {
-    /// The state.
+    /// The state of the state machine.
     pub state: State,
-    /// What led to it; `None` before the first transition.
+    /// The last transition; `None` before the first transition.
     pub last: Option<&'static Transition>,
-    /// When that was; else when the skill came to be.
+    /// Time of the last transition; before the first, the creation time of the skill.
     pub since: SystemTime,
     /// The number of the newest run; 0 before the first.
     pub run: u32,
-    /// How much of it is done, 0 to 1.
+    /// The progress of the newest run, 0 to 1.
     pub progress: f32,
-    /// What it is about.
+    /// The current step of the newest run.
     pub step: String,
-    /// What the newest run was started with.
+    /// The parameters of the newest run.
     pub parameters: Arc<Parameters>,
-    /// How the newest run that has ended did so.
+    /// The outcome of the newest run that has ended.
     pub outcome: Option<Arc<Outcome>>,
-    /// Who did what last.
+    /// The last call and its caller.
     pub diagnostic: Diagnostic,
-    /// Why a run that is being cancelled has not ended.
+    /// The reason why a run that is being cancelled has not ended.
     pub pending: Option<String>,
-    /// The outcome of the newest run is unknown: only a Reset makes the skill ready.
+    /// Whether the outcome of the newest run is unknown: only a Reset makes the skill Ready.
     pub needs_reset: bool,
-    /// For each of [`Method::ALL`] whether a call would be taken now.
+    /// For each of [`Method::ALL`], whether a call is possible in this state.
     pub executable: [bool; 5],
 }
 
 /// The end of a run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Outcome {
-    /// Which run.
+    /// The number of the run.
     pub run: u32,
-    /// Whether it did its work.
+    /// Whether the work was done.
     pub succeeded: bool,
-    /// Why not, or what there is to say.
+    /// The reason of a failure, or a message.
     pub message: String,
-    /// Its results, in the order of the type; where it failed, none.
+    /// The results, in the order of the type; empty after a failure.
     pub results: Vec<(String, Value)>,
-    /// Its steps and what was done in them, in order, each with the seconds since its beginning: `0.412 MovePick`.
+    /// The steps and their parts in order, each with the seconds since the start of the run: `0.412
+    /// MovePick`.
     pub trace: Vec<String>,
 }
 
-/// What ProgramDiagnostic says (OPC 10000-10, 5.2.9).
+/// The content of ProgramDiagnostic (OPC 10000-10, 5.2.9).
 #[derive(Debug, Clone)]
 pub struct Diagnostic {
-    /// When the skill came to be.
+    /// The creation time of the skill.
     pub created: SystemTime,
-    /// The last call, taken or refused.
+    /// The last call, accepted or refused.
     pub last_call: Option<LastCall>,
 }
 
 /// A call of a method.
 #[derive(Debug, Clone)]
 pub struct LastCall {
-    /// Which.
+    /// The method.
     pub method: Method,
-    /// By whom.
+    /// The caller.
     pub by: Owner,
-    /// When.
+    /// The time of the call.
     pub at: SystemTime,
-    /// Why it was refused, if it was.
+    /// The refusal, if the call was refused.
     pub refused: Option<Refusal>,
 }
 
 /// A transition that has happened.
 #[derive(Debug, Clone)]
 pub struct Transitioned {
-    /// Which.
+    /// The transition.
     pub transition: &'static Transition,
-    /// The newest run; 0 before the first.
+    /// The number of the newest run; 0 before the first.
     pub run: u32,
-    /// For people.
+    /// A message for people.
     pub message: String,
-    /// When.
+    /// The time of the transition.
     pub at: SystemTime,
 }
 
-/// What is told of a skill, in the order in which it happens.
+/// An event of a skill, in the order in which it happens.
 #[derive(Debug, Clone, Copy)]
 pub enum Told<'a> {
-    /// A run is about to begin with these; its transition follows, and then the work.
+    /// A run is about to start with these parameters; its transition follows, and then the work.
     Parameters(&'a Parameters),
-    /// A transition. Before the work of a run begins, and after the outcome of a run that ends.
+    /// A transition: before the work of a run starts, or after the outcome of a run.
     Transition(&'a Transitioned),
-    /// The run has come to another step.
+    /// The run has started another step.
     Step,
-    /// The run is being cancelled and has not ended, or cannot be cancelled: why, for people.
+    /// The run is being cancelled and has not ended, or cannot be cancelled; with the reason for
+    /// people.
     Pending(&'a str),
-    /// More of the run is done.
+    /// The progress of the run has changed.
     Progress,
-    /// How a run has ended; its transition follows.
+    /// The outcome of a run; its transition follows.
     Outcome(&'a Outcome),
-    /// A call was taken or refused.
+    /// A call was accepted or refused.
     Called,
 }
 
-/// Hears of everything that happens to a skill, in order, from the task that owns it: it may not wait.
+/// Receives all events of a skill in order, from the task that owns the skill. It must not block.
 pub trait Observer: Send + Sync + 'static {
-    /// Something has happened, after which the skill is as `shown`.
+    /// Receives an event, after which the skill has the state `shown`.
     fn told(&self, what: Told<'_>, shown: &Shown);
 
-    /// Nothing more is told of it, since its server cannot be reached: of one that is executed elsewhere.
+    /// Reports that the server of a mirrored skill is lost; no further events follow.
     fn lost(&self, why: &str) {
         let _is_told_otherwise = why;
     }

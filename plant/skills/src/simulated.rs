@@ -1,4 +1,4 @@
-//! Drivers without a machine: they take the time that one would, and keep its state.
+//! Drivers that simulate a machine: its timing and its state.
 
 mod arm;
 mod base;

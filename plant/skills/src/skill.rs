@@ -1,4 +1,4 @@
-//! A skill that is executed here: the handle, and what it is made of.
+//! A skill that is executed in this process: its handle and its description.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -15,26 +15,27 @@ use crate::refusal::{Code, Refusal};
 use crate::shown::{Observer, Outcome, Shown};
 use crate::value::Value;
 
-/// What a skill is, for as long as it is there.
+/// The constant description of a skill.
 #[derive(Debug, Clone)]
 pub struct Facts {
-    /// What its component calls it.
+    /// The name of the skill in its component.
     pub name: String,
     /// Its type and all supertypes, nearest first.
     pub types: Vec<TypeName>,
-    /// What a run is told.
+    /// The parameters of a run.
     pub parameters: Vec<Parameter>,
-    /// What a run says at its end.
+    /// The results of a run.
     pub results: Vec<Parameter>,
-    /// The IRIs of the capabilities it provides.
+    /// The IRIs of the capabilities that it provides.
     pub capabilities: Vec<String>,
-    /// How long a run may take; `None` for as long as it likes.
+    /// Time limit of a run; `None` for no limit.
     pub timeout: Option<Duration>,
-    /// The state after a run that did its work, as its type says.
+    /// The state after a successful run, as its type defines it.
     pub rests_in: Rest,
 }
 
-/// A skill that is executed here. Clones are of the same one; it ends with the last of them, its run being stopped.
+/// A skill that is executed in this process. Clones share the skill. It ends when the last clone is
+/// dropped, and its run is stopped then.
 #[derive(Debug, Clone)]
 pub struct Skill {
     facts: Arc<Facts>,
@@ -45,7 +46,8 @@ pub struct Skill {
     outcomes: Arc<Mutex<VecDeque<Arc<Outcome>>>>,
 }
 
-/// Parameters written for the next run, and by whom: those of one client are nothing to the next.
+/// The parameters that an owner has written for the next run. A write by another owner discards
+/// them.
 #[derive(Debug, Default)]
 pub(crate) struct Pending {
     by: Option<Owner>,
@@ -53,7 +55,7 @@ pub(crate) struct Pending {
 }
 
 impl Pending {
-    /// Those of this owner.
+    /// Returns the values of this owner; discards the values of another owner.
     fn of(&mut self, by: &Owner) -> &mut BTreeMap<String, Value> {
         if self.by.as_ref() != Some(by) {
             self.by = Some(by.clone());
@@ -72,7 +74,7 @@ impl Pending {
 }
 
 impl Skill {
-    /// Starts a skill, in Halted, whose first run is 1. Needs a tokio runtime.
+    /// Starts a skill in the state Halted, whose first run has the number 1. Needs a tokio runtime.
     #[must_use]
     pub fn spawn(
         facts: Facts,
@@ -83,7 +85,8 @@ impl Skill {
         Self::counting_from(1, facts, driver, authority, observers)
     }
 
-    /// The same with the number of its first run, that no number which it had before it was started anew comes again.
+    /// Starts a skill whose first run has this number, so that numbers used before a restart are
+    /// not reused.
     #[must_use]
     pub fn counting_from(
         first_run: u32,
@@ -113,25 +116,26 @@ impl Skill {
         }
     }
 
-    /// What it is.
+    /// Returns the description of the skill.
     #[must_use]
     pub fn facts(&self) -> &Arc<Facts> {
         &self.facts
     }
 
-    /// How it is now.
+    /// Returns the current state of the skill.
     #[must_use]
     pub fn shown(&self) -> Arc<Shown> {
         self.shown.borrow().clone()
     }
 
-    /// How it is, and each change; of changes that follow each other closely the newest. An [`Observer`] hears of all.
+    /// Returns the state and its changes. Only the newest of rapid changes is delivered; an
+    /// [`Observer`] receives all.
     #[must_use]
     pub fn watch(&self) -> watch::Receiver<Arc<Shown>> {
         self.shown.clone()
     }
 
-    /// How a run ended, of the newest ones.
+    /// Returns the outcome of a run, if it is one of the newest runs.
     #[must_use]
     pub fn outcome(&self, run: u32) -> Option<Arc<Outcome>> {
         lock(&self.outcomes)
@@ -140,11 +144,13 @@ impl Skill {
             .cloned()
     }
 
-    /// Writes a parameter for the next run.
+    /// Writes a parameter for the next run. A refused write changes nothing.
     ///
     /// # Errors
-    /// BadLocked, BadInvalidState while a run goes on, BadInvalidArgument for a name that is none of the type, and as
-    /// [`Parameter::take`]. Nothing has changed then.
+    /// - BadLocked
+    /// - BadInvalidState during a run
+    /// - BadInvalidArgument for a name that the type does not have
+    /// - As [`Parameter::take`]
     pub fn write(&self, by: &Owner, name: &str, value: Value) -> Result<(), Refusal> {
         self.authority.claim(by)?;
         let written = self.written(by, name, value);
@@ -172,7 +178,8 @@ impl Skill {
         Ok(())
     }
 
-    /// What an owner that is gone has written counts for nothing any more. Says whether there was anything.
+    /// Discards the parameters that an owner wrote, for example when its session has closed.
+    /// Returns whether the owner had written any.
     pub fn forget(&self, by: &Owner) -> bool {
         let mut pending = lock(&self.pending);
         let theirs = pending.by.as_ref() == Some(by);
@@ -182,18 +189,23 @@ impl Skill {
         theirs
     }
 
-    /// Calls a method; Start begins a run with the parameters that the same owner has written. Gives the number of the
-    /// newest run.
+    /// Calls a method. Start starts a run with the parameters that the same owner has written.
+    /// Returns the number of the newest run.
     ///
     /// # Errors
-    /// In this order: BadLocked (authority), BadInvalidState (mode), BadNotSupported (capability), BadArgumentsMissing,
-    /// BadTypeMismatch or BadInvalidArgument (parameters), BadInvalidState while another skill of the component runs and
-    /// BadTooManyOperations (queue). Nothing has changed then.
+    /// Checked in this order; a refused call changes nothing:
+    ///
+    /// 1. BadLocked (authority)
+    /// 2. BadInvalidState (mode)
+    /// 3. BadNotSupported (capability)
+    /// 4. BadArgumentsMissing, BadTypeMismatch or BadInvalidArgument (parameters)
+    /// 5. BadInvalidState while another skill of the component runs, and BadTooManyOperations
+    ///    (queue)
     pub async fn call(&self, by: Owner, method: Method) -> Result<u32, Refusal> {
         self.order(by, method, Given::default()).await
     }
 
-    /// Begins a run with these parameters, whatever was written before.
+    /// Starts a run with these parameters, regardless of parameters written before.
     ///
     /// # Errors
     /// As [`call`](Self::call).
@@ -209,9 +221,9 @@ impl Skill {
         self.order(by, Method::Start, given).await
     }
 
-    /// Begins a run with these parameters in one call, a Halted skill being made ready first; the run fails when it is not
-    /// done `within` that time, or within that of the skill where that is shorter. Gives the number by which
-    /// [`outcome_of`](Self::outcome_of) is asked.
+    /// Starts a run with these parameters in one call; a Halted skill is reset first. The run fails
+    /// if it is not done `within` that time, or within the time limit of the skill if that is
+    /// shorter. Returns the number of the run for [`outcome_of`](Self::outcome_of).
     ///
     /// # Errors
     /// As [`call`](Self::call).
@@ -229,12 +241,12 @@ impl Skill {
         self.order(by, Method::Start, given).await
     }
 
-    /// How a run ended; `None` while it goes on. Run 0 is the newest one.
+    /// Returns the outcome of a run; `None` while it is in progress. Run 0 is the newest run.
     ///
     /// # Errors
-    /// BadNotFound for a run that never was, or of which nothing is known any more.
+    /// BadNotFound for a run that does not exist or whose outcome is no longer kept.
     pub fn outcome_of(&self, run: u32) -> Result<Option<Arc<Outcome>>, Refusal> {
-        // In this order: a run that ends meanwhile is found.
+        // The number is read before the outcome, so that a run that ends meanwhile is found.
         let newest = self.shown.borrow().run;
         let run = if run == 0 { newest } else { run };
         match self.outcome(run) {
@@ -247,11 +259,12 @@ impl Skill {
         }
     }
 
-    /// Ends the skill: what runs is halted, whoever has the lease. Every later call is refused.
+    /// Ends the skill: a run in progress is halted, regardless of the holder of the lease. Later
+    /// calls are refused.
     pub async fn close(&self) {
         let (closed, ended) = oneshot::channel();
         if self.orders.send(Order::Close(closed)).await.is_ok() {
-            // Without an answer it has ended already.
+            // Without a reply, the skill has ended already.
             let _ended = ended.await;
         }
     }
@@ -274,7 +287,8 @@ impl Skill {
         answer.await.unwrap_or_else(|_| Err(ends()))
     }
 
-    /// Why a call is refused for which there is no room: what would be wrong with it at any time comes first.
+    /// Returns the refusal of a call for which the queue has no space. Errors that do not depend on
+    /// the queue come first.
     fn no_room(&self, by: &Owner, given: Option<Vec<(String, Value)>>) -> Refusal {
         if let Err(refusal) = self.authority.allows(by) {
             return refusal;
@@ -295,11 +309,11 @@ fn ends() -> Refusal {
 }
 
 pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    // Each change is whole before the lock is given back.
+    // Each change is complete before the mutex is released, so a poisoned mutex is usable.
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// So many calls of one skill may wait.
+/// Maximum number of waiting calls of a skill.
 const MOST_ORDERS: usize = 16;
 
 #[cfg(test)]

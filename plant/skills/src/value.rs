@@ -1,4 +1,4 @@
-//! Values of parameters and results: the builtin types of OPC UA that a skill is told in.
+//! Values of parameters and results: the builtin types of OPC UA that skills support.
 
 use std::fmt;
 
@@ -11,16 +11,16 @@ macro_rules! builtins {
         pub enum Builtin { $($(#[$doc])* $name = $id,)* }
 
         impl Builtin {
-            /// All of them, by their numbers.
+            /// All builtin types, by their numbers.
             pub const ALL: &'static [Self] = &[$(Self::$name),*];
 
-            /// As `Double`.
+            /// Returns the name, as `Double`.
             #[must_use]
             pub const fn name(self) -> &'static str {
                 match self { $(Self::$name => stringify!($name)),* }
             }
 
-            /// The numeric identifier of the data type in namespace 0.
+            /// Returns the numeric identifier of the data type in namespace 0.
             #[must_use]
             pub const fn id(self) -> u8 {
                 match self { $(Self::$name => $id),* }
@@ -57,7 +57,7 @@ builtins! {
 }
 
 impl Builtin {
-    /// The type of that number in namespace 0, where it is one of those.
+    /// Returns the type with this identifier in namespace 0, if it is supported.
     #[must_use]
     pub fn of_id(id: u32) -> Option<Self> {
         Self::ALL
@@ -67,17 +67,17 @@ impl Builtin {
     }
 }
 
-/// A builtin type and its rank: one value, or an array of one dimension.
+/// A builtin type and its rank: a scalar, or an array of one dimension.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Shape {
-    /// Of the value, or of each element.
+    /// The type of the value or of each element.
     pub builtin: Builtin,
-    /// Whether there are several.
+    /// Whether it is an array.
     pub array: bool,
 }
 
 impl Shape {
-    /// One value.
+    /// Returns the shape of a scalar.
     #[must_use]
     pub const fn scalar(builtin: Builtin) -> Self {
         Self {
@@ -86,7 +86,7 @@ impl Shape {
         }
     }
 
-    /// An array of one dimension.
+    /// Returns the shape of an array of one dimension.
     #[must_use]
     pub const fn array(builtin: Builtin) -> Self {
         Self {
@@ -95,10 +95,10 @@ impl Shape {
         }
     }
 
-    /// The value that a JSON text has in this shape.
+    /// Reads a JSON value in this shape.
     ///
     /// # Errors
-    /// What is expected instead, for people. Numbers are never rounded or cut.
+    /// The expected type, as text for people. Numbers are never rounded or truncated.
     pub fn read_json(self, json: &Json) -> Result<Value, String> {
         if !self.array {
             return scalar_of_json(self.builtin, json);
@@ -115,7 +115,8 @@ impl Shape {
         ))
     }
 
-    /// The value in this shape where it can be without loss: itself, or a number in a wider type.
+    /// Converts a value to this shape if that is possible without loss: the same type, or a number
+    /// in a wider type.
     #[must_use]
     pub fn take(self, value: Value) -> Option<Value> {
         if value.shape() == self {
@@ -143,7 +144,7 @@ impl fmt::Display for Shape {
     }
 }
 
-/// A value of one of the builtin types, or an array of them.
+/// A value of a builtin type, or an array of such values.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Value {
     /// true or false
@@ -170,12 +171,12 @@ pub enum Value {
     Double(f64),
     /// UTF-8
     String(String),
-    /// Values that all are of the type said first.
+    /// An array whose elements all have this type.
     Array(Builtin, Vec<Self>),
 }
 
 impl Value {
-    /// What type it is of.
+    /// Returns the type of the value.
     #[must_use]
     pub fn shape(&self) -> Shape {
         let builtin = match self {
@@ -196,7 +197,8 @@ impl Value {
         Shape::scalar(builtin)
     }
 
-    /// As JSON. Numbers that JSON has none for are the texts `NaN`, `Infinity`, `-Infinity`, as OPC 10000-6 has it (5.4.2.4).
+    /// Converts the value to JSON. Numbers that JSON does not have are the texts `NaN`, `Infinity`
+    /// and `-Infinity` (OPC 10000-6, 5.4.2.4).
     #[must_use]
     pub fn to_json(&self) -> Json {
         match self {
@@ -216,7 +218,7 @@ impl Value {
         }
     }
 
-    /// A single number, of whatever type, as Double.
+    /// Returns a scalar number of any type as Double.
     #[must_use]
     pub fn as_f64(&self) -> Option<f64> {
         match self {
@@ -234,7 +236,7 @@ impl Value {
         }
     }
 
-    /// An array of numbers as Double.
+    /// Returns an array of numbers as Double.
     #[must_use]
     pub fn as_f64s(&self) -> Option<Vec<f64>> {
         let Self::Array(_, elements) = self else {
@@ -243,7 +245,7 @@ impl Value {
         elements.iter().map(Self::as_f64).collect()
     }
 
-    /// A text.
+    /// Returns a text.
     #[must_use]
     pub fn as_str(&self) -> Option<&str> {
         let Self::String(text) = self else {
@@ -252,7 +254,7 @@ impl Value {
         Some(text)
     }
 
-    /// A Boolean.
+    /// Returns a Boolean.
     #[must_use]
     pub fn as_bool(&self) -> Option<bool> {
         let Self::Boolean(value) = self else {
@@ -261,7 +263,8 @@ impl Value {
         Some(*value)
     }
 
-    /// Whether a number in it is none, or has no end: nothing that a machine should be told.
+    /// Returns whether the value contains a number that is NaN or infinite, which must not be sent
+    /// to a machine.
     #[must_use]
     pub fn is_unreal(&self) -> bool {
         if let Self::Array(_, elements) = self {
@@ -271,7 +274,7 @@ impl Value {
     }
 }
 
-/// As JSON.
+/// Writes the value as JSON.
 impl fmt::Display for Value {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{}", self.to_json())
@@ -334,7 +337,7 @@ fn scalar_of_json(builtin: Builtin, json: &Json) -> Result<Value, String> {
     value.ok_or_else(|| format!("expected {}, found {}", builtin.name(), shown(json)))
 }
 
-/// At most 40 characters of a JSON text.
+/// Returns at most 40 characters of a JSON text.
 fn shown(json: &Json) -> String {
     let text = json.to_string();
     let mut short: String = text.chars().take(40).collect();
@@ -354,7 +357,7 @@ fn real_of_json(json: &Json) -> Option<f64> {
     }
 }
 
-/// The nearest Float; none where that would be infinite.
+/// Returns the nearest Float; `None` if it would be infinite.
 fn narrow(value: f64) -> Option<f32> {
     #[expect(
         clippy::cast_possible_truncation,

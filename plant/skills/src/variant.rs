@@ -1,10 +1,10 @@
-//! Values of skills and of OPC UA.
+//! Conversion between values of skills and Variants of OPC UA.
 
 use plant_opcua::types::{Array, NodeId, UAString, Variant, VariantScalarTypeId};
 
 use crate::value::{Builtin, Value};
 
-/// As OPC UA has it.
+/// Converts a value to a Variant.
 pub(crate) fn to_variant(value: &Value) -> Variant {
     match value {
         Value::Boolean(value) => Variant::Boolean(*value),
@@ -30,7 +30,7 @@ pub(crate) fn to_variant(value: &Value) -> Variant {
     }
 }
 
-/// Names and values in two arrays, as methods have them.
+/// Returns names and values as two arrays, as the arguments of methods have them.
 pub(crate) fn to_pairs(of: &[(String, Value)]) -> [Variant; 2] {
     let array = |value_type, values| {
         Variant::Array(Box::new(Array {
@@ -51,7 +51,7 @@ pub(crate) fn to_pairs(of: &[(String, Value)]) -> [Variant; 2] {
     ]
 }
 
-/// The pairs of two arrays; none where they are not of one length, or hold what skills have no values of.
+/// Reads pairs from two arrays; `None` if their lengths differ or a value is not supported.
 pub(crate) fn from_pairs(names: &Variant, values: &Variant) -> Option<Vec<(String, Value)>> {
     let elements = |of: &Variant| {
         if let Variant::Array(array) = of {
@@ -74,7 +74,8 @@ pub(crate) fn from_pairs(names: &Variant, values: &Variant) -> Option<Vec<(Strin
     names.iter().zip(&values).map(pair).collect()
 }
 
-/// From OPC UA; none for what skills have no values of: other types, arrays of several dimensions, nothing.
+/// Converts a Variant to a value; `None` for other types, arrays of several dimensions and empty
+/// Variants.
 #[expect(
     clippy::wildcard_enum_match_arm,
     reason = "of the types of OPC UA those that a skill can be told in are named"
@@ -114,7 +115,7 @@ pub(crate) fn from_variant(variant: &Variant) -> Option<Value> {
     })
 }
 
-/// The builtin type of a data type that is one.
+/// Returns the builtin type of a data type that is a builtin type.
 pub(crate) fn builtin_of(data_type: &NodeId) -> Option<Builtin> {
     let id = (data_type.namespace == 0).then(|| data_type.as_u32())??;
     Builtin::of_id(id)

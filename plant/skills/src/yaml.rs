@@ -1,7 +1,7 @@
-//! YAML that people write, read so that every fault is told with its place, all of them at once.
+//! Reads YAML that people write. All errors are reported together, with their locations.
 //!
-//! [`parse`] makes a tree of nodes that know where they stand; [`Reader`] takes values from it and notes what is wrong in
-//! [`Findings`]. Anchors, aliases and tags are not read: the documents are short.
+//! [`parse`] builds a tree of nodes with locations. [`Reader`] reads values from it and adds errors
+//! to [`Findings`]. Anchors, aliases and tags are not supported.
 
 mod findings;
 mod read;

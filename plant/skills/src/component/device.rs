@@ -1,4 +1,4 @@
-//! What a component may be besides simulated: a device, of a kind that another crate brings.
+//! Devices that do the work of skills, implemented by other crates.
 
 use std::fmt::Debug;
 use std::sync::Arc;
@@ -8,22 +8,24 @@ use crate::driver::Driver;
 use crate::parameters::TypeName;
 use crate::yaml::{Node, Reader};
 
-/// One device: its drivers share the connection to it.
+/// A device, whose drivers share its connection.
 pub trait Device: Debug + Send + Sync {
-    /// The driver of a skill whose type and supertypes these are, nearest first. Nothing is connected before a run.
+    /// Returns the driver of a skill with this type and these supertypes, nearest first. The device
+    /// is not connected before a run.
     ///
     /// # Errors
-    /// It cannot do the work of that type.
+    /// The device cannot do the work of that type.
     fn driver(&self, types: &[TypeName]) -> Result<Arc<dyn Driver>, DriverFault>;
 }
 
-/// The kinds of devices that the YAML of a component may name.
+/// The kinds of devices that the YAML of a component can contain.
 pub trait DeviceKinds {
-    /// Reads what stands under `device`. What is wrong is noted; `None` then.
+    /// Reads the value of the key `device`. Returns `None` after an error, which is added to the
+    /// findings.
     fn read(&self, node: &Node, reader: &mut Reader<'_>) -> Option<Arc<dyn Device>>;
 }
 
-/// No kind at all.
+/// Supports no kind of device.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct NoDevices;
 

@@ -13,15 +13,17 @@ use crate::parameters::{TypeName, shortened};
 use crate::yaml::{Code, Findings, Kind, Node, Place, Reader, parse};
 
 impl Component {
-    /// Reads the text of a component's YAML; paths in it are relative to `folder`. All that is wrong is told at once.
+    /// Reads a component from YAML; paths are relative to `folder`. All errors are reported
+    /// together.
     ///
     /// # Errors
-    /// What is wrong. Whether types exist is only known with their NodeSets.
+    /// The findings in the document. The existence of types is checked later, when their NodeSets
+    /// are loaded.
     pub fn from_yaml(text: &str, folder: &Path) -> Result<Self, Findings> {
         Self::from_yaml_with(text, folder, &NoDevices)
     }
 
-    /// The same with devices of these kinds.
+    /// Reads a component with devices of these kinds.
     ///
     /// # Errors
     /// As [`from_yaml`](Self::from_yaml).
@@ -81,7 +83,7 @@ fn component(
         robot,
         skills,
     ] = reader.map(root, keys)?;
-    // Each is read, so that all is told, whether or not another is wrong.
+    // All values are read, so that all errors are reported.
     let name = reader
         .needed(name, "component", root.place)
         .and_then(|node| read_name(node, reader));
@@ -126,7 +128,7 @@ fn component(
     })
 }
 
-/// The value of a key that may be left out; `None` where it is there and wrong.
+/// Returns the value of an optional key; `None` if the value is invalid.
 fn whole<T>(read: Option<Option<T>>) -> Option<Option<T>> {
     match read {
         Some(read) => read.map(Some),
@@ -338,7 +340,7 @@ fn read_skills(node: &Node, reader: &mut Reader<'_>) -> Vec<SkillSetup> {
         let Some((skill, name_at)) = read_skill(node, reader) else {
             continue;
         };
-        // Names are found by people, who do not tell them apart by case.
+        // Names are compared without case, because people do not distinguish them by case.
         if skills
             .iter()
             .any(|known| known.name.eq_ignore_ascii_case(&skill.name))
@@ -449,7 +451,7 @@ fn read_partners(node: &Node, reader: &mut Reader<'_>) -> Option<Partners> {
     })
 }
 
-/// An endpoint, or the ApplicationUri of one that is looked for.
+/// Reads an endpoint, or the ApplicationUri of a server that is discovered.
 fn read_partner(node: &Node, reader: &mut Reader<'_>) -> Option<Partner> {
     let is_uri = matches!(&node.kind, Kind::Scalar(text) if text.starts_with("urn:"));
     match is_uri {

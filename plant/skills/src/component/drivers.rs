@@ -1,4 +1,4 @@
-//! From what a component says of its drivers to drivers.
+//! Creates the drivers of a component from its description.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -10,7 +10,8 @@ use crate::model::NAMESPACE;
 use crate::parameters::TypeName;
 use crate::simulated::{Arm, ArmSettings, Base, Change, Changer, Gripper, GripperSettings, Path};
 
-/// Makes the drivers of one component: its skills share one gripper, one robot, one tool changer, one base.
+/// Creates the drivers of one component. Its skills share one gripper, one robot, one tool changer
+/// and one base.
 #[derive(Debug, Default)]
 pub struct Drivers {
     gripper: Gripper,
@@ -27,7 +28,7 @@ pub struct Drivers {
 pub struct DriverFault(pub String);
 
 impl Drivers {
-    /// Those of a new component that has this device, and finds others by that detector.
+    /// Creates the factory for a component with this device; the detector finds its partners.
     #[must_use]
     pub fn new(device: Option<Arc<dyn Device>>, detector: Option<Detector>) -> Self {
         Self {
@@ -37,10 +38,10 @@ impl Drivers {
         }
     }
 
-    /// The driver of a skill whose type and supertypes these are, nearest first.
+    /// Returns the driver of a skill with this type and these supertypes, nearest first.
     ///
     /// # Errors
-    /// It cannot do the work of that type.
+    /// The driver cannot do the work of that type.
     pub fn make(
         &mut self,
         setup: &DriverSetup,
@@ -124,7 +125,7 @@ fn gripper(how: &Simulation) -> GripperSettings {
     }
 }
 
-/// The types whose work is simulated, those below others first.
+/// The types with a simulation, subtypes before their supertypes.
 const SIMULATED: [&str; 12] = [
     "GraspSkillType",
     "ReleaseSkillType",
@@ -139,5 +140,5 @@ const SIMULATED: [&str; 12] = [
     "ChangeToolSkillType",
     "NavigateToSkillType",
 ];
-/// How long a tool takes to be attached or detached.
+/// Default time to attach or detach a tool.
 const USUAL_CHANGE: Duration = Duration::from_secs(2);

@@ -1,4 +1,5 @@
-//! Work that a call or an action of the space does: what it is asked with, and what comes out.
+//! Work that a call or an action of the space does: the mapping of parameters to the request and of
+//! the response to results.
 
 use std::time::Duration;
 
@@ -7,65 +8,66 @@ use serde_json::Value as Json;
 use crate::parameters::{Parameters, shortened};
 use crate::yaml::{Code, Kind, Node, Reader};
 
-/// The work of a skill that somebody else in the space does.
+/// The work of a skill that another participant of the space does.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SpaceWork {
-    /// What is asked.
+    /// The kind of request.
     pub asked: Asked,
-    /// Its name in the space, as `ua_2_2_70`.
+    /// The name of the call or action in the space, as `ua_2_2_70`.
     pub topic: String,
-    /// How long the answer of a call is waited for, or the word on a goal.
+    /// Time limit for the response of a call, or for the acceptance of a goal.
     pub within: Duration,
-    /// How long after Halt the end of the work is waited for until a second Halt ends the run with an unknown outcome.
+    /// Time after Halt during which the end of the work is awaited. After it, a second Halt ends
+    /// the run with an unknown outcome.
     pub halt_timeout: Duration,
-    /// What fields of the request are made of, by their names; of an action those of the goal. Others are made of the
-    /// parameters that are called so.
+    /// The sources of the fields of the request or goal, by name. Other fields are set from the
+    /// parameters of the same name.
     pub request: Vec<(String, Source)>,
     /// What results are made of, by their names. Others are made of the fields of the answer that are called so.
     pub results: Vec<(String, Source)>,
-    /// Fields of the answer, and what they are where the work is done.
+    /// Fields of the response and the values that they have on success.
     pub succeeds: Vec<(String, String)>,
 }
 
-/// What does the work.
+/// The kind of request that does the work.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Asked {
-    /// An answer is the end of it.
+    /// A call, which ends with its response.
     Call,
-    /// A goal, which can be cancelled, has a result.
+    /// An action, whose goal can be cancelled and has a result.
     Action,
 }
 
-/// What a field is made of.
+/// The source of a field.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Source {
-    /// Always the same, as it is written.
+    /// A constant value.
     Constant(Json),
     /// A parameter of the run.
     Parameter(Part),
-    /// A field of the answer.
+    /// A field of the response.
     Field(Part),
 }
 
-/// A value, or a part of one.
+/// A value or a part of a value.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Part {
-    /// Of the parameter or field.
+    /// The name of the parameter or field.
     pub name: String,
-    /// Which element of an array, from 0; all of it without.
+    /// The index of an array element, from 0; `None` for the whole value.
     pub at: Option<usize>,
-    /// What is made of that.
+    /// The conversion of the value.
     pub form: Form,
 }
 
-/// What is made of a value.
+/// The conversion of a value.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Form {
-    /// The same.
+    /// No conversion.
     Plain,
-    /// Of a heading in rad, the z of the quaternion that turns about z.
+    /// The z of the quaternion that turns about the z axis by a heading in rad.
     QuaternionZ,
-    /// Its w.
+    /// The w of that quaternion.
     QuaternionW,
 }
 
@@ -93,10 +95,10 @@ impl Part {
 }
 
 impl Source {
-    /// The value, of the parameters of a run and, once there is one, the answer.
+    /// Returns the value, from the parameters of a run and, after the response, from its fields.
     ///
     /// # Errors
-    /// What is not there, for people.
+    /// The missing value, as text for people.
     pub fn value(
         &self,
         parameters: &Parameters,
@@ -116,7 +118,7 @@ impl Source {
     }
 }
 
-/// Reads what stands under `call` or `action`.
+/// Reads the value of the key `call` or `action`.
 pub(super) fn read(asked: Asked, node: &Node, reader: &mut Reader<'_>) -> Option<SpaceWork> {
     let (topic, [within, halt_timeout, request, results, succeeds]) = match (&node.kind, asked) {
         (Kind::Scalar(_), _) => (Some(node), [None; 5]),
@@ -202,7 +204,7 @@ fn read_topic(node: &Node, reader: &mut Reader<'_>) -> Option<String> {
     None
 }
 
-/// The entries of a map of any keys.
+/// Reads the entries of a map with arbitrary keys.
 fn entries<T>(
     node: Option<&Node>,
     reader: &mut Reader<'_>,
@@ -281,9 +283,9 @@ fn read_source(node: &Node, of_answer: bool, reader: &mut Reader<'_>) -> Option<
     }
 }
 
-/// As who asks a call of the space without saying otherwise.
+/// Default time limit, the same as for other callers of the space.
 const USUALLY_WITHIN: Duration = Duration::from_secs(10);
-/// The usual `halt_timeout`.
+/// Default `halt_timeout`.
 const HALT_TIMEOUT: Duration = Duration::from_secs(10);
 
 #[cfg(test)]

@@ -1,4 +1,5 @@
-//! The names that skill types have in an earlier system, whose components are found and run as what they are.
+//! The names of skill types in an earlier system, whose components are found and run as their
+//! equivalents.
 
 use super::{SkillType, find};
 use crate::parameters::TypeName;
@@ -13,7 +14,7 @@ pub const EARLIER: [&str; 6] = [
     "https://fortiss.org/UA/SemanticMES/",
 ];
 
-/// A name there, without the ending `Type` that some have, and the type here.
+/// A name of that system, without the optional suffix `Type`, and its equivalent in this crate.
 const ALIASES: [(&str, &str); 21] = [
     ("Skill", "SkillType"),
     ("GripperSkill", "GripperSkillType"),
@@ -38,7 +39,7 @@ const ALIASES: [(&str, &str); 21] = [
     ("ExecuteProcessSkill", "ExecuteProcessSkillType"),
 ];
 
-/// The type here that a type of the earlier system is; none for all other types.
+/// Returns the equivalent of a type of the earlier system; `None` for all other types.
 #[must_use]
 pub fn of(name: &TypeName) -> Option<&'static SkillType> {
     if !EARLIER.contains(&name.namespace.as_str()) {

@@ -11,7 +11,7 @@ use super::types::TYPES;
 use super::{CONTROLLER_TYPE, EVENT_TYPE, NAMESPACE, SKILL_TYPE, USED_SKILL_TYPE, USES_SKILL};
 use crate::value::{Builtin, Value};
 
-/// The NodeSet of [`NAMESPACE`]: the same text each time. It needs namespace 0 only.
+/// Returns the NodeSet of [`NAMESPACE`]. The text is deterministic and requires namespace 0 only.
 #[must_use]
 pub fn nodeset() -> String {
     let mut nodes = Nodes(HEAD.replace("{NAMESPACE}", NAMESPACE));
@@ -30,12 +30,12 @@ pub fn nodeset() -> String {
 struct Node<'a> {
     class: &'a str,
     id: u32,
-    /// With the index of its namespace, as `1:Name`.
+    /// The BrowseName with the index of its namespace, as `1:Name`.
     browse_name: &'a str,
-    /// More attributes, each with a space before it.
+    /// Additional attributes, each with a leading space.
     attributes: String,
     about: &'a str,
-    /// Type of the reference, whether it is one back, and its target.
+    /// ReferenceType, whether it is inverse, and the target.
     references: Vec<(&'a str, bool, String)>,
     value: Option<String>,
 }
@@ -73,7 +73,7 @@ impl<'a> Node<'a> {
         self
     }
 
-    /// A child of a type, with the modelling rule.
+    /// Adds a child of a type, with the modelling rule.
     fn child_of(self, parent: u32, reference: &'a str, rule: Rule) -> Self {
         self.attribute("ParentNodeId", &own(parent))
             .forward("HasModellingRule", rule.node())
@@ -115,7 +115,7 @@ impl Nodes {
         } = node;
         let display = browse_name.trim_start_matches("1:");
         let out = &mut self.0;
-        // A write to a String cannot fail.
+        // Writing to a String cannot fail.
         _ = writeln!(
             out,
             "  <{class} NodeId=\"{}\" BrowseName=\"{browse_name}\"{attributes}>",
@@ -204,7 +204,7 @@ impl Nodes {
         );
     }
 
-    /// What every skill has beside the members of a Program.
+    /// Adds the members of every skill beside the members of a Program.
     fn root_members(&mut self, parent: u32) {
         for (place, method) in (0..).zip(METHODS) {
             let node = Node::new("UAMethod", parent + FIRST_METHOD + place, method.name());
@@ -240,7 +240,7 @@ impl Nodes {
         }
     }
 
-    /// Said anew by a type that differs from its supertypes.
+    /// Overrides the value of the supertypes.
     fn ready_after_success(&mut self, id: u32, parent: u32, value: bool) {
         let mut rests = Node::new("UAVariable", id, "1:ReadyAfterSuccess")
             .about(
@@ -253,7 +253,7 @@ impl Nodes {
         self.add(rests);
     }
 
-    /// How a run has ended.
+    /// Adds the members that hold the outcome of a run.
     fn outcome_members(&mut self, parent: u32) {
         let outcome = [
             (
@@ -377,7 +377,7 @@ impl Nodes {
 }
 
 impl Nodes {
-    /// What a skill refers to that is made of others.
+    /// Adds the reference type and the object type for composites.
     fn used_skills(&mut self) {
         let browse_name = format!("1:{USES_SKILL}");
         let node = Node::new("UAReferenceType", USES_SKILL_ID, &browse_name)
@@ -447,7 +447,7 @@ fn escaped(text: &str) -> String {
         .replace('>', "&gt;")
 }
 
-/// Offset, BrowseName, type, whether it is an array, whether it is a property, and what it says.
+/// Offset, BrowseName, type, whether it is an array, whether it is a property, and the description.
 const MEMBERS: [(u32, &str, Builtin, bool, bool, &str); 6] = [
     (
         20,
@@ -573,7 +573,7 @@ mod tests {
             .skip(1)
             .filter_map(|rest| rest.split('"').next())
             .collect();
-        // Each ParentNodeId is found by the split too, and it must be there likewise.
+        // The split also finds each ParentNodeId, whose node must be defined too.
         let defined: Vec<&str> = text
             .split(" NodeId=\"ns=1;")
             .skip(1)

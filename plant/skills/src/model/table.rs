@@ -1,4 +1,4 @@
-//! What the table of skill types is made of.
+//! The elements of the table of skill types.
 
 use program::Rest;
 
@@ -7,47 +7,49 @@ use crate::value::Shape;
 /// A skill type.
 #[derive(Debug)]
 pub struct SkillType {
-    /// Its BrowseName.
+    /// The BrowseName.
     pub name: &'static str,
-    /// The numeric identifier of its node; those of its children follow it, within a hundred.
+    /// The numeric identifier of its node; the identifiers of its children follow, within a
+    /// hundred.
     pub id: u32,
-    /// The type of the table it is a subtype of.
+    /// The name of its supertype in the table.
     pub base: Option<&'static str>,
-    /// Whether only subtypes have instances.
+    /// Whether the type is abstract.
     pub is_abstract: bool,
-    /// What its instances do, for people.
+    /// Description of the instances, for people.
     pub about: &'static str,
-    /// What a run is told, beside what the supertypes have. A parameter keeps its place: new ones come last.
+    /// The parameters, beside the supertypes' parameters. The order is stable: new parameters are
+    /// appended.
     pub parameters: &'static [Variable],
-    /// What a run says at its end, likewise.
+    /// The results, beside the supertypes' results; the order is stable too.
     pub results: &'static [Variable],
-    /// The state after a run that did its work.
+    /// The state after a successful run.
     pub rests_in: Rest,
 }
 
 /// A parameter or result in the table.
 #[derive(Debug)]
 pub struct Variable {
-    /// Its BrowseName.
+    /// The BrowseName.
     pub name: &'static str,
     /// Type and rank.
     pub shape: Shape,
-    /// How many elements an array has.
+    /// The number of elements of an array.
     pub length: Option<u32>,
-    /// What counts where nothing is given.
+    /// The default value.
     pub preset: Preset,
     /// The unit.
     pub unit: Option<&'static Unit>,
-    /// The lowest and the highest of a number.
+    /// The lowest and the highest value of a number.
     pub range: Option<(f64, f64)>,
-    /// What it means, for people.
+    /// Description for people.
     pub about: &'static str,
 }
 
-/// A default.
+/// A default value.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Preset {
-    /// There is none: it must be given.
+    /// No default: the parameter is mandatory.
     None,
     /// A number.
     Number(f64),
@@ -60,10 +62,11 @@ pub enum Preset {
 /// A unit of UNECE Recommendation 20.
 #[derive(Debug, PartialEq, Eq)]
 pub struct Unit {
-    /// As `m/s`.
+    /// The symbol, as `m/s`.
     pub symbol: &'static str,
-    /// As `metre per second`.
+    /// The name, as `metre per second`.
     pub name: &'static str,
-    /// The code as a number: its characters, the first one highest (OPC 10000-8, 5.6.4.3).
+    /// The UNECE code as a number, with the first character in the highest byte (OPC 10000-8,
+    /// 5.6.4.3).
     pub id: u32,
 }

@@ -42,7 +42,7 @@ const TURNING_UP: Unit = Unit {
     id: code(b"2B"),
 };
 
-/// Of two or three characters.
+/// Converts a UNECE code of two or three characters to its number.
 const fn code(characters: &[u8]) -> u32 {
     let mut code = 0;
     let mut rest = characters;
@@ -83,7 +83,7 @@ const fn text(name: &'static str, preset: Preset, about: &'static str) -> Variab
     }
 }
 
-/// Position and orientation of a tool.
+/// A mandatory parameter: position and orientation of a tool.
 const fn position(name: &'static str, about: &'static str) -> Variable {
     Variable {
         name,
@@ -96,7 +96,7 @@ const fn position(name: &'static str, about: &'static str) -> Variable {
     }
 }
 
-/// Numbers that must be given.
+/// A mandatory parameter: an array of numbers.
 const fn numbers(
     name: &'static str,
     length: Option<u32>,
@@ -114,7 +114,7 @@ const fn numbers(
     }
 }
 
-/// A number that a run finds out.
+/// A result: a number that the run measures.
 const fn measured(
     name: &'static str,
     unit: Option<&'static Unit>,

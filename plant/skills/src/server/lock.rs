@@ -1,4 +1,5 @@
-//! Locking of a component (OPC 10000-100, 7): the lease of its skills, held by a session without having it do anything.
+//! Locking of a component (OPC 10000-100, 7): a session holds the lease of its skills without
+//! running them.
 
 use std::future::Future;
 use std::path::Path;
@@ -16,10 +17,11 @@ use crate::authority::{Authority, Owner};
 pub(super) use crate::model::DEVICES as NAMESPACE;
 use crate::skill::lock;
 
-/// The part of it that is about locking, for components whose types need no more of it.
+/// The part of the DI NodeSet that defines locking, for components whose types need no other part.
 pub(super) const NODESET: &str = include_str!("locking.xml");
 
-/// Whether a NodeSet file has that namespace as a whole. One that cannot be read is told of by who loads it.
+/// Returns whether a NodeSet file defines the complete namespace. The loader reports files that
+/// cannot be read.
 pub(super) fn has_di(file: &Path) -> bool {
     let text = std::fs::read_to_string(file).unwrap_or_default();
     let model = format!("<Model ModelUri=\"{NAMESPACE}\"");
@@ -36,7 +38,7 @@ pub(super) struct Lock {
     changed: watch::Sender<()>,
 }
 
-/// A lock that a session has.
+/// A lock that a session holds.
 #[derive(Debug, Clone)]
 struct Held {
     session: u32,
@@ -44,8 +46,8 @@ struct Held {
 }
 
 impl Lock {
-    /// Makes the object below the component. What comes back ends locks that are not renewed, and those of sessions that have
-    /// lost the lease.
+    /// Creates the object below the component. The returned future ends locks that are not renewed
+    /// and locks of sessions that lost the lease.
     pub(super) fn serve(
         server: &Server,
         authority: &Authority,
@@ -99,7 +101,7 @@ impl Lock {
             _ => String::new(),
         };
         self.hold(session);
-        // Who does not say what it is for is known by its application.
+        // Without a context, the lock is shown with the ApplicationUri of the client.
         let client = if context.is_empty() {
             request.caller.application_uri.clone()
         } else {
@@ -125,7 +127,7 @@ impl Lock {
         Ok(DONE)
     }
 
-    /// For administrators, of whom a component knows none.
+    /// For administrators; a component has none.
     fn break_lock(&self, _request: &MethodRequest) -> Answer {
         Err(StatusCode::BadUserAccessDenied)
     }
@@ -151,7 +153,7 @@ impl Lock {
         self.changed.send_replace(());
     }
 
-    /// Ends a lock that nobody needs any more: what has something done keeps it without renewing it.
+    /// Ends an expired lock. Activity of the holder extends the lock without a renewal.
     fn end_or_extend(&self, held: &Held) {
         let now = Instant::now();
         let idle = self.authority.idle(now);
@@ -177,7 +179,8 @@ impl Lock {
                 continue;
             };
             let is_another = |now: &Option<Owner>| *now != Some(Owner::Session(held.session));
-            // What it gives keeps the holder from being changed.
+            // Dropping the returned reference unlocks the watch channel, so that the holder can
+            // change.
             let gone = async { drop(holder.wait_for(is_another).await) };
             tokio::select! {
                 renewed = changed.changed() => if renewed.is_err() { return },
@@ -205,7 +208,7 @@ impl Lock {
         ];
         for (name, value) in values {
             if let Some(node) = self.object.node(name) {
-                // The node is ours for as long as the server is there.
+                // The node exists as long as the server.
                 let _shown = self.server.show(node, value);
             }
         }
@@ -214,9 +217,9 @@ impl Lock {
 
 type Answer = Result<i32, StatusCode>;
 
-/// What the methods give (OPC 10000-100, 7.4 and following).
+/// Return values of the methods (OPC 10000-100, 7.4 and following).
 const DONE: i32 = 0;
 const ALREADY_LOCKED: i32 = -1;
 const NOT_LOCKED: i32 = -1;
-/// A lock that is not renewed for so long ends: MaxInactiveLockTime.
+/// MaxInactiveLockTime: a lock that is not renewed ends after this time.
 const LONGEST_LOCK: Duration = Duration::from_secs(600);

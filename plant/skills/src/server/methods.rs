@@ -1,4 +1,4 @@
-//! What clients have a skill do.
+//! Methods and writes of the clients of a skill.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -16,7 +16,7 @@ use crate::refusal::Refusal;
 use crate::skill::Skill;
 use crate::variant::{from_pairs, from_variant, to_pairs};
 
-/// Has clients write parameters and call methods.
+/// Registers the handlers for writes of parameters and calls of methods.
 pub(super) fn serve(server: &Server, nodes: &Nodes, skill: &Skill) {
     for (name, node) in nodes.parameters() {
         let (skill, name) = (skill.clone(), name.to_owned());

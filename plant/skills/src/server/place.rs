@@ -1,4 +1,5 @@
-//! The method by which the supervisor of the component's level tells it where it is in the plant.
+//! The method with which the supervisor of the component's level sets the location of the component
+//! in the plant.
 
 use std::sync::Arc;
 
@@ -13,8 +14,9 @@ use plant_opcua::types::{
 use plant_opcua::users::Access;
 use tracing::warn;
 
-/// Adds the method `Configure` and the last arguments of it to the object of a component. Only the supervisor of the component
-/// and users with the role ConfigureAdmin may call it.
+/// Adds the method `Configure`, and properties with its last arguments, to the object of a
+/// component. Only the supervisor of the component and users with the role ConfigureAdmin may call
+/// it.
 pub(super) fn configurable(
     server: &Server,
     object: &NodeId,

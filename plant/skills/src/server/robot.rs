@@ -1,6 +1,8 @@
-//! A robot as OPC 40010-1 shows it, beside its skills: the skill that runs is the program of its one task control.
+//! A robot as defined by OPC 40010-1, beside its skills: the running skill is the program of its
+//! only task control.
 //!
-//! Drivers know nothing of axes, power trains and safety states, which are not there, nor of `SpeedOverride`, which is Bad.
+//! Drivers have no data about axes, power trains and safety states, so these are not shown.
+//! `SpeedOverride` has a Bad status.
 
 use std::future::Future;
 
@@ -14,7 +16,7 @@ use crate::model::DEVICES;
 use crate::skill::Skill;
 use crate::yaml::{Code, Finding};
 
-/// What is wrong where there is a robot, and the types of OPC 40010-1 are not.
+/// Returns a finding if there is a robot and the types of OPC 40010-1 are missing.
 pub(super) fn lacks_types(server: &Server, robot: Option<&Robot>) -> Option<Finding> {
     let robot = robot?;
     if server.find_type(ROBOTICS, SYSTEM).is_some() {
@@ -25,7 +27,8 @@ pub(super) fn lacks_types(server: &Server, robot: Option<&Robot>) -> Option<Find
     Some(Finding::error(Code::NodeSet, robot.place, message).with_help(help))
 }
 
-/// Makes the motion device system in the DeviceSet of OPC 10000-100. What comes back keeps its task control up to date.
+/// Creates the motion device system in the DeviceSet of OPC 10000-100. The returned future updates
+/// its task control.
 pub(super) fn serve(
     server: &Server,
     (name, robot): (&str, &Robot),
@@ -57,7 +60,7 @@ pub(super) fn serve(
         show_plate(server, device, robot);
     }
     show(server, &arm, "MotionDeviceCategory", robot.category);
-    // No driver tells how fast a robot may be at most, and its controller has no users.
+    // Drivers do not report a speed limit, and the controller has no users.
     for (of, path) in [
         (&arm, "ParameterSet/SpeedOverride"),
         (&controller, "CurrentUser/Level"),
@@ -75,7 +78,7 @@ pub(super) fn serve(
     Ok(keep(server.clone(), task, skills.to_vec()))
 }
 
-/// What stands on the plate of a device.
+/// Shows the nameplate of a device.
 fn show_plate(server: &Server, device: &Instance, robot: &Robot) {
     for (name, text) in [
         ("Manufacturer", &robot.manufacturer),
@@ -91,7 +94,7 @@ fn show_plate(server: &Server, device: &Instance, robot: &Robot) {
     }
 }
 
-/// Shows which skill runs, whenever that is another.
+/// Shows the running skill at each change.
 async fn keep(server: Server, task: Instance, skills: Vec<Skill>) {
     let mut watches: Vec<_> = skills.iter().map(Skill::watch).collect();
     let mut before = None;
@@ -132,7 +135,7 @@ async fn keep(server: Server, task: Instance, skills: Vec<Skill>) {
 
 fn show(server: &Server, of: &Instance, path: &str, value: impl Into<Variant>) {
     if let Some(node) = of.node(path) {
-        // The node is ours for as long as the server is there.
+        // The node exists as long as the server.
         let _shown = server.show(node, value);
     }
 }
@@ -173,5 +176,5 @@ const SYSTEM: &str = "MotionDeviceSystemType";
 const DEVICE_SET: u32 = 5001;
 /// The ReferenceType Controls (OPC 40010-1, 8.2).
 const CONTROLS: u32 = 4002;
-/// Of ExecutionModeEnumeration (OPC 40010-1, 7.11.3): a skill runs once and ends.
+/// A value of ExecutionModeEnumeration (OPC 40010-1, 7.11.3): a skill runs once and ends.
 const CYCLE: i32 = 0;

@@ -1,4 +1,4 @@
-//! What clients see of a skill: the values of its nodes and its events.
+//! The values of the nodes of a skill and its events, for clients.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -26,7 +26,7 @@ pub(super) struct Nodes {
     parameters: BTreeMap<String, NodeId>,
     results: BTreeMap<String, NodeId>,
     event_type: Option<NodeId>,
-    /// The index of the namespace of our types.
+    /// The index of the namespace of the skill types.
     types: u16,
 }
 
@@ -63,12 +63,12 @@ impl Nodes {
         self.named(method.name())
     }
 
-    /// A member that the type has.
+    /// Returns the node of a member of the type.
     pub(super) fn named(&self, name: &str) -> Option<&NodeId> {
         self.instance.node(name)
     }
 
-    /// What is so for as long as the skill is there, and how it is before anything happens.
+    /// Shows the constant values of the skill and its initial state.
     pub(super) fn show_at_first(&self, server: &Server, facts: &Facts, uses: &[String]) {
         let mut values = Values::new(self);
         values.add("Name", facts.name.as_str());
@@ -92,13 +92,13 @@ impl Nodes {
         }
     }
 
-    /// The parameters as they are for who has written none.
+    /// Shows the default parameters, for a client that has not written any.
     pub(super) fn show_defaults(&self, server: &Server, facts: &Facts) {
         let values = facts.parameters.iter().filter_map(|parameter| {
             let node = self.parameters.get(&parameter.name)?;
             let value = match &parameter.default {
                 Some(value) => DataValue::new_now(to_variant(value)),
-                // It must be given, and is not.
+                // The parameter is mandatory and has no value.
                 None => {
                     DataValue::new_now_status(Variant::Empty, StatusCode::BadWaitingForInitialData)
                 }
@@ -177,7 +177,8 @@ impl Nodes {
         values.show(server);
     }
 
-    /// Shows why a run has not ended that is being cancelled, and raises an event without a transition.
+    /// Shows why a run that is being cancelled has not ended, and raises an event without a
+    /// transition.
     fn show_pending(&self, server: &Server, why: &str, shown: &Shown) {
         self.show_progress(server, shown);
         let source = (self.skill().clone(), &*self.name);
@@ -198,7 +199,7 @@ impl Nodes {
         values.show(server);
     }
 
-    /// ProgramDiagnostic as a whole and its members (OPC 10000-10, 5.2.9).
+    /// Sets ProgramDiagnostic as a whole and its members (OPC 10000-10, 5.2.9).
     fn diagnostic(&self, values: &mut Values<'_>, shown: &Shown) {
         let of = &shown.diagnostic;
         let created = date_time(of.created);
@@ -244,7 +245,7 @@ impl Nodes {
     }
 }
 
-/// Shows what happens to a skill.
+/// An observer that shows the events of a skill.
 pub(super) struct Shower {
     server: Server,
     nodes: Arc<Nodes>,
@@ -270,7 +271,7 @@ impl Observer for Shower {
     }
 }
 
-/// Values on their way to the nodes of a skill.
+/// Values to be written to the nodes of a skill.
 struct Values<'n> {
     nodes: &'n Nodes,
     values: Vec<(NodeId, DataValue)>,
@@ -284,7 +285,7 @@ impl<'n> Values<'n> {
         }
     }
 
-    /// Of a node that the type has; nothing for others.
+    /// Adds a value for a node of the type; ignored if there is no such node.
     fn add(&mut self, path: &str, value: impl Into<Variant>) {
         if let Some(node) = self.nodes.instance.node(path) {
             self.values
@@ -348,7 +349,7 @@ fn date_time(time: SystemTime) -> DateTime {
     DateTime::from(ticks.saturating_add(TICKS_TO_1970))
 }
 
-/// Intervals of 100 ns from 1601 to 1970.
+/// Number of intervals of 100 ns from 1601 to 1970.
 const TICKS_TO_1970: i64 = 116_444_736_000_000_000;
 
 /// Severities from 1 to 1000 (OPC 10000-5, 6.4.2).

@@ -1,4 +1,4 @@
-//! What a skill is, from its type and the instance of it.
+//! Derives the description of a skill from its type and the instance of the type.
 
 use plant_opcua::server::{Instance, Server};
 use plant_opcua::types::{NodeId, Variant};
@@ -9,7 +9,7 @@ use crate::parameters::{Parameter, TypeName};
 use crate::value::Shape;
 use crate::variant::{builtin_of, from_variant};
 
-/// A type and its supertypes, nearest first.
+/// Returns a type and its supertypes, nearest first.
 pub(super) fn chain(server: &Server, type_id: &NodeId) -> Vec<TypeName> {
     let namespaces = server.namespaces();
     let named = |id: &NodeId| {
@@ -26,7 +26,8 @@ pub(super) fn chain(server: &Server, type_id: &NodeId) -> Vec<TypeName> {
         .collect()
 }
 
-/// The variables of one of its groups: those of our types as the table has them and in its order, then what other types add.
+/// Returns the variables of a group: first the variables of types of the table, in its order, then
+/// the additional variables of other types.
 pub(super) fn parameters(
     server: &Server,
     instance: &Instance,
@@ -54,7 +55,7 @@ pub(super) fn parameters(
         };
         let value = facts.value.value.as_ref().and_then(from_variant);
         if let Some(known) = all.iter_mut().find(|known| known.name == name) {
-            // A subtype may have another default.
+            // A subtype may override the default.
             if let Some(value) = value.filter(|value| value.shape() == known.shape) {
                 known.default = Some(value);
             }
@@ -84,7 +85,7 @@ pub(super) fn parameters(
     all
 }
 
-/// Where a run ends that did its work: what the most derived type says of it.
+/// Returns the state after a successful run, as the most derived type defines it.
 pub(super) fn rests_in(server: &Server, instance: &Instance) -> Rest {
     let node = instance.node("ReadyAfterSuccess");
     match node
@@ -114,5 +115,5 @@ fn range(server: &Server, node: &NodeId) -> Option<(f64, f64)> {
     Some((range.low, range.high))
 }
 
-/// What SkillType itself has among its results.
+/// The members of the results of SkillType itself.
 pub(crate) const OUTCOME: [&str; 4] = ["Run", "Succeeded", "Message", "Trace"];

@@ -1,4 +1,4 @@
-//! Which skills of other components those of this one are made of, as references.
+//! References from composite skills to the skills of other components that they use.
 
 use std::collections::BTreeMap;
 
@@ -7,8 +7,8 @@ use plant_opcua::types::{NodeId, ObjectTypeId, QualifiedName, ReferenceTypeId};
 
 use crate::model::{NAMESPACE, USED_SKILL_TYPE, USES_SKILL};
 
-/// Shows what each skill uses, as `<component> <type>`: an object below the folder `UsedSkills` of the component, one for each
-/// that is used, and a reference to it.
+/// Shows the skills that each skill uses, as `<component> <type>`. Each used skill has an object
+/// below the folder `UsedSkills` of the component, and a reference leads to it.
 pub(super) fn show(
     server: &Server,
     component: &NodeId,
@@ -48,7 +48,7 @@ pub(super) fn show(
                 let (component, of_type) = text.split_once(' ').unwrap_or(("", text));
                 for (name, value) in [("Component", component), ("Type", of_type)] {
                     if let Some(node) = object.node(name) {
-                        // The node is ours for as long as the server is there.
+                        // The node exists as long as the server.
                         let _shown = server.show(node, value);
                     }
                 }

@@ -1,4 +1,4 @@
-//! A robot of six axes that moves nothing real.
+//! A simulated robot with six axes.
 
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
@@ -11,18 +11,18 @@ use crate::driver::{Driver, Results, Work};
 use crate::parameters::Parameters;
 use crate::skill::lock;
 
-/// How a simulated robot is.
+/// Settings of a simulated robot.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ArmSettings {
-    /// How far from its base the tool comes, m.
+    /// Maximum distance of the tool from the base, m.
     pub reach: f64,
-    /// How many times faster than time it works.
+    /// Factor by which the simulation is faster than real time.
     pub time_scale: f64,
-    /// Where its tool is at the beginning: m, m, m, rad, rad, rad.
+    /// Initial pose of the tool: m, m, m, rad, rad, rad.
     pub home: [f64; 6],
-    /// How fast it turns its tool at most, rad/s.
+    /// Maximum turning speed of the tool, rad/s.
     pub turning: f64,
-    /// Below which height of the tool something pushes back, m.
+    /// Height of the tool below which a contact force acts, m.
     pub contact: Option<f64>,
 }
 
@@ -38,16 +38,17 @@ impl Default for ArmSettings {
     }
 }
 
-/// How the tool gets from where it is to the target.
+/// The path of the tool to the target.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Path {
-    /// All six coordinates by themselves, each as fast as it may, beginning and ending together.
+    /// All six coordinates move independently, each as fast as allowed, and start and end together.
     PointToPoint,
-    /// Along a straight line.
+    /// A straight line.
     Linear,
 }
 
-/// One robot; its drivers share where its tool and its joints are. It has no kinematics: neither follows the other.
+/// A simulated robot, whose drivers share the pose of its tool and the positions of its joints. It
+/// has no kinematics: the pose and the joints are independent.
 #[derive(Debug, Clone)]
 pub struct Arm {
     settings: ArmSettings,
@@ -56,7 +57,7 @@ pub struct Arm {
 }
 
 impl Arm {
-    /// One whose tool is at home.
+    /// Creates a robot whose tool is at home.
     #[must_use]
     pub fn new(settings: ArmSettings) -> Self {
         let position = Arc::new(Mutex::new(settings.home));
@@ -67,7 +68,7 @@ impl Arm {
         }
     }
 
-    /// The same robot with other settings; where its tool is stays as it is.
+    /// Returns the same robot with other settings; the pose of the tool is kept.
     #[must_use]
     pub fn with(&self, settings: ArmSettings) -> Self {
         Self {
@@ -77,7 +78,7 @@ impl Arm {
         }
     }
 
-    /// The driver of the moves of one kind.
+    /// Returns the driver of Cartesian moves along this kind of path.
     #[must_use]
     pub fn moves(&self, path: Path) -> Arc<dyn Driver> {
         Arc::new(Motion {
@@ -87,7 +88,7 @@ impl Arm {
         })
     }
 
-    /// The driver of ForceMoveSkillType.
+    /// Returns the driver of ForceMoveSkillType.
     #[must_use]
     pub fn yields(&self) -> Arc<dyn Driver> {
         Arc::new(Motion {
@@ -97,13 +98,13 @@ impl Arm {
         })
     }
 
-    /// The driver of the moves of its joints.
+    /// Returns the driver of joint moves.
     #[must_use]
     pub fn turns(&self) -> Arc<dyn Driver> {
         Arc::new(Joints { arm: self.clone() })
     }
 
-    /// Where its tool is.
+    /// Returns the pose of the tool.
     #[must_use]
     pub fn position(&self) -> [f64; 6] {
         *lock(&self.position)
@@ -113,7 +114,7 @@ impl Arm {
 struct Motion {
     arm: Arm,
     path: Path,
-    /// Whether it ends where something pushes back.
+    /// Whether the move ends at a contact force.
     yields: bool,
 }
 
@@ -163,7 +164,7 @@ impl Driver for Motion {
             if touched || seconds >= profile.seconds() {
                 break touched;
             }
-            // What stands still has not moved meanwhile.
+            // The robot does not move while it is suspended.
             work.going().await.map_err(|_| self.stopped())?;
             let began = Instant::now();
             work.spend(TICK).await.map_err(|_| self.stopped())?;
@@ -184,7 +185,7 @@ impl Driver for Motion {
 }
 
 impl Motion {
-    /// Below which height it is stopped by what pushes back.
+    /// Returns the height below which a contact force stops the move.
     fn touches(&self, parameters: &Parameters) -> Option<f64> {
         let counts = self.yields
             && parameters
@@ -193,7 +194,7 @@ impl Motion {
         self.arm.settings.contact.filter(|_| counts)
     }
 
-    /// The motion of the slowest coordinate: the others keep pace with it.
+    /// Returns the profile of the slowest coordinate, which determines the pace of the others.
     fn profile(
         &self,
         from: [f64; 6],
@@ -214,7 +215,7 @@ impl Motion {
         let moves = along
             .into_iter()
             .map(|way| Profile::new(way, speed, acceleration));
-        // It gains its speed of turning within the same time as that of moving.
+        // The turning accelerates within the same time as the translation.
         let turns = turns
             .iter()
             .map(|way| Profile::new(*way, turning, turning * acceleration / speed));
@@ -230,7 +231,7 @@ impl Motion {
     }
 }
 
-/// Moves of joints.
+/// The driver of joint moves.
 struct Joints {
     arm: Arm,
 }
@@ -296,9 +297,9 @@ fn length(of: &[f64]) -> f64 {
     of.iter().map(|part| part * part).sum::<f64>().sqrt()
 }
 
-/// In so many pieces its joints turn.
+/// Number of pieces of a joint move.
 const PIECES: u8 = 50;
-/// How often it says where it is.
+/// Interval between updates of the position.
 const TICK: Duration = Duration::from_millis(10);
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! A mobile base that drives nowhere real.
+//! A simulated mobile base.
 
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
@@ -10,14 +10,15 @@ use crate::driver::{Driver, Results, Work};
 use crate::parameters::Parameters;
 use crate::skill::lock;
 
-/// One mobile base, in the frame `map`.
+/// A simulated mobile base, in the frame `map`.
 #[derive(Debug, Clone, Default)]
 pub struct Base {
     pose: Arc<Mutex<[f64; 3]>>,
 }
 
 impl Base {
-    /// The driver of NavigateToSkillType, so many times faster than time.
+    /// Returns the driver of NavigateToSkillType; `time_scale` is the factor by which it is faster
+    /// than real time.
     #[must_use]
     pub fn navigates(&self, time_scale: f64) -> Arc<dyn Driver> {
         Arc::new(Navigation {
@@ -26,7 +27,7 @@ impl Base {
         })
     }
 
-    /// x, y and heading.
+    /// Returns x, y and heading.
     #[must_use]
     pub fn pose(&self) -> [f64; 3] {
         *lock(&self.pose)
@@ -88,7 +89,7 @@ impl Navigation {
     }
 }
 
-/// m/s and rad/s.
+/// Speeds in m/s and rad/s.
 const SPEED: f64 = 0.5;
 const TURNING: f64 = 1.0;
 

@@ -1,4 +1,4 @@
-//! A tool changer that has nothing real at its flange.
+//! A simulated tool changer.
 
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
@@ -9,13 +9,13 @@ use crate::driver::{Driver, Results, Work};
 use crate::parameters::Parameters;
 use crate::skill::lock;
 
-/// One tool changer; its drivers share which tool is attached.
+/// A simulated tool changer, whose drivers share the attached tool.
 #[derive(Debug, Clone, Default)]
 pub struct Changer {
     tool: Arc<Mutex<String>>,
 }
 
-/// What to do with the tool.
+/// A change of the tool.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Change {
     /// AttachToolSkillType.
@@ -27,7 +27,7 @@ pub enum Change {
 }
 
 impl Changer {
-    /// The driver of one of its skills, each of whose ways takes that long.
+    /// Returns the driver of a skill; each attach or detach takes the time `takes`.
     #[must_use]
     pub fn driver(&self, change: Change, takes: Duration) -> Arc<dyn Driver> {
         Arc::new(Changing {
@@ -37,7 +37,7 @@ impl Changer {
         })
     }
 
-    /// The ApplicationUri of the tool that is attached; nothing for none.
+    /// Returns the ApplicationUri of the attached tool; empty if no tool is attached.
     #[must_use]
     pub fn tool(&self) -> String {
         lock(&self.tool).clone()

@@ -1,4 +1,4 @@
-//! A gripper that holds nothing real.
+//! A simulated gripper.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -8,14 +8,14 @@ use async_trait::async_trait;
 
 use crate::driver::{Driver, Results, Work};
 
-/// How a simulated gripper is.
+/// Settings of a simulated gripper.
 #[derive(Debug, Clone, PartialEq)]
 pub struct GripperSettings {
-    /// How long closing and opening take, before the time scale.
+    /// Duration of closing and opening, before the time scale.
     pub duration: Duration,
-    /// Whether there is a thing where it closes.
+    /// Whether there is an object to grasp.
     pub object: bool,
-    /// How many times faster than time it works.
+    /// Factor by which the simulation is faster than real time.
     pub time_scale: f64,
 }
 
@@ -29,7 +29,7 @@ impl Default for GripperSettings {
     }
 }
 
-/// One gripper; its drivers share what it holds.
+/// A simulated gripper, whose drivers share whether it holds an object.
 #[derive(Debug, Clone, Default)]
 pub struct Gripper {
     settings: GripperSettings,
@@ -37,7 +37,7 @@ pub struct Gripper {
 }
 
 impl Gripper {
-    /// One that holds nothing.
+    /// Creates a gripper that holds no object.
     #[must_use]
     pub fn new(settings: GripperSettings) -> Self {
         Self {
@@ -46,19 +46,22 @@ impl Gripper {
         }
     }
 
-    /// The driver of GraspSkillType and what is below it; with other settings than the gripper's if need be.
+    /// Returns the driver of GraspSkillType and its subtypes. `settings` override the settings of
+    /// the gripper.
     #[must_use]
     pub fn grasp(&self, settings: Option<GripperSettings>) -> Arc<dyn Driver> {
         self.motion(true, settings)
     }
 
-    /// The driver of ReleaseSkillType and what is below it.
+    /// Returns the driver of ReleaseSkillType and its subtypes. `settings` override the settings of
+    /// the gripper.
     #[must_use]
     pub fn release(&self, settings: Option<GripperSettings>) -> Arc<dyn Driver> {
         self.motion(false, settings)
     }
 
-    /// The driver of MoveGripperSkillType and what is below it.
+    /// Returns the driver of MoveGripperSkillType and its subtypes. `settings` override the
+    /// settings of the gripper.
     #[must_use]
     pub fn moves(&self, settings: Option<GripperSettings>) -> Arc<dyn Driver> {
         let settings = settings.unwrap_or_else(|| self.settings.clone());
@@ -68,7 +71,7 @@ impl Gripper {
         })
     }
 
-    /// Whether it holds a thing.
+    /// Returns whether the gripper holds an object.
     #[must_use]
     pub fn holds(&self) -> bool {
         self.holds.load(Ordering::SeqCst)
@@ -84,7 +87,7 @@ impl Gripper {
     }
 }
 
-/// Opening or closing it.
+/// Opens or closes the gripper.
 #[derive(Debug)]
 struct Motion {
     closes: bool,
@@ -117,7 +120,7 @@ impl Driver for Motion {
     }
 }
 
-/// Bringing its fingers to a width.
+/// Moves the fingers to a width.
 #[derive(Debug)]
 struct Width {
     settings: GripperSettings,

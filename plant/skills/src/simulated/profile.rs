@@ -1,8 +1,9 @@
-//! How a motion speeds up and slows down.
+//! The speed profile of a motion.
 
 use std::time::Duration;
 
-/// A trapezoid of speed: constant acceleration, constant speed, the same deceleration. Short ways have no constant part.
+/// A trapezoidal speed profile: constant acceleration, constant speed, the same deceleration. Short
+/// motions have no constant part.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Profile {
     distance: f64,
@@ -14,8 +15,11 @@ pub struct Profile {
 }
 
 impl Profile {
-    /// For a way of `distance` at most at `speed`, gaining and losing it by `acceleration`; units as the caller likes, per
-    /// second. A way of nothing takes no time; speed and acceleration are above 0.
+    /// Creates the profile of a motion over `distance` at up to `speed`, with this acceleration and
+    /// deceleration.
+    ///
+    /// The units are the caller's, per second. A distance of zero takes no time; speed and
+    /// acceleration must be above 0.
     #[must_use]
     pub fn new(distance: f64, speed: f64, acceleration: f64) -> Self {
         let distance = distance.abs();
@@ -33,19 +37,19 @@ impl Profile {
         }
     }
 
-    /// How long it takes, s.
+    /// Returns the duration of the motion, s.
     #[must_use]
     pub fn seconds(&self) -> f64 {
         2.0 * self.ramp + self.cruise
     }
 
-    /// How long it takes.
+    /// Returns the duration of the motion.
     #[must_use]
     pub fn time(&self) -> Duration {
         Duration::try_from_secs_f64(self.seconds()).unwrap_or(Duration::MAX)
     }
 
-    /// How far it has come after `seconds`, as a share of the way from 0 to 1.
+    /// Returns the share of the distance that is covered after `seconds`, from 0 to 1.
     #[must_use]
     pub fn share(&self, seconds: f64) -> f64 {
         let total = self.seconds();

@@ -1,4 +1,4 @@
-//! One skill and a driver, without a server.
+//! Tests of a skill with a driver, without a server.
 
 use std::sync::atomic::{AtomicU32, Ordering};
 use tokio::time::Instant;
@@ -16,7 +16,7 @@ const ME: Owner = Owner::Session(1);
 const OTHER: Owner = Owner::Session(2);
 const HALT_TIMEOUT: Duration = Duration::from_secs(10);
 
-/// Does what its `how` says, as often as it is let.
+/// A driver that behaves as `how` defines, once per permit of `gate`.
 struct Scripted {
     how: How,
     gate: Arc<Semaphore>,
@@ -28,11 +28,12 @@ enum How {
     WhenLet,
     Panics,
     Fails,
-    /// Neither ends nor hears.
+    /// Neither ends nor reacts to the stop signal.
     Deaf,
-    /// Does not even give its thread back.
+    /// Blocks its thread.
     Blocks(Duration),
-    /// Is done elsewhere, and says that when it is stopped. Then it ends as stopped when it is let.
+    /// Is done elsewhere and reports this when it is stopped. It ends as stopped at the next
+    /// permit.
     Elsewhere(Elsewhere),
 }
 
@@ -341,7 +342,7 @@ async fn of_two_clients_that_race_one_begins_one_run_with_its_own_parameters() {
     assert_eq!(first, Ok(1));
     assert_eq!(second.unwrap_err().code, Code::Locked);
     assert_eq!(bench.skill.shown().parameters.number("Force"), Some(7.0));
-    // Authority comes before everything else.
+    // The authority is checked before everything else.
     let refusal = bench.skill.call(OTHER, Method::Reset).await.unwrap_err();
     assert_eq!(refusal.code, Code::Locked);
     // The run outlives the session; the lease does not.
@@ -350,7 +351,7 @@ async fn of_two_clients_that_race_one_begins_one_run_with_its_own_parameters() {
     bench.gate.add_permits(1);
     bench.until(State::Ready).await;
     assert!(bench.skill.outcome(1).unwrap().succeeded);
-    // What the first client wrote is nothing to the second.
+    // The second client does not inherit the parameters of the first.
     bench.skill.call(OTHER, Method::Start).await.unwrap();
     assert_eq!(bench.skill.shown().parameters.number("Force"), Some(20.0));
 }
@@ -407,7 +408,7 @@ async fn execute_makes_ready_and_begins_at_once_or_changes_nothing() {
 async fn a_full_queue_is_told_of_only_where_nothing_else_is_wrong() {
     let bench = bench(How::Deaf);
     bench.run_to(State::Running).await;
-    // Halt of what does not hear takes a second, in which calls wait.
+    // Halt of work that does not react takes a second, in which calls wait.
     let halting = bench.skill.call(ME, Method::Halt);
     let mut waiting: Vec<_> = (0..MOST_ORDERS)
         .map(|_| Box::pin(bench.skill.call(ME, Method::Halt)))
@@ -563,7 +564,7 @@ async fn a_run_that_takes_too_long_fails() {
         shown.outcome.as_ref().unwrap().message,
         "the work was not done within 20ms"
     );
-    // Time in which it stands still does not count.
+    // Suspended time does not count.
     bench.call(Method::Reset).await.unwrap();
     bench.call(Method::Start).await.unwrap();
     bench.call(Method::Suspend).await.unwrap();
@@ -659,7 +660,7 @@ async fn work_elsewhere_is_halted_when_it_has_ended() {
     let shown = bench.skill.shown();
     assert_eq!(shown.state, State::Running);
     assert_eq!(shown.pending.as_deref(), Some("the goal has not ended"));
-    // Once more: it is on its way.
+    // A second Halt: the cancellation is in progress.
     bench.call(Method::Halt).await.unwrap();
     assert_eq!(bench.skill.shown().state, State::Running);
     bench.gate.add_permits(1);

@@ -1,4 +1,5 @@
-//! What is wrong with a document, told as rustc tells it: code, place, the line with a caret, help.
+//! Errors in a document, formatted like errors of rustc: code, location, the line with a caret, and
+//! help.
 
 use std::fmt::{self, Write as _};
 
@@ -6,22 +7,23 @@ use super::tree::Place;
 
 macro_rules! codes {
     ($($name:ident = $text:literal, $explanation:literal;)*) => {
-        /// What kind of finding. A code keeps its meaning from release to release; new ones may come.
+        /// The kind of a finding. The meaning of a code is stable across releases; codes may be
+        /// added.
         #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
         #[non_exhaustive]
         pub enum Code { $(#[doc = concat!($text, ", of which [`explanation`](Self::explanation) tells more.")] $name,)* }
 
         impl Code {
-            /// Every code, ascending.
+            /// All codes, in ascending order.
             pub const ALL: &'static [Self] = &[$(Self::$name),*];
 
-            /// As `P001`.
+            /// Returns the code, as `P001`.
             #[must_use]
             pub const fn as_str(self) -> &'static str {
                 match self { $(Self::$name => $text),* }
             }
 
-            /// What the code means in general and what to do about it.
+            /// Returns the meaning of the code and how to correct the document.
             #[must_use]
             pub const fn explanation(self) -> &'static str {
                 match self { $(Self::$name => $explanation),* }
@@ -57,21 +59,21 @@ impl fmt::Display for Code {
     }
 }
 
-/// One finding. Each is an error: the document cannot be used with it.
+/// A finding. Each is an error: the document cannot be used with it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Finding {
-    /// What kind.
+    /// The kind.
     pub code: Code,
-    /// The text it is about.
+    /// The location in the text.
     pub place: Place,
-    /// What is wrong, naming the value.
+    /// What is wrong, with the value.
     pub message: String,
-    /// What to do about it.
+    /// How to correct it.
     pub help: Option<String>,
 }
 
 impl Finding {
-    /// An error.
+    /// Creates an error.
     pub fn error(code: Code, place: Place, message: impl Into<String>) -> Self {
         Self {
             code,
@@ -81,21 +83,21 @@ impl Finding {
         }
     }
 
-    /// With what to do about it.
+    /// Adds how to correct it.
     #[must_use]
     pub fn with_help(mut self, help: impl Into<String>) -> Self {
         self.help = Some(help.into());
         self
     }
 
-    /// The finding with its source line, several lines of text that end in a newline. Control characters of the source are
-    /// replaced, so that a document cannot steer the terminal.
+    /// Returns the finding with its source line, as several lines that end with a newline. Control
+    /// characters of the source are replaced, so that a document cannot control the terminal.
     #[must_use]
     pub fn render(&self, file: &str, source: &str) -> String {
         let Place { line, column, len } = self.place;
         let width = line.to_string().len();
         let mut out = format!("error[{}]: {}\n", self.code, printable(&self.message));
-        // A write to a String cannot fail.
+        // Writing to a String cannot fail.
         _ = writeln!(out, "{:width$}--> {}:{line}:{column}", "", printable(file));
         if let Some(text) = line.checked_sub(1).and_then(|n| source.lines().nth(n)) {
             let shown: String = text.trim_end().chars().take(WIDTH).map(visible).collect();
@@ -114,7 +116,7 @@ impl Finding {
     }
 }
 
-/// What has been found so far.
+/// The findings of a document.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Findings {
     found: Vec<Finding>,
@@ -122,7 +124,7 @@ pub struct Findings {
 }
 
 impl Findings {
-    /// Takes one in. From a few hundred on they are counted only.
+    /// Adds a finding. After the first 200, further findings are only counted.
     pub fn push(&mut self, finding: Finding) {
         if self.found.len() >= MOST {
             self.left_out += 1;
@@ -131,12 +133,12 @@ impl Findings {
         }
     }
 
-    /// Notes an error.
+    /// Adds an error.
     pub fn error(&mut self, code: Code, place: Place, message: impl Into<String>) {
         self.push(Finding::error(code, place, message));
     }
 
-    /// Notes an error with what to do about it.
+    /// Adds an error and how to correct it.
     pub fn error_with(
         &mut self,
         code: Code,
@@ -147,19 +149,19 @@ impl Findings {
         self.push(Finding::error(code, place, message).with_help(help));
     }
 
-    /// Whether there is none.
+    /// Returns whether there are no findings.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.found.is_empty()
     }
 
-    /// How many there are.
+    /// Returns the number of findings.
     #[must_use]
     pub fn len(&self) -> usize {
         self.found.len() + self.left_out
     }
 
-    /// In the order of the text.
+    /// Returns the findings in the order of the text.
     #[must_use]
     pub fn sorted(mut self) -> Vec<Finding> {
         self.found
@@ -172,7 +174,7 @@ impl Findings {
         self.found
     }
 
-    /// All of them as text for people, a blank line after each.
+    /// Returns all findings as text for people, each followed by a blank line.
     #[must_use]
     pub fn render(self, file: &str, source: &str) -> String {
         self.sorted()
@@ -182,7 +184,7 @@ impl Findings {
     }
 }
 
-/// Widest piece of a line that is shown.
+/// Maximum number of characters of a line that is shown.
 const WIDTH: usize = 160;
 const MOST: usize = 200;
 
@@ -194,7 +196,7 @@ fn visible(c: char) -> char {
     match c {
         '\t' => '\u{2192}',
         c if c.is_control() => '\u{fffd}',
-        // Marks that turn the direction of the text around them.
+        // Marks that change the direction of the text around them.
         '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}' => '\u{fffd}',
         c => c,
     }

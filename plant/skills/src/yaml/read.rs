@@ -1,4 +1,4 @@
-//! Tree -> values. Every fault is noted and reading goes on beside it.
+//! Reads values from a tree. Each error is recorded, and reading continues.
 
 use std::time::Duration;
 
@@ -6,25 +6,26 @@ use super::findings::{Code, Finding, Findings};
 use super::tree::{Kind, Node, Place};
 use crate::parameters::shortened;
 
-/// Takes values from nodes and notes what is wrong with them.
+/// Reads values from nodes and records errors.
 #[derive(Debug)]
 pub struct Reader<'f> {
     findings: &'f mut Findings,
 }
 
 impl<'f> Reader<'f> {
-    /// One that notes there.
+    /// Creates a reader that records errors in `findings`.
     pub fn new(findings: &'f mut Findings) -> Self {
         Self { findings }
     }
 
-    /// Where it notes.
+    /// Returns the recorded errors.
     pub fn findings(&mut self) -> &mut Findings {
         self.findings
     }
 
-    /// The values of a map in the order of `keys`; a key without a value counts as left out. Keys that are none of them are
-    /// noted; a misspelt one is then read as the key that it resembles. `None` where it is no map.
+    /// Returns the values of a map in the order of `keys`; a key without a value counts as missing.
+    /// Unknown keys are recorded as errors; a misspelt key is then read as the key that it
+    /// resembles. Returns `None` if the node is not a map.
     pub fn map<'n, const N: usize>(
         &mut self,
         node: &'n Node,
@@ -78,7 +79,7 @@ impl<'f> Reader<'f> {
         Some(values)
     }
 
-    /// A key that has to be there.
+    /// Requires a key.
     pub fn needed<'n>(
         &mut self,
         value: Option<&'n Node>,
@@ -92,7 +93,7 @@ impl<'f> Reader<'f> {
         value
     }
 
-    /// A single value as written.
+    /// Returns a scalar as written.
     pub fn text<'n>(&mut self, node: &'n Node, wanted: &str) -> Option<&'n str> {
         let Kind::Scalar(text) = &node.kind else {
             self.wrong(node, wanted);
@@ -101,7 +102,7 @@ impl<'f> Reader<'f> {
         Some(text)
     }
 
-    /// A list; a single value counts as a list of one.
+    /// Returns a list; a scalar counts as a list with one element.
     pub fn list<'n>(&mut self, node: &'n Node) -> &'n [Node] {
         match &node.kind {
             Kind::List(nodes) => nodes,
@@ -114,7 +115,7 @@ impl<'f> Reader<'f> {
         }
     }
 
-    /// `true` or `false`.
+    /// Reads `true` or `false`.
     pub fn boolean(&mut self, node: &Node) -> Option<bool> {
         match self.text(node, "true or false")? {
             "true" => Some(true),
@@ -127,10 +128,10 @@ impl<'f> Reader<'f> {
         }
     }
 
-    /// A number of a range.
+    /// Reads a number within a range.
     pub fn number(&mut self, node: &Node, (low, high): (f64, f64)) -> Option<f64> {
         let text = self.text(node, "a number")?;
-        // `inf` and `nan` are numbers to Rust.
+        // Rust also parses `inf` and `nan` as numbers.
         let number = text
             .parse()
             .ok()
@@ -145,7 +146,7 @@ impl<'f> Reader<'f> {
         })
     }
 
-    /// A duration with its unit, from 1 ms to 24 h.
+    /// Reads a duration with its unit, from 1 ms to 24 h.
     pub fn duration(&mut self, node: &Node) -> Option<Duration> {
         let text = self.text(node, "a duration")?;
         parse_duration(text).or_else(|| {
@@ -160,13 +161,13 @@ impl<'f> Reader<'f> {
         })
     }
 
-    /// Notes an error at a node. Gives `None`.
+    /// Records an error at a node. Returns `None`.
     pub fn refuse<T>(&mut self, node: &Node, code: Code, message: String) -> Option<T> {
         self.findings.error(code, node.place, message);
         None
     }
 
-    /// Notes that `wanted` (with its article) should stand there.
+    /// Records that `wanted` (with its article) is expected.
     pub fn wrong(&mut self, node: &Node, wanted: &str) {
         let message = format!("expected {wanted}, found {}", node.kind.name());
         self.findings.error(Code::WrongValue, node.place, message);
@@ -190,13 +191,13 @@ fn parse_duration(text: &str) -> Option<Duration> {
         .then_some(duration)
 }
 
-/// `a`, `b`, `c`
+/// Formats names as a list: `a`, `b`, `c`.
 fn list(names: &[&str]) -> String {
     let names: Vec<String> = names.iter().map(|name| format!("`{name}`")).collect();
     names.join(", ")
 }
 
-/// The name that was meant, if one differs in a few letters only.
+/// Returns the known name that differs in a few letters only, if any.
 pub(crate) fn nearest<'k>(name: &str, known: &[&'k str]) -> Option<&'k str> {
     if name.chars().count() > 64 {
         return None;
@@ -211,12 +212,12 @@ pub(crate) fn nearest<'k>(name: &str, known: &[&'k str]) -> Option<&'k str> {
         .map(|(_, name)| name)
 }
 
-/// Counts the letters to insert, delete, change or swap with their neighbour, case apart (the optimal string alignment
-/// distance).
+/// Counts the letters to insert, delete, change or swap with their neighbour, ignoring case (the
+/// optimal string alignment distance).
 fn distance(a: &str, b: &str) -> usize {
     let (a, b) = (a.to_lowercase(), b.to_lowercase());
     let mut above: Vec<usize> = (0..=b.chars().count()).collect();
-    // The row of the letter before the last one, in which a swap of both letters continues.
+    // The row of the letter before the last, from which a swap of both letters continues.
     let mut before: Vec<usize> = Vec::new();
     let mut last = None;
     for (line, x) in a.chars().enumerate() {

@@ -1,22 +1,22 @@
-//! YAML text -> a tree of nodes that know their place.
+//! Parses YAML text into a tree of nodes with locations.
 
 use granit_parser::{Event, Parser, ScalarStyle, ScanError, Span};
 
 use super::findings::{Code, Finding};
 
-/// Where in the text, counted from 1 in lines and characters, within one line.
+/// A location in the text, within one line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct Place {
-    /// From 1.
+    /// The line, from 1.
     pub line: usize,
-    /// From 1, in characters.
+    /// The column in characters, from 1.
     pub column: usize,
-    /// In characters, at least 1.
+    /// The length in characters, at least 1.
     pub len: usize,
 }
 
 impl Place {
-    /// The beginning of the text.
+    /// The start of the text.
     pub const START: Self = Self {
         line: 1,
         column: 1,
@@ -27,27 +27,27 @@ impl Place {
 /// A value of the document.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Node {
-    /// Where it stands.
+    /// Its location.
     pub place: Place,
-    /// What it is.
+    /// Its content.
     pub kind: Kind,
 }
 
-/// What a value is.
+/// The content of a node.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Kind {
-    /// Nothing, `~` or `null`.
+    /// An empty value, `~` or `null`.
     Null,
-    /// A single value, as written.
+    /// A scalar, as written.
     Scalar(String),
-    /// Values.
+    /// A list.
     List(Vec<Node>),
-    /// Keys and values in the order of the text, repeated keys included.
+    /// Keys and values in the order of the text, with repeated keys.
     Map(Vec<(Node, Node)>),
 }
 
 impl Kind {
-    /// With its article.
+    /// Returns the name with its article.
     #[must_use]
     pub const fn name(&self) -> &'static str {
         match self {
@@ -59,10 +59,10 @@ impl Kind {
     }
 }
 
-/// Reads a text as one document.
+/// Parses a text as one document.
 ///
 /// # Errors
-/// The first place that cannot be read; nothing after it has been looked at.
+/// The first location that cannot be parsed; the text after it is not checked.
 pub fn parse(text: &str) -> Result<Node, Finding> {
     if text.len() > MAX_BYTES {
         let message = format!(
@@ -104,7 +104,7 @@ struct Builder {
     nodes: usize,
 }
 
-/// A list or map whose end has not come.
+/// A list or map that is not complete.
 struct Open {
     place: Place,
     map: bool,
@@ -147,7 +147,7 @@ impl Builder {
                 "an alias",
                 "a text that begins with * or & stands in quotes",
             )),
-            // The enumeration is open: a node this does not know would be missing from the tree.
+            // The enumeration is non-exhaustive: an unknown node would be missing from the tree.
             other => Err(not_read(
                 place,
                 &format!("{other:?}"),
@@ -223,7 +223,7 @@ fn syntax(text: &str, error: &ScanError) -> Finding {
     Finding::error(Code::Syntax, place, error.info()).with_help(help)
 }
 
-/// The first line of what is marked.
+/// Returns the location of the first line of a span.
 fn place(text: &str, marks: Span) -> Place {
     let (start, end) = (marks.start, marks.end);
     let len = if end.line() == start.line() {
@@ -247,11 +247,11 @@ fn place(text: &str, marks: Span) -> Place {
     }
 }
 
-/// Largest text, in bytes.
+/// Maximum size of a text, in bytes.
 const MAX_BYTES: usize = 1 << 20;
-/// Most values of a text.
+/// Maximum number of values of a text.
 const MAX_NODES: usize = 20_000;
-/// Deepest nesting.
+/// Maximum nesting depth.
 const MAX_DEPTH: usize = 16;
 
 #[cfg(test)]

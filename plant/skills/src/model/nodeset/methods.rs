@@ -4,7 +4,7 @@ use super::{Node, Nodes, PROPERTY_TYPE, Rule, TYPES_NAMESPACE, escaped};
 
 /// A method that a type declares.
 pub(super) struct Method {
-    /// How far from the identifier of its type; its properties follow.
+    /// Offset from the identifier of its type; the identifiers of its properties follow.
     offset: u32,
     browse_name: &'static str,
     about: &'static str,
@@ -44,7 +44,7 @@ const STRING: u32 = 12;
 const BASE_DATA_TYPE: u32 = 24;
 const DURATION: u32 = 290;
 
-/// What a skill has beside the methods of a Program.
+/// The methods of a skill beside the methods of a Program.
 pub(super) const OF_A_SKILL: [Method; 2] = [
     Method {
         offset: 60,
