@@ -533,7 +533,7 @@ impl Actor {
         Some(work.unknown.is_some() || halting.over <= Instant::now())
     }
 
-    /// Ends a run whose work goes on elsewhere, or may go on. Its outcome is unknown.
+    /// Ends a run while its work goes on elsewhere, or may go on. The outcome is unknown.
     fn give_up(&mut self, message: &str) {
         let Some(work) = self.work.take() else {
             return;
@@ -640,7 +640,7 @@ impl Actor {
         }
     }
 
-    /// Records the outcome of a run whose work was stopped. The caller performs the transition.
+    /// Records the outcome of a run after its work was stopped. The caller performs the transition.
     fn end_without_work(&mut self, message: String) {
         let Some(run) = self.program.run() else {
             return;
@@ -902,5 +902,5 @@ const LONGEST_TRACED: usize = 240;
 const TOLD_EVERY: Duration = Duration::from_secs(1);
 /// Time that a closing component waits for the end of work that it has cancelled elsewhere.
 const PENDING_AT_END: Duration = Duration::from_millis(4_500);
-/// Number of runs whose outcomes are kept.
+/// Number of outcomes that are kept.
 const MOST_OUTCOMES: usize = 64;

@@ -5,7 +5,7 @@
 //! - this module
 //! - `packed`: structures that hold numbers
 //! - `find`: the skills of a server
-//! - `handle`: one skill
+//! - `handle`: a skill of a server
 //! - `mirror`: the skills of a server, presented like local skills
 //! - `detector`: the skills of all servers
 //! - `remote`: a composite of the skills of several servers
@@ -629,7 +629,7 @@ mod tests {
                 .unwrap()
                 .unwrap();
         }
-        // A person who has locked one of the components is not disturbed, and nothing moves.
+        // A person has locked a component. That person is not disturbed, and nothing moves.
         let other = client(&gripper).await;
         let theirs = other.handle(&other.skills().await.unwrap()[0]);
         assert!(theirs.lock("a person").await.unwrap());

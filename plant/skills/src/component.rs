@@ -117,7 +117,7 @@ impl Lds {
     }
 }
 
-/// One skill of a component.
+/// A skill of a component.
 #[derive(Debug, Clone)]
 pub struct SkillSetup {
     /// The name of the skill in its component.
@@ -176,7 +176,7 @@ pub struct Simulation {
     pub contact: Option<f64>,
 }
 
-/// The servers whose skills a composite runs.
+/// The servers of the skills that a composite runs.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Partners {
     /// The server of the robot.
@@ -187,7 +187,7 @@ pub struct Partners {
     pub within: Duration,
 }
 
-/// A server whose skills a composite runs.
+/// A server of skills that a composite runs.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Partner {
     /// The server at this endpoint.

@@ -361,7 +361,7 @@ mod tests {
         approach: 0.05,
     };
 
-    /// A skill whose component can be lost.
+    /// A skill of a component that can be lost.
     struct Losable {
         inner: LocalRun,
         gone: watch::Receiver<bool>,

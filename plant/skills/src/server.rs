@@ -461,7 +461,7 @@ const FIRST_FREE_ID: u32 = 1_000_000;
 /// Number of checks for an idle lease within the idle time.
 const LOOKS: u32 = 10;
 const SHORTEST_LOOK: Duration = Duration::from_millis(10);
-/// Maximum number of sessions whose end waits to be processed.
+/// Maximum number of closed sessions that wait to be processed.
 const MOST_CLOSED: usize = 1_024;
 
 #[cfg(test)]

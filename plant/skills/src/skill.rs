@@ -74,7 +74,7 @@ impl Pending {
 }
 
 impl Skill {
-    /// Starts a skill in the state Halted, whose first run has the number 1. Needs a tokio runtime.
+    /// Starts a skill in the state Halted. Its first run has the number 1. Needs a tokio runtime.
     #[must_use]
     pub fn spawn(
         facts: Facts,
@@ -85,8 +85,8 @@ impl Skill {
         Self::counting_from(1, facts, driver, authority, observers)
     }
 
-    /// Starts a skill whose first run has this number, so that numbers used before a restart are
-    /// not reused.
+    /// Starts a skill with this number for its first run, so that numbers used before a restart
+    /// are not reused.
     #[must_use]
     pub fn counting_from(
         first_run: u32,
@@ -244,7 +244,7 @@ impl Skill {
     /// Returns the outcome of a run; `None` while it is in progress. Run 0 is the newest run.
     ///
     /// # Errors
-    /// BadNotFound for a run that does not exist or whose outcome is no longer kept.
+    /// BadNotFound if the run does not exist or its outcome is no longer kept.
     pub fn outcome_of(&self, run: u32) -> Result<Option<Arc<Outcome>>, Refusal> {
         // The number is read before the outcome, so that a run that ends meanwhile is found.
         let newest = self.shown.borrow().run;

@@ -171,7 +171,7 @@ pub enum Value {
     Double(f64),
     /// UTF-8
     String(String),
-    /// An array whose elements all have this type.
+    /// An array with elements of this type.
     Array(Builtin, Vec<Self>),
 }
 

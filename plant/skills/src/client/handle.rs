@@ -1,4 +1,4 @@
-//! Handle of one skill of another component.
+//! Handle of a skill of another component.
 
 use std::time::Duration;
 

@@ -52,7 +52,7 @@ struct Order {
     reply: oneshot::Sender<Result<u32, SkillFault>>,
 }
 
-/// The skills of one server for the lifetime of one connection. Dropping it ends the reports.
+/// The skills of a server for the lifetime of a connection. Dropping them ends the reports.
 #[derive(Debug)]
 pub struct Mirrors {
     skills: Vec<Mirror>,

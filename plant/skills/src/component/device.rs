@@ -8,7 +8,7 @@ use crate::driver::Driver;
 use crate::parameters::TypeName;
 use crate::yaml::{Node, Reader};
 
-/// A device, whose drivers share its connection.
+/// A device. Its drivers share the connection to it.
 pub trait Device: Debug + Send + Sync {
     /// Returns the driver of a skill with this type and these supertypes, nearest first. The device
     /// is not connected before a run.

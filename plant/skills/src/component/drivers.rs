@@ -10,8 +10,8 @@ use crate::model::NAMESPACE;
 use crate::parameters::TypeName;
 use crate::simulated::{Arm, ArmSettings, Base, Change, Changer, Gripper, GripperSettings, Path};
 
-/// Creates the drivers of one component. Its skills share one gripper, one robot, one tool changer
-/// and one base.
+/// Creates the drivers of a component. Its skills share a gripper, a robot, a tool changer and a
+/// base.
 #[derive(Debug, Default)]
 pub struct Drivers {
     gripper: Gripper,

@@ -23,7 +23,8 @@ pub struct SpaceWork {
     /// The sources of the fields of the request or goal, by name. Other fields are set from the
     /// parameters of the same name.
     pub request: Vec<(String, Source)>,
-    /// What results are made of, by their names. Others are made of the fields of the answer that are called so.
+    /// The sources of results, by name. Other results are set from the fields of the response of
+    /// the same name.
     pub results: Vec<(String, Source)>,
     /// Fields of the response and the values that they have on success.
     pub succeeds: Vec<(String, String)>,
@@ -34,7 +35,7 @@ pub struct SpaceWork {
 pub enum Asked {
     /// A call, which ends with its response.
     Call,
-    /// An action, whose goal can be cancelled and has a result.
+    /// An action. Its goal has a result and can be cancelled.
     Action,
 }
 

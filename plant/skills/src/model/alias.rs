@@ -1,5 +1,5 @@
-//! The names of skill types in an earlier system, whose components are found and run as their
-//! equivalents.
+//! The names of skill types in an earlier system. Its components are found and run under the
+//! equivalent types.
 
 use super::{SkillType, find};
 use crate::parameters::TypeName;

@@ -573,7 +573,7 @@ mod tests {
             .skip(1)
             .filter_map(|rest| rest.split('"').next())
             .collect();
-        // The split also finds each ParentNodeId, whose node must be defined too.
+        // The split also finds each ParentNodeId. The parent must be defined too.
         let defined: Vec<&str> = text
             .split(" NodeId=\"ns=1;")
             .skip(1)

@@ -17,7 +17,7 @@ use crate::authority::{Authority, Owner};
 pub(super) use crate::model::DEVICES as NAMESPACE;
 use crate::skill::lock;
 
-/// The part of the DI NodeSet that defines locking, for components whose types need no other part.
+/// The part of the DI NodeSet that defines locking, for components that need no other part of it.
 pub(super) const NODESET: &str = include_str!("locking.xml");
 
 /// Returns whether a NodeSet file defines the complete namespace. The loader reports files that
@@ -127,7 +127,7 @@ impl Lock {
         Ok(DONE)
     }
 
-    /// For administrators; a component has none.
+    /// Always refused: the method is for administrators, and a component has no administrators.
     fn break_lock(&self, _request: &MethodRequest) -> Answer {
         Err(StatusCode::BadUserAccessDenied)
     }

@@ -18,7 +18,7 @@ use crate::skill::Facts;
 use crate::value::{Builtin, Value};
 use crate::variant::to_variant;
 
-/// The nodes of one skill.
+/// The nodes of a skill.
 #[derive(Debug)]
 pub(super) struct Nodes {
     name: String,

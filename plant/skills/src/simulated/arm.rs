@@ -47,7 +47,7 @@ pub enum Path {
     Linear,
 }
 
-/// A simulated robot, whose drivers share the pose of its tool and the positions of its joints. It
+/// A simulated robot. Its drivers share the pose of its tool and the positions of its joints. It
 /// has no kinematics: the pose and the joints are independent.
 #[derive(Debug, Clone)]
 pub struct Arm {
@@ -57,7 +57,7 @@ pub struct Arm {
 }
 
 impl Arm {
-    /// Creates a robot whose tool is at home.
+    /// Creates a robot with its tool at home.
     #[must_use]
     pub fn new(settings: ArmSettings) -> Self {
         let position = Arc::new(Mutex::new(settings.home));

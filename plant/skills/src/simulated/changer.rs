@@ -9,7 +9,7 @@ use crate::driver::{Driver, Results, Work};
 use crate::parameters::Parameters;
 use crate::skill::lock;
 
-/// A simulated tool changer, whose drivers share the attached tool.
+/// A simulated tool changer. Its drivers share the attached tool.
 #[derive(Debug, Clone, Default)]
 pub struct Changer {
     tool: Arc<Mutex<String>>,

@@ -29,7 +29,7 @@ impl Default for GripperSettings {
     }
 }
 
-/// A simulated gripper, whose drivers share whether it holds an object.
+/// A simulated gripper. Its drivers share whether it holds an object.
 #[derive(Debug, Clone, Default)]
 pub struct Gripper {
     settings: GripperSettings,

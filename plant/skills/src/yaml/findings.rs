@@ -66,7 +66,7 @@ pub struct Finding {
     pub code: Code,
     /// The location in the text.
     pub place: Place,
-    /// What is wrong, with the value.
+    /// The error, with the invalid value.
     pub message: String,
     /// How to correct it.
     pub help: Option<String>,

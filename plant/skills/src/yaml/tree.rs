@@ -59,7 +59,7 @@ impl Kind {
     }
 }
 
-/// Parses a text as one document.
+/// Parses a text as a single document.
 ///
 /// # Errors
 /// The first location that cannot be parsed; the text after it is not checked.
