@@ -1,4 +1,5 @@
-//! The NodeSet2 files that a mapping names (`server.nodesets`), as its check asks for them: read as `ua-server` reads them.
+//! Reads the NodeSet2 files of a mapping (`server.nodesets`) for its check, with the reader of
+//! `ua-server`.
 
 use std::path::PathBuf;
 
@@ -23,13 +24,13 @@ pub fn read(files: &[PathBuf]) -> Box<dyn mappings::NodeSets> {
     })
 }
 
-/// An identifier as the OPC UA library has it.
+/// Converts an identifier to the type of the OPC UA library.
 #[must_use]
 pub fn identifier(text: &Identifier) -> Known {
     match text {
         Identifier::Numeric(number) => Known::Numeric(*number),
         Identifier::String(text) => Known::String(text.as_str().into()),
-        // The mapping has checked the two texts.
+        // The mapping has validated the texts of both variants.
         Identifier::Guid(text) => Known::Guid(text.parse().unwrap_or_default()),
         Identifier::Opaque(text) => {
             Known::ByteString(ByteString::from_base64(text).unwrap_or_default())

@@ -1,35 +1,35 @@
-//! Who may start what: one owner of a component at a time.
+//! The lease of a component: at most one client controls the component.
 
 use thiserror::Error;
 
-/// The right to have a component do something. Reading needs none.
+/// The right to control a component. Reading does not require the lease.
 ///
-/// Without it two clients that each write parameters and then call Start would run with each other's. `S` is what a client
-/// is known by, as its session.
+/// Without the lease, two clients that each write parameters and then call Start could start runs
+/// with each other's parameters. `S` identifies a client, for example by its session.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Lease<S> {
     holder: Option<S>,
 }
 
-/// Somebody else holds the lease; nothing has changed.
+/// Another client holds the lease; nothing has changed.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
 #[error("another client has the lease of this component")]
 pub struct Held<S> {
-    /// Who does.
+    /// The holder.
     pub by: S,
 }
 
 impl<S: Clone + PartialEq> Lease<S> {
-    /// A lease that nobody holds.
+    /// Creates a lease without a holder.
     #[must_use]
     pub fn free() -> Self {
         Self { holder: None }
     }
 
-    /// Takes the lease, or keeps it.
+    /// Acquires or renews the lease.
     ///
     /// # Errors
-    /// [`Held`] when it is somebody else's.
+    /// [`Held`] if another client holds the lease.
     pub fn claim(&mut self, by: S) -> Result<(), Held<S>> {
         match &self.holder {
             Some(holder) if *holder != by => Err(Held { by: holder.clone() }),
@@ -40,7 +40,8 @@ impl<S: Clone + PartialEq> Lease<S> {
         }
     }
 
-    /// Gives the lease back, as when the session of its holder ends. Says whether it was theirs.
+    /// Releases the lease, for example when the session of its holder ends. Returns whether this
+    /// client held it.
     pub fn release(&mut self, by: &S) -> bool {
         let theirs = self.holder.as_ref() == Some(by);
         if theirs {
@@ -49,7 +50,7 @@ impl<S: Clone + PartialEq> Lease<S> {
         theirs
     }
 
-    /// Who holds it.
+    /// Returns the holder.
     #[must_use]
     pub fn holder(&self) -> Option<&S> {
         self.holder.as_ref()

@@ -1,8 +1,10 @@
 //! The state machine of an OPC UA Program (OPC 10000-10, 4.2) as a table.
 //!
-//! A [`Program`] is one instance of ProgramStateMachineType: it takes [`Method`]s and the [`Ending`] of a run, and gives
-//! the [`Transition`] that follows, or why there is none. It runs nothing, stores no parameters and knows no server: whoever
-//! owns it keeps the parameters, shows the transition and only then lets the work begin. Who may call is the [`Lease`]'s.
+//! A [`Program`] is an instance of ProgramStateMachineType. It processes [`Method`]s and the
+//! [`Ending`] of a run, and returns the resulting [`Transition`], or the reason why there is no
+//! transition. It runs nothing, stores no parameters and does not depend on a server. Its owner
+//! stores the parameters, publishes the transition and then starts the work. The [`Lease`] controls
+//! which client may call.
 //!
 //! | state | Start | Suspend | Resume | Halt | Reset |
 //! |---|---|---|---|---|---|
@@ -11,7 +13,8 @@
 //! | Running | | Suspended | | Halted | |
 //! | Suspended | | | Running | Halted | Ready |
 //!
-//! Part 10 lists Reset twice as a cause that leads out of Suspended, to Ready and to Halted; here it leads to Ready.
+//! Part 10 lists Reset as a cause of two transitions from Suspended, to Ready and to Halted. In
+//! this crate it leads to Ready.
 
 mod lease;
 mod table;
@@ -21,12 +24,13 @@ pub use table::{Cause, Ending, Method, State, TRANSITIONS, Transition};
 
 use thiserror::Error;
 
-/// One run of a program, from its Start to its end. Numbers rise by one and start over after 2^32 runs; 0 is no run.
+/// The number of a run of a program. Numbers are incremented with each Start and wrap around after
+/// 2^32 runs; 0 is not a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct RunId(u32);
 
 impl RunId {
-    /// The number by which the run's outcome is asked for later.
+    /// Returns the number, by which clients read the outcome of the run.
     #[must_use]
     pub fn number(self) -> u32 {
         self.0
@@ -37,16 +41,17 @@ impl RunId {
     }
 }
 
-/// What the type of a program says of all its instances.
+/// The properties of a program that its type defines.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Nature {
-    /// Whether its work can stand still and go on. Without it Suspend is never executable.
+    /// Whether the work can be suspended and resumed. Otherwise Suspend is never executable.
     pub can_suspend: bool,
-    /// Where a run ends that did its work: Ready where it may be started again, Halted where a Reset comes first.
+    /// The state after a successful run: Ready if it can be started again, Halted if it requires a
+    /// Reset.
     pub rests_in: Rest,
 }
 
-/// The state after success.
+/// The state after a successful run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Rest {
     /// By RunningToReady, as skills of the Plug and Produce line do.
@@ -55,24 +60,25 @@ pub enum Rest {
     Halted,
 }
 
-/// A method that is not legal now; nothing has changed.
+/// A refused method call; nothing has changed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
 #[non_exhaustive]
 pub enum Refused {
-    /// The table has no transition. BadInvalidState (OPC 10000-10, 5.2.3.2).
+    /// The table has no such transition. BadInvalidState (OPC 10000-10, 5.2.3.2).
     #[error("{method} is not possible in the state {state}")]
     State {
-        /// What was called.
+        /// The called method.
         method: Method,
-        /// Where the program is and stays.
+        /// The current state, which does not change.
         state: State,
     },
-    /// The work of this type cannot stand still. BadNotSupported.
+    /// The work of this type cannot be suspended. BadNotSupported.
     #[error("this program cannot be suspended")]
     CannotSuspend,
 }
 
-/// The end of a run that is not the one that goes on, as that of a worker which was halted and ends only now.
+/// The end of a run that is not the current run, for example of a worker that was halted and ends
+/// later.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
 #[error("run {run:?} is not the one that runs")]
 pub struct NotRunning {
@@ -80,7 +86,7 @@ pub struct NotRunning {
     pub run: RunId,
 }
 
-/// One instance. It begins in Halted, as Part 10 has it.
+/// An instance of a program. Its initial state is Halted (OPC 10000-10).
 #[derive(Debug, Clone)]
 pub struct Program {
     nature: Nature,
@@ -92,14 +98,14 @@ pub struct Program {
 }
 
 impl Program {
-    /// A program that was never started, whose first run is 1.
+    /// Creates a program. Its first run has the number 1.
     #[must_use]
     pub fn new(nature: Nature) -> Self {
         Self::counting_from(nature, 1)
     }
 
-    /// A program that was never started, whose first run has this number; 0 counts as 1. One that is loaded anew counts from
-    /// where it has not been, so that nobody takes one of its runs for an earlier one.
+    /// Creates a program with this number for its first run; 0 counts as 1. A restarted program
+    /// counts from an unused number, so that its runs are not confused with earlier runs.
     #[must_use]
     pub fn counting_from(nature: Nature, first: u32) -> Self {
         Self {
@@ -111,10 +117,10 @@ impl Program {
         }
     }
 
-    /// Calls a method: gives the transition that has happened.
+    /// Calls a method and returns the resulting transition.
     ///
     /// # Errors
-    /// [`Refused`], and nothing has changed.
+    /// [`Refused`]; nothing has changed.
     pub fn call(&mut self, method: Method) -> Result<&'static Transition, Refused> {
         if method == Method::Suspend && !self.nature.can_suspend {
             return Err(Refused::CannotSuspend);
@@ -132,11 +138,11 @@ impl Program {
         Ok(self.take(transition))
     }
 
-    /// The work of a run has ended: gives the transition that has happened.
+    /// Reports the end of the work of a run and returns the resulting transition.
     ///
     /// # Errors
-    /// [`NotRunning`] for any run but the one that goes on; a success of one that is suspended is none either, since its
-    /// work stands still.
+    /// [`NotRunning`] for any run except the current one, and for the success of a suspended run,
+    /// because suspended work cannot finish.
     pub fn ended(&mut self, run: RunId, ending: Ending) -> Result<&'static Transition, NotRunning> {
         let transition = match self.run == Some(run) {
             true => Transition::by_ending(self.state, ending, self.nature.rests_in),
@@ -146,25 +152,26 @@ impl Program {
         Ok(self.take(transition))
     }
 
-    /// The state now.
+    /// Returns the current state.
     #[must_use]
     pub fn state(&self) -> State {
         self.state
     }
 
-    /// What led to the state; `None` before the first transition.
+    /// Returns the last transition; `None` before the first transition.
     #[must_use]
     pub fn last_transition(&self) -> Option<&'static Transition> {
         self.last
     }
 
-    /// The newest run, whether it goes on or has ended; `None` before the first Start.
+    /// Returns the newest run, in progress or ended; `None` before the first Start.
     #[must_use]
     pub fn run(&self) -> Option<RunId> {
         self.run
     }
 
-    /// Whether a call would be taken now: the attribute Executable of the method's node.
+    /// Returns whether a call is possible in the current state: the attribute Executable of the
+    /// method's node.
     #[must_use]
     pub fn is_executable(&self, method: Method) -> bool {
         (method != Method::Suspend || self.nature.can_suspend)

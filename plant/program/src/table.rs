@@ -1,4 +1,4 @@
-//! States, transitions and their numbers, as the NodeSet of namespace 0 has them.
+//! States, transitions and their identifiers, as the NodeSet of namespace 0 defines them.
 
 use std::fmt;
 
@@ -7,21 +7,21 @@ use crate::Rest;
 /// A state of ProgramStateMachineType (OPC 10000-10, 5.2.3.1).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum State {
-    /// Not started, or ended; a Reset makes it ready.
+    /// Not started, or ended. A Reset leads to Ready.
     Halted,
     /// Can be started.
     Ready,
-    /// Does its work.
+    /// Doing its work.
     Running,
-    /// Its work stands still.
+    /// The work is suspended.
     Suspended,
 }
 
 impl State {
-    /// All of them.
+    /// All states.
     pub const ALL: [Self; 4] = [Self::Halted, Self::Ready, Self::Running, Self::Suspended];
 
-    /// The StateNumber.
+    /// Returns the StateNumber.
     #[must_use]
     pub fn number(self) -> u32 {
         match self {
@@ -32,7 +32,7 @@ impl State {
         }
     }
 
-    /// The numeric identifier of its node in namespace 0, which is the Id of CurrentState.
+    /// Returns the numeric identifier of its node in namespace 0, which is the Id of CurrentState.
     #[must_use]
     pub fn node_id(self) -> u32 {
         match self {
@@ -43,7 +43,7 @@ impl State {
         }
     }
 
-    /// The BrowseName.
+    /// Returns the BrowseName.
     #[must_use]
     pub fn name(self) -> &'static str {
         match self {
@@ -64,20 +64,20 @@ impl fmt::Display for State {
 /// A method of ProgramStateMachineType (OPC 10000-10, 5.2.3.2).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Method {
-    /// Begins a run.
+    /// Starts a run.
     Start,
-    /// Makes the work stand still.
+    /// Suspends the work.
     Suspend,
-    /// Makes it go on.
+    /// Resumes the work.
     Resume,
-    /// Ends the run, or takes readiness away.
+    /// Ends the run, or leaves Ready.
     Halt,
-    /// Makes ready.
+    /// Leads to Ready.
     Reset,
 }
 
 impl Method {
-    /// All of them.
+    /// All methods.
     pub const ALL: [Self; 5] = [
         Self::Start,
         Self::Suspend,
@@ -86,7 +86,8 @@ impl Method {
         Self::Reset,
     ];
 
-    /// The numeric identifier of the type's method in namespace 0, by which clients may call any instance's.
+    /// Returns the numeric identifier of the type's method in namespace 0. Clients may use it to
+    /// call the method of any instance.
     #[must_use]
     pub fn node_id(self) -> u32 {
         match self {
@@ -98,7 +99,7 @@ impl Method {
         }
     }
 
-    /// The BrowseName.
+    /// Returns the BrowseName.
     #[must_use]
     pub fn name(self) -> &'static str {
         match self {
@@ -117,23 +118,23 @@ impl fmt::Display for Method {
     }
 }
 
-/// How the work of a run ended by itself.
+/// The end of the work of a run, not caused by a method call.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Ending {
-    /// It is done.
+    /// The work is done.
     Success,
-    /// It is not, and goes no further.
+    /// The work is not done and does not continue.
     Failure,
 }
 
-/// What makes a transition happen.
+/// The cause of a transition.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Cause {
-    /// A client's call alone.
+    /// Only a method call.
     Method(Method),
-    /// The end of the work alone.
+    /// Only the end of the work.
     Work,
-    /// Either.
+    /// A method call or the end of the work.
     MethodOrWork(Method),
 }
 
@@ -146,11 +147,11 @@ pub struct Transition {
     pub name: &'static str,
     /// The numeric identifier of its node in namespace 0, which is the Id of LastTransition.
     pub node_id: u32,
-    /// The state it leads out of.
+    /// The source state.
     pub from: State,
-    /// The state it leads to.
+    /// The target state.
     pub to: State,
-    /// What makes it happen.
+    /// The cause.
     pub cause: Cause,
 }
 
