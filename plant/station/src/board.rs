@@ -1,4 +1,4 @@
-//! What is known of both levels, and what is told of it.
+//! The state of both levels, for the status pages and the discovery server.
 
 use std::collections::BTreeMap;
 use std::sync::{Mutex, PoisonError};
@@ -8,33 +8,33 @@ use registry::renamed;
 use serde::Serialize;
 use tokio::sync::watch;
 
-/// Which level a server is on.
+/// The level of a server.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum Level {
     /// Above the station.
     Above,
-    /// Below it.
+    /// Below the station.
     Below,
 }
 
-/// One server as it is shown in the status.
+/// A server in the status.
 #[derive(Debug, Clone, Default, Serialize)]
 pub(crate) struct Peer {
-    /// The name it is shown by, which no other has on its level.
+    /// The displayed name, unique on its level.
     pub(crate) name: String,
     pub(crate) uri: String,
     /// `waiting`, `refused`, `connected`, `busy` or `away`.
     pub(crate) state: &'static str,
-    /// Why it is not connected or not configured.
+    /// The reason why it is not connected or not configured.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) fault: Option<String>,
-    /// Whether its certificate has been checked.
+    /// Whether its certificate has been verified.
     pub(crate) secured: bool,
-    /// How often its certificate was refused, each attempt to connect counted.
+    /// Number of connection attempts at which its certificate was refused.
     pub(crate) certificates_refused: u64,
     pub(crate) methods: usize,
     pub(crate) methods_kept_back: usize,
-    /// The place it was told.
+    /// The place that it was configured with.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) place: Option<String>,
 }
@@ -48,14 +48,14 @@ impl Peer {
 
 #[derive(Debug, Default)]
 struct State {
-    /// The face below, which is listed as if it had registered; `None` without a level above.
+    /// The face below, which is listed like a registered server; `None` without a level above.
     own: Option<Gated>,
     place: Option<String>,
     discovery_above: Option<String>,
     peers: BTreeMap<(Level, String), Peer>,
 }
 
-/// Shared by all who tend servers.
+/// The shared state of both levels.
 #[derive(Debug)]
 pub(crate) struct Board {
     state: Mutex<State>,
@@ -83,7 +83,7 @@ impl Board {
         done
     }
 
-    /// There is a face below.
+    /// Adds the face below.
     pub(crate) fn own(&self, own: Gated) {
         self.change(|state| state.own = Some(own));
     }
@@ -96,7 +96,8 @@ impl Board {
         self.change(|state| state.discovery_above = url);
     }
 
-    /// Takes a server up under a name that no other of its level has: the wish, or the wish with a number.
+    /// Adds a server under a name that is unique on its level: the requested name, or the requested
+    /// name with a number.
     pub(crate) fn enter(&self, level: Level, url: &str, wish: &str) -> String {
         self.change(|state| {
             let taken = |state: &State, name: &str| {
@@ -113,7 +114,7 @@ impl Board {
         })
     }
 
-    /// Notes something about a server that is there.
+    /// Updates the entry of a server, if it exists.
     pub(crate) fn note(&self, level: Level, url: &str, how: impl FnOnce(&mut Peer)) {
         self.change(|state| {
             if let Some(peer) = state.peers.get_mut(&(level, url.to_owned())) {
@@ -122,7 +123,8 @@ impl Board {
         });
     }
 
-    /// Returns whether a server of the level has this ApplicationUri in a certificate that was checked.
+    /// Returns whether a connected server of the level has this ApplicationUri in a verified
+    /// certificate.
     pub(crate) fn knows(&self, level: Level, application_uri: &str) -> bool {
         let state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
         state.peers.iter().any(|((at, _), peer)| {
@@ -130,14 +132,15 @@ impl Board {
         })
     }
 
-    /// A server is gone. Gives its name.
+    /// Removes a server. Returns its name.
     pub(crate) fn leave(&self, level: Level, url: &str) -> Option<String> {
         let gone = self.change(|state| state.peers.remove(&(level, url.to_owned())));
         gone.map(|peer| peer.name)
     }
 }
 
-/// What is listed beside the registered servers: the face below, and the neighbours that are called through it.
+/// Returns the servers that are listed beside the registered servers: the face below, and the
+/// neighbours that are called through it.
 fn gated(state: &State) -> Vec<Gated> {
     let above = state
         .peers
@@ -169,7 +172,7 @@ fn status(state: &State) -> serde_json::Value {
 }
 
 pub(crate) const CONNECTED: &str = "connected";
-/// Connected, and it answers no requests: it executes a method for somebody.
+/// Connected, but not responding: the server is executing a method.
 pub(crate) const BUSY: &str = "busy";
 
 #[cfg(test)]

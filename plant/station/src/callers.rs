@@ -1,7 +1,7 @@
-//! Who calls through a station: whether a caller may, and the session that each caller has at each server.
+//! The callers of a station: their permissions, and their sessions at each server.
 //!
-//! A lock, a lease or a run of a server belongs to a session. So each caller has its own session at each server that it calls,
-//! for as long as its session at the station lasts.
+//! A lock, a lease or a run of a server belongs to a session. So each caller has its own session at
+//! each server that it calls, for the lifetime of its session at the station.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError, Weak};
@@ -15,7 +15,7 @@ use tokio::time::Instant;
 
 use crate::board::{Board, Level};
 
-/// Judges callers on one level.
+/// Checks callers on a level.
 #[derive(Clone)]
 pub(crate) struct Admission {
     pub(crate) users: Arc<Access>,
@@ -25,11 +25,11 @@ pub(crate) struct Admission {
 }
 
 impl Admission {
-    /// Checks that the calls of a caller are passed on: it is a server of its level by a certificate that was checked, or its
-    /// user is an operator or engineer.
+    /// Checks that the calls of a caller are forwarded. The caller must be a server of its level
+    /// with a verified certificate, or a user with the role operator or engineer.
     ///
     /// # Errors
-    /// BadUserAccessDenied for others.
+    /// BadUserAccessDenied for other callers.
     pub(crate) fn check(&self, caller: &Caller) -> Result<(), StatusCode> {
         let is_peer = caller.proven
             && caller.encrypted
@@ -42,9 +42,9 @@ impl Admission {
     }
 }
 
-/// The sessions at one server.
+/// The sessions at a server.
 pub(crate) struct Callers {
-    /// The station's own.
+    /// The session of the station itself.
     client: Client,
     sessions: Mutex<BTreeMap<u32, Client>>,
 }
@@ -57,7 +57,8 @@ impl Callers {
         }
     }
 
-    /// Returns the client of a caller, connected to the run of the server that the station itself is connected to.
+    /// Returns the client of a caller, connected to the same run of the server as the station
+    /// itself.
     ///
     /// # Errors
     /// There is no such connection.
@@ -73,13 +74,13 @@ impl Callers {
         };
         let until = Instant::now() + LONGEST_WAIT;
         while let Err(error) = client.up(CONNECT_LIMIT).await {
-            // A server that executes the call of another caller makes no session meanwhile.
+            // A server that executes the call of another caller does not create sessions meanwhile.
             if !client.is_calling() || Instant::now() >= until {
                 return Err(error);
             }
         }
         let is_current = matches!(&*self.client.link().borrow(), Link::Up { connects: now, .. } if *now == connects);
-        // NodeIds hold as long as the namespaces are the same.
+        // NodeIds are valid as long as the namespaces are the same.
         if is_current && client.namespaces() == self.client.namespaces() {
             return Ok(client);
         }
@@ -87,9 +88,9 @@ impl Callers {
         Err(ClientError::NotConnected(another))
     }
 
-    /// The session of a caller at the station is gone, and with it those at the server.
+    /// Closes the session of a caller at the server after its session at the station has closed.
     pub(crate) fn gone(&self, session: u32) {
-        // The last handle closes the client.
+        // Dropping the last handle closes the client.
         let _closed = self.lock().remove(&session);
     }
 

@@ -1,17 +1,17 @@
-//! The method by which a component is told its place: `Configure(Place, SupervisorUri, DiscoveryUrl)`, three Strings, nothing
-//! back, on an object below Objects.
+//! The method that sets the place of a component: `Configure(Place, SupervisorUri, DiscoveryUrl)`,
+//! with three Strings, without results, on an object below Objects.
 
 use plant_opcua::supervision::CONFIGURE;
 use plant_opcua::types::{Argument, DataTypeId, NodeId, Variant};
 
-/// What a component is told.
+/// The arguments of the method.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Told {
-    /// Where it is in the plant.
+    /// The place of the component in the plant.
     pub(crate) place: String,
-    /// The ApplicationUri of whoever tells it.
+    /// The ApplicationUri of the supervisor.
     pub(crate) supervisor_uri: String,
-    /// The discovery server of its level.
+    /// The discovery server of the component's level.
     pub(crate) discovery_url: String,
 }
 
@@ -27,7 +27,7 @@ impl Told {
             .to_vec()
     }
 
-    /// Of the arguments of a call, which has them all.
+    /// Reads the arguments of a call; `None` if an argument is missing or is not a String.
     pub(crate) fn read(arguments: &[Variant]) -> Option<Self> {
         let mut texts = arguments.iter().map(|argument| {
             let Variant::String(text) = argument else {
@@ -43,7 +43,7 @@ impl Told {
     }
 }
 
-/// Whether a method is the one.
+/// Returns whether a method has the name and the arguments of `Configure`.
 pub(crate) fn is_configure(name: &str, takes: &[Argument], gives: &[Argument]) -> bool {
     let text: NodeId = DataTypeId::String.into();
     name == CONFIGURE

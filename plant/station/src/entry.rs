@@ -103,7 +103,8 @@ struct UaStation {
     log: LogFormat,
 }
 
-/// Runs `ua-station` from its command line to its end. `arguments` begin with the name of the program.
+/// Runs `ua-station` with the command line `arguments`, which start with the name of the program,
+/// until it ends.
 #[must_use]
 pub fn run(arguments: Vec<OsString>) -> ExitCode {
     run_service::<UaStation>(arguments)

@@ -1,4 +1,4 @@
-//! A server that shows the methods of others, and passes their calls on.
+//! A server that shows the methods of other servers and forwards their calls.
 
 use std::collections::BTreeSet;
 use std::path::PathBuf;
@@ -21,42 +21,42 @@ use tracing::{debug, warn};
 use crate::callers::{Admission, AllCallers, Callers};
 use crate::mirror::{Found, Mirror};
 
-/// One face of a station.
+/// A face of a station: its server on a level.
 #[derive(Clone)]
 pub(crate) struct Face {
     pub(crate) server: Server,
-    /// The folder of those whose methods are shown.
+    /// The folder of the servers that are shown.
     folder: &'static str,
     admission: Admission,
     callers: AllCallers,
 }
 
-/// How a face listens.
+/// The settings of a face.
 pub(crate) struct FaceSettings {
     pub(crate) application_uri: String,
     pub(crate) name: String,
     pub(crate) endpoint: EndpointUrl,
-    /// The certificate store; the pair is there.
+    /// The certificate store, which contains the certificate and the key of the station.
     pub(crate) pki: Option<PathBuf>,
     pub(crate) allow_unsecured: bool,
     pub(crate) trust_any: bool,
-    /// The judge of callers.
+    /// Checks callers.
     pub(crate) admission: Admission,
 }
 
-/// A server whose methods are shown.
+/// A server to be shown.
 pub(crate) struct Shown<'a> {
     /// Its name below the folder.
     pub(crate) name: &'a str,
     pub(crate) application_uri: &'a str,
     pub(crate) mirror: &'a Mirror,
     pub(crate) callers: &'a Arc<Callers>,
-    /// The connection on which its NodeIds hold.
+    /// The number of the connection for which its NodeIds are valid.
     pub(crate) connects: u64,
 }
 
 impl Face {
-    /// Listens; nobody is served until the server is started.
+    /// Binds the port; clients are served after the server is started.
     pub(crate) fn open(settings: FaceSettings, folder: &'static str) -> Result<Self, ServerError> {
         let FaceSettings {
             application_uri,
@@ -94,15 +94,15 @@ impl Face {
         Ok(face)
     }
 
-    /// Has the sessions at a server end with those of its callers here.
+    /// Closes the sessions at a server when the sessions of its callers at this face close.
     pub(crate) fn follow(&self, callers: &Arc<Callers>) {
         self.callers.add(callers);
     }
 
-    /// Shows the methods of a server in the place of what was shown of it, and tells clients.
+    /// Shows the methods of a server, replacing the methods shown before, and notifies clients.
     ///
     /// # Errors
-    /// The folder is not there any more.
+    /// The folder does not exist.
     pub(crate) fn show(&self, shown: &Shown<'_>) -> Result<(), InstanceError> {
         self.server.remove(&self.root(shown.name));
         let made = self.add(shown);
@@ -124,7 +124,7 @@ impl Face {
                 method: found.method.clone(),
             });
             match self.method(&root, found, &mut objects, handler) {
-                // Two that differ in their namespaces alone: the first is shown.
+                // Methods that differ only in their namespaces: the first is shown.
                 Err(InstanceError::Taken(node)) => debug!(%node, "a method is not shown"),
                 made => made?,
             }
@@ -132,13 +132,13 @@ impl Face {
         Ok(())
     }
 
-    /// Shows nothing more of a server, and tells clients.
+    /// Removes a server, and notifies clients.
     pub(crate) fn remove(&self, name: &str) {
         self.server.remove(&self.root(name));
         self.tell(name, Became::Deleted);
     }
 
-    /// The object of a server.
+    /// Returns the NodeId of a server's object.
     fn root(&self, name: &str) -> NodeId {
         id(&format!("{}/{name}", self.folder))
     }
@@ -181,7 +181,7 @@ impl Face {
         self.server.add_method(spec, handler)
     }
 
-    /// An object with nothing below it.
+    /// Adds an object without children.
     pub(crate) fn object(
         &self,
         path: &str,
@@ -199,7 +199,7 @@ impl Face {
         })
     }
 
-    /// A property of an object of ours, with a text.
+    /// Adds a property with a text to an object of the face.
     pub(crate) fn property(
         &self,
         object: &str,
@@ -223,12 +223,12 @@ impl Face {
     }
 }
 
-/// The NodeId of a path.
+/// Returns the NodeId of a path.
 pub(crate) fn id(path: &str) -> NodeId {
     NodeId::new(OWN, path)
 }
 
-/// Passes a call on, in the session that its caller has at the server.
+/// Forwards a call in the session that its caller has at the server.
 struct Passing {
     admission: Admission,
     callers: Arc<Callers>,
@@ -252,7 +252,7 @@ impl MethodHandler for Passing {
             );
         })?;
         let options = CallOptions {
-            // The caller gets this answer rather than a timeout.
+            // The forwarded call times out first, so that the caller receives its status.
             within: LONGEST_CALL * 9 / 10,
             connection: None,
         };
@@ -262,7 +262,7 @@ impl MethodHandler for Passing {
             .await
             .map_err(|error| Refusal::Status(status(error)))?;
         if !request.presence.lasts() {
-            // The caller left while its session at the server was made.
+            // The caller disconnected while its session at the server was created.
             self.callers.gone(caller.session);
             return Err(Refusal::Status(StatusCode::BadSessionClosed));
         }
@@ -274,17 +274,18 @@ impl MethodHandler for Passing {
     }
 }
 
-/// The status of a call that has no result.
+/// Returns the status of a call without a result.
 fn status(error: ClientError) -> StatusCode {
     match error {
         ClientError::NotConnected(_) => StatusCode::BadNoCommunication,
         ClientError::Status(status) => status,
-        // Nobody knows whether it was executed: it was sent, and the answer has not come.
+        // The request was sent and there is no response: it is unknown whether the method was
+        // executed.
         ClientError::Lost(_) | ClientError::Answer(_) => StatusCode::BadRequestInterrupted,
     }
 }
 
-/// How long a call that is passed on may take. A caller that waits for less gives up earlier by its own timeout.
+/// Time limit of a forwarded call. A caller with a shorter timeout gives up earlier.
 const LONGEST_CALL: Duration = Duration::from_secs(300);
 /// The namespace of the ApplicationUri.
 const OWN: u16 = 1;

@@ -1,14 +1,25 @@
-//! One level of a plant: a workstation that hides its devices from the level above, and hides that level from them.
+//! One level of a plant: a workstation that hides its devices from the level above, and hides that
+//! level from the devices.
 //!
-//! It is a Local Discovery Server for the level below ([`discovery::lds`]) and one application with two faces: a server on
-//! the level above that shows the methods of the devices, and one on the level below that shows the methods of the
-//! neighbours above. What is called there is passed on. No address of one level is told on the other.
+//! A station is a Local Discovery Server for the level below ([`discovery::lds`]) and an
+//! application with two faces. The face above shows the methods of the devices, the face below
+//! shows the methods of the neighbours above. Calls are forwarded. Addresses of one level are not
+//! visible on the other.
 //!
-//! Whoever comes on the level below is configured: the station connects, holds the certificate against what is registered,
-//! and calls the method `Configure` of the component with its place in the plant.
+//! Servers that appear on the level below are configured: the station connects, compares the
+//! certificate with the registration, and calls the method `Configure` of the component with its
+//! place in the plant.
 //!
-//! Reading order: `configure` (the method), `mirror` (which methods a server has), `callers` (who may call them), `face` (how they are shown), `board` (what
-//! is known), `tend` (one server's life), `marks` (looking for a node), `station` (all of it).
+//! Reading order:
+//!
+//! - `configure`: the method
+//! - `mirror`: the methods of a server
+//! - `callers`: the permissions of callers
+//! - `face`: the servers that show methods
+//! - `board`: the state of both levels
+//! - `tend`: the supervision of a server
+//! - `marks`: the search for a node
+//! - `station`: the complete station
 
 mod board;
 mod callers;

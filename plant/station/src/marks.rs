@@ -1,4 +1,4 @@
-//! Looking for a node in the address space of a discovery server.
+//! Searches a node in the address space of a discovery server.
 
 use std::time::Duration;
 
@@ -7,7 +7,7 @@ use discovery::Marks;
 use plant_opcua::client::{Client, ClientConfig};
 use plant_opcua::types::{AttributeId, NodeId};
 
-/// Looks with a session.
+/// Searches with a client session.
 pub(crate) struct Sessions(pub(crate) ClientConfig);
 
 #[async_trait]
@@ -34,7 +34,7 @@ async fn has(client: &Client, text: &str) -> bool {
     value.is_some_and(|value| value.status().is_good() && value.value.is_some())
 }
 
-/// A NodeId as text, whose namespace may be said by its URI.
+/// Parses a NodeId, with the URI or the index of its namespace.
 fn node(client: &Client, text: &str) -> Option<NodeId> {
     let Some(rest) = text.strip_prefix("nsu=") else {
         return text.parse().ok();

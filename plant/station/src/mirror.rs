@@ -1,4 +1,4 @@
-//! Which methods a server has, by the objects they are below of.
+//! Reads the methods of a server, with the paths of their objects.
 
 use std::collections::{BTreeSet, VecDeque};
 
@@ -11,21 +11,22 @@ use tracing::debug;
 
 use crate::configure::is_configure;
 
-/// What a server has.
+/// The methods of a server.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub(crate) struct Mirror {
-    /// Methods that can be passed on.
+    /// Methods that can be forwarded.
     pub(crate) methods: Vec<Found>,
     /// Object and method of its `Configure`.
     pub(crate) configure: Option<(NodeId, NodeId)>,
-    /// Methods that cannot be: their arguments mean something only at that server.
+    /// Number of methods that cannot be forwarded, because their arguments are valid only at that
+    /// server.
     pub(crate) kept_back: usize,
 }
 
 /// A method of a server.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Found {
-    /// The BrowseNames of the objects from Objects down, that of the method last.
+    /// The BrowseNames of the objects below Objects, followed by the BrowseName of the method.
     pub(crate) path: Vec<String>,
     pub(crate) object: NodeId,
     pub(crate) method: NodeId,
@@ -33,10 +34,10 @@ pub(crate) struct Found {
     pub(crate) gives: Vec<Argument>,
 }
 
-/// Reads it, over the connection there is.
+/// Reads the methods over the current connection.
 ///
 /// # Errors
-/// There is no answer.
+/// No response.
 pub(crate) async fn look(client: &Client) -> Result<Mirror, ClientError> {
     let mut mirror = Mirror::default();
     let objects: NodeId = ObjectId::ObjectsFolder.into();
@@ -50,7 +51,8 @@ pub(crate) async fn look(client: &Client) -> Result<Mirror, ClientError> {
         for reference in client.browse(&object, below).await? {
             let id = reference.node_id.node_id;
             let elsewhere = reference.node_id.server_index != 0;
-            // What each server has, as the object Server, is not what it is for.
+            // Nodes of namespace 0, such as the object Server, exist in every server and are
+            // skipped.
             if id.namespace == 0 || elsewhere || path.len() >= DEEPEST {
                 continue;
             }
@@ -89,7 +91,7 @@ async fn take(
     };
     let name = path.last().map(String::as_str).unwrap_or_default();
     if is_configure(name, &takes, &gives) {
-        // Whose place it is says the station alone.
+        // Only the station configures the place, so the method is not shown.
         let known = mirror.configure.take();
         mirror.configure = known.or_else(|| Some((object.clone(), method)));
         return Ok(());
@@ -104,7 +106,7 @@ async fn take(
     Ok(())
 }
 
-/// What a method takes and gives; `None` where that cannot be passed on.
+/// Returns the input and output arguments of a method; `None` if it cannot be forwarded.
 async fn signature(
     client: &Client,
     method: &NodeId,
@@ -138,8 +140,8 @@ async fn signature(
     Ok(Some(both))
 }
 
-/// The argument as it is shown here; `None` where its values name nodes or are structures of that server's own, whose
-/// numbers mean something else here.
+/// Returns the argument for this server. `None` if its values identify nodes or are custom
+/// structures: their identifiers differ between servers.
 async fn passed(client: &Client, argument: Argument) -> Result<Option<Argument>, ClientError> {
     let mut data_type = argument.data_type.clone();
     if data_type.namespace != 0 {
@@ -149,7 +151,7 @@ async fn passed(client: &Client, argument: Argument) -> Result<Option<Argument>,
             Err(error) => return Err(error),
         };
         match above.into_iter().find(|one| one.namespace == 0) {
-            // An enumeration, or a number with a meaning.
+            // An enumeration, or a subtype of a number.
             Some(known) if known != DataTypeId::Structure => data_type = known,
             Some(_) | None => return Ok(None),
         }

@@ -1,4 +1,5 @@
-//! All of a station: the discovery server of the level below, both faces, and who is tended.
+//! A complete station: the discovery server of the level below, both faces, and the supervised
+//! servers.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -30,22 +31,22 @@ use crate::face::{Face, FaceSettings, id};
 use crate::marks::Sessions;
 use crate::tend::Tending;
 
-/// What a station is.
+/// The settings of a station.
 #[derive(Debug, Clone)]
 pub struct StationSettings {
     /// Its name on the level above.
     pub name: String,
-    /// The place of the level, where nobody above says it.
+    /// The place of the level, used until a supervisor above sets it.
     pub place: Option<Place>,
     /// The discovery server of the level below.
     pub lds: LdsSettings,
-    /// Where the face below listens; any port of the interface below without it.
+    /// The endpoint of the face below; `None` for a free port of the interface below.
     pub devices_endpoint: Option<EndpointUrl>,
-    /// The level above; `None` for the top.
+    /// The level above; `None` for the top level.
     pub upper: Option<Upper>,
-    /// The roles of callers without a user name. Calls of operators and engineers are passed on.
+    /// The roles of callers without a user name. Calls of operators and engineers are forwarded.
     pub anonymous: Roles,
-    /// The rule for servers at hosts that their trusted certificates do not name.
+    /// The rule for servers at hosts that are missing in their trusted certificates.
     pub host_names: HostNames,
     /// The Global Discovery Server that issues its certificate. Needs the store of `lds`.
     pub gds: Option<Invitation>,
@@ -56,13 +57,13 @@ pub struct StationSettings {
 pub struct Upper {
     /// The network interface.
     pub interface: Interface,
-    /// Where the face above listens; any port of the interface without it.
+    /// The endpoint of the face above; `None` for a free port of the interface.
     pub endpoint: Option<EndpointUrl>,
-    /// The discovery server to register with.
+    /// The discovery server at which the station registers.
     pub discovery: Choice,
 }
 
-/// Runs a station until it is told to stop.
+/// Runs a station until `stop` completes.
 ///
 /// # Errors
 /// An endpoint, an interface or the certificate store cannot be used.
@@ -121,7 +122,7 @@ pub async fn run(
         ..settings.lds
     };
     let ended = lds::run_around(lds, Some(around), pages, stop).await;
-    // The place is kept until nobody can be told it any more.
+    // The sender of the place is kept until no server can be configured any more.
     drop(place);
     levels.leave().await;
     if let Some(Faces { above, below }) = faces {
@@ -137,7 +138,7 @@ struct Faces {
     below: Face,
 }
 
-/// What both faces and the levels share.
+/// Data that the faces and the levels share.
 struct Common<'a> {
     settings: &'a StationSettings,
     uri: &'a str,
@@ -192,7 +193,7 @@ impl Common<'_> {
         Ok(Faces { above, below })
     }
 
-    /// The certificate store of a face, and the judge of its callers.
+    /// Returns the certificate store of a face, and the check of its callers.
     fn callers(&self, level: Level) -> (Option<PathBuf>, Admission) {
         let admission = Admission {
             users: Arc::clone(&self.users),
@@ -203,7 +204,7 @@ impl Common<'_> {
     }
 }
 
-/// How the station connects to others.
+/// Returns the configuration of the clients of the station.
 fn client(settings: &StationSettings, uri: &str, pki: Option<PathBuf>) -> ClientConfig {
     ClientConfig {
         accept_untrusted: settings.lds.trust_any,
@@ -219,7 +220,7 @@ fn client(settings: &StationSettings, uri: &str, pki: Option<PathBuf>) -> Client
     }
 }
 
-/// Ends a task with it.
+/// Aborts a task when it is dropped.
 struct Abort(AbortHandle);
 
 impl Drop for Abort {
@@ -228,7 +229,7 @@ impl Drop for Abort {
     }
 }
 
-/// What runs beside the discovery server.
+/// The tasks that run beside the discovery server.
 #[derive(Default)]
 struct Levels {
     /// Keeps the certificate current.
@@ -236,7 +237,7 @@ struct Levels {
     above: Option<Abort>,
     below: Option<Abort>,
     announced: Vec<Announced>,
-    /// Closed, it ends the registration; the task ends when that is taken back.
+    /// Dropping the sender ends the registration. The task ends when the server is unregistered.
     registered: Option<(mpsc::Sender<()>, tokio::task::JoinHandle<()>)>,
 }
 
@@ -253,7 +254,7 @@ impl Levels {
     }
 }
 
-/// Makes the one certificate of the station, for all addresses it is reached under.
+/// Creates the certificate of the station, for the addresses of both interfaces.
 fn certificates(settings: &StationSettings, uri: &str) -> Result<Option<PathBuf>, Failure> {
     let Some(root) = &settings.lds.pki else {
         return Ok(None);
@@ -347,7 +348,7 @@ fn unavailable(error: &ServerError) -> Failure {
     Failure::new(FailureKind::Unavailable, error.to_string())
 }
 
-/// That given, or any port of the first address of an interface.
+/// Returns the given endpoint, or a free port of the first address of an interface.
 fn endpoint(
     given: Option<&EndpointUrl>,
     interface: &Interface,
@@ -367,7 +368,7 @@ fn endpoint(
         .map_err(|error| Failure::new(FailureKind::Unavailable, format!("{error}")))
 }
 
-/// The object of the station itself, whose place the supervisor above says.
+/// Adds the object of the station itself, on which the supervisor above sets its place.
 fn configurable(
     face: &Face,
     name: &str,
@@ -416,7 +417,7 @@ fn configurable(
     face.server.add_method(spec, handler).map_err(failed)
 }
 
-/// Tells of each face on its own level alone.
+/// Announces each face on its own level only.
 fn tell(
     settings: &StationSettings,
     upper: &Upper,
@@ -450,7 +451,7 @@ fn no_mdns(fault: MdnsFault) -> Failure {
     Failure::new(FailureKind::Unavailable, fault.to_string())
 }
 
-/// Registers the face above with the discovery server that is chosen there, whenever that is another.
+/// Registers the face above at the chosen discovery server, and again at each change of the choice.
 fn register(
     settings: &StationSettings,
     upper: &Upper,
@@ -470,7 +471,7 @@ fn register(
             board.discovery_above(lds.clone());
             let how = AnnounceSettings {
                 lds: lds.clone(),
-                // It announces itself.
+                // The faces are announced separately.
                 mdns: None,
                 pki: pki.clone(),
                 supervision: supervision.clone(),
@@ -482,7 +483,7 @@ fn register(
                 _ = stopped.recv() => false,
             };
             if !changed && !stopped.is_closed() {
-                // Where it is was said once for all.
+                // The choice is final.
                 stopped.recv().await;
             }
             if let Some(registered) = registered {
@@ -496,7 +497,7 @@ fn register(
     Ok((stop, task))
 }
 
-/// Tends whoever is announced on the level above.
+/// Supervises the servers that are announced on the level above.
 fn follow(upper: &Upper, tending: Tending) -> Result<Abort, Failure> {
     let settings = WatchSettings {
         mdns: Some(upper.interface.clone()),
@@ -537,18 +538,18 @@ async fn tend_below(mut events: mpsc::Receiver<OnLevel>, tending: Tending) {
                 tended.unregistered(&source);
                 tended.left(&source);
             }
-            // Its client sees that for itself.
+            // The client detects the restart itself.
             OnLevel::Restarted { .. } => {}
         }
     }
 }
 
-/// Who is tended on one level.
+/// The supervised servers of a level.
 struct Tended {
     tending: Arc<Tending>,
     roster: Roster,
     tasks: BTreeMap<String, Abort>,
-    /// Where the servers are that registered here, by their ApplicationUris.
+    /// The URLs of the registered servers, by their ApplicationUris.
     registered: BTreeMap<String, String>,
 }
 
@@ -563,7 +564,7 @@ impl Tended {
     }
 
     fn registered(&mut self, source: &str, url: &str) {
-        // As the roster has it.
+        // The same form as in the roster.
         let url = url.trim_end_matches('/').to_owned();
         self.registered.insert(source.to_owned(), url);
         self.tell_registered();
@@ -614,5 +615,6 @@ const STATION: &str = "Station";
 const MOST_EVENTS: usize = 1024;
 const MOST_TENDED: usize = 256;
 const LEAVE_LIMIT: Duration = Duration::from_secs(1);
-/// How long a server may answer nothing while its host is reachable: it may execute a method for somebody.
+/// Time that a server may be unresponsive while its host is reachable, because it may be executing
+/// a method.
 const BUSY_FOR: Duration = Duration::from_secs(60);

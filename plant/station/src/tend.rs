@@ -1,4 +1,5 @@
-//! One server of a level: who it is, its place told to it, its methods shown, for as long as it is there.
+//! Supervises a server of a level: identifies it, configures its place and shows its methods, until
+//! it is lost.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -20,25 +21,26 @@ use crate::configure::Told;
 use crate::face::{Face, Shown};
 use crate::mirror::{self, Mirror};
 
-/// What all who tend servers of one level share.
+/// Data that the supervisors of all servers of a level share.
 pub(crate) struct Tending {
     pub(crate) level: Level,
     pub(crate) board: Arc<Board>,
-    /// On the other level; `None` where there is none.
+    /// The face on the other level; `None` without another level.
     pub(crate) face: Option<Face>,
     pub(crate) client: ClientConfig,
-    /// The place of the station, for servers that are to be told theirs.
+    /// The place of the station, for servers that are configured with their place.
     pub(crate) place: Option<watch::Receiver<Option<Place>>>,
     /// The discovery server of this level.
     pub(crate) discovery_url: String,
-    /// Us: our own servers are not tended.
+    /// The ApplicationUri of the station: its own servers are not supervised.
     pub(crate) own_uri: String,
-    /// The URLs of the servers that registered here. Only these are told their place.
+    /// The URLs of the servers that registered here. Only these are configured with their place.
     pub(crate) registered: watch::Sender<BTreeSet<String>>,
 }
 
 impl Tending {
-    /// Tends the server at a URL. Never ends while it is there; whoever aborts it calls [`leave`](Self::leave).
+    /// Supervises the server at a URL. Does not return while the server exists; a caller that
+    /// aborts it must call [`leave`](Self::leave).
     pub(crate) async fn tend(self: Arc<Self>, url: String) {
         let Some(application) = self.ask(&url).await else {
             return;
@@ -101,7 +103,7 @@ impl Tending {
         }
     }
 
-    /// The server is gone.
+    /// Removes the server.
     pub(crate) fn leave(&self, url: &str) {
         if let Some(name) = self.board.leave(self.level, url)
             && let Some(face) = &self.face
@@ -110,7 +112,8 @@ impl Tending {
         }
     }
 
-    /// Who is at a URL; `None` for discovery servers, which have nothing of their own, and for ourselves.
+    /// Identifies the application at a URL; `None` for discovery servers and for the station
+    /// itself.
     async fn ask(&self, url: &str) -> Option<Application> {
         let mut wait = FIRST_WAIT;
         loop {
@@ -134,7 +137,7 @@ impl Tending {
         }
     }
 
-    /// While there is that connection.
+    /// Supervises a server for the lifetime of a connection.
     async fn connected(
         &self,
         of: &Connected<'_>,
@@ -144,7 +147,7 @@ impl Tending {
         let mut known = None;
         let mut changes = of.client.subscribe(vec![model_changes()], TOLD_EVERY, 10);
         loop {
-            // A server that executes a method may answer nothing else meanwhile.
+            // A server that executes a method may not respond to other requests.
             if known.is_none() || !of.client.is_calling() {
                 match mirror::look(of.client).await {
                     Ok(looked) if known.as_ref() != Some(&looked) => {
@@ -159,7 +162,8 @@ impl Tending {
                     Err(error) => self.fault(of.url, "waiting", error.to_string()),
                 }
             }
-            // Being told its place may change a server: it is not told again for that.
+            // Configuring a server may change its nodes: it is not configured again for that
+            // change.
             let is_told = match (&*place, &known) {
                 (
                     Some(place),
@@ -185,9 +189,10 @@ impl Tending {
                     return;
                 }
                 () = told => {}
-                // What a server has may change: that of another station does whenever a device comes or goes.
+                // The nodes of a server may change, for example those of another station when a
+                // device appears or disappears.
                 () = changed(&mut changes), if is_told => {}
-                // Not every server says so.
+                // Not every server notifies model changes.
                 () = sleep(LOOK_AGAIN) => {}
             }
         }
@@ -223,7 +228,7 @@ impl Tending {
         );
     }
 
-    /// A server that was busy answers as before.
+    /// Records that a busy server responds again.
     fn answers_again(&self, of: &Connected<'_>) {
         self.board.note(self.level, of.url, |peer| {
             if peer.state == BUSY {
@@ -234,8 +239,8 @@ impl Tending {
         });
     }
 
-    /// Tells the server its place, until it has heard it; then waits for another place. Servers that did not register here
-    /// belong to another supervisor.
+    /// Configures the place of the server until that succeeds, then waits for another place.
+    /// Servers that did not register here belong to another supervisor.
     async fn keep_told(
         &self,
         of: &Connected<'_>,
@@ -265,7 +270,7 @@ impl Tending {
         }
     }
 
-    /// Calls its `Configure`. Whether there is nothing more to be done.
+    /// Calls `Configure` of the server. Returns whether there is nothing left to do.
     async fn configure(&self, of: &Connected<'_>, mirror: &Mirror, station: &Place) -> bool {
         let Some((object, method)) = &mirror.configure else {
             return true;
@@ -295,7 +300,7 @@ impl Tending {
                 self.note_fault(of, format!("not configured: {error}"));
                 false
             }
-            // The connection is gone: the next one is told.
+            // The connection is lost: the server is configured after the reconnection.
             Err(error @ CallError::Client(_)) => {
                 self.note_fault(of, format!("not configured: {error}"));
                 false
@@ -307,7 +312,7 @@ impl Tending {
         self.fault(of.url, CONNECTED, fault);
     }
 
-    /// Each reason is told once.
+    /// Logs each reason only once.
     fn fault(&self, url: &str, state: &'static str, fault: String) {
         self.board.note(self.level, url, |peer| {
             if peer.fault.as_ref() != Some(&fault) {
@@ -319,7 +324,7 @@ impl Tending {
     }
 }
 
-/// That nodes of a server are others than before.
+/// Returns a subscription to model changes of a server.
 fn model_changes() -> Watch {
     Watch::Events {
         node: ObjectId::Server.into(),
@@ -328,7 +333,7 @@ fn model_changes() -> Watch {
     }
 }
 
-/// Ready when the server says that it has changed.
+/// Completes when the server reports a model change.
 async fn changed(changes: &mut Subscription) {
     loop {
         match changes.next().await {
@@ -339,7 +344,7 @@ async fn changed(changes: &mut Subscription) {
     }
 }
 
-/// A connection to the server that it is said to be.
+/// A connection to the server with the registered identity.
 struct Connected<'a> {
     client: &'a Client,
     callers: &'a Arc<Callers>,
@@ -348,15 +353,15 @@ struct Connected<'a> {
     url: &'a str,
     name: &'a str,
     uri: &'a str,
-    /// The place of the station by which it was told its own.
+    /// The place of the station with which the server was last configured.
     told: tokio::sync::Mutex<Option<Place>>,
 }
 
-/// The fault of a server that executes a method for somebody, as far as is known.
+/// The fault of a server that is probably executing a method.
 const ANSWERS_NOTHING: &str =
     "it answers no requests, and its host is reachable: it may execute a method";
 const ASK_LIMIT: Duration = Duration::from_secs(2);
-/// How soon a server is to tell of a change.
+/// Publishing interval of the subscription to model changes.
 const TOLD_EVERY: Duration = Duration::from_millis(50);
 const LOOK_AGAIN: Duration = Duration::from_secs(2);
 const FIRST_WAIT: Duration = Duration::from_millis(250);
