@@ -1,4 +1,4 @@
-//! The plant as it is: who is in the graph, how its skills are opened, and what becomes of runs.
+//! The current state of the plant: the components in the graph, their skills, and the runs.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -18,7 +18,7 @@ use crate::plan::Offer;
 use crate::process::Process;
 use crate::record::{Run, Runs};
 
-/// The plant.
+/// The current state of the plant.
 pub(crate) struct Cell {
     knowledge: Arc<Knowledge>,
     pub(crate) processes: Vec<Process>,
@@ -30,27 +30,28 @@ pub(crate) struct Cell {
 
 #[derive(Default)]
 struct Present {
-    /// By their IRIs.
+    /// The components by their IRIs.
     components: BTreeMap<String, Component>,
     gone: VecDeque<Gone>,
 }
 
-/// A component that is in the graph.
+/// A component in the graph.
 #[derive(Debug, Clone, Serialize)]
 struct Component {
     application_uri: String,
     name: String,
     endpoint: String,
     namespace: Option<u16>,
-    /// When it was discovered, when its skills were asked for, and since when it is in the graph; ms since 1970.
+    /// Times of the discovery, of the query of its skills, and of its entry into the graph; ms
+    /// since 1970.
     seen_ms: u64,
     listed_ms: u64,
     since_ms: u64,
     skills: Vec<String>,
-    /// By which discovery knows it.
+    /// The name of the server in discovery.
     #[serde(skip)]
     discovered: String,
-    /// By the IRIs of the skills.
+    /// The skills by their IRIs.
     #[serde(skip)]
     found: BTreeMap<String, FoundSkill>,
 }
@@ -64,7 +65,7 @@ struct Gone {
     why: String,
 }
 
-/// What discovery knows of a server.
+/// A server, as discovery found it.
 #[derive(Debug, Clone)]
 pub(crate) struct Seen {
     pub(crate) name: String,
@@ -92,12 +93,12 @@ impl Cell {
         &self.client
     }
 
-    /// The process of an IRI.
+    /// Returns the process with an IRI.
     pub(crate) fn process(&self, iri: &str) -> Option<&Process> {
         self.processes.iter().find(|process| process.iri == iri)
     }
 
-    /// A server has told its skills: it is in the graph from now on.
+    /// Adds a server to the graph after it has listed its skills.
     pub(crate) fn came(
         &self,
         seen: &Seen,
@@ -113,7 +114,8 @@ impl Cell {
             namespace: first.namespace,
             skills: found.iter().filter_map(skill_facts).collect(),
         };
-        // Who comes under a URI that another has takes its place; who says something else of itself keeps its own.
+        // A component with the ApplicationUri of another component replaces it. A component that
+        // changes its description keeps its entry.
         self.remove(
             |known| known.application_uri == application_uri && known.discovered != seen.name,
             "another came under its ApplicationUri",
@@ -156,7 +158,7 @@ impl Cell {
         self.changed.send_modify(|changes| *changes += 1);
     }
 
-    /// Puts what a component says into the graph, and tells whether it is there.
+    /// Adds the description of a component to the graph. Returns whether it was added.
     fn take_in(&self, facts: &ComponentFacts, at: u64) -> bool {
         let (triples, left_out) = facts.triples();
         if !left_out.is_empty() {
@@ -177,7 +179,7 @@ impl Cell {
         taken.is_ok()
     }
 
-    /// A server that discovery knew is gone.
+    /// Removes a server that discovery has lost.
     pub(crate) fn went(&self, discovered: &str, why: &str) {
         self.remove(|component| component.discovered == discovered, why);
     }
@@ -219,7 +221,7 @@ impl Cell {
         }
     }
 
-    /// What there is to be seen of it, as JSON.
+    /// Returns the status page as JSON.
     pub(crate) fn status(&self) -> serde_json::Value {
         let present = self.present();
         let components: Vec<_> = present.components.values().collect();
@@ -439,7 +441,7 @@ fn parameter_facts(parameter: &FoundParameter, is_output: bool) -> ParameterFact
     }
 }
 
-/// ms since 1970.
+/// Returns the time in ms since 1970.
 #[expect(
     clippy::disallowed_methods,
     reason = "this is the shell; what plans and records takes its time from here"
@@ -448,7 +450,7 @@ pub(crate) fn now() -> u64 {
     since_1970(SystemTime::now())
 }
 
-/// ms since 1970.
+/// Converts a time to ms since 1970.
 pub(crate) fn since_1970(at: SystemTime) -> u64 {
     let since = at
         .duration_since(SystemTime::UNIX_EPOCH)

@@ -1,4 +1,5 @@
-//! A process from its plan to its end: planned with what the plant offers, run, and planned anew when a component is lost.
+//! Executes a process: plans it with the available skills, runs the plan, and plans again when a
+//! component is lost.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -13,50 +14,51 @@ use crate::plan::{Fallen, Offer, Plan, plan};
 use crate::process::{Job, Process, Role};
 use crate::record::{How, Planned, Ran, Run};
 
-/// The plant as a process sees it.
+/// The plant as the execution of a process needs it.
 #[async_trait]
 pub(crate) trait Plant: Send + Sync {
-    /// What is there now.
+    /// Returns the available skills.
     fn offers(&self) -> Vec<Offer>;
 
-    /// Rises with each change of that.
+    /// Returns a counter that is incremented when the available skills change.
     fn changes(&self) -> watch::Receiver<u64>;
 
-    /// Gets ready to run these skills, in the order of the offers. Who runs them has them for himself until it is closed.
+    /// Opens these skills to run them, in the order of the offers. The caller holds the leases of
+    /// their components until it calls [`Opened::close`].
     async fn open(&self, offers: &[Offer]) -> Result<Box<dyn Opened>, OpenFault>;
 
-    /// What a step gives a skill, as the skill wants it.
+    /// Converts the parameters of a step to the parameters of a skill.
     fn values(
         &self,
         skill: &str,
         given: &[(String, serde_json::Value)],
     ) -> Result<Vec<(String, Value)>, String>;
 
-    /// Keeps what has become of a run.
+    /// Stores the state of a run.
     fn keep(&self, run: &Run);
 
-    /// The time in ms since 1970.
+    /// Returns the time in ms since 1970.
     fn now(&self) -> u64;
 }
 
 /// Skills that can be run.
 #[async_trait]
 pub(crate) trait Opened: Send + Sync {
-    /// In the order in which they were asked for.
+    /// Returns the skills in the order in which they were requested.
     fn skills(&self) -> Vec<Arc<dyn Runs>>;
 
-    /// Gives them back.
+    /// Releases the leases of the components.
     async fn close(self: Box<Self>);
 }
 
-/// Which offer could not be opened, and why.
+/// The component that could not be opened, and the reason.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct OpenFault {
     pub(crate) component: String,
     pub(crate) why: String,
 }
 
-/// Runs a process to its end. `teller` hears of each step, and may want all to stop.
+/// Runs a process to its end. `teller` receives each step, and can stop the run.
 pub(crate) async fn execute(
     plant: &Arc<dyn Plant>,
     process: &Process,
@@ -96,7 +98,8 @@ pub(crate) async fn execute(
     run
 }
 
-/// Ends the record of a run that nobody waits for any more, as when its skill is halted and does not come to its end in time.
+/// Completes the record of a run when its execution is dropped, for example when its skill is
+/// halted and does not end in time.
 struct Whole(Arc<Log>);
 
 impl Drop for Whole {
@@ -125,7 +128,7 @@ fn tell(run: &Run) {
     }
 }
 
-/// Plans a process and does nothing.
+/// Plans a process without running it.
 pub(crate) fn dry_run(plant: &dyn Plant, process: &Process) -> Plan {
     plan(process, &plant.offers(), &[])
 }
@@ -137,12 +140,12 @@ struct Execution<'a> {
     teller: &'a dyn Teller,
 }
 
-/// How a plan ended.
+/// The result of a plan.
 enum Ended {
     Done,
-    /// Another plan may do it.
+    /// Another plan can do the work.
     Broken(String),
-    /// None may.
+    /// No other plan can do the work.
     Over(String),
 }
 
@@ -186,7 +189,7 @@ impl Execution<'_> {
         Err(format!("{MOST_PLANS} plans broke; the last: {last}"))
     }
 
-    /// A plan that has somebody for all, as soon as there is one, with the offers chosen by their roles.
+    /// Waits for a complete plan, and returns it with the chosen offers by their roles.
     async fn planned(&self, last: &str) -> Result<(Plan, Vec<(Role, Offer)>), String> {
         let mut changes = self.plant.changes();
         let wait = tokio::time::sleep(self.process.wait);
@@ -277,7 +280,7 @@ impl Execution<'_> {
             Job::Sequence(parameters) => self.sequence(parameters, chosen, &roles).await,
         };
         drop(roles);
-        // Who is lost does not say goodbye.
+        // A lost component does not respond to the close.
         if tokio::time::timeout(CLOSE, opened.close()).await.is_err() {
             warn!("the components of a plan were not given back in time");
         }
@@ -317,7 +320,7 @@ impl Execution<'_> {
                         plan.retreated = Some(has_retreated);
                     }
                 });
-                // With a robot over the place, or nobody knows where, no other begins.
+                // If the robot may still be above the place, another robot must not start.
                 if has_retreated {
                     Ended::Broken(broken.to_string())
                 } else {
@@ -364,7 +367,7 @@ impl Execution<'_> {
                 Ok(outcome) => outcome.message,
                 Err(fault) => fault.to_string(),
             };
-            // What was done before would be done twice by another plan.
+            // Another plan would repeat the completed steps.
             let why = format!("{}: {} {why}", step.name, skill.name());
             let is_first = self.process.steps.first() == Some(step);
             return if is_first && !goes_on {
@@ -377,7 +380,7 @@ impl Execution<'_> {
     }
 }
 
-/// The composite tells its steps to the log and to who asked.
+/// Forwards the steps of the composite to the log and to the caller.
 #[async_trait]
 impl Teller for Execution<'_> {
     async fn step(&self, step: &'static str) {
@@ -398,7 +401,7 @@ impl Teller for Execution<'_> {
     }
 }
 
-/// What becomes of a run.
+/// The record of a run.
 struct Log {
     plant: Arc<dyn Plant>,
     kept: Mutex<Kept>,
@@ -411,7 +414,7 @@ struct Kept {
 }
 
 impl Log {
-    /// Changes the record and keeps it. Nobody is waited for with the lock held.
+    /// Changes the record and stores it. The lock is not held while the record is stored.
     fn change(&self, change: impl FnOnce(&mut Kept, u64)) {
         let now = self.plant.now();
         let run = {
@@ -460,7 +463,7 @@ impl Log {
     }
 }
 
-/// A skill whose runs are kept in the log.
+/// A skill that records its runs in the log.
 struct Watched {
     inner: Arc<dyn Runs>,
     offer: Offer,
@@ -563,7 +566,8 @@ impl Runs for Watched {
     }
 }
 
-/// The step of the process that a step of the composite belongs to: picking up to where the thing is lifted, then placing.
+/// Returns the step of the process that contains a step of the composite: picking, up to the lift
+/// of the object, or placing.
 fn of_step(process: &Process, step: &str) -> String {
     let is_picking = step.starts_with("MovePick") || matches!(step, "Init" | "Grasp");
     let of = match (&process.work, process.steps.as_slice()) {
@@ -580,7 +584,7 @@ fn of_step(process: &Process, step: &str) -> String {
     of.map_or_else(|| step.to_owned(), |of| of.name.clone())
 }
 
-/// How many plans of a run may break.
+/// Maximum number of plans of a run.
 const MOST_PLANS: usize = 10;
 const MOST_FALLEN: usize = 100;
 const CLOSE: Duration = Duration::from_secs(3);

@@ -1,4 +1,4 @@
-//! ExecuteProcess: what the MES does as a skill of its own.
+//! ExecuteProcess, the skill of the MES.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -11,7 +11,7 @@ use crate::cell::Cell;
 use crate::execute::{Plant, dry_run, execute};
 use crate::record::How;
 
-/// Plans and runs the process it is started with.
+/// Plans and runs the process of its parameter.
 pub(crate) struct ExecuteProcess {
     pub(crate) cell: Arc<Cell>,
     pub(crate) runs: AtomicU64,
@@ -19,7 +19,7 @@ pub(crate) struct ExecuteProcess {
 
 #[async_trait]
 impl Driver for ExecuteProcess {
-    /// Halt waits for the skills that the work is done with.
+    /// Halt waits for the end of the skills that do the work.
     fn halt_timeout(&self) -> Option<Duration> {
         Some(COMPOSITE_HALT_TIMEOUT)
     }
@@ -66,7 +66,7 @@ impl Driver for ExecuteProcess {
             if whole.to_string().len() <= MOST_REPORT {
                 return report(&whole);
             }
-            // The reasons are on the page of the plan.
+            // The page of the plan contains the reasons.
             let short: String = missing.chars().take(1000).collect();
             return report(
                 &serde_json::json!({ "process": iri, "complete": complete, "missing": short }),
@@ -84,7 +84,7 @@ impl Driver for ExecuteProcess {
     }
 }
 
-/// Tells the skill its steps, and how much is done.
+/// Reports steps and progress to the skill.
 struct Telling<'a>(&'a Work);
 
 #[async_trait]
@@ -109,10 +109,11 @@ impl Teller for Telling<'_> {
     }
 }
 
-/// Bytes of a report, which crosses the space as a value and is read by clients as a whole.
+/// Maximum size of a report in bytes. The report crosses the space as a value, and clients read it
+/// as a whole.
 const MOST_REPORT: usize = 32 << 10;
 
-/// How much is done when a step of the composite begins.
+/// Progress at the start of each step of the composite.
 const DONE: [(&str, f32); 10] = [
     ("Init", 0.0),
     ("MovePickApproachBefore", 0.05),

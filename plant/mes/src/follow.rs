@@ -1,4 +1,5 @@
-//! From discovery to the graph: who is seen is asked for its skills, who is gone is forgotten.
+//! Updates the graph from discovery: queries the skills of discovered servers, and removes lost
+//! servers.
 
 use std::collections::HashMap;
 use std::net::IpAddr;
@@ -12,7 +13,7 @@ use tracing::{debug, warn};
 
 use crate::cell::{Cell, Seen, now, since_1970};
 
-/// Follows discovery for as long as it goes on. With `only_loopback`, servers elsewhere are left alone.
+/// Follows discovery until it ends. With `only_loopback`, servers at other addresses are ignored.
 pub(crate) async fn follow(cell: Arc<Cell>, mut watcher: Watcher, only_loopback: bool) {
     let mut looks = JoinSet::new();
     let mut looking: HashMap<String, AbortHandle> = HashMap::new();
@@ -48,7 +49,7 @@ pub(crate) async fn follow(cell: Arc<Cell>, mut watcher: Watcher, only_loopback:
     }
 }
 
-/// Asks a server for its skills until it has answered.
+/// Queries the skills of a server until the server responds.
 async fn look(cell: Arc<Cell>, known: Known, only_loopback: bool) {
     if only_loopback && !is_loopback(&known.url) {
         warn!(

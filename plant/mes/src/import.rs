@@ -1,4 +1,4 @@
-//! Files to the graph: what capabilities are, which types there are, what modules can do, which processes are known.
+//! Imports files into the graph: capabilities, types, modules and processes.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -10,10 +10,10 @@ use tracing::{info, warn};
 
 use crate::settings::{self, Settings};
 
-/// Takes in all files that the YAML names.
+/// Imports all files that the YAML names.
 ///
 /// # Errors
-/// The first that cannot be read, with its name.
+/// The first file that cannot be read, with its name.
 pub(crate) fn all(knowledge: &Knowledge, settings: &Settings, at: u64) -> Result<(), Failure> {
     let mut types = BTreeMap::new();
     let ours = skills::model::nodeset();
@@ -135,5 +135,5 @@ fn refused(name: &str, fault: &dyn std::fmt::Display) -> Failure {
     Failure::new(FailureKind::Configuration, format!("{name}: {fault}"))
 }
 
-/// Bytes of the largest file of knowledge.
+/// Maximum size of a file in bytes.
 const LARGEST: u64 = 64 << 20;

@@ -1,9 +1,17 @@
-//! The semantic MES: it keeps what is known of the plant, answers questions about it, and runs processes with whatever
-//! components there are.
+//! The semantic MES: it stores knowledge about the plant, answers queries about it, and runs
+//! processes with the available components.
 //!
-//! Reading order: `settings` (its YAML), `process`, `plan` (who does what, and why), `execute` (a plan carried out, and planned
-//! anew), `record` (what became of it), `cell` (the plant as it is), `follow` (from discovery to the graph), `import` (files to the
-//! graph), `execution_skill` (its own skill).
+//! Reading order:
+//!
+//! - `settings`: the YAML
+//! - `process`: processes and their steps
+//! - `plan`: the assignment of skills to steps, with reasons
+//! - `execute`: the execution of a plan, and planning again after a loss
+//! - `record`: the record of runs
+//! - `cell`: the current state of the plant
+//! - `follow`: from discovery to the graph
+//! - `import`: from files to the graph
+//! - `execution_skill`: the skill of the MES
 
 mod cell;
 mod execute;
@@ -89,7 +97,7 @@ struct UaMes {
     serving: OnceLock<Endpoint>,
 }
 
-/// What is made of the YAML.
+/// The objects created from the YAML.
 struct Ready {
     settings: Settings,
     component: Component,
@@ -106,7 +114,8 @@ impl std::fmt::Debug for Ready {
     }
 }
 
-/// Runs `ua-mes` from its command line to its end. `arguments` begin with the name of the program.
+/// Runs `ua-mes` with the command line `arguments`, which start with the name of the program, until
+/// it ends.
 #[must_use]
 pub fn run(arguments: Vec<OsString>) -> ExitCode {
     bridge_node::run::<UaMes>(arguments)
@@ -185,7 +194,7 @@ impl UaMes {
         Ok(settings)
     }
 
-    /// The certificate store, where anything is secured.
+    /// Returns the directory of the certificate store, used if a connection is secured.
     fn pki_root(&self, settings: &Settings) -> PathBuf {
         let root = || plant_opcua::pki::default_root(|name| std::env::var(name).ok());
         let usual = || root().join(&settings.name);
@@ -214,7 +223,7 @@ impl UaMes {
         interface.with_networks(self.networks.iter().copied())
     }
 
-    /// Answers questions, and follows who comes and goes.
+    /// Serves queries, and follows the components of the plant.
     async fn serve(&self, ready: &Ready) -> Result<(), Failure> {
         let page = page(&ready.cell);
         let address = ready.settings.sparql;
@@ -281,7 +290,7 @@ impl Program for UaMes {
         Ok(Some(Made::Run(made(&ready.component))))
     }
 
-    /// As whom its server comes, from the same certificate store.
+    /// Returns a key service with the identity and the certificate store of the MES server.
     fn key_service(&self, _mapping: &Mapping) -> Option<Arc<dyn KeyService>> {
         let settings = &self.ready().ok()?.settings;
         Some(Arc::new(plant_keys::Service::new(plant_keys::Identity {
@@ -316,7 +325,7 @@ impl Program for UaMes {
     }
 }
 
-/// The MES as a component of the plant.
+/// Returns the MES as a component of the plant.
 fn component(settings: &Settings, driver: ExecuteProcess) -> Component {
     Component {
         name: settings.name.clone(),
@@ -342,7 +351,8 @@ fn component(settings: &Settings, driver: ExecuteProcess) -> Component {
     }
 }
 
-/// `/status`, and `/plan/IRI`: what would be done now, and why.
+/// Returns the pages `/status` and `/plan/IRI`. The latter shows the plan that would be run, with
+/// its reasons.
 fn page(cell: &Arc<Cell>) -> knowledge::Page {
     let cell = Arc::clone(cell);
     Arc::new(move |path| {
@@ -359,20 +369,20 @@ fn page(cell: &Arc<Cell>) -> knowledge::Page {
     })
 }
 
-/// Runs a process by the skill, as any caller does.
+/// Runs a process with the skill, like any other caller.
 async fn run_process(skill: Skill, iri: String) {
     let run = LocalRun {
         skill,
         by: Owner::Local("the command line"),
     };
     let parameters = vec![("ProcessIri".to_owned(), Value::String(iri.clone()))];
-    // How a run ends is told by the run itself.
+    // The run itself logs its end.
     if let Err(fault) = run.run(parameters, RUN).await {
         error!(process = iri, "the process was not run: {fault}");
     }
 }
 
-/// How long a component may take to answer.
+/// Time limit for a response of a component.
 const WITHIN: Duration = Duration::from_secs(2);
-/// How long a process started by the command line may take.
+/// Time limit of a process that is started from the command line.
 const RUN: Duration = Duration::from_secs(24 * 3600);

@@ -1,5 +1,5 @@
-//! From what a process needs and what the plant offers to who does what, and why. A pure function: the rows of one question in,
-//! a plan with its reasons out.
+//! Assigns available skills to the needs of a process, with reasons. Planning is a pure function:
+//! its input is the result of a query, its output is a plan.
 
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
@@ -9,41 +9,42 @@ use serde::Serialize;
 
 use crate::process::{Group, Need, Process, Role};
 
-/// A skill that is there, as the question `candidates` tells it.
+/// An available skill, as a row of the query `candidates`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Offer {
-    /// Whether it is one of a component, and not of a module.
+    /// Whether it is a skill of a component, and not a service of a module.
     pub(crate) is_skill: bool,
-    /// IRIs.
+    /// IRIs of the component and of the skill.
     pub(crate) component: String,
     pub(crate) skill: String,
     pub(crate) component_name: String,
     pub(crate) name: String,
-    /// Its type and those above it, as `nsu=<namespace>;<BrowseName>`.
+    /// Its type and supertypes, as `nsu=<namespace>;<BrowseName>`.
     pub(crate) types: Vec<String>,
-    /// The classes of capability it realises.
+    /// The classes of the capabilities that it realises.
     pub(crate) capabilities: Vec<String>,
-    /// Those, and all above them.
+    /// These classes and all their superclasses.
     pub(crate) closure: Vec<String>,
     pub(crate) endpoint: String,
     pub(crate) node: String,
-    /// Since when its component is in the graph, ms since 1970.
+    /// Time at which its component entered the graph, ms since 1970.
     pub(crate) since_ms: u64,
 }
 
-/// What is not to be chosen although it may be there, and why.
+/// A skill or component that must not be chosen, and the reason.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Fallen {
     /// The IRI of the component.
     pub(crate) component: String,
-    /// Of the component's stay in the graph; when it has come anew, it is as good as new.
+    /// Time at which the component entered the graph. A component that enters again can be chosen
+    /// again.
     pub(crate) since_ms: u64,
-    /// The skill that failed; `None` where all of the component is lost.
+    /// The failed skill; `None` if the component is lost.
     pub(crate) skill: Option<String>,
     pub(crate) why: String,
 }
 
-/// Who does what, and why not another.
+/// The skills chosen for the steps, and the reasons.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub(crate) struct Plan {
     pub(crate) steps: Vec<PlannedStep>,
@@ -56,21 +57,21 @@ pub(crate) struct PlannedStep {
     pub(crate) needs: Vec<PlannedNeed>,
 }
 
-/// What a step needs, and who was looked at for it.
+/// A need of a step, and its candidates.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub(crate) struct PlannedNeed {
     pub(crate) role: &'static str,
     pub(crate) capability: Option<String>,
     #[serde(rename = "type")]
     pub(crate) skill_type: Option<String>,
-    /// The IRI of the skill that was chosen.
+    /// The IRI of the chosen skill.
     pub(crate) chosen: Option<String>,
     pub(crate) candidates: Vec<Candidate>,
     #[serde(skip)]
     role_is: Role,
 }
 
-/// A skill that was looked at.
+/// A skill that was considered.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub(crate) struct Candidate {
     pub(crate) skill: String,
@@ -82,7 +83,8 @@ pub(crate) struct Candidate {
 }
 
 impl Offer {
-    /// Of the answer to `candidates`. `since` tells since when a component is there, by its IRI.
+    /// Reads the result of the query `candidates`. `since` returns the time at which a component
+    /// entered the graph, by its IRI.
     pub(crate) fn all(answer: &Answer, since: &dyn Fn(&str) -> u64) -> Vec<Self> {
         let offer = |row| {
             let text = |column| Answer::text(row, column).to_owned();
@@ -105,7 +107,7 @@ impl Offer {
     }
 }
 
-/// Plans a process with what is offered, without those that have fallen out.
+/// Plans a process with the available skills, except failed skills and lost components.
 pub(crate) fn plan(process: &Process, offers: &[Offer], fallen: &[Fallen]) -> Plan {
     let mut roles: BTreeMap<Role, Vec<&Need>> = BTreeMap::new();
     for need in process.steps.iter().flat_map(|step| &step.needs) {
@@ -137,12 +139,12 @@ pub(crate) fn plan(process: &Process, offers: &[Offer], fallen: &[Fallen]) -> Pl
 }
 
 impl Plan {
-    /// Whether there is somebody for all.
+    /// Returns whether a skill is chosen for each need.
     pub(crate) fn is_complete(&self) -> bool {
         self.needs().all(|(_, need)| need.chosen.is_some())
     }
 
-    /// What nobody can do, for people.
+    /// Returns the needs without a skill, as text for people.
     pub(crate) fn missing(&self) -> String {
         let missing = self.needs().filter(|(_, need)| need.chosen.is_none());
         let told = missing.map(|(step, need)| {
@@ -172,7 +174,7 @@ impl Plan {
         told.collect::<Vec<_>>().join(", ")
     }
 
-    /// The IRI of the skill for a role.
+    /// Returns the IRI of the skill for a role.
     pub(crate) fn chosen(&self, role: Role) -> Option<&str> {
         self.needs()
             .find(|(_, need)| need.role_is == role)
@@ -188,9 +190,9 @@ impl Plan {
 
 /// The component that fills the roles of a group.
 struct Team<'a> {
-    /// Who does what; empty where no component can do all.
+    /// The skills by role; empty if no component can fill all roles.
     chosen: BTreeMap<Role, &'a Offer>,
-    /// What a component that cannot do all lacks.
+    /// The missing roles of each component that cannot fill all.
     lacks: BTreeMap<&'a str, Vec<Role>>,
 }
 
@@ -236,7 +238,8 @@ impl<'a> Team<'a> {
                 lacks.insert(component, missing);
             }
         }
-        // Who is called what is asked for, before who is it by a subclass; then who is there the longest.
+        // Components with the exact capabilities come before components with subclasses; then the
+        // longest available component comes first.
         let rank = |(exact, chosen): &(usize, BTreeMap<Role, &'a Offer>)| {
             let first = chosen.values().next();
             (
@@ -265,7 +268,7 @@ fn planned(
     let mut candidates = Vec::new();
     for offer in offers {
         let judged = judge(need, offer, fallen);
-        // Who has neither the capability nor the type is not asked at all.
+        // Skills with neither the capability nor the type are not listed as candidates.
         if judged == Err(NotFit::Unrelated) {
             continue;
         }
@@ -304,7 +307,7 @@ enum NotFit {
     Because(String),
 }
 
-/// Whether an offer can do what is needed, and why.
+/// Returns the reason why an offer fits a need, or why it does not.
 fn judge(need: &Need, offer: &Offer, fallen: &[Fallen]) -> Result<String, NotFit> {
     let has_capability = need
         .capability
@@ -365,7 +368,7 @@ fn judge(need: &Need, offer: &Offer, fallen: &[Fallen]) -> Result<String, NotFit
     Ok(reasons.join(", "))
 }
 
-/// Why one that would fit is not chosen.
+/// Returns the reason why a fitting offer is not chosen.
 fn why_not(need: &Need, offer: &Offer, chosen: Option<&Offer>, team: Option<&Team<'_>>) -> String {
     if let Some(lacking) = team.and_then(|team| team.lacks.get(offer.component.as_str())) {
         let lacking: Vec<_> = lacking.iter().map(|role| role.name()).collect();
@@ -390,7 +393,7 @@ fn why_not(need: &Need, offer: &Offer, chosen: Option<&Offer>, team: Option<&Tea
     )
 }
 
-/// Whether it realises just the capabilities that are needed, and not only some below them.
+/// Returns whether the offer realises exactly the needed capabilities, not only subclasses of them.
 fn is_exact(needs: &[&Need], offer: &Offer) -> bool {
     needs
         .iter()

@@ -1,4 +1,4 @@
-//! A process: steps in their order, and what each of them needs.
+//! Processes: their steps and the needs of each step.
 
 use std::time::Duration;
 
@@ -6,26 +6,26 @@ use knowledge::{is_iri, vocabulary as v};
 use mtp::{Object, Triple, escaped};
 use skills::TypeName;
 
-/// Something that the MES can be asked to do, by its IRI.
+/// A process that the MES can run, identified by its IRI.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Process {
     pub(crate) iri: String,
     pub(crate) name: String,
     pub(crate) work: Job,
-    /// In their order.
+    /// The steps in order.
     pub(crate) steps: Vec<Step>,
-    /// How long each run of a skill may take.
+    /// Time limit of each run of a skill.
     pub(crate) within: Duration,
-    /// How long to wait for a component that a plan lacks.
+    /// Time to wait for a component that a plan needs.
     pub(crate) wait: Duration,
 }
 
-/// How the steps are done.
+/// The way in which the steps are done.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Job {
-    /// All together, by the composite that brings a thing from one place to another.
+    /// All steps together, by the composite that moves an object to another pose.
     PickAndPlace(skills::Job),
-    /// One after the other, a skill each, with these parameters as JSON.
+    /// A sequence of skills, with these parameters as JSON.
     Sequence(Vec<Vec<(String, serde_json::Value)>>),
 }
 
@@ -39,35 +39,35 @@ pub(crate) struct Step {
 /// A skill that a step needs.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Need {
-    /// What it is for. In all steps of a composite one skill has one role.
+    /// The role of the skill. In all steps of a composite, each role has the same skill.
     pub(crate) role: Role,
-    /// The class of capability it has to realise.
+    /// The class of the capability that the skill has to realise.
     pub(crate) capability: Option<String>,
-    /// The type it has to have, or one below it.
+    /// The required type; subtypes match too.
     pub(crate) skill_type: Option<TypeName>,
 }
 
-/// What a skill is for.
+/// The role of a skill.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub(crate) enum Role {
-    /// Moves fast, on a way of the robot's choice.
+    /// Moves fast, along a path that the robot chooses.
     Ptp,
-    /// Moves straight.
+    /// Moves along a straight line.
     Linear,
-    /// Takes hold of the thing.
+    /// Grasps the object.
     Grasp,
-    /// Lets it go.
+    /// Releases the object.
     Release,
-    /// Does the step of this number, by itself.
+    /// Does the step with this number alone.
     Alone(usize),
 }
 
 impl Role {
-    /// Those of the composite.
+    /// The roles of the composite.
     pub(crate) const OF_COMPOSITE: [Self; 4] =
         [Self::Ptp, Self::Linear, Self::Grasp, Self::Release];
 
-    /// As the YAML and the graph have it.
+    /// Returns the name in the YAML and in the graph.
     pub(crate) fn name(self) -> &'static str {
         match self {
             Self::Ptp => "ptp",
@@ -78,7 +78,7 @@ impl Role {
         }
     }
 
-    /// The type of ours that it takes where the process does not say which.
+    /// Returns the default skill type of the role.
     pub(crate) fn skill_type(self) -> Option<TypeName> {
         let name = match self {
             Self::Ptp => "PtpMoveSkillType",
@@ -90,7 +90,8 @@ impl Role {
         Some(TypeName::own(name))
     }
 
-    /// Skills of one group are all of one component: one robot moves, one tool holds and lets go.
+    /// Returns the group. The same component fills all roles of a group: one robot moves, one tool
+    /// grasps and releases.
     pub(crate) fn group(self) -> Group {
         match self {
             Self::Ptp | Self::Linear => Group::Robot,
@@ -100,7 +101,7 @@ impl Role {
     }
 }
 
-/// Roles that one component has to fill.
+/// Roles that the same component has to fill.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub(crate) enum Group {
     Robot,
@@ -109,7 +110,7 @@ pub(crate) enum Group {
 }
 
 impl Process {
-    /// The process in the terms of the graph. `type_iri` finds the IRI of a type, where it is known.
+    /// Returns the triples of the process. `type_iri` returns the IRI of a type, if it is known.
     pub(crate) fn triples(&self, type_iri: &dyn Fn(&TypeName) -> Option<String>) -> Vec<Triple> {
         let mut all = Vec::new();
         let mut say = |subject: &str, predicate: &str, object: Object| {
@@ -150,7 +151,7 @@ impl Process {
     }
 }
 
-/// The IRI of a step of a process.
+/// Returns the IRI of a step of a process.
 pub(crate) fn step_iri(process: &str, step: &str) -> String {
     format!("{process}/step/{}", escaped(step))
 }

@@ -1,4 +1,4 @@
-//! What was planned and run, for /status and for the graph.
+//! Records of plans and runs, for `/status` and for the graph.
 
 use std::collections::VecDeque;
 use std::sync::{Mutex, PoisonError};
@@ -10,35 +10,35 @@ use serde::Serialize;
 use crate::plan::{Fallen, Plan};
 use crate::process::{Process, step_iri};
 
-/// How something ended, or that it goes on.
+/// The outcome of a process, plan or skill run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub(crate) enum How {
     Running,
     Done,
     Failed,
-    /// Its component was lost in the middle.
+    /// Its component was lost during the run.
     Lost,
-    /// It was halted because of something else.
+    /// It was halted for another reason.
     Stopped,
 }
 
 /// A run of a process. Times are in ms since 1970.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub(crate) struct Run {
-    /// Its IRI.
+    /// The IRI of the run.
     pub(crate) run: String,
     pub(crate) process: String,
     pub(crate) started_ms: u64,
     pub(crate) ended_ms: Option<u64>,
     pub(crate) outcome: How,
     pub(crate) reason: Option<String>,
-    /// What it waits for; nothing where it does not.
+    /// The missing components that the run waits for, if any.
     pub(crate) waits_for: Option<String>,
     pub(crate) plans: Vec<Planned>,
 }
 
-/// A plan of a run, and what was run by it.
+/// A plan of a run, and the skill runs of the plan.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub(crate) struct Planned {
     pub(crate) number: usize,
@@ -49,11 +49,11 @@ pub(crate) struct Planned {
     pub(crate) ran: Vec<Ran>,
     pub(crate) outcome: How,
     pub(crate) reason: Option<String>,
-    /// After a fault: whether the robot is away from the place.
+    /// After a fault, whether the robot has retreated.
     pub(crate) retreated: Option<bool>,
 }
 
-/// One skill that was run.
+/// A run of a skill.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub(crate) struct Ran {
     /// The step of the composite, or the name of the step.
@@ -68,12 +68,12 @@ pub(crate) struct Ran {
     pub(crate) reason: Option<String>,
 }
 
-/// The runs there were, the newest last; the oldest go.
+/// The newest runs, in order; old runs are removed.
 #[derive(Debug, Default)]
 pub(crate) struct Runs(Mutex<VecDeque<Run>>);
 
 impl Runs {
-    /// Takes a run in, or what has become of it. Gives the runs that had to go for it.
+    /// Adds or updates a run. Returns the runs that were removed to make space.
     pub(crate) fn put(&self, run: &Run) -> Vec<String> {
         let mut all = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         match all.iter_mut().find(|known| known.run == run.run) {
@@ -87,7 +87,7 @@ impl Runs {
         gone
     }
 
-    /// All of them.
+    /// Returns all runs.
     pub(crate) fn all(&self) -> Vec<Run> {
         self.0
             .lock()
@@ -99,7 +99,7 @@ impl Runs {
 }
 
 impl Run {
-    /// A run that begins. `number` tells runs of one millisecond apart.
+    /// Creates a run. `number` distinguishes runs that start in the same millisecond.
     pub(crate) fn begins(process: &Process, at: u64, number: u64) -> Self {
         Self {
             run: format!("urn:ua-bridge:run:{at}-{number}"),
@@ -113,7 +113,7 @@ impl Run {
         }
     }
 
-    /// In the terms of the graph.
+    /// Returns the triples of the run.
     pub(crate) fn triples(&self) -> Vec<Triple> {
         let mut graph = Graph(Vec::new());
         let run = &self.run;
@@ -160,14 +160,14 @@ impl Run {
         graph.0
     }
 
-    /// The plan that is carried out.
+    /// Returns the plan that is being executed.
     pub(crate) fn plan(&mut self) -> Option<&mut Planned> {
         self.plans.last_mut()
     }
 }
 
 impl Planned {
-    /// Ends it. What still ran was stopped.
+    /// Ends the plan. Skills that are still running are recorded as stopped.
     pub(crate) fn end(&mut self, at: u64, outcome: How, reason: Option<String>) {
         self.ended_ms = Some(at);
         self.outcome = outcome;
@@ -178,7 +178,7 @@ impl Planned {
         }
     }
 
-    /// A component is lost: what it ran has no other end.
+    /// Records the loss of a component: its running skills end as lost.
     pub(crate) fn lost(&mut self, at: u64, fallen: &Fallen) {
         let of_component =
             |ran: &&mut Ran| ran.ended_ms.is_none() && ran.component == fallen.component;
@@ -230,11 +230,11 @@ fn iri(iri: &str) -> Object {
     Object::Iri(iri.to_owned())
 }
 
-/// ms since 1970 as an xsd:dateTime in UTC.
+/// Formats ms since 1970 as an xsd:dateTime in UTC.
 pub(crate) fn date_time(ms: u64) -> String {
     let (seconds, ms) = (ms / 1000, ms % 1000);
     let (days, second) = (seconds / 86_400, seconds % 86_400);
-    // Years begin in March here, so that the day that not all of them have is their last.
+    // Years start in March in this calculation, so that the leap day is the last day of a year.
     let days = days + 719_468;
     let (era, of_era) = (days / 146_097, days % 146_097);
     let year_of_era = (of_era - of_era / 1460 + of_era / 36_524 - of_era / 146_096) / 365;

@@ -11,19 +11,19 @@ use skills::{Lds, Security, TypeName};
 
 use crate::process::{Job, Need, Process, Role, Step};
 
-/// What the MES is started with.
+/// The settings of the MES.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Settings {
-    /// Its name as a component.
+    /// The name of the component.
     pub(crate) name: String,
     pub(crate) application_uri: String,
-    /// Its number in the space.
+    /// The number of the component in the space.
     pub(crate) namespace: u16,
     pub(crate) endpoint: String,
     pub(crate) security: Vec<Security>,
     pub(crate) lds: Lds,
     pub(crate) open: bool,
-    /// Where questions are answered.
+    /// The address of the SPARQL endpoint.
     pub(crate) sparql: SocketAddr,
     /// Turtle files.
     pub(crate) knowledge: Vec<Source>,
@@ -32,7 +32,7 @@ pub(crate) struct Settings {
     pub(crate) processes: Vec<Process>,
 }
 
-/// A file, by what the YAML calls it.
+/// A file, with its name in the YAML.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Source {
     pub(crate) name: String,
@@ -45,12 +45,13 @@ pub(crate) struct Manifest {
     pub(crate) source: Source,
     /// The IRI of the module.
     pub(crate) iri: String,
-    /// Classes of capability by the name of a service, or of `service/procedure`.
+    /// Classes of capabilities by the name of a service, or of `service/procedure`.
     pub(crate) capabilities: BTreeMap<String, Vec<String>>,
 }
 
 impl Settings {
-    /// Reads the text; paths in it are relative to `folder`. All that is wrong is told at once.
+    /// Reads the settings from YAML; paths are relative to `folder`. All errors are reported
+    /// together.
     pub(crate) fn from_yaml(text: &str, folder: &Path) -> Result<Self, Findings> {
         let mut findings = Findings::default();
         let read = match parse(text) {
@@ -349,7 +350,7 @@ impl Reading<'_> {
         })
     }
 
-    /// A step of a composite, or the one of a number that is done by itself.
+    /// Reads a step of a composite, or the step with a number that a single skill does.
     fn step(
         &mut self,
         node: &Node,
@@ -558,7 +559,7 @@ impl Reading<'_> {
     }
 }
 
-/// A value as JSON: a number or truth value where it reads as one.
+/// Converts a value to JSON: a number or Boolean if the text is a valid number or Boolean.
 fn json(node: &Node) -> serde_json::Value {
     match &node.kind {
         Kind::Scalar(text) => serde_json::from_str(text)

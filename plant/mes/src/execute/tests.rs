@@ -6,12 +6,12 @@ use skills::TypeName;
 use super::*;
 use crate::process::{Need, Step};
 
-/// A plant of the tests: skills that do nothing but are known to have been run.
+/// A plant for tests. Its skills do nothing and record their runs.
 struct Fakes {
     offers: Mutex<Vec<Offer>>,
     changed: watch::Sender<u64>,
     lost: watch::Sender<Vec<String>>,
-    /// A skill whose component is lost when it is run, and one that fails.
+    /// A skill that loses its component when it is run, and a skill that fails.
     dies_at: Mutex<Option<&'static str>>,
     fails_at: Option<&'static str>,
     /// A skill that runs until it is halted, because the gripper is lost meanwhile.
@@ -21,7 +21,7 @@ struct Fakes {
     journal: Mutex<Vec<String>>,
     kept: Mutex<Vec<Run>>,
     clock: AtomicU64,
-    /// Comes when something is lost.
+    /// Appears when a component is lost.
     spare: Mutex<Vec<Offer>>,
 }
 
@@ -195,7 +195,7 @@ impl Runs for FakeSkill {
         let spare: Vec<_> = self.plant.spare.lock().unwrap().drain(..).collect();
         if !spare.is_empty() {
             let plant = Arc::clone(&self.plant);
-            // Plugged in a little later, while the process waits.
+            // Connected a little later, while the process waits.
             tokio::spawn(async move {
                 tokio::time::sleep(Duration::from_millis(50)).await;
                 plant.offers.lock().unwrap().extend(spare);
@@ -496,7 +496,7 @@ async fn a_sequence_gives_each_step_what_it_needs_and_never_does_one_twice() {
     );
 }
 
-/// Wants all to stop with the first step.
+/// Stops the run at this step.
 struct StopAt(&'static str, watch::Sender<bool>);
 
 #[async_trait]

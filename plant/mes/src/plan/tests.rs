@@ -17,7 +17,7 @@ fn need(role: Role, capability: &str) -> Need {
     }
 }
 
-/// Pick a part, place it.
+/// A process that picks a part and places it.
 fn process() -> Process {
     let moves = || [need(Role::Ptp, MOVE), need(Role::Linear, MOVE)];
     let step = |name: &str, last| Step {
@@ -140,7 +140,7 @@ fn a_type_never_seen_fits_by_its_supertype_and_a_capability_by_its_superclass() 
 
 #[test]
 fn one_component_fills_all_roles_of_its_group() {
-    // One can only grasp, the other can only release, and a third can do both.
+    // The first gripper can only grasp, the second can only release, and the third can do both.
     let grasps = gripper("a-grasps").into_iter().take(1).collect();
     let releases = gripper("a-releases").into_iter().skip(1).collect();
     let offers = [robot("robot"), grasps, releases, gripper("gripper")].concat();
