@@ -1,8 +1,9 @@
-//! The wall clock, by which the processes of the demo compare what they saw: they run on one machine.
+//! The wall clock. All processes of the demo run on the same machine, so their timestamps are
+//! comparable.
 
 use std::time::{SystemTime, UNIX_EPOCH};
 
-/// Nanoseconds since 1970 UTC.
+/// Returns the nanoseconds since 1970 UTC.
 pub(crate) fn wall_nanos() -> i64 {
     #[expect(
         clippy::disallowed_methods,

@@ -1,6 +1,7 @@
-//! What the demo's own processes tell the one that started them: a line of JSON on standard output per event.
+//! Events of the demo's own processes for their parent process: each is a line of JSON on standard
+//! output.
 //!
-//! This is for the timeline only. The robots hear of one another through the space.
+//! They are used for the timeline only. The robots communicate through the space.
 
 use std::io::{self, Write as _};
 
@@ -13,14 +14,14 @@ use crate::robots::niryo::NiryoEvent;
 use crate::robots::turtlebot::TurtlebotEvent;
 use crate::skilled::MachineEvent;
 
-/// An event and when it was, in nanoseconds since 1970.
+/// An event and its time, in nanoseconds since 1970.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Stamped {
     pub(crate) at_ns: i64,
     pub(crate) event: Event,
 }
 
-/// Something that happened in a child process.
+/// An event in a child process.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(untagged)]
 pub(crate) enum Event {
@@ -32,38 +33,39 @@ pub(crate) enum Event {
     Machine(MachineEvent),
 }
 
-/// From the ROS master.
+/// An event of the ROS master.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "master", rename_all = "snake_case")]
 pub(crate) enum MasterEvent {
     Listening { uri: String },
 }
 
-/// From the OPC UA client.
+/// An event of the OPC UA client.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "supervisor", rename_all = "snake_case")]
 pub(crate) enum SupervisorEvent {
     Connected,
-    /// These values have not come to the server yet.
+    /// The server has no values of these names yet.
     Awaits {
         names: Vec<Name>,
     },
-    /// All values are there, and the Method that switches the conveyor is not.
+    /// The server has all values, but not the Method that switches the conveyor.
     AwaitsSwitch,
-    /// It has called the switch of the conveyor, and Niryo Ned has answered. The stamp is of the call.
+    /// The client called the switch of the conveyor, and Niryo Ned responded. The timestamp is the
+    /// time of the call.
     Switched {
         on: bool,
-        /// From the call to its answer.
+        /// Nanoseconds from the call to its response.
         answered_after_ns: i64,
     },
-    /// The server has a new value; the stamp is the server's.
+    /// The server has a new value; the timestamp is the server's.
     Saw {
         name: Name,
         value: Value,
     },
 }
 
-/// The two kinds of values of the line.
+/// A value of the line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(untagged)]
 pub(crate) enum Value {
@@ -80,12 +82,12 @@ impl std::fmt::Display for Value {
     }
 }
 
-/// Tells of an event that happens now. Fails when nobody listens any more.
+/// Prints an event that happens at this moment. Fails if standard output is closed.
 pub(crate) fn tell(event: impl Into<Event>) -> io::Result<()> {
     tell_at(wall_nanos(), event)
 }
 
-/// Tells of an event that happened at `at_ns`.
+/// Prints an event that happened at `at_ns`.
 pub(crate) fn tell_at(at_ns: i64, event: impl Into<Event>) -> io::Result<()> {
     let mut line = serde_json::to_vec(&Stamped {
         at_ns,

@@ -1,8 +1,9 @@
-//! The names of the line's values and of its one call: in both ROS spaces, and as nodes of the OPC UA server.
+//! The names of the values and of the call of the line, in both ROS spaces and as nodes of the OPC
+//! UA server.
 
 use serde::{Deserialize, Serialize};
 
-/// One value of the line.
+/// A value of the line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "PascalCase")]
 pub(crate) enum Name {
@@ -10,9 +11,9 @@ pub(crate) enum Name {
     ConveyorRunning,
     /// UInt32, from Niryo Ned.
     CoversInStorage,
-    /// UInt32, from Niryo Ned: covers placed on the conveyor so far.
+    /// UInt32, from Niryo Ned: number of covers placed on the conveyor.
     CoversOnConveyor,
-    /// UInt32, from Niryo Ned: covers placed on TurtleBot3 so far.
+    /// UInt32, from Niryo Ned: number of covers placed on TurtleBot3.
     CoversOnTurtleBot3,
     /// Boolean, from TurtleBot3.
     ParkBusy,
@@ -30,7 +31,7 @@ impl Name {
         Self::BucketBusy,
     ];
 
-    /// The ROS topic, without the leading slash.
+    /// Returns the ROS topic, without the leading slash.
     pub(crate) const fn ros_topic(self) -> &'static str {
         match self {
             Self::ConveyorRunning => "conveyor/running",
@@ -42,7 +43,7 @@ impl Name {
         }
     }
 
-    /// The numeric identifier of the node in namespace [`NAMESPACE`].
+    /// Returns the numeric identifier of the node in namespace [`NAMESPACE`].
     pub(crate) const fn node(self) -> u32 {
         match self {
             Self::ConveyorRunning => 10,
@@ -54,7 +55,7 @@ impl Name {
         }
     }
 
-    /// The program that produces the value.
+    /// Returns the program that produces the value.
     pub(crate) const fn producer(self) -> &'static str {
         match self {
             Self::ConveyorRunning
@@ -72,14 +73,14 @@ impl std::fmt::Display for Name {
     }
 }
 
-/// The call that switches the conveyor: a service (std_srvs/SetBool) of Niryo Ned, without the leading slash, and a
-/// Method of the OPC UA server.
+/// The call that switches the conveyor: a service (std_srvs/SetBool) of Niryo Ned, without the
+/// leading slash, and a Method of the OPC UA server.
 pub(crate) const SWITCH: &str = "conveyor/switch";
 /// The numeric identifier of that Method in namespace [`NAMESPACE`].
 pub(crate) const SWITCH_NODE: u32 = 61;
-/// Where the OPC UA server has the values.
+/// The namespace of the values in the OPC UA server.
 pub(crate) const NAMESPACE: &str = "urn:ua-bridge:assembly-line";
-/// Where the OPC UA server listens.
+/// The endpoint of the OPC UA server.
 pub(crate) const ENDPOINT: &str = "opc.tcp://127.0.0.1:4840";
 /// The DDS domain of TurtleBot3.
 pub(crate) const DOMAIN: u16 = 2;

@@ -1,12 +1,18 @@
-//! Stories with simulated robots and the programs people run: the fault-tolerant product assembly line by skills, the same line by
-//! topics, plug and produce, and the change of tools.
+//! Scenarios with simulated robots and the released programs: the fault-tolerant product assembly
+//! line with skills, the same line with topics, plug and produce, and the tool change.
 //!
-//! One binary is all the demo's own processes: started plainly it starts the others, which are hidden subcommands of
-//! it, and the programs that stand beside it. The robots know one another, and components, through the topics of the space
-//! alone; what they print is for the timeline.
+//! All processes of the demo use the same binary. Without a subcommand it starts the others, which
+//! are hidden subcommands, and the other programs in its directory. The robots and the components
+//! communicate through the space only; their standard output is for the timeline.
 //!
-//! Reading order: `robots::niryo` and `robots::turtlebot` (what the robots decide), `line` (the values they share),
-//! `supervisor`, `orchestra` (who starts and watches them all); `skilled`, `plug` and `tools` (the other stories); `stage` (what both stand on).
+//! Reading order:
+//!
+//! - `robots::niryo` and `robots::turtlebot`: the logic of the robots
+//! - `line`: their shared values
+//! - `supervisor` and `orchestra`: the OPC UA client, and the process that starts and watches all
+//!   others
+//! - `skilled`, `plug` and `tools`: the other scenarios
+//! - `stage`: the shared parts of the scenarios
 
 mod clock;
 mod event;
@@ -137,7 +143,7 @@ fn main() -> ExitCode {
         Ok(arguments) => arguments,
         Err(error) => {
             let code = if error.use_stderr() { USAGE } else { 0 };
-            // When nothing can be printed the exit code still says it.
+            // If nothing can be printed, the exit code still reports the error.
             error.print().ok();
             return ExitCode::from(code);
         }
@@ -205,7 +211,7 @@ fn main() -> ExitCode {
 }
 
 async fn play_role(role: Role) -> anyhow::Result<()> {
-    // RustDDS reports at level error what is part of every orderly end.
+    // RustDDS logs at level error during every regular shutdown.
     let filter = tracing_subscriber::EnvFilter::new("info,rustdds=off,ros2_client=warn,opcua=warn");
     tracing_subscriber::fmt()
         .with_env_filter(filter)
@@ -229,7 +235,7 @@ async fn play_role(role: Role) -> anyhow::Result<()> {
 }
 
 fn complain(error: &anyhow::Error) -> ExitCode {
-    // When nothing can be printed the exit code still says it.
+    // If nothing can be printed, the exit code still reports the error.
     writeln!(std::io::stderr(), "error: {error:#}").ok();
     ExitCode::FAILURE
 }

@@ -8,7 +8,7 @@ use tcpros::Core;
 use crate::event::{MasterEvent, tell};
 use crate::stop::Stop;
 
-/// Runs a master on a free port of 127.0.0.1 until it is told to end.
+/// Runs a master on a free port of 127.0.0.1 until the process is stopped.
 pub(crate) async fn run() -> anyhow::Result<()> {
     let mut stop = Stop::new()?;
     let core = Core::start(SocketAddr::from((Ipv4Addr::LOCALHOST, 0)))

@@ -1,13 +1,14 @@
-//! How long the robots take, at a given speed.
+//! The durations of the robots' actions at a given speed.
 
 use std::time::Duration;
 
-/// Speed of the story: all times of the robots are divided by it.
+/// The speed of a scenario: all durations of the robots are divided by it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Speed(f64);
 
 impl Speed {
-    /// Takes a factor of 0.1 to 1000: past that the robots would be faster than the values they wait for.
+    /// Creates a speed from a factor between 0.1 and 1000. At higher speeds the robots would be
+    /// faster than the values that they wait for.
     pub(crate) fn new(factor: f64) -> Option<Self> {
         (0.1..=1000.0).contains(&factor).then_some(Self(factor))
     }
@@ -16,14 +17,14 @@ impl Speed {
         self.0
     }
 
-    /// What so many seconds of the story last.
+    /// Converts seconds of the scenario to a real duration.
     pub(crate) fn real(self, story_seconds: f64) -> Duration {
         Duration::try_from_secs_f64(story_seconds / self.0).unwrap_or(Duration::MAX)
     }
 
-    /// How many seconds of the story so many nanoseconds are.
+    /// Converts real nanoseconds to seconds of the scenario.
     pub(crate) fn story_seconds(self, real_nanos: i64) -> f64 {
-        // Exact up to 2^53 ns, which is a hundred days.
+        // Exact up to 2^53 ns, which is about a hundred days.
         #[expect(
             clippy::cast_precision_loss,
             reason = "a story lasts less than a hundred days"
@@ -42,32 +43,33 @@ impl std::str::FromStr for Speed {
     }
 }
 
-/// How long each action takes, in real time.
+/// The duration of each action, in real time.
 ///
-/// With four covers and the conveyor switched off at second 25 the arm then holds the third cover: two go by conveyor
-/// and two by TurtleBot3, and the last cycle is long, because TurtleBot3 is away with the third.
+/// With four covers and the conveyor switched off at second 25, the arm holds the third cover at
+/// that time. Two covers go by conveyor and two by TurtleBot3. The last cycle is long, because
+/// TurtleBot3 is away with the third cover.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Pace {
-    /// Before the first cycle and between cycles.
+    /// Before the first cycle.
     pub(crate) first_rest: Duration,
     /// Between two cycles.
     pub(crate) rest: Duration,
-    /// Half of a pick-and-place cycle, for the first, third... cover, which lie far from the arm.
+    /// Half of a pick-and-place cycle for the first, third... cover, which lie far from the arm.
     pub(crate) far_half: Duration,
-    /// Half of a cycle for the covers that lie near.
+    /// Half of a cycle for the other covers, which lie near.
     pub(crate) near_half: Duration,
-    /// From the cover in the bucket to the wheels turning.
+    /// From the placement of the cover in the bucket to the departure.
     pub(crate) load: Duration,
     /// From the park to the worker, and back.
     pub(crate) drive: Duration,
-    /// At the worker.
+    /// Unloading at the worker.
     pub(crate) unload: Duration,
-    /// After this long a report that the bucket is free is newer than the cover just placed in it.
+    /// Age after which a report that the bucket is free is newer than the placed cover.
     pub(crate) report_age: Duration,
 }
 
 impl Pace {
-    /// All times at a speed.
+    /// Returns all durations at a speed.
     pub(crate) fn at(speed: Speed) -> Self {
         Self {
             first_rest: speed.real(2.0),
@@ -77,12 +79,12 @@ impl Pace {
             load: speed.real(2.0),
             drive: speed.real(7.0),
             unload: speed.real(3.0),
-            // Networks do not run faster when the robots do.
+            // Network delays do not depend on the speed of the robots.
             report_age: speed.real(20.0).max(Duration::from_secs(5)),
         }
     }
 
-    /// One half of the cycle of this number, counted from 0.
+    /// Returns the duration of half of a cycle, by the number of the cycle from 0.
     pub(crate) const fn half_cycle(&self, cycle: u32) -> Duration {
         if cycle.is_multiple_of(2) {
             self.far_half
@@ -92,8 +94,8 @@ impl Pace {
     }
 }
 
-/// Seconds of the story after which a line of so many covers is overdue: each by TurtleBot3, one after another, with
-/// as much again for waiting.
+/// Returns the seconds of the scenario after which a line with this many covers is overdue.
+/// TurtleBot3 could deliver all covers in sequence within half of the time.
 pub(crate) fn overdue_after(covers: u32, conveyor_off_at: f64) -> f64 {
     conveyor_off_at + 60.0 + 60.0 * f64::from(covers)
 }

@@ -1,4 +1,4 @@
-//! When a child process ends: on a signal, or when the demo that started it is gone.
+//! The end of a child process: on a signal, or when its parent process has ended.
 
 use std::io;
 use std::time::Duration;
@@ -7,7 +7,7 @@ use rustix::process::{Pid, getppid};
 use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::time::{Interval, interval};
 
-/// Waits for the reason to end.
+/// Waits for a reason to end.
 pub(crate) struct Stop {
     terminate: Signal,
     interrupt: Signal,
@@ -25,13 +25,13 @@ impl Stop {
         })
     }
 
-    /// Returns when it is time to end. Cancel-safe.
+    /// Returns when the process has to end. Cancel-safe.
     pub(crate) async fn wait(&mut self) {
         loop {
             tokio::select! {
                 _ = self.terminate.recv() => return,
                 _ = self.interrupt.recv() => return,
-                // A killed demo tells nobody; its children get another parent.
+                // A killed demo does not signal its children, but they get another parent.
                 _ = self.look.tick() => if getppid() != self.parent { return },
             }
         }

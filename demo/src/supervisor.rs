@@ -1,5 +1,5 @@
-//! The supervisor: an OPC UA client that calls the switch of the conveyor, a service of Niryo Ned, and watches all
-//! values.
+//! The supervisor: an OPC UA client that calls the switch of the conveyor, a service of Niryo Ned,
+//! and monitors all values.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -20,8 +20,8 @@ use crate::event::{SupervisorEvent, Value, tell, tell_at};
 use crate::line::{ENDPOINT, NAMESPACE, Name, SWITCH_NODE};
 use crate::stop::Stop;
 
-/// Starts the line when all its values and its switch are at the server, switches the conveyor off after `off_after`, and watches
-/// until it is told to end.
+/// Starts the line when the server has all its values and its switch. Switches the conveyor off
+/// after `off_after`, and monitors the values until the process is stopped.
 pub(crate) async fn run(off_after: Duration, pki: PathBuf) -> anyhow::Result<()> {
     let mut stop = Stop::new()?;
     tokio::select! {
@@ -65,7 +65,7 @@ fn subscription_ended() -> anyhow::Error {
     anyhow!("the OPC UA server has ended the subscription")
 }
 
-/// Connects as soon as the server listens.
+/// Connects when the server listens.
 async fn connect(pki: PathBuf) -> anyhow::Result<Arc<Session>> {
     let mut client = ClientBuilder::new()
         .application_name("Supervisor of the assembly line")
@@ -97,7 +97,7 @@ async fn connect(pki: PathBuf) -> anyhow::Result<Arc<Session>> {
             IdentityToken::Anonymous,
         )
         .map_err(|error| anyhow!("{ENDPOINT} is no endpoint to connect to: {error}"))?;
-    // It ends with the session, and the session with the process.
+    // The task ends with the session, and the session ends with the process.
     drop(events.spawn());
     match timeout(CONNECT_LIMIT, session.wait_for_connection()).await {
         Ok(true) => Ok(session),
@@ -116,7 +116,8 @@ async fn namespace_index(session: &Session) -> anyhow::Result<u16> {
         .ok_or_else(|| anyhow!("the OPC UA server has no namespace {NAMESPACE}"))
 }
 
-/// Subscribes all values of the line. The queue holds more than a line produces while the timeline is written.
+/// Subscribes to all values of the line. The queue holds more changes than a line produces while
+/// the timeline is written.
 async fn subscribe(
     session: &Session,
     namespace: u16,
@@ -140,7 +141,7 @@ async fn subscribe(
             NodeId::new(namespace, name.node()).into(),
             MonitoringMode::Reporting,
             MonitoringParameters {
-                // Every change, as it comes.
+                // Report every change immediately.
                 sampling_interval: 0.0,
                 queue_size: 100,
                 discard_oldest: true,
@@ -165,14 +166,14 @@ fn is(node: &NodeId, name: Name) -> bool {
     matches!(&node.identifier, Identifier::Numeric(number) if *number == name.node())
 }
 
-/// The Method that switches the conveyor, and the object it is of.
+/// The Method that switches the conveyor, and its object.
 struct Switch {
     object: NodeId,
     method: NodeId,
 }
 
 impl Switch {
-    /// Waits until the server has the Method, which it has as long as Niryo Ned's service is there.
+    /// Waits until the server has the Method, which exists while Niryo Ned's service is available.
     async fn find(session: &Session, namespace: u16) -> anyhow::Result<Self> {
         let method = NodeId::new(namespace, SWITCH_NODE);
         let mut told = false;
@@ -188,8 +189,8 @@ impl Switch {
         }
     }
 
-    /// Switches the conveyor. A call that came to nothing is made anew, as the whole story hangs on it; also one of which
-    /// nobody knows whether it was executed, since to be told twice changes nothing.
+    /// Switches the conveyor. A failed call is repeated, because the scenario depends on it. A call
+    /// with an unknown result is repeated too, because the call is idempotent.
     async fn turn(&self, session: &Session, on: bool) -> anyhow::Result<()> {
         let mut problem = String::new();
         for _ in 0..CALL_ATTEMPTS {
@@ -219,7 +220,7 @@ impl Switch {
     }
 }
 
-/// Whether the response of std_srvs/SetBool says that it was done.
+/// Checks that the response of std_srvs/SetBool reports success.
 fn follow(result: &CallMethodResult, on: bool) -> anyhow::Result<()> {
     match result.output_arguments.as_deref() {
         Some([Variant::Boolean(true), _]) => Ok(()),
@@ -230,7 +231,7 @@ fn follow(result: &CallMethodResult, on: bool) -> anyhow::Result<()> {
     }
 }
 
-/// The object that has a Method as its component; nothing where there is no such Method.
+/// Returns the object that has a Method as its component; `None` if the Method does not exist.
 async fn object_of(session: &Session, method: &NodeId) -> anyhow::Result<Option<NodeId>> {
     let description = BrowseDescription {
         node_id: method.clone(),
@@ -250,7 +251,7 @@ async fn object_of(session: &Session, method: &NodeId) -> anyhow::Result<Option<
     Ok(object.map(|reference| reference.node_id.node_id))
 }
 
-/// The last value seen of each variable.
+/// The last value of each variable.
 struct Watch {
     last: std::collections::BTreeMap<Name, Value>,
 }
@@ -262,7 +263,7 @@ impl Watch {
         }
     }
 
-    /// Whether every value that the robots produce has come to the server.
+    /// Returns whether the server has all values of the robots.
     fn complete(&self) -> bool {
         self.missing().is_empty()
     }
@@ -274,7 +275,7 @@ impl Watch {
             .collect()
     }
 
-    /// Tells of a value when it is good and new.
+    /// Reports a value if it is good and new.
     fn see(&mut self, name: Name, data: &DataValue) -> anyhow::Result<()> {
         let status = data.status.unwrap_or(StatusCode::Good);
         if !status.is_good() {
@@ -302,20 +303,20 @@ impl Watch {
     }
 }
 
-/// When the server got the value, in nanoseconds since 1970; in steps of 100 ns.
+/// Returns the server timestamp in nanoseconds since 1970, with a resolution of 100 ns.
 fn server_time(data: &DataValue) -> Option<i64> {
     let ticks = data.server_timestamp.as_ref()?.ticks();
     ticks.checked_sub(UNIX_EPOCH_TICKS)?.checked_mul(100)
 }
 
-/// 1970 in 100 ns since 1601.
+/// 1970 in units of 100 ns since 1601.
 const UNIX_EPOCH_TICKS: i64 = 116_444_736_000_000_000;
 const PUBLISHING_INTERVAL: Duration = Duration::from_millis(10);
 const CONNECT_LIMIT: Duration = Duration::from_secs(60);
-/// More than the mapping's `timeout` of the call, after which the server answers.
+/// More than the mapping's `timeout` of the call, after which the server responds.
 const REQUEST_LIMIT: Duration = Duration::from_secs(8);
 const CALL_ATTEMPTS: u32 = 10;
-/// Between two looks or calls.
+/// Interval between polls and between calls.
 const LOOK_AGAIN: Duration = Duration::from_millis(200);
 
 #[cfg(test)]

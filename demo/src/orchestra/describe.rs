@@ -1,11 +1,11 @@
-//! What the timeline says of the events of the line.
+//! The texts of the timeline for the events of the line.
 
 use crate::event::{Event, SupervisorEvent};
 use crate::robots::niryo::{NiryoEvent, WaitCause};
 use crate::robots::turtlebot::TurtlebotEvent;
 use crate::stage::Who;
 
-/// Whose event it is and what to say of it, unless it is not for people.
+/// Returns the source and the text of an event, or `None` if it is not shown.
 pub(crate) fn describe(event: &Event) -> Option<(Who, String)> {
     match event {
         Event::Master(_)

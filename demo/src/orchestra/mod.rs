@@ -1,4 +1,4 @@
-//! The demo itself: starts the programs of the cell, watches the story they make together, and ends them.
+//! The line by topics: starts the programs of the cell, watches their events, and stops them.
 
 mod describe;
 mod report;
@@ -22,17 +22,17 @@ use crate::stage::{
     free_port, must_be_free,
 };
 
-/// What the story is to be.
+/// The options of the scenario.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Plan {
     pub(crate) covers: u32,
     pub(crate) speed: Speed,
-    /// In seconds of the story.
+    /// In seconds of the scenario.
     pub(crate) conveyor_off_at: f64,
     pub(crate) json: bool,
 }
 
-/// Plays the story and prints it. Returns the exit code.
+/// Plays the scenario and prints it. Returns the exit code.
 pub(crate) async fn play(plan: Plan) -> u8 {
     let mut timeline = Timeline::open(plan.json);
     let mut story = Story::new(plan.covers, plan.speed);
@@ -41,7 +41,7 @@ pub(crate) async fn play(plan: Plan) -> u8 {
     let printed = conclude(plan, &mut timeline, (&story, hops), outcome.as_ref().err());
     match (outcome, printed) {
         (Err(failure), _) => failure.exit_code(),
-        // Nobody reads any more, as with `| head`.
+        // Standard output is closed, for example by `| head`.
         (Ok(()), Err(_)) => 74,
         (Ok(()), Ok(())) => 0,
     }
@@ -99,10 +99,10 @@ async fn perform(
         story,
     };
     let outcome = stage.direct(hops).await;
-    // Nothing is heard from here on, and nobody is to wait with telling it.
+    // No reports are read after this point, and no process may block on sending them.
     stage.reports.close();
     stage.programs.end().await;
-    // The logs are for those who wonder what went wrong.
+    // The logs are kept after a failure.
     if matches!(outcome, Ok(()) | Err(Failure::Interrupted { .. }))
         && let Err(error) = stage.programs.clean_up()
     {
@@ -119,7 +119,7 @@ struct Binaries {
     server: PathBuf,
 }
 
-/// Everything the run has at hand.
+/// The state of a run of the scenario.
 struct Director<'a> {
     plan: Plan,
     binaries: Binaries,
@@ -142,7 +142,8 @@ impl Director<'_> {
         let overdue = overdue_after(self.plan.covers, self.plan.conveyor_off_at);
         let finish_by = Instant::now() + self.plan.speed.real(overdue) + SPARE;
         self.watch(finish_by, Story::finished).await?;
-        // The last counts may be on their way to the server; the covers have arrived with or without them.
+        // The last counts may still be on their way to the server. The covers have arrived in any
+        // case.
         match self.watch(Instant::now() + SPARE, Story::settled).await {
             Ok(()) | Err(Failure::Stuck { .. }) => {}
             Err(failure) => return Err(failure),
@@ -181,7 +182,7 @@ impl Director<'_> {
         Err(self.not_begun())
     }
 
-    /// Starts all but the master. Returns the ports at which the bridges give out their figures.
+    /// Starts all programs except the master. Returns the ports of the status pages of the bridges.
     fn start_cell(&mut self, master_uri: &str) -> Result<(u16, u16), Failure> {
         let mapping = self.programs.directory().join("assembly-line.yaml");
         fs::write(&mapping, MAPPING).map_err(Failure::io("cannot write the mapping"))?;
@@ -266,7 +267,7 @@ impl Director<'_> {
         Ok(())
     }
 
-    /// Takes events until the story has come to where it should be.
+    /// Processes events until the condition is met.
     async fn watch(&mut self, by: Instant, there: impl Fn(&Story) -> bool) -> Result<(), Failure> {
         while !there(self.story) {
             if self.next_report(by).await?.is_none() {
@@ -280,7 +281,7 @@ impl Director<'_> {
         Ok(())
     }
 
-    /// The next event, `None` when the time is over. Prints what is due meanwhile.
+    /// Returns the next event, or `None` after the time limit. Prints due lines meanwhile.
     async fn next_report(&mut self, by: Instant) -> Result<Option<Event>, Failure> {
         let mut print = interval(PRINT_EVERY);
         loop {
@@ -301,9 +302,9 @@ impl Director<'_> {
                         let logs = self.programs.directory().to_owned();
                         return Err(Failure::ChildEnded { name, status, last_lines, logs });
                     }
-                    // Nothing of the line is killed.
+                    // No program of this scenario is killed.
                     Some(Report::Killed { .. }) => {}
-                    // The programs hold a sender, so it does not end before them.
+                    // The programs hold a sender, so the channel does not close before them.
                     None => return Ok(None),
                 },
                 () = sleep_until(by) => return Ok(None),
@@ -347,8 +348,8 @@ fn owned(environment: &[(&'static str, &str)]) -> Vec<(&'static str, String)> {
 }
 
 const MAPPING: &str = include_str!("../../../mappings/assembly-line.yaml");
-/// How long the programs may take to find one another.
+/// Time limit for the programs to connect to each other.
 const BEGIN_WITHIN: Duration = Duration::from_secs(60);
-/// For what does not get faster with the story.
+/// Time for processes that do not speed up with the scenario.
 const SPARE: Duration = Duration::from_secs(10);
 const PRINT_EVERY: Duration = Duration::from_millis(50);

@@ -1,24 +1,24 @@
-//! What is printed at the end: the outcome, and the delays beside those of the paper.
+//! The report at the end: the outcome, and the delays beside the published delays.
 
 use serde::Serialize;
 
 use super::story::Story;
 use crate::stage::{Hop, Hops, delays, micros};
 
-/// The outcome, as `--json` prints it.
+/// The outcome, as printed by `--json`.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub(crate) struct Report {
     covers: u32,
     delivered: u32,
     by_conveyor: u32,
     by_turtlebot: u32,
-    /// In seconds of the story; `null` when it was not switched off before the last cover arrived.
+    /// In seconds of the scenario; `null` if it was not switched off before the last cover arrived.
     conveyor_off_at_s: Option<f64>,
     finished: bool,
     hops: Hops,
-    /// Of each call of the switch, from the client's call to its answer.
+    /// Duration of each call of the switch, from the client's call to its response.
     switch_answered_us: Vec<f64>,
-    /// `null` when the conveyor was not running when it was switched off, or was not switched off.
+    /// `null` if the conveyor was not switched off, or was not running at that time.
     server_saw_conveyor_off_after_us: Option<f64>,
 }
 
@@ -42,7 +42,7 @@ impl Report {
         }
     }
 
-    /// The table for people.
+    /// Returns the table for people.
     pub(crate) fn table(&self, story: &Story) -> String {
         let mut text = format!(
             "\n{} of {} covers arrived: {} by conveyor, {} by TurtleBot3\n\n",

@@ -1,4 +1,5 @@
-//! What the events of all processes come to: how many covers have arrived, what is stuck, and how late values were.
+//! The state of the line, derived from the events of all processes: arrived covers, blocked steps
+//! and delays of values.
 
 use std::collections::BTreeMap;
 
@@ -8,12 +9,12 @@ use crate::pace::Speed;
 use crate::robots::niryo::{NiryoEvent, WaitCause};
 use crate::robots::turtlebot::TurtlebotEvent;
 
-/// The line as its events tell it. Events of different processes may come in any order.
+/// The state of the line. Events of different processes may arrive in any order.
 #[derive(Debug)]
 pub(crate) struct Story {
     covers: u32,
     speed: Speed,
-    /// When the supervisor worked the switch for the first time: second 0.
+    /// Time of the first call of the switch: second 0.
     began_at: Option<i64>,
     switched_off_at: Option<i64>,
     conveyor_stopped_at: Option<i64>,
@@ -24,7 +25,7 @@ pub(crate) struct Story {
     server: BTreeMap<Name, Vec<(i64, Value)>>,
     awaited: Vec<Name>,
     awaits_switch: bool,
-    /// Nanoseconds from each call of the switch to its answer.
+    /// Nanoseconds from each call of the switch to its response.
     switch_answered: Vec<i64>,
     connected: bool,
     arm: &'static str,
@@ -119,7 +120,7 @@ impl Story {
         self.began_at.is_some()
     }
 
-    /// Seconds of the story at a moment, once it has begun.
+    /// Converts a time to seconds of the scenario, after it has started.
     pub(crate) fn seconds(&self, at_ns: i64) -> Option<f64> {
         Some(self.speed.story_seconds(at_ns - self.began_at?))
     }
@@ -144,7 +145,7 @@ impl Story {
         self.delivered() == self.covers
     }
 
-    /// All covers have arrived, and the server has the final counts.
+    /// Returns whether all covers have arrived and the server has the final counts.
     pub(crate) fn settled(&self) -> bool {
         let at_server = |name, count| {
             let last = self.server.get(&name).and_then(|values| values.last());
@@ -155,12 +156,14 @@ impl Story {
             && at_server(Name::CoversOnTurtleBot3, last(&self.placed_on_turtlebot))
     }
 
-    /// When the supervisor switched the conveyor off, in seconds of the story.
+    /// Returns the time at which the supervisor switched the conveyor off, in seconds of the
+    /// scenario.
     pub(crate) fn conveyor_off_at(&self) -> Option<f64> {
         self.seconds(self.switched_off_at?)
     }
 
-    /// Nanoseconds from the stop of the conveyor at Niryo Ned to the server's value saying so.
+    /// Returns the nanoseconds from the stop of the conveyor at Niryo Ned to the corresponding
+    /// value at the server.
     pub(crate) fn server_saw_off_after(&self) -> Option<i64> {
         let stopped = self.conveyor_stopped_at?;
         let values = self.server.get(&Name::ConveyorRunning)?;
@@ -168,12 +171,12 @@ impl Story {
         values.iter().find(off).map(|(at, _)| at - stopped)
     }
 
-    /// Nanoseconds from each call of the switch to its answer.
+    /// Returns the nanoseconds from each call of the switch to its response.
     pub(crate) fn switch_answered_after(&self) -> &[i64] {
         &self.switch_answered
     }
 
-    /// Nanoseconds from each cover placed to the count at the server.
+    /// Returns the nanoseconds from each placed cover to the count at the server.
     pub(crate) fn place_to_counter(&self) -> Vec<i64> {
         [
             (&self.placed_on_conveyor, Name::CoversOnConveyor),
@@ -196,13 +199,13 @@ impl Story {
         .collect()
     }
 
-    /// Nanoseconds from each cover placed on TurtleBot3 to its departure.
+    /// Returns the nanoseconds from each cover placed on TurtleBot3 to its departure.
     pub(crate) fn place_to_move(&self) -> Vec<i64> {
         let left = |(count, placed): (&u32, &i64)| Some(self.left_park.get(count)? - placed);
         self.placed_on_turtlebot.iter().filter_map(left).collect()
     }
 
-    /// Where everything stands, for somebody who wonders why nothing moves.
+    /// Describes the current state, to explain why the line does not continue.
     pub(crate) fn standing(&self) -> String {
         if !self.connected {
             return "no OPC UA session with the server".to_owned();

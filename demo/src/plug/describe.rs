@@ -1,10 +1,11 @@
-//! What the timeline says of what was seen.
+//! The texts of the timeline for facts.
 
 use super::fact::{Fact, Level, NodeEvent, Part, Ros, Run};
 use super::story::Story;
 use crate::stage::Who;
 
-/// Whose a fact is and what to say of it, unless it is not for people or known. To be asked before the story takes it.
+/// Returns the sources and the texts of a fact. Facts that are known already or not for people have
+/// no text. Must be called before the story observes the fact.
 pub(crate) fn describe(story: &Story, fact: &Fact) -> Vec<(Who, String)> {
     match fact {
         Fact::Ready(program) => vec![(Who::DEMO, format!("{program} runs"))],
@@ -106,7 +107,7 @@ fn node(story: &Story, event: &NodeEvent) -> Vec<(Who, String)> {
     vec![(node_of(ros), what)]
 }
 
-/// What is new in a run.
+/// Returns the changes of a run.
 fn changes(known: Option<&Run>, run: &Run) -> Vec<String> {
     let mut new = Vec::new();
     if known.is_none() {
@@ -159,7 +160,7 @@ fn changes(known: Option<&Run>, run: &Run) -> Vec<String> {
     new
 }
 
-/// The first thing that is waited for, without who was looked at for it.
+/// Returns the first need that a run waits for, without its candidates.
 fn need(what: &str) -> &str {
     what.split_once(" by a skill ")
         .map_or(what, |(need, _)| need)

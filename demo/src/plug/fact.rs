@@ -1,10 +1,10 @@
-//! What can be seen of a cell in which components are plugged in.
+//! The observable facts of a cell in which components are plugged in.
 
 use serde::{Deserialize, Serialize};
 
 use super::skill_messages::{SkillResult, SkillState};
 
-/// A component of the story.
+/// A component of the scenario.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub(crate) enum Part {
@@ -16,7 +16,7 @@ pub(crate) enum Part {
 impl Part {
     pub(crate) const ALL: [Self; 3] = [Self::Robot, Self::Gripper, Self::Vacuum];
 
-    /// Its name as its YAML has it, and that of its log.
+    /// Returns the name in its YAML, which is the name of its log too.
     pub(crate) const fn name(self) -> &'static str {
         match self {
             Self::Robot => "robot",
@@ -25,7 +25,7 @@ impl Part {
         }
     }
 
-    /// Its ApplicationUri.
+    /// Returns the ApplicationUri.
     pub(crate) const fn uri(self) -> &'static str {
         match self {
             Self::Robot => "urn:example:robot",
@@ -34,7 +34,7 @@ impl Part {
         }
     }
 
-    /// Its namespace number in the space.
+    /// Returns the namespace number in the space.
     pub(crate) const fn namespace(self) -> u16 {
         match self {
             Self::Robot => 6,
@@ -58,25 +58,25 @@ impl Part {
     }
 }
 
-/// Where a component that was plugged in is known, or not any more.
+/// A place where a component becomes known, or stops being known.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub(crate) enum Level {
-    /// Its mDNS announcement was heard.
+    /// Its mDNS announcement was received.
     Announced,
-    /// It is in the list of the discovery server.
+    /// It is registered at the discovery server.
     Registered,
-    /// The MES has listed its skills.
+    /// The MES has read its skills.
     Listed,
     /// It is in the graph.
     InGraph,
-    /// A value of it was on the network.
+    /// A value of the component was on the network.
     InSpace,
-    /// The OPC UA server of the cell has a value of it.
+    /// The OPC UA server of the cell has a value of the component.
     AtServer,
-    /// A ROS 1 node has a value of it.
+    /// A ROS 1 node has received a value of the component.
     Ros1,
-    /// A ROS 2 node has a value of it.
+    /// A ROS 2 node has received a value of the component.
     Ros2,
 }
 
@@ -92,7 +92,7 @@ impl Level {
         Self::Ros2,
     ];
 
-    /// What is said when it is reached, or is not.
+    /// Returns the label for reaching or missing this level.
     pub(crate) const fn label(self) -> &'static str {
         match self {
             Self::Announced => "heard by mDNS",
@@ -106,7 +106,7 @@ impl Level {
         }
     }
 
-    /// Where it is gone from when it has left.
+    /// Returns the text for the place that a component has left.
     pub(crate) const fn gone_from(self) -> &'static str {
         match self {
             Self::Announced => "what mDNS tells",
@@ -121,7 +121,7 @@ impl Level {
     }
 }
 
-/// Which of the two nodes.
+/// Selects the ROS 1 or the ROS 2 node.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub(crate) enum Ros {
@@ -130,7 +130,7 @@ pub(crate) enum Ros {
 }
 
 impl Ros {
-    /// The name of its process.
+    /// Returns the name of the process.
     pub(crate) const fn node(self) -> &'static str {
         match self {
             Self::Ros1 => "ros1-node",
@@ -146,30 +146,30 @@ impl Ros {
     }
 }
 
-/// What the two nodes tell.
+/// An event of the ROS 1 or ROS 2 node.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(tag = "node", rename_all = "snake_case")]
 pub(crate) enum NodeEvent {
-    /// It is in its graph and listens.
+    /// The node has joined its graph and listens.
     Up { ros: Ros },
-    /// A state of a skill came: skill `number` of the component with this namespace.
+    /// A state was received, of the first skill of the component with this namespace.
     State {
         ros: Ros,
         namespace: u16,
         state: String,
         run: u32,
     },
-    /// It asks for Reset of the gripper's first skill, which is Halted.
+    /// The node requests Reset of the gripper's first skill, which is Halted.
     Resets { ros: Ros },
-    /// It asks for Start of the gripper's first skill.
+    /// The node requests Start of the gripper's first skill.
     Asks { ros: Ros },
-    /// What became of that, or of the Reset that was refused.
+    /// The response to Start, or to a refused Reset.
     Answered {
         ros: Ros,
         success: bool,
         message: String,
     },
-    /// The final result of a run came.
+    /// The final result of a run was received.
     Result {
         ros: Ros,
         namespace: u16,
@@ -189,7 +189,8 @@ impl NodeEvent {
         }
     }
 
-    /// Whether it says that the gripper's first skill has to be reset before it can be started.
+    /// Returns whether the gripper's first skill is Halted, which requires a Reset before Start;
+    /// `None` for other events.
     pub(crate) fn halted(&self) -> Option<bool> {
         match self {
             Self::State {
@@ -215,32 +216,32 @@ impl NodeEvent {
     }
 }
 
-/// Something that was seen. Its time is beside it, in nanoseconds since 1970.
+/// A fact. Its time is passed separately, in nanoseconds since 1970.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) enum Fact {
-    /// A program answers at its status page.
+    /// The status page of a program is available.
     Ready(&'static str),
     /// The process of a component was started.
     Started(Part),
     Reached(Part, Level),
-    /// A component is not known there any more.
+    /// A component is no longer known at this level.
     Left(Part, Level),
     Node(NodeEvent),
     /// A component was killed.
     Killed(Part),
-    /// The MES has another state of a run, counted from 0.
+    /// The MES has a new state of a run, counted from 0.
     Run(usize, Run),
-    /// `ua-space call` has ended, for the run of this number.
+    /// `ua-space call` has ended, for the run with this number.
     CallEnded {
         run: usize,
         succeeded: bool,
         why: String,
     },
-    /// What the question answered.
+    /// The result of the query.
     Asked(Asked),
 }
 
-/// A run of the MES, of its status page what the story needs.
+/// A run of the MES, with the fields of its status page that the scenario needs.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Deserialize)]
 #[serde(default)]
 pub(crate) struct Run {
@@ -277,11 +278,11 @@ pub(crate) struct Ran {
     pub(crate) outcome: String,
 }
 
-/// What `ua-space ask what-can-run` has answered.
+/// The result of `ua-space ask what-can-run`.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub(crate) struct Asked {
     pub(crate) skills: usize,
     pub(crate) services: usize,
-    /// Rows that lack capabilities, or an endpoint, or are without a name.
+    /// Rows without capabilities, endpoint or name.
     pub(crate) incomplete: Vec<String>,
 }

@@ -1,4 +1,4 @@
-//! The YAML files of the story: those that the project shows to integrators, at the speed of the story.
+//! The YAML files of the scenario: the examples for integrators, with the speed of the scenario.
 
 use std::fs;
 use std::io;
@@ -10,13 +10,13 @@ use crate::pace::Speed;
 /// The manifest of a module.
 #[derive(Clone, Debug)]
 pub(crate) struct Manifest {
-    /// As it is told.
+    /// The name as printed.
     pub(crate) name: String,
     pub(crate) text: Vec<u8>,
 }
 
 impl Manifest {
-    /// The one in a file, or that of the example plant.
+    /// Reads the manifest from a file, or returns the manifest of the example plant.
     ///
     /// # Errors
     /// The file cannot be read.
@@ -34,7 +34,7 @@ impl Manifest {
     }
 }
 
-/// Writes what the programs are started with into a directory.
+/// Writes the input files of the programs into a directory.
 ///
 /// # Errors
 /// A file cannot be written.
@@ -48,12 +48,12 @@ pub(crate) fn write(directory: &Path, speed: Speed, manifest: &Manifest) -> io::
     fs::write(of_mes(directory), with_manifest(MES))
 }
 
-/// The YAML of a component.
+/// Returns the path of the YAML of a component.
 pub(crate) fn of_part(directory: &Path, part: Part) -> PathBuf {
     directory.join(format!("{}.yaml", part.name()))
 }
 
-/// The YAML of the MES.
+/// Returns the path of the YAML of the MES.
 pub(crate) fn of_mes(directory: &Path) -> PathBuf {
     directory.join("mes.yaml")
 }
@@ -66,13 +66,13 @@ const fn yaml(part: Part) -> &'static str {
     }
 }
 
-/// With the work of simulated drivers that many times as fast.
+/// Sets the speed of simulated drivers.
 fn scaled(yaml: &str, speed: Speed) -> String {
     let scale = format!("{SIMULATED}time_scale: {}, ", speed.factor());
     yaml.replace(SIMULATED, &scale)
 }
 
-/// With the module of the story beside those it has.
+/// Adds the module of the scenario to the manifests of the MES.
 fn with_manifest(mes: &str) -> String {
     let module = "manifests:\n  - {name: module, file: module.aml}\n";
     match mes.split_once("processes:\n") {

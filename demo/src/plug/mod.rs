@@ -1,7 +1,14 @@
-//! Plug and produce: components are plugged in, found, started from ROS, run by the MES, lost and replaced.
+//! Plug and produce: components are plugged in, discovered, started from ROS, run by the MES, lost
+//! and replaced.
 //!
-//! Reading order: `fact` (what can be seen), `story` (what has to be seen, and what follows), `pages` and `watchers` (who
-//! looks), `ros1_node` and `ros2_node` (the robots that listen), `files` (what the programs are started with), `report`.
+//! Reading order:
+//!
+//! - `fact`: observable facts
+//! - `story`: the expected facts, and the actions that follow
+//! - `pages` and `watchers`: the observers
+//! - `ros1_node` and `ros2_node`: the robots that listen
+//! - `files`: the input files of the programs
+//! - `report`: the report
 
 mod describe;
 mod fact;
@@ -39,16 +46,16 @@ use crate::stage::{
     free_port, must_be_free,
 };
 
-/// What the story is to be.
+/// The options of the scenario.
 #[derive(Clone, Debug)]
 pub(crate) struct Plan {
     pub(crate) speed: Speed,
     pub(crate) json: bool,
-    /// The manifest of a module, in place of that of the example plant.
+    /// The manifest of a module; `None` for the manifest of the example plant.
     pub(crate) manifest: Option<PathBuf>,
 }
 
-/// Plays the story and prints it. Returns the exit code.
+/// Plays the scenario and prints it. Returns the exit code.
 pub(crate) async fn play(plan: Plan) -> u8 {
     let mut show = Show {
         timeline: Timeline::open(plan.json),
@@ -74,7 +81,7 @@ pub(crate) async fn play(plan: Plan) -> u8 {
     let printed = conclude(&mut show, &report, failure, plan.json);
     match (outcome, printed) {
         (Err(failure), _) => failure.exit_code(),
-        // Nobody reads any more, as with `| head`.
+        // Standard output is closed, for example by `| head`.
         (Ok(()), Err(_)) => 74,
         (Ok(()), Ok(())) => 0,
     }
@@ -103,7 +110,7 @@ fn conclude(
     Ok(())
 }
 
-/// The story, and what people see of it.
+/// The story and its timeline.
 struct Show {
     timeline: Timeline,
     story: Story,
@@ -118,7 +125,7 @@ impl Show {
         self.story.observe(at_ns, fact);
     }
 
-    /// Prints what is due at a moment, or all.
+    /// Prints the lines that are due at a time, or all lines.
     fn print(&mut self, now_ns: Option<i64>) -> std::io::Result<()> {
         let began_at = self.began_at;
         let seconds = |at_ns: i64| Some(report::millis(at_ns - began_at) / 1e3);
@@ -168,11 +175,11 @@ async fn perform(plan: &Plan, manifest: &Manifest, show: &mut Show) -> Result<()
         show,
     };
     let outcome = director.direct().await;
-    // Nothing is heard from here on, and nobody is to wait with telling it.
+    // No reports are read after this point, and no process may block on sending them.
     director.reports.close();
     director.facts.close();
     director.programs.end().await;
-    // The logs are for those who wonder what went wrong.
+    // The logs are kept after a failure.
     if matches!(outcome, Ok(()) | Err(Failure::Interrupted { .. }))
         && let Err(error) = director.programs.clean_up()
     {
@@ -193,7 +200,7 @@ struct Binaries {
     tool: PathBuf,
 }
 
-/// Everything the run has at hand.
+/// The state of a run of the scenario.
 struct Director<'a> {
     plan: &'a Plan,
     manifest: &'a Manifest,
@@ -203,7 +210,7 @@ struct Director<'a> {
     watchers: Watchers,
     facts: mpsc::Receiver<Dated>,
     interrupt: Interrupt,
-    /// The port where the MES answers questions.
+    /// The port of the SPARQL endpoint of the MES.
     questions: u16,
     show: &'a mut Show,
 }
@@ -253,7 +260,7 @@ impl Director<'_> {
         }
     }
 
-    /// Starts all that is there before a component comes.
+    /// Starts all programs that run before the first component.
     fn start_cell(&mut self, master: &str) -> Result<(), Failure> {
         let directory = self.programs.directory().to_owned();
         files::write(&directory, self.plan.speed, self.manifest)
@@ -326,7 +333,7 @@ impl Director<'_> {
                         succeeded,
                         why,
                     };
-                    // When nobody listens, nobody wonders.
+                    // If the receiver is closed, the scenario has ended.
                     facts.send((wall_nanos(), ended)).await.ok();
                 });
                 Ok(())
@@ -406,7 +413,7 @@ impl Director<'_> {
         Ok(())
     }
 
-    /// Takes what is seen until the act is over.
+    /// Processes facts until the act is over.
     async fn watch(&mut self) -> Result<(), Failure> {
         let act = self.show.story.act();
         let by = Instant::now() + limit(act);
@@ -421,7 +428,7 @@ impl Director<'_> {
         }
     }
 
-    /// The next thing that happens. Prints what is due meanwhile.
+    /// Returns the next event. Prints due lines meanwhile.
     async fn next(&mut self, by: Instant) -> Result<Next, Failure> {
         let mut print = interval(PRINT_EVERY);
         loop {
@@ -447,7 +454,7 @@ impl Director<'_> {
                         let logs = self.programs.directory().to_owned();
                         return Err(Failure::ChildEnded { name, status, last_lines, logs });
                     }
-                    // The programs hold a sender, so it does not end before them.
+                    // The programs hold a sender, so the channel does not close before them.
                     None => return Ok(Next::Late),
                 },
                 Some((at_ns, fact)) = self.facts.recv() => {
@@ -488,17 +495,18 @@ impl Director<'_> {
     }
 }
 
-/// What has happened.
+/// The next event.
 enum Next {
-    /// A process of the demo has told something.
+    /// An event of a process of the demo.
     Told(Event),
-    /// Something was seen from outside, and the story has it.
+    /// A fact was observed, and the story has processed it.
     Seen,
-    /// Nothing, and the time is over.
+    /// The time limit has passed.
     Late,
 }
 
-/// Has the MES run the process, and follows it to its end. Whether it succeeded, and why not.
+/// Calls the MES to run the process, and waits for its end. Returns whether it succeeded, and the
+/// reason if not.
 async fn call(tool: &Path) -> (bool, String) {
     let process = format!("ProcessIri={PROCESS}");
     let limit = RUN_LIMIT.as_secs().to_string();
@@ -510,7 +518,8 @@ async fn call(tool: &Path) -> (bool, String) {
             .stdin(Stdio::null())
             .output()
     };
-    // It is Halted at first; when it is not, it says so, and Start tells the rest.
+    // The skill is Halted at first. If it is not, the Reset is refused, and Start reports any other
+    // error.
     drop(call(&["mes.ExecuteProcess.Reset"]).await);
     let start = ["mes.ExecuteProcess", &process, "--run-timeout", &limit];
     match call(&start).await {
@@ -520,7 +529,7 @@ async fn call(tool: &Path) -> (bool, String) {
     }
 }
 
-/// Asks what can run.
+/// Queries which skills and services can run.
 async fn ask(tool: &Path, url: &str) -> Result<Asked, String> {
     let output = command(tool)
         .args(["ask", "what-can-run", "--url", url, "--json"])
@@ -536,7 +545,7 @@ async fn ask(tool: &Path, url: &str) -> Result<Asked, String> {
     Ok(answer.count())
 }
 
-/// The last line of what a program said.
+/// Returns the last line of the output of a program.
 fn said(output: &std::process::Output) -> String {
     let all = [&output.stdout[..], &output.stderr].concat();
     let text = String::from_utf8_lossy(&all);
@@ -544,14 +553,15 @@ fn said(output: &std::process::Output) -> String {
     last.map_or_else(|| output.status.to_string(), str::to_owned)
 }
 
-/// The answer of `ua-space ask what-can-run --json`.
+/// The output of `ua-space ask what-can-run --json`.
 #[derive(Debug, Deserialize)]
 struct Answer {
     rows: Vec<Map<String, Value>>,
 }
 
 impl Answer {
-    /// How many skills and services there are, and of which something is missing: a capability or the endpoint.
+    /// Counts skills and services, and lists incomplete rows: without capability, parameters or
+    /// endpoint.
     fn count(&self) -> Asked {
         let text = |row: &Map<String, Value>, column: &str| {
             let value = row.get(column).and_then(Value::as_str);
@@ -564,7 +574,7 @@ impl Answer {
                 .count()
         };
         let lacks = |row: &&Map<String, Value>| {
-            // What the MES itself can do are processes, which stand elsewhere.
+            // The MES provides processes, which are listed elsewhere.
             if text(row, "component") == MES {
                 return false;
             }
@@ -592,12 +602,12 @@ fn owned(environment: &[(&'static str, &str)]) -> Vec<(&'static str, String)> {
         .collect()
 }
 
-/// A topic of space 0 as ROS has it.
+/// Returns the ROS name of a topic of space 0.
 fn topic(namespace: u16, id: u16) -> String {
     format!("/ua_0_{namespace}_{id}")
 }
 
-/// How long an act may take: what is counted in it does not get faster with the story.
+/// Returns the time limit of an act. The awaited events do not speed up with the scenario.
 const fn limit(act: Act) -> Duration {
     match act {
         Act::Cell => Duration::from_secs(60),
@@ -612,11 +622,11 @@ const fn limit(act: Act) -> Duration {
     }
 }
 
-/// The name of the MES as a component.
+/// The component name of the MES.
 const MES: &str = "mes";
 const LDS_PORT: u16 = 4840;
 const SERVER_PORT: u16 = 4841;
-/// Identifiers of a component's first skill: its state, its result, and the calls that start it and make it ready.
+/// Identifiers of a component's first skill: its state, its result, and its calls Start and Reset.
 const STATE: u16 = 101;
 const RESULT: u16 = 104;
 const START: u16 = 105;

@@ -1,4 +1,4 @@
-//! What the status pages of the programs say of the components, and what is new in it.
+//! Reads facts about components from the status pages of the programs, and detects changes.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -11,17 +11,17 @@ use super::fact::{Fact, Level, Part, Run};
 /// A fact and its time, in nanoseconds since 1970.
 pub(crate) type Dated = (i64, Fact);
 
-/// A program's page, and who can read it.
+/// The kind of a status page.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Page {
     Lds,
     Mes,
     Server,
-    /// A bridge: only whether it can do its work.
+    /// A page of a bridge, which only shows whether the bridge is ready.
     Bridge,
 }
 
-/// What one page said last.
+/// The last state of a status page.
 #[derive(Debug)]
 pub(crate) struct Reader {
     program: &'static str,
@@ -88,15 +88,15 @@ impl Reader {
         }
     }
 
-    /// Whether no more is to be learned of it.
+    /// Returns whether the page provides no further facts.
     pub(crate) fn is_done(&self) -> bool {
         self.page == Page::Bridge && self.ready
     }
 
-    /// What is new in the page as it is at `now_ns`.
+    /// Returns the changes of the page at `now_ns`.
     pub(crate) fn read(&mut self, now_ns: i64, page: &Value) -> Vec<Dated> {
         let mut facts = Vec::new();
-        // A bridge of several spaces has an object for each.
+        // A bridge with several spaces has an object for each.
         let objects = page
             .as_array()
             .map_or_else(|| std::slice::from_ref(page), Vec::as_slice);
@@ -123,7 +123,7 @@ impl Reader {
             .iter()
             .filter_map(|server| Some((Part::of_uri(&server.uri)?, server.since_ms)));
         self.tell(now_ns, Level::Registered, registered, facts);
-        // The mDNS name is the name of the server, and what makes it the only one.
+        // The mDNS name is the name of the server with a suffix that makes it unique.
         let announced = page.network.iter().filter_map(|record| {
             let part = Part::ALL.into_iter().find(|part| {
                 let rest = record.name.strip_prefix(part.name());
@@ -190,7 +190,7 @@ impl Reader {
     }
 }
 
-/// Of a page that is otherwise than thought nothing is known.
+/// Reads a page; returns the default if its format is unexpected.
 fn part<T: Default + for<'de> Deserialize<'de>>(page: &Value) -> T {
     T::deserialize(page).unwrap_or_else(|error| {
         tracing::debug!(%error, "a page was not understood");

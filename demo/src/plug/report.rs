@@ -1,4 +1,4 @@
-//! What is printed at the end: whether all happened, and how long it took beside what was published.
+//! The report at the end: the outcome, and the delays beside the published delays.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -9,16 +9,17 @@ use super::fact::{Asked, Level, Part, Ros};
 use super::story::{Grasp, LOST_FROM, Story};
 use crate::pace::Speed;
 
-/// The outcome, as `--json` prints it. Times are in milliseconds; `null` is what has not happened.
+/// The outcome, as printed by `--json`. Times are in milliseconds; `null` for events that have not
+/// happened.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub(crate) struct Report {
     finished: bool,
     failure: Option<String>,
     speed: f64,
     manifest: String,
-    /// By component, from the start of its process to where it is known.
+    /// By component: time from the start of its process until it is known at a level.
     components: BTreeMap<Part, BTreeMap<Level, Option<f64>>>,
-    /// By node, from its request.
+    /// By node: times from its request.
     grasps: BTreeMap<Ros, GraspTimes>,
     runs: Vec<RunTimes>,
     loss: Loss,
@@ -38,19 +39,19 @@ struct GraspTimes {
 struct RunTimes {
     outcome: String,
     plans: usize,
-    /// From its beginning to its end, with what was waited for.
+    /// Duration of the run, including the time spent waiting.
     lasted_ms: Option<u64>,
-    /// The reasons for which plans broke.
+    /// The reasons for which plans failed.
     broke: Vec<String>,
 }
 
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 struct Loss {
-    /// From the signal to where the gripper is not known any more.
+    /// Time from the signal until the gripper is no longer known at a level.
     lost_ms: BTreeMap<Level, Option<f64>>,
-    /// From the signal to the end of the plan, with the retreat of the robot.
+    /// Time from the signal to the end of the plan, including the retreat of the robot.
     halted_and_retreated_ms: Option<f64>,
-    /// From the start of the other gripper's process to the next plan.
+    /// Time from the start of the other gripper's process to the next plan.
     planned_anew_ms: Option<f64>,
 }
 
@@ -105,7 +106,7 @@ impl Report {
         }
     }
 
-    /// The table for people.
+    /// Returns the table for people.
     pub(crate) fn table(&self) -> String {
         let mut text = String::from("\n");
         row(
@@ -209,7 +210,7 @@ impl GraspTimes {
     }
 }
 
-/// A level in a word or two.
+/// Returns a short label of a level.
 const fn short(level: Level) -> &'static str {
     match level {
         Level::Announced => "heard by mDNS",
@@ -226,7 +227,7 @@ const fn short(level: Level) -> &'static str {
 fn row(text: &mut String, label: &str, cells: [&str; 3], published: &str) {
     let [first, second, third] = cells;
     let line = format!("{label:<40} {first:>9} {second:>9} {third:>9}   {published}");
-    // Writing to a string does not fail.
+    // Writing to a String cannot fail.
     let _written = writeln!(text, "{}", line.trim_end());
 }
 
@@ -243,7 +244,7 @@ fn shown(ms: Option<f64>) -> String {
     )
 }
 
-/// Milliseconds with three places.
+/// Converts nanoseconds to milliseconds with three decimal places.
 pub(crate) fn millis(nanos: i64) -> f64 {
     #[expect(
         clippy::cast_precision_loss,

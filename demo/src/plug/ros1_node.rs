@@ -1,4 +1,5 @@
-//! The robot of the story as a ROS 1 node: it listens to skills of the space, and starts one when it is told to.
+//! The robot of the scenario as a ROS 1 node. It listens to skills of the space, and starts a skill
+//! on request.
 
 use anyhow::Context as _;
 use bytes::Bytes;
@@ -16,10 +17,11 @@ use crate::stop::Stop;
 
 const ROS: Ros = Ros::Ros1;
 
-/// What a message is of: namespace and identifier.
+/// The namespace and the identifier of a message.
 type Place = (u16, u16);
 
-/// Runs the node until it is told to end. A line on its standard input has it start the gripper's first skill.
+/// Runs the node until the process is stopped. A line on its standard input starts the gripper's
+/// first skill.
 pub(crate) async fn run() -> anyhow::Result<()> {
     let mut stop = Stop::new()?;
     let node = Node::start(NodeOptions::from_env("old_robot"))?;
@@ -49,7 +51,7 @@ pub(crate) async fn run() -> anyhow::Result<()> {
                     break;
                 }
                 let reset = halted.then(|| reset.clone());
-                // When nobody listens, nobody wonders.
+                // If standard output is closed, the demo has ended.
                 let ask = ask(reset, start.clone());
                 drop(tokio::spawn(async move { tell(ask.await).ok() }));
             }
@@ -60,7 +62,7 @@ pub(crate) async fn run() -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Starts the skill, and makes it ready before if that is to be. What became of it.
+/// Starts the skill, after a Reset if necessary. Returns the response.
 async fn ask(reset: Option<ServiceClient>, start: ServiceClient) -> NodeEvent {
     let mut answer = (true, String::new());
     if let Some(reset) = reset {

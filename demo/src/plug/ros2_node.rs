@@ -1,4 +1,5 @@
-//! The robot of the story as a ROS 2 node: it listens to skills of the space, and starts one when it is told to.
+//! The robot of the scenario as a ROS 2 node. It listens to skills of the space, and starts a skill
+//! on request.
 
 use std::net::{IpAddr, Ipv4Addr};
 use std::pin::Pin;
@@ -25,7 +26,7 @@ use crate::stop::Stop;
 
 const ROS: Ros = Ros::Ros2;
 
-/// Request of `std_srvs/Trigger`: without fields, which CDR writes as one byte.
+/// The request of `std_srvs/Trigger`. It has no fields, which CDR encodes as one byte.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 struct TriggerRequest {
     structure_needs_at_least_one_member: u8,
@@ -33,7 +34,7 @@ struct TriggerRequest {
 
 impl Message for TriggerRequest {}
 
-/// Response of `std_srvs/Trigger`.
+/// The response of `std_srvs/Trigger`.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 struct TriggerResponse {
     success: bool,
@@ -46,7 +47,8 @@ type Trigger = Client<TriggerRequest, TriggerResponse>;
 
 type Events = Pin<Box<dyn Stream<Item = NodeEvent>>>;
 
-/// Runs the node until it is told to end. A line on its standard input has it start the gripper's first skill.
+/// Runs the node until the process is stopped. A line on its standard input starts the gripper's
+/// first skill.
 pub(crate) async fn run() -> anyhow::Result<()> {
     let mut stop = Stop::new()?;
     let mut node = join()?;
@@ -112,7 +114,7 @@ pub(crate) async fn run() -> anyhow::Result<()> {
     }
 }
 
-/// Starts the skill, and makes it ready before if that is to be. What became of it.
+/// Starts the skill, after a Reset if necessary. Returns the response.
 async fn ask(node: &Node, reset: Option<&Trigger>, start: &Trigger) -> NodeEvent {
     let mut answer = (true, String::new());
     if let Some(reset) = reset {
@@ -129,11 +131,11 @@ async fn ask(node: &Node, reset: Option<&Trigger>, start: &Trigger) -> NodeEvent
     }
 }
 
-/// Calls a service as soon as it is there.
+/// Calls a service when it is available.
 async fn trigger(node: &Node, client: &Trigger, begins: NodeEvent) -> (bool, String) {
     let call = async {
         client.wait_for_service(node).await;
-        // When nobody listens, nobody wonders.
+        // If standard output is closed, the demo has ended.
         tell(begins).ok();
         let request = TriggerRequest {
             structure_needs_at_least_one_member: 0,
@@ -147,12 +149,12 @@ async fn trigger(node: &Node, client: &Trigger, begins: NodeEvent) -> (bool, Str
     }
 }
 
-/// The messages of a subscription as events, to the end of the program.
+/// Converts the messages of a subscription to events, until the end of the program.
 fn events<M: Message + DeserializeOwned + 'static>(
     subscription: Subscription<M>,
     event: impl Fn(M) -> NodeEvent + 'static,
 ) -> Events {
-    // It lives as long as the program, and a stream borrows it.
+    // The stream borrows the subscription, which lives as long as the program.
     let subscription: &'static Subscription<M> = Box::leak(Box::new(subscription));
     Box::pin(subscription.async_stream().filter_map(move |sample| {
         let event = match sample {
@@ -169,7 +171,7 @@ fn events<M: Message + DeserializeOwned + 'static>(
 impl Message for SkillState {}
 impl Message for SkillResult {}
 
-/// Joins the domain on the loopback interface alone.
+/// Joins the domain on the loopback interface only.
 fn join() -> anyhow::Result<Node> {
     let participant = DomainParticipantBuilder::new(DOMAIN)
         .with_only_networks([IpAddr::V4(Ipv4Addr::LOCALHOST)])

@@ -1,4 +1,4 @@
-//! The messages of skills as the two nodes read them: `ua_msgs/SkillState` and `ua_msgs/SkillResult`, and
+//! The skill messages that both nodes read: `ua_msgs/SkillState` and `ua_msgs/SkillResult`, and
 //! `std_srvs/Trigger`.
 
 use serde::{Deserialize, Serialize};
@@ -27,7 +27,7 @@ pub(crate) struct SkillResult {
 impl SkillState {
     pub(crate) const MD5: &'static str = "5db6a3669f9df08bc39eec9478ea8231";
 
-    /// Reads a ROS 1 message body.
+    /// Decodes the body of a ROS 1 message.
     pub(crate) fn from_ros1(body: &[u8]) -> Option<Self> {
         let mut body = Body(body);
         let message = Self {
@@ -45,7 +45,7 @@ impl SkillState {
 impl SkillResult {
     pub(crate) const MD5: &'static str = "bdfa5b931cf5a1c1aa35916cdc13d9d5";
 
-    /// Reads a ROS 1 message body.
+    /// Decodes the body of a ROS 1 message.
     pub(crate) fn from_ros1(body: &[u8]) -> Option<Self> {
         let mut body = Body(body);
         let message = Self {
@@ -59,14 +59,14 @@ impl SkillResult {
     }
 }
 
-/// Reads the response of `std_srvs/Trigger`, a ROS 1 body: whether it was a success, and the message.
+/// Decodes the response of `std_srvs/Trigger` from a ROS 1 body: success and message.
 pub(crate) fn trigger_response(body: &[u8]) -> Option<(bool, String)> {
     let mut body = Body(body);
     let response = (body.byte()? != 0, body.text()?);
     body.ends().then_some(response)
 }
 
-/// What is left of a ROS 1 message.
+/// The remaining bytes of a ROS 1 message.
 struct Body<'a>(&'a [u8]);
 
 impl Body<'_> {
@@ -92,7 +92,8 @@ impl Body<'_> {
     }
 
     fn texts(&mut self) -> Option<Vec<String>> {
-        // Each takes 4 bytes at least, so a count that lies ends with the bytes.
+        // Each text takes at least 4 bytes, so decoding stops at the end of the body if the count
+        // is too large.
         (0..self.number()?).map(|_| self.text()).collect()
     }
 
@@ -101,7 +102,7 @@ impl Body<'_> {
     }
 }
 
-/// Type name and checksum of `std_srvs/Trigger`.
+/// Type name and MD5 sum of `std_srvs/Trigger`.
 pub(crate) const TRIGGER: (&str, &str) = ("std_srvs/Trigger", "937c9679a518e3a18d831e57125ea522");
 
 #[cfg(test)]

@@ -1,4 +1,5 @@
-//! The story as a state machine: what has to be seen next, and what is done once it was.
+//! The scenario as a state machine: the facts that have to be observed next, and the action that
+//! follows.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -6,41 +7,41 @@ use super::fact::{Asked, Fact, Level, NodeEvent, Part, Ros, Run};
 use super::pages::nanos;
 use super::report::millis;
 
-/// An act of the story, in their order.
+/// An act of the scenario, in order.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum Act {
-    /// The programs of the cell run, and the two nodes listen.
+    /// The programs of the cell are ready, and both nodes listen.
     Cell,
     Robot,
     Gripper,
     GraspFromRos2,
     GraspFromRos1,
     FirstRun,
-    /// Up to where the gripper holds the part.
+    /// Ends when the gripper holds the part.
     SecondRun,
-    /// The gripper is dead.
+    /// The gripper is killed.
     Loss,
-    /// Another gripper comes, and the run comes to its end.
+    /// Another gripper is plugged in, and the run ends.
     Vacuum,
-    /// What can run is asked.
+    /// The query of skills and services that can run.
     Question,
     End,
 }
 
-/// What is to be done when an act begins.
+/// The action at the start of an act.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Order {
     Plug(Part),
     Grasp(Ros),
-    /// Have the MES run the process, for the time of this number, counted from 0.
+    /// Runs the process with the MES, as the run with this number, from 0.
     Run(usize),
     Kill(Part),
     Ask,
-    /// All has happened.
+    /// The scenario is complete.
     End,
 }
 
-/// All that was seen, and how far the story is.
+/// All observed facts, and the current act.
 #[derive(Debug)]
 pub(crate) struct Story {
     act: Act,
@@ -56,15 +57,16 @@ pub(crate) struct Story {
     pub(crate) asked: Option<Asked>,
 }
 
-/// A grasp that was started from ROS, as its node saw it.
+/// A grasp that was started from ROS, as observed by its node.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(crate) struct Grasp {
     pub(crate) asked_at: Option<i64>,
     pub(crate) answered: Option<(i64, Result<(), String>)>,
-    /// States of the gripper's first skill since then, as they changed, with the one before.
+    /// Distinct consecutive states of the gripper's first skill since the request, starting with
+    /// the state before it.
     pub(crate) states: Vec<(i64, String)>,
     pub(crate) result: Option<(i64, Result<(), String>)>,
-    /// The state that holds while nobody has asked.
+    /// The state before the request.
     before: Option<(i64, String, u32)>,
 }
 
@@ -93,7 +95,7 @@ impl Story {
         self.act == Act::End
     }
 
-    /// Takes what was seen at a moment. Facts may come in any order; the earliest of a kind counts.
+    /// Processes a fact. Facts may arrive in any order; the earliest of a kind counts.
     pub(crate) fn observe(&mut self, at_ns: i64, fact: &Fact) {
         match fact {
             Fact::Ready(program) => {
@@ -103,7 +105,7 @@ impl Story {
                 self.started.insert(*part, at_ns);
             }
             Fact::Reached(part, level) => earliest(&mut self.reached, (*part, *level), at_ns),
-            // Before it is to die nobody is lost.
+            // Before the act of the loss, no component is lost.
             Fact::Left(part, level) => {
                 if self.act >= Act::Loss && *part == Part::Gripper {
                     earliest(&mut self.left, (*part, *level), at_ns);
@@ -188,36 +190,39 @@ impl Story {
         self.grasps.entry(ros).or_default()
     }
 
-    /// Milliseconds from the start of a component's process to where it is known.
+    /// Returns the milliseconds from the start of a component's process until it is known at a
+    /// level.
     pub(crate) fn after_start(&self, part: Part, level: Level) -> Option<f64> {
         let reached = self.reached.get(&(part, level))?;
         Some(millis(reached - self.started.get(&part)?))
     }
 
-    /// Milliseconds from the death of the gripper to where it is not known any more.
+    /// Returns the milliseconds from the kill of the gripper until it is no longer known at a
+    /// level.
     pub(crate) fn after_kill(&self, level: Level) -> Option<f64> {
         let left = self.left.get(&(Part::Gripper, level))?;
         Some(millis(left - self.killed_at?))
     }
 
-    /// Milliseconds from the death of the gripper to the end of the plan it was in.
+    /// Returns the milliseconds from the kill of the gripper to the end of its plan.
     pub(crate) fn halted_after(&self) -> Option<f64> {
         let plan = self.runs.get(&1)?.plans.first()?;
         Some(millis(nanos(plan.ended_ms?) - self.killed_at?))
     }
 
-    /// Milliseconds from the start of the other gripper's process to the plan with it.
+    /// Returns the milliseconds from the start of the other gripper's process to the plan with it.
     pub(crate) fn planned_anew_after(&self) -> Option<f64> {
         let plan = self.runs.get(&1)?.plans.get(1)?;
         Some(millis(nanos(plan.at_ms) - self.started.get(&Part::Vacuum)?))
     }
 
-    /// Whether it is news that a component is not known there any more.
+    /// Returns whether the loss of a component at this level is expected and not known yet.
     pub(crate) fn loses(&self, part: Part, level: Level) -> bool {
         self.act >= Act::Loss && part == Part::Gripper && !self.left.contains_key(&(part, level))
     }
 
-    /// Whether a state of the gripper, as a node tells it, is another than before, in a grasp of this node.
+    /// Returns whether a state of the gripper, as reported by a node, is new in a grasp of this
+    /// node.
     pub(crate) fn is_new_state(&self, ros: Ros, state: &str) -> bool {
         self.grasps.get(&ros).is_some_and(|grasp| {
             grasp.asked_at.is_some()
@@ -226,14 +231,17 @@ impl Story {
         })
     }
 
-    /// Whether a node has asked for a grasp and has no result yet.
+    /// Returns whether a node has requested a grasp and has no result yet.
     pub(crate) fn awaits_result(&self, ros: Ros) -> bool {
         self.grasps
             .get(&ros)
             .is_some_and(|grasp| grasp.asked_at.is_some() && grasp.result.is_none())
     }
 
-    /// What the act still lacks, for people; nothing when it is over. `Err`: what makes its end impossible.
+    /// Returns the missing conditions of the act, as text for people; empty when it is over.
+    ///
+    /// # Errors
+    /// The reason why the act cannot succeed any more.
     pub(crate) fn missing(&self) -> Result<Vec<String>, String> {
         match self.act {
             Act::Cell => Ok(self.cell_lacks()),
@@ -254,7 +262,7 @@ impl Story {
         }
     }
 
-    /// Goes on to the next act. What is to be done for it.
+    /// Proceeds to the next act. Returns its action.
     pub(crate) fn advance(&mut self) -> Order {
         let (act, order) = match self.act {
             Act::Cell => (Act::Robot, Order::Plug(Part::Robot)),
@@ -317,7 +325,7 @@ impl Story {
         Ok(lacks)
     }
 
-    /// What the run of this number lacks to have ended well, by its plan of this number, counted from 1.
+    /// Returns the missing conditions for the success of a run with this number of plans.
     fn run_lacks(&self, number: usize, plans: usize) -> Result<Vec<String>, String> {
         let Some(run) = self.runs.get(&number) else {
             return match self.calls.get(&number) {
@@ -421,7 +429,7 @@ impl Grasp {
         }
     }
 
-    /// Whether Ready, Running and Ready or Halted were seen, in this order, and the end of them.
+    /// Returns whether the states Ready, Running and then Ready or Halted were observed last.
     pub(crate) fn has_run(&self) -> bool {
         let states: Vec<&str> = self.states.iter().map(|(_, s)| s.as_str()).collect();
         matches!(
@@ -445,7 +453,7 @@ fn earliest<K: Ord>(times: &mut BTreeMap<K, i64>, key: K, at_ns: i64) {
         .or_insert(at_ns);
 }
 
-/// Where a run stands, for people.
+/// Describes the state of a run for people.
 fn standing(run: &Run) -> String {
     if let Some(what) = &run.waits_for {
         return format!("it waits for {what}");
@@ -461,7 +469,7 @@ fn or_nothing(text: &str) -> &str {
     if text.is_empty() { "nothing" } else { text }
 }
 
-/// The programs whose pages have to answer.
+/// The programs that must provide their status pages.
 pub(crate) const PROGRAMS: [&str; 5] = [
     "ua-lds",
     "ua-server",
@@ -470,7 +478,7 @@ pub(crate) const PROGRAMS: [&str; 5] = [
     "ua-mes",
 ];
 
-/// Where a component that died has to be missing.
+/// The levels at which a killed component must no longer be known.
 pub(crate) const LOST_FROM: [Level; 4] = [
     Level::Announced,
     Level::Registered,
@@ -478,7 +486,7 @@ pub(crate) const LOST_FROM: [Level; 4] = [
     Level::Ros1,
 ];
 
-/// Steps of the composite during which the gripper holds the part, and does nothing.
+/// Steps of the composite in which the gripper holds the part without running a skill.
 const CARRYING: [&str; 3] = [
     "MovePickApproachAfter",
     "MovePlaceApproachBefore",

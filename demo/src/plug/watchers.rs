@@ -1,4 +1,4 @@
-//! Who looks: at the status pages, at the datagrams of the group, and at the graph of ROS 1.
+//! Observers of the status pages, of the datagrams of the group, and of the ROS 1 graph.
 
 use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4};
 use std::time::Duration;
@@ -17,7 +17,7 @@ use super::{START, topic};
 use crate::clock::wall_nanos;
 use crate::stage::{LOOPBACK, fetch};
 
-/// The tasks that look. Dropping it ends them.
+/// The observer tasks. Dropping this value stops them.
 pub(crate) struct Watchers {
     tasks: JoinSet<()>,
     facts: mpsc::Sender<Dated>,
@@ -25,23 +25,23 @@ pub(crate) struct Watchers {
 
 impl Watchers {
     pub(crate) fn new() -> (Self, mpsc::Receiver<Dated>) {
-        // When nobody takes facts, those who look wait.
+        // If facts are not received, the observers wait.
         let (facts, receiver) = mpsc::channel(1024);
         let tasks = JoinSet::new();
         (Self { tasks, facts }, receiver)
     }
 
-    /// Where other tasks may tell facts.
+    /// Returns a sender for facts of other tasks.
     pub(crate) fn facts(&self) -> mpsc::Sender<Dated> {
         self.facts.clone()
     }
 
-    /// Runs a task for as long as the story.
+    /// Runs a task until the end of the scenario.
     pub(crate) fn spawn(&mut self, task: impl Future<Output = ()> + Send + 'static) {
         self.tasks.spawn(task);
     }
 
-    /// Looks at the page that a program serves at a port.
+    /// Observes the status page of a program at a port.
     pub(crate) fn page(&mut self, program: &'static str, page: Page, port: u16) {
         self.spawn(watch_page(Reader::new(program, page), port, self.facts()));
     }
@@ -60,7 +60,7 @@ impl Watchers {
         Ok(())
     }
 
-    /// Looks who offers the gripper's first skill as a service of ROS 1.
+    /// Observes the ROS 1 graph for the service of the gripper's first skill.
     pub(crate) fn graph(&mut self, master: String) {
         self.spawn(watch_graph(master, self.facts()));
     }
@@ -71,7 +71,7 @@ async fn watch_page(mut reader: Reader, port: u16, facts: mpsc::Sender<Dated>) {
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
     while !reader.is_done() {
         ticks.tick().await;
-        // Before it listens, and when it has ended, there is no page.
+        // The page is not available before the program listens or after it has ended.
         let Ok(page) = fetch::<Value>(port).await else {
             continue;
         };
@@ -104,7 +104,7 @@ async fn listen(udp: Udp, facts: mpsc::Sender<Dated>) {
     }
 }
 
-/// The component of whose values a datagram is, if it is of one.
+/// Returns the component of the values in a datagram, if any.
 fn value_of(datagram: &[u8]) -> Option<Part> {
     let message = NetworkMessage::decode(datagram).ok()?;
     if message.publisher_id() != Some(PublisherId::UInt16(0)) || message.is_action() {
@@ -143,7 +143,7 @@ async fn watch_graph(master: String, facts: mpsc::Sender<Dated>) {
     }
 }
 
-/// The group that programs take unless they are told another.
+/// The default group of the programs.
 const GROUP: SocketAddr = SocketAddr::V4(SocketAddrV4::new(Ipv4Addr::new(239, 192, 0, 40), 4840));
 const LOOK_EVERY: Duration = Duration::from_millis(20);
 const MOST_BYTES: usize = 65_536;

@@ -1,4 +1,4 @@
-//! Both robots on one line, with a space between them that is slow and loses messages.
+//! Tests of both robots on the same line, connected by a slow space that loses messages.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -7,18 +7,18 @@ use super::niryo::{Heard, Niryo, NiryoEvent};
 use super::turtlebot::{Turtlebot, TurtlebotEvent};
 use crate::pace::{Pace, Speed};
 
-/// What a run of the line came to.
+/// The outcome of a run of the line.
 #[derive(Debug, Default)]
 struct Outcome {
     by_conveyor: u32,
     by_turtlebot: u32,
-    /// When the last cover arrived.
+    /// Time at which the last cover arrived.
     finished: Duration,
     most_in_bucket: u32,
     last_cycle: Duration,
 }
 
-/// The states travelling from one robot to the other.
+/// States in transit between the robots.
 struct Channel<T> {
     delay: Duration,
     under_way: VecDeque<(Duration, T)>,
@@ -38,7 +38,8 @@ impl<T> Channel<T> {
     }
 }
 
-/// Plays the line in steps of 10 ms. Every `keep`th of the repeated reports arrives, those between are lost.
+/// Simulates the line in steps of 10 ms. Every `keep`th of the repeated reports arrives, the others
+/// are lost.
 fn play(covers: u32, off_at: u64, delay: Duration, keep: u32) -> Outcome {
     let pace = Pace::at(Speed::new(1.0).unwrap());
     let (mut niryo, mut turtlebot) = (Niryo::new(covers, pace), Turtlebot::new(pace));

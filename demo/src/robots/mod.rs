@@ -1,4 +1,4 @@
-//! The two simulated robots: what they decide, and the nodes they decide it in.
+//! The two simulated robots: their logic and their nodes.
 
 use std::time::Duration;
 
@@ -12,10 +12,10 @@ pub(crate) mod turtlebot_node;
 #[cfg(test)]
 mod line_tests;
 
-/// How often a robot repeats its states.
+/// Interval in which a robot repeats its states.
 const REPEAT: Duration = Duration::from_millis(500);
 
-/// An instant that no story reaches.
+/// Returns an instant after the end of any scenario.
 fn far_away(from: Instant) -> Instant {
     from + Duration::from_secs(365 * 24 * 3600)
 }

@@ -1,8 +1,7 @@
-//! The business program of Niryo Ned, without sockets and clock.
+//! The logic of Niryo Ned, without sockets and clock.
 //!
-//! The arm knows of the rest of the line only what the topics of the space say: the switch of its conveyor, and
-//! whether park and bucket are busy. All of these are states, heard as often as they are repeated; what counts is the
-//! last one heard.
+//! The arm uses only the topics of the space: the switch of its conveyor, and whether park and
+//! bucket are busy. All of these are states that are repeated; the last received value counts.
 
 use std::time::Duration;
 
@@ -10,31 +9,31 @@ use serde::{Deserialize, Serialize};
 
 use crate::pace::Pace;
 
-/// What the arm hears.
+/// An input of the arm.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Heard {
     /// The switch of the conveyor is on or off.
     Switch(bool),
-    /// TurtleBot3 stands at the park, or does not.
+    /// TurtleBot3 is at the park, or is not.
     Park(bool),
-    /// There is a cover in the bucket, or there is none.
+    /// The bucket contains a cover, or is empty.
     Bucket(bool),
-    /// Nothing: time has passed.
+    /// No input: time has passed.
     Nothing,
 }
 
-/// What the arm tells the line.
+/// The outputs of the arm for the line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Counts {
     pub(crate) conveyor_running: bool,
     pub(crate) in_storage: u32,
-    /// Covers placed on the conveyor so far.
+    /// Number of covers placed on the conveyor.
     pub(crate) on_conveyor: u32,
-    /// Covers placed on TurtleBot3 so far.
+    /// Number of covers placed on TurtleBot3.
     pub(crate) on_turtlebot: u32,
 }
 
-/// What the arm does, for the timeline.
+/// An action of the arm, for the timeline.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(tag = "niryo", rename_all = "snake_case")]
 pub(crate) enum NiryoEvent {
@@ -47,15 +46,15 @@ pub(crate) enum NiryoEvent {
     StorageEmpty,
 }
 
-/// Why the arm holds a cover and does not place it.
+/// The reason why the arm holds a cover without placing it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub(crate) enum WaitCause {
     /// TurtleBot3 is not at the park.
     ParkFree,
-    /// The bucket has a cover already.
+    /// The bucket contains a cover already.
     BucketBusy,
-    /// Nothing has been heard of TurtleBot3 yet.
+    /// Nothing has been received from TurtleBot3 yet.
     Unknown,
 }
 
@@ -71,10 +70,10 @@ pub(crate) struct Niryo {
     bucket: Bucket,
 }
 
-/// Times are since the program's start.
+/// The state of the arm. Times are relative to the start of the program.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Arm {
-    /// Until the switch of the conveyor has been heard once.
+    /// Waiting for the first state of the switch of the conveyor.
     Awaiting,
     Resting {
         until: Duration,
@@ -85,20 +84,20 @@ enum Arm {
     Carrying {
         until: Duration,
     },
-    /// Over the place with a cover in the gripper.
+    /// Above the place, with a cover in the gripper.
     Holding {
         told: Option<WaitCause>,
     },
     Done,
 }
 
-/// What the arm knows of the bucket.
+/// The state of the bucket, as known to the arm.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Bucket {
     Unknown,
     Free,
     Busy,
-    /// We have placed a cover. Reports that it is free may be older than that.
+    /// The arm has placed a cover. Reports that the bucket is free may be older than that.
     Filled {
         at: Duration,
     },
@@ -140,7 +139,7 @@ impl Niryo {
         self.counts
     }
 
-    /// When to come back if nothing is heard.
+    /// Returns the time of the next call of `handle` without an input.
     pub(crate) const fn timeout(&self) -> Option<Duration> {
         match self.arm {
             Arm::Resting { until } | Arm::Picking { until } | Arm::Carrying { until } => {
@@ -157,7 +156,7 @@ impl Niryo {
                 until: now + self.pace.first_rest,
             };
         }
-        // The cable: the conveyor follows its switch at once.
+        // The conveyor is wired to the arm and follows its switch immediately.
         if self.counts.conveyor_running != on {
             self.counts.conveyor_running = on;
             let holding_cover = matches!(self.arm, Arm::Carrying { .. } | Arm::Holding { .. });
@@ -172,7 +171,8 @@ impl Niryo {
     fn hear_park(&mut self, busy: bool) {
         self.park = Some(busy);
         if !busy && matches!(self.bucket, Bucket::Filled { .. }) {
-            // It has left, so it has seen the cover; it will say when the bucket is free.
+            // TurtleBot3 has left, so it has seen the cover. It will report when the bucket is
+            // free.
             self.bucket = Bucket::Busy;
         }
     }
@@ -185,7 +185,8 @@ impl Niryo {
         };
     }
 
-    /// One step of the arm: `None` when it has to wait, `Some(None)` for a step not worth telling.
+    /// Runs a step of the arm. Returns `None` if the arm has to wait, and `Some(None)` for a step
+    /// without an event.
     fn step(&mut self, now: Duration) -> Option<Option<NiryoEvent>> {
         match self.arm {
             Arm::Awaiting | Arm::Done => None,
@@ -217,7 +218,7 @@ impl Niryo {
         }
     }
 
-    /// Where the cover goes is decided when the arm is there, not before.
+    /// Places the cover. The destination is chosen when the arm arrives, not before.
     fn place(&mut self, told: Option<WaitCause>, now: Duration) -> Option<NiryoEvent> {
         let event = if self.counts.conveyor_running {
             self.counts.on_conveyor += 1;
@@ -260,7 +261,7 @@ mod tests {
         Niryo::new(covers, Pace::at(Speed::new(1.0).unwrap()))
     }
 
-    /// Lets the time pass up to `end`, waking the arm when it asks for it.
+    /// Lets time pass until `end`, calling the arm at each of its timeouts.
     fn run_until(niryo: &mut Niryo, end: Duration) -> Vec<(Duration, NiryoEvent)> {
         let mut events = Vec::new();
         while let Some(at) = niryo.timeout().filter(|at| *at <= end) {
@@ -384,7 +385,7 @@ mod tests {
         assert_eq!(run_until(&mut arm, s(60)).last(), Some(&(s(9), waits)));
     }
 
-    /// An arm that has just placed its first of two covers on TurtleBot3, at second 9.
+    /// Returns an arm that has just placed its first of two covers on TurtleBot3, at second 9.
     fn after_the_first_on_turtlebot3() -> Niryo {
         let mut arm = niryo(2);
         arm.handle(Heard::Park(true), s(0));
@@ -408,7 +409,7 @@ mod tests {
     fn a_missed_report_of_a_busy_bucket_does_not_stop_the_line() {
         let mut arm = after_the_first_on_turtlebot3();
         run_until(&mut arm, s(20));
-        // All that said busy and away was lost; this is long after.
+        // All reports of busy and away were lost; this report is much later.
         let events = arm.handle(Heard::Bucket(false), s(40));
         assert_eq!(events, [NiryoEvent::PlacedOnTurtlebot { total: 2 }]);
     }

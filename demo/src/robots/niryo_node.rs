@@ -19,7 +19,7 @@ use crate::line::{Name, SWITCH};
 use crate::pace::{Pace, Speed};
 use crate::stop::Stop;
 
-/// Runs the node until it is told to end.
+/// Runs the node until the process is stopped.
 pub(crate) async fn run(covers: u32, speed: Speed) -> anyhow::Result<()> {
     let mut stop = Stop::new()?;
     let node = Node::start(NodeOptions::from_env("niryo_ned"))?;
@@ -49,13 +49,13 @@ pub(crate) async fn run(covers: u32, speed: Speed) -> anyhow::Result<()> {
         let Some(heard) = heard else { continue };
         let before = niryo.counts();
         let events = niryo.handle(heard, started.elapsed());
-        // The stamp is of what the arm did; publishing it comes after.
+        // The timestamp is the time of the action; publishing follows.
         let stamp = wall_nanos();
         if niryo.counts() != before {
             outputs.publish(niryo.counts());
         }
         if let Some(done) = done {
-            // Who asked may have given up.
+            // The caller may have given up.
             done.send(()).ok();
         }
         tell(stamp, &events).context("the demo does not listen any more")?;
@@ -108,14 +108,14 @@ fn subscribe(node: &Node, inbox: &Inbox<Name>) -> anyhow::Result<Vec<Subscriptio
         .collect()
 }
 
-/// What the switch of the conveyor is told.
+/// A request to switch the conveyor.
 struct Order {
     on: bool,
-    /// Told when the conveyor has followed.
+    /// Signals that the conveyor has followed.
     done: oneshot::Sender<()>,
 }
 
-/// Offers the switch of the conveyor: a service that answers when the conveyor has followed.
+/// Advertises the switch of the conveyor, a service that responds when the conveyor has followed.
 fn serve_switch(node: &Node, orders: mpsc::Sender<Order>) -> anyhow::Result<ServiceServer> {
     let service_type = ServiceType {
         name: SET_BOOL.0.to_owned(),
@@ -144,7 +144,8 @@ fn serve_switch(node: &Node, orders: mpsc::Sender<Order>) -> anyhow::Result<Serv
     Ok(node.advertise_service(&format!("/{SWITCH}"), service_type, options, serve)?)
 }
 
-/// A response of std_srvs/SetBool that says yes: the Boolean, then the text with its length before it.
+/// Encodes a successful response of std_srvs/SetBool: the Boolean, then the text with its length
+/// before it.
 pub(crate) fn set_bool_response(message: &str) -> Bytes {
     let length = u32::try_from(message.len()).unwrap_or_default();
     let parts: [&[u8]; 3] = [&[1], &length.to_le_bytes(), message.as_bytes()];
@@ -198,7 +199,7 @@ impl Outputs {
     }
 }
 
-/// Type name, checksum and definition of the two ROS types of the line.
+/// Type name, MD5 sum and definition of the two ROS types of the line.
 const BOOL: (&str, &str, &str) = (
     "std_msgs/Bool",
     "8b94c1b53db61fb6aed406028ad6332a",
@@ -210,9 +211,9 @@ const UINT32: (&str, &str, &str) = (
     "uint32 data\n",
 );
 
-/// Type name and checksum of the service that switches the conveyor.
+/// Type name and MD5 sum of the service that switches the conveyor.
 pub(crate) const SET_BOOL: (&str, &str) = ("std_srvs/SetBool", "09fb03525b03e7ea1fd3992bafd87e16");
-/// Calls of the switch that wait for the arm to come to them.
+/// Maximum number of waiting calls of the switch.
 const MOST_ORDERS: usize = 16;
 
 #[cfg(test)]

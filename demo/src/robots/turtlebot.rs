@@ -1,7 +1,7 @@
-//! The business program of TurtleBot3, without sockets and clock.
+//! The logic of TurtleBot3, without sockets and clock.
 //!
-//! It knows one thing of the line: how many covers have been placed on it so far. That count stands in for the sensor
-//! of its bucket, and being a state, not an edge, it does no harm when it comes late or twice.
+//! Its only input from the line is the number of covers placed on it. That number replaces a sensor
+//! in its bucket. It is a state, not an edge, so late or repeated messages do no harm.
 
 use std::time::Duration;
 
@@ -9,34 +9,34 @@ use serde::{Deserialize, Serialize};
 
 use crate::pace::Pace;
 
-/// What TurtleBot3 tells the line.
+/// The outputs of TurtleBot3 for the line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Status {
-    /// It stands at the park.
+    /// Whether it is at the park.
     pub(crate) park_busy: bool,
-    /// There is a cover in its bucket.
+    /// Whether there is a cover in its bucket.
     pub(crate) bucket_busy: bool,
 }
 
-/// What TurtleBot3 does, for the timeline.
+/// An action of TurtleBot3, for the timeline.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(tag = "turtlebot", rename_all = "snake_case")]
 pub(crate) enum TurtlebotEvent {
-    /// `placed` is the count that says so.
+    /// `placed` is the received number of covers.
     CoverInBucket {
         placed: u32,
     },
     LeavesPark {
         placed: u32,
     },
-    /// `total` covers have been delivered so far.
+    /// `total` covers have been delivered.
     Unloaded {
         total: u32,
     },
     BackAtPark,
 }
 
-/// The robot on its way between park and worker.
+/// The state of the robot between park and worker.
 #[derive(Clone, Debug)]
 pub(crate) struct Turtlebot {
     pace: Pace,
@@ -45,7 +45,7 @@ pub(crate) struct Turtlebot {
     place: Place,
 }
 
-/// Times are since the program's start.
+/// The location and the activity. Times are relative to the start of the program.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Place {
     Park,
@@ -56,7 +56,7 @@ enum Place {
 }
 
 impl Turtlebot {
-    /// A robot at the park with an empty bucket.
+    /// Creates a robot at the park with an empty bucket.
     pub(crate) const fn new(pace: Pace) -> Self {
         Self {
             pace,
@@ -66,7 +66,7 @@ impl Turtlebot {
         }
     }
 
-    /// Takes the count of covers placed on it, `None` when only time has passed.
+    /// Processes the number of covers placed on it; `None` if only time has passed.
     pub(crate) fn handle(&mut self, placed: Option<u32>, now: Duration) -> Vec<TurtlebotEvent> {
         if let Some(placed) = placed {
             self.placed = placed;
@@ -85,7 +85,7 @@ impl Turtlebot {
         }
     }
 
-    /// When to come back if nothing is heard.
+    /// Returns the time of the next call of `handle` without an input.
     pub(crate) const fn timeout(&self) -> Option<Duration> {
         match self.place {
             Place::Park => None,

@@ -20,7 +20,7 @@ use crate::line::{DOMAIN, Name};
 use crate::pace::{Pace, Speed};
 use crate::stop::Stop;
 
-/// Runs the node until it is told to end.
+/// Runs the node until the process is stopped.
 pub(crate) async fn run(speed: Speed) -> anyhow::Result<()> {
     let mut stop = Stop::new()?;
     let mut node = join()?;
@@ -52,7 +52,7 @@ pub(crate) async fn run(speed: Speed) -> anyhow::Result<()> {
         };
         let before = robot.status();
         let events = robot.handle(placed, started.elapsed());
-        // The stamp is of what the robot did; publishing it comes after.
+        // The timestamp is the time of the action; publishing follows.
         let stamp = wall_nanos();
         if robot.status() != before {
             outputs.publish(robot.status());
@@ -63,7 +63,7 @@ pub(crate) async fn run(speed: Speed) -> anyhow::Result<()> {
     }
 }
 
-/// Joins the domain on the loopback interface alone.
+/// Joins the domain on the loopback interface only.
 fn join() -> anyhow::Result<Node> {
     let participant = DomainParticipantBuilder::new(DOMAIN)
         .with_only_networks([IpAddr::V4(Ipv4Addr::LOCALHOST)])
@@ -81,7 +81,7 @@ fn join() -> anyhow::Result<Node> {
         .map_err(|error| anyhow!("cannot make a ROS 2 node: {error}"))
 }
 
-/// The last value counts, and who comes late gets it.
+/// The last value counts, and late subscribers receive it.
 const STATE: QosProfile = QosProfile::publisher_default()
     .reliability_reliable(WhenFull::Fail)
     .durability(Durability::TransientLocal)
@@ -123,7 +123,7 @@ impl Outputs {
             (Name::ParkBusy, &self.park, status.park_busy),
         ] {
             if let Err(error) = publisher.publish(value) {
-                // It is repeated soon.
+                // The state is repeated soon.
                 tracing::warn!(%name, ?error, "a state was not published");
             }
         }

@@ -1,4 +1,4 @@
-//! The arm as a ROS 1 node: its moves and its gripper are actions.
+//! The arm as a ROS 1 node, with actions for its moves and its gripper.
 
 use std::time::Duration;
 
@@ -16,7 +16,7 @@ use crate::event::tell;
 use crate::pace::Speed;
 use crate::stop::Stop;
 
-/// Runs the node until it is told to end.
+/// Runs the node until the process is stopped.
 pub(crate) async fn run(speed: Speed) -> anyhow::Result<()> {
     let mut stop = Stop::new()?;
     let node = Node::start(NodeOptions::from_env("niryo_ned"))?;
@@ -25,7 +25,7 @@ pub(crate) async fn run(speed: Speed) -> anyhow::Result<()> {
     let mut releases = serve(&node, RELEASE, RELEASED)?;
     let mut at = HOME;
     loop {
-        // One goal after another: the arm has one body.
+        // Goals are executed sequentially, because the arm has one body.
         tokio::select! {
             goal = moves.next() => {
                 let to = target(goal.body());
@@ -57,12 +57,12 @@ pub(crate) async fn run(speed: Speed) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Works for that long. False when it was told not to go on; the goal has ended then.
+/// Works for a duration. Returns false if the goal was preempted; the goal has ended then.
 async fn works(server: &mut SimpleActionServer, goal: &ServerGoal, lasts: Duration) -> bool {
     tokio::select! {
         () = sleep(lasts) => true,
         () = server.preempted(goal) => {
-            // It may have ended already.
+            // The goal may have ended already.
             goal.cancelled(None, "stopped on the way").ok();
             false
         }
@@ -75,7 +75,7 @@ fn succeed(goal: &ServerGoal, result: &[u8]) {
     }
 }
 
-/// Offers an action of `ua_msgs`, whose empty result has so many bytes.
+/// Creates the server of an action of `ua_msgs` with an empty result of `empty` bytes.
 fn serve(
     node: &Node,
     (name, type_name): (&str, &str),
@@ -105,7 +105,7 @@ fn action_type(name: &str) -> anyhow::Result<ActionType> {
     })
 }
 
-/// Where a goal of `ua_msgs/PtpMove` leads: its first six numbers.
+/// Returns the target of a goal of `ua_msgs/PtpMove`: its first six numbers.
 fn target(goal: &[u8]) -> Option<[f64; 6]> {
     let mut at = [0.0; 6];
     let mut rest = goal;
@@ -117,7 +117,7 @@ fn target(goal: &[u8]) -> Option<[f64; 6]> {
     Some(at)
 }
 
-/// A result of `ua_msgs/PtpMove`: the run, which has no number here, and the place.
+/// Encodes a result of `ua_msgs/PtpMove`: the run, without a number here, and the position.
 fn moved(at: [f64; 6]) -> Vec<u8> {
     let mut result = vec![0; 4];
     result.extend(at.into_iter().flat_map(f64::to_le_bytes));
@@ -128,11 +128,11 @@ const fn position([x, y, z, ..]: [f64; 6]) -> [f64; 3] {
     [x, y, z]
 }
 
-/// The actions, and their types.
+/// The actions and their types.
 const MOVE: (&str, &str) = ("/niryo_ned/move", "PtpMove");
 const GRASP: (&str, &str) = ("/niryo_ned/grasp", "Grasp");
 const RELEASE: (&str, &str) = ("/niryo_ned/release", "Release");
-/// Bytes of their results.
+/// Sizes of their results in bytes.
 const MOVED: usize = 4 + 6 * 8;
 const GRASPED: usize = 5;
 const RELEASED: usize = 4;

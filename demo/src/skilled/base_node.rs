@@ -1,4 +1,4 @@
-//! The mobile robot as a ROS 2 node: to drive is an action.
+//! The mobile robot as a ROS 2 node, with an action to drive.
 
 use std::net::{IpAddr, Ipv4Addr};
 use std::time::Duration;
@@ -29,14 +29,14 @@ struct Goal {
     frame: String,
 }
 
-/// Its result.
+/// The result of `ua_msgs/NavigateTo`.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 struct Reached {
     run: u32,
     pose: [f64; 3],
 }
 
-/// Its feedback.
+/// The feedback of `ua_msgs/NavigateTo`.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 struct OnTheWay {
     state: String,
@@ -51,7 +51,7 @@ impl Message for OnTheWay {}
 
 type Server = AsyncActionServer<Goal, Reached, OnTheWay>;
 
-/// Runs the node until it is told to end.
+/// Runs the node until the process is stopped.
 pub(crate) async fn run(speed: Speed) -> anyhow::Result<()> {
     let mut stop = Stop::new()?;
     let mut node = join()?;
@@ -67,7 +67,7 @@ pub(crate) async fn run(speed: Speed) -> anyhow::Result<()> {
     }
 }
 
-/// Takes goals, one after another.
+/// Executes goals sequentially.
 async fn drive(server: &Server, lasts: Duration) -> anyhow::Result<()> {
     let broken = |error: &dyn std::fmt::Debug| anyhow!("the action does not work: {error:?}");
     loop {
@@ -96,7 +96,7 @@ async fn drive(server: &Server, lasts: Duration) -> anyhow::Result<()> {
     }
 }
 
-/// Waits until somebody asks for the result.
+/// Waits for a request of the result, and responds.
 async fn answer(server: &Server, goal: ExecutingGoalHandle<Goal>, reached: Reached) {
     let told = server.send_result_response(goal, GoalEndStatus::Succeeded, reached);
     match timeout(RESULT_WITHIN, told).await {
@@ -126,7 +126,7 @@ fn serve(node: &mut Node) -> anyhow::Result<Server> {
     Ok(AsyncActionServer::new(server))
 }
 
-/// Joins the domain on the loopback interface alone.
+/// Joins the domain on the loopback interface only.
 fn join() -> anyhow::Result<Node> {
     let participant = DomainParticipantBuilder::new(DOMAIN)
         .with_only_networks([IpAddr::V4(Ipv4Addr::LOCALHOST)])
@@ -145,6 +145,6 @@ fn join() -> anyhow::Result<Node> {
 }
 
 const ACTION: &str = "/turtlebot3/navigate_to";
-/// How long it waits until somebody asks for a result.
+/// Time limit for the request of a result.
 const RESULT_WITHIN: Duration = Duration::from_secs(5);
 const NOBODY: &str = "the demo does not listen any more";

@@ -1,4 +1,4 @@
-//! The conveyor as a ROS 1 node: a service switches it.
+//! The conveyor as a ROS 1 node, with a service to switch it.
 
 use anyhow::Context as _;
 use bytes::Bytes;
@@ -10,7 +10,7 @@ use crate::line::SWITCH;
 use crate::robots::niryo_node::{SET_BOOL, read_bool, set_bool_response};
 use crate::stop::Stop;
 
-/// Runs the node until it is told to end.
+/// Runs the node until the process is stopped.
 pub(crate) async fn run() -> anyhow::Result<()> {
     let mut stop = Stop::new()?;
     let node = Node::start(NodeOptions::from_env("conveyor"))?;

@@ -1,10 +1,10 @@
-//! The cell of the line: its mapping and its components, as the project shows them to integrators.
+//! The cell of the line: its mapping and its components, from the examples for integrators.
 
 use std::fs;
 use std::io;
 use std::path::Path;
 
-/// A component: the name it is told by, its YAML, and the skill of it that the line runs, if any.
+/// A component: its name, its ApplicationUri and its YAML.
 pub(super) struct Part {
     pub(super) name: &'static str,
     pub(super) uri: &'static str,
@@ -37,11 +37,11 @@ pub(super) const PARTS: [Part; 4] = [
     },
 ];
 
-/// The file of the mapping in a directory.
+/// The file name of the mapping.
 pub(super) const MAPPING: &str = "line-by-skills.yaml";
 const MAPPING_TEXT: &str = include_str!("../../../mappings/line-by-skills.yaml");
 
-/// Writes what the programs are started with into a directory.
+/// Writes the input files of the programs into a directory.
 ///
 /// # Errors
 /// A file cannot be written.

@@ -1,19 +1,19 @@
-//! What the simulated machines of the line tell of themselves.
+//! Events of the simulated machines of the line.
 
 use serde::{Deserialize, Serialize};
 
-/// Something that a machine did.
+/// An action of a machine.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "machine", rename_all = "snake_case")]
 pub(crate) enum MachineEvent {
-    /// The gripper of the arm has closed, at x, y, z in m.
+    /// The gripper of the arm has closed at x, y, z in m.
     Grasps { at: [f64; 3] },
-    /// It has opened.
+    /// The gripper of the arm has opened at x, y, z in m.
     Releases { at: [f64; 3] },
-    /// The conveyor runs or stands still.
+    /// The conveyor runs or has stopped.
     Belt { runs: bool },
-    /// The mobile robot sets out.
+    /// The mobile robot departs.
     Leaves,
-    /// The mobile robot stands at x, y in m.
+    /// The mobile robot has arrived at x, y in m.
     Arrives { at: [f64; 2] },
 }

@@ -1,5 +1,5 @@
-//! The line itself: a composite of skills that are found by what they can do. Where a skill is lost it goes on without it, and
-//! takes back what that skill has left half done.
+//! The line: a composite of skills that are found by their types. If a skill is lost, the line
+//! continues without it, and takes back the cover that the skill has not delivered.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -9,33 +9,34 @@ use tokio::time::sleep;
 
 use super::world::{BELT, BUCKET, PARK, STORAGE, WORKER};
 
-/// The skills that the line is made of.
+/// The skills of the line.
 pub(super) struct Line {
-    /// Brings things from one place to another.
+    /// Moves objects from one pose to another.
     pub(super) pick_and_place: Arc<dyn Runs>,
     pub(super) conveyor: Arc<dyn Runs>,
     pub(super) base: Arc<dyn Runs>,
-    /// How long the conveyor takes from its beginning to its end.
+    /// Time that the conveyor takes to move a cover from its start to its end.
     pub(super) transport: Duration,
-    /// How long a run of a skill may take.
+    /// Time limit of a run of a skill.
     pub(super) within: Duration,
 }
 
-/// What the line tells of a step: which skill, and what for.
+/// Receives the progress of the line: the skill and its purpose.
 pub(super) trait Teller {
-    /// A run begins.
+    /// A run starts.
     fn begins(&self, skill: &str, what: &str);
-    /// It has ended, well or not.
+    /// A run has ended, with or without success.
     fn ended(&self, skill: &str, what: &str, message: &str);
-    /// The line goes another way from now on.
+    /// The line continues in another way.
     fn turns(&self, why: &str);
 }
 
 impl Line {
-    /// Brings all covers to their places: by the conveyor for as long as there is one, else by the mobile robot.
+    /// Brings all covers to the worker: by the conveyor while it is available, then by the mobile
+    /// robot.
     ///
     /// # Errors
-    /// A skill without which there is no line did not do its work; why, for people.
+    /// The reason why an indispensable skill failed, as text for people.
     pub(super) async fn run(&self, covers: u32, teller: &dyn Teller) -> Result<(), String> {
         let mut conveyor = self.switch_on(teller).await;
         for number in 1..=covers {
@@ -63,7 +64,7 @@ impl Line {
         ran(&*self.conveyor, on, ("runs", self.within), teller).await
     }
 
-    /// Waits until the conveyor has carried away what lies on it, and asks it then whether it runs.
+    /// Waits until the conveyor has delivered its covers, and then checks that it still runs.
     async fn carried_away(&self, teller: &dyn Teller) -> Result<(), String> {
         tokio::select! {
             why = self.conveyor.lost() => return Err(format!("{} is lost: {why}", self.conveyor.name())),
@@ -92,7 +93,7 @@ impl Line {
         .await
     }
 
-    /// The mobile robot brings what it has to the worker and comes back.
+    /// Sends the mobile robot with its cover to the worker and back.
     async fn deliver(&self, teller: &dyn Teller) -> Result<(), String> {
         for (what, [x, y, heading]) in [("to the worker", WORKER), ("to the park", PARK)] {
             let goal = Value::from(vec![x, y, heading]);

@@ -1,8 +1,14 @@
-//! The assembly line, run by skills: an arm of ROS 1, a conveyor and a mobile robot of ROS 2 are components, and a composite that
-//! finds their skills by type brings covers to the worker. The conveyor dies on the way, with a cover on its way to it.
+//! The assembly line with skills. An arm of ROS 1, a conveyor and a mobile robot of ROS 2 are
+//! components. A composite finds their skills by type and brings covers to the worker. The conveyor
+//! is killed while a cover is on its way to it.
 //!
-//! All programs but the machines are those that people run.
-//! Reading order: this (who is started and what happens to them), `line` (the composite), `world` (who says whether it worked).
+//! All programs except the machines are the released programs.
+//!
+//! Reading order:
+//!
+//! - this module: the programs and the events of the scenario
+//! - `line`: the composite
+//! - `world`: the check of the result
 
 pub(crate) mod arm_node;
 pub(crate) mod base_node;
@@ -38,7 +44,7 @@ use crate::stage::{
     fetch, find, free_port, must_be_free,
 };
 
-/// What the story is to be.
+/// The options of the scenario.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Plan {
     pub(crate) covers: u32,
@@ -46,7 +52,7 @@ pub(crate) struct Plan {
     pub(crate) json: bool,
 }
 
-/// Plays the story and prints it. Returns the exit code.
+/// Plays the scenario and prints it. Returns the exit code.
 pub(crate) async fn play(plan: Plan) -> u8 {
     let show = Show {
         timeline: RefCell::new(Timeline::open(plan.json)),
@@ -66,29 +72,29 @@ pub(crate) async fn play(plan: Plan) -> u8 {
     }
     match (outcome, show.conclude(plan.json)) {
         (Err(failure), _) => failure.exit_code(),
-        // Nobody reads any more, as with `| head`.
+        // Standard output is closed, for example by `| head`.
         (Ok(()), Err(_)) => 74,
         (Ok(()), Ok(())) => 0,
     }
 }
 
-/// What people see.
+/// The printed output.
 struct Show {
     timeline: RefCell<Timeline>,
     report: RefCell<Report>,
     began_at: i64,
-    /// The run that is under way, or was the last.
+    /// The current or last run.
     under_way: Cell<UnderWay>,
 }
 
-/// A run of a skill, as those see it who asked for it and who look at the machines.
+/// A run of a skill, as observed by its caller and by the observers of the machines.
 #[derive(Clone, Copy)]
 struct UnderWay {
-    /// When it was asked for.
+    /// Time of the request.
     since: Instant,
-    /// In nanoseconds since 1970.
+    /// Time of the request in nanoseconds since 1970.
     since_ns: i64,
-    /// From there until a machine first did something, in milliseconds.
+    /// Milliseconds from the request to the first action of a machine.
     acted_ms: Option<f64>,
 }
 
@@ -113,7 +119,7 @@ impl Show {
         let began_at = self.began_at;
         let seconds = |at_ns: i64| Some(millis(at_ns - began_at) / 1e3);
         if let Err(error) = timeline.print_all(&seconds) {
-            // The end says so with its exit code.
+            // The exit code reports it at the end.
             tracing::debug!(%error, "nobody reads");
         }
     }
@@ -218,7 +224,7 @@ async fn perform(plan: Plan, show: &Show) -> Result<(), Failure> {
         report.taken_back = world.taken_back();
     }
     story.programs.end().await;
-    // The logs are for those who wonder what went wrong.
+    // The logs are kept after a failure.
     if matches!(outcome, Ok(()) | Err(Failure::Interrupted { .. }))
         && let Err(error) = story.programs.clean_up()
     {
@@ -227,19 +233,19 @@ async fn perform(plan: Plan, show: &Show) -> Result<(), Failure> {
     outcome
 }
 
-/// Takes what the machines tell, and lets the world know.
+/// Receives the events of the machines and updates the world.
 struct Watcher<'a> {
     reports: mpsc::Receiver<Told>,
     seen: watch::Sender<World>,
-    /// Where the ROS master listens.
+    /// The URI of the ROS master.
     master: watch::Sender<Option<String>>,
-    /// When the conveyor was killed, in nanoseconds since 1970.
+    /// Time at which the conveyor was killed, in nanoseconds since 1970.
     killed: watch::Sender<Option<i64>>,
     show: &'a Show,
 }
 
 impl Watcher<'_> {
-    /// Until a program ends without being told to.
+    /// Processes reports until a program ends unexpectedly.
     async fn watch(&mut self) -> (&'static str, ExitStatus) {
         let mut passes = interval(PASS);
         loop {
@@ -255,7 +261,7 @@ impl Watcher<'_> {
                         self.killed.send_replace(Some(at_ns));
                     }
                     Some(Told::Killed { .. }) => {}
-                    // The programs hold a sender, so it does not end before them.
+                    // The programs hold a sender, so the channel does not close before them.
                     None => return std::future::pending().await,
                 },
                 _ = passes.tick() => self.seen.send_modify(|world| world.pass(wall_nanos())),
@@ -297,7 +303,7 @@ fn describe(event: MachineEvent) -> (Who, String) {
     }
 }
 
-/// Why the story stops.
+/// The reason why the scenario stops.
 enum Stop {
     Failed(Failure),
     Broken(String),
@@ -324,16 +330,16 @@ struct Story<'a> {
     plan: Plan,
     binaries: Binaries,
     programs: Programs,
-    /// Where the discovery server shows its page.
+    /// The port of the status page of the discovery server.
     page: u16,
-    /// Where the bridges of ROS 1 and of ROS 2 show theirs.
+    /// The ports of the status pages of the ROS 1 bridge and of the ROS 2 bridge.
     bridges: [u16; 2],
     transport: Duration,
     world: watch::Receiver<World>,
     show: &'a Show,
 }
 
-/// What of the page of the discovery server is read.
+/// The used part of the status page of the discovery server.
 #[derive(Debug, Default, Deserialize)]
 struct Page {
     servers: Vec<Registered>,
@@ -345,7 +351,7 @@ struct Registered {
     urls: Vec<String>,
 }
 
-/// The skills of the line, and the sessions that they are run by.
+/// The skills of the line, and the sessions that run them.
 struct Found {
     line: Line,
     sessions: Vec<SkillClient>,
@@ -507,7 +513,7 @@ impl Story<'_> {
         Ok(())
     }
 
-    /// Finds the skills of the line by their types, whosever they are.
+    /// Finds the skills of the line by their types, in any component.
     async fn find(&self, began: Instant) -> Result<Found, Stop> {
         let detector = Detector::new(ClientOptions {
             application_name: "assembly line".to_owned(),
@@ -550,7 +556,7 @@ impl Story<'_> {
         Ok(Found { line, sessions })
     }
 
-    /// Tells a detector of the servers that are registered, for as long as it is wanted.
+    /// Reports the registered servers to a detector until the future is dropped.
     async fn tell_of_servers(&self, detector: &Detector) {
         let mut known: Vec<String> = Vec::new();
         loop {
@@ -586,7 +592,8 @@ impl Story<'_> {
     }
 }
 
-/// Kills the conveyor, its machine and its component, while the arm carries the third cover to it, or the last of fewer.
+/// Kills the machine and the component of the conveyor while the arm carries the third cover to it,
+/// or the last cover if there are fewer.
 async fn strike(programs: &Programs, mut world: watch::Receiver<World>, covers: u32, show: &Show) {
     let left = covers.saturating_sub(STRIKES_AT);
     let carried = world.wait_for(|world| world.is_held() && world.in_storage() <= left);
@@ -600,7 +607,7 @@ async fn strike(programs: &Programs, mut world: watch::Receiver<World>, covers: 
     }
 }
 
-/// Notes how long it takes until the line knows that its conveyor is dead.
+/// Records the time until the line detects the loss of the conveyor.
 async fn learn(conveyor: &dyn Runs, mut killed: watch::Receiver<Option<i64>>, show: &Show) {
     let why = conveyor.lost().await;
     let now = wall_nanos();
@@ -629,13 +636,13 @@ const BASE: Who = Who("TurtleBot3", "36");
 /// The machine of the conveyor.
 const BELT_NODE: &str = "conveyor";
 const LDS_PORT: u16 = 4840;
-/// Which cover is carried when the conveyor dies.
+/// Number of the cover that is carried when the conveyor is killed.
 const STRIKES_AT: u32 = 3;
-/// How long the conveyor takes from one end to the other.
+/// Time that the conveyor takes to move a cover from its start to its end.
 const TRANSPORT_SECONDS: f64 = 3.0;
 const FOUND: Duration = Duration::from_secs(60);
 const WITHIN: Duration = Duration::from_secs(120);
-/// For what does not get faster with the story.
+/// Time for processes that do not speed up with the scenario.
 const SPARE: Duration = Duration::from_secs(10);
 const POLL: Duration = Duration::from_millis(20);
 const PASS: Duration = Duration::from_millis(20);

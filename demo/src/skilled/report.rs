@@ -1,4 +1,4 @@
-//! What a run of the story was like.
+//! The report of a run of the scenario.
 
 use std::fmt::Write as _;
 
@@ -6,48 +6,50 @@ use serde::Serialize;
 
 use crate::stage::{Hops, delays};
 
-/// All of it.
+/// The report.
 #[derive(Clone, Debug, Default, Serialize)]
 pub(super) struct Report {
     pub(super) finished: bool,
     pub(super) failure: Option<String>,
     pub(super) speed: f64,
     pub(super) covers: u32,
-    /// As the machines tell it, and not those that sent them.
+    /// As the machines report it, not their callers.
     pub(super) by_conveyor: u32,
     pub(super) by_turtlebot: u32,
-    /// Covers that were taken from the dead conveyor.
+    /// Number of covers that were taken back from the dead conveyor.
     pub(super) taken_back: u32,
-    /// From the start of the components until the skills of the line were found by their types.
+    /// Time from the start of the components until the skills of the line were found by their
+    /// types.
     pub(super) found_ms: Option<f64>,
-    /// From the signal that killed the conveyor until the line knew of it.
+    /// Time from the signal that killed the conveyor until the line detected the loss.
     pub(super) told_lost_ms: Option<f64>,
     pub(super) runs: Vec<Run>,
-    /// Of the values beside the skills, such as what an action feeds back.
+    /// Delays of the values beside the skills, such as the feedback of an action.
     pub(super) hops: Hops,
 }
 
-/// One run of a skill.
+/// A run of a skill.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Run {
-    /// As `line-handling.PickAndPlace`.
+    /// The skill, as `line-handling.PickAndPlace`.
     pub(super) skill: String,
-    /// What it was run for.
+    /// The purpose of the run.
     pub(super) what: String,
-    /// Empty where all went well.
+    /// Empty after a success.
     pub(super) message: String,
-    /// From the line's asking until a machine first did something for it: the arm grasps, the conveyor is switched, the robot sets out.
+    /// Time from the request of the line to the first action of a machine: the arm grasps, the
+    /// conveyor is switched or the robot departs.
     pub(super) acted_ms: Option<f64>,
-    /// From the line's asking until it knew the outcome.
+    /// Time from the request of the line to the outcome.
     pub(super) lasted_ms: f64,
 }
 
 impl Report {
-    /// As people read it.
+    /// Returns the table for people.
     pub(super) fn table(&self) -> String {
         let mut out = String::from("\n");
         let ms = |ms: Option<f64>| ms.map_or_else(|| "-".to_owned(), |ms| format!("{ms:.0} ms"));
-        // A write to a String cannot fail.
+        // Writing to a String cannot fail.
         _ = writeln!(
             out,
             "{:<28} {:<34} {:>12} {:>10}  outcome",

@@ -1,42 +1,44 @@
-//! The world of the line: where each cover is. It knows only what the machines did, not what anybody wanted of them, and so says
-//! whether the line has done its work.
+//! The world of the line: the location of each cover. It is derived from the actions of the
+//! machines, not from requests to them, so it proves whether the line has done its work.
 
 use std::time::Duration;
 
 use super::fact::MachineEvent;
 
-/// Where the covers lie that nobody has brought anywhere yet, in m and rad in the frame of the arm.
+/// Pose of the covers in the storage, in m and rad in the frame of the arm.
 pub(super) const STORAGE: [f64; 6] = [0.25, 0.2, 0.1, 0.0, 0.0, 0.0];
-/// Where the conveyor begins.
+/// Pose of the start of the conveyor.
 pub(super) const BELT: [f64; 6] = [0.25, -0.2, 0.1, 0.0, 0.0, 0.0];
-/// The bucket of the mobile robot when it stands at the park.
+/// Pose of the bucket of the mobile robot at the park.
 pub(super) const BUCKET: [f64; 6] = [-0.25, 0.0, 0.15, 0.0, 0.0, 0.0];
-/// Where the mobile robot is loaded: x and y in m and the heading, in the frame of the map.
+/// Pose of the mobile robot during loading: x and y in m and the heading, in the frame of the map.
 pub(super) const PARK: [f64; 3] = [0.0, 0.0, 0.0];
-/// Where the worker takes covers out of the bucket.
+/// Pose of the mobile robot at the worker.
 pub(super) const WORKER: [f64; 3] = [2.0, 1.0, 0.0];
 
-/// Where the covers are.
+/// The locations of the covers.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct World {
     in_storage: u32,
     is_held: bool,
     belt_runs: bool,
-    /// Nanoseconds from the belt's beginning to its end.
+    /// Nanoseconds that the belt takes to move a cover from its start to its end.
     transport: i64,
-    /// When each cover was placed on the belt; moved on by as long as it stood still since.
+    /// Time at which each cover was placed on the belt, shifted by the time for which the belt
+    /// stood still.
     on_belt: Vec<i64>,
     base_at_park: bool,
     in_bucket: u32,
     by_conveyor: u32,
     by_turtlebot: u32,
     taken_back: u32,
-    /// On the floor: released where nothing is.
+    /// Covers on the floor, released at a location without a support.
     fallen: u32,
 }
 
 impl World {
-    /// All covers in the storage, the conveyor still, the mobile robot at the park. `transport` is how long the conveyor takes.
+    /// Creates a world with all covers in the storage, the conveyor stopped and the mobile robot at
+    /// the park. `transport` is the time that the conveyor takes.
     pub(super) fn new(covers: u32, transport: Duration) -> Self {
         Self {
             in_storage: covers,
@@ -53,7 +55,7 @@ impl World {
         }
     }
 
-    /// Something has happened, at nanoseconds since 1970.
+    /// Processes an action of a machine at a time in nanoseconds since 1970.
     pub(super) fn see(&mut self, event: MachineEvent, at_ns: i64) {
         self.pass(at_ns);
         match event {
@@ -72,7 +74,7 @@ impl World {
         }
     }
 
-    /// The time goes on: what has come to the end of a running conveyor has arrived.
+    /// Lets time pass: covers at the end of a running conveyor arrive.
     pub(super) fn pass(&mut self, now_ns: i64) {
         if self.belt_runs {
             let transport = self.transport;
@@ -109,7 +111,7 @@ impl World {
         }
     }
 
-    /// Whether the arm has a cover in its gripper.
+    /// Returns whether the arm has a cover in its gripper.
     pub(super) const fn is_held(&self) -> bool {
         self.is_held
     }
@@ -122,7 +124,7 @@ impl World {
         self.by_turtlebot
     }
 
-    /// Covers that were taken from a conveyor that stood still.
+    /// Returns the number of covers that were taken from a stopped conveyor.
     pub(super) const fn taken_back(&self) -> u32 {
         self.taken_back
     }
@@ -131,12 +133,12 @@ impl World {
         self.by_conveyor + self.by_turtlebot
     }
 
-    /// How many have been picked from the storage.
+    /// Returns the number of covers in the storage.
     pub(super) const fn in_storage(&self) -> u32 {
         self.in_storage
     }
 
-    /// Where the covers are that have not arrived, for people.
+    /// Describes the locations of the covers that have not arrived, for people.
     pub(super) fn standing(&self) -> String {
         format!(
             "{} of the covers have arrived by conveyor and {} by TurtleBot3; {} are in the storage, {} in the gripper, {} on the \

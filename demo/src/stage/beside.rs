@@ -1,11 +1,12 @@
-//! What is there before anything starts: programs beside this one, and free ports.
+//! Preconditions of a scenario: the other programs in the directory, and free ports.
 
 use std::net::{Ipv4Addr, TcpListener};
 use std::path::PathBuf;
 
 use super::Failure;
 
-/// This program, and others in the same directory, in the order of their names.
+/// Returns the paths of this program and of other programs in the same directory, in the order of
+/// their names.
 pub(crate) fn find<const N: usize>(names: [&str; N]) -> Result<(PathBuf, [PathBuf; N]), Failure> {
     let demo = std::env::current_exe().map_err(Failure::io("the demo cannot find itself"))?;
     let suffix = std::env::consts::EXE_SUFFIX;
@@ -22,14 +23,14 @@ pub(crate) fn find<const N: usize>(names: [&str; N]) -> Result<(PathBuf, [PathBu
     }
 }
 
-/// Finds out whether a port is free where it can still be said in one line.
+/// Checks that a port is free, before the program that needs it fails with a longer message.
 pub(crate) fn must_be_free(port: u16, program: &'static str) -> Result<(), Failure> {
     TcpListener::bind((Ipv4Addr::LOCALHOST, port))
         .map(drop)
         .map_err(|_| Failure::PortTaken { port, program })
 }
 
-/// A port that nobody listens on now.
+/// Returns a port that is free at this moment.
 pub(crate) fn free_port() -> Result<u16, Failure> {
     let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0));
     let address = listener.and_then(|listener| listener.local_addr());

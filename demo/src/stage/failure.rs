@@ -1,4 +1,4 @@
-//! Why a scenario did not come to its end.
+//! The reasons why a scenario fails.
 
 use std::io;
 use std::path::PathBuf;
@@ -6,7 +6,7 @@ use std::process::ExitStatus;
 
 use thiserror::Error;
 
-/// What went wrong, and what to do about it.
+/// The error, with a hint for its solution.
 #[derive(Debug, Error)]
 pub(crate) enum Failure {
     #[error(
@@ -56,12 +56,13 @@ pub(crate) enum Failure {
 }
 
 impl Failure {
-    /// For `map_err` on IO.
+    /// Returns a converter for `map_err` of IO errors.
     pub(crate) fn io(what: &'static str) -> impl FnOnce(io::Error) -> Self {
         move |source| Self::Io { what, source }
     }
 
-    /// The exit code of `sysexits.h` that says whose it is to mend; 1 for a story that did not finish.
+    /// Returns the exit code of `sysexits.h` for the kind of error; 1 for a scenario that did not
+    /// finish.
     pub(crate) const fn exit_code(&self) -> u8 {
         match self {
             Self::Missing(_) | Self::PortTaken { .. } => 69,

@@ -1,4 +1,4 @@
-//! The delays that the bridges have measured, and how delays are shown.
+//! The delays measured by the bridges, and their table.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -7,13 +7,14 @@ use serde::{Deserialize, Serialize};
 
 use super::pages::{PageError, fetch};
 
-/// Of a bridge's status page, the delays per hop by its own names: `out`, `origin`, `network`, `in`.
+/// The part of a bridge's status page with the delays per hop, by the names of the bridge: `out`,
+/// `origin`, `network`, `in`.
 #[derive(Debug, Default, Deserialize)]
 pub(crate) struct Status {
     pub(crate) hops: BTreeMap<String, Hop>,
 }
 
-/// The delays of one hop as the bridges give them out.
+/// The delays of a hop, as measured by a bridge.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Hop {
     pub(crate) p50_us: f64,
@@ -22,7 +23,7 @@ pub(crate) struct Hop {
     pub(crate) count: u64,
 }
 
-/// The hops of the paper that lie between robots of both ROS. `None` where a bridge did not answer.
+/// The hops of the paper between robots of ROS 1 and ROS 2. `None` if a bridge did not respond.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub(crate) struct Hops {
     /// In the ROS 1 bridge.
@@ -37,7 +38,7 @@ pub(crate) struct Hops {
 }
 
 impl Hops {
-    /// Asks both bridges at their pages; beside the hops what they are without, for people.
+    /// Reads the status pages of both bridges. Returns the hops and the errors, as text for people.
     pub(crate) async fn ask([ros1, ros2]: [u16; 2]) -> (Self, Vec<String>) {
         let (ros1, ros2) = tokio::join!(fetch::<Status>(ros1), fetch::<Status>(ros2));
         let (mut hops, mut missing) = (Self::default(), Vec::new());
@@ -60,11 +61,11 @@ impl Hops {
 }
 
 impl Hop {
-    /// Over a few delays in nanoseconds; `None` when there are none.
+    /// Calculates the statistics of delays in nanoseconds; `None` if there are no delays.
     pub(crate) fn of(nanos: &[i64]) -> Option<Self> {
         let mut sorted = nanos.to_vec();
         sorted.sort_unstable();
-        // The smallest delay that `percent` of all do not exceed.
+        // The smallest delay that at least `percent` of all delays do not exceed.
         let quantile = |percent: usize| {
             let rank = (sorted.len() * percent).div_ceil(100);
             sorted.get(rank.saturating_sub(1)).copied().map(micros)
@@ -78,7 +79,7 @@ impl Hop {
     }
 }
 
-/// A table of delays: what, how long, and what the paper says of it.
+/// Formats a table of delays: label, measured values and the value of the paper.
 pub(crate) fn delays(rows: &[(&str, Option<Hop>, &str)]) -> String {
     let mut text = String::new();
     row(&mut text, "delay", ["p50", "p99", "max", "count"], "paper");
@@ -102,7 +103,7 @@ pub(crate) fn delays(rows: &[(&str, Option<Hop>, &str)]) -> String {
 
 fn row(text: &mut String, label: &str, cells: [&str; 4], paper: &str) {
     let [p50, p99, max, count] = cells;
-    // Writing to a string does not fail.
+    // Writing to a String cannot fail.
     let _written = writeln!(
         text,
         "{label:<36} {p50:>9} {p99:>9} {max:>9} {count:>6}   {paper}"

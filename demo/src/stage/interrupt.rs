@@ -1,10 +1,10 @@
-//! Ctrl-C of who runs the demo.
+//! Ctrl-C and SIGTERM.
 
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
 use super::Failure;
 
-/// Waits for the wish to end it.
+/// Waits for a signal to stop the demo.
 pub(crate) struct Interrupt {
     interrupt: Signal,
     terminate: Signal,
@@ -23,7 +23,7 @@ impl Interrupt {
         })
     }
 
-    /// Returns when it comes. Cancel-safe.
+    /// Returns when a signal arrives. Cancel-safe.
     pub(crate) async fn come(&mut self) {
         tokio::select! {
             _ = self.interrupt.recv() => {}

@@ -1,4 +1,4 @@
-//! What every scenario of the demo stands on: child processes, the timeline, the pages of programs, and Ctrl-C.
+//! Shared parts of the scenarios: child processes, the timeline, status pages, and Ctrl-C.
 
 mod beside;
 mod failure;
@@ -16,5 +16,5 @@ pub(crate) use pages::fetch;
 pub(crate) use programs::{Program, Programs, Report, Stage, command};
 pub(crate) use timeline::{Timeline, Who};
 
-/// The interface of the PubSub group, by address, because its name is not the same everywhere.
+/// The interface of the PubSub group, by address, because its name differs between systems.
 pub(crate) const LOOPBACK: &str = "127.0.0.1";

@@ -1,4 +1,4 @@
-//! What programs say of themselves over HTTP.
+//! Reads status pages of programs over HTTP.
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::time::Duration;
@@ -13,7 +13,7 @@ use thiserror::Error;
 use tokio::net::TcpStream;
 use tokio::time::timeout;
 
-/// Asks a program on this host for its status page.
+/// Reads the status page of a program on this host.
 pub(crate) async fn fetch<T: DeserializeOwned>(port: u16) -> Result<T, PageError> {
     timeout(LIMIT, request(port))
         .await
@@ -46,12 +46,13 @@ async fn request<T: DeserializeOwned>(port: u16) -> Result<T, PageError> {
     tokio::select! {
         biased;
         answer = &mut answer => answer,
-        // The connection is done when the last byte is read; the answer may not be.
+        // The connection ends when the last byte is read, possibly before the response is
+        // processed.
         ended = &mut connection => { ended?; answer.await }
     }
 }
 
-/// Why there is no page.
+/// The reason why a page is not available.
 #[derive(Debug, Error)]
 pub(crate) enum PageError {
     #[error("nobody listens there: {0}")]

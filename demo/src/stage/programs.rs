@@ -1,4 +1,4 @@
-//! The child processes: started, listened to, and ended in order.
+//! Child processes: starts them, reads their events, and stops them in order.
 
 use std::fs::{self, File};
 use std::io;
@@ -18,11 +18,11 @@ use super::failure::Failure;
 use crate::clock::wall_nanos;
 use crate::event::Stamped;
 
-/// What comes from the children.
+/// A report of a child process.
 #[derive(Debug)]
 pub(crate) enum Report {
     Told(Stamped),
-    /// A line that is no event.
+    /// A line that is not an event.
     Garbled {
         name: &'static str,
         line: String,
@@ -31,28 +31,29 @@ pub(crate) enum Report {
         name: &'static str,
         status: ExitStatus,
     },
-    /// It was killed, as was asked for; the time is that of the signal.
+    /// The process was killed on request; the time is the time of the signal.
     Killed {
         name: &'static str,
         at_ns: i64,
     },
 }
 
-/// One program to start.
+/// A program to start.
 pub(crate) struct Program {
     pub(crate) name: &'static str,
     pub(crate) path: PathBuf,
     pub(crate) arguments: Vec<String>,
     pub(crate) environment: Vec<(&'static str, String)>,
-    /// It tells events on its standard output; else that goes into its log.
+    /// Whether it prints events on its standard output; otherwise the output goes to its log.
     pub(crate) tells: bool,
-    /// It is told things on its standard input; else that is closed.
+    /// Whether its standard input is used; otherwise it is closed.
     pub(crate) hears: bool,
-    /// When it is to end.
+    /// The stage in which it ends.
     pub(crate) stage: Stage,
 }
 
-/// The order in which programs end: each needs those of the later stages to say goodbye.
+/// The order in which programs end. Each program needs the programs of later stages for its
+/// shutdown.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum Stage {
     Robots,
@@ -69,7 +70,7 @@ struct Running {
     stdin: Option<ChildStdin>,
 }
 
-/// The running programs. Dropping it kills what still runs.
+/// The running programs. Dropping this value kills them.
 pub(crate) struct Programs {
     directory: PathBuf,
     reports: mpsc::Sender<Report>,
@@ -79,10 +80,10 @@ pub(crate) struct Programs {
 }
 
 impl Programs {
-    /// Makes the directory for logs and the receiver of the reports. When nobody takes reports, children wait with
-    /// telling them.
+    /// Creates the directory for logs, and the receiver of the reports. If reports are not
+    /// received, the children block on sending them.
     pub(crate) fn prepare() -> io::Result<(Self, mpsc::Receiver<Report>)> {
-        // Process ids come again; logs of a run that failed stay.
+        // Process identifiers are reused, and the logs of failed runs are kept.
         let name = format!(
             "ua-bridge-demo-{}-{}",
             wall_nanos() / 1_000_000,
@@ -104,12 +105,12 @@ impl Programs {
         ))
     }
 
-    /// Where logs are, and room for what the programs need.
+    /// Returns the directory for logs and for the input files of the programs.
     pub(crate) fn directory(&self) -> &Path {
         &self.directory
     }
 
-    /// Starts a program. Returns when that was, in nanoseconds since 1970.
+    /// Starts a program. Returns the time of the start, in nanoseconds since 1970.
     pub(crate) fn start(&mut self, program: Program) -> Result<i64, Failure> {
         let log =
             File::create(self.log(program.name)).map_err(Failure::io("cannot write a log"))?;
@@ -158,14 +159,15 @@ impl Programs {
         Ok(started)
     }
 
-    /// SIGKILL to a program, as when its power goes. [`Report::Killed`] says when it was; nothing if it has ended.
+    /// Sends SIGKILL to a program, as in a power failure. [`Report::Killed`] contains the time.
+    /// Does nothing if the program has ended.
     pub(crate) fn kill(&self, name: &str) {
         for running in self.running.iter().filter(|running| running.name == name) {
             running.kill.notify_one();
         }
     }
 
-    /// Writes a line to the standard input of a program that hears.
+    /// Writes a line to the standard input of a program, if it is used.
     pub(crate) async fn tell(&mut self, name: &str, line: &str) -> io::Result<()> {
         let mut running = self.running.iter_mut();
         let stdin = running
@@ -177,7 +179,7 @@ impl Programs {
         stdin.flush().await
     }
 
-    /// Ends all programs, in order; each has [`GRACE`] from SIGTERM to SIGKILL.
+    /// Stops all programs in order. Each has [`GRACE`] from SIGTERM to SIGKILL.
     pub(crate) async fn end(&mut self) {
         for stage in [
             Stage::Robots,
@@ -192,11 +194,11 @@ impl Programs {
             }
         }
         self.running.clear();
-        // What a child has started may still hold its standard output open.
+        // Processes started by a child may still hold its standard output open.
         self.listeners.shutdown().await;
     }
 
-    /// The last lines of a program's log.
+    /// Returns the last lines of a program's log.
     pub(crate) fn last_lines(&self, name: &str) -> String {
         let log = fs::read(self.log(name)).unwrap_or_default();
         let text = String::from_utf8_lossy(&log);
@@ -217,7 +219,8 @@ impl Programs {
     }
 }
 
-/// A program that is to be ended by us alone, without the environment of this terminal's ROS and OPC UA.
+/// Returns the command of a program that is independent of the terminal's signals and of its
+/// environment variables for ROS and OPC UA.
 pub(crate) fn command(path: &Path) -> Command {
     let mut command = Command::new(path);
     for (key, _) in std::env::vars_os() {
@@ -228,12 +231,12 @@ pub(crate) fn command(path: &Path) -> Command {
             command.env_remove(key);
         }
     }
-    // Ctrl-C is for the demo, which then ends them in order.
+    // Ctrl-C is handled by the demo, which stops the programs in order.
     command.process_group(0).kill_on_drop(true);
     command
 }
 
-/// Passes on what a child tells, until it closes its standard output.
+/// Forwards the events of a child until it closes its standard output.
 async fn listen(name: &'static str, stdout: ChildStdout, reports: mpsc::Sender<Report>) {
     let mut lines = BufReader::new(stdout).lines();
     while let Ok(Some(line)) = lines.next_line().await {
@@ -247,7 +250,7 @@ async fn listen(name: &'static str, stdout: ChildStdout, reports: mpsc::Sender<R
     }
 }
 
-/// Waits for a child to end, by itself or because its stage has come.
+/// Waits for the end of a child, by itself or in its stage.
 async fn attend(
     name: &'static str,
     mut child: Child,
@@ -263,7 +266,7 @@ async fn attend(
     tokio::select! {
         status = child.wait() => {
             if let Ok(status) = status {
-                // When nobody listens, nobody wonders.
+                // If the receiver is closed, the scenario has ended.
                 reports.send(Report::Ended { name, status }).await.ok();
             }
         }
@@ -276,13 +279,14 @@ async fn attend(
         _ = ended => {
             terminate(&mut child);
             if timeout(GRACE, child.wait()).await.is_err() && child.kill().await.is_err() {
-                // It ended just now.
+                // The child has ended in between.
             }
         }
     }
 }
 
-/// SIGTERM to a child that has not been waited for, so that its process id is its own.
+/// Sends SIGTERM to a child that has not been waited for, so its process identifier has not been
+/// reused.
 fn terminate(child: &mut Child) {
     let pid = child
         .id()
@@ -295,7 +299,7 @@ fn terminate(child: &mut Child) {
     }
 }
 
-/// How long a program may take to end.
+/// Time that a program has to end.
 const GRACE: Duration = Duration::from_secs(3);
 const LAST_LINES: usize = 15;
 

@@ -1,15 +1,16 @@
-//! The timeline: a line per event, in the order in which things happened.
+//! The timeline: a line for each event, in chronological order.
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 use std::io::{self, IsTerminal as _, Write};
 
-/// Prints events. Those of several processes are held back for a moment, to be put in order.
+/// Prints events. Events are delayed for a short time, so that events of different processes can be
+/// sorted.
 pub(crate) struct Timeline {
     out: Box<dyn Write>,
     colour: bool,
     held: BinaryHeap<Reverse<Entry>>,
-    /// Keeps events of one instant in the order of their reading.
+    /// Keeps events with the same timestamp in the order of their arrival.
     number: u64,
 }
 
@@ -21,7 +22,7 @@ struct Entry {
     what: String,
 }
 
-/// Whose event it is: the name, and its colour as a code of SGR.
+/// The source of an event: its name, and its colour as a code of SGR.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) struct Who(pub(crate) &'static str, pub(crate) &'static str);
 
@@ -30,7 +31,7 @@ impl Who {
 }
 
 impl Timeline {
-    /// On standard output, or on standard error when that is for JSON.
+    /// Prints to standard output, or to standard error if standard output is used for JSON.
     pub(crate) fn open(json: bool) -> Self {
         let (out, terminal): (Box<dyn Write>, bool) = if json {
             (Box::new(io::stderr()), io::stderr().is_terminal())
@@ -46,7 +47,7 @@ impl Timeline {
         }
     }
 
-    /// Takes a line.
+    /// Adds a line.
     pub(crate) fn note(&mut self, at_ns: i64, who: Who, what: String) {
         self.number += 1;
         self.held.push(Reverse(Entry {
@@ -57,18 +58,18 @@ impl Timeline {
         }));
     }
 
-    /// Prints what is older than the moment for which events are held back.
-    /// `seconds` says which second of the story a moment is.
+    /// Prints the events that are older than the delay. `seconds` converts a time to seconds of the
+    /// scenario.
     pub(crate) fn print_before(&mut self, now_ns: i64, seconds: Seconds<'_>) -> io::Result<()> {
         self.print_while(seconds, |entry| entry.at_ns + HELD_NS <= now_ns)
     }
 
-    /// Prints all there is.
+    /// Prints all events.
     pub(crate) fn print_all(&mut self, seconds: Seconds<'_>) -> io::Result<()> {
         self.print_while(seconds, |_| true)
     }
 
-    /// Prints text as it is.
+    /// Prints text unchanged.
     pub(crate) fn print_text(&mut self, text: &str) -> io::Result<()> {
         self.out.write_all(text.as_bytes())?;
         self.out.flush()
@@ -92,12 +93,12 @@ impl Timeline {
     }
 }
 
-/// The second of the story that a moment is, in nanoseconds since 1970; `None` before it began.
+/// Converts nanoseconds since 1970 to seconds of the scenario; `None` before its start.
 pub(crate) type Seconds<'a> = &'a dyn Fn(i64) -> Option<f64>;
 
 fn line(entry: &Entry, seconds: Seconds<'_>, colour: bool) -> String {
     let time = match seconds(entry.at_ns) {
-        // What led to the start was before it.
+        // Events before the start have no time.
         Some(seconds) if seconds >= 0.0 => format!("{seconds:>9.3}"),
         Some(_) | None => format!("{:>9}", "-"),
     };
@@ -112,7 +113,7 @@ fn line(entry: &Entry, seconds: Seconds<'_>, colour: bool) -> String {
     }
 }
 
-/// How long events wait for those that happened before them: several times what a child takes to tell.
+/// Delay of events, several times the time that a child takes to report an event.
 const HELD_NS: i64 = 200_000_000;
 
 #[cfg(test)]

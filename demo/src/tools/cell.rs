@@ -1,4 +1,5 @@
-//! The cell of the story: the simulators of the devices and the components before them, at the addresses of the examples.
+//! The cell of the scenario: the simulators of the devices and their components, at the addresses
+//! of the examples.
 
 use std::fs;
 use std::io;
@@ -6,7 +7,7 @@ use std::path::Path;
 
 use crate::pace::Speed;
 
-/// A component: the name it is told by, its YAML, where clients connect.
+/// A component: its name, its ApplicationUri, its YAML and the port of its endpoint.
 pub(super) struct Part {
     pub(super) name: &'static str,
     pub(super) uri: &'static str,
@@ -14,7 +15,7 @@ pub(super) struct Part {
     pub(super) port: Option<u16>,
 }
 
-/// The components. The last is a second robot, which has nothing to do.
+/// The components. The last is a second robot, which is not used.
 pub(super) const PARTS: [Part; 6] = [
     Part {
         name: "ur5",
@@ -59,14 +60,14 @@ pub(super) const VACUUM: &str = "schmalz-ecbpi";
 pub(super) const CHANGER: &str = "tool-changer";
 pub(super) const HANDLING: &str = "handling";
 
-/// Where the simulators listen: RTDE, secondary interface, gripper, IO-Link master, converter.
+/// The ports of the simulators: RTDE, secondary interface, gripper, IO-Link master, converter.
 pub(super) const DEVICE_PORTS: [u16; 5] = [30_004, 30_002, 1502, 8090, 1503];
 const DOCKS: [[f64; 6]; 2] = [
     [0.3, 0.35, 0.2, 0.0, 0.0, 0.0],
     [-0.3, 0.35, 0.2, 0.0, 0.0, 0.0],
 ];
 
-/// Where the dock of a tool is: of the fingers, or of the vacuum.
+/// Returns the pose of the dock of a tool, the fingers or the vacuum gripper.
 pub(super) fn dock(tool: &str, swapped: bool) -> [f64; 6] {
     let [first, second] = DOCKS;
     if (tool == FINGERS) == swapped {
@@ -76,7 +77,8 @@ pub(super) fn dock(tool: &str, swapped: bool) -> [f64; 6] {
     }
 }
 
-/// Writes the YAML of the components into a directory: with the tools in each other's docks if they are swapped.
+/// Writes the YAML of the components into a directory. If `swapped`, each tool is in the other
+/// tool's dock.
 ///
 /// # Errors
 /// A file cannot be written.
@@ -100,7 +102,7 @@ pub(super) fn write(directory: &Path, speed: Speed, swapped: bool) -> io::Result
     Ok(())
 }
 
-/// The simulators: what each is called, and its arguments after `simulate`.
+/// Returns the simulators: the name of each, and its arguments after `simulate`.
 pub(super) fn simulators(speed: Speed) -> [(&'static str, Vec<String>); 4] {
     let speed = ["--speed".to_owned(), speed.factor().to_string()];
     let of = |device: &str, more: &[String]| {

@@ -1,8 +1,15 @@
-//! Tools are changed: a robot takes its fingers, brings a part from one place to another, changes to vacuum, brings it back,
-//! and puts the tool away. On the way a gripper is killed and plugged in again.
+//! Tool change: a robot takes its fingers and moves a part to another place. Then it changes to the
+//! vacuum gripper, moves the part back, and puts the tool away. A gripper is killed during a move
+//! and plugged in again.
 //!
-//! All programs are those that people run; the devices are simulated behind the protocols of their makers.
-//! Reading order: this (what happens), `cell` (who is there), `report`.
+//! All programs are the released programs; the devices are simulated behind the protocols of their
+//! vendors.
+//!
+//! Reading order:
+//!
+//! - this module: the events of the scenario
+//! - `cell`: the components
+//! - `report`: the report
 
 mod cell;
 mod report;
@@ -27,16 +34,16 @@ use crate::stage::{
     find, free_port, must_be_free,
 };
 
-/// What the story is to be.
+/// The options of the scenario.
 #[derive(Clone, Debug)]
 pub(crate) struct Plan {
     pub(crate) speed: Speed,
     pub(crate) json: bool,
-    /// The tools are in each other's docks.
+    /// Whether each tool is in the other tool's dock.
     pub(crate) swapped: bool,
 }
 
-/// Plays the story and prints it. Returns the exit code.
+/// Plays the scenario and prints it. Returns the exit code.
 pub(crate) async fn play(plan: Plan) -> u8 {
     let mut show = Show {
         timeline: Timeline::open(plan.json),
@@ -53,13 +60,13 @@ pub(crate) async fn play(plan: Plan) -> u8 {
     let printed = show.conclude(plan.json);
     match (outcome, printed) {
         (Err(failure), _) => failure.exit_code(),
-        // Nobody reads any more, as with `| head`.
+        // Standard output is closed, for example by `| head`.
         (Ok(()), Err(_)) => 74,
         (Ok(()), Ok(())) => 0,
     }
 }
 
-/// What people see.
+/// The printed output.
 struct Show {
     timeline: Timeline,
     report: Report,
@@ -118,7 +125,7 @@ async fn perform(plan: &Plan, show: &mut Show) -> Result<(), Failure> {
     reports.close();
     let outcome = played.map_err(|stop| story.failure(stop));
     story.programs.end().await;
-    // The logs are for those who wonder what went wrong.
+    // The logs are kept after a failure.
     if matches!(outcome, Ok(()) | Err(Failure::Interrupted { .. }))
         && let Err(error) = story.programs.clean_up()
     {
@@ -127,7 +134,7 @@ async fn perform(plan: &Plan, show: &mut Show) -> Result<(), Failure> {
     outcome
 }
 
-/// Why the story stops.
+/// The reason why the scenario stops.
 enum Stop {
     Failed(Failure),
     Broken(String),
@@ -141,13 +148,13 @@ impl From<Failure> for Stop {
     }
 }
 
-/// The first program that ends without being told to.
+/// Returns the first program that ends unexpectedly.
 async fn unexpected(reports: &mut mpsc::Receiver<Told>) -> (&'static str, ExitStatus) {
     loop {
         match reports.recv().await {
             Some(Told::Ended { name, status }) => return (name, status),
             Some(Told::Killed { .. } | Told::Told(_) | Told::Garbled { .. }) => {}
-            // The programs hold a sender, so it does not end before them.
+            // The programs hold a sender, so the channel does not close before them.
             None => std::future::pending().await,
         }
     }
@@ -158,7 +165,7 @@ struct Story<'a> {
     lds: PathBuf,
     component: PathBuf,
     programs: Programs,
-    /// Where the discovery server shows its page.
+    /// The port of the status page of the discovery server.
     page: u16,
     show: &'a mut Show,
 }
@@ -247,7 +254,7 @@ impl Story<'_> {
         Ok(())
     }
 
-    /// Waits until a component is registered.
+    /// Waits until a component is registered, and its skills are available if its port is known.
     async fn found(&mut self, part: &Part, began: Instant) -> Result<(), Stop> {
         loop {
             let page: Json = fetch(self.page).await.unwrap_or_default();
@@ -282,7 +289,7 @@ impl Story<'_> {
         skills
     }
 
-    /// Two robots are there, and the story is about one of them.
+    /// Counts the robots in the cell. The scenario uses one of two.
     async fn count_robots(&mut self) -> Result<(), Stop> {
         let page: Json = fetch(self.page)
             .await
@@ -317,7 +324,7 @@ impl Story<'_> {
         must(&run)
     }
 
-    /// The vacuum gripper is killed while the robot carries the part, and plugged in again.
+    /// Kills the vacuum gripper while the robot carries the part, and starts it again.
     async fn lose_and_plug_in(&mut self) -> Result<(), Stop> {
         let client = connect_to(HANDLING).await?;
         let handle = handle_of(&client, "PlaceByVacuum").await?;
@@ -443,12 +450,12 @@ impl Story<'_> {
     }
 }
 
-/// The steps of a run that were seen.
+/// The observed steps of a run.
 #[derive(Default)]
 struct Steps(Vec<String>);
 
 impl Steps {
-    /// Looks at what the run is about now. A look that gets no answer has seen nothing.
+    /// Reads the current step of the run. A failed read is ignored.
     async fn look(&mut self, handle: &SkillHandle) {
         if let Ok(Ok(state)) = timeout(LOOKS, handle.state()).await
             && !state.step.is_empty()

@@ -1,46 +1,47 @@
-//! What a run of the story was like.
+//! The report of a run of the scenario.
 
 use std::fmt::Write as _;
 
 use serde::Serialize;
 
-/// All of it.
+/// The report.
 #[derive(Clone, Debug, Default, Serialize)]
 pub(super) struct Report {
     pub(super) finished: bool,
     pub(super) failure: Option<String>,
     pub(super) speed: f64,
     pub(super) swapped: bool,
-    /// How many robots there are in the cell.
+    /// Number of robots in the cell.
     pub(super) robots: usize,
-    /// From the start of the components until all of their skills were found.
+    /// Time from the start of the components until all their skills were found.
     pub(super) found_ms: Option<f64>,
     pub(super) runs: Vec<Run>,
-    /// From the signal that killed a component: until the run said so, and until it was found again after its start.
+    /// Time from the signal that killed a component until the run reported it, and until the
+    /// component was found again after its restart.
     pub(super) told_lost_ms: Option<f64>,
     pub(super) found_again_ms: Option<f64>,
 }
 
-/// One run of a skill.
+/// A run of a skill.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Run {
-    /// As `tool-changer.ChangeTool`.
+    /// The skill, as `tool-changer.ChangeTool`.
     pub(super) skill: String,
-    /// What it was run for.
+    /// The purpose of the run.
     pub(super) what: String,
     pub(super) succeeded: bool,
     pub(super) message: String,
     pub(super) lasted_ms: f64,
-    /// Those that were seen, in their order.
+    /// The observed steps, in order.
     pub(super) steps: Vec<String>,
 }
 
 impl Report {
-    /// As people read it.
+    /// Returns the table for people.
     pub(super) fn table(&self) -> String {
         let mut out = String::from("\n");
         let ms = |ms: Option<f64>| ms.map_or_else(|| "-".to_owned(), |ms| format!("{ms:.0} ms"));
-        // A write to a String cannot fail.
+        // Writing to a String cannot fail.
         _ = writeln!(
             out,
             "{:<28} {:<28} {:>9}  outcome",

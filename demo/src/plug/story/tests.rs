@@ -1,7 +1,7 @@
 use super::super::fact::{Plan, Ran};
 use super::*;
 
-/// A story that has come to an act.
+/// Returns a story in this act.
 fn at(act: Act) -> Story {
     let mut story = Story::new();
     while story.act() != act {
@@ -57,7 +57,7 @@ fn a_component_is_plugged_in_when_it_is_known_everywhere() {
             "{lacks:?}"
         );
         story.observe(1, &Fact::Reached(Part::Robot, level));
-        // What another component reaches is nothing to it.
+        // Facts about another component do not count.
         story.observe(1, &Fact::Reached(Part::Vacuum, level));
     }
     assert_eq!(story.missing(), Ok(Vec::new()));
@@ -182,7 +182,7 @@ fn a_second_run_that_is_over_too_early_is_a_failure() {
 fn who_died_has_to_be_missing_everywhere_and_the_robot_away() {
     let mut story = at(Act::SecondRun);
     let left = |level| Fact::Left(Part::Gripper, level);
-    // Nobody is lost before the signal.
+    // No component is lost before the signal.
     sees(&mut story, [(1, left(Level::Registered))]);
     assert!(story.left.is_empty());
     story.advance();
