@@ -325,7 +325,7 @@ impl Story {
         Ok(lacks)
     }
 
-    /// Returns the missing conditions for the success of a run with this number of plans.
+    /// Returns the missing conditions for the success of a run with at least this number of plans.
     fn run_lacks(&self, number: usize, plans: usize) -> Result<Vec<String>, String> {
         let Some(run) = self.runs.get(&number) else {
             return match self.calls.get(&number) {

@@ -525,7 +525,7 @@ impl Actor {
         self.pends(why);
     }
 
-    /// Returns `None` if no Halt is in progress, otherwise whether the next Halt ends the run with
+    /// Returns `None` if the run is not being stopped, otherwise whether the next Halt ends it with
     /// an unknown outcome.
     fn is_halting(&self) -> Option<bool> {
         let work = self.work.as_ref()?;

@@ -126,7 +126,7 @@ type Step<'s> = (
 enum Fault {
     /// Halt: everything stops where it is.
     Stopped(String),
-    /// The robot is lost, so it cannot retreat, or its movement is unknown.
+    /// The robot is lost or cannot be halted, or its movement is unknown, so it cannot retreat.
     RobotLost(String),
     Other(String),
 }

@@ -186,7 +186,8 @@ impl ComponentServer {
         self.server.start();
     }
 
-    /// Halts running skills, closes all connections and stops listening. Takes at most 4 s.
+    /// Halts running skills, closes all connections and stops listening. Takes at most 4 s, or 8 s
+    /// while work that is done elsewhere is being cancelled.
     pub async fn stop(mut self) {
         self.tasks.abort_all();
         let closing = self.skills.iter().map(Skill::close);

@@ -11,7 +11,7 @@ struct Fakes {
     offers: Mutex<Vec<Offer>>,
     changed: watch::Sender<u64>,
     lost: watch::Sender<Vec<String>>,
-    /// A skill that loses its component when it is run, and a skill that fails.
+    /// The skill that loses its component when it is run.
     dies_at: Mutex<Option<&'static str>>,
     fails_at: Option<&'static str>,
     /// A skill that runs until it is halted, because the gripper is lost meanwhile.

@@ -16,7 +16,7 @@ const ME: Owner = Owner::Session(1);
 const OTHER: Owner = Owner::Session(2);
 const HALT_TIMEOUT: Duration = Duration::from_secs(10);
 
-/// A driver that behaves as `how` defines, once per permit of `gate`.
+/// A driver that behaves as `how` defines. A permit of `gate` lets waiting work end.
 struct Scripted {
     how: How,
     gate: Arc<Semaphore>,
