@@ -141,7 +141,7 @@ impl Program {
     /// Reports the end of the work of a run and returns the resulting transition.
     ///
     /// # Errors
-    /// [`NotRunning`] for any run except the current one, and for the success of a suspended run,
+    /// [`NotRunning`] for any run except the current run, and for the success of a suspended run,
     /// because suspended work cannot finish.
     pub fn ended(&mut self, run: RunId, ending: Ending) -> Result<&'static Transition, NotRunning> {
         let transition = match self.run == Some(run) {

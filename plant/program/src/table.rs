@@ -138,7 +138,7 @@ pub enum Cause {
     MethodOrWork(Method),
 }
 
-/// One of the nine transitions (OPC 10000-10, 5.2.3.1).
+/// A transition of ProgramStateMachineType, which has nine (OPC 10000-10, 5.2.3.1).
 #[derive(Debug, PartialEq, Eq)]
 pub struct Transition {
     /// The TransitionNumber, 1 to 9.
