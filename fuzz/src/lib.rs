@@ -18,7 +18,7 @@ mod nodeset;
 mod reader_state;
 mod registry;
 mod secured;
-#[path = "../../messages/tests/support/mod.rs"]
+#[path = "../../ros/messages/tests/support/mod.rs"]
 mod tape;
 
 pub use self::registry::registry;

@@ -64,7 +64,7 @@ pub(crate) fn messages(workspace: &Workspace, arguments: &[&str]) -> anyhow::Res
             (PathBuf::from("/usr/bin/python3"), "genpy"),
             (peers::python(workspace), "rosbags"),
         ] {
-            let script = workspace.root.join("messages/bench/serializers.py");
+            let script = workspace.root.join("ros/messages/bench/serializers.py");
             let mut measured = Command::new(&python)
                 .arg(script)
                 .arg(library)

@@ -25,8 +25,8 @@ const FURTHER: [&[&str]; 6] = [
 ];
 /// Sources of the metrics: the file, the text before the name of a metric, and the end of the name.
 const METRICS: [(&str, &str, &str); 3] = [
-    ("bridge-node/src/status.rs", "line(", ""),
-    ("bridge-node/src/mapping_file.rs", "(", "_total"),
+    ("space/bridge-node/src/status.rs", "line(", ""),
+    ("space/bridge-node/src/mapping_file.rs", "(", "_total"),
     ("plant/discovery/src/lds.rs", "(", "_total"),
 ];
 

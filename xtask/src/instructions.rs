@@ -105,7 +105,7 @@ struct List {
 impl List {
     fn of(workspace: &Workspace, of: &str) -> Self {
         Self {
-            path: workspace.root.join(of).join("bench/instructions.txt"),
+            path: workspace.folder(of).join("bench/instructions.txt"),
             of: of.to_owned(),
         }
     }

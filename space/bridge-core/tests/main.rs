@@ -9,10 +9,10 @@
 )]
 
 mod cell;
-#[path = "../../messages/tests/support/inventor.rs"]
+#[path = "../../../ros/messages/tests/support/inventor.rs"]
 #[expect(dead_code, reason = "the tests of `messages` use the rest")]
 mod inventor;
-#[path = "../../messages/tests/support/mod.rs"]
+#[path = "../../../ros/messages/tests/support/mod.rs"]
 #[expect(dead_code, reason = "the tests of `messages` use the rest")]
 mod support;
 

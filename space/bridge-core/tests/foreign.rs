@@ -128,7 +128,7 @@ impl Bench {
 
 /// Where the datagrams of other makers are.
 fn vectors() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("../uadp/tests/vectors")
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../../uadp/tests/vectors")
 }
 
 /// A captured datagram, with PublisherId 2 in place of the 2234 that is none of the space.

@@ -502,7 +502,7 @@ fn an_action_of_ros_2_has_its_status_before_its_result() {
 /// `ros/ua_msgs` is the package of these types for nodes of users.
 #[test]
 fn the_package_people_build_has_the_skill_messages_that_are_built_in() {
-    let folder = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../ros/ua_msgs");
+    let folder = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../ros/ua_msgs");
     let cmake = std::fs::read_to_string(folder.join("CMakeLists.txt")).unwrap();
     for dialect in [Dialect::Ros1, Dialect::Ros2] {
         let built_in = Registry::bundle(dialect);

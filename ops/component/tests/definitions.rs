@@ -54,7 +54,7 @@ fn the_actions_of_the_package_are_those_of_the_table_of_skill_types() {
 
 #[test]
 fn the_actions_that_are_built_in_are_those_of_the_package() {
-    let path = root().join("messages/bundle/ua_msgs.txt");
+    let path = root().join("ros/messages/bundle/ua_msgs.txt");
     let now = fs::read_to_string(&path).unwrap();
     let mut wanted: String = now
         .lines()

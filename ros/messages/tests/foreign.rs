@@ -296,7 +296,7 @@ fn debian() -> PathBuf {
 
 fn venv() -> PathBuf {
     let here = Path::new(env!("CARGO_MANIFEST_DIR"));
-    let own = || here.join("../target/peers/venv/bin/python");
+    let own = || here.join("../../target/peers/venv/bin/python");
     std::env::var_os("UA_PEERS_PYTHON").map_or_else(own, PathBuf::from)
 }
 
