@@ -1,4 +1,4 @@
-//! Requests and responses of Actions as JSON, and back.
+//! Converts requests and responses of Actions to JSON and back.
 
 use uadp::action::{
     ActionCall, ActionDialect, ActionEncoder, ActionEncoding, ActionFields, ActionHeader,
@@ -10,7 +10,7 @@ use crate::fault::{Fault, MessagePlace, Place, Stop, in_field, offset};
 use crate::values::{WrongValue, show_variant, variant_bytes};
 use crate::{decode, encode, hex, shape};
 
-/// What is shown of an Action message, as far as it could be read.
+/// The decoded part of an Action message, up to the first fault.
 #[derive(Default)]
 pub(crate) struct Shown {
     pub(crate) header: Option<shape::ActionHeader>,
@@ -18,7 +18,8 @@ pub(crate) struct Shown {
     pub(crate) fault: Option<Fault>,
 }
 
-/// Reads an Action message by the text of the standard, and where only UA-.NETStandard's form makes sense of it, so.
+/// Reads an Action message in the dialect of the standard. If that fails and the dialect of
+/// UA-.NETStandard succeeds, returns the reading of UA-.NETStandard.
 pub(crate) fn read(message: &NetworkMessage<'_>) -> Shown {
     let standard = read_as(message, ActionDialect::Standard);
     if standard.fault.is_none() {
@@ -73,14 +74,14 @@ pub(crate) fn write(
         write_message(message, &mut encoder)
             .map_err(|wrong| wrong.at(&format!("dataSetMessages[{at}]")))?;
     }
-    // A seal or footer follows.
+    // A signature or SecurityFooter follows.
     if extras.security.is_none() {
         encoder.finish()?;
     }
     Ok(())
 }
 
-/// Appends the headers of an Action message that is sealed; where its payload starts.
+/// Appends the headers of a sealed Action message and returns the offset of its payload.
 pub(crate) fn headers(
     json: &shape::Datagram,
     (network, extras): (&NetworkHeader<'_>, &Extras<'_>),
@@ -117,7 +118,7 @@ fn read_as(message: &NetworkMessage<'_>, dialect: ActionDialect) -> Shown {
             return shown;
         }
     }
-    // Bytes behind the last one.
+    // Bytes after the last Action message.
     if let Some(stop) = stop_of(message, dialect) {
         shown.fault = Some(fault(message, dialect, None, stop));
     }
@@ -188,7 +189,7 @@ fn show_fields(action: &ActionMessage<'_>, shown: &mut Vec<shape::Field>) -> Res
     Ok(())
 }
 
-/// Where reading stops.
+/// Returns the field and the error at which reading stops.
 fn stop_of(message: &NetworkMessage<'_>, dialect: ActionDialect) -> Option<Stop> {
     let actions = match message.actions(dialect) {
         Ok(actions) => actions,
@@ -215,7 +216,7 @@ fn fault(
     let (field, error) = stop;
     let start = message.payload_offset();
     let headers = message.datagram().get(..start).unwrap_or_default();
-    // What was opened is not read again: of that the place is where the payload starts.
+    // Decrypted payloads are not read again, so their fault is located at the start of the payload.
     let opened = message
         .security()
         .is_some_and(|security| security.is_secured());

@@ -1,4 +1,4 @@
-//! The words of the command line.
+//! The command line arguments.
 
 mod discover;
 mod live;
@@ -275,7 +275,7 @@ pub(crate) struct Init {
     pub(crate) json: bool,
 }
 
-/// `None` for the one of the environment.
+/// Parses a DDS domain; `None` stands for the domain of the environment.
 fn domain(text: &str) -> Result<Option<u16>, &'static str> {
     if text.is_empty() {
         return Ok(None);

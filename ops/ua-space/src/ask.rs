@@ -1,4 +1,4 @@
-//! `ua-space ask`: questions to what is known of the plant.
+//! `ua-space ask`: queries the knowledge base of the plant.
 
 use std::fs::File;
 use std::io::{self, Read, Write as _};
@@ -12,7 +12,7 @@ use crate::http::{Answer, Server, encoded};
 use crate::live::{Table, harmless, is_coloured};
 use crate::survey::look;
 
-/// `ua-space ask`.
+/// Runs `ua-space ask`.
 pub(crate) fn ask(arguments: &Ask) -> Result<(), Failure> {
     let server = Server::parse(&arguments.url)?;
     let query = arguments.sparql.as_deref().map(read).transpose()?;
@@ -46,7 +46,7 @@ fn read(file: &str) -> Result<String, Failure> {
     Ok(text)
 }
 
-/// The questions there are.
+/// The list of available questions.
 #[derive(Debug, Deserialize)]
 struct Questions {
     questions: Vec<Question>,
@@ -68,7 +68,7 @@ struct Rows {
     rows: Vec<Map<String, Value>>,
 }
 
-/// The standard form of SPARQL 1.1.
+/// The JSON results format of SPARQL 1.1.
 #[derive(Debug, Deserialize)]
 struct Results {
     #[serde(default)]
@@ -90,7 +90,8 @@ struct Bindings {
     bindings: Vec<Map<String, Value>>,
 }
 
-/// Where a question is asked, with its parameters; values without a name are those of the question in its order.
+/// Returns the request path of a question with its parameters. Values without a name take the
+/// parameter names of the question in order.
 async fn path(server: &Server, question: &str, words: &[String]) -> Result<String, Failure> {
     let is_named = |word: &String| {
         let name = word.split_once('=').map(|(name, _)| name);
@@ -137,7 +138,7 @@ fn parsed<'a, T: Deserialize<'a>>(body: &'a str) -> Result<T, Failure> {
         .map_err(|error| Failure::Data(format!("the answer was not understood: {error}")))
 }
 
-/// Why there is no answer.
+/// Returns the reason of a response with an error status.
 fn refusal(answer: &Answer) -> Failure {
     #[derive(Deserialize)]
     struct Told {
@@ -218,7 +219,7 @@ fn dash() -> String {
     "-".to_owned()
 }
 
-/// A value in a cell; of the standard form its `value`.
+/// Formats a value for a cell; a term of the SPARQL results format is shown by its `value`.
 fn cell(value: &Value) -> String {
     match value {
         Value::Null => dash(),
@@ -230,5 +231,5 @@ fn cell(value: &Value) -> String {
     }
 }
 
-/// More than any query.
+/// Maximum length of a query, in bytes.
 const MOST_QUERY: u64 = 1 << 20;

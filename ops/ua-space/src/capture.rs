@@ -1,5 +1,5 @@
-//! The packets of a capture file: pcap in all its variants (draft-ietf-opsawg-pcap) and pcapng
-//! (draft-ietf-opsawg-pcapng), read one after the other.
+//! Reads the packets of a capture file in order: pcap in all its variants (draft-ietf-opsawg-pcap)
+//! and pcapng (draft-ietf-opsawg-pcapng).
 
 use std::io::{self, Read};
 
@@ -8,19 +8,19 @@ use std::io::{self, Read};
 pub(crate) struct Capture<R> {
     reader: R,
     format: Format,
-    /// Bytes read so far.
+    /// Number of bytes read so far.
     at: u64,
 }
 
-/// What was captured of a packet.
+/// The captured part of a packet.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) struct Packet {
-    /// Nanoseconds since 1970-01-01 UTC; `None` where the capture does not say.
+    /// Nanoseconds since 1970-01-01 UTC; `None` if the capture has no timestamp for the packet.
     pub(crate) time: Option<i128>,
-    /// LINKTYPE number: what the data starts with.
+    /// The LINKTYPE number, which defines the first header of the data.
     pub(crate) link_type: u16,
     pub(crate) data: Vec<u8>,
-    /// Bytes the packet had on the wire and has not here.
+    /// Number of bytes of the packet on the wire that were not captured.
     pub(crate) missing: usize,
 }
 
@@ -54,16 +54,16 @@ struct Interface {
     clock: Clock,
 }
 
-/// How an interface counts time.
+/// The resolution and offset of the timestamps of an interface.
 #[derive(Debug, Clone, Copy)]
 struct Clock {
-    /// `if_tsresol`: the exponent, to base 2 with the highest bit set, else to base 10.
+    /// `if_tsresol`: the exponent, to base 2 if the highest bit is set, otherwise to base 10.
     resolution: u8,
-    /// `if_tsoffset`, seconds.
+    /// `if_tsoffset`, in seconds.
     offset: i64,
 }
 
-/// True for bytes a capture file starts with.
+/// Returns true if these are the first bytes of a capture file.
 pub(crate) fn is_capture(start: [u8; 4]) -> bool {
     let pcap = [start, reversed(start)]
         .iter()
@@ -72,7 +72,8 @@ pub(crate) fn is_capture(start: [u8; 4]) -> bool {
 }
 
 impl<R: Read> Capture<R> {
-    /// Reads the header of a file that starts with `magic`; `reader` gives what follows.
+    /// Reads the header of a file that starts with `magic`; `reader` returns the bytes after
+    /// `magic`.
     pub(crate) fn new(magic: [u8; 4], reader: R) -> Result<Self, CaptureError> {
         let mut capture = Self {
             reader,
@@ -89,7 +90,7 @@ impl<R: Read> Capture<R> {
         }
         let big_endian = [MICROSECONDS, NANOSECONDS].contains(&magic);
         let header = capture.exact::<20>(0)?;
-        // The upper half holds the length of a frame check sequence, which stands behind the packet.
+        // The upper half holds the length of the frame check sequence that follows the packet.
         let [a, b, c, d] = tail(&header);
         let link_type = match big_endian {
             true => u16::from_be_bytes([c, d]),
@@ -103,7 +104,7 @@ impl<R: Read> Capture<R> {
         Ok(capture)
     }
 
-    /// The next packet, `None` at the end.
+    /// Returns the next packet, or `None` at the end of the file.
     pub(crate) fn next_packet(&mut self) -> Result<Option<Packet>, CaptureError> {
         match self.format {
             Format::Pcap {
@@ -115,7 +116,7 @@ impl<R: Read> Capture<R> {
         }
     }
 
-    /// A record of a pcap file.
+    /// Reads a record of a pcap file.
     fn record(
         &mut self,
         big_endian: bool,
@@ -137,7 +138,7 @@ impl<R: Read> Capture<R> {
         }))
     }
 
-    /// Blocks of a pcapng file up to the next with a packet.
+    /// Reads the blocks of a pcapng file up to the next block with a packet.
     fn block(&mut self) -> Result<Option<Packet>, CaptureError> {
         loop {
             let start = self.at;
@@ -173,7 +174,7 @@ impl<R: Read> Capture<R> {
         }
     }
 
-    /// A section may have another byte order, and has interfaces of its own.
+    /// Reads a Section Header Block. Each section has its own byte order and interfaces.
     fn section_header(&mut self, start: u64, length: [u8; 4]) -> Result<(), CaptureError> {
         let byte_order = self.exact::<4>(start)?;
         let big_endian = byte_order == BYTE_ORDER;
@@ -270,7 +271,7 @@ impl<R: Read> Capture<R> {
             .ok_or("a packet of an interface that was not described")
     }
 
-    /// Bytes of a packet or block that started at `start`.
+    /// Reads the bytes of a packet or block that started at `start`.
     fn bytes(&mut self, start: u64, length: u32) -> Result<Vec<u8>, CaptureError> {
         if length > MAX_LENGTH {
             return Err(CaptureError::Broken {
@@ -299,7 +300,8 @@ impl<R: Read> Capture<R> {
         }
     }
 
-    /// `None` at the end of the file; an error inside of the bytes.
+    /// Reads `N` bytes. Returns `None` at the end of the file, and an error if the file ends within
+    /// the bytes.
     fn exact_or_end<const N: usize>(&mut self) -> Result<Option<[u8; N]>, CaptureError> {
         let start = self.at;
         let mut bytes = [0; N];
@@ -326,7 +328,7 @@ impl Clock {
         offset: 0,
     };
 
-    /// From the options of an interface.
+    /// Reads the clock from the options of an interface.
     fn read(mut options: &[u8], big_endian: bool) -> Self {
         let mut clock = Self::MICROSECONDS;
         let half = |bytes: [u8; 2]| match big_endian {
@@ -354,11 +356,11 @@ impl Clock {
         clock
     }
 
-    /// Nanoseconds since 1970-01-01 UTC.
+    /// Converts a timestamp to nanoseconds since 1970-01-01 UTC.
     fn nanos(self, count: u64) -> i128 {
         let exponent = u32::from(self.resolution & 0x7F);
         let base: i128 = if self.resolution & 0x80 != 0 { 2 } else { 10 };
-        // What does not fit is a unit too small to count up to a nanosecond.
+        // If the power overflows, the unit is too small for any count to reach a nanosecond.
         let nanos = base
             .checked_pow(exponent)
             .map_or(0, |units| i128::from(count) * NANOS_PER_SECOND / units);
@@ -379,7 +381,7 @@ fn word(bytes: [u8; 4], big_endian: bool) -> u32 {
     }
 }
 
-/// The words of a header from its start.
+/// Returns the first `N` 32-bit words of a header.
 fn words<const N: usize>(bytes: &[u8], big_endian: bool) -> [u32; N] {
     let (chunks, _) = bytes.as_chunks();
     let mut chunks = chunks.iter();
@@ -397,9 +399,9 @@ const fn reversed([a, b, c, d]: [u8; 4]) -> [u8; 4] {
 /// The first bytes of a pcap file written by a big-endian machine.
 const MICROSECONDS: [u8; 4] = [0xA1, 0xB2, 0xC3, 0xD4];
 const NANOSECONDS: [u8; 4] = [0xA1, 0xB2, 0x3C, 0x4D];
-/// The type of a pcapng Section Header Block, the same in either byte order.
+/// The type of a pcapng Section Header Block, which is the same in both byte orders.
 const SECTION_HEADER: [u8; 4] = [0x0A, 0x0D, 0x0D, 0x0A];
-/// Byte order of a section, as written by a big-endian machine.
+/// The byte-order magic of a section written by a big-endian machine.
 const BYTE_ORDER: [u8; 4] = [0x1A, 0x2B, 0x3C, 0x4D];
 const INTERFACE_DESCRIPTION: u32 = 1;
 const SIMPLE_PACKET: u32 = 3;
@@ -408,7 +410,7 @@ const END_OF_OPTIONS: u16 = 0;
 const TIME_RESOLUTION: u16 = 9;
 const TIME_OFFSET: u16 = 14;
 const NANOS_PER_SECOND: i128 = 1_000_000_000;
-/// No packet is longer; what says so is damaged.
+/// Maximum length of a packet or block, in bytes; a capture with a greater length is damaged.
 const MAX_LENGTH: u32 = 16 << 20;
 const MAX_INTERFACES: usize = 4096;
 
@@ -422,7 +424,7 @@ mod tests {
         Capture::new(*magic, rest)
     }
 
-    /// A pcap file of one packet, by a machine of either byte order.
+    /// Returns a pcap file with one packet, written by a machine of either byte order.
     fn pcap(magic: [u8; 4], fraction: u32, big_endian: bool) -> Vec<u8> {
         let order = |number: u32| match big_endian {
             true => number.to_be_bytes(),

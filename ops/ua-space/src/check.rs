@@ -1,4 +1,4 @@
-//! What is wrong with a mapping, for people and for programs.
+//! `ua-space check`: reports the findings of a mapping as text or JSON.
 
 use std::fs::File;
 use std::io::{self, BufWriter, Write as _};
@@ -69,7 +69,7 @@ pub(crate) fn check(arguments: &Check) -> Result<(), Failure> {
 fn read(file: &str) -> Result<String, Failure> {
     let read = match file {
         "-" => type_files::read_text(io::stdin().lock()),
-        // It may be a pipe, which who names it here fills.
+        // The file may be a pipe, which the user who names it fills.
         file => File::open(file)
             .map_err(|error| error.to_string())
             .and_then(type_files::read_text),
@@ -77,7 +77,7 @@ fn read(file: &str) -> Result<String, Failure> {
     read.map_err(|why| Failure::Io(format!("cannot read {file}: {why}")))
 }
 
-/// What is beside a mapping, and what was found in the cell.
+/// The files and variables around a mapping, with the environment if it was queried.
 #[derive(Default)]
 struct Around<'a> {
     environment: Option<&'a Environment>,
@@ -113,7 +113,7 @@ impl Surroundings for Around<'_> {
     }
 }
 
-/// What there is, in a line.
+/// Returns the summary line of a mapping.
 fn sum(name: &str, checked: &Checked, spaces: &[SpaceId]) -> String {
     let numbers: Vec<String> = spaces.iter().map(ToString::to_string).collect();
     let part = match spaces.len() {
@@ -134,7 +134,8 @@ fn sum(name: &str, checked: &Checked, spaces: &[SpaceId]) -> String {
         several(mapping.calls().len(), "call"),
         several(mapping.spaces().len(), "ROS space"),
     ];
-    // Most likely a slip of the pen; a bridge would run there without a line of configuration.
+    // A space without configuration is most likely a typing error; a bridge would run there without
+    // a line of configuration.
     let unknown: Vec<String> = spaces
         .iter()
         .filter(|space| **space != SpaceId::UA && mapping.space(**space).is_none())
@@ -152,11 +153,11 @@ fn sum(name: &str, checked: &Checked, spaces: &[SpaceId]) -> String {
 struct Told<'a> {
     file: &'a str,
     can_run: bool,
-    /// The spaces of the host it was asked for.
+    /// The spaces given with `--for`.
     #[serde(rename = "for", skip_serializing_if = "Vec::is_empty")]
     spaces: Vec<u8>,
     findings: Vec<Finding<'a>>,
-    /// The message, service and action types it names.
+    /// The message, service and action types that the mapping uses.
     types: Vec<Type<'a>>,
     #[serde(skip_serializing_if = "Option::is_none")]
     environment: Option<&'a [Asked]>,
@@ -166,7 +167,7 @@ struct Told<'a> {
 struct Type<'a> {
     ros: u8,
     name: &'a str,
-    /// A file, `built in`, or `unknown`.
+    /// The path of a file, `built in`, or `unknown`.
     from: &'a str,
 }
 
@@ -189,7 +190,7 @@ impl<'a> Type<'a> {
 
 #[derive(Serialize)]
 struct Finding<'a> {
-    /// Where it is not the file that was asked about, but one that it includes.
+    /// The file of the finding, if it is an included file instead of the checked file.
     #[serde(skip_serializing_if = "Option::is_none")]
     file: Option<&'a str>,
     code: &'static str,
@@ -202,7 +203,7 @@ struct Finding<'a> {
     label: Option<&'a str>,
     #[serde(skip_serializing_if = "Option::is_none")]
     help: Option<&'a str>,
-    /// The spaces whose programs it stops, where it does not stop all.
+    /// The spaces whose programs the finding stops; empty if it stops all programs.
     #[serde(rename = "neededBy", skip_serializing_if = "Vec::is_empty")]
     needed_by: Vec<u8>,
 }

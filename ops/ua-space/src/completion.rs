@@ -1,4 +1,4 @@
-//! `ua-space completion`: words for shells, with the names that are heard in the space.
+//! `ua-space completion`: completes words for shells, including the names received in the space.
 
 use std::io::{self, Write as _};
 
@@ -8,7 +8,7 @@ use crate::arguments::{Arguments, Group, Shell};
 use crate::exit::Failure;
 use crate::live::{HeardNames, heard_names};
 
-/// `ua-space completion`.
+/// Runs `ua-space completion`.
 pub(crate) fn script(shell: Shell) -> Result<(), Failure> {
     let text = match shell {
         Shell::Bash => BASH,
@@ -19,7 +19,8 @@ pub(crate) fn script(shell: Shell) -> Result<(), Failure> {
     Ok(())
 }
 
-/// `ua-space complete`: a word a line. Where nothing can be said, no word: a shell has no use for a fault.
+/// Runs `ua-space complete`: prints the candidates, a word per line. Failures give no candidates,
+/// because a shell cannot use an error message.
 pub(crate) fn complete(words: &[String]) -> Result<(), Failure> {
     let (typed, before) = match words.split_last() {
         Some((typed, before)) => (typed.as_str(), before),
@@ -41,20 +42,20 @@ pub(crate) fn complete(words: &[String]) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Where in the command line a word is to come.
+/// The position of the completed word in the command line.
 struct Place {
     command: Command,
-    /// The option whose value it is.
+    /// The option whose value is completed.
     option: Option<Arg>,
-    /// How many words that are no option came before it.
+    /// The number of positional words before the completed word.
     position: usize,
 }
 
-/// What the names of a place are of.
+/// The kind of names that complete a word.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Names {
     Skills,
-    /// Of components and skills.
+    /// Components and skills.
     Either,
     Calls,
     Topics,
@@ -67,7 +68,7 @@ impl Place {
             option: None,
             position: 0,
         };
-        // What is global or written by clap itself is there from now on.
+        // `build` adds the global arguments and the arguments that clap generates.
         place.command.build();
         for word in before {
             place.pass(word);
@@ -100,7 +101,7 @@ impl Place {
         }
     }
 
-    /// Words that are the same in any space.
+    /// Returns the candidates that do not depend on the space.
     fn words(&self, typed: &str) -> Vec<String> {
         let values = |arg: &Arg| -> Vec<String> {
             let values = arg.get_possible_values();
@@ -166,7 +167,7 @@ impl Names {
             }
             Self::Calls if typed.starts_with("ua_") => topics,
             Self::Calls => {
-                // What starts a skill is called by its name alone.
+                // The Start call of a skill is completed by the name of the skill alone.
                 skills.extend(calls.into_iter().filter(|name| !name.ends_with(".Start")));
                 skills
             }
@@ -175,7 +176,7 @@ impl Names {
     }
 }
 
-/// Where the space is, by what was typed so far and the environment.
+/// Returns the location of the space from the words typed so far and the environment.
 fn group(before: &[String]) -> Group {
     let mut words = vec!["ua-space".to_owned()];
     let mut rest = before.iter();

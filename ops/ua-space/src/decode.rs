@@ -1,4 +1,4 @@
-//! From a datagram to its JSON.
+//! Decodes a datagram to its JSON.
 
 use std::time::Duration;
 
@@ -17,7 +17,7 @@ use crate::raw_data::Layout;
 use crate::values::show_variant;
 use crate::{actions, discovery, hex, iso_time, messages, shape};
 
-/// What a reader knows besides the datagrams.
+/// The keys and metadata that decoding needs besides the datagrams.
 #[derive(Debug)]
 pub(crate) struct Context {
     pub(crate) keys: Option<KeyFile>,
@@ -25,7 +25,7 @@ pub(crate) struct Context {
     pub(crate) raw_reading: RawReading,
 }
 
-/// Puts chunks together, in the order of a file.
+/// Reassembles chunks in the order of a file.
 #[derive(Debug)]
 pub(crate) struct Chunks {
     reassembler: Reassembler,
@@ -33,24 +33,24 @@ pub(crate) struct Chunks {
     start: Option<i128>,
 }
 
-/// What was read of a datagram.
+/// The decoded contents of a datagram.
 #[derive(Debug, Default)]
 pub(crate) struct Reading {
     pub(crate) shape: shape::Datagram,
     pub(crate) faults: Vec<Fault>,
-    /// Why it was not opened, although there are keys.
+    /// The reason why the message was not decrypted although keys were given.
     pub(crate) refused: Option<String>,
-    /// What the chunk it is completes.
+    /// The message that this chunk completes.
     pub(crate) whole: Option<Box<Self>>,
-    /// What else there is to tell.
+    /// Further notes for the user.
     pub(crate) notes: Vec<String>,
-    /// The bytes the offsets of the faults count in: the datagram, as far as it was opened.
+    /// The bytes to which the offsets of the faults refer: the datagram, decrypted where possible.
     pub(crate) bytes: Vec<u8>,
 }
 
 impl Context {
-    /// Reads a datagram to its end, or to the first fault of each of its parts. With `chunks`, one that completes
-    /// a whole comes with that.
+    /// Reads a datagram to its end, or to the first fault of each of its parts. With `chunks`, the
+    /// reading of a chunk that completes a message includes that message.
     pub(crate) fn read(&self, datagram: &[u8], chunks: Option<&mut Chunks>) -> Reading {
         let mut reading = Reading {
             bytes: datagram.to_vec(),
@@ -70,7 +70,7 @@ impl Context {
         reading
     }
 
-    /// Shows a sealed message as it is once it is opened, or as far as that goes without.
+    /// Shows a sealed message decrypted, or only its headers if it cannot be decrypted.
     fn open(
         &self,
         sealed: &NetworkMessage<'_>,
@@ -86,7 +86,7 @@ impl Context {
                 return;
             }
         };
-        // Where several keys share the one that signs, the right ones show by what comes out.
+        // If several key sets share the signing key, the right set decrypts to a readable message.
         let reads = |keys: &&Keys| {
             let mut tried = Reading {
                 bytes: sealed.datagram().to_vec(),
@@ -182,13 +182,14 @@ impl Context {
     ) {
         match chunks.reassembler.receive(message, chunks.now) {
             Ok(Some(whole)) => reading.whole = Some(Box::new(self.read_whole(message, &whole))),
-            // A network may deliver twice.
+            // A network may deliver a chunk twice.
             Ok(None) | Err(ChunkRefusal::Duplicate) => {}
             Err(refusal) => reading.notes.push(format!("not put together: {refusal}")),
         }
     }
 
-    /// What chunks hold together: one DataSetMessage, or what stands behind the headers of a discovery message.
+    /// Reads the reassembled bytes of chunks: one DataSetMessage, or the body of a discovery
+    /// message after its headers.
     fn read_whole(&self, last: &NetworkMessage<'_>, whole: &Reassembled<'_>) -> Reading {
         let mut reading = Reading {
             bytes: whole.bytes.to_vec(),
@@ -209,7 +210,7 @@ impl Context {
             }
         }
         if whole.writer_id.is_none() && !reading.faults.is_empty() {
-            // UA-.NETStandard cuts up the NetworkMessage and leaves the payload header out.
+            // UA-.NETStandard splits the NetworkMessage and omits the payload header.
             let other = self.read(whole.bytes, None);
             if other.faults.is_empty() {
                 reading = other;
@@ -223,7 +224,7 @@ impl Context {
         reading
     }
 
-    /// How the RawData of a DataSetWriter is laid out, if that is known.
+    /// Returns the layout of the RawData of a DataSetWriter, if metadata for it is available.
     pub(crate) fn layout(
         &self,
         datagram: &shape::Datagram,
@@ -235,13 +236,14 @@ impl Context {
             writer_group_id: group.and_then(|group| group.writer_group_id),
             data_set_writer_id,
         })?;
-        // What is no layout was refused when it was read.
+        // Invalid layouts were rejected when the metadata file was read.
         Layout::new(metadata, self.raw_reading).ok()
     }
 }
 
 impl Chunks {
-    /// Chunks that are up to a minute apart belong together: what is looked at may have been slow.
+    /// Creates the reassembly buffer. Chunks belong together if they are at most a minute apart,
+    /// because the recorded sender may have been slow.
     pub(crate) fn new() -> Self {
         Self {
             reassembler: Reassembler::new(ReassemblyLimits {
@@ -253,14 +255,15 @@ impl Chunks {
         }
     }
 
-    /// Moves on to when the next datagram was captured, in nanoseconds since any time; never back.
+    /// Advances the clock to the capture time of the next datagram, in nanoseconds since any epoch.
+    /// The clock never moves back.
     pub(crate) fn at(&mut self, time: i128) {
         let since = time - *self.start.get_or_insert(time);
         let since = u64::try_from(since).unwrap_or_default();
         self.now = self.now.max(Duration::from_nanos(since));
     }
 
-    /// True when chunks were never put together because others did not come.
+    /// Returns true if chunks were not reassembled because other chunks are missing.
     pub(crate) fn is_any_incomplete(&self) -> bool {
         let counters = self.reassembler.counters();
         self.reassembler.poll_timeout().is_some()
@@ -270,8 +273,8 @@ impl Chunks {
 }
 
 impl Reading {
-    /// False for what other protocols might send by chance: not without fault, from nobody, or sealed in a way that
-    /// no policy has.
+    /// Returns false for datagrams that other protocols may send by chance: datagrams with a fault,
+    /// without PublisherId and GroupHeader, or sealed in a way that no SecurityPolicy defines.
     pub(crate) fn is_plausible(&self) -> bool {
         let shape = &self.shape;
         let names_its_sender = shape.publisher_id.is_some() || shape.group_header.is_some();
@@ -352,7 +355,7 @@ impl Reading {
                 let in_payload = if let DecodeError::Truncated { found, .. } = error {
                     payload - found
                 } else {
-                    // The ChunkOffset, behind the MessageSequenceNumber.
+                    // The ChunkOffset, which follows the MessageSequenceNumber.
                     2
                 };
                 self.faults.push(Fault {
@@ -366,7 +369,7 @@ impl Reading {
 }
 
 impl Reading {
-    /// A body that stands `start` bytes behind the first.
+    /// Reads a body that starts `start` bytes after the first byte.
     fn discovery(&mut self, message_type: NetworkMessageType, body: &[u8], start: usize) {
         let read: fn(&[u8]) -> Result<(), DecodeError>;
         let shown = match message_type {
@@ -396,7 +399,7 @@ fn promoted_fault(message: &NetworkMessage<'_>, field: usize, error: DecodeError
     let bytes = message.datagram().get(fields.clone()).unwrap_or_default();
     let stop = (Some(field), error);
     let read = |bytes: &[u8]| {
-        // A NetworkMessage of nothing but these fields.
+        // A NetworkMessage that holds only these fields.
         let size = u16::try_from(bytes.len()).ok()?.to_le_bytes();
         let datagram = [&[0x81, 0x80, 0x02, size[0], size[1]], bytes].concat();
         let message = NetworkMessage::decode(&datagram).ok()?;
@@ -416,7 +419,8 @@ fn promoted_fault(message: &NetworkMessage<'_>, field: usize, error: DecodeError
     }
 }
 
-/// Where the PromotedFields stand: before the SecurityHeader, and behind headers that would be written the same again.
+/// Returns the range of the PromotedFields, which precede the SecurityHeader. The headers before
+/// them are measured by encoding them again.
 fn promoted_range(message: &NetworkMessage<'_>) -> Option<std::ops::Range<usize>> {
     let ids: Option<Vec<_>> = message.writer_ids().map(Iterator::collect);
     let headers_with = |security| {

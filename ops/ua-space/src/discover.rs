@@ -1,4 +1,4 @@
-//! `ua-space discover`: who is there.
+//! `ua-space discover`: lists the programs and servers of the network.
 
 mod around;
 mod entry;

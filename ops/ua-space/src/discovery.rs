@@ -1,4 +1,4 @@
-//! Discovery messages: their kind and what names them in plain, their structures as bytes.
+//! Discovery messages as JSON: their type and identifiers as values, their structures as bytes.
 
 use uadp::discovery::{Announced, Announcement, List, Probe};
 use uadp::{DecodeError, StatusCode};
@@ -7,7 +7,7 @@ use crate::shape::{self, FieldMetaData};
 use crate::values::WrongValue;
 use crate::{hex, node_ids};
 
-/// Shows what stands behind the headers of a probe.
+/// Shows the body of a probe, after its headers.
 pub(crate) fn show_probe(body: &[u8]) -> Result<shape::Probe, DecodeError> {
     let mut shown = shape::Probe {
         probe_type: PUBLISHER_INFORMATION,
@@ -51,7 +51,7 @@ pub(crate) fn show_probe(body: &[u8]) -> Result<shape::Probe, DecodeError> {
     Ok(shown)
 }
 
-/// What stands behind the headers of a probe.
+/// Returns the body of a probe, after its headers.
 pub(crate) fn probe_body(json: &shape::Probe) -> Result<Vec<u8>, WrongValue> {
     let ids = json.data_set_writer_ids.as_deref().unwrap_or_default();
     let uris = json.transport_profile_uris.as_deref().unwrap_or_default();
@@ -82,7 +82,7 @@ pub(crate) fn probe_body(json: &shape::Probe) -> Result<Vec<u8>, WrongValue> {
     Ok(body)
 }
 
-/// Shows what stands behind the headers of an announcement.
+/// Shows the body of an announcement, after its headers.
 pub(crate) fn show_announcement(body: &[u8]) -> Result<shape::Announcement, DecodeError> {
     let Announcement {
         sequence_number,
@@ -93,7 +93,7 @@ pub(crate) fn show_announcement(body: &[u8]) -> Result<shape::Announcement, Deco
         sequence_number,
         ..shape::Announcement::default()
     };
-    // Bytes before and behind the structure.
+    // The numbers of bytes before and after the structure.
     let (head, tail) = match announced {
         Announced::PublisherEndpoints { endpoints, status } => {
             shown.endpoints = Some(endpoints.len());
@@ -147,7 +147,7 @@ pub(crate) fn show_announcement(body: &[u8]) -> Result<shape::Announcement, Deco
     Ok(shown)
 }
 
-/// What stands behind the headers of an announcement.
+/// Returns the body of an announcement, after its headers.
 pub(crate) fn announcement_body(json: &shape::Announcement) -> Result<Vec<u8>, WrongValue> {
     let structure = json.body_hex.as_deref().unwrap_or_default();
     let structure =
@@ -216,9 +216,9 @@ fn length(count: usize) -> Result<[u8; 4], WrongValue> {
 
 const PUBLISHER_INFORMATION: u8 = 1;
 const FIND_APPLICATIONS: u8 = 2;
-/// AnnouncementType and SequenceNumber.
+/// Bytes of AnnouncementType and SequenceNumber.
 const ANNOUNCEMENT_HEAD: usize = 3;
-/// Bytes of an array's length, a DataSetWriterId and a StatusCode.
+/// Bytes of the length of an array, of a DataSetWriterId and of a StatusCode.
 const LENGTH: usize = 4;
 const WRITER_ID: usize = 2;
 const STATUS: usize = size_of::<StatusCode>();

@@ -1,8 +1,14 @@
-//! From JSON to a datagram.
+//! Encodes JSON to a datagram.
 //!
-//! What is written says what was read, in the usual way: flag bytes that announce nothing are left out, a true Boolean
-//! is 1, a NaN that of OPC 10000-6, 5.2.2.3, a NodeId has its shortest encoding, an array of dimensions only where there
-//! are two or more, a key frame always its FieldCount, a discovery message always its SecurityHeader.
+//! The datagram has the same contents as the decoded datagram, in the canonical encoding:
+//!
+//! - flag bytes without a set bit are left out,
+//! - a Boolean that is true is 1,
+//! - a NaN is the NaN of OPC 10000-6, 5.2.2.3,
+//! - a NodeId has its shortest encoding,
+//! - the dimensions of an array are written only if there are two or more,
+//! - a key frame always has its FieldCount,
+//! - a discovery message always has its SecurityHeader.
 
 use std::str::FromStr;
 
@@ -21,7 +27,7 @@ use crate::{actions, discovery, hex, iso_time, node_ids, shape};
 
 type Written = Result<(), WrongValue>;
 
-/// The bytes of a datagram.
+/// Returns the bytes of a datagram.
 pub(crate) fn write(json: &shape::Datagram, context: &Context) -> Result<Vec<u8>, WrongValue> {
     if let Some(why) = &json.malformed {
         return Err(WrongValue::new(format!("is malformed ({why})")).at("the datagram"));
@@ -70,7 +76,7 @@ pub(crate) fn write(json: &shape::Datagram, context: &Context) -> Result<Vec<u8>
     .write()
 }
 
-/// A datagram on its way, its headers read.
+/// A datagram in progress, with its headers parsed.
 struct Writing<'a> {
     json: &'a shape::Datagram,
     header: NetworkHeader<'a>,
@@ -79,7 +85,7 @@ struct Writing<'a> {
     context: &'a Context,
 }
 
-/// A SecurityHeader with its texts read.
+/// A SecurityHeader with its hexadecimal texts parsed.
 struct Security {
     signed: bool,
     encrypted: bool,
@@ -119,11 +125,12 @@ impl Writing<'_> {
         Ok(out)
     }
 
-    /// One piece is written as if it were the whole, and then put in its place.
+    /// Writes a chunk: encodes its data as a complete message, then replaces the offset and total
+    /// size.
     fn chunk(&self, chunk: &shape::Chunk, out: &mut Vec<u8>) -> Written {
         let data = bytes(&chunk.chunk_data_hex).map_err(|wrong| wrong.at("chunk.chunkDataHex"))?;
         let payload_at = self.chunk_headers(chunk.message_sequence_number, &data, out)?;
-        // Behind the MessageSequenceNumber.
+        // The ChunkOffset and TotalSize follow the MessageSequenceNumber.
         let places = out.get_mut(payload_at + 2..).unwrap_or_default();
         let numbers = [chunk.chunk_offset, chunk.total_size].map(u32::to_le_bytes);
         for (place, byte) in places.iter_mut().zip(numbers.as_flattened()) {
@@ -132,7 +139,7 @@ impl Writing<'_> {
         Ok(())
     }
 
-    /// The NetworkMessage of a whole in one chunk; where its payload starts.
+    /// Writes the NetworkMessage with all data in one chunk and returns the offset of its payload.
     fn chunk_headers(
         &self,
         message_sequence_number: u16,
@@ -169,7 +176,8 @@ impl Writing<'_> {
         }
     }
 
-    /// Headers of chunks and discovery messages, and any payload; where that starts.
+    /// Writes the headers of a chunk or discovery message with a placeholder payload, and returns
+    /// the offset of the payload.
     fn other_headers(&self, is_chunk: bool, out: &mut Vec<u8>) -> Result<usize, WrongValue> {
         if is_chunk {
             return self.chunk_headers(0, &[0], out);
@@ -232,7 +240,7 @@ impl Writing<'_> {
         }
     }
 
-    /// The headers, and behind them what was not opened.
+    /// Writes the headers, followed by the encrypted bytes.
     fn sealed(&self, sealed: &shape::Sealed, out: &mut Vec<u8>) -> Result<(), WrongValue> {
         let payload_at = if sealed.action {
             if sealed.chunk {
@@ -252,7 +260,7 @@ impl Writing<'_> {
         Ok(())
     }
 
-    /// Headers and DataSetMessages, as they are before they are secured.
+    /// Writes headers and DataSetMessages, before they are signed and encrypted.
     fn messages(&self, out: &mut Vec<u8>) -> Result<(), WrongValue> {
         let messages = self.json.data_set_messages.as_deref().unwrap_or_default();
         let ids = self.json.data_set_writer_ids.as_deref();
@@ -281,7 +289,7 @@ impl Writing<'_> {
             )
             .map_err(|wrong| wrong.at(&format!("dataSetMessages[{at}]")))?;
         }
-        // A seal or footer follows.
+        // A signature or SecurityFooter follows.
         if self.security.is_none() {
             encoder.finish()?;
         }
@@ -367,7 +375,7 @@ impl Security {
     }
 }
 
-/// The bytes of a DataSetMessage by itself.
+/// Returns the bytes of a single DataSetMessage.
 pub(crate) fn message_bytes(
     json: &shape::DataSetMessage,
     layout: Option<&Layout<'_>>,
@@ -396,7 +404,7 @@ fn write_message(
     if let Some(text) = &json.message_hex {
         let message = bytes(text).map_err(|wrong| wrong.at(".messageHex"))?;
         return Ok(encoder.raw_key_frame(&DataSetHeader::default(), |out| {
-            // In the place of the one byte of flags.
+            // The message replaces the byte of flags.
             out.pop();
             out.extend(message);
             Ok(())
@@ -451,7 +459,7 @@ fn write_message(
     }
 }
 
-/// The fields of a key frame or event.
+/// Writes the fields of a key frame or event.
 fn write_variants(json: &shape::DataSetMessage, mut frame: FieldEncoder<'_>) -> Written {
     each_field(json, |field| {
         if field.index.is_some() {
@@ -465,7 +473,8 @@ fn write_variants(json: &shape::DataSetMessage, mut frame: FieldEncoder<'_>) -> 
     Ok(frame.finish()?)
 }
 
-/// RawData by the layout of the message itself or the one that is known, or as its bytes.
+/// Returns RawData, encoded by the layout in the message or the given layout, or from its
+/// hexadecimal text.
 fn raw_data(
     json: &shape::DataSetMessage,
     known: Option<&Layout<'_>>,

@@ -1,4 +1,4 @@
-//! What is there of what a mapping names.
+//! Queries the environment for the topics, types and nodes of a mapping.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -12,18 +12,18 @@ use crate::arguments::{Check, Part};
 use crate::exit::Failure;
 use crate::survey::{self, look};
 
-/// What was found, and what was not there to be asked.
+/// The queried environment, with the parts that were not available.
 #[derive(Default)]
 pub(crate) struct Seen {
     pub(crate) environment: Environment,
     pub(crate) asked: Vec<Asked>,
 }
 
-/// Somebody who was asked.
+/// A queried part of the environment.
 #[derive(Debug, Serialize)]
 #[serde(rename_all = "camelCase")]
 pub(crate) struct Asked {
-    /// As `ROS 1 master http://localhost:11311`.
+    /// The name of the part, as `ROS 1 master http://localhost:11311`.
     pub(crate) whom: String,
     pub(crate) there: bool,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -31,10 +31,12 @@ pub(crate) struct Asked {
 }
 
 impl Seen {
-    /// Asks the graphs of the mapping's spaces and its servers, as far as that is wished.
+    /// Queries the graphs of the spaces and the servers of the mapping, as selected by
+    /// `--environment`.
     ///
     /// # Errors
-    /// What was typed, or the environment's own configuration, is wrong; who is not there is no error.
+    /// The arguments or the configuration of the environment are wrong. An unavailable part is not
+    /// an error.
     pub(crate) fn look(mapping: &Mapping, arguments: &Check) -> Result<Self, Failure> {
         let mut seen = Self::default();
         let wished = |part| arguments.environment.contains(&part);
@@ -64,7 +66,7 @@ impl Seen {
         Ok(seen)
     }
 
-    /// Asks each server that has Methods of the mapping.
+    /// Queries each server that has Methods of the mapping.
     fn methods(&mut self, mapping: &Mapping) -> Result<(), Failure> {
         let mut by_server: BTreeMap<String, (&Access, Vec<&MethodTarget>)> = BTreeMap::new();
         for call in mapping.executed_in(SpaceId::UA) {
@@ -86,7 +88,7 @@ impl Seen {
         Ok(())
     }
 
-    /// Asks each server that variables come from or go to.
+    /// Queries each server that is a source or target of variables.
     fn remote(&mut self, mapping: &Mapping) -> Result<(), Failure> {
         for server in mapping.servers() {
             let mut nodes: Vec<&ExpandedNodeIdText> = Vec::new();
@@ -125,7 +127,7 @@ impl Seen {
         Ok(there)
     }
 
-    /// Whether everybody was there.
+    /// Returns true if all parts were available.
     pub(crate) fn is_whole(&self) -> bool {
         self.asked.iter().all(|asked| asked.there)
     }

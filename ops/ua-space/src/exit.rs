@@ -1,42 +1,42 @@
-//! How the program ends.
+//! The exit codes of the program.
 
 use std::io;
 use std::process::ExitCode;
 
-/// Why a verb could not do what was asked.
+/// The reason why a command failed.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum Failure {
-    /// A datagram, JSON, keys or metadata that are not what they should be.
+    /// A malformed datagram, JSON file, key file or metadata file.
     #[error("{0}")]
     Data(String),
-    /// Datagrams that were not; each was told of when it came.
+    /// Some datagrams are malformed; each was reported when it was read.
     #[error("some datagrams are malformed")]
     Told,
-    /// A mapping that cannot run; why was told.
+    /// A mapping cannot run; the reasons were reported.
     #[error("a mapping cannot run")]
     Configuration,
-    /// A configuration that cannot run, and why.
+    /// A configuration cannot run, with the reason.
     #[error("{0}")]
     Unconfigured(String),
-    /// What was typed makes no sense together.
+    /// The arguments are wrong, or contradict each other.
     #[error("{0}")]
     Usage(String),
-    /// A master, domain or server that is not there.
+    /// A master, domain or server is not available.
     #[error("{0}")]
     Unavailable(String),
-    /// Somebody of an environment is not there, which was told.
+    /// A part of the environment is not available, which was reported.
     #[error("not all of the environment is there")]
     NotThere,
-    /// What was asked for was answered with a no, or did not succeed.
+    /// The request was refused, or did not succeed.
     #[error("{0}")]
     Failed(String),
-    /// Whoever started it wants it to end, and it had not come to an end.
+    /// The user interrupted the command before its end.
     #[error("interrupted")]
     Interrupted,
-    /// A file that cannot be read, or an output that cannot be written.
+    /// A file cannot be read, or the output cannot be written.
     #[error("{0}")]
     Io(String),
-    /// Whoever read the output has seen enough.
+    /// The reader of the output closed it.
     #[error("the output was closed")]
     Closed,
 }
@@ -47,7 +47,7 @@ impl Failure {
     }
 }
 
-/// What went wrong with the output.
+/// Maps errors of the output.
 impl From<io::Error> for Failure {
     fn from(error: io::Error) -> Self {
         if error.kind() == io::ErrorKind::BrokenPipe {
@@ -57,7 +57,7 @@ impl From<io::Error> for Failure {
     }
 }
 
-/// As in `sysexits.h`.
+/// Returns the exit code, as in `sysexits.h`.
 impl From<&Failure> for ExitCode {
     fn from(failure: &Failure) -> Self {
         match failure {
@@ -73,5 +73,5 @@ impl From<&Failure> for ExitCode {
     }
 }
 
-/// What was typed is none of the program's words.
+/// The exit code of wrong arguments.
 pub(crate) const USAGE: u8 = 64;

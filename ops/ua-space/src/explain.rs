@@ -1,4 +1,5 @@
-//! What a code means, and what a mapping may hold.
+//! `ua-space explain` and `ua-space schema`: explains the code of a finding, and prints the schema
+//! of mappings.
 
 use std::io::{self, BufWriter, Write as _};
 

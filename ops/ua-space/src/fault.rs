@@ -1,7 +1,8 @@
-//! What is wrong with a datagram, and at which byte.
+//! Locates the fault of a datagram.
 //!
-//! A decoding error names the field and not where it stands. That is found by reading again with other bytes behind a
-//! place: reading goes strictly from left to right, so as long as they are behind the fault they change nothing.
+//! A decoding error names the field but not its offset. The offset is found by decoding copies with
+//! other bytes after a position: decoding goes strictly from left to right, so bytes after the
+//! fault do not change its result.
 
 use std::fmt;
 
@@ -12,42 +13,43 @@ use uadp::DecodeError;
 pub(crate) struct Fault {
     pub(crate) place: Place,
     pub(crate) error: DecodeError,
-    /// Bytes before it.
+    /// The number of bytes before the fault.
     pub(crate) offset: usize,
 }
 
-/// In which part of the datagram the fault is.
+/// The part of the datagram with the fault.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Place {
     Headers,
     PromotedField(usize),
     Chunk,
     Discovery,
-    /// What stands around the DataSetMessages.
+    /// The bytes around the DataSetMessages.
     Payload,
     Message(MessagePlace),
 }
 
-/// Which DataSetMessage, and which of its fields if not its header.
+/// The DataSetMessage with the fault, and its field unless the fault is in the header.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct MessagePlace {
     pub(crate) writer_id: Option<u16>,
     pub(crate) field: Option<usize>,
 }
 
-/// Why reading stopped: after how many parts, and the error.
+/// The number of parts read before the error, and the error.
 pub(crate) type Stop = (Option<usize>, DecodeError);
 
-/// Bytes before what makes reading `bytes` stop. `read` tells where it stops in others like them.
+/// Returns the offset of the fault in `bytes`. `read` returns the stop of similar bytes.
 ///
-/// At most some 40 of those are read.
+/// Calls `read` at most about 40 times.
 pub(crate) fn offset(bytes: &[u8], stop: Stop, read: impl Fn(&[u8]) -> Option<Stop>) -> usize {
     let (_, error) = stop;
     let shorter = |end: usize| read(bytes.get(..end)?);
     if let DecodeError::Truncated { found, .. } = error
         && shorter(bytes.len().saturating_sub(1)) != Some(stop)
     {
-        // How many bytes were left says where they were missed; else what was read ends before the bytes do.
+        // The number of remaining bytes gives the offset of the fault. Otherwise the decoded part
+        // ends before the end of the bytes.
         return bytes.len().saturating_sub(found);
     }
     if let DecodeError::TrailingBytes(left) = error {
@@ -56,20 +58,20 @@ pub(crate) fn offset(bytes: &[u8], stop: Stop, read: impl Fn(&[u8]) -> Option<St
     if let DecodeError::Reserved { field, .. } = error
         && field == "field encoding"
     {
-        // Bits of the first byte, looked at after those of the second.
+        // Bits of the first byte, which are checked after the bits of the second byte.
         return 0;
     }
     let end = end(bytes, stop, &read);
     let last = end.saturating_sub(1);
-    // Without its last byte, what is at fault is cut off: that says where it starts.
+    // Without its last byte, the field at fault is truncated, which gives its start.
     if let Some((_, DecodeError::Truncated { found, .. })) = shorter(last) {
         return last.saturating_sub(found);
     }
     end.saturating_sub(width(error))
 }
 
-/// Where what is at fault ends: what stands behind makes no difference. The length does not change, as counts are
-/// held against it.
+/// Returns the end of the field at fault: the first position after which the bytes make no
+/// difference. The length stays the same, because counts are compared with it.
 fn end(bytes: &[u8], stop: Stop, read: &impl Fn(&[u8]) -> Option<Stop>) -> usize {
     let mut other = bytes.to_vec();
     let (mut before, mut end) = (0, bytes.len());
@@ -90,7 +92,7 @@ fn end(bytes: &[u8], stop: Stop, read: &impl Fn(&[u8]) -> Option<Stop>) -> usize
     end
 }
 
-/// Bytes of what is at fault, where nothing else tells.
+/// Returns the number of bytes of the field at fault, by the kind of error.
 fn width(error: DecodeError) -> usize {
     if let DecodeError::Limit { field, .. } = error {
         return if field == "FieldCount" { 2 } else { 4 };
@@ -103,7 +105,7 @@ fn width(error: DecodeError) -> usize {
     1
 }
 
-/// Where an error stands that came after so many fields: what is behind the last one is in none.
+/// Returns the stop of an error after `field` fields. Trailing bytes belong to no field.
 pub(crate) const fn in_field(field: usize, error: DecodeError) -> Stop {
     if let DecodeError::TrailingBytes(_) = error {
         return (None, error);
@@ -141,7 +143,7 @@ impl fmt::Display for Fault {
     }
 }
 
-/// The standard's name of what is at fault, and what is wrong with it.
+/// Returns the name of the field at fault in the standard, and the description of the error.
 fn described(error: DecodeError) -> (Option<&'static str>, String) {
     if let DecodeError::Truncated {
         field,

@@ -1,8 +1,8 @@
-//! Bytes as hexadecimal digits: what people paste, and what a fault is shown in.
+//! Hexadecimal text: parses pasted digits, and shows the bytes around a fault.
 
 use std::fmt::Write as _;
 
-/// A character that has no place in hexadecimal text.
+/// A character that is not valid in hexadecimal text.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("line {line}, column {column}: {what}")]
 pub(crate) struct HexError {
@@ -11,7 +11,8 @@ pub(crate) struct HexError {
     what: String,
 }
 
-/// Reads digits in pairs. Blanks and commas may stand between bytes, `0x` before them; `#` starts a comment.
+/// Parses pairs of digits. Blanks and commas may separate bytes, `0x` may precede them, and `#`
+/// starts a comment.
 pub(crate) fn parse(text: &str) -> Result<Vec<u8>, HexError> {
     let mut bytes = Vec::with_capacity(text.len() / 2);
     for (line, number) in text.lines().zip(1..) {
@@ -20,7 +21,7 @@ pub(crate) fn parse(text: &str) -> Result<Vec<u8>, HexError> {
     Ok(bytes)
 }
 
-/// One line of such text; `number` is its own.
+/// Parses a line of such text; `number` is the line number.
 pub(crate) fn parse_line(line: &str, number: usize, bytes: &mut Vec<u8>) -> Result<(), HexError> {
     let digits = line.split('#').next().unwrap_or_default();
     let mut column = 1;
@@ -37,7 +38,7 @@ pub(crate) fn parse_line(line: &str, number: usize, bytes: &mut Vec<u8>) -> Resu
     Ok(())
 }
 
-/// On an error, which character of the word it is.
+/// Parses a word; an error has the index of the character in the word.
 fn parse_word(word: &str, bytes: &mut Vec<u8>) -> Result<(), (usize, String)> {
     let mut high = None;
     for (character, at) in word.chars().zip(0..) {
@@ -59,7 +60,7 @@ fn parse_word(word: &str, bytes: &mut Vec<u8>) -> Result<(), (usize, String)> {
     }
 }
 
-/// Lower case, without blanks.
+/// Formats bytes in lower case, without blanks.
 pub(crate) fn text(bytes: &[u8]) -> String {
     bytes.iter().fold(String::new(), |mut text, byte| {
         // Writing to a String does not fail.
@@ -68,7 +69,8 @@ pub(crate) fn text(bytes: &[u8]) -> String {
     })
 }
 
-/// The lines of 16 bytes around `at`, each with the offset of its first byte, and a caret below the byte at `at`.
+/// Returns the lines of 16 bytes around `at`, each with the offset of its first byte, and a caret
+/// below the byte at `at`.
 pub(crate) fn around(bytes: &[u8], at: usize) -> String {
     let line = at / LINE;
     let mut out = String::new();
@@ -82,14 +84,14 @@ pub(crate) fn around(bytes: &[u8], at: usize) -> String {
         }
     }
     if at == bytes.len() && at.is_multiple_of(LINE) {
-        // Behind a last line that is full.
+        // The position after a full last line.
         let _written = writeln!(out, "  {at:04x}\n{}^^", " ".repeat(MARGIN));
     }
     out
 }
 
 const LINE: usize = 16;
-/// Columns before the first byte.
+/// Number of columns before the first byte.
 const MARGIN: usize = 8;
 
 #[cfg(test)]

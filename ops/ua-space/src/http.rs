@@ -1,4 +1,4 @@
-//! Asking over HTTP, bounded in bytes and time.
+//! Sends HTTP requests with limits on size and time.
 
 use std::time::Duration;
 
@@ -12,25 +12,27 @@ use tokio::time::timeout;
 
 use crate::exit::Failure;
 
-/// What was answered.
+/// An HTTP response.
 pub(crate) struct Answer {
     pub(crate) status: u16,
     pub(crate) content_type: String,
     pub(crate) body: String,
 }
 
-/// Who is asked: `http://host:port`, or `host:port` alone.
+/// An HTTP server: `http://host:port`, or `host:port` alone.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Server {
     /// `host:port`.
     authority: String,
-    /// What stands in front of every path; no slash at its end.
+    /// The prefix of every path, without a slash at its end.
     prefix: String,
 }
 
 impl Server {
+    /// Parses the URL of a server.
+    ///
     /// # Errors
-    /// [`Failure::Usage`] for what is no such URL.
+    /// [`Failure::Usage`] if the URL is malformed.
     pub(crate) fn parse(url: &str) -> Result<Self, Failure> {
         let rest = url.strip_prefix("http://").unwrap_or(url);
         let (authority, path) = rest.split_once('/').unwrap_or((rest, ""));
@@ -50,19 +52,19 @@ impl Server {
         }
     }
 
-    /// Asks for a path, which begins with a slash.
+    /// Requests a path, which begins with a slash.
     ///
     /// # Errors
-    /// [`Failure::Unavailable`] when nobody answers in time.
+    /// [`Failure::Unavailable`] if the server does not respond in time.
     pub(crate) async fn get(&self, path: &str) -> Result<Answer, Failure> {
         self.request(Method::GET, path, (JSON, "", Bytes::new()))
             .await
     }
 
-    /// Asks a query of SPARQL.
+    /// Sends a SPARQL query.
     ///
     /// # Errors
-    /// As [`get`](Self::get).
+    /// See [`get`](Self::get).
     pub(crate) async fn query(&self, path: &str, query: String) -> Result<Answer, Failure> {
         let content = (RESULTS, "application/sparql-query", query.into());
         self.request(Method::POST, path, content).await
@@ -130,7 +132,8 @@ impl Server {
         tokio::select! {
             biased;
             answer = &mut answer => answer,
-            // The connection is done when the last byte is read; the answer may not be.
+            // The connection ends when the last byte is read, possibly before the response is
+            // complete.
             ended = &mut connection => {
                 ended.map_err(text)?;
                 answer.await
@@ -146,7 +149,7 @@ impl Server {
     }
 }
 
-/// A value as it stands in a query.
+/// Percent-encodes a value for a query.
 pub(crate) fn encoded(value: &str) -> String {
     let mut text = String::with_capacity(value.len());
     for byte in value.bytes() {
@@ -160,10 +163,10 @@ pub(crate) fn encoded(value: &str) -> String {
     text
 }
 
-/// Plain JSON, where the standard form of results is to be had too.
+/// Plain JSON, which is accepted even where the server also offers the SPARQL results format.
 const JSON: &str = "application/json";
 const RESULTS: &str = "application/sparql-results+json, application/n-triples";
-/// Longer than the longest query may take.
+/// The time limit of a request, longer than the time limit of a query.
 const LIMIT: Duration = Duration::from_secs(15);
 const MOST_BYTES: usize = 32 << 20;
 

@@ -1,4 +1,4 @@
-//! A mapping of what is there: from live graphs, from a server, from NodeSets.
+//! `ua-space init`: proposes a mapping from live graphs, servers and NodeSets.
 
 mod calls;
 mod known;
@@ -69,11 +69,11 @@ pub(crate) fn init(arguments: &Init) -> Result<(), Failure> {
     )
 }
 
-/// What was looked at.
+/// The inspected sources.
 struct Found {
     graphs: Vec<Graph>,
     nodes: Vec<Nodes>,
-    /// For people, in their order.
+    /// The names of the sources for the head of the file, in order.
     places: Vec<String>,
 }
 
@@ -112,7 +112,8 @@ impl Found {
         Ok(found)
     }
 
-    /// Whoever is found beside what was asked for. Who cannot be looked into is told of in the head.
+    /// Adds the discovered sources that were not named in the arguments. Sources that cannot be
+    /// inspected are named in the head of the file.
     fn discover(&mut self, arguments: &Init, known: &Mapping) -> Result<(), Failure> {
         if arguments.ros1.is_none() {
             let uri = survey::ros1::master_uri();
@@ -136,7 +137,7 @@ impl Found {
             }
         }
         for entry in look(discover::around(&arguments.look))?.entries {
-            // Components and bridges are in the space without being mapped.
+            // Components and bridges take part in the space without a mapping.
             let is_source = matches!(entry.kind, Kind::Server | Kind::Cell);
             let Some(url) = entry.urls.first().filter(|_| is_source) else {
                 continue;
@@ -174,7 +175,7 @@ impl Found {
     }
 }
 
-/// Those asked for, each once, in their order.
+/// Returns the requested domains in ascending order, without duplicates.
 fn domains(asked: &[Option<u16>]) -> Result<Vec<u16>, Failure> {
     let mut domains = Vec::new();
     for asked in asked {
@@ -198,7 +199,8 @@ fn domains(asked: &[Option<u16>]) -> Result<Vec<u16>, Failure> {
     Ok(domains)
 }
 
-/// The space of a domain: the one the mapping gives it, that of its number, or for domains 0 and 1 a free one.
+/// Returns the space of a domain: its space in the mapping, the space with its number, or a free
+/// space for domains 0 and 1.
 fn space_of(domain: u16, known: &Mapping, graphs: &[Graph]) -> Result<SpaceId, Failure> {
     let taken = |space: &SpaceId| graphs.iter().any(|graph| graph.space == *space);
     if let Some(space) = known.space_of_domain(domain).filter(|space| !taken(space)) {
@@ -213,7 +215,7 @@ fn space_of(domain: u16, known: &Mapping, graphs: &[Graph]) -> Result<SpaceId, F
     })
 }
 
-/// The mapping in the file; `None` where there is none.
+/// Reads the mapping in the file; `None` if the file does not exist.
 fn existing(file: &str) -> Result<Option<(Mapping, String)>, Failure> {
     let bytes = match bytes_of(file) {
         Ok(bytes) => bytes,
@@ -238,7 +240,7 @@ fn bytes_of(file: &str) -> io::Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// A document of its own.
+/// Returns a new document.
 fn written(file: &str, places: &[String], plan: &mut Plan) -> Result<String, Failure> {
     settled(file, plan, |plan| {
         let mut lines = render::head(places);
@@ -264,7 +266,7 @@ fn written(file: &str, places: &[String], plan: &mut Plan) -> Result<String, Fai
                 ]
                 .map(str::to_owned),
             );
-            // A list of nothing but comments is none.
+            // A list that holds only comments would be null.
             let any = plan.entries.iter().any(|entry| entry.faulty.is_none());
             lines.push(if any { "variables:" } else { "variables: []" }.to_owned());
         }
@@ -285,7 +287,7 @@ fn written(file: &str, places: &[String], plan: &mut Plan) -> Result<String, Fai
     })
 }
 
-/// What stands before the calls of a document of its own.
+/// The heading of the calls of a new document.
 const CALLS: [&str; 5] = [
     "",
     "# What one space executes and the others ask for: there each has its name in the space, as /ua_1_2_61, or the one that a",
@@ -297,14 +299,14 @@ const CALLS: [&str; 5] = [
 fn section(lines: &mut Vec<String>, title: &str, key: &str, block: Vec<String>) {
     if !block.is_empty() {
         lines.push(String::new());
-        // Places are counted in lines.
+        // Positions are counted in lines.
         lines.extend(format!("# {title}").lines().map(str::to_owned));
         lines.push(format!("{key}:"));
         lines.extend(block);
     }
 }
 
-/// The document with what is new in it.
+/// Returns the document with the new entries added.
 fn added(file: &str, (text, before): (&str, &Mapping), plan: &mut Plan) -> Result<String, Failure> {
     let merged = settled(file, plan, |plan| {
         let mut merged = text.to_owned();
@@ -364,7 +366,8 @@ fn unmergeable() -> Failure {
     )
 }
 
-/// A document, and for its variables and its calls the line they begin at and the lines of each among them.
+/// A document, with the line at which its variables and its calls begin and the line ranges of the
+/// entries.
 struct Rendered {
     text: String,
     variables: (usize, Vec<Range<usize>>),
@@ -372,7 +375,7 @@ struct Rendered {
 }
 
 impl Rendered {
-    /// Makes the entry that a finding is about a comment; whether there is one that is none yet.
+    /// Comments out the entry with the finding. Returns true if an active entry was found.
     fn mark(&self, finding: &Diagnostic, plan: &mut Plan) -> bool {
         let line = finding.at.line.saturating_sub(1);
         let within = |(start, entries): &(usize, Vec<Range<usize>>)| {
@@ -393,7 +396,7 @@ impl Rendered {
     }
 }
 
-/// What a comment says of an entry that has a finding.
+/// Returns the comment of an entry with a finding.
 fn why(finding: &Diagnostic, origin: SpaceId) -> String {
     let why = format!("{}: {}", finding.code, finding.message);
     let hint = if finding.code == Code::UnknownMessageType && origin == SpaceId::ROS1 {
@@ -410,7 +413,7 @@ fn why(finding: &Diagnostic, origin: SpaceId) -> String {
     format!("{why}\n{hint}")
 }
 
-/// Renders until no entry has a finding: those that have one become comments with its text.
+/// Renders until no entry has a finding. Entries with a finding become comments with its text.
 fn settled(
     file: &str,
     plan: &mut Plan,
@@ -421,20 +424,20 @@ fn settled(
         let Checked {
             mapping, findings, ..
         } = Mapping::from_text(&rendered.text, file, &Disk);
-        // An entry without an end of its movement runs, and has a comment that says how to end it.
+        // An entry without `on_loss` runs, and has a comment that explains `on_loss`.
         let here = findings
             .iter()
             .filter(|finding| *finding.at.file == *file && finding.code != Code::EndlessMotion);
         let marked = here.filter(|finding| rendered.mark(finding, plan)).count();
         if marked > 0 {
-            // The file has the comment already.
+            // The file already contains the comment.
             plan.entries
                 .retain(|entry| entry.faulty.is_none() || !entry.is_set_aside);
             plan.calls
                 .retain(|call| call.faulty.is_none() || !call.is_set_aside);
             continue;
         }
-        // Such as that there is too much of it.
+        // For example, the document is too large.
         return match (mapping, findings.first()) {
             (None, Some(first)) => Err(Failure::Unconfigured(format!(
                 "what would be written could not run: {}",
@@ -480,8 +483,8 @@ fn put(arguments: &Init, before: Option<&str>, text: &str, plan: &Plan) -> Resul
     Ok(out.flush()?)
 }
 
-/// Puts another text in the place of that which was read, at once and with its permissions. The survey takes some time, in
-/// which somebody may have saved the file.
+/// Replaces the text of the file atomically and keeps its permissions. Fails if the file was
+/// changed during the survey.
 fn replace(file: &str, before: &str, text: &str) -> Result<(), Failure> {
     let now = bytes_of(file).map_err(|error| Failure::reading(file, &error))?;
     if now != before.as_bytes() {
@@ -492,22 +495,23 @@ fn replace(file: &str, before: &str, text: &str) -> Result<(), Failure> {
     exchanged(file, text).map_err(|error| cannot_write(file, &error))
 }
 
-/// Writes beside the file and renames: who reads it meanwhile has the one text or the other.
+/// Writes a temporary file in the same folder and renames it, so readers see either the old or the
+/// new text.
 fn exchanged(file: &str, text: &str) -> io::Result<()> {
-    // What a link names is exchanged, not the link.
+    // A symbolic link stays; its target is replaced.
     let target = std::fs::canonicalize(file)?;
     let found = target.metadata()?;
     if !found.is_file() {
         return Err(io::Error::other("it is no regular file"));
     }
-    // Who may write into the folder may not yet write the file.
+    // Write permission for the folder does not imply write permission for the file.
     drop(OpenOptions::new().write(true).open(&target)?);
     let beside = beside(&target);
     let mut opened = OpenOptions::new()
         .write(true)
         .create_new(true)
         .open(&beside)?;
-    // Root leaves the file to whom it belongs; who is not root can give nothing away.
+    // Root keeps the owner of the file. For other users, changing the owner may fail.
     drop(fchown(&opened, Some(found.uid()), Some(found.gid())));
     let written = opened
         .set_permissions(found.permissions())
@@ -515,13 +519,13 @@ fn exchanged(file: &str, text: &str) -> io::Result<()> {
         .and_then(|()| opened.sync_all())
         .and_then(|()| std::fs::rename(&beside, &target));
     if written.is_err() {
-        // The cause counts.
+        // The first error is reported, not an error of the removal.
         drop(std::fs::remove_file(&beside));
     }
     written
 }
 
-/// A name in the same folder, hidden, so that no `include` takes it.
+/// Returns a hidden name in the same folder, which no `include` pattern matches.
 fn beside(target: &Path) -> PathBuf {
     let mut name = std::ffi::OsString::from(".");
     name.push(target.file_name().unwrap_or_default());
@@ -533,7 +537,7 @@ fn cannot_write(file: &str, error: &io::Error) -> Failure {
     Failure::Io(format!("cannot write {file}: {error}"))
 }
 
-/// What came of it.
+/// The summary of the written mapping.
 #[derive(Serialize)]
 #[serde(rename_all = "camelCase")]
 struct Sum<'a> {
@@ -592,9 +596,9 @@ impl std::fmt::Display for Sum<'_> {
     }
 }
 
-/// Spaces of domains 0 and 1 begin here: lower numbers are those of the domains people have.
+/// The first space for domains 0 and 1; lower numbers are kept for domains with the same number.
 const FIRST_FREE: u16 = 40;
-/// More than a mapping may have (M002).
+/// One byte more than the largest mapping (M002).
 const MOST: u64 = (32 << 20) + 1;
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! What a file holds: one datagram, several, or a capture.
+//! Reads the datagrams of a file: one datagram, several lines, or a capture.
 
 use std::fs::File;
 use std::io::{self, BufReader, Read};
@@ -7,16 +7,16 @@ use crate::capture::{Capture, CaptureError, is_capture};
 use crate::exit::Failure;
 use crate::hex;
 
-/// A file that was recognised.
+/// A file with its detected format.
 pub(crate) enum Input {
-    /// One datagram, as text or as it is.
+    /// One datagram, as hexadecimal text or as bytes.
     Datagram(Vec<u8>),
-    /// One datagram a line, each with the number of its line.
+    /// One datagram per line, each with its line number.
     Lines(Vec<(usize, Vec<u8>)>),
     Capture(Capture<Box<dyn Read>>),
 }
 
-/// Opens a file, `-` for stdin. With `lines` every line of hexadecimal text is a datagram.
+/// Opens a file, `-` for stdin. With `lines`, every line of hexadecimal text is a datagram.
 pub(crate) fn open(file: &str, lines: bool) -> Result<Input, Failure> {
     let reading = |error: io::Error| Failure::reading(name(file), &error);
     let mut reader: Box<dyn Read> = match file {
@@ -60,7 +60,7 @@ pub(crate) fn open(file: &str, lines: bool) -> Result<Input, Failure> {
     }
 }
 
-/// What to call the file in messages.
+/// Returns the name of the file for messages.
 pub(crate) fn name(file: &str) -> &str {
     match file {
         "-" => "stdin",
@@ -68,7 +68,7 @@ pub(crate) fn name(file: &str) -> &str {
     }
 }
 
-/// What it means that a capture cannot be read on.
+/// Returns the failure for an error of a capture.
 pub(crate) fn failure(file: &str, error: CaptureError) -> Failure {
     match error {
         CaptureError::Io(error) => Failure::reading(name(file), &error),
@@ -78,8 +78,8 @@ pub(crate) fn failure(file: &str, error: CaptureError) -> Failure {
     }
 }
 
-/// Text, unless there are bytes that no text has. A datagram always has some: its counts and lengths are small
-/// numbers.
+/// Returns the bytes as text, unless they contain control characters. A datagram always contains
+/// some, because its counts and lengths are small numbers.
 fn text(bytes: &[u8]) -> Option<&str> {
     let control = |byte: &u8| byte.is_ascii_control() && !byte.is_ascii_whitespace();
     match bytes.iter().any(control) {
@@ -100,5 +100,5 @@ fn read_lines(text: &str) -> Result<Input, hex::HexError> {
     Ok(Input::Lines(datagrams))
 }
 
-/// More than any datagram and its comments have.
+/// Maximum size of a datagram file with its comments, in bytes.
 const MAX_BYTES: u64 = 1 << 30;

@@ -1,8 +1,9 @@
-//! Times as ISO 8601 text.
+//! Formats and parses times as ISO 8601 text.
 
 use uadp::DateTime;
 
-/// A DateTime with as many digits as it needs: `2026-05-17T12:34:56.789Z`. Years beyond four digits have a sign.
+/// Formats a DateTime with as many digits as needed: `2026-05-17T12:34:56.789Z`. Years beyond four
+/// digits have a sign.
 pub(crate) fn of_date_time(time: DateTime) -> String {
     let seconds = time.0.div_euclid(TICKS_PER_SECOND) - UNIX_EPOCH_SECONDS;
     let ticks = time.0.rem_euclid(TICKS_PER_SECOND);
@@ -12,7 +13,7 @@ pub(crate) fn of_date_time(time: DateTime) -> String {
     format!("{}{point}{fraction}Z", of_seconds(seconds))
 }
 
-/// Nanoseconds since 1970-01-01 UTC, with all nine digits.
+/// Formats nanoseconds since 1970-01-01 UTC, with all nine digits.
 pub(crate) fn of_unix_nanos(nanos: i128) -> String {
     let seconds = i64::try_from(nanos.div_euclid(1_000_000_000)).unwrap_or_default();
     format!(
@@ -22,7 +23,7 @@ pub(crate) fn of_unix_nanos(nanos: i128) -> String {
     )
 }
 
-/// The DateTime that text names; `None` when it is none or names a time no DateTime has.
+/// Parses a DateTime; `None` if the text is not a time or the time is out of range.
 pub(crate) fn parse(text: &str) -> Option<DateTime> {
     let (date, time) = text.strip_suffix('Z')?.split_once('T')?;
     // The first sign belongs to the year.
@@ -63,7 +64,8 @@ fn of_seconds(seconds: i64) -> String {
     format!("{year}-{month:02}-{day:02}T{hour:02}:{minute:02}:{second:02}")
 }
 
-/// Days from 1970-01-01 to a day of the Gregorian calendar; `None` for one that its month does not have.
+/// Returns the days from 1970-01-01 to a day of the Gregorian calendar; `None` if the month does
+/// not have the day.
 fn days_from_1970(year: i64, month: i64, day: i64) -> Option<i64> {
     if year.abs() > 100_000 {
         return None;
@@ -72,7 +74,7 @@ fn days_from_1970(year: i64, month: i64, day: i64) -> Option<i64> {
     (date(days) == (year, month, day)).then_some(days)
 }
 
-/// As [`days_from_1970`]; a day the month does not have counts on into the next.
+/// Like [`days_from_1970`], but a day beyond the end of the month counts into the next month.
 fn days_of(year: i64, month: i64, day: i64) -> i64 {
     // Years counted from March end with the leap day.
     let (year, month) = match month {
@@ -84,9 +86,10 @@ fn days_of(year: i64, month: i64, day: i64) -> i64 {
     year * 365 + leap_days + before_month + day - 1 - MARCH_0000_TO_1970
 }
 
-/// Year, month and day of a day counted from 1970-01-01.
+/// Returns year, month and day of a day counted from 1970-01-01.
 fn date(days: i64) -> (i64, i64, i64) {
-    // A guess that is at most a year off, then the first of that year that is not too late.
+    // The estimate is at most a year off; then the latest year that starts on or before the day is
+    // chosen.
     let guess = 1970 + (days * 400).div_euclid(DAYS_IN_400_YEARS);
     let late = |year: &i64| days_of(*year, 1, 1) > days;
     let year = [guess + 1, guess, guess - 1]
@@ -102,7 +105,7 @@ fn date(days: i64) -> (i64, i64, i64) {
 
 const TICKS_PER_SECOND: i64 = 10_000_000;
 const SECONDS_PER_DAY: i64 = 86_400;
-/// From 1601-01-01 to 1970-01-01.
+/// Seconds from 1601-01-01 to 1970-01-01.
 const UNIX_EPOCH_SECONDS: i64 = 11_644_473_600;
 const DAYS_IN_400_YEARS: i64 = 146_097;
 const MARCH_0000_TO_1970: i64 = 719_468;

@@ -1,4 +1,4 @@
-//! JSON files with one object or several.
+//! Reads JSON files with one object or several.
 
 use std::path::Path;
 
@@ -7,7 +7,7 @@ use serde_json::Deserializer;
 
 use crate::exit::Failure;
 
-/// The text of a file.
+/// Returns the text of a file.
 pub(crate) fn read(path: &Path) -> Result<String, Failure> {
     let name = path.display().to_string();
     let bytes = type_files::read_bounded(path, LARGEST)
@@ -15,10 +15,10 @@ pub(crate) fn read(path: &Path) -> Result<String, Failure> {
     String::from_utf8(bytes).map_err(|_| Failure::Data(format!("{name}: not UTF-8, so no JSON")))
 }
 
-/// Bytes of the largest file or input.
+/// Maximum size of a file or input, in bytes.
 pub(crate) const LARGEST: u64 = 64 << 20;
 
-/// The objects of an array, or one or more objects, one after the other. An error names line and column.
+/// Parses the objects of an array, or a sequence of objects. Errors have line and column.
 pub(crate) fn one_or_many<T: DeserializeOwned>(text: &str) -> Result<Vec<T>, serde_json::Error> {
     if text.trim_start().starts_with('[') {
         return serde_json::from_str(text);
@@ -26,7 +26,7 @@ pub(crate) fn one_or_many<T: DeserializeOwned>(text: &str) -> Result<Vec<T>, ser
     Deserializer::from_str(text).into_iter().collect()
 }
 
-/// What is wrong with JSON, without the names of all keys there might have been.
+/// Returns the failure for invalid JSON, without the list of expected keys.
 pub(crate) fn explain(name: &str, error: &serde_json::Error) -> Failure {
     let text = error.to_string();
     let (what, place) = match text.rsplit_once(" at line ") {

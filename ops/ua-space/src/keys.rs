@@ -1,4 +1,4 @@
-//! Keys of secured messages, from a file.
+//! Reads keys of secured messages from a file.
 
 use std::io::Read as _;
 use std::path::Path;
@@ -25,20 +25,21 @@ struct Entry {
     keys: Keys,
 }
 
-/// One key of a SecurityGroup, in its parts; those of text are hexadecimal.
+/// The parts of a key of a SecurityGroup; texts are hexadecimal.
 #[derive(Debug, Deserialize)]
 #[serde(rename_all = "camelCase", deny_unknown_fields)]
 struct Written {
-    /// SecurityPolicyUri.
+    /// The SecurityPolicyUri.
     policy: String,
     security_token_id: u32,
     signing_key: String,
     encrypting_key: String,
     key_nonce: String,
-    /// Only of this publisher and WriterGroup.
+    /// Limits the key to this publisher and WriterGroup.
     publisher_id: Option<selector::Publisher>,
     writer_group_id: Option<u16>,
-    /// What the messages themselves say, and more that test vectors know of theirs.
+    /// Keys of test vectors that are ignored: values that the messages contain, and expected
+    /// results.
     #[serde(default, rename = "mode")]
     _mode: IgnoredAny,
     #[serde(default, rename = "payloadOffset")]
@@ -54,7 +55,7 @@ struct Written {
 }
 
 impl KeyFile {
-    /// Reads the keys; warns when others can read them as well.
+    /// Reads the keys; warns if other users can read the file.
     pub(crate) fn read(path: &Path, warn: impl FnOnce(&str)) -> Result<Self, Failure> {
         let name = path.display().to_string();
         let text = json_file::read(path)?;
@@ -74,9 +75,9 @@ impl KeyFile {
         Ok(Self { name, entries })
     }
 
-    /// The keys with which the signature of a sealed message is right, at least one.
+    /// Returns all keys that match the signature of a sealed message, at least one.
     ///
-    /// Each message is opened by itself, so that one sent twice is shown twice.
+    /// Each message is verified independently, so a message that was sent twice is shown twice.
     pub(crate) fn find(&self, message: &NetworkMessage<'_>) -> Result<Vec<&Keys>, String> {
         let token_id = message.security().map_or(0, |security| security.token_id);
         let mut found = Vec::new();
@@ -103,7 +104,7 @@ impl KeyFile {
         })
     }
 
-    /// The keys to secure a message with.
+    /// Returns the keys to secure a message with.
     pub(crate) fn of(
         &self,
         token_id: u32,
@@ -114,7 +115,7 @@ impl KeyFile {
         self.entries.iter().find(wanted).map(|entry| &entry.keys)
     }
 
-    /// The first key, with its SecurityTokenId.
+    /// Returns the first key, with its SecurityTokenId.
     pub(crate) fn first(&self) -> Option<(u32, &Keys)> {
         let first = self.entries.first()?;
         Some((first.written.security_token_id, &first.keys))
@@ -125,7 +126,7 @@ impl KeyFile {
     }
 }
 
-/// Fills `bytes` with random ones.
+/// Fills `bytes` with random bytes.
 pub(crate) fn random(bytes: &mut [u8]) -> Result<(), Failure> {
     std::fs::File::open(RANDOM)
         .and_then(|mut random| random.read_exact(bytes))
@@ -134,7 +135,7 @@ pub(crate) fn random(bytes: &mut [u8]) -> Result<(), Failure> {
 
 const RANDOM: &str = "/dev/urandom";
 
-/// Opens a message, into `scratch` if it is encrypted.
+/// Verifies a message and decrypts it into `scratch` if it is encrypted.
 pub(crate) fn open<'a>(
     keys: &Keys,
     message: &NetworkMessage<'a>,
@@ -190,7 +191,7 @@ impl Written {
     }
 }
 
-/// The file's mode where it lets others read.
+/// Returns the mode of the file if other users may access it.
 #[cfg(unix)]
 fn others_may_read(path: &Path) -> Option<u32> {
     use std::os::unix::fs::MetadataExt as _;

@@ -1,4 +1,4 @@
-//! JSON for people: short parts on one line, long ones indented.
+//! Formats JSON for people: short parts on one line, long parts indented.
 
 /// Breaks compact JSON into lines of 100 columns; a text or a list of plain values may be longer.
 pub(crate) fn lines(compact: &str) -> String {
@@ -11,15 +11,15 @@ pub(crate) fn lines(compact: &str) -> String {
     out
 }
 
-/// A part of the JSON, as it stands there, and what it is made of.
+/// A part of the JSON, with its text and its parts.
 struct Node<'a> {
     text: &'a str,
-    /// With their keys and colons in an object.
+    /// The parts of an array or object; in an object with their keys and colons.
     parts: Vec<(&'a str, Self)>,
 }
 
 impl Node<'_> {
-    /// `before` is what stands on the line already.
+    /// Writes the part; `before` is the number of columns already used on the line.
     fn write(&self, indent: usize, before: usize, out: &mut String) {
         let plain_list =
             self.text.starts_with('[') && self.parts.iter().all(|(_, part)| part.parts.is_empty());
@@ -54,7 +54,7 @@ impl Node<'_> {
     }
 }
 
-/// Takes one value from the front.
+/// Parses one value from the front.
 fn read<'a>(rest: &mut &'a str) -> Option<Node<'a>> {
     let start = *rest;
     let mut parts = Vec::new();
@@ -89,7 +89,7 @@ fn read<'a>(rest: &mut &'a str) -> Option<Node<'a>> {
 fn skip_string(rest: &mut &str) -> Option<()> {
     let mut escaped = true;
     for (at, character) in rest.char_indices() {
-        // The first quote opens.
+        // The first quote opens the string.
         match character {
             '"' if !escaped => {
                 *rest = rest.get(at + 1..)?;
@@ -102,7 +102,7 @@ fn skip_string(rest: &mut &str) -> Option<()> {
     None
 }
 
-/// What was taken from `start` until only `rest` is left.
+/// Returns the text between the starts of `start` and `rest`.
 fn taken<'a>(start: &'a str, rest: &str) -> Option<&'a str> {
     start.get(..start.len() - rest.len())
 }

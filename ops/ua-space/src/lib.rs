@@ -1,4 +1,4 @@
-//! `ua-space`: looks into the space.
+//! `ua-space`: shows, checks and calls the contents of a running space.
 
 mod actions;
 mod arguments;
@@ -47,13 +47,14 @@ use clap::error::ErrorKind;
 use arguments::{Arguments, Verb};
 use exit::Failure;
 
-/// Runs `ua-space` from its command line to its end. `arguments` begin with the name of the program.
+/// Runs `ua-space` from its command line to its end. `arguments` begin with the name of the
+/// program.
 #[must_use]
 pub fn run(arguments: Vec<OsString>) -> ExitCode {
     let arguments = match Arguments::try_parse_from(arguments) {
         Ok(arguments) => arguments,
         Err(usage) => {
-            // Nobody is left to tell when stdout or stderr is closed.
+            // A closed stdout or stderr cannot be reported.
             let _printed = usage.print();
             let asked = [ErrorKind::DisplayHelp, ErrorKind::DisplayVersion];
             return match asked.contains(&usage.kind()) {

@@ -1,4 +1,4 @@
-//! Looking into a running space: what is heard in its group, without a mapping.
+//! Inspects a running space: receives the messages of its group without a mapping.
 
 mod all;
 mod application;
@@ -44,12 +44,12 @@ use book::{Book, News};
 use prober::Prober;
 use sealing::Sealing;
 
-/// A place in the group.
+/// A connection to the group.
 pub(crate) struct Live {
     udp: Udp,
-    /// What its times count from.
+    /// The origin of its times.
     start: Instant,
-    /// The same in nanoseconds since 1970.
+    /// The same instant in nanoseconds since 1970.
     start_utc: i128,
     pub(crate) book: Book,
     prober: Prober,
@@ -57,30 +57,30 @@ pub(crate) struct Live {
     interrupt: Signal,
     terminate: Signal,
     buffer: Vec<u8>,
-    /// Of a secured group.
+    /// The keys of a secured group.
     sealing: Option<Sealing>,
     shown_group: SocketAddr,
 }
 
-/// Why listening came to an end.
+/// The reason why listening ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Ended {
-    /// It is time.
+    /// The time is over.
     Time,
-    /// The closure said so.
+    /// The closure requested the end.
     Enough,
     /// SIGINT or SIGTERM.
     Interrupted,
 }
 
-/// What to do after a message.
+/// Continues or ends listening after a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Go {
     On,
     Enough,
 }
 
-/// Joins the group, and looks into it until `looking` is done.
+/// Joins the group and runs `looking` to its end.
 pub(crate) fn in_group<T>(
     group: &Group,
     looking: impl AsyncFnOnce(Live) -> Result<T, Failure>,
@@ -91,16 +91,16 @@ pub(crate) fn in_group<T>(
     })
 }
 
-/// Who is in a group.
+/// The programs in a group.
 #[derive(Debug, Default)]
 pub(crate) struct InGroup {
-    /// Each ROS space and from where, and of how many topics.
+    /// The number of topics of each sender: its ROS space and address.
     pub(crate) senders: BTreeMap<(u16, String), usize>,
-    /// What programs say they are: for which space, and from where.
+    /// The announced applications, by space and address.
     pub(crate) applications: BTreeMap<(u16, String), Application>,
 }
 
-/// Who says something in the group for `seconds`, or what it is when it is asked.
+/// Returns the senders and applications of the group, which are probed and received for `seconds`.
 pub(crate) async fn in_the_group(group: &Group, seconds: f64) -> Result<(InGroup, ()), Failure> {
     let mut live = Live::join(group)?;
     live.want_all();
@@ -144,7 +144,7 @@ impl Live {
         })
     }
 
-    /// Who was heard, and what they say they are.
+    /// Returns the received senders and applications.
     pub(crate) fn who(&self) -> InGroup {
         let mut senders = BTreeMap::new();
         for (topic, heard) in self.book.topics() {
@@ -162,22 +162,22 @@ impl Live {
         }
     }
 
-    /// Time since it joined.
+    /// Returns the time since the group was joined.
     pub(crate) fn now(&self) -> Duration {
         self.start.elapsed()
     }
 
-    /// When it joined, in nanoseconds since 1970.
+    /// Returns the time at which the group was joined, in nanoseconds since 1970.
     pub(crate) const fn start_utc(&self) -> i128 {
         self.start_utc
     }
 
-    /// The group, for people.
+    /// Returns the address of the group for output.
     pub(crate) const fn group(&self) -> SocketAddr {
         self.shown_group
     }
 
-    /// Asks the spaces that are heard of, and these, which calls they have.
+    /// Probes for the calls of all received spaces and of the given spaces.
     pub(crate) fn want_calls(&mut self, spaces: impl IntoIterator<Item = u16>) {
         self.wants_calls = true;
         for space in spaces {
@@ -185,12 +185,12 @@ impl Live {
         }
     }
 
-    /// Asks who there is.
+    /// Probes for all applications.
     pub(crate) fn want_all(&mut self) {
         self.prober.want_all();
     }
 
-    /// Asks what a topic or call consists of.
+    /// Probes for the description of a topic or call.
     pub(crate) fn want(&mut self, topic: TopicId) {
         let (space, _, writer_id) = topic.triple();
         self.prober.want(space, writer_id, self.start.elapsed());
@@ -212,7 +212,8 @@ impl Live {
         }
     }
 
-    /// Hears what comes until then, or until `each` has enough. Whatever is heard is asked for what it consists of.
+    /// Receives messages until the given time, or until `each` ends it. Probes for the description
+    /// of every received topic.
     pub(crate) async fn listen(
         &mut self,
         until: Duration,
@@ -235,7 +236,7 @@ impl Live {
         }
     }
 
-    /// Takes one datagram, or waits until then.
+    /// Receives one datagram, or waits until the given time.
     async fn step(
         &mut self,
         until: Duration,
@@ -257,7 +258,7 @@ impl Live {
         }
     }
 
-    /// Whatever has values and no description is asked for.
+    /// Probes for all topics that have values but no description.
     fn ask_for_all(&mut self, now: Duration) {
         let (mut known, mut wanted) = (BTreeSet::new(), BTreeSet::new());
         for (topic, _) in self.book.topics().filter(|(_, heard)| !heard.secured) {
@@ -269,7 +270,7 @@ impl Live {
         for (space, writer_id) in &wanted {
             self.prober.want(*space, *writer_id, now);
         }
-        // Of a DataSetWriterId that several programs have all are waited for.
+        // If several programs use a DataSetWriterId, probing continues until all have answered.
         for (space, writer_id) in known.difference(&wanted) {
             self.prober.answered(*space, *writer_id);
         }
@@ -286,7 +287,7 @@ impl Live {
         }
     }
 
-    /// Tells of what was not taken.
+    /// Reports the messages that were dropped.
     pub(crate) fn tell_dropped(&self) {
         for (drop, count) in self.book.dropped() {
             warn(&format!("{count} left out: {}", drop.label()));
@@ -294,7 +295,7 @@ impl Live {
     }
 }
 
-/// Whether `each` has enough after a datagram.
+/// Handles a datagram. Returns [`Ended::Enough`] if `each` ends the listening.
 fn take(
     (book, sealing): (&mut Book, Option<&mut Sealing>),
     (datagram, from): (&[u8], SocketAddr),
@@ -326,7 +327,7 @@ fn unix_nanos() -> i128 {
     i128::try_from(since.unwrap_or_default().as_nanos()).unwrap_or_default()
 }
 
-/// When so many seconds are over; without them, never.
+/// Returns the time `seconds` after `now`; without `seconds`, a time that is never reached.
 pub(crate) fn until(now: Duration, seconds: Option<f64>) -> Duration {
     let seconds = seconds.map(Duration::try_from_secs_f64);
     match seconds {
@@ -335,5 +336,5 @@ pub(crate) fn until(now: Duration, seconds: Option<f64>) -> Duration {
     }
 }
 
-/// How often is looked what to ask.
+/// The interval at which due probes are sent.
 const LOOK: Duration = Duration::from_millis(100);

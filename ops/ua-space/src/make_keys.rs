@@ -1,4 +1,4 @@
-//! Files with keys: made, and changed so that everybody can follow.
+//! `ua-space keys`: creates key files, and changes them so that running programs can follow.
 
 use std::fs::{File, OpenOptions};
 use std::io::Write as _;
@@ -57,9 +57,9 @@ pub(crate) fn make_keys(arguments: &MakeKeys) -> Result<(), Failure> {
     Ok(())
 }
 
-/// The keys of a file, as they stand there.
+/// Returns the keys of a file as JSON.
 fn listed(file: &Path) -> Result<Vec<Value>, Failure> {
-    // What is no key is told as by everybody else.
+    // Invalid keys are reported as by the programs that read the file.
     KeyFile::read(file, warn)?;
     let name = file.display().to_string();
     let text = json_file::read(file)?;
@@ -71,7 +71,7 @@ fn made(token: u32, policy: SecurityPolicy) -> Result<Value, Failure> {
         let mut bytes = vec![0; len];
         keys::random(&mut bytes).map(|()| hex::text(&bytes))
     };
-    // Beside the encrypting key.
+    // The bytes besides the encrypting key.
     let others = SIGNING + NONCE;
     Ok(json!({
         "policy": policy.uri(),
@@ -82,13 +82,13 @@ fn made(token: u32, policy: SecurityPolicy) -> Result<Value, Failure> {
     }))
 }
 
-/// Writes a file that is not there yet, for its owner alone.
+/// Writes a new file that only its owner can access.
 fn write(file: &Path, keys: &[Value]) -> Result<(), Failure> {
     let mut made = create(file)?;
     put(&mut made, keys).map_err(|error| writing(file, &error))
 }
 
-/// Puts another file in the place of the one that is there, at once.
+/// Replaces an existing file atomically.
 fn replace(file: &Path, keys: &[Value]) -> Result<(), Failure> {
     let mut beside = file.as_os_str().to_owned();
     beside.push(".new");

@@ -1,4 +1,4 @@
-//! The DataSetMessages of a payload.
+//! Reads the DataSetMessages of a payload.
 
 use uadp::{DataSetMessage, DecodeError, FieldEncoding, MessageKind, NetworkMessage};
 
@@ -10,12 +10,12 @@ use crate::{decode, encode, hex, shape};
 /// A DataSetMessage of a payload.
 pub(crate) struct Part<'a> {
     pub(crate) writer_id: Option<u16>,
-    /// Where in the datagram it starts.
+    /// Offset of the message in the datagram.
     pub(crate) offset: usize,
     pub(crate) bytes: &'a [u8],
 }
 
-/// The DataSetMessages of a payload, as many as there are before the first fault of their Sizes.
+/// Splits a payload into its DataSetMessages, up to the first fault of their Sizes.
 pub(crate) fn split<'a>(message: &NetworkMessage<'a>) -> (Vec<Part<'a>>, Option<Fault>) {
     let payload = message.payload();
     let start = message.payload_offset();
@@ -68,7 +68,7 @@ pub(crate) fn split<'a>(message: &NetworkMessage<'a>) -> (Vec<Part<'a>>, Option<
     (parts, left)
 }
 
-/// Reads a DataSetMessage, one of RawData with its layout. The fields before a fault are shown.
+/// Reads a DataSetMessage; RawData is read with the layout. The fields before a fault are included.
 pub(crate) fn read(
     part: &Part<'_>,
     layout: Option<&Layout<'_>>,
@@ -108,7 +108,7 @@ pub(crate) fn read(
     (shown, fault)
 }
 
-/// Where reading a DataSetMessage stops.
+/// Returns the field and error at which reading a DataSetMessage stops.
 fn stop_of(bytes: &[u8], layout: Option<&Layout<'_>>) -> Option<Stop> {
     match DataSetMessage::decode(None, bytes) {
         Ok(message) => read_fields(&message, layout, |_| {}).err(),
@@ -138,7 +138,7 @@ fn show_header(message: &DataSetMessage<'_>, shown: &mut shape::DataSetMessage) 
     shown.minor_version = header.minor_version;
 }
 
-/// Shows the bytes of fields that are not shown otherwise.
+/// Adds the metadata, or the bytes of RawData fields that cannot be shown otherwise.
 fn show_rest(
     message: &DataSetMessage<'_>,
     layout: Option<&Layout<'_>>,
@@ -155,8 +155,8 @@ fn show_rest(
     }
 }
 
-/// Nothing behind a cleared valid bit means anything, so it is shown only where it might: where it would be written
-/// the same again.
+/// Shows a message whose valid bit is cleared. Its contents have no meaning, so they are shown as
+/// fields only if encoding them gives the same bytes.
 fn show_invalid(
     shown: shape::DataSetMessage,
     bytes: &[u8],
@@ -176,7 +176,7 @@ fn is_raw(message: &DataSetMessage<'_>) -> bool {
     message.encoding() == FieldEncoding::RawData && message.kind != MessageKind::KeepAlive
 }
 
-/// Gives the fields one by one.
+/// Passes the fields to `each`.
 fn read_fields(
     message: &DataSetMessage<'_>,
     layout: Option<&Layout<'_>>,
@@ -207,7 +207,7 @@ fn read_fields(
     Ok(())
 }
 
-/// Bytes the message is padded to, if it is.
+/// Returns the size to which the message is padded with zeros, if it is padded.
 fn configured_size(
     message: &DataSetMessage<'_>,
     bytes: &[u8],
@@ -240,7 +240,7 @@ fn configured_size(
         let mut read = 0;
         read_fields(&message, layout, |_| read += 1).is_ok() && read == fields
     };
-    // The shortest prefix that holds everything; the bytes behind it are zeros.
+    // The search finds the shortest prefix that holds all fields; the bytes after it are zeros.
     let (mut end, mut short) = (bytes.len(), least.max(bytes.len() - zeros));
     while short < end {
         let middle = short + (end - short) / 2;

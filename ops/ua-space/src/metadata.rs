@@ -1,4 +1,4 @@
-//! What the fields of RawData messages are, from a file.
+//! Reads the metadata of RawData messages from a file.
 
 use std::path::Path;
 
@@ -11,7 +11,7 @@ use crate::raw_data::Layout;
 use crate::shape::{FieldMetaData, PublisherId};
 use crate::{json_file, selector};
 
-/// The metadata of a file. Of several entries that fit a message the first counts.
+/// The metadata of a file. The first entry that matches a message is used.
 #[derive(Debug, Default)]
 pub(crate) struct MetaDataFile {
     entries: Vec<Entry>,
@@ -26,7 +26,7 @@ struct Entry {
     meta_data: Vec<FieldMetaData>,
 }
 
-/// Whose DataSetMessage it is.
+/// The writer of a DataSetMessage.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Writer<'a> {
     pub(crate) publisher_id: Option<&'a PublisherId>,
@@ -35,7 +35,7 @@ pub(crate) struct Writer<'a> {
 }
 
 impl MetaDataFile {
-    /// Reads entries, or a list of fields that is for every message.
+    /// Reads entries, or a list of fields that applies to all messages.
     pub(crate) fn read(path: &Path, reading: RawReading) -> Result<Self, Failure> {
         let text = json_file::read(path)?;
         let read = match is_list_of_fields(&text) {
@@ -58,7 +58,7 @@ impl MetaDataFile {
         Ok(Self { entries })
     }
 
-    /// The fields of a message, if they are known.
+    /// Returns the fields of a message, if an entry matches.
     pub(crate) fn find(&self, writer: Writer<'_>) -> Option<&[FieldMetaData]> {
         let fits = |entry: &&Entry| {
             selector::publisher_fits(entry.publisher_id.as_ref(), writer.publisher_id)

@@ -1,4 +1,5 @@
-//! NodeIds and ExpandedNodeIds as text (OPC 10000-6, 5.1.12 and 5.1.13): `ns=2;s=Robot`, `nsu=urn:x;i=85`.
+//! Formats and parses NodeIds and ExpandedNodeIds as text (OPC 10000-6, 5.1.12 and 5.1.13):
+//! `ns=2;s=Robot`, `nsu=urn:x;i=85`.
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD as BASE64;
@@ -46,7 +47,7 @@ impl OwnedIdentifier {
 }
 
 impl OwnedNodeId {
-    /// Reads a NodeId or ExpandedNodeId.
+    /// Parses a NodeId or ExpandedNodeId.
     pub(crate) fn parse(text: &str) -> Option<Self> {
         let mut node_id = Self::default();
         let mut rest = text;
@@ -66,7 +67,7 @@ impl OwnedNodeId {
         Some(node_id)
     }
 
-    /// As a NodeId; `None` with a URI or server index, which a NodeId does not have.
+    /// Returns the NodeId; `None` with a URI or server index, which a NodeId does not have.
     pub(crate) fn node_id(&self) -> Option<NodeId<'_>> {
         let expanded = self.expanded();
         (expanded == expanded.node_id.into()).then_some(expanded.node_id)
@@ -90,7 +91,7 @@ impl OwnedNodeId {
     }
 }
 
-/// The text of a NodeId. A null identifier, which the standard has no text for, is `s` or `b` alone.
+/// Formats a NodeId. A null identifier, for which the standard has no text, is `s` or `b` alone.
 pub(crate) fn text(node_id: NodeId<'_>) -> String {
     let identifier = match node_id.identifier {
         Identifier::Numeric(identifier) => format!("i={identifier}"),
@@ -106,7 +107,7 @@ pub(crate) fn text(node_id: NodeId<'_>) -> String {
     }
 }
 
-/// The text of an ExpandedNodeId. A namespace index beside a URI is kept.
+/// Formats an ExpandedNodeId. A namespace index besides a URI is kept.
 pub(crate) fn expanded_text(node_id: ExpandedNodeId<'_>) -> String {
     let server = match node_id.server_index {
         0 => String::new(),
@@ -122,7 +123,7 @@ pub(crate) fn expanded_text(node_id: ExpandedNodeId<'_>) -> String {
     )
 }
 
-/// A Guid of the form `72962B91-FA75-4AE6-8D28-B404DC7DAF63`, in either case.
+/// Parses a Guid of the form `72962B91-FA75-4AE6-8D28-B404DC7DAF63`, in either case.
 pub(crate) fn parse_guid(text: &str) -> Option<Guid> {
     let mut parts = text.split('-');
     let mut next = |digits: usize| {
@@ -140,7 +141,7 @@ pub(crate) fn parse_guid(text: &str) -> Option<Guid> {
     ))
 }
 
-/// What stands between a prefix and the next semicolon, and what behind that.
+/// Returns the text between a prefix and the next semicolon, and the text after the semicolon.
 fn part<'a>(text: &'a str, prefix: &str) -> Option<(&'a str, &'a str)> {
     text.strip_prefix(prefix)?.split_once(';')
 }

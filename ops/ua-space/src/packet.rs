@@ -1,4 +1,4 @@
-//! From a captured packet to its UDP datagram: link layers, IPv4, IPv6, and fragments of either.
+//! Extracts the UDP datagram of a captured packet: link layers, IPv4, IPv6, and fragments of both.
 
 use std::borrow::Cow;
 use std::collections::VecDeque;
@@ -10,28 +10,29 @@ pub(crate) struct Udp<'a> {
     pub(crate) source: SocketAddr,
     pub(crate) destination: SocketAddr,
     pub(crate) payload: Cow<'a, [u8]>,
-    /// Bytes of the payload that were not captured.
+    /// Number of bytes of the payload that were not captured.
     pub(crate) missing: usize,
 }
 
-/// What a packet is.
+/// The contents of a packet.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) enum Found<'a> {
     Udp(Udp<'a>),
-    /// A piece of a datagram whose other pieces have not come yet.
+    /// A fragment of a datagram that is not complete yet.
     Fragment,
-    /// Another protocol, or less of a packet than its headers.
+    /// Another protocol, or a packet with truncated headers.
     Other,
-    /// A LINKTYPE that is not read.
+    /// An unsupported LINKTYPE.
     UnknownLink,
 }
 
-/// Takes the UDP datagram out of a packet.
+/// Extracts the UDP datagram of a packet.
 pub(crate) fn udp<'a>(link_type: u16, data: &'a [u8], fragments: &mut Fragments) -> Found<'a> {
     let packet = match link_type {
         ETHERNET => ethernet(data),
         RAW | RAW_BSD | RAW_OPENBSD | IPV4 | IPV6 => Some(data),
-        // An address family, which is numbered differently everywhere; the IP header says it as well.
+        // The address family has different numbers on different systems; the version in the IP
+        // header is used instead.
         NULL | LOOP => data.get(4..),
         LINUX_SLL => data.get(16..),
         LINUX_SLL2 => data.get(20..),
@@ -49,7 +50,7 @@ pub(crate) fn udp<'a>(link_type: u16, data: &'a [u8], fragments: &mut Fragments)
             .map_or(Found::Other, |(header, payload)| {
                 Found::Udp(header.with(Cow::Borrowed(payload)))
             }),
-        // A piece that was not captured whole leaves a gap that never closes.
+        // A fragment that was not captured completely leaves a gap that never closes.
         Some(fragment) => {
             match fragments.add((addresses, fragment.identification), &fragment, ip.payload) {
                 None => Found::Fragment,
@@ -62,9 +63,9 @@ pub(crate) fn udp<'a>(link_type: u16, data: &'a [u8], fragments: &mut Fragments)
     }
 }
 
-/// Pieces of IP datagrams that are not complete.
+/// Fragments of incomplete IP datagrams.
 ///
-/// Of at most 256 datagrams and 4 MiB; beyond that the one begun first is given up.
+/// Holds at most 256 datagrams and 4 MiB; beyond these limits the oldest datagram is discarded.
 #[derive(Debug, Default)]
 pub(crate) struct Fragments {
     open: VecDeque<Partial>,
@@ -78,14 +79,14 @@ type FragmentKey = ((IpAddr, IpAddr), u32);
 #[derive(Debug)]
 struct Partial {
     key: FragmentKey,
-    /// In the order they came, each with its offset.
+    /// The fragments in the order of arrival, each with its offset.
     pieces: Vec<(usize, Vec<u8>)>,
-    /// Known once the last piece came.
+    /// The total length, known once the last fragment has arrived.
     length: Option<usize>,
 }
 
 impl Fragments {
-    /// IP datagrams that were not complete, up to now.
+    /// Returns the number of incomplete IP datagrams so far.
     pub(crate) fn incomplete(&self) -> usize {
         self.given_up + self.open.len()
     }
@@ -127,7 +128,8 @@ impl Partial {
         pieces.map(|(_, piece)| piece.len() + PIECE_COST).sum()
     }
 
-    /// All bytes, if there is no gap. Where pieces overlap the one that came last counts.
+    /// Returns all bytes if there is no gap. If fragments overlap, the last received fragment is
+    /// used.
     fn whole(&mut self) -> Option<Vec<u8>> {
         let length = self.length?;
         let mut order: Vec<_> = self
@@ -160,14 +162,14 @@ struct Ip<'a> {
     protocol: u8,
     fragment: Option<Fragment>,
     payload: &'a [u8],
-    /// Bytes of the payload that were not captured.
+    /// Number of bytes of the payload that were not captured.
     missing: usize,
 }
 
 struct Fragment {
     identification: u32,
     offset: usize,
-    /// It is not the last.
+    /// True if more fragments follow.
     more: bool,
 }
 
@@ -197,7 +199,7 @@ impl<'a> Ip<'a> {
         ] = *header;
         let header_length = usize::from(first & 0x0F) * 4;
         let total = match u16::from_be_bytes([total_a, total_b]) {
-            // Left to the network card to fill in.
+            // The length is left to the network card to fill in.
             0 => packet.len(),
             total => total.into(),
         };
@@ -244,7 +246,7 @@ impl<'a> Ip<'a> {
             next = following;
             payload = payload.get(extension..)?;
             if fragment.is_some() {
-                // What the other headers of a fragmented packet hold shows once it is whole.
+                // Further headers of a fragmented packet are read after its reassembly.
                 break;
             }
         }
@@ -260,7 +262,8 @@ impl<'a> Ip<'a> {
 }
 
 impl Fragment {
-    /// The outer `None` when the header is cut off, the inner one when it is there for a datagram in one piece.
+    /// Reads a fragment header. The outer `None` stands for a truncated header, the inner `None`
+    /// for an unfragmented datagram.
     fn read_v6(header: &[u8]) -> Option<Option<Self>> {
         let [_, _, offset_a, offset_b, identification @ ..] = *header.first_chunk::<8>()?;
         let word = u16::from_be_bytes([offset_a, offset_b]);
@@ -273,7 +276,7 @@ impl Fragment {
     }
 }
 
-/// What follows the Ethernet header and its VLAN tags, if that is IP.
+/// Returns the bytes after the Ethernet header and its VLAN tags, if they are IP.
 fn ethernet(frame: &[u8]) -> Option<&[u8]> {
     let mut rest = frame.get(12..)?;
     for _ in 0..=MAX_VLAN_TAGS {
@@ -352,7 +355,7 @@ const MAX_VLAN_TAGS: usize = 4;
 const MAX_EXTENSIONS: usize = 16;
 const MAX_OPEN: usize = 256;
 const MAX_HELD: usize = 4 << 20;
-/// What a piece is counted as besides its bytes.
+/// Bytes counted for a fragment in addition to its data.
 const PIECE_COST: usize = 64;
 
 #[cfg(test)]
@@ -473,7 +476,7 @@ mod tests {
             let mut fragments = Fragments::default();
             for index in &order[..2] {
                 assert_eq!(udp(RAW, &pieces[*index], &mut fragments), Found::Fragment);
-                // Another datagram's piece is not mixed in.
+                // A fragment of another datagram is not mixed in.
                 let other = v4(0x2000 | 6, 8, &[0xEE; 48]);
                 assert_eq!(udp(RAW, &other, &mut fragments), Found::Fragment);
             }

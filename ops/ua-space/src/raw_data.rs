@@ -1,4 +1,4 @@
-//! RawData by its metadata (OPC 10000-14, 7.2.4.5.11).
+//! Reads and writes RawData by its metadata (OPC 10000-14, 7.2.4.5.11).
 
 use std::sync::LazyLock;
 
@@ -13,7 +13,7 @@ use crate::node_ids::OwnedNodeId;
 use crate::shape::{Field, FieldMetaData, FieldValue};
 use crate::values::{WrongValue, show_scalar, show_variant, variant_bytes};
 
-/// The fields of a DataSet, as far as RawData needs them.
+/// The fields of a DataSet, with the properties that RawData uses.
 #[derive(Debug)]
 pub(crate) struct Layout<'a> {
     metadata: &'a [FieldMetaData],
@@ -22,7 +22,7 @@ pub(crate) struct Layout<'a> {
 }
 
 impl<'a> Layout<'a> {
-    /// Fails when the fields are none that RawData can have.
+    /// Creates the layout. Fails if RawData cannot have these fields.
     pub(crate) fn new(
         metadata: &'a [FieldMetaData],
         reading: RawReading,
@@ -57,7 +57,7 @@ impl<'a> Layout<'a> {
         self.metadata
     }
 
-    /// Gives the fields of a payload one by one; on an error, how many were before it.
+    /// Passes the fields of a payload to `each`; an error has the number of fields before it.
     pub(crate) fn read(&self, payload: &[u8], mut each: impl FnMut(Field)) -> Result<(), Stop> {
         let layout = RawLayout::new(&self.fields)
             .map_err(|_| (None, DecodeError::Misread("not what its metadata says")))?;
@@ -69,7 +69,7 @@ impl<'a> Layout<'a> {
         Ok(())
     }
 
-    /// The payload of these fields.
+    /// Returns the payload of these fields.
     pub(crate) fn write(&self, fields: &[Field]) -> Result<Vec<u8>, WrongValue> {
         let mut buffers = Vec::new();
         for (field, at) in fields.iter().zip(0..) {
@@ -130,7 +130,7 @@ fn show_raw(value: &RawValue<'_>) -> Result<FieldValue, DecodeError> {
     })
 }
 
-/// The structures that RawData may hold among those that are known: all fields Doubles.
+/// Returns a known structure that RawData may hold; all its fields are Doubles.
 fn structure(data_type: &str) -> Option<&'static RawStructure<'static>> {
     static RANGE: Known = LazyLock::new(|| doubles(NodeId::numeric(0, 886), &DOUBLES[..2]));
     static THREE_D_FRAME: Known = LazyLock::new(|| doubles(NodeId::numeric(0, 18823), &DOUBLES));
@@ -153,5 +153,5 @@ fn doubles(
     RawStructure::new(encoding, RawStructureType::Structure, fields).ok()
 }
 
-/// A ThreeDFrame holds two structures of three Doubles, which stand inline like six.
+/// A ThreeDFrame holds two structures of three Doubles, which are encoded inline as six Doubles.
 static DOUBLES: [RawField<'static>; 6] = [RawField::new(BuiltinType::Double); 6];

@@ -1,4 +1,4 @@
-//! What the program says of datagrams: JSON on stdout, faults on stderr.
+//! Writes the output of `decode`: JSON to stdout, faults to stderr.
 
 use std::io::{self, BufWriter, StdoutLock, Write as _};
 
@@ -6,7 +6,7 @@ use crate::decode::Reading;
 use crate::exit::Failure;
 use crate::{hex, layout};
 
-/// Where the output goes, and how it looks.
+/// The output and its style.
 pub(crate) struct Report {
     out: BufWriter<StdoutLock<'static>>,
     style: Style,
@@ -18,7 +18,7 @@ pub(crate) struct Report {
 pub(crate) enum Style {
     /// One object, for people.
     Single,
-    /// One object a line.
+    /// One object per line.
     Lines,
     /// One array of all objects.
     Array,
@@ -34,7 +34,7 @@ impl Report {
         }
     }
 
-    /// Shows a datagram and tells what is wrong with it; `name` says which it is.
+    /// Shows a datagram and reports its faults; `name` identifies the datagram.
     pub(crate) fn show(&mut self, name: &str, reading: &Reading) -> Result<(), Failure> {
         if !reading.faults.is_empty() || reading.refused.is_some() {
             self.faulty += 1;
@@ -66,12 +66,12 @@ impl Report {
         Ok(())
     }
 
-    /// Datagrams shown so far.
+    /// Returns the number of shown datagrams.
     pub(crate) const fn shown(&self) -> usize {
         self.shown
     }
 
-    /// Ends the output; fails when something was wrong with a datagram.
+    /// Ends the output; fails if a datagram was malformed.
     pub(crate) fn finish(mut self) -> Result<(), Failure> {
         if self.style == Style::Array {
             let end = if self.shown == 0 { "[]\n" } else { "\n]\n" };
@@ -85,8 +85,8 @@ impl Report {
     }
 }
 
-/// Tells something on stderr.
+/// Writes a message to stderr.
 pub(crate) fn warn(what: &str) {
-    // Nobody is left to tell when stderr is closed.
+    // A closed stderr cannot be reported.
     let _written = writeln!(io::stderr(), "{what}");
 }

@@ -1,11 +1,11 @@
-//! Which datagrams an entry of a keys or metadata file is for.
+//! Selects the datagrams to which an entry of a key or metadata file applies.
 
 use serde::Deserialize;
 use serde_json::Value;
 
 use crate::shape;
 
-/// A PublisherId: with its type, or the number or text alone, which then may have any type.
+/// A PublisherId: with its type, or a number or text alone, which matches any type.
 #[derive(Debug, Deserialize)]
 #[serde(untagged)]
 pub(crate) enum Publisher {
@@ -24,7 +24,7 @@ impl Publisher {
     }
 }
 
-/// True where what is wanted is there, or nothing is.
+/// Returns true if the ids are equal or `wanted` is `None`.
 pub(crate) fn publisher_fits(wanted: Option<&Publisher>, id: Option<&shape::PublisherId>) -> bool {
     match (wanted, id) {
         (None, _) => true,
@@ -33,12 +33,12 @@ pub(crate) fn publisher_fits(wanted: Option<&Publisher>, id: Option<&shape::Publ
     }
 }
 
-/// As [`publisher_fits`], of a WriterGroupId or DataSetWriterId.
+/// Like [`publisher_fits`], for a WriterGroupId or DataSetWriterId.
 pub(crate) fn number_fits(wanted: Option<u16>, id: Option<u16>) -> bool {
     wanted.is_none() || wanted == id
 }
 
-/// 64 bit numbers stand as text.
+/// Returns the text of a value; 64-bit numbers are stored as text.
 fn text(value: &Value) -> String {
     let text = value.as_str().map(str::to_owned);
     text.unwrap_or_else(|| value.to_string())

@@ -1,4 +1,4 @@
-//! The verbs, from their arguments to the end.
+//! The commands `decode` and `encode`.
 
 use std::borrow::Cow;
 use std::io::{self, Read, Write as _};
@@ -16,7 +16,7 @@ use crate::packet::{self, Found, Fragments, Udp};
 use crate::report::{Report, Style, warn};
 use crate::{hex, iso_time, json_file, shape};
 
-/// `ua-space decode`.
+/// Runs `ua-space decode`.
 pub(crate) fn decode(arguments: &Decode) -> Result<(), Failure> {
     let name = input::name(&arguments.file);
     let context = context(&arguments.known)?;
@@ -40,7 +40,7 @@ pub(crate) fn decode(arguments: &Decode) -> Result<(), Failure> {
     ended.and(finished)
 }
 
-/// `ua-space encode`.
+/// Runs `ua-space encode`.
 pub(crate) fn encode(arguments: &Encode) -> Result<(), Failure> {
     let name = input::name(&arguments.file);
     let context = context(&arguments.known)?;
@@ -85,7 +85,7 @@ fn context(known: &Known) -> Result<Context, Failure> {
     })
 }
 
-/// `decode` on its way through a file.
+/// The state of `decode` while it reads a file.
 struct Session<'a> {
     name: &'a str,
     port: Option<u16>,
@@ -95,16 +95,16 @@ struct Session<'a> {
     counters: Counters,
 }
 
-/// What is worth a line at the end.
+/// The counts that are reported at the end.
 #[derive(Debug, Default)]
 struct Counters {
-    /// Secured, and shown as they are for want of keys.
+    /// Secured messages that are shown encrypted because keys are missing.
     sealed: usize,
-    /// Datagrams of other ports that are no NetworkMessages.
+    /// Datagrams of other ports that are not NetworkMessages.
     foreign: usize,
-    /// IP datagrams whose fragments are not all there.
+    /// IP datagrams with missing fragments.
     incomplete: usize,
-    /// Packets of a link layer that is not read, and its number.
+    /// Packets with an unsupported link layer, and its number.
     unknown_links: usize,
     unknown_link: u16,
     udp: usize,
@@ -195,7 +195,7 @@ impl Session<'_> {
         self.show(&name, &reading)
     }
 
-    /// Says what the output does not show.
+    /// Reports the counts that the output does not show.
     fn tell(&self) {
         let Counters {
             sealed,
@@ -238,5 +238,5 @@ impl Session<'_> {
     }
 }
 
-/// Where UADP is sent by convention (OPC 10000-14, 7.3.2).
+/// The default UDP port of UADP (OPC 10000-14, 7.3.2).
 const UADP_PORT: u16 = 4840;

@@ -1,11 +1,11 @@
-//! The JSON of a datagram, key by key. What is absent or null is not on the wire. There are no flags: they follow from
-//! what is there.
+//! The JSON of a datagram, key by key. Absent or null keys are not on the wire. There are no keys
+//! for flags, because the flags follow from the present keys.
 
 use serde::de::IgnoredAny;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-/// One NetworkMessage (OPC 10000-14, 7.2.4.4.2).
+/// A NetworkMessage (OPC 10000-14, 7.2.4.4.2).
 #[derive(Debug, Default, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase", deny_unknown_fields, default)]
 pub(crate) struct Datagram {
@@ -15,13 +15,13 @@ pub(crate) struct Datagram {
     pub(crate) source: Option<String>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) destination: Option<String>,
-    /// Why it could not be read to the end.
+    /// The fault at which reading stopped.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) malformed: Option<String>,
-    /// All bytes, where not even the headers could be read.
+    /// All bytes, if even the headers could not be read.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) datagram_hex: Option<String>,
-    /// What was put together from chunks.
+    /// The properties of a message that was reassembled from chunks.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) reassembled: Option<Value>,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -46,7 +46,7 @@ pub(crate) struct Datagram {
     pub(crate) security_header: Option<SecurityHeader>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) action_header: Option<ActionHeader>,
-    /// What stands behind the headers, while it is encrypted or its signature was not verified.
+    /// The bytes after the headers, while they are encrypted or their signature is not verified.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) sealed: Option<Sealed>,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -57,7 +57,7 @@ pub(crate) struct Datagram {
     pub(crate) announcement: Option<Announcement>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) data_set_messages: Option<Vec<DataSetMessage>>,
-    /// Whence the datagram, in files of test vectors; nothing of it is written.
+    /// The origin of the datagram in files of test vectors; these keys are not written.
     #[serde(skip_serializing)]
     pub(crate) name: IgnoredAny,
     #[serde(skip_serializing)]
@@ -90,7 +90,8 @@ pub(crate) enum NetworkMessageType {
     DiscoveryAnnouncement,
 }
 
-/// `value` is a text where it does not fit in the number of a JSON reader: UInt64 and String.
+/// A PublisherId. `value` is a text for UInt64 and String, because JSON readers may not keep all
+/// digits of a 64-bit number.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct PublisherId {
@@ -121,7 +122,7 @@ pub(crate) struct GroupHeader {
     pub(crate) sequence_number: Option<u16>,
 }
 
-/// A DateTime of a header. Where both are there the ticks count.
+/// A DateTime of a header. If both keys are present, the ticks are used.
 #[derive(Debug, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub(crate) struct Timestamp {
@@ -152,23 +153,23 @@ pub(crate) struct SecurityHeader {
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Sealed {
-    /// Payload, footer and signature.
+    /// Payload, footer and signature, in hexadecimal.
     pub(crate) hex: String,
-    /// The payload is a chunk.
+    /// True if the payload is a chunk.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub(crate) chunk: bool,
-    /// The payload starts with an ActionHeader.
+    /// True if the payload starts with an ActionHeader.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub(crate) action: bool,
 }
 
-/// What belongs to all requests or responses of a NetworkMessage (OPC 10000-14, 7.2.4.4.2).
+/// The header of all requests or responses of a NetworkMessage (OPC 10000-14, 7.2.4.4.2).
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase", deny_unknown_fields)]
 pub(crate) struct ActionHeader {
     #[serde(rename = "type")]
     pub(crate) kind: ActionKind,
-    /// How the requests or responses are laid out.
+    /// The layout of the requests or responses.
     #[serde(default, skip_serializing_if = "ActionDialect::is_standard")]
     pub(crate) dialect: ActionDialect,
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -189,7 +190,7 @@ pub(crate) enum ActionKind {
     Response,
 }
 
-/// By the text of the standard, or without DataSetMessage headers as UA-.NETStandard has it.
+/// The layout of the standard, or the layout of UA-.NETStandard without DataSetMessage headers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase")]
 pub(crate) enum ActionDialect {
@@ -208,14 +209,14 @@ impl ActionDialect {
     }
 }
 
-/// What a request or response says of itself (OPC 10000-14, 7.2.4.5.9 and 7.2.4.5.10).
+/// The header of a request or response (OPC 10000-14, 7.2.4.5.9 and 7.2.4.5.10).
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase", deny_unknown_fields)]
 pub(crate) struct Action {
     pub(crate) target_id: u16,
     pub(crate) request_id: u16,
     pub(crate) state: ActionState,
-    /// Of RawData.
+    /// Number of fields, for RawData.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(crate) field_count: Option<u16>,
 }
@@ -228,7 +229,7 @@ pub(crate) enum ActionState {
     Done,
 }
 
-/// A piece of a message (OPC 10000-14, 7.2.4.4.4).
+/// A chunk of a message (OPC 10000-14, 7.2.4.4.4).
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase", deny_unknown_fields)]
 pub(crate) struct Chunk {
@@ -238,7 +239,7 @@ pub(crate) struct Chunk {
     pub(crate) chunk_data_hex: String,
 }
 
-/// What is asked for (OPC 10000-14, 7.2.4.6.12).
+/// A discovery probe (OPC 10000-14, 7.2.4.6.12).
 #[derive(Debug, Default, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase", deny_unknown_fields, default)]
 pub(crate) struct Probe {
@@ -257,7 +258,7 @@ pub(crate) struct Probe {
     pub(crate) include_data_set_writers: Option<bool>,
 }
 
-/// What is announced (OPC 10000-14, 7.2.4.6.3).
+/// A discovery announcement (OPC 10000-14, 7.2.4.6.3).
 #[derive(Debug, Default, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase", deny_unknown_fields, default)]
 pub(crate) struct Announcement {
@@ -268,35 +269,36 @@ pub(crate) struct Announcement {
     pub(crate) data_set_writer_id: Option<u16>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) data_set_writer_ids: Option<Vec<u16>>,
-    /// How many there are in the body.
+    /// Number of endpoints in the body.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) endpoints: Option<usize>,
-    /// As in the body, which counts.
+    /// The URLs in the body; only the body is written.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub(crate) endpoint_urls: Vec<String>,
-    /// How many there are in the body; without it that is one and a StatusCode, as other stacks have it.
+    /// Number of connections in the body. If absent, the body is one connection and a StatusCode,
+    /// as other stacks send it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) connections: Option<usize>,
-    /// As in the body, which counts.
+    /// The name in the body; only the body is written.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) meta_data_name: Option<String>,
-    /// As in the body, which counts.
+    /// The fields in the body; only the body is written.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub(crate) meta_data: Vec<FieldMetaData>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) status_code: Option<u32>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) status_codes: Option<Vec<u32>>,
-    /// The structures as they stand, without what is shown around them.
+    /// The bytes of the structures, without the values shown in other keys.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) body_hex: Option<String>,
 }
 
-/// One DataSetMessage (OPC 10000-14, 7.2.4.5.4).
+/// A DataSetMessage (OPC 10000-14, 7.2.4.5.4).
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase", deny_unknown_fields, default)]
 pub(crate) struct DataSetMessage {
-    /// Why it could not be read to the end; the fields before are there.
+    /// The fault at which reading stopped; the fields before it are included.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) malformed: Option<String>,
     pub(crate) valid: bool,
@@ -315,16 +317,16 @@ pub(crate) struct DataSetMessage {
     pub(crate) major_version: Option<u32>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) minor_version: Option<u32>,
-    /// Of a request or response.
+    /// The header of a request or response.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) action: Option<Action>,
-    /// Bytes it is padded to with zeros.
+    /// Size in bytes to which the message is padded with zeros.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) configured_size: Option<u16>,
-    /// All bytes of a message that is not valid, where the other keys do not tell them.
+    /// All bytes of an invalid message, if the other keys do not represent them.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) message_hex: Option<String>,
-    /// RawData as it stands, where no metadata says what it holds.
+    /// The bytes of RawData without metadata.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) raw_data_hex: Option<String>,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -373,22 +375,22 @@ pub(crate) enum FieldEncoding {
     DataValue,
 }
 
-/// What a reader has to know of a RawData field: a part of its FieldMetaData (OPC 10000-14, 6.2.3.2.4).
+/// The part of FieldMetaData that reading a RawData field needs (OPC 10000-14, 6.2.3.2.4).
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase", deny_unknown_fields)]
 pub(crate) struct FieldMetaData {
-    /// For people.
+    /// The name for people.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(crate) name: Option<String>,
     pub(crate) built_in_type: u8,
-    /// -1 is one value, above that the number of dimensions.
+    /// -1 for a scalar, above that the number of dimensions.
     #[serde(default = "scalar_rank")]
     pub(crate) value_rank: i32,
     #[serde(default)]
     pub(crate) array_dimensions: Vec<u32>,
     #[serde(default)]
     pub(crate) max_string_length: u32,
-    /// NodeId of a structure's type; only those of the known structures.
+    /// The NodeId of the DataType of a structure; only the known structures are supported.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(crate) data_type: Option<String>,
 }
@@ -400,25 +402,26 @@ const fn scalar_rank() -> i32 {
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Field {
-    /// Of a delta frame.
+    /// The index of a field in a delta frame.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(crate) index: Option<u16>,
     pub(crate) value: FieldValue,
 }
 
-/// A Variant, and where it is a DataValue its quality and times. UaType 0 is the null Variant, no UaType is no value.
+/// A Variant, or a DataValue with status and timestamps. UaType 0 is the null Variant, an absent
+/// UaType is a DataValue without value.
 #[derive(Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "PascalCase", deny_unknown_fields, default)]
 pub(crate) struct FieldValue {
     /// Number of the builtin type.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) ua_type: Option<u8>,
-    /// The elements one after the other, the last dimension first, where it is an array.
+    /// The value; for an array the elements in order, with the last dimension varying fastest.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) value: Option<Value>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) dimensions: Option<Vec<u32>>,
-    /// The array is null, which is not an empty one.
+    /// True if the array is null, which differs from an empty array.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub(crate) null_array: bool,
     #[serde(alias = "StatusCode", skip_serializing_if = "Option::is_none")]
@@ -437,7 +440,7 @@ pub(crate) struct FieldValue {
 #[serde(rename_all = "PascalCase", deny_unknown_fields)]
 pub(crate) struct Status {
     pub(crate) code: u32,
-    /// Its name, for people.
+    /// The name of the code, for people.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(crate) symbol: Option<String>,
 }

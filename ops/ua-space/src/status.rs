@@ -1,14 +1,14 @@
-//! Names of the StatusCodes that come with values.
+//! Names of StatusCodes of values.
 
 use uadp::StatusCode;
 
-/// Name of a code without info bits; `None` for those that hardly ever come with a value.
+/// Returns the name of a code without info bits; `None` for codes that values rarely have.
 pub(crate) fn symbol(status: StatusCode) -> Option<&'static str> {
     let known = |entry: &&(u32, &'static str)| entry.0 == status.0;
     KNOWN.iter().find(known).map(|(_, symbol)| *symbol)
 }
 
-/// Of OPC 10000-6, Annex A (StatusCodes).
+/// StatusCodes of OPC 10000-6, Annex A.
 const KNOWN: [(u32, &str); 46] = [
     (0x0000_0000, "Good"),
     (0x0030_0000, "GoodClamped"),

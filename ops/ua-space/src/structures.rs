@@ -1,11 +1,11 @@
-//! The structures of the standard whose fields are shown; any other is shown as its bytes.
+//! Structures of the standard whose fields are shown; other structures are shown as bytes.
 
 use serde_json::{Map, Value};
 use uadp::{BuiltinType, StructureReader};
 
 use crate::values::{WrongValue, show_scalar, write_scalar};
 
-/// A structure's type and its fields, in order.
+/// The type of a structure and its fields, in order.
 #[derive(Debug)]
 pub(crate) struct Structure {
     /// NodeId of the type in namespace 0.
@@ -30,7 +30,8 @@ impl Structure {
         KNOWN.iter().find(|known| known.data_type == data_type)
     }
 
-    /// The fields of a body; `None` for a body that is not exactly those, or would not be written the same again.
+    /// Returns the fields of a body; `None` if the body has other fields, or encoding the fields
+    /// gives other bytes.
     pub(crate) fn show(&self, body: &[u8]) -> Option<Map<String, Value>> {
         let mut reader = StructureReader::new(body);
         let mut shown = show_fields(self.fields, &mut reader)?;

@@ -1,4 +1,4 @@
-//! What is there: ROS graphs, OPC UA servers and NodeSets, as `init` and `check --environment` look at them.
+//! Inspects ROS graphs, OPC UA servers and NodeSets for `init` and `check --environment`.
 
 pub(crate) mod data_types;
 pub(crate) mod nodeset;
@@ -13,48 +13,49 @@ use uadp::BuiltinType;
 
 use crate::exit::Failure;
 
-/// A ROS graph that was looked at.
+/// An inspected ROS graph.
 #[derive(Clone, Debug)]
 pub(crate) struct Graph {
     pub(crate) space: SpaceId,
-    /// Of a ROS 2 space.
+    /// The DDS domain of a ROS 2 space.
     pub(crate) domain: Option<u16>,
     pub(crate) live: LiveSpace,
 }
 
-/// Nodes of a server that runs, or of a NodeSet.
+/// Nodes of a running server, or of a NodeSet.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Nodes {
-    /// What they are from, for people.
+    /// The name of the source, for people.
     pub(crate) place: String,
-    /// Of a server that runs.
+    /// The server, if the nodes are from a running server.
     pub(crate) server: Option<UaServer>,
-    /// The URI of each namespace index that its node ids use; 0 is OPC UA's own.
+    /// The URI of each namespace index in the node ids; 0 is the namespace of OPC UA.
     pub(crate) namespaces: Vec<String>,
-    /// Its variables below the Objects folder, properties and parts of variables aside.
+    /// The variables below the Objects folder, except properties and components of variables.
     pub(crate) variables: Vec<UaVariable>,
-    /// Of a server that runs: its Methods there, but for those by which a server of the space shows its calls.
+    /// The Methods of a running server, except the Methods with which a server of the space offers
+    /// its calls.
     pub(crate) methods: Vec<UaMethod>,
 }
 
-/// A server that was looked at.
+/// An inspected server.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct UaServer {
     pub(crate) endpoint: String,
-    /// Its ApplicationName.
+    /// The ApplicationName.
     pub(crate) name: String,
-    /// Whether it is the server of a cell, which shows the space.
+    /// True if the server is the server of a cell, which shows the space.
     pub(crate) is_cell: bool,
 }
 
 /// A Method of a server.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct UaMethod {
-    /// What it is called on.
+    /// The object on which the Method is called.
     pub(crate) object: NodeIdText,
     pub(crate) method: NodeIdText,
     pub(crate) name: String,
-    /// The name of the object, where that is not the Objects folder.
+    /// The name of the object; empty for the Objects folder.
     pub(crate) within: String,
 }
 
@@ -63,39 +64,39 @@ pub(crate) struct UaMethod {
 pub(crate) struct UaVariable {
     pub(crate) node: NodeIdText,
     pub(crate) name: String,
-    /// The name of the object it is in, where that is not the Objects folder.
+    /// The name of the object with the variable; empty for the Objects folder.
     pub(crate) within: String,
-    /// Where its value comes from, if that is not the cell's own server.
+    /// The source of the value, if it is not the server of the cell.
     pub(crate) source: Option<UaSource>,
-    /// Builtin type and whether it is an array; `None` for matrices and abstract types.
+    /// The builtin type, and whether the value is an array; `None` for matrices and abstract types.
     pub(crate) value: Option<(BuiltinType, bool)>,
 }
 
-/// A node of a server that is not the cell's own.
+/// A node of a server other than the server of the cell.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct UaSource {
-    /// What the mapping calls the server.
+    /// The name of the server in the mapping.
     pub(crate) server: String,
-    /// The node there, by the URI of its namespace.
+    /// The node, with the URI of its namespace.
     pub(crate) node: String,
 }
 
-/// Runs what looks around, on a runtime that ends with it.
+/// Runs a survey on a runtime of its own.
 pub(crate) fn look<T>(looking: impl Future<Output = Result<T, Failure>>) -> Result<T, Failure> {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()
         .map_err(|error| Failure::Io(format!("cannot start: {error}")))?;
     let found = runtime.block_on(looking);
-    // Looking up a name of a host has no end of its own.
+    // A name resolution may never end, so the runtime does not wait for it.
     runtime.shutdown_background();
     found
 }
 
-/// The failure of something that is not there, with what to do about it.
+/// Returns the failure for an unavailable source, with a hint.
 fn away(what: impl Display, help: &str) -> Failure {
     Failure::Unavailable(format!("{what}\n  = help: {help}"))
 }
 
-/// Most topics of a graph and variables of a server that are looked at.
+/// Maximum number of inspected topics of a graph and variables of a server.
 pub(crate) const MOST: usize = 20_000;

@@ -1,4 +1,4 @@
-//! The words of the verb that looks for who is there.
+//! The command line arguments of `ua-space discover`.
 
 use clap::Args;
 use discovery::scan::Range;

@@ -1,4 +1,4 @@
-//! The words of the verbs that look into a running space.
+//! The command line arguments of the commands that inspect a running space.
 
 use std::fmt;
 use std::path::PathBuf;
@@ -227,7 +227,7 @@ pub(crate) struct Ask {
     pub(crate) json: bool,
 }
 
-/// What is called.
+/// The target of a call.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum Target {
     Topic(TopicId),
@@ -255,7 +255,7 @@ impl fmt::Display for Target {
     }
 }
 
-/// As ROS has it or without the slash.
+/// Parses a topic in the notation of ROS, with or without the leading slash.
 fn topic(text: &str) -> Result<TopicId, &'static str> {
     let name = text.strip_prefix('/').unwrap_or(text);
     name.parse()

@@ -1,4 +1,5 @@
-//! Looking for all who are there: announcements, discovery servers, the group, and addresses where somebody asks for that.
+//! Finds programs and servers: from announcements, discovery servers, the PubSub group, and scanned
+//! addresses if the user requests a scan.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
@@ -17,14 +18,14 @@ use crate::exit::Failure;
 use crate::live::{self, InGroup};
 use crate::report::warn;
 
-/// Who is there.
+/// The result of a discovery.
 pub(crate) struct Around {
     pub(crate) entries: Vec<Entry>,
-    /// How many places were tried, if any.
+    /// The number of scanned addresses, if there was a scan.
     pub(crate) tried: Option<u32>,
 }
 
-/// Looks around; Ctrl-C ends it.
+/// Discovers programs and servers. Ctrl-C ends it with [`Failure::Interrupted`].
 pub(crate) async fn around(look: &Look) -> Result<Around, Failure> {
     let hearing = live::in_the_group(&look.group, look.seconds);
     let (found, heard) = around_and(look, hearing).await?;
@@ -34,7 +35,7 @@ pub(crate) async fn around(look: &Look) -> Result<Around, Failure> {
     Ok(found)
 }
 
-/// The same with somebody who listens in the group.
+/// Discovers programs and servers together with a given listener in the group.
 pub(crate) async fn around_and<T>(
     look: &Look,
     hearing: impl Future<Output = Result<(InGroup, T), Failure>>,
@@ -101,18 +102,18 @@ fn interfaces(look: &Look) -> impl Iterator<Item = Interface> + use<> {
     interfaces.into_iter().take(MOST_INTERFACES)
 }
 
-/// The bridges that are announced on the network.
+/// Returns the bridges announced on the network.
 async fn told(look: &Look, limit: Duration) -> Vec<HeardBridge> {
     let mut hearing = JoinSet::new();
     for interface in interfaces(look) {
         hearing.spawn(async move { heard_bridges(&interface, limit).await });
     }
-    // What cannot be heard there is told of servers.
+    // Interfaces without mDNS are reported by the search for servers.
     let all = hearing.join_all().await;
     all.into_iter().flatten().flatten().collect()
 }
 
-/// The servers that are announced on the network.
+/// Returns the servers announced on the network.
 async fn heard(look: &Look, limit: Duration) -> Vec<Known> {
     let mut hearing = JoinSet::new();
     for interface in interfaces(look) {
@@ -137,7 +138,7 @@ async fn heard(look: &Look, limit: Duration) -> Vec<Known> {
                             }
                         }
                     };
-                    // It ends by the limit.
+                    // The search ends at the limit.
                     let _over = timeout(limit, all).await;
                     known.into_values().collect::<Vec<Known>>()
                 });
@@ -148,7 +149,7 @@ async fn heard(look: &Look, limit: Duration) -> Vec<Known> {
     hearing.join_all().await.into_iter().flatten().collect()
 }
 
-/// Somewhere a server is said to be.
+/// The announced or listed location of a server.
 struct Place {
     by: By,
     url: String,
@@ -156,7 +157,8 @@ struct Place {
     capabilities: Vec<String>,
     is_lds: bool,
     uri: String,
-    /// Of a discovery server: where it is itself, which is the host of those that register with it.
+    /// The host of the discovery server that listed the server, which is also the host of the
+    /// servers registered with it.
     host: Option<String>,
 }
 
@@ -186,10 +188,10 @@ impl Place {
         })
     }
 
-    /// Asks who it is.
+    /// Requests the description of the server.
     async fn reached(self) -> Entry {
         let first = describe(&self.url, ANSWER).await;
-        // A name of a host that means nothing here.
+        // The host name in the URL may not resolve on this host.
         let elsewhere = self.host.as_deref().and_then(|host| moved(&self.url, host));
         let (url, described) = match (first, elsewhere) {
             (Err(fault), Some(url)) => match describe(&url, ANSWER).await {
@@ -226,7 +228,7 @@ impl Place {
     }
 }
 
-/// Those that discovery servers list.
+/// Returns the servers that the discovery servers list.
 async fn listed(look: &Look, asked: BTreeSet<String>) -> Vec<Place> {
     let mut asking = JoinSet::new();
     for url in asked.into_iter().take(MOST_LDS) {
@@ -247,7 +249,7 @@ async fn listed(look: &Look, asked: BTreeSet<String>) -> Vec<Place> {
             }
             Err(_) => {}
         }
-        // A server that is none of discovery has no such list.
+        // A server that is not a discovery server has no such list.
         for one in announced.into_iter().flatten() {
             places.push(Place {
                 by: By::Lds,
@@ -324,7 +326,8 @@ fn of_bridge(heard: HeardBridge) -> Entry {
     entry
 }
 
-/// What an application says of itself in the group. One without a URL is no server.
+/// Returns the entry of an application announced in the group. An application without URLs is not a
+/// server.
 fn application(((space, from), told): (&(u16, String), &live::Application)) -> Entry {
     let kind = match told.urls.is_empty() {
         true => Kind::Bridge,
@@ -341,7 +344,7 @@ fn application(((space, from), told): (&(u16, String), &live::Application)) -> E
     entry
 }
 
-/// The host in a URL, with the brackets of an address of IPv6.
+/// Returns the host of a URL, with the brackets of an IPv6 address.
 fn host(url: &str) -> Option<String> {
     let place = url.strip_prefix("opc.tcp://")?.split('/').next()?;
     let host = match place.rsplit_once(':') {
@@ -351,7 +354,7 @@ fn host(url: &str) -> Option<String> {
     Some(host.to_owned())
 }
 
-/// The URL at another host.
+/// Returns the URL with its host replaced.
 fn moved(url: &str, to: &str) -> Option<String> {
     let from = host(url)?;
     let rest = url.strip_prefix("opc.tcp://")?.strip_prefix(&from)?;

@@ -1,23 +1,23 @@
-//! Somebody who was found, and two findings of the same as one.
+//! A discovered program or server; findings of the same program are merged.
 
 use std::collections::BTreeSet;
 
 use serde::Serialize;
 
-/// What somebody is.
+/// The kind of a discovered program.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum Kind {
     /// A discovery server.
     Lds,
     /// The server of a cell, `ua-server`.
     Cell,
-    /// A server of this project with skills, or that leads those that have them.
+    /// A server of this project with skills, or a server that coordinates such servers.
     Component,
     /// Any other OPC UA server.
     Server,
-    /// Who sends the values of a ROS space.
+    /// The publisher of the values of a ROS space.
     Bridge,
-    /// Somebody who listens and is no OPC UA server.
+    /// A listener that is not an OPC UA server.
     Other,
 }
 
@@ -33,7 +33,7 @@ impl Kind {
         }
     }
 
-    /// Of what a server says it is an instance of.
+    /// Returns the kind from the ProductUri of a server.
     pub(super) fn of_product(uri: &str) -> Self {
         match uri {
             "urn:ua-bridge:server" => Self::Cell,
@@ -43,7 +43,7 @@ impl Kind {
     }
 }
 
-/// How somebody was found.
+/// The way in which an entry was found.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum By {
     Mdns,
@@ -63,26 +63,26 @@ impl By {
     }
 }
 
-/// Somebody.
+/// A discovered program or server.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Entry {
     pub(crate) kind: Kind,
     pub(crate) name: String,
-    /// The ApplicationUri; empty where it is not told.
+    /// The ApplicationUri; empty if it is unknown.
     pub(crate) uri: String,
-    /// Where it is, the place it was reached at first.
+    /// The URLs of the server, starting with the URL at which it was first reached.
     pub(crate) urls: Vec<String>,
     pub(crate) capabilities: BTreeSet<String>,
-    /// The ways its endpoints may be talked to.
+    /// The SecurityModes and SecurityPolicies of its endpoints.
     pub(crate) security: Vec<String>,
     pub(crate) found_by: BTreeSet<By>,
-    /// Why it was not reached, or not understood.
+    /// The reason why the server was not reached or its response was not understood.
     pub(crate) fault: Option<String>,
-    /// Whose values it carries or sends, where it is known.
+    /// The space whose values the program carries or publishes, if known.
     pub(crate) space: Option<u16>,
-    /// How many topics were heard of a bridge.
+    /// The number of topics received from a bridge.
     pub(crate) topics: Option<usize>,
-    /// The PubSub group that a bridge says it speaks in.
+    /// The PubSub group that a bridge announces as its own.
     pub(crate) group: Option<String>,
 }
 
@@ -140,8 +140,9 @@ impl Entry {
         }
     }
 
-    /// Whether both are the same: by the ApplicationUri, or the place where that is not told. A bridge is so for each space, and
-    /// one that is only known by what it sends is the one of that space.
+    /// Returns true if both entries are the same program: if their ApplicationUris are equal, or a
+    /// URL is equal where an ApplicationUri is unknown. Bridges of different spaces are different
+    /// programs.
     fn is(&self, other: &Self) -> bool {
         if (self.kind, other.kind) == (Kind::Bridge, Kind::Bridge) && self.space != other.space {
             return false;
@@ -152,9 +153,9 @@ impl Entry {
         }
     }
 
-    /// Takes what another finding says of the same.
+    /// Merges another finding of the same program.
     fn join(&mut self, other: Self) {
-        // Who was reached is told before who was not.
+        // The finding that reached the program precedes a finding that did not.
         let better = self.fault.is_some() && other.fault.is_none();
         let (mut first, second) = match better {
             true => (other, self.clone()),
@@ -187,7 +188,7 @@ impl Entry {
     }
 }
 
-/// Each once, in the order of their kinds and names.
+/// Merges entries of the same program and sorts them by kind and name.
 pub(super) fn merged(found: impl IntoIterator<Item = Entry>) -> Vec<Entry> {
     let mut entries: Vec<Entry> = Vec::new();
     for one in found {

@@ -1,4 +1,4 @@
-//! What somebody executes: services and actions of ROS, and Methods of OPC UA servers, as `calls` of a mapping.
+//! Proposes services and actions of ROS, and Methods of OPC UA servers, as `calls` of a mapping.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;
@@ -10,38 +10,38 @@ use super::topics::camel;
 use super::yaml::{comment, scalar, wrapped};
 use crate::survey::{Graph, Nodes, UaMethod};
 
-/// A call.
+/// A proposed call.
 #[derive(Clone, Debug)]
 pub(super) struct CallEntry {
     pub(super) node: NodeIdText,
     pub(super) name: String,
     pub(super) origin: SpaceId,
     pub(super) what: Executor,
-    /// Why it is a comment.
+    /// The reason why the entry is a comment.
     pub(super) faulty: Option<String>,
-    /// Whether the file has it as a comment already.
+    /// True if the file already has the entry as a comment.
     pub(super) is_set_aside: bool,
 }
 
-/// Who executes a call.
+/// The executor of a call.
 #[derive(Clone, Debug)]
 pub(super) enum Executor {
-    /// A service or action of the origin, and its type.
+    /// A service or action of the origin, with its name and type.
     Ros(CallKind, String, String),
     /// A Method of a server.
     Method { server: Whose, target: String },
 }
 
-/// A server, as a call names it.
+/// A server in a call.
 #[derive(Clone, Debug)]
 pub(super) enum Whose {
-    /// By its name among `servers`.
+    /// The name of the server in `servers`.
     Named(String),
-    /// By its endpoint.
+    /// The endpoint of the server.
     At(String),
 }
 
-/// What is found, without a node yet.
+/// A call without a node.
 pub(super) struct Candidate {
     pub(super) name: String,
     pub(super) origin: SpaceId,
@@ -49,7 +49,7 @@ pub(super) struct Candidate {
 }
 
 impl Candidate {
-    /// How many numbers it takes.
+    /// Returns the number of identifiers that the call uses.
     pub(super) const fn numbers(&self) -> u16 {
         match self.what {
             Executor::Ros(CallKind::Action, ..) => 5,
@@ -58,10 +58,10 @@ impl Candidate {
     }
 }
 
-/// Services of which nobody tells one type, by their spaces.
+/// Services without a unique type, by space.
 pub(super) type Untyped = BTreeMap<SpaceId, BTreeSet<String>>;
 
-/// The calls of `graphs` and `nodes` that are not `known`, in their order.
+/// Returns the calls of `graphs` and `nodes` that are not in `known`, in order.
 pub(super) fn candidates(
     graphs: &[Graph],
     (nodes, servers): (&[Nodes], &[Option<String>]),
@@ -151,10 +151,10 @@ fn method(one: &UaMethod, (server, at): (&Nodes, &Whose), known: &Known) -> Opti
     })
 }
 
-/// The names of services and actions that a mapping has in a space.
+/// The names of services and actions that a mapping uses in a space.
 struct Names<'m>(BTreeSet<(CallWord, &'m str)>);
 
-/// [`CallKind`] in an order.
+/// The word of a [`CallKind`], which has an order.
 type CallWord = &'static str;
 
 impl<'m> Names<'m> {
@@ -181,12 +181,12 @@ impl<'m> Names<'m> {
     }
 }
 
-/// A name of the space needs no mapping.
+/// Returns true for a name of the space, which needs no mapping.
 fn is_of_space(name: &str) -> bool {
     name.trim_start_matches('/').parse::<TopicId>().is_ok()
 }
 
-/// Whether it is there for those who run the node, as its parameters are, or hidden.
+/// Returns true if the service administers its node, as its parameters do, or is hidden.
 fn serves_its_node(name: &str, types: &BTreeSet<String>) -> bool {
     let last = name.rsplit('/').next().unwrap_or_default();
     let of_node = |kind: &String| {
@@ -198,7 +198,7 @@ fn serves_its_node(name: &str, types: &BTreeSet<String>) -> bool {
         || types.iter().any(of_node)
 }
 
-/// The lines of the calls, and which lines are which entry.
+/// Returns the lines of the calls, and the line range of each entry.
 pub(super) fn render(
     calls: &[CallEntry],
     untyped: &Untyped,
@@ -262,7 +262,7 @@ fn entry(call: &CallEntry, indent: &str, lines: &mut Vec<String>) {
 
 /// The end of the heading of services without a type.
 pub(super) const UNTYPED: &str = "whose type nobody tells, or several differ";
-/// Services that nodes have for those who run them.
+/// Services with which nodes are administered.
 const EACH_NODE: [&str; 10] = [
     "describe_parameters",
     "get_loggers",
@@ -276,7 +276,7 @@ const EACH_NODE: [&str; 10] = [
     "tf2_frames",
 ];
 
-/// Packages of services of that kind.
+/// Packages of services with which nodes are administered.
 const OF_NODES: [&str; 8] = [
     "composition_interfaces",
     "diagnostic_msgs",

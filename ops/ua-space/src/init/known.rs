@@ -1,4 +1,4 @@
-//! What the file that is added to says already.
+//! The contents of the existing file.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 
@@ -11,33 +11,37 @@ use super::topics::LeftOut;
 use super::yaml;
 use crate::survey::UaSource;
 
-/// A mapping, and what its comments speak of: what somebody left out on purpose is not proposed again.
+/// A mapping with the names in its comments. Topics and nodes that a user left out on purpose are
+/// not proposed again.
 #[derive(Default)]
 pub(super) struct Known {
     pub(super) mapping: Mapping,
     nodes: HashSet<NodeIdText>,
     names: HashSet<(u16, String)>,
-    /// The last number that was tried behind a name.
+    /// The last number tried as the suffix of a name.
     numbered: HashMap<(u16, String), u32>,
-    /// Identifiers in topic names, by the namespace in them.
+    /// Identifiers in topic names, by namespace.
     numbers: HashMap<u16, BTreeSet<u16>>,
     /// Words of comments that begin with a slash.
     mentioned: HashSet<String>,
-    /// Such words in comments that `init` wrote because something was missing, such as the definition of a type.
+    /// Words that begin with a slash, in comments that `init` wrote because something was missing,
+    /// such as the definition of a type.
     set_aside: HashSet<String>,
-    /// Nodes of other servers that variables come from or go to: the server's name, and the node there.
+    /// Nodes of other servers that are sources or targets of variables: the name of the server, and
+    /// the node.
     sources: HashSet<(String, String)>,
-    /// Names that were given to servers.
+    /// Names assigned to new servers.
     servers: HashSet<String>,
-    /// Methods in comments, as they are written: `object: .., method: ..`.
+    /// Methods in comments, as written: `object: .., method: ..`.
     methods: HashSet<String>,
-    /// Node ids in comments, as they are written.
+    /// Node ids in comments, as written.
     written: HashSet<String>,
-    /// The namespace of the last of them; a node of namespace 0 has this in its topic names.
+    /// The namespace of the last node id read; nodes of namespace 0 use this number in their topic
+    /// names.
     hearing: u16,
 }
 
-/// Of which server a node is that a variable has already.
+/// The server of a node that is already in use by a variable.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(super) enum Whose {
     Same,
@@ -46,13 +50,13 @@ pub(super) enum Whose {
 
 /// The name of a server.
 pub(super) enum Named {
-    /// In the mapping.
+    /// A name in the mapping.
     Known(String),
     New(String),
 }
 
 impl Known {
-    /// `text` is what `mapping` was read from.
+    /// Collects the names of `mapping`, which was read from `text`.
     pub(super) fn of(mapping: Mapping, text: &str) -> Self {
         let mut known = Self::default();
         for variable in mapping.variables() {
@@ -132,12 +136,13 @@ impl Known {
         self.numbers.entry(namespace).or_default().insert(number);
     }
 
-    /// The next number nobody has: above all there are, so that one that was given and taken back is not given again.
+    /// Returns the next free number, above all used numbers, so a number that was removed from the
+    /// file is not used again.
     pub(super) fn next_number(&mut self, namespace: u16) -> Option<u16> {
         self.next_numbers(namespace, 1)
     }
 
-    /// The first of so many numbers in a row that nobody has.
+    /// Returns the first of `count` consecutive free numbers.
     pub(super) fn next_numbers(&mut self, namespace: u16, count: u16) -> Option<u16> {
         let used = self.numbers.entry(namespace).or_default();
         let last_of = |first: u16| first.checked_add(count.saturating_sub(1));
@@ -155,7 +160,8 @@ impl Known {
         self.nodes.contains(node) || self.written.contains(&yaml::scalar(&node.to_string()))
     }
 
-    /// Whether a variable comes from that node of another server or goes there, or a comment says so.
+    /// Returns true if a variable or a comment has this node of another server as its source or
+    /// target.
     pub(super) fn has_source(&self, source: &UaSource) -> bool {
         let UaSource { server, node } = source;
         let written = yaml::scalar(node);
@@ -164,7 +170,8 @@ impl Known {
             .any(|node| self.sources.contains(&(server.clone(), node.clone())))
     }
 
-    /// Whether a variable has the node, and if so whether it is of another server than that.
+    /// Returns the server of the variable with the node, compared with `server`; `None` if the node
+    /// is not in use.
     pub(super) fn has_node_of(&self, node: &NodeIdText, server: &str) -> Option<Whose> {
         if !self.has_node(node) {
             return None;
@@ -179,7 +186,7 @@ impl Known {
         })
     }
 
-    /// What the mapping calls the server at an endpoint, or is to call it.
+    /// Returns the name of the server at an endpoint, from the mapping or new.
     pub(super) fn server(&mut self, endpoint: &str, wanted: &str) -> Named {
         let servers = self.mapping.servers().iter();
         let mut there =
@@ -213,7 +220,7 @@ impl Known {
         Named::New(name)
     }
 
-    /// `wanted`, or with a number behind it where that name is taken.
+    /// Returns `wanted`, with a number appended if the name is in use.
     pub(super) fn free_name(&mut self, namespace: u16, wanted: &str) -> String {
         let wanted = if wanted.trim().is_empty() {
             "Value"
@@ -241,22 +248,23 @@ impl Known {
         }
     }
 
-    /// Whether a comment speaks of the topic.
+    /// Returns true if a comment names the topic.
     pub(super) fn mentions(&self, topic: &str) -> bool {
         self.mentioned.contains(topic)
     }
 
-    /// Whether `init` wrote the topic or service as a comment because something was missing.
+    /// Returns true if `init` wrote the topic or service as a comment because something was
+    /// missing.
     pub(super) fn is_set_aside(&self, name: &str) -> bool {
         self.set_aside.contains(name)
     }
 
-    /// Whether a comment has the Method, as `object: .., method: ..`.
+    /// Returns true if a comment contains the Method, as `object: .., method: ..`.
     pub(super) fn mentions_method(&self, target: &str) -> bool {
         self.methods.contains(target)
     }
 
-    /// The name of a variable the topic is bound in, or of the pattern that takes it.
+    /// Returns true if a variable is bound to the topic, or a pattern matches it.
     pub(super) fn bound(&self, space: SpaceId, topic: &str, kind: Option<&TypeName>) -> bool {
         self.mapping
             .bindings(space)
@@ -264,7 +272,7 @@ impl Known {
             || self.mapping.matching(space, topic, kind).is_some()
     }
 
-    /// The variable that the topic is bound in, in whatever space.
+    /// Returns the name of the variable that is bound to the topic in any space.
     pub(super) fn variable_of(&self, topic: &str) -> Option<&str> {
         let variables = self.mapping.variables().iter();
         let mut bound = variables.filter(|variable| {
@@ -274,7 +282,7 @@ impl Known {
         bound.next().map(|variable| variable.name.as_str())
     }
 
-    /// The namespace that most variables with a ROS topic are in.
+    /// Returns the namespace that most variables with a ROS topic use.
     pub(super) fn ros_namespace(&self) -> Option<u16> {
         let mut counts: BTreeMap<u16, usize> = BTreeMap::new();
         for variable in self.mapping.variables() {
@@ -290,8 +298,8 @@ impl Known {
     }
 }
 
-/// Whether a comment of `init` begins what it left out because something was missing: the code of a finding, or the heading
-/// of names without a type.
+/// Returns true if the comment starts a block that `init` left out because something was missing:
+/// it begins with the code of a finding, or is the heading of names without a type.
 fn begins_set_aside(comment: &str) -> bool {
     let comment = comment.trim();
     let has_code = comment.split_once(": ").is_some_and(|(code, _)| {
@@ -301,7 +309,7 @@ fn begins_set_aside(comment: &str) -> bool {
     has_code || comment.ends_with(LeftOut::Untyped.heading()) || comment.ends_with(UNTYPED)
 }
 
-/// The node of another server that a comment speaks of, as `render` writes it.
+/// Returns the node of another server named in a comment, in the notation of `render`.
 fn source_in(comment: &str) -> Option<(String, String)> {
     let (_, source) = comment.split_once(": {server: ")?;
     let (server, node) = source.split_once(", node: ")?;

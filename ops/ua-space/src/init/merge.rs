@@ -1,8 +1,10 @@
-//! Putting lines into a document that somebody has written, without touching another byte of it.
+//! Inserts lines into an existing document without changing any other byte.
 
-/// Puts `block`, entries of the top-level key `key`, behind those that are there; the key at the end of the document where
-/// there is none. Gives the text and the line, from 0, at which the block begins; `None` where the value of the key is
-/// written in braces or brackets, into which nothing is put.
+/// Inserts `block`, entries of the top-level key `key`, after the existing entries. A missing key
+/// is appended to the document.
+///
+/// Returns the text and the line, from 0, at which the block begins. Returns `None` if the value of
+/// the key is written in braces or brackets, because nothing can be inserted there.
 pub(super) fn append(text: &str, key: &str, block: &[String]) -> Option<(String, usize)> {
     let newline = if text.contains("\r\n") { "\r\n" } else { "\n" };
     let lines: Vec<&str> = text.split_inclusive('\n').collect();
@@ -23,7 +25,7 @@ pub(super) fn append(text: &str, key: &str, block: &[String]) -> Option<(String,
         Some(at) => {
             let (_, rest) = lines.get(at)?.split_once(':')?;
             let rest = rest.trim();
-            // An empty list, as a document has whose entries are all comments.
+            // An empty list, which `init` writes if all entries are comments.
             let behind = rest.strip_prefix("[]").map(str::trim_start);
             if let Some(behind) = behind.filter(|behind| is_comment(behind)) {
                 let space = if behind.is_empty() { "" } else { " " };
@@ -67,7 +69,7 @@ fn is_comment(text: &str) -> bool {
     text.is_empty() || text.starts_with('#')
 }
 
-/// How far the entries of that key are indented.
+/// Returns the indentation of the entries of the key.
 pub(super) fn indent(text: &str, key: &str) -> String {
     let key = format!("{key}:");
     let mut inside = text

@@ -1,4 +1,4 @@
-//! Nodes of servers and files, as a mapping names them.
+//! Nodes of servers and NodeSet files, in the notation of a mapping.
 
 use std::collections::{BTreeMap, HashMap, HashSet};
 
@@ -6,11 +6,11 @@ use mappings::NodeIdText;
 
 use crate::survey::{Nodes, UaSource};
 
-/// What the indexes in node ids mean.
+/// The namespace indexes of node ids.
 pub(super) struct Indexes {
     all: BTreeMap<u16, String>,
     by_uri: HashMap<String, u16>,
-    /// Those that are new.
+    /// The new indexes.
     pub(super) given: BTreeMap<u16, String>,
 }
 
@@ -27,13 +27,15 @@ impl Indexes {
         }
     }
 
-    /// Gives every namespace of variables its index in the mapping: that at the server, from 2 on for files and for servers other
-    /// than the cell's, since 1 is each server's own.
+    /// Assigns an index in the mapping to each namespace that has variables. The index is the index
+    /// at the server. For NodeSet files and for servers other than the server of the cell it starts
+    /// at 2, because index 1 is the own namespace of each server.
     pub(super) fn give(&mut self, source: &Nodes) -> HashMap<u16, u16> {
         let variables = source.variables.iter();
         let used: HashSet<u16> = variables.map(|one| one.node.namespace).collect();
         let mut indexes = HashMap::new();
-        // From the index that is wanted on, then below it; none is given back, so nothing is free before them.
+        // The search continues from the wanted index upwards, then from 2. Indexes are never
+        // released, so none before these positions is free.
         let (mut above, mut below) = (0, 2);
         for (index, uri) in (0..=u16::MAX).zip(&source.namespaces).skip(1) {
             if !used.contains(&index) {
@@ -71,7 +73,7 @@ impl Indexes {
     }
 }
 
-/// A node as a server of another namespace table knows it.
+/// Returns the node with its namespace URI, for a server with another namespace table.
 pub(super) fn source_of(server: &str, node: &NodeIdText, namespaces: &[String]) -> UaSource {
     let uri = namespaces.get(usize::from(node.namespace));
     let namespace = match uri {
@@ -89,18 +91,18 @@ pub(super) fn source_of(server: &str, node: &NodeIdText, namespaces: &[String]) 
     }
 }
 
-/// Whether an endpoint is at that port of this host.
+/// Returns true if the endpoint is at this port of this host.
 pub(super) fn is_at(endpoint: &str, port: u16) -> bool {
     let (host, at, _) = place(endpoint);
     at == port.to_string() && ["127.0.0.1", "localhost", "[::1]"].contains(&host.as_str())
 }
 
-/// Whether both endpoints are the same, however they are written.
+/// Returns true if both endpoints are equal after normalization.
 pub(super) fn is_same(one: &str, other: &str) -> bool {
     place(one) == place(other)
 }
 
-/// Host, port and path; without a port it is 4840 (OPC 10000-6, 7.2).
+/// Returns host, port and path; the default port is 4840 (OPC 10000-6, 7.2).
 fn place(endpoint: &str) -> (String, String, &str) {
     let rest = endpoint.trim_start_matches("opc.tcp://");
     let (place, path) = rest.split_once('/').unwrap_or((rest, ""));

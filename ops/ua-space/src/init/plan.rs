@@ -1,4 +1,5 @@
-//! What a mapping says of what was found: which topic is which node, and what is left out.
+//! Plans a mapping of the inspected sources: joins topics and nodes, and leaves out topics of ROS
+//! itself.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
@@ -12,27 +13,27 @@ use super::nodes::{Indexes, is_at, is_same, source_of};
 use super::topics::{Form, LeftOut, camel, normal, registry};
 use crate::survey::{Graph, Nodes, UaServer, UaSource, UaVariable};
 
-/// What is to be written, in its order.
+/// The contents of the mapping, in order.
 #[derive(Default)]
 pub(super) struct Plan {
     pub(super) spaces: Vec<(SpaceId, Option<u16>)>,
     pub(super) namespaces: BTreeMap<u16, String>,
-    /// Of the cell's own server.
+    /// The endpoint of the server of the cell.
     pub(super) endpoint: Option<String>,
-    /// Servers that exist already, by their names.
+    /// Names and endpoints of existing servers.
     pub(super) servers: Vec<(String, String)>,
     pub(super) entries: Vec<Entry>,
     pub(super) left_out: BTreeMap<(SpaceId, LeftOut), BTreeSet<String>>,
-    /// Topics that a variable of the file could be bound to beside its own.
+    /// Topics to which a variable of the file could be bound additionally.
     pub(super) proposals: Vec<String>,
     pub(super) calls: Vec<CallEntry>,
     pub(super) untyped: Untyped,
 }
 
-/// A variable.
+/// A proposed variable.
 #[derive(Clone, Debug)]
 pub(super) struct Entry {
-    /// Those of one group stand together under this heading.
+    /// The heading under which the variables of a group are listed.
     pub(super) group: String,
     pub(super) node: NodeIdText,
     pub(super) alias: Option<u16>,
@@ -40,18 +41,19 @@ pub(super) struct Entry {
     pub(super) value: Option<(BuiltinType, bool)>,
     pub(super) origin: SpaceId,
     pub(super) bindings: Vec<Bound>,
-    /// The node of another server that it comes from, or goes to where ROS makes it.
+    /// The node of another server that is the source of the value, or its target if ROS produces
+    /// the value.
     pub(super) source: Option<UaSource>,
     pub(super) notes: Vec<String>,
-    /// Nobody said that these belong together.
+    /// True if the join of topics or nodes is a guess.
     pub(super) guessed: bool,
-    /// Why it is a comment.
+    /// The reason why the entry is a comment.
     pub(super) faulty: Option<String>,
-    /// Whether the file has it as a comment already.
+    /// True if the file already has the entry as a comment.
     pub(super) is_set_aside: bool,
 }
 
-/// A topic it is tied to.
+/// A topic to which the variable is bound.
 #[derive(Clone, Debug)]
 pub(super) struct Bound {
     pub(super) space: SpaceId,
@@ -60,15 +62,15 @@ pub(super) struct Bound {
     pub(super) form: Form,
 }
 
-/// What is asked for on the command line.
+/// The options from the command line.
 pub(super) struct Wishes<'a> {
-    /// The URI of the namespace of values that have no node yet.
+    /// The URI of the namespace for values without a node.
     pub(super) namespace: &'a str,
     pub(super) transforms: bool,
 }
 
 impl Plan {
-    /// What `graphs` and `nodes` have that is not `known`.
+    /// Plans the topics and nodes of `graphs` and `nodes` that are not in `known`.
     pub(super) fn new(
         graphs: &[Graph],
         nodes: &[Nodes],
@@ -94,11 +96,12 @@ impl Plan {
 
 struct Planner<'k> {
     plan: Plan,
-    /// Of ROS 1 and of ROS 2.
+    /// The registries of ROS 1 and of ROS 2.
     registries: [Registry; 2],
-    /// Nodes that are no variable yet, in the mapping's namespaces; `None` where one has become one.
+    /// Nodes without a variable, in the namespaces of the mapping; `None` once the node has a
+    /// variable.
     ua: Vec<Option<UaVariable>>,
-    /// Which of them have a name, as [`normal`] has it.
+    /// Positions of the nodes by name, as [`normal`] returns it.
     alike: HashMap<String, Vec<usize>>,
     known: &'k mut Known,
 }
@@ -112,7 +115,7 @@ impl Planner<'_> {
         }
     }
 
-    /// The names of those that are servers of others.
+    /// Returns the names of the servers, `None` for NodeSet files and for the server of the cell.
     fn servers(&mut self, sources: &[Nodes]) -> Vec<Option<String>> {
         let mut names = Vec::with_capacity(sources.len());
         for source in sources {
@@ -127,7 +130,7 @@ impl Planner<'_> {
             };
             names.push(name);
         }
-        // The cell's own server is not where another is.
+        // The server of the cell gets an endpoint that no other server on this host uses.
         let ports = |port: u16| {
             let mut all = self.plan.servers.iter();
             all.any(|(_, endpoint)| is_at(endpoint, port))
@@ -154,7 +157,7 @@ impl Planner<'_> {
         }
     }
 
-    /// The nodes that are not known, in the mapping's namespaces.
+    /// Collects the new nodes, in the namespaces of the mapping.
     fn nodes(&mut self, sources: &[Nodes], servers: &[Option<String>], uri: &str) {
         let mut indexes = Indexes::of(self.known.mapping.namespaces());
         let mut taken = BTreeSet::new();
@@ -162,7 +165,7 @@ impl Planner<'_> {
         for (source, server) in sources.iter().zip(servers) {
             let indexes = indexes.give(source);
             for one in &source.variables {
-                // Without an index its nodes stay out.
+                // Nodes of a namespace without an index are left out.
                 let Some(namespace) = indexes.get(&one.node.namespace) else {
                     continue;
                 };
@@ -177,7 +180,7 @@ impl Planner<'_> {
                 let from = from.map(|server| source_of(server, &one.node, &source.namespaces));
                 let known = match &from {
                     Some(from) if self.known.has_source(from) => continue,
-                    // Two servers of one make have nodes of the same names.
+                    // Two servers of the same model have nodes of the same names.
                     Some(from) => self.known.has_node_of(&node, &from.server),
                     None => self.known.has_node(&node).then_some(Whose::Same),
                 };
@@ -208,7 +211,8 @@ impl Planner<'_> {
         self.ua = ua.into_iter().map(Some).collect();
     }
 
-    /// Nodes whose names other servers' nodes have: they get numbers among the values without a node.
+    /// Assigns numbers in the namespace of values without a node to nodes whose node id is already
+    /// used by a node of another server.
     fn twins(&mut self, twins: Vec<UaVariable>, uri: &str, ua: &mut Vec<UaVariable>) {
         for twin in twins {
             let namespace = self.namespace(uri);
@@ -245,7 +249,8 @@ impl Planner<'_> {
         }
     }
 
-    /// How the topic is bound in each space that has it, and whether it is published there.
+    /// Returns the binding of the topic in each space that has it, and whether it is published
+    /// there.
     fn bound(
         &mut self,
         name: &str,
@@ -369,7 +374,7 @@ impl Planner<'_> {
         });
     }
 
-    /// The namespace of values that have no node yet; `None` when no index is left for it.
+    /// Returns the namespace of values without a node; `None` if no index is free.
     fn namespace(&mut self, uri: &str) -> Option<u16> {
         let all = self.known.mapping.namespaces().iter();
         let all = all.chain(&self.plan.namespaces);
@@ -388,7 +393,7 @@ impl Planner<'_> {
         Some(index)
     }
 
-    /// The nodes no topic is tied to: the OPC UA side writes them.
+    /// Adds the nodes to which no topic is bound; the OPC UA side writes them.
     fn rest(&mut self) {
         for one in std::mem::take(&mut self.ua).into_iter().flatten() {
             let mut notes = Vec::new();
@@ -464,7 +469,7 @@ impl Planner<'_> {
     }
 }
 
-/// Where the cell's own server is if nothing is said.
+/// The default port of the server of the cell.
 const OWN_PORT: u16 = 4840;
 
 /// A topic that becomes a variable.
@@ -475,8 +480,9 @@ struct Candidate {
     bindings: Vec<Bound>,
 }
 
-/// The variables a topic becomes: one for all spaces where at most one publishes it, else one for each that does. Those
-/// of another type are values of their own.
+/// Returns the variables of a topic: one variable for all spaces if at most one space publishes the
+/// topic, otherwise one variable for each publishing space. Topics of another type become separate
+/// variables.
 fn candidates(name: &str, bound: Vec<(Bound, bool)>) -> Vec<Candidate> {
     let group = name.trim_start_matches('/').split_once('/');
     let group = group.map_or("", |(first, _)| first);

@@ -1,4 +1,4 @@
-//! A plan as YAML.
+//! Renders a plan as YAML.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -10,13 +10,13 @@ use super::topics::Form;
 use super::yaml::{comment, scalar, wrapped};
 use crate::survey::UaSource;
 
-/// The lines of a plan's variables, and which lines are which entry.
+/// The lines of the variables of a plan, and the line range of each entry.
 pub(super) struct Variables {
     pub(super) lines: Vec<String>,
     pub(super) entries: Vec<Range<usize>>,
 }
 
-/// The head of a file of its own; `sources` are what was looked at.
+/// Returns the head of a new file; `sources` are the inspected sources.
 pub(super) fn head(sources: &[String]) -> Vec<String> {
     let mut lines = vec![
         "# yaml-language-server: $schema=schema.json".to_owned(),
@@ -35,7 +35,7 @@ pub(super) fn head(sources: &[String]) -> Vec<String> {
     lines
 }
 
-/// The ROS sides.
+/// Returns the lines of the ROS spaces.
 pub(super) fn spaces(plan: &Plan, indent: &str) -> Vec<String> {
     let space = |(id, domain): &(SpaceId, Option<u16>)| match domain {
         Some(domain) => format!("{indent}- {{id: {id}, domain: {domain}}}"),
@@ -44,7 +44,7 @@ pub(super) fn spaces(plan: &Plan, indent: &str) -> Vec<String> {
     plan.spaces.iter().map(space).collect()
 }
 
-/// How values travel, as it is without being written.
+/// Returns the lines of the network settings, with their default values.
 pub(super) fn network(plan: &Plan) -> Vec<String> {
     let mut lines = [
         "",
@@ -65,7 +65,7 @@ pub(super) fn network(plan: &Plan) -> Vec<String> {
     lines
 }
 
-/// The servers that exist already.
+/// Returns the lines of the existing servers.
 pub(super) fn servers(plan: &Plan, indent: &str) -> Vec<String> {
     let all = plan.servers.iter();
     all.map(|(name, endpoint)| {
@@ -75,14 +75,14 @@ pub(super) fn servers(plan: &Plan, indent: &str) -> Vec<String> {
     .collect()
 }
 
-/// What the indexes in node ids mean.
+/// Returns the lines of the namespace indexes.
 pub(super) fn namespaces(plan: &Plan, indent: &str) -> Vec<String> {
     let all = plan.namespaces.iter();
     all.map(|(index, uri)| format!("{indent}{index}: {}", scalar(uri)))
         .collect()
 }
 
-/// The variables, those of a group below its name, and what is left out.
+/// Returns the variables, grouped under headings, and the topics left out.
 pub(super) fn variables(plan: &Plan, indent: &str) -> Variables {
     let mut lines = Vec::new();
     let mut entries = Vec::new();

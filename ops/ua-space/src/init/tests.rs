@@ -9,7 +9,7 @@ const WISHES: Wishes<'static> = Wishes {
     transforms: false,
 };
 
-/// A graph whose topics are (name, type, published).
+/// Returns a graph; the topics are (name, type, published).
 fn graph(space: u16, topics: &[(&str, &str, bool)]) -> Graph {
     let topic = |(name, kind, published): &(&str, &str, bool)| {
         let live = LiveTopic {
@@ -80,7 +80,7 @@ fn a_side_that_joins_later_is_proposed_once_and_changes_nothing() {
         ]
     );
     assert_eq!(merged(&second, &both), second);
-    // Seen together, they are one value.
+    // Surveyed together, both topics become the same variable.
     assert_eq!(
         origins(&fresh(&both))[0],
         ("AB".to_owned(), "ua_1_2_1".to_owned(), 2)
@@ -147,7 +147,7 @@ fn a_topic_that_a_comment_names_or_a_pattern_takes_stays_out() {
     );
     assert_eq!(merged(text, &[seen]), text);
     let more = merged(text, &[graph(1, &[("/next", "std_msgs/Bool", true)])]);
-    // In the namespace of the others, behind the highest number, and before the next key.
+    // The entry has the namespace of the others and the next number, and precedes the next key.
     assert_eq!(origins(&more)[1].1, "ua_1_2_6");
     assert!(more.find("name: Next").unwrap() < more.find("patterns:").unwrap());
 }
@@ -164,7 +164,7 @@ fn what_was_left_out_for_want_of_a_definition_is_proposed_once_it_is_there() {
         "{without}"
     );
     assert_eq!(merged(&without, std::slice::from_ref(&seen)), without);
-    // The same names, of types that are known.
+    // The same names, with known types.
     let mut typed = graph(
         1,
         &[("/a", "std_msgs/Bool", true), ("/u", "std_msgs/Bool", true)],
@@ -192,7 +192,7 @@ fn what_calls_have_is_not_given_away_and_their_services_are_not_told_of() {
             .into(),
     );
     let more = merged(text, std::slice::from_ref(&seen));
-    // Behind the number of the call, under another name than its own.
+    // The entry follows the number of the call and has another name than the call.
     assert_eq!(
         origins(&more),
         [("A2".to_owned(), "ua_2_2_62".to_owned(), 1)]
@@ -264,7 +264,7 @@ fn what_is_executed_anywhere_becomes_calls_once() {
         .map(|call| (call.topic.to_string(), call.name.as_str()))
         .collect();
     let one = |topic: &str, name: &'static str| (topic.to_owned(), name);
-    // An action takes five numbers, a comment the one it says.
+    // An action uses five numbers, a comment the number it names.
     assert_eq!(
         calls,
         [
@@ -281,7 +281,7 @@ fn what_is_executed_anywhere_becomes_calls_once() {
         "  #   ros: {service: /belt/odd, type: odd_msgs/Odd}",
         "  #   /belt/mute",
         "    opcua: {server: press-7-left-2, object: nsu=urn:plc;s=Line, ",
-        // The cell's own server is not where another is.
+        // The server of the cell has an endpoint of its own.
         "server:\n  endpoint: opc.tcp://127.0.0.1:4841\n",
     ] {
         assert!(text.contains(told), "{told}\n{text}");
@@ -325,7 +325,7 @@ fn calls_that_stand_before_the_variables_keep_both_apart() {
     );
 }
 
-/// A server of another, with a number, a text and one that is named as a topic.
+/// Returns a server with a numeric node id, a string node id, and a node named like a topic.
 fn plc(url: &str, is_cell: bool) -> Nodes {
     let variable = |node: &str, name: &str| survey::UaVariable {
         node: node.parse().unwrap(),
@@ -382,7 +382,7 @@ fn a_server_of_another_is_a_source_and_not_the_cells_own() {
         )
     };
     let text_of = |text: &str| Some(text.to_owned());
-    // 1 is each server's own namespace.
+    // Index 1 is the own namespace of each server.
     assert_eq!(
         ends("Door"),
         ("ns=2;i=5".to_owned(), text_of("nsu=urn:own;i=5"), None)
@@ -391,7 +391,7 @@ fn a_server_of_another_is_a_source_and_not_the_cells_own() {
         ends("Belt"),
         ("ns=3;i=7".to_owned(), text_of("nsu=urn:plc;i=7"), None)
     );
-    // What ROS makes goes there.
+    // A value that ROS produces is written to the server.
     assert_eq!(
         ends("Lamp"),
         (
@@ -425,7 +425,7 @@ fn servers_of_one_make_are_told_apart_also_when_one_is_added_later() {
     let mut plan = of_servers(&all, &[], &mut known);
     let later = added("", (&first, &found), &mut plan).unwrap();
     assert_eq!(sources(&later), sources(&both), "{later}");
-    // Once more nothing is new.
+    // A third run adds nothing.
     let found = mapping(&later);
     let mut known = Known::of(found.clone(), &later);
     let mut plan = of_servers(&all, &[], &mut known);

@@ -1,9 +1,9 @@
-//! Which topics of a graph are left out, and how the others are bound.
+//! Selects the topics of a graph to leave out, and the bindings of the others.
 
 use messages::{Dialect, Leaf, Rank, Registry, TypeName};
 use uadp::BuiltinType;
 
-/// Why a topic is no value of the cell; its text heads a list of them.
+/// The reason why a topic is left out; its text is the heading of a list of topics.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum LeftOut {
     Log,
@@ -30,7 +30,7 @@ impl LeftOut {
         }
     }
 
-    /// What the topic is for by its name and type, where it is not for the cell.
+    /// Returns the reason to leave out the topic, by its name and type.
     pub(super) fn of(topic: &str, kind: Option<&TypeName>, transforms: bool) -> Option<Self> {
         let parts: Vec<&str> = topic.trim_start_matches('/').split('/').collect();
         let last = parts.last().copied().unwrap_or_default();
@@ -65,7 +65,7 @@ impl LeftOut {
     }
 }
 
-/// The goal, feedback and result of an action of ROS 1.
+/// Returns true for the goal, feedback and result topics of a ROS 1 action.
 fn is_of_action(topic: &str, kind: &str) -> bool {
     [
         ("goal", "ActionGoal"),
@@ -76,19 +76,19 @@ fn is_of_action(topic: &str, kind: &str) -> bool {
     .any(|(name, end)| topic == *name && kind.ends_with(end))
 }
 
-/// What of the messages is the value.
+/// The part of a message that is the value.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) enum Form {
-    /// The one field it has, and its type.
+    /// The path of the only field, and its type.
     Field(String, (BuiltinType, bool)),
     /// All fields.
     Whole,
-    /// The message as it is.
+    /// The serialized message.
     Bytes,
 }
 
 impl Form {
-    /// How a message of that type is bound.
+    /// Returns the form in which a message of this type is bound.
     pub(super) fn of(kind: &TypeName, registry: &Registry) -> Self {
         if BULKY.contains(&kind.as_str()) {
             return Self::Bytes;
@@ -107,12 +107,12 @@ fn value_type(leaf: &Leaf) -> (BuiltinType, bool) {
     (leaf.builtin, matches!(leaf.rank, Rank::Array { .. }))
 }
 
-/// The definitions that are built in, for a space.
+/// Returns the built-in definitions for ROS 1 or ROS 2.
 pub(super) fn registry(ros2: bool) -> Registry {
     Registry::bundle(if ros2 { Dialect::Ros2 } else { Dialect::Ros1 })
 }
 
-/// Types whose messages nobody reads field by field.
+/// Types whose messages are not useful field by field.
 const BULKY: [&str; 9] = [
     "map_msgs/OccupancyGridUpdate",
     "nav_msgs/OccupancyGrid",
@@ -125,7 +125,7 @@ const BULKY: [&str; 9] = [
     "visualization_msgs/InteractiveMarkerUpdate",
 ];
 
-/// The words of a name, each with a capital: `/conveyor/is_running` is `ConveyorIsRunning`.
+/// Returns the words of a name in camel case: `/conveyor/is_running` is `ConveyorIsRunning`.
 pub(super) fn camel(topic: &str) -> String {
     let words = topic.split(|c: char| !c.is_ascii_alphanumeric());
     let mut name = String::new();
@@ -137,7 +137,8 @@ pub(super) fn camel(topic: &str) -> String {
     name
 }
 
-/// A name without what names are spelt with differently: `Conveyor.Is_Running` is `conveyorisrunning`.
+/// Normalizes a name for comparisons, without case and punctuation: `Conveyor.Is_Running` is
+/// `conveyorisrunning`.
 pub(super) fn normal(name: &str) -> String {
     let letters = name.chars().filter(|c| c.is_alphanumeric());
     letters.flat_map(char::to_lowercase).collect()

@@ -1,8 +1,9 @@
-//! Texts in YAML.
+//! Writes text in YAML.
 
 use std::fmt::Write as _;
 
-/// A scalar that is read back as `text`: as it is where nothing in it means anything in YAML, else in quotes.
+/// Returns a scalar that parses as `text`: plain if no character is special in YAML, otherwise
+/// quoted.
 pub(super) fn scalar(text: &str) -> String {
     let plain = |c: char| c.is_ascii_alphanumeric() || "_/=;.-+: ".contains(c);
     let begins = text.starts_with(|c: char| c.is_ascii_alphabetic() || c == '/');
@@ -15,15 +16,15 @@ pub(super) fn scalar(text: &str) -> String {
         return text.to_owned();
     }
     let mut quoted = String::from('"');
-    // What would stand for a variable of the environment.
+    // `${` would start an environment variable.
     for c in text.replace("${", "$${").chars() {
         match c {
             '"' | '\\' => quoted.extend(['\\', c]),
             c if c.is_ascii() && !c.is_control() => quoted.push(c),
-            // Signs as the degree's; the soft hyphen is not to be seen.
+            // Signs such as the degree sign; the soft hyphen is invisible.
             '\u{a1}'..='\u{ac}' | '\u{ae}'..='\u{ff}' => quoted.push(c),
             c if c.is_alphanumeric() => quoted.push(c),
-            // A write to a String cannot fail.
+            // Writing to a String does not fail.
             c => _ = write!(quoted, "\\U{:08x}", u32::from(c)),
         }
     }
@@ -31,14 +32,15 @@ pub(super) fn scalar(text: &str) -> String {
     quoted
 }
 
-/// A text that stays within its comment and steers no terminal.
+/// Replaces control characters, so the text stays within its comment and sends no commands to a
+/// terminal.
 pub(super) fn comment(text: &str) -> String {
     text.chars()
         .map(|c| if c.is_control() { ' ' } else { c })
         .collect()
 }
 
-/// Words in comments of at most [`WIDTH`] characters, each line beginning with `lead`.
+/// Joins words to comment lines of at most [`WIDTH`] characters, each starting with `lead`.
 pub(super) fn wrapped(lead: &str, words: impl IntoIterator<Item = String>) -> Vec<String> {
     let mut lines: Vec<String> = Vec::new();
     for word in words {

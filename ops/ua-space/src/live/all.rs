@@ -1,4 +1,4 @@
-//! `ua-space list`: which spaces there are, who carries them, and what is in them.
+//! `ua-space list`: lists the spaces, their programs, topics and calls.
 
 use std::collections::BTreeMap;
 use std::io::{self, Write as _};
@@ -14,13 +14,13 @@ use crate::discover::{Entry, Kind, around_and};
 use crate::exit::Failure;
 use crate::survey::look;
 
-/// `ua-space list`.
+/// Runs `ua-space list`.
 pub(crate) fn list(arguments: &List) -> Result<(), Failure> {
     look(async {
         let (programs, mut groups) = found(arguments).await?;
         let elsewhere = elsewhere(arguments, &programs);
         for address in elsewhere {
-            // That of a bridge that told of it.
+            // The group that a bridge announced.
             let group = Group {
                 address: Some(format!("opc.udp://{address}")),
                 ..arguments.group.clone()
@@ -31,7 +31,7 @@ pub(crate) fn list(arguments: &List) -> Result<(), Failure> {
     })
 }
 
-/// Who there is, and what is heard in the group.
+/// Returns the discovered programs, and the contents of the group.
 async fn found(arguments: &List) -> Result<(Vec<Entry>, Vec<Live>), Failure> {
     let hearing = heard(arguments, &arguments.group);
     if arguments.topics {
@@ -61,7 +61,7 @@ async fn heard(arguments: &List, group: &Group) -> Result<(InGroup, Live), Failu
     Ok((live.who(), live))
 }
 
-/// The other groups that bridges told of, where no group was named.
+/// Returns the other groups that bridges announce, unless a group was given.
 fn elsewhere(arguments: &List, programs: &[Entry]) -> Vec<String> {
     if arguments.group.address.is_some() {
         return Vec::new();
@@ -78,7 +78,7 @@ fn elsewhere(arguments: &List, programs: &[Entry]) -> Vec<String> {
     groups
 }
 
-/// A space, with who is in it.
+/// A space with its programs.
 #[derive(Serialize)]
 struct Space<'p> {
     space: u8,
@@ -97,7 +97,7 @@ struct All<'a> {
     topics: Vec<Placed<'a>>,
 }
 
-/// A topic with the group it was heard in.
+/// A topic with the group in which it was received.
 #[derive(Serialize)]
 struct Placed<'a> {
     #[serde(flatten)]
@@ -257,5 +257,5 @@ fn or_dash(text: String) -> String {
     }
 }
 
-/// Whoever can send to the network can make up groups.
+/// Maximum number of further groups, because any host of the network can announce groups.
 const MOST_GROUPS: usize = 4;

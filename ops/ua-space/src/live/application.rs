@@ -1,20 +1,21 @@
-//! What programs of a group say they are.
+//! The application descriptions that programs announce.
 
 use uadp::discovery::{ApplicationDescription, List};
 
-/// A program, in its own words.
+/// The announced description of a program.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Application {
     pub(crate) uri: String,
     pub(crate) product_uri: String,
     pub(crate) name: String,
-    /// Where its server is; none of a program without one.
+    /// The DiscoveryUrls of its server; empty if the program has no server.
     pub(crate) urls: Vec<String>,
     pub(crate) capabilities: Vec<String>,
 }
 
 impl Application {
-    /// `None` where the words are too long, too many, or do not say who it is.
+    /// Reads a description; `None` if texts are too long or too many, or the ApplicationUri is
+    /// missing.
     pub(super) fn read(
         description: &ApplicationDescription<'_>,
         capabilities: List<'_, Option<&str>>,

@@ -1,4 +1,4 @@
-//! What is heard in a group, kept within bounds: who sends what, and what it is said to be.
+//! A bounded table of the topics and descriptions received in a group.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::net::SocketAddr;
@@ -16,22 +16,22 @@ use uadp::{
 use super::application::Application;
 use super::described::{Described, topic_of};
 
-/// All that was heard. Whoever can send to the group can make up topics, senders and announcements: there is room for
-/// so many, and what there is none for is counted.
+/// All received topics, descriptions and applications. Any host in the group can send made-up
+/// topics, senders and announcements, so the table is bounded and counts the entries that it drops.
 pub(crate) struct Book {
     topics: BTreeMap<TopicId, Heard>,
     announced: BTreeMap<Subject, Announcing>,
     applications: BTreeMap<(u16, SocketAddr), Application>,
-    /// Bytes of all descriptions, roughly.
+    /// The approximate size of all descriptions, in bytes.
     weight: usize,
     reassembler: Reassembler<SocketAddr>,
     counters: BTreeMap<Drop, u64>,
 }
 
-/// What an announcement is about, and whose word it is.
+/// The subject of an announcement, and its sender.
 type Subject = (TopicId, Kind, SocketAddr);
 
-/// What is announced under a name of the space.
+/// The kind of item that is announced under a name of the space.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum Kind {
     Value,
@@ -43,42 +43,42 @@ struct Announcing {
     first: Duration,
 }
 
-/// A topic that values were heard of.
+/// A topic with received values.
 #[derive(Debug, Clone)]
 pub(crate) struct Heard {
-    /// Messages with values.
+    /// Number of messages with values.
     pub(crate) values: u64,
-    /// Messages without: their writer lives.
+    /// Number of keep-alive messages.
     pub(crate) keep_alives: u64,
     pub(crate) first: Duration,
     pub(crate) last: Duration,
-    /// Who sent the last one.
+    /// The sender of the last message.
     pub(crate) from: SocketAddr,
-    /// How often that was another than before: of two programs with the same ids, all the time.
+    /// Number of changes of the sender; it keeps growing if two programs use the same ids.
     pub(crate) changed_hands: u64,
-    /// It cannot be read without keys.
+    /// True if the messages cannot be decrypted because keys are missing.
     pub(crate) secured: bool,
-    /// Builtin type of the only field, where it says it and there is one.
+    /// The builtin type of the only field, if the message contains the type and has a single field.
     pub(crate) only: Option<(uadp::BuiltinType, bool)>,
 }
 
-/// Why something was not taken.
+/// The reason why a message was dropped.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum Drop {
-    /// No NetworkMessage, or something in it is malformed.
+    /// The datagram is not a NetworkMessage, or a part of it is malformed.
     Malformed,
-    /// Not of the space: another PublisherId, or without the ids that make a topic.
+    /// The PublisherId is not a space, or the ids that make a topic are missing.
     NotInSpace,
-    /// There is no room for more topics.
+    /// The table of topics is full.
     Topics,
-    /// There is no room for more descriptions.
+    /// The table of descriptions is full.
     Descriptions,
-    /// A description that is too much, or of what is no topic.
+    /// The description is too large, or its name is not a topic.
     Useless,
 }
 
 impl Drop {
-    /// For people.
+    /// Returns the text for output.
     pub(crate) const fn label(self) -> &'static str {
         match self {
             Self::Malformed => "malformed",
@@ -90,24 +90,24 @@ impl Drop {
     }
 }
 
-/// What came with a datagram.
+/// The contents of a datagram.
 pub(crate) enum News<'a> {
-    /// A value, or a sign of life without one.
+    /// A value, or a keep-alive message.
     Sample(Sample<'a>),
     /// A response of an Action, and its sender.
     Response(ActionMessage<'a>, SocketAddr),
-    /// The announcement of a topic or call that is new or has changed, and its sender.
+    /// The new or changed announcement of a topic or call, and its sender.
     Announced(TopicId, Kind, &'a Arc<Described>, SocketAddr),
 }
 
 /// A DataSetMessage of a topic.
 pub(crate) struct Sample<'a> {
     pub(crate) topic: TopicId,
-    /// Address of its sender.
+    /// The address of the sender.
     pub(crate) from: SocketAddr,
-    /// What its writer says it is.
+    /// The description announced by the sender.
     pub(crate) described: Option<Arc<Described>>,
-    /// Of its NetworkMessage.
+    /// The header of its NetworkMessage.
     pub(crate) network: NetworkHeader<'a>,
     pub(crate) message: DataSetMessage<'a>,
 }
@@ -128,12 +128,12 @@ impl Book {
         }
     }
 
-    /// A datagram was none of UADP.
+    /// Counts a datagram that is not a NetworkMessage.
     pub(crate) fn malformed(&mut self) {
         self.count(Drop::Malformed);
     }
 
-    /// Takes a datagram; `each` is given what is in it that passes by.
+    /// Handles a datagram and passes its values, responses and new announcements to `each`.
     pub(crate) fn handle(
         &mut self,
         (message, from): (&NetworkMessage<'_>, SocketAddr),
@@ -162,7 +162,7 @@ impl Book {
         self.data(message, (space, from), now, each);
     }
 
-    /// Topics of which values or signs of life were heard.
+    /// Returns the topics with received values or keep-alive messages.
     pub(crate) fn topics(&self) -> impl Iterator<Item = (TopicId, &Heard)> {
         self.topics.iter().map(|(topic, heard)| (*topic, heard))
     }
@@ -171,21 +171,22 @@ impl Book {
         self.topics.get(&topic)
     }
 
-    /// What a topic is said to be by who sends its values.
+    /// Returns the description of a topic that was announced by the sender of its values.
     pub(crate) fn described(&self, topic: TopicId) -> Option<&Arc<Described>> {
         let from = self.topics.get(&topic)?.from;
         let found = self.announced.get(&(topic, Kind::Value, from))?;
         Some(&found.described)
     }
 
-    /// What is announced of topics, and by whom, in the order of the topics; of several who announce one, who was first.
+    /// Returns the announcements with their senders, in the order of topics. If several senders
+    /// announce a topic, returns the first announcement.
     pub(crate) fn announced(
         &self,
     ) -> impl Iterator<Item = (TopicId, Kind, &Arc<Described>, SocketAddr)> {
         self.announced_where(|_| true)
     }
 
-    /// As [`announced`](Self::announced), by some senders only.
+    /// Like [`announced`](Self::announced), limited to some senders.
     pub(crate) fn announced_where(
         &self,
         counts: impl Fn(SocketAddr) -> bool,
@@ -198,25 +199,26 @@ impl Book {
             .map(|((topic, kind, from), found)| (*topic, *kind, &found.described, *from))
     }
 
-    /// The calls among them.
+    /// Returns the announced calls.
     pub(crate) fn calls(&self) -> impl Iterator<Item = (TopicId, &Arc<Described>)> {
         let calls = self.announced().filter(|(_, kind, ..)| *kind == Kind::Call);
         calls.map(|(topic, _, described, _)| (topic, described))
     }
 
-    /// How many addresses say what a call is.
+    /// Returns the number of addresses that announce a call.
     pub(crate) fn announcers(&self, topic: TopicId) -> usize {
         let all = self.announced.keys();
         all.filter(|(of, kind, _)| (*of, *kind) == (topic, Kind::Call))
             .count()
     }
 
-    /// What programs say they are, for which space, and from where.
+    /// Returns the announced applications, by space and address.
     pub(crate) fn applications(&self) -> impl Iterator<Item = (&(u16, SocketAddr), &Application)> {
         self.applications.iter()
     }
 
-    /// The spaces that something is heard or known of, and those that an application speaks for.
+    /// Returns the spaces with received or announced topics, and the spaces of announced
+    /// applications.
     pub(crate) fn spaces(&self) -> BTreeSet<u16> {
         let all = self
             .topics
@@ -228,7 +230,7 @@ impl Book {
             .collect()
     }
 
-    /// What was not taken, and how often.
+    /// Returns the reasons of dropped messages with their counts.
     pub(crate) fn dropped(&self) -> impl Iterator<Item = (Drop, u64)> {
         self.counters.iter().map(|(drop, count)| (*drop, *count))
     }
@@ -280,7 +282,7 @@ impl Book {
         }
     }
 
-    /// Takes note of a message of a topic; without one it is secured.
+    /// Records a message of a topic; `None` stands for a secured message.
     fn hear(
         &mut self,
         writer_id: u16,
@@ -330,7 +332,7 @@ impl Book {
         now: Duration,
         each: &mut dyn FnMut(News<'_>),
     ) {
-        // The whole borrows from it.
+        // The reassembled message borrows from the reassembler.
         let mut reassembler = std::mem::take(&mut self.reassembler);
         match reassembler.receive_from(of.1, message, now) {
             Ok(None) => {}
@@ -340,7 +342,8 @@ impl Book {
                     Err(_) => self.count(Drop::Malformed),
                 }
             }
-            // Without a payload header it is an encoded NetworkMessage that was cut up, as those of calls are.
+            // Without a payload header the chunks hold a complete encoded NetworkMessage, as the
+            // messages of calls do.
             Ok(Some(whole)) if whole.writer_id.is_none() => {
                 match NetworkMessage::decode(whole.bytes) {
                     Ok(inner) if inner.is_action() && !inner.is_sealed() => {
@@ -429,7 +432,7 @@ impl Book {
                     each(News::Announced(topic, kind, &news, from));
                 }
             }
-            // What a publisher has not got, or not any more.
+            // The publisher does not have the item, or has removed it.
             (Some(topic), None) => {
                 self.forget((topic, Kind::Value, from));
                 self.forget((topic, Kind::Call, from));
@@ -439,7 +442,7 @@ impl Book {
         }
     }
 
-    /// Takes what a program says it is, if there is room for it.
+    /// Stores the description of an application, unless the table is full.
     fn meet(&mut self, application: Option<Application>, who: (u16, SocketAddr)) {
         let is_known = self.applications.contains_key(&who);
         match application {
@@ -451,7 +454,7 @@ impl Book {
         }
     }
 
-    /// What is new, if there is room for it.
+    /// Stores a description, unless the table is full. Returns it if it is new or changed.
     fn keep(
         &mut self,
         subject: Subject,
@@ -490,7 +493,7 @@ impl Book {
     }
 }
 
-/// The space of a publisher.
+/// Returns the space of a publisher.
 fn space(publisher: Option<PublisherId<'_>>) -> Option<u16> {
     match publisher? {
         PublisherId::UInt16(space) => mappings::SpaceId::new(space).map(u16::from),
@@ -501,7 +504,7 @@ fn space(publisher: Option<PublisherId<'_>>) -> Option<u16> {
     }
 }
 
-/// Type of the only field, and whether it is an array.
+/// Returns the type of the only field, and whether it is an array.
 fn only(message: &DataSetMessage<'_>) -> Option<(uadp::BuiltinType, bool)> {
     if message.kind == MessageKind::DeltaFrame {
         return None;
@@ -514,11 +517,11 @@ fn only(message: &DataSetMessage<'_>) -> Option<(uadp::BuiltinType, bool)> {
     values.next().is_none().then_some((builtin, is_array))
 }
 
-/// Of the two upper bits of a StatusCode.
+/// The bit of a StatusCode that marks the severity Bad.
 const BAD: u32 = 0x8000_0000;
 const MOST_TOPICS: usize = 16_384;
 const MOST_APPLICATIONS: usize = 1_024;
-/// Bytes of all descriptions.
+/// Maximum size of all descriptions, in bytes.
 const MOST_WEIGHT: usize = 32 << 20;
 
 #[cfg(test)]

@@ -1,4 +1,5 @@
-//! `ua-space call`: asks for a call of the space, and follows the run of a skill or the goal of an action to its end.
+//! `ua-space call`: sends a request to a call of the space, and follows the run of a skill or the
+//! goal of an action to its end.
 
 mod executor;
 mod goal;
@@ -30,12 +31,12 @@ use crate::exit::Failure;
 use crate::report::warn;
 use crate::status;
 
-/// `ua-space call`.
+/// Runs `ua-space call`.
 pub(crate) fn call(arguments: &Call) -> Result<(), Failure> {
     ask_for(arguments, true)
 }
 
-/// The same without the answer being told.
+/// Calls without printing the response.
 pub(super) fn call_quietly(arguments: &Call) -> Result<(), Failure> {
     ask_for(arguments, false)
 }
@@ -72,8 +73,9 @@ fn ask_for(arguments: &Call, is_told: bool) -> Result<(), Failure> {
     })
 }
 
-/// Who asks is named in every request. A tool is no space: a String can be no number of one, not even where peers take
-/// PublisherIds of any width. It says what it is, and by chance which: process ids of two hosts may be equal.
+/// Creates the requestor, whose PublisherId is in every request. The id is a String, so it cannot
+/// equal the number of a space, even for peers that accept PublisherIds of any width. It has a
+/// random part, because process ids of two hosts may be equal.
 fn requestor() -> Requestor {
     let random = || RandomState::new().build_hasher().finish();
     let id = format!("ua-space-{}-{:08x}", std::process::id(), random() >> 32);
@@ -88,7 +90,7 @@ fn requestor() -> Requestor {
     )
 }
 
-/// A call, for people.
+/// Returns the topic and name of a call for output.
 fn called(topic: TopicId, described: &Described) -> String {
     match described.name.as_str() {
         "" => topic.to_string(),
@@ -96,7 +98,7 @@ fn called(topic: TopicId, described: &Described) -> String {
     }
 }
 
-/// What a call was answered.
+/// The response of a call.
 struct Answer {
     status: StatusCode,
     fields: Named,
@@ -113,7 +115,7 @@ enum Shown<'a> {
     },
 }
 
-/// What came of one call.
+/// The outcome of a call.
 enum Came {
     Answer(Answer),
     Lost(String),
@@ -134,7 +136,7 @@ impl Asking<'_> {
         let target = &self.arguments.target;
         match target {
             Target::Topic(topic) => self.live.want(*topic),
-            // A bridge without values is found by asking which applications there are.
+            // A bridge without values is found by a probe for applications.
             Target::Name(_) => {
                 self.live.want_all();
                 self.live.want_calls([0]);
@@ -191,7 +193,8 @@ impl Asking<'_> {
         ))
     }
 
-    /// Asks, and waits for the answer. At the first interruption a skill is halted and the answer still waited for.
+    /// Sends the request and waits for the response. The first interruption halts the skill, and
+    /// the response is still awaited.
     async fn ask(
         &mut self,
         (topic, described): (TopicId, &Described),
@@ -228,7 +231,7 @@ impl Asking<'_> {
         }
     }
 
-    /// How long an answer is waited for.
+    /// Returns how long to wait for a response.
     fn timeout(&self) -> Duration {
         Duration::try_from_secs_f64(self.arguments.timeout).unwrap_or(Duration::MAX)
     }
@@ -256,7 +259,7 @@ impl Asking<'_> {
         begun.map_err(|error| Failure::Usage(format!("{topic}: {error}")))
     }
 
-    /// Calls Halt. What it is answered is of no interest: its effect is, which is followed.
+    /// Calls Halt. Its response is ignored, because the followed run shows the effect.
     fn halt(&mut self, places: &Places) -> Result<(), Failure> {
         warn("interrupted: calling Halt (once more to leave at once)");
         let halt = Described {
@@ -268,7 +271,8 @@ impl Asking<'_> {
             .map(drop)
     }
 
-    /// Sends what is due and listens until more is, something came of the call, or `until`.
+    /// Sends due requests and listens until more are due, the call has an outcome, or `until` is
+    /// reached.
     async fn turn(
         &mut self,
         described: &Described,
@@ -338,7 +342,7 @@ impl Asking<'_> {
         Ok(())
     }
 
-    /// One object, or its lines for people.
+    /// Prints a JSON object, or the lines for people.
     fn tell(&self, what: &impl Serialize, lines: &str) -> Result<(), Failure> {
         let mut out = io::stdout().lock();
         match self.arguments.json {
@@ -395,7 +399,7 @@ impl Asking<'_> {
         }
     }
 
-    /// Hears a moment of what the component says.
+    /// Listens for a moment to the values of the run.
     async fn hear_run(
         &mut self,
         places: &Places,
@@ -414,7 +418,7 @@ impl Asking<'_> {
         let mut each = |news: News<'_>, now| {
             match &news {
                 News::Response(response, from) => {
-                    // Acknowledgements, and the answer of Halt.
+                    // Acknowledgements, and the response of Halt.
                     if executor.answers(requestor, (response, *from)) {
                         let _heard = requestor.handle_response(response, now).is_ok();
                     }
@@ -440,7 +444,7 @@ impl Asking<'_> {
         Ok(ended)
     }
 
-    /// Lets the Responder forget what was asked, as far as that takes no time.
+    /// Lets the Responder release the request, within a short time limit.
     async fn acknowledge(&mut self) -> Result<(), Failure> {
         let end = self.live.now() + ACKNOWLEDGE;
         while self.requestor.open_calls() > 0 && self.live.now() < end {
@@ -458,7 +462,7 @@ impl Asking<'_> {
     }
 }
 
-/// What a response says of the call, if it ends it.
+/// Returns the outcome of the call, if the response completes it.
 fn hear(
     requestor: &mut Requestor,
     response: &ActionMessage<'_>,
@@ -477,7 +481,7 @@ fn hear(
     })
 }
 
-/// An answer that is a no.
+/// Returns an error if the response reports a failure.
 fn refused((topic, described): (TopicId, &Described), answer: &Answer) -> Result<(), Failure> {
     let bad = answer.status.0 & BAD != 0;
     let no = answer
@@ -511,11 +515,11 @@ fn refused((topic, described): (TopicId, &Described), answer: &Answer) -> Result
     )))
 }
 
-/// Of the two upper bits of a StatusCode.
+/// The bit of a StatusCode that marks the severity Bad.
 const BAD: u32 = 0x8000_0000;
-/// Calls that are named where one is not found.
+/// Maximum number of calls listed if the call is not found.
 const SHOWN: usize = 20;
-/// How often is looked whether a run has ended.
+/// The interval at which a run is checked for its end.
 const LOOK: Duration = Duration::from_millis(100);
-/// How long an acknowledgement may take.
+/// Time limit of an acknowledgement.
 const ACKNOWLEDGE: Duration = Duration::from_millis(500);

@@ -1,8 +1,8 @@
-//! What topics and calls consist of, as their writers announce it, in a form of our own.
+//! The descriptions of topics and calls, as announced by their writers.
 //!
-//! The name of what is announced begins with its topic, since an announcement has no WriterGroupId; behind a space
-//! stands what people call it: `ua_0_7_101 gripper.Grasp.State`. The description is the ROS type that the fields make,
-//! and behind `; ` whatever else there is to say, such as the type of a skill.
+//! The announced name begins with the topic, because an announcement has no WriterGroupId. The
+//! display name follows after a space: `ua_0_7_101 gripper.Grasp.State`. The description is the ROS
+//! type of the fields, followed by `; ` and further information, such as the type of a skill.
 
 use mappings::TopicId;
 use serde::Serialize;
@@ -11,12 +11,12 @@ use uadp::{BuiltinType, Scalar, Variant};
 
 use super::structure::Structure;
 
-/// A topic or call as it was announced.
+/// The announced description of a topic or call.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Described {
-    /// What people call the DataSet or Action; may be empty.
+    /// The display name of the DataSet or Action; may be empty.
     pub(crate) name: String,
-    /// What its writer says of it.
+    /// The description by the writer.
     pub(crate) description: String,
     pub(crate) what: What,
 }
@@ -27,18 +27,18 @@ pub(crate) enum What {
     Call(Call),
 }
 
-/// What goes into a call, what comes out, and on what it can be called.
+/// The request and response of a call, and its targets.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Call {
     pub(crate) request: Vec<Field>,
     pub(crate) response: Vec<Field>,
     /// ActionTargetIds; never empty.
     pub(crate) targets: Vec<u16>,
-    /// Of one that sends goals.
+    /// The parts of the action, for a call that sends goals.
     pub(crate) action: Option<Action>,
 }
 
-/// The DataSetWriterIds of an action beside that of its goals.
+/// The DataSetWriterIds of an action besides the id of its goals.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Action {
     pub(crate) cancel: u16,
@@ -46,22 +46,23 @@ pub(crate) struct Action {
     pub(crate) feedback: u16,
 }
 
-/// One field of a DataSet.
+/// A field of a DataSet.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Field {
     pub(crate) name: String,
-    /// `None` for an id that is no builtin type.
+    /// `None` for an id that is not a builtin type.
     pub(crate) builtin: Option<BuiltinType>,
-    /// As in the standard: -1 for a scalar, else the number of dimensions or which numbers are allowed.
+    /// The ValueRank of the standard: -1 for a scalar, otherwise the number of dimensions or a
+    /// constraint on it.
     pub(crate) rank: i32,
-    /// Most elements in each dimension, 0 where that is open.
+    /// Maximum number of elements in each dimension, 0 if unlimited.
     pub(crate) dimensions: Vec<u32>,
     pub(crate) max_string_length: u32,
-    /// What it is, for people.
+    /// The description for people.
     pub(crate) description: String,
-    /// May be left out of a request.
+    /// True if a request may leave the field out.
     pub(crate) optional: bool,
-    /// What the messages in it consist of.
+    /// The fields of the messages in this field.
     pub(crate) structure: Option<Structure>,
 }
 
@@ -78,10 +79,10 @@ pub(crate) struct ShownField<'a> {
 }
 
 impl Described {
-    /// Of a DataSet.
+    /// Reads the description of a DataSet.
     ///
     /// # Errors
-    /// In words, what is too much.
+    /// The name of the part that exceeds a limit.
     pub(crate) fn of_value(meta_data: &DataSetMetaDataType<'_>) -> Result<Self, &'static str> {
         Ok(Self {
             name: called(meta_data.name)?,
@@ -90,10 +91,10 @@ impl Described {
         })
     }
 
-    /// Of an Action.
+    /// Reads the description of an Action.
     ///
     /// # Errors
-    /// In words, what is too much.
+    /// The name of the part that exceeds a limit.
     pub(crate) fn of_call(meta_data: &ActionMetaData<'_>) -> Result<Self, &'static str> {
         let targets = meta_data.action_targets.iter().take(MOST_TARGETS);
         let targets: Vec<u16> = targets.map(|target| target.action_target_id).collect();
@@ -112,7 +113,7 @@ impl Described {
         })
     }
 
-    /// The fields of the values, or of what comes out of the call.
+    /// Returns the fields of the values, or of the response of the call.
     pub(crate) fn fields(&self) -> &[Field] {
         match &self.what {
             What::Value(fields) => fields,
@@ -127,14 +128,15 @@ impl Described {
         }
     }
 
-    /// The ROS type that the fields make, where the description begins with one.
+    /// Returns the ROS type of the fields, if the description begins with a type.
     pub(crate) fn ros_type(&self) -> Option<&str> {
         let first = self.description.split([';', ' ']).next()?;
         let is_type = first.parse::<messages::TypeName>().is_ok();
         is_type.then_some(first)
     }
 
-    /// The type of the skill whose state it is: `GraspSkillType nsu=urn:ua-bridge:skills` somewhere in the description.
+    /// Returns the name and namespace of the SkillType from the description of a state, as
+    /// `GraspSkillType nsu=urn:ua-bridge:skills`.
     pub(crate) fn skill_type(&self) -> Option<(&str, &str)> {
         let (before, after) = self.description.split_once("nsu=")?;
         let name = before.split_whitespace().next_back()?;
@@ -142,7 +144,7 @@ impl Described {
         Some((name, namespace))
     }
 
-    /// What it takes and gives, in a line.
+    /// Returns the request and response, or the type, in one line.
     pub(crate) fn summary(&self) -> String {
         match &self.what {
             What::Value(fields) => match (self.ros_type(), fields.as_slice()) {
@@ -155,7 +157,7 @@ impl Described {
         }
     }
 
-    /// Roughly the bytes it takes up.
+    /// Returns the approximate size in bytes.
     pub(crate) fn weight(&self) -> usize {
         let of = |fields: &[Field]| -> usize {
             let texts = fields.iter().map(|field| {
@@ -173,7 +175,7 @@ impl Described {
 }
 
 impl Field {
-    /// As `Double[6]`.
+    /// Returns the type of the field, as `Double[6]`.
     pub(crate) fn kind(&self) -> String {
         let name = self.builtin.map_or("?", BuiltinType::name);
         match (self.rank, self.dimensions.as_slice()) {
@@ -200,7 +202,8 @@ impl Field {
     }
 }
 
-/// As `TargetPosition: Double[6], [MaxVelocity: Double]`, in brackets what may be left out.
+/// Returns a list of fields, as `TargetPosition: Double[6], [MaxVelocity: Double]`, with optional
+/// fields in brackets.
 pub(crate) fn list(fields: &[Field]) -> String {
     let each = fields.iter().map(|field| {
         let text = format!("{}: {}", field.name, field.kind());
@@ -212,12 +215,12 @@ pub(crate) fn list(fields: &[Field]) -> String {
     each.collect::<Vec<_>>().join(", ")
 }
 
-/// The topic at the beginning of a name.
+/// Returns the topic at the beginning of a name.
 pub(super) fn topic_of(name: Option<&str>) -> Option<TopicId> {
     name?.split(' ').next()?.parse().ok()
 }
 
-/// What stands behind the topic.
+/// Returns the display name after the topic.
 fn called(name: Option<&str>) -> Result<String, &'static str> {
     let rest = name.and_then(|name| name.split_once(' '));
     bounded(rest.map(|(_, rest)| rest), "the name")
@@ -264,7 +267,7 @@ fn read(
     })
 }
 
-/// What the first field of a request that sends goals says of the action.
+/// Reads the parts of an action from the first field of a request that sends goals.
 fn action(request: &DataSetMetaDataType<'_>) -> Option<Action> {
     let first = request.fields.get(0)?;
     let mut properties = first.properties.iter().take(MOST_PROPERTIES);
@@ -294,9 +297,10 @@ fn bounded(text: Option<&str>, what: &'static str) -> Result<String, &'static st
     }
 }
 
-/// Of a field that may be left out of a request.
+/// The property of a field that a request may leave out.
 const OPTIONAL: &str = "Optional";
-/// Of the first field of a request that sends goals: what cancels, what waits for results, feedback, statuses.
+/// The property of the first field of a request that sends goals: the DataSetWriterIds of cancel,
+/// result, feedback and status.
 const ACTION_FAMILY: &str = "ActionFamily";
 const MOST_PROPERTIES: usize = 64;
 const MOST_TEXT: usize = 1024;

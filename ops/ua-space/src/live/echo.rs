@@ -1,4 +1,4 @@
-//! `ua-space echo` and `ua-space hz`: the values of a topic, and how often they come.
+//! `ua-space echo` and `ua-space hz`: shows the values of a topic, and measures their rate.
 
 use std::collections::VecDeque;
 use std::io::{self, Write as _};
@@ -17,7 +17,7 @@ use crate::exit::Failure;
 use crate::iso_time;
 use crate::report::warn;
 
-/// `ua-space echo`.
+/// Runs `ua-space echo`.
 pub(crate) fn echo(arguments: &Echo) -> Result<(), Failure> {
     in_group(&arguments.group, async |mut live| {
         live.want(arguments.topic);
@@ -28,7 +28,7 @@ pub(crate) fn echo(arguments: &Echo) -> Result<(), Failure> {
             left_out: 0,
             unread: None,
         };
-        // Its names may come a moment after its first value.
+        // The names of the fields may arrive shortly after the first value.
         let named = until(live.now(), Some(NAMED_WITHIN));
         let end = until(live.now(), arguments.seconds);
         let mut ended = echo.listen(&mut live, named.min(end)).await?;
@@ -47,14 +47,14 @@ pub(crate) fn echo(arguments: &Echo) -> Result<(), Failure> {
 struct Printing<'a> {
     arguments: &'a Echo,
     shown: u64,
-    /// Lines that wait for names; `None` when nothing waits any more.
+    /// Values that wait for names; `None` once waiting has ended.
     waiting: Option<VecDeque<Raw>>,
     left_out: u64,
-    /// Why a value could not be shown.
+    /// The reason why a value could not be shown.
     unread: Option<String>,
 }
 
-/// A value as it came, to be shown when its names are known.
+/// A received value, to be shown when the names are known.
 struct Raw {
     shown: Named,
     has_names: bool,
@@ -145,7 +145,7 @@ impl Printing<'_> {
         Ok(if printed { Go::Enough } else { Go::On })
     }
 
-    /// Shows what waited for names, by those that have come or by numbers.
+    /// Shows the waiting values by name, or by number if the names are unknown.
     fn print_waiting(&mut self, described: Option<&Described>) -> Result<(), Failure> {
         let waiting = self.waiting.take().unwrap_or_default();
         for mut raw in waiting {
@@ -203,7 +203,7 @@ impl Printing<'_> {
     }
 }
 
-/// `ua-space hz`.
+/// Runs `ua-space hz`.
 pub(crate) fn hz(arguments: &Hz) -> Result<(), Failure> {
     in_group(&arguments.group, async |mut live| {
         let end = until(live.now(), arguments.seconds);
@@ -245,16 +245,16 @@ pub(crate) fn hz(arguments: &Hz) -> Result<(), Failure> {
     })
 }
 
-/// How values follow each other.
+/// The rate of values.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 struct Rhythm {
     rate_hz: f64,
     min_s: f64,
     max_s: f64,
     std_dev_s: f64,
-    /// Gaps the figures are of.
+    /// Number of intervals in the statistics.
     window: usize,
-    /// Values heard in all.
+    /// Number of all received values.
     values: u64,
 }
 
@@ -306,11 +306,11 @@ impl Rhythm {
     }
 }
 
-/// Seconds that values wait for their names.
+/// Time that values wait for their names, in seconds.
 const NAMED_WITHIN: f64 = 1.2;
-/// Values that wait for them.
+/// Maximum number of waiting values.
 const MOST_WAITING: usize = 256;
-/// Seconds between two lines of `hz`.
+/// Interval of the reports of `hz`, in seconds.
 const REPORT: f64 = 1.0;
 
 #[cfg(test)]

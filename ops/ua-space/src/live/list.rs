@@ -1,4 +1,4 @@
-//! The topics and calls of a group, as `ua-space list` and `ua-space info` show them.
+//! The topics and calls of a group, as shown by `ua-space list` and `ua-space info`.
 
 use std::collections::BTreeMap;
 use std::io::{self, Write as _};
@@ -14,7 +14,7 @@ use super::{Go, Live, in_group, until};
 use crate::arguments::Info;
 use crate::exit::Failure;
 
-/// `ua-space info`.
+/// Runs `ua-space info`.
 pub(crate) fn info(arguments: &Info) -> Result<(), Failure> {
     in_group(&arguments.group, async |mut live| {
         let end = until(live.now(), Some(arguments.seconds));
@@ -33,7 +33,7 @@ pub(crate) fn info(arguments: &Info) -> Result<(), Failure> {
     })
 }
 
-/// Nothing came of a topic.
+/// Returns the failure for a topic that was not received.
 pub(super) fn unheard(live: &Live, topic: TopicId, seconds: f64) -> Failure {
     let group = live.group();
     let heard = live.book.topics().count();
@@ -46,22 +46,22 @@ pub(super) fn unheard(live: &Live, topic: TopicId, seconds: f64) -> Failure {
     Failure::Unavailable(format!("{what}\n  = help: {help}"))
 }
 
-/// JSON that a terminal shows as it is.
+/// Returns JSON without characters that control a terminal.
 pub(crate) fn json(shown: &impl Serialize) -> Result<String, Failure> {
     let text = serde_json::to_string(shown).map_err(|error| Failure::Data(error.to_string()))?;
     Ok(mappings::harmless_json(&text))
 }
 
-/// A topic or call as it is listed.
+/// A topic or call in the list.
 pub(super) struct Line<'b> {
     pub(super) topic: TopicId,
     described: Option<&'b Described>,
     heard: Option<&'b Heard>,
     pub(super) is_call: bool,
     from: String,
-    /// Since it was heard last.
+    /// Time since the last message.
     age: Option<Duration>,
-    /// Values a second.
+    /// Values per second.
     rate: Option<f64>,
 }
 
@@ -146,7 +146,7 @@ pub(super) fn table(lines: &[&Line<'_>]) -> Table {
     table
 }
 
-/// Spaces that are asked for their calls before anything is heard of them.
+/// Spaces that are probed for calls before any message is received from them.
 pub(super) const FIRST_ASKED: [u16; 3] = [0, 1, 2];
 
 pub(super) fn origin(space: SpaceId) -> &'static str {
@@ -165,7 +165,7 @@ impl Line<'_> {
         }
     }
 
-    /// What people call it.
+    /// Returns the display name.
     fn name(&self) -> Option<&str> {
         let name = self.described?.name.as_str();
         (!name.is_empty()).then_some(name)
@@ -217,7 +217,7 @@ impl Line<'_> {
         }
     }
 
-    /// All of it, a line each.
+    /// Returns all details, one per line.
     fn told(&self) -> String {
         let mut text = String::new();
         let mut line = |name: &str, value: &str| {

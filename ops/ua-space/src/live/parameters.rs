@@ -1,4 +1,4 @@
-//! `name=value` of a command line as the request of a call, by what the call takes.
+//! Encodes `name=value` arguments as the request of a call, by the types of the call.
 
 use serde_json::{Value, json};
 use uadp::BuiltinType;
@@ -7,7 +7,7 @@ use super::described::{Field, list};
 use crate::shape::FieldValue;
 use crate::values::variant_bytes;
 
-/// What is wrong with the words, and what there should be.
+/// A wrong argument, and the parameters that the call takes.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{what}\n  = help: {help}")]
 pub(crate) struct WrongParameter {
@@ -15,11 +15,12 @@ pub(crate) struct WrongParameter {
     help: String,
 }
 
-/// The request: a FieldCount and so many Variants, in the order of the call. What may be left out and is, is a null
-/// Variant; with nothing given at all there are no fields.
+/// Returns the request: a FieldCount and as many Variants, in the order of the call. An omitted
+/// optional parameter is a null Variant; without any arguments there are no fields.
 ///
 /// # Errors
-/// [`WrongParameter`] names the first word that is wrong, or what is missing, and says what the call takes.
+/// [`WrongParameter`] names the first wrong argument or the missing parameters, and lists the
+/// parameters of the call.
 pub(crate) fn request(words: &[String], takes: &[Field]) -> Result<Vec<u8>, WrongParameter> {
     let wrong = |what: String| WrongParameter {
         what,
@@ -109,7 +110,7 @@ fn value(field: &Field, text: &str) -> Result<Value, String> {
     elements.collect::<Result<_, _>>()
 }
 
-/// A text as it is typed, as the JSON of its type.
+/// Converts a typed text to the JSON of its type.
 fn scalar(builtin: BuiltinType, text: &str) -> Result<Value, String> {
     let expected = || format!("expected a {}, found `{text}`", builtin.name());
     #[expect(

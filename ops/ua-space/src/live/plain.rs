@@ -1,4 +1,4 @@
-//! Values as people read them: plain JSON, and YAML line by line.
+//! Formats values for people: plain JSON, and YAML line by line.
 
 use serde::ser::{Serialize, SerializeMap as _, Serializer};
 use serde_json::{Value, json};
@@ -11,7 +11,7 @@ use crate::raw_data::Layout;
 use crate::shape::FieldMetaData;
 use crate::values::show_scalar;
 
-/// Named values in their order.
+/// Named values in order.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub(crate) struct Named(pub(crate) Vec<(String, Value)>);
 
@@ -29,7 +29,7 @@ impl Named {
         self.get(name)?.as_u64()
     }
 
-    /// Gives values that came before their names the names they have.
+    /// Renames values that were received before their names.
     pub(crate) fn rename(&mut self, fields: &[Field]) {
         for (known, _) in &mut self.0 {
             let (number, rest) = known.split_once('.').unwrap_or((known, ""));
@@ -43,7 +43,7 @@ impl Named {
         }
     }
 
-    /// As YAML, a line each.
+    /// Returns YAML, one value per line.
     pub(crate) fn yaml(&self) -> String {
         let mut text = String::new();
         for (name, value) in &self.0 {
@@ -69,10 +69,12 @@ impl Serialize for Named {
     }
 }
 
-/// The fields of a message, by the names they were announced with; without them `field_1` and so on.
+/// Returns the fields of a message by their announced names, or as `field_1` and so on without an
+/// announcement.
 ///
 /// # Errors
-/// [`DecodeError`] for what is malformed, and [`DecodeError::Misread`] for RawData that nobody described.
+/// [`DecodeError`] if the message is malformed, [`DecodeError::Misread`] for RawData without an
+/// announcement.
 pub(crate) fn message(
     message: &DataSetMessage<'_>,
     described: Option<&Described>,
@@ -105,10 +107,10 @@ pub(crate) fn message(
     Ok(named)
 }
 
-/// The fields of a response.
+/// Returns the fields of a response.
 ///
 /// # Errors
-/// As [`message`].
+/// See [`message`].
 pub(crate) fn response(
     fields: uadp::action::ActionFields<'_>,
     described: &[Field],
@@ -124,7 +126,8 @@ pub(crate) fn response(
     Ok(named)
 }
 
-/// A value of the field with that number: messages by the names of their fields, where they were announced.
+/// Returns the value of the field with this index; messages in it have the announced names of their
+/// fields.
 fn field(value: &Variant<'_>, fields: &[Field], index: usize) -> Result<Value, DecodeError> {
     let Some(structure) = fields.get(index).and_then(|field| field.structure.as_ref()) else {
         return variant(value);
@@ -147,7 +150,7 @@ fn name(fields: &[Field], index: usize) -> String {
     }
 }
 
-/// In front of the number of a field whose name is not known.
+/// The prefix of the number of an unnamed field.
 const UNNAMED: &str = "field_";
 
 fn raw(payload: &[u8], fields: &[Field]) -> Result<Named, DecodeError> {
@@ -181,10 +184,11 @@ fn metadata(field: &Field) -> FieldMetaData {
     }
 }
 
-/// A value without its type; numbers of 64 bit are numbers here, which `decode` has as texts.
+/// Returns a value without its type. 64-bit numbers are JSON numbers here; `decode` shows them as
+/// text.
 ///
 /// # Errors
-/// [`DecodeError`] for what is malformed inside.
+/// [`DecodeError`] if the value is malformed.
 pub(crate) fn variant(value: &Variant<'_>) -> Result<Value, DecodeError> {
     match value {
         Variant::Null => Ok(Value::Null),
@@ -214,7 +218,7 @@ pub(super) fn elements(array: Array<'_>) -> Result<Value, DecodeError> {
     array.iter().map(scalar).collect()
 }
 
-/// Arrays in arrays, the innermost dimension last.
+/// Nests a flat array by its dimensions, the innermost dimension last.
 fn nested(mut flat: Value, dimensions: &[u32]) -> Value {
     for size in dimensions.iter().skip(1).rev() {
         let size = usize::try_from(*size).unwrap_or(usize::MAX).max(1);

@@ -1,4 +1,5 @@
-//! Asking publishers what their topics and calls are, a few times each and never fast.
+//! Probes publishers for the descriptions of their topics and calls, a few times each and at a
+//! limited rate.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
@@ -6,23 +7,24 @@ use std::time::Duration;
 use uadp::discovery::{List, Probe};
 use uadp::{PublisherId, SecurityHeader};
 
-/// What is still to be asked. A probe names a space and no WriterGroup: of several programs that publish for one space
-/// each answers for itself.
+/// The open questions. A probe names a space but no WriterGroup: if several programs publish for a
+/// space, each of them answers.
 #[derive(Debug, Default)]
 pub(crate) struct Prober {
     wanted: BTreeMap<(u16, Question), Wanted>,
-    /// When a probe was sent last.
+    /// The time of the last probe.
     sent: Option<Duration>,
-    /// How often was asked who there is, where that is to be asked.
+    /// The number of probes for applications; `None` if they are not wanted.
     asked_all: Option<u32>,
 }
 
-/// What a space is asked.
+/// A question to a space.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 enum Question {
-    /// All its calls. Asked for by their connections, the bridges tell them.
+    /// All calls of the space. Bridges announce them in response to a probe for their
+    /// PubSubConnections.
     Calls,
-    /// What is behind a DataSetWriterId.
+    /// The description of a DataSetWriterId.
     Writer(u16),
 }
 
@@ -33,17 +35,17 @@ struct Wanted {
 }
 
 impl Prober {
-    /// Asks for a DataSetWriter, unless that is or was done.
+    /// Queues a probe for a DataSetWriter, unless it was queued before.
     pub(crate) fn want(&mut self, space: u16, writer_id: u16, now: Duration) {
         self.ask(space, Question::Writer(writer_id), now);
     }
 
-    /// Asks which calls a space has, unless that is or was done.
+    /// Queues a probe for the calls of a space, unless it was queued before.
     pub(crate) fn want_calls(&mut self, space: u16, now: Duration) {
         self.ask(space, Question::Calls, now);
     }
 
-    /// Asks who there is.
+    /// Queues a probe for applications.
     pub(crate) fn want_all(&mut self) {
         self.asked_all.get_or_insert(0);
     }
@@ -57,14 +59,14 @@ impl Prober {
         }
     }
 
-    /// There is an answer.
+    /// Marks a question as answered.
     pub(crate) fn answered(&mut self, space: u16, writer_id: u16) {
         if let Some(wanted) = self.wanted.get_mut(&(space, Question::Writer(writer_id))) {
             wanted.attempts = ATTEMPTS;
         }
     }
 
-    /// The datagram to send now, if any.
+    /// Returns the datagram that is due, if any.
     pub(crate) fn poll(&mut self, now: Duration) -> Option<Vec<u8>> {
         if self.sent.is_some_and(|sent| now < sent + PACE) {
             return None;
@@ -114,24 +116,25 @@ impl Prober {
     }
 }
 
-/// The question who there is, which is for everybody.
+/// Returns the probe for applications, which is addressed to all publishers.
 fn all() -> Option<Vec<u8>> {
     let mut datagram = Vec::new();
     let encoded = Probe::FindApplications.encode(None, SecurityHeader::NONE, &mut datagram);
     encoded.is_ok().then_some(datagram)
 }
 
-/// How often is asked who there is: a datagram may be lost.
+/// Number of probes for applications, because a datagram may be lost.
 const ASK_ALL: u32 = 2;
-/// Questions that are remembered, asked or not.
+/// Maximum number of questions, open or answered.
 const MOST: usize = 8192;
-/// DataSetWriters of one probe: as many as publishers of the bridges announce within half a second.
+/// Maximum number of DataSetWriters in a probe: the number that a publisher of the bridges
+/// announces within half a second.
 const TOGETHER: usize = 50;
-/// What is heard meanwhile is asked for together.
+/// Topics received within this time are probed together.
 const GATHER: Duration = Duration::from_millis(120);
-/// Between two probes.
+/// Minimum interval between two probes.
 const PACE: Duration = Duration::from_millis(100);
-/// Before asking again, and twice as long before the third time.
+/// Time before the second probe; the third probe follows after twice this time.
 const WAIT: Duration = Duration::from_millis(700);
 const ATTEMPTS: u32 = 3;
 
@@ -141,7 +144,7 @@ mod tests {
 
     use super::*;
 
-    /// The space and the DataSetWriters that are asked for; none are of a question for calls.
+    /// Returns the space and the probed DataSetWriters; empty for a probe for calls.
     fn read(datagram: &[u8]) -> (Option<PublisherId<'_>>, Vec<u16>) {
         let message = NetworkMessage::decode(datagram).unwrap();
         let probe = Probe::decode(&message).unwrap();

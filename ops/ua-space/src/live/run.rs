@@ -1,4 +1,4 @@
-//! A run of a skill, followed from its start to its end by what the component publishes.
+//! Follows a run of a skill from its start to its end, by the values that the component publishes.
 
 use std::time::Duration;
 
@@ -8,7 +8,7 @@ use serde_json::Value;
 
 use super::plain::Named;
 
-/// Which values tell of the runs of a skill. Their identifiers follow from that of its Start.
+/// The topics of the runs of a skill. Their identifiers follow from the identifier of Start.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Places {
     state: TopicId,
@@ -18,19 +18,19 @@ pub(super) struct Places {
     pub(super) halt: TopicId,
 }
 
-/// What there is to tell of a run.
+/// An event of a run.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[serde(tag = "event", rename_all = "snake_case")]
 pub(super) enum Step {
-    /// It came into another state.
+    /// The skill entered another state.
     State {
         state: String,
         #[serde(skip_serializing_if = "Option::is_none")]
         transition: Option<String>,
     },
-    /// How far it is.
+    /// The progress of the run.
     Progress { progress: f64, step: String },
-    /// How it ended.
+    /// The result of the run.
     Result {
         succeeded: bool,
         message: String,
@@ -38,36 +38,36 @@ pub(super) enum Step {
     },
 }
 
-/// How a run went.
+/// The end of a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum End {
     Succeeded,
     Failed,
-    /// Another run began, and the result of this one was not heard.
+    /// Another run began, and the result of this run was not received.
     Overtaken,
-    /// It ended, and its result was not heard.
+    /// The run ended, and its result was not received.
     NoResult,
-    /// Nothing is heard of the component.
+    /// No value is received from the component.
     Silent,
     /// The component publishes the state of other runs only.
     NoSuchRun,
 }
 
-/// A run that is followed.
+/// A followed run.
 #[derive(Debug)]
 pub(super) struct Run {
     number: u64,
     state: Option<String>,
     progress: Option<(u32, String)>,
     ended: Option<(End, Duration)>,
-    /// First state of an earlier run, while none of this run was received.
+    /// The time of the first state of an earlier run, until a state of this run is received.
     earlier: Option<Duration>,
     heard: Duration,
     succeeded: Option<bool>,
 }
 
 impl Places {
-    /// Of a call that starts a skill; `None` for a call that is none.
+    /// Returns the topics for a call that starts a skill; `None` for other calls.
     pub(super) fn of(start: TopicId, name: &str) -> Option<Self> {
         let (space, namespace, id) = start.triple();
         if !name.ends_with(".Start") || id % 100 != START {
@@ -83,7 +83,7 @@ impl Places {
         })
     }
 
-    /// Whether something comes there that a run is followed by.
+    /// Returns true if values of the topic belong to a run.
     pub(super) fn has(&self, topic: TopicId) -> bool {
         [self.state, self.events, self.result].contains(&topic)
     }
@@ -102,7 +102,7 @@ impl Run {
         }
     }
 
-    /// What a value says that is new.
+    /// Returns the new events in a value.
     pub(super) fn handle(
         &mut self,
         places: &Places,
@@ -133,7 +133,7 @@ impl Run {
     fn state(&mut self, value: &Named, now: Duration) -> Vec<Step> {
         match value.number("run") {
             Some(run) if run == self.number => self.earlier = None,
-            // Runs are counted.
+            // Runs have increasing numbers.
             Some(run) if run > self.number => {
                 self.ended.get_or_insert((End::Overtaken, now));
                 return Vec::new();
@@ -193,7 +193,7 @@ impl Run {
         }]
     }
 
-    /// How it ended, when all is told that there is to tell.
+    /// Returns the end of the run, once all events are received.
     pub(super) fn end(&self, now: Duration) -> Option<End> {
         let stands = self
             .state
@@ -201,7 +201,7 @@ impl Run {
             .is_some_and(|state| state != "Running" && state != "Suspended");
         let since = self.ended.map(|(_, at)| now.saturating_sub(at));
         match (self.succeeded, self.ended) {
-            // The last transition may follow its result.
+            // The last transition may follow the result.
             (Some(succeeded), _) if stands || since >= Some(LAST) => Some(match succeeded {
                 true => End::Succeeded,
                 false => End::Failed,
@@ -220,7 +220,7 @@ impl Run {
     }
 }
 
-/// What came out, by name.
+/// Returns the results by name.
 pub(super) fn results(value: &Named) -> Named {
     let list = |name: &str| {
         let found = value.get(name).and_then(Value::as_array);
@@ -245,7 +245,7 @@ pub(super) fn percent(progress: f64) -> u32 {
 }
 
 impl Step {
-    /// For people, a line.
+    /// Returns a line for people.
     pub(super) fn told(&self) -> String {
         match self {
             Self::State { state, transition } => match transition {
@@ -277,13 +277,13 @@ impl Step {
     }
 }
 
-/// Place of Start among the identifiers of a skill.
+/// Offset of Start among the identifiers of a skill.
 const START: u16 = 5;
-/// After the result, for the last transition.
+/// Time to wait for the last transition after the result.
 const LAST: Duration = Duration::from_millis(500);
-/// For the result of a run that ended: two of its repetitions.
+/// Time to wait for the result of a run that ended: two repetitions of the result.
 const LATE: Duration = Duration::from_secs(3);
-/// States are repeated every second.
+/// Time without values after which the component counts as lost; states are repeated every second.
 const SILENT: Duration = Duration::from_secs(5);
 
 #[cfg(test)]

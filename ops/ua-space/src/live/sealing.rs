@@ -1,4 +1,4 @@
-//! Keys in a running space: what is heard is opened with them, and what is asked is sealed.
+//! The keys of a running space: decrypts received messages and secures requests.
 
 use std::path::Path;
 
@@ -8,12 +8,12 @@ use crate::exit::Failure;
 use crate::keys::{self, KeyFile};
 use crate::report::warn;
 
-/// The keys of a file, and what is sealed with the first of them.
+/// The keys of a file, and the sealer with the first key.
 #[derive(Debug)]
 pub(crate) struct Sealing {
     file: KeyFile,
     sealer: Sealer,
-    /// Random bytes of this run, which tell its messages from those of others.
+    /// Random bytes of this process, which distinguish its messages from messages of other senders.
     mark: [u8; 4],
     refused: u64,
 }
@@ -42,7 +42,7 @@ impl Sealing {
         })
     }
 
-    /// Opens a message into `scratch` where that can be done; it stays as it is where not.
+    /// Verifies and decrypts a message into `scratch`; returns the message unchanged if this fails.
     pub(crate) fn open<'a>(
         &mut self,
         message: NetworkMessage<'a>,

@@ -1,6 +1,6 @@
-//! `ua-space skills`: the skills of all components, and how they are.
+//! `ua-space skills`: shows the skills of all components with their states.
 //!
-//! Reading order: this (what is heard of them, and the list), `info`, `start`, `watch`.
+//! Reading order: this module (received states, and the list), `info`, `start`, `watch`.
 
 mod info;
 mod start;
@@ -23,15 +23,15 @@ use super::{Ended, Go, Live, in_group, until};
 use crate::arguments::{Group, ListSkills, Skills, SkillsVerb};
 use crate::exit::Failure;
 
-/// Behind `<component>.<skill>` in the name of the value that says how a skill is.
+/// The suffix of the name of a state, after `<component>.<skill>`.
 const STATE: &str = ".State";
-/// And in that of the value that says how its last run ended.
+/// The suffix of the name of the result of the last run.
 const RESULT: &str = ".Result";
 
 /// Methods of a skill, in the order of their identifiers.
 const METHODS: [&str; 5] = ["Start", "Halt", "Suspend", "Resume", "Reset"];
 
-/// `ua-space skills`.
+/// Runs `ua-space skills`.
 pub(crate) fn skills(arguments: &Skills) -> Result<(), Failure> {
     match &arguments.verb {
         None => list(&arguments.list),
@@ -72,7 +72,7 @@ fn list(arguments: &ListSkills) -> Result<(), Failure> {
     })
 }
 
-/// Listens for so long, or until `enough` is known.
+/// Listens for `seconds`, or until `enough` returns true.
 async fn hear(
     live: &mut Live,
     seconds: f64,
@@ -95,7 +95,8 @@ async fn hear(
     }
 }
 
-/// What is heard in a while of the names that `call` takes: those of skills, of calls, and topics.
+/// Returns the names that `call` accepts and that are received within a short time: skills, calls
+/// and topics.
 pub(crate) fn heard_names(group: &Group) -> Result<HeardNames, Failure> {
     in_group(group, async |mut live| {
         let (found, _) = hear(&mut live, FOR_NAMES, &|_| false).await?;
@@ -117,7 +118,7 @@ pub(crate) fn heard_names(group: &Group) -> Result<HeardNames, Failure> {
     })
 }
 
-/// Names that are heard in a space.
+/// Names received in a space.
 #[derive(Debug, Default)]
 pub(crate) struct HeardNames {
     pub(crate) components: Vec<String>,
@@ -126,12 +127,12 @@ pub(crate) struct HeardNames {
     pub(crate) topics: Vec<String>,
 }
 
-/// What skills last said of their states and results.
+/// The last states and results of skills.
 #[derive(Default)]
 struct States(BTreeMap<TopicId, Named>);
 
 impl States {
-    /// Takes in a state or result, or what may be one: of a value that comes before its name the identifier tells.
+    /// Stores a state or result. A value received before its name is recognized by its identifier.
     fn take(&mut self, news: &News<'_>) {
         let News::Sample(sample) = news else {
             return;
@@ -153,7 +154,7 @@ impl States {
         }
     }
 
-    /// The state or result of a skill, by the names that are known by now.
+    /// Returns the state or result of a skill, with the names known at this time.
     fn of(&self, topic: TopicId, described: &Described) -> Option<Named> {
         let mut state = self.0.get(&topic)?.clone();
         state.rename(described.fields());
@@ -161,7 +162,7 @@ impl States {
     }
 }
 
-/// A skill as it is listed.
+/// A skill in the list.
 #[derive(Debug, Serialize)]
 struct Skill {
     component: String,
@@ -169,35 +170,36 @@ struct Skill {
     #[serde(rename = "type")]
     type_name: Option<String>,
     type_namespace: Option<String>,
-    /// The topic of its state.
+    /// The topic of the state.
     topic: String,
     state: Option<String>,
     run: Option<u64>,
     progress: Option<f64>,
     step: Option<String>,
-    /// Seconds since its state was heard last.
+    /// Seconds since the last state.
     age_s: f64,
-    /// Topic of each method.
+    /// The topic of each method.
     calls: BTreeMap<&'static str, String>,
-    /// What Start takes.
+    /// The parameters of Start, in one line.
     takes: Option<String>,
-    /// How the last run ended.
+    /// The result of the last run.
     #[serde(skip)]
     result: Option<Named>,
-    /// What Start takes, one by one.
+    /// The parameters of Start.
     #[serde(skip)]
     parameters: Vec<Field>,
 }
 
 impl Skill {
-    /// As `call` takes it.
+    /// Returns the name that `call` accepts.
     fn name(&self) -> String {
         format!("{}.{}", self.component, self.skill)
     }
 }
 
 fn find(book: &Book, states: &States, now: Duration) -> Vec<Skill> {
-    // By the place of the state, since two components may have one name.
+    // The key includes the space and namespace of the state, because two components may have the
+    // same name.
     let mut calls: BTreeMap<(u16, u16, String), _> = BTreeMap::new();
     for (topic, described) in book.calls() {
         let (space, namespace, _) = topic.triple();
@@ -248,7 +250,7 @@ fn find(book: &Book, states: &States, now: Duration) -> Vec<Skill> {
     skills
 }
 
-/// Where the result of a skill is, from where its state is.
+/// Returns the topic of the result from the topic of the state.
 fn result_of(state: TopicId) -> Option<TopicId> {
     let (space, namespace, id) = state.triple();
     TopicId::new(space, namespace, id.checked_add(RESULT_ID - STATE_ID)?)
@@ -282,15 +284,15 @@ fn table(skills: &[Skill]) -> Table {
     table
 }
 
-/// Place of the state among the identifiers of a skill.
+/// Offset of the state among the identifiers of a skill.
 const STATE_ID: u16 = 1;
-/// And of the result.
+/// Offset of the result.
 const RESULT_ID: u16 = 4;
-/// How often is looked whether enough is known.
+/// The interval at which the received skills are checked.
 const LOOK: Duration = Duration::from_millis(100);
-/// Seconds in which every skill says its state.
+/// Time in which every skill sends its state, in seconds.
 const FOR_NAMES: f64 = 1.3;
-/// States that are kept.
+/// Maximum number of stored states.
 const MOST: usize = 4096;
-/// Three times what a state is repeated in.
+/// Three times the interval at which states are repeated.
 const SILENT: Duration = Duration::from_secs(3);

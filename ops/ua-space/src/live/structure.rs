@@ -1,4 +1,4 @@
-//! Messages in arrays: structures, whose fields the announcement of a topic or call defines.
+//! Structures in arrays, whose fields are defined in the announcement of a topic or call.
 
 use serde_json::{Map, Value};
 use uadp::discovery::{DataTypeSchemaHeader, StructureField, StructureType};
@@ -6,7 +6,7 @@ use uadp::{BuiltinType, DecodeError, ExtensionBody, Identifier, NodeId, Scalar, 
 
 use super::plain;
 
-/// What a structure consists of, those in it included.
+/// The fields of a structure, including nested structures.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Structure(Vec<Part>);
 
@@ -24,8 +24,9 @@ enum Kind {
 }
 
 impl Structure {
-    /// The structure of a DataType; `None` for one that is not defined there, or has too much in it. `room` is how many
-    /// fields there may be, those of structures in structures included: a short schema can say any number of them.
+    /// Returns the structure of a DataType; `None` if the schema does not define it or it exceeds a
+    /// limit. `room` is the remaining number of fields, including the fields of nested structures,
+    /// because a short schema can define any number of them.
     pub(super) fn of(
         schema: &DataTypeSchemaHeader<'_>,
         data_type: NodeId<'_>,
@@ -62,7 +63,7 @@ impl Structure {
         parts.collect::<Option<Vec<_>>>().map(Self)
     }
 
-    /// Roughly the bytes it takes up.
+    /// Returns the approximate size in bytes.
     pub(super) fn weight(&self) -> usize {
         let of = |part: &Part| {
             let inner = match &part.kind {
@@ -74,10 +75,11 @@ impl Structure {
         self.0.iter().map(of).sum()
     }
 
-    /// The fields of a value; `None` for what is no structure in the binary encoding.
+    /// Returns the fields of a value; `None` if the value is not a structure in the binary
+    /// encoding.
     ///
     /// # Errors
-    /// [`DecodeError`] for what is not what was announced.
+    /// [`DecodeError`] if the value does not match the announcement.
     pub(super) fn show(&self, value: Scalar<'_>) -> Result<Option<Value>, DecodeError> {
         let Scalar::ExtensionObject(object) = value else {
             return Ok(None);
@@ -109,7 +111,7 @@ impl Structure {
     }
 }
 
-/// The builtin type that a field is of itself.
+/// Returns the builtin type of a field whose DataType is a builtin type.
 fn builtin(field: &StructureField<'_>) -> Option<BuiltinType> {
     match (field.data_type.namespace, field.data_type.identifier) {
         (0, Identifier::Numeric(number)) => BuiltinType::from_id(number.try_into().ok()?),
@@ -117,7 +119,7 @@ fn builtin(field: &StructureField<'_>) -> Option<BuiltinType> {
     }
 }
 
-/// Structures in structures.
+/// Maximum depth of nested structures.
 const MOST_NESTED: usize = 16;
-/// Structures that are shown of one value.
+/// Maximum number of structures shown of a value.
 const MOST_VALUES: usize = 1 << 16;

@@ -1,8 +1,8 @@
-//! How things look in a terminal: tables, and texts of strangers made harmless.
+//! Terminal output: tables, and texts from the network without control characters.
 
 use std::io::{self, IsTerminal as _, Write};
 
-/// A table whose columns are as wide as they have to be; the last one is as long as it is.
+/// A table with columns of the necessary width; the last column is not padded.
 pub(crate) struct Table {
     head: Vec<String>,
     rows: Vec<Vec<String>>,
@@ -16,13 +16,13 @@ impl Table {
         }
     }
 
-    /// Adds a row; what cannot be printed in it is shown by its number.
+    /// Adds a row; unprintable characters are escaped.
     pub(crate) fn row(&mut self, cells: impl IntoIterator<Item = String>) {
         self.rows
             .push(cells.into_iter().map(|cell| harmless(&cell)).collect());
     }
 
-    /// Writes it; the head in bold where `bold` says so.
+    /// Writes the table; with `bold`, the head is bold.
     pub(crate) fn write(&self, out: &mut impl Write, bold: bool) -> io::Result<()> {
         let mut widths: Vec<usize> = self.head.iter().map(|text| text.chars().count()).collect();
         for row in &self.rows {
@@ -51,12 +51,13 @@ impl Table {
     }
 }
 
-/// Whether stdout is a terminal that colours are wanted in.
+/// Returns true if stdout is a terminal and colours are not disabled.
 pub(crate) fn is_coloured() -> bool {
     io::stdout().is_terminal() && std::env::var_os("NO_COLOR").is_none_or(|set| set.is_empty())
 }
 
-/// A text of anybody without what a terminal would obey: control characters, and those that turn the direction.
+/// Escapes the characters of an untrusted text that control a terminal: control characters, and
+/// characters that change the text direction.
 pub(crate) fn harmless(text: &str) -> String {
     let mut shown = String::with_capacity(text.len());
     for c in text.chars() {
@@ -68,7 +69,7 @@ pub(crate) fn harmless(text: &str) -> String {
     shown
 }
 
-/// A time that people can compare: `340 ms`, `2.5 s`, `3 min`.
+/// Formats a duration for people: `340 ms`, `2.5 s`, `3 min`.
 pub(crate) fn age(of: std::time::Duration) -> String {
     match of.as_secs() {
         0 => format!("{} ms", of.as_millis()),
@@ -77,7 +78,7 @@ pub(crate) fn age(of: std::time::Duration) -> String {
     }
 }
 
-/// As `12.5 us`, `3.40 ms`, `2.00 s`.
+/// Formats microseconds as `12.5 us`, `3.40 ms`, `2.00 s`.
 pub(crate) fn micros(us: f64) -> String {
     if us < 1000.0 {
         format!("{us:.1} us")

@@ -1,7 +1,8 @@
-//! `ua-space trace`: how long values take, hop by hop.
+//! `ua-space trace`: shows the delays of values, hop by hop.
 //!
-//! Programs measure their own hops over all topics (`/status`); what each topic takes on its way to here is read off the
-//! times in its messages: when its writer had the value, when it sent it, and when it came.
+//! Programs measure their own hops over all topics (`/status`). The delays of each topic on its way
+//! to this program are computed from the times in its messages: the time at which its writer took
+//! the value, the time of sending, and the time of arrival.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::io::{self, Write as _};
@@ -20,7 +21,7 @@ use crate::http::Server;
 use crate::report::warn;
 use crate::survey::look;
 
-/// `ua-space trace`.
+/// Runs `ua-space trace`.
 pub(crate) fn trace(arguments: &Trace) -> Result<(), Failure> {
     let mut topics = Vec::new();
     if arguments.seconds > 0.0 {
@@ -62,7 +63,7 @@ pub(crate) fn trace(arguments: &Trace) -> Result<(), Failure> {
     }
 }
 
-/// A program's own figures.
+/// The measurements of a program.
 #[derive(Debug, Deserialize, Serialize)]
 struct Program {
     program: String,
@@ -70,18 +71,18 @@ struct Program {
     hops: BTreeMap<String, Hop>,
 }
 
-/// The delays of one hop.
+/// The delays of a hop.
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize, Serialize)]
 struct Hop {
     p50_us: f64,
     p99_us: f64,
     max_us: f64,
     count: u64,
-    /// Delays below zero, which only clocks that disagree can make.
+    /// Number of negative delays, which are caused by clocks that disagree.
     negative: u64,
 }
 
-/// One hop of one topic.
+/// A hop of a topic.
 #[derive(Debug, Serialize)]
 struct Row {
     topic: String,
@@ -96,7 +97,7 @@ struct Shown<'a> {
     topics: &'a [Row],
 }
 
-/// One object for each space a program serves.
+/// The response of a program: an object for each space that it serves.
 #[derive(Deserialize)]
 #[serde(untagged)]
 enum Status {
@@ -117,7 +118,7 @@ async fn status(server: &Server, url: &str) -> Result<Vec<Program>, Failure> {
     }
 }
 
-/// Delays of topics, those that came last.
+/// The latest delays of topics.
 #[derive(Default)]
 struct Delays {
     topics: BTreeMap<TopicId, Topic>,
@@ -125,7 +126,8 @@ struct Delays {
 
 #[derive(Default)]
 struct Topic {
-    /// When the value of the message before was taken: one that is repeated keeps that time.
+    /// The time at which the value of the previous message was taken; a repeated value keeps this
+    /// time.
     taken: Option<i128>,
     origin: Window,
     network: Window,
@@ -139,7 +141,7 @@ struct Window {
 }
 
 impl Delays {
-    /// Takes note of a message that arrived at that time, in nanoseconds since 1970.
+    /// Records a message that arrived at the given time, in nanoseconds since 1970.
     fn take(&mut self, sample: &Sample<'_>, arrived: i128) {
         if sample.message.kind == MessageKind::KeepAlive
             || (self.topics.len() >= MOST_TOPICS && !self.topics.contains_key(&sample.topic))
@@ -159,7 +161,7 @@ impl Delays {
         let sent = nanos(sample.network.timestamp, sample.network.picoseconds);
         let before = std::mem::replace(&mut topic.taken, taken);
         if let (Some(taken), Some(sent)) = (taken, sent)
-            // The first that is heard may be a repetition too.
+            // The first received message may be a repetition too.
             && before.is_some_and(|before| before != taken)
         {
             topic.origin.record(sent - taken);
@@ -207,7 +209,7 @@ impl Window {
         }
         let mut sorted: Vec<u64> = self.nanos.iter().copied().collect();
         sorted.sort_unstable();
-        // The smallest that `percent` of all do not exceed.
+        // The smallest delay that at least `percent` of all delays do not exceed.
         let quantile = |percent: usize| {
             let rank = (sorted.len() * percent).div_ceil(100);
             let nanos = sorted.get(rank.saturating_sub(1)).copied();
@@ -280,7 +282,7 @@ fn print(arguments: &Trace, programs: &[Program], topics: &[Row]) -> Result<(), 
     Ok(())
 }
 
-/// What a hop is, for people.
+/// Returns the description of a hop.
 fn called(hop: &str) -> String {
     match hop {
         "out" => "out: from here into the space".to_owned(),
@@ -294,7 +296,7 @@ fn called(hop: &str) -> String {
 const ORIGIN: &str = "origin";
 const NETWORK: &str = "network";
 const MOST_TOPICS: usize = 1024;
-/// Delays of one hop of one topic that the figures are of.
+/// Maximum number of delays of a topic and hop in the statistics.
 const MOST_DELAYS: usize = 2048;
 
 #[cfg(test)]

@@ -1,21 +1,24 @@
-//! Data types of OPC UA's own namespace: which builtin type their values have (OPC 10000-3, 5.8.3; OPC 10000-6, 5.1.2).
+//! DataTypes of namespace 0 and the builtin types of their values (OPC 10000-3, 5.8.3; OPC 10000-6,
+//! 5.1.2).
 
 use uadp::BuiltinType;
 
-/// The builtin type of values of the DataType `i=number`, `None` for abstract ones and for types this table does not
-/// have, whose supertypes may tell.
+/// Returns the builtin type of values of the DataType `i=number`; `None` for abstract DataTypes and
+/// for DataTypes that are not in the table, whose supertypes may have a builtin type.
 pub(crate) fn builtin(number: u32) -> Option<BuiltinType> {
     BuiltinType::from_id(plant_opcua::nodeset::builtin(number)?)
 }
 
-/// Structures are ExtensionObjects, whose fields a subscriber finds in the server.
+/// The DataType Structure, whose values are ExtensionObjects; a subscriber finds the fields in the
+/// server.
 pub(crate) const STRUCTURE: u32 = 22;
 
-/// A builtin type and whether the values are arrays; `None` for matrices and values of any rank.
+/// Returns a builtin type and whether the values are arrays; `None` for matrices and values of any
+/// rank.
 pub(crate) fn ranked(builtin: BuiltinType, rank: i64) -> Option<(BuiltinType, bool)> {
     match rank {
         -1 => Some((builtin, false)),
-        // 0 is one or more dimensions.
+        // Rank 0 stands for one or more dimensions.
         1 => Some((builtin, true)),
         _ => None,
     }

@@ -1,4 +1,4 @@
-//! The sender that announced a call, whose answers alone count.
+//! The executor of a call: the sender that announced it. Responses of other senders are ignored.
 
 use std::net::SocketAddr;
 
@@ -6,11 +6,11 @@ use uadp::action::{ActionMessage, Requestor};
 
 use crate::report::warn;
 
-/// The sender that announced a call, as the carrier tells senders apart.
+/// The sender that announced a call, identified by its address.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Executor {
     from: Option<SocketAddr>,
-    /// A forged answer was reported.
+    /// True if a forged response was reported.
     reported: bool,
 }
 
@@ -22,12 +22,13 @@ impl Executor {
         }
     }
 
-    /// Whether values and announcements of that sender are of the executor.
+    /// Returns true if `from` is the address of the executor.
     pub(super) fn publishes(&self, from: SocketAddr) -> bool {
         self.from == Some(from)
     }
 
-    /// Whether a response comes from the executor. The first answer to an open call from another sender is reported.
+    /// Returns true if a response comes from the executor. Reports the first response to an open
+    /// call from another sender.
     pub(super) fn answers(
         &mut self,
         requestor: &Requestor,

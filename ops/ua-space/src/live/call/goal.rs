@@ -1,4 +1,5 @@
-//! An action: its goal is sent, its feedback shown, its result waited for; Ctrl-C cancels it.
+//! Runs an action: sends its goal, shows its feedback and waits for its result. Ctrl-C cancels the
+//! goal.
 
 use std::hash::{BuildHasher as _, RandomState};
 use std::sync::Arc;
@@ -18,7 +19,7 @@ use super::{Asking, LOOK, called, refused, words};
 use crate::exit::Failure;
 use crate::report::warn;
 
-/// Where an action is asked beside the call that sends its goals, and where it tells.
+/// The calls and the feedback topic of an action, besides the call that sends goals.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Parts {
     cancel: TopicId,
@@ -27,7 +28,7 @@ pub(super) struct Parts {
 }
 
 impl Parts {
-    /// `None` for a call that sends no goals.
+    /// Returns the parts of an action; `None` for a call that does not send goals.
     pub(super) fn of(goal: TopicId, described: &Described) -> Option<Self> {
         let action = described.call()?.action?;
         let (space, namespace, _) = goal.triple();
@@ -40,7 +41,7 @@ impl Parts {
     }
 }
 
-/// What there is to tell of a goal.
+/// An event of a goal.
 #[derive(Debug, Serialize)]
 #[serde(tag = "event", rename_all = "snake_case")]
 pub(super) enum Told {
@@ -55,7 +56,7 @@ pub(super) enum Told {
 }
 
 impl Told {
-    /// For people, a line or more.
+    /// Returns the lines for people.
     pub(super) fn told(&self) -> String {
         match self {
             Self::Feedback { fields } => {
@@ -83,10 +84,10 @@ impl Told {
     }
 }
 
-/// A goal that is followed.
+/// A followed goal.
 struct Goal {
     parts: Parts,
-    /// As values show it.
+    /// The goal id as values show it.
     id: String,
     bytes: [u8; 16],
     result: Arc<Described>,
@@ -96,27 +97,27 @@ struct Goal {
     cancelling: Option<Cancelling>,
 }
 
-/// A goal that is being cancelled.
+/// The cancellation of a goal.
 struct Cancelling {
-    /// The newest request.
+    /// The latest request.
     call: CallId,
-    /// When the next one is due: a request may come before the goal, or get lost.
+    /// The time of the next request; a request may arrive before the goal, or get lost.
     again: Duration,
-    /// When the end of the goal is waited for no longer.
+    /// The time limit for the end of the goal.
     until: Duration,
     is_refused: bool,
 }
 
-/// What came of the call that waits.
+/// The outcome of the call that waits for the result.
 enum Came {
     Result(Named),
-    /// Nobody answered for as long as it could wait.
+    /// The time limit passed without a response.
     Nothing,
     Failed(Failure),
 }
 
 impl Asking<'_> {
-    /// Sends a goal and, unless that is not wanted, sees it to its end.
+    /// Sends a goal and, without `--no-wait`, follows it to its end.
     pub(super) async fn send_goal(
         &mut self,
         (topic, described): (TopicId, &Described),
@@ -144,7 +145,8 @@ impl Asking<'_> {
         };
         let of_result = (parts.result, &*result);
         let answer = match self.ask((topic, described), &request, None).await {
-            // The goal may be accepted already or later. Its result tells the end in both cases.
+            // The goal may already be accepted, or be accepted later. Its result gives the end in
+            // both cases.
             Err(failure @ (Failure::Interrupted | Failure::Unavailable(_))) => {
                 if let Failure::Unavailable(why) = &failure {
                     warn(why);
@@ -180,7 +182,7 @@ impl Asking<'_> {
         self.follow_goal(waiting(waits)).await?
     }
 
-    /// What the calls of an action are that wait for results and cancel.
+    /// Waits for the announcements of the calls that return results and cancel goals.
     async fn parts_of(
         &mut self,
         goal: TopicId,
@@ -224,10 +226,10 @@ impl Asking<'_> {
         }
     }
 
-    /// Waits for the end of a goal, and gives how it ended.
+    /// Waits for the end of a goal and returns it.
     ///
     /// # Errors
-    /// It is not waited for any longer, or its end is unknown.
+    /// The wait was interrupted or timed out, or the end of the goal is unknown.
     async fn follow_goal(&mut self, mut goal: Goal) -> Result<Result<(), Failure>, Failure> {
         let limit = until(self.live.now(), self.arguments.run_timeout);
         loop {
@@ -279,7 +281,8 @@ impl Asking<'_> {
         }
     }
 
-    /// Asks to cancel the goal. Its end is followed, whatever that is answered.
+    /// Requests the cancellation of the goal, which is followed to its end whatever the response
+    /// is.
     fn cancel_goal(&mut self, goal: &mut Goal) -> Result<(), Failure> {
         let request = cancel_request(&behind_nothing(goal.bytes));
         let cancel = Arc::clone(&goal.cancel);
@@ -295,7 +298,7 @@ impl Asking<'_> {
         Ok(())
     }
 
-    /// Hears a moment of what is told of a goal.
+    /// Listens for a moment to the feedback and result of a goal.
     async fn hear_goal(
         &mut self,
         goal: &mut Goal,
@@ -356,7 +359,7 @@ impl Asking<'_> {
         Ok((ended, told, came))
     }
 
-    /// Tells how a goal ended.
+    /// Prints the result of a goal.
     fn end_goal(&self, fields: &Named) -> Result<Result<(), Failure>, Failure> {
         let status = fields.get("status").and_then(serde_json::Value::as_i64);
         let status = match status {
@@ -429,7 +432,7 @@ fn hear(outcome: &Outcome<'_>, described: &Described) -> Came {
     }
 }
 
-/// Whether the answer to a request to cancel is that the server goes on.
+/// Returns true if the server rejects the cancellation and continues the goal.
 fn is_refused(outcome: &Outcome<'_>, cancel: &Described) -> bool {
     let Outcome::Answered { status, fields } = outcome else {
         return false;
@@ -451,7 +454,7 @@ fn unknown(why: Unknown) -> Came {
     )))
 }
 
-/// The fields of one part, by their own names.
+/// Returns the fields of a part, by their names within the part.
 fn own(value: Named, part: &str) -> Named {
     let fields = value.0.into_iter();
     let fields = fields.filter(|(name, _)| name != words::GOAL_ID);
@@ -470,7 +473,7 @@ fn new_id() -> [u8; 16] {
     id
 }
 
-/// The fields of a block behind the id of a goal; `None` where they are too many.
+/// Prepends the goal id to the fields of a block; `None` if there are too many fields.
 fn behind(id: [u8; 16], block: &[u8]) -> Option<Vec<u8>> {
     let (count, rest) = block.split_first_chunk()?;
     let count = u16::from_le_bytes(*count).checked_add(1)?;
@@ -482,12 +485,12 @@ fn behind(id: [u8; 16], block: &[u8]) -> Option<Vec<u8>> {
     Some(whole)
 }
 
-/// The id alone.
+/// Returns a block with the goal id only.
 fn behind_nothing(id: [u8; 16]) -> Vec<u8> {
     behind(id, &[0, 0]).unwrap_or_default()
 }
 
-/// The id of a goal, and the beginning of 1970, which is no time.
+/// Returns a block with the goal id and the start of 1970, which stands for no time.
 fn cancel_request(of: &[u8]) -> Vec<u8> {
     let mut request = of.to_vec();
     if let Some(count) = request.first_mut() {
@@ -498,18 +501,18 @@ fn cancel_request(of: &[u8]) -> Vec<u8> {
     request
 }
 
-/// How long a request for a result waits at a time.
+/// Time limit of a request for a result, which is repeated.
 const RESULT_WITHIN: Duration = Duration::from_secs(30);
-/// How long a request to cancel waits.
+/// Time limit of a request to cancel.
 const CANCEL_WITHIN: Duration = Duration::from_secs(5);
-/// How often a goal is cancelled until it has ended.
+/// The interval of requests to cancel, until the goal has ended.
 const CANCEL_AGAIN: Duration = Duration::from_secs(1);
-/// How long the end of a goal is waited for once it is cancelled.
+/// Time limit for the end of a goal after its cancellation.
 const ENDS_WITHIN: Duration = Duration::from_secs(60);
-/// `action_msgs/CancelGoal`, ERROR_REJECTED.
+/// ERROR_REJECTED of `action_msgs/CancelGoal`.
 const REJECTED: i64 = 1;
 /// EncodingMasks of OPC 10000-6, 5.2.2.16.
 const BYTE_STRING: u8 = 15;
 const DATE_TIME: u8 = 13;
-/// 1970 as a DateTime.
+/// The start of 1970 as a DateTime.
 const UNIX_EPOCH: i64 = 116_444_736_000_000_000;

@@ -1,4 +1,4 @@
-//! What was typed of a goal: `name=value`, or all of it as YAML in one word.
+//! Parses the arguments of a goal: `name=value`, or the whole goal as YAML in one word.
 
 use granit_parser::{Event, Parser};
 use serde_json::{Value, json};
@@ -6,7 +6,7 @@ use uadp::BuiltinType;
 
 use super::super::described::Field;
 
-/// The fields of a goal by their own names, without the one that tells it.
+/// Returns the fields of a goal by their names within the goal, without the goal id.
 pub(super) fn fields(takes: &[Field]) -> Vec<Field> {
     let fields = takes.iter().filter(|field| field.name != GOAL_ID);
     fields
@@ -17,7 +17,7 @@ pub(super) fn fields(takes: &[Field]) -> Vec<Field> {
         .collect()
 }
 
-/// The name of a field within a goal, its feedback or its result.
+/// Returns the name of a field within a goal, its feedback or its result.
 pub(super) fn own<'n>(name: &'n str, part: &str) -> &'n str {
     let rest = name
         .strip_prefix(part)
@@ -25,10 +25,11 @@ pub(super) fn own<'n>(name: &'n str, part: &str) -> &'n str {
     rest.unwrap_or(name)
 }
 
-/// The words as `name=value`. Where `fills`, what is not given is what a message of ROS has where nothing is set.
+/// Returns the arguments as `name=value`. With `fills`, missing fields get the default values of a
+/// ROS message.
 ///
 /// # Errors
-/// What does not read, for people.
+/// A description of the argument that cannot be parsed.
 pub(super) fn spelled(
     typed: &[String],
     takes: &[Field],
@@ -57,7 +58,7 @@ pub(super) fn spelled(
     Ok(words)
 }
 
-/// A value of which nothing was set; `None` for a type of no message.
+/// Returns the default value of a field; `None` for types that ROS messages do not have.
 fn nothing(field: &Field) -> Option<String> {
     let builtin = field.builtin?;
     let one = match builtin {
@@ -97,7 +98,7 @@ fn nothing(field: &Field) -> Option<String> {
     Some(json!(vec![one; count]).to_string())
 }
 
-/// Maps in maps become names with dots.
+/// Flattens nested maps to names with dots.
 fn flatten(value: &Value, path: &str, words: &mut Vec<String>) {
     match value {
         Value::Object(fields) => {
@@ -113,7 +114,7 @@ fn flatten(value: &Value, path: &str, words: &mut Vec<String>) {
     }
 }
 
-/// A text of YAML, whose single values stay texts: their types are those of the fields.
+/// Parses YAML and keeps scalars as text, because their types are the types of the fields.
 fn yaml(text: &str) -> Result<Value, String> {
     let options = granit_parser::options! {
         emit_comments: false,
@@ -145,7 +146,7 @@ fn yaml(text: &str) -> Result<Value, String> {
             Event::Alias(_) | Event::UnresolvedAlias(_) | Event::Anchor(..) => {
                 return Err(NO_ALIAS.to_owned());
             }
-            // The enumeration is open.
+            // The enumeration is non-exhaustive.
             _ => return Err(NO_ALIAS.to_owned()),
         };
         match open.last_mut() {
@@ -176,13 +177,13 @@ fn closed(is_map: bool, values: Vec<Value>) -> Result<Value, String> {
     Ok(Value::Object(fields))
 }
 
-/// Tells a goal from all others.
+/// The field that identifies a goal.
 pub(super) const GOAL_ID: &str = "goal_id";
-/// In front of the fields of a goal.
+/// The prefix of the fields of a goal.
 const GOAL: &str = "goal";
 const NO_ALIAS: &str = "the goal is YAML of lists, maps and single values";
 const MOST_DEEP: usize = 32;
-/// Of an array of fixed length that is filled.
+/// Maximum number of default elements of a fixed-length array.
 const MOST_ELEMENTS: usize = 10_000;
 
 #[cfg(test)]
@@ -220,7 +221,7 @@ mod tests {
 
     #[test]
     fn a_goal_is_typed_by_its_fields_or_as_yaml() {
-        // In which order they stand is of no weight.
+        // The order of the fields does not matter.
         let spelled = |words: &[&str]| {
             let mut spelled = of(words, false).unwrap();
             spelled.sort();

@@ -1,4 +1,4 @@
-//! `ua-space skills info`: all that is known of one skill.
+//! `ua-space skills info`: shows all details of a skill.
 
 use std::io::{self, Write as _};
 
@@ -53,7 +53,7 @@ pub(super) fn info(arguments: &InfoSkill) -> Result<(), Failure> {
     })
 }
 
-/// Nobody has that skill: who has which.
+/// Returns the failure for a skill that was not found, with the received skills.
 pub(super) fn not_found(wanted: &str, found: &[Skill], seconds: f64) -> Failure {
     let names: Vec<String> = found.iter().take(SHOWN).map(Skill::name).collect();
     let help = if names.is_empty() {
@@ -74,7 +74,7 @@ struct Whole<'a> {
     #[serde(flatten)]
     skill: &'a Skill,
     parameters: Vec<ShownField<'a>>,
-    /// How the last run ended; none before the first has.
+    /// The result of the last run; `None` before the end of the first run.
     result: Option<Ending>,
 }
 
@@ -150,5 +150,5 @@ impl Whole<'_> {
     }
 }
 
-/// Names that are told where one is not found.
+/// Maximum number of names listed if a skill is not found.
 const SHOWN: usize = 20;

@@ -1,4 +1,4 @@
-//! `ua-space skills start`: makes a skill ready where it has to be, and runs it.
+//! `ua-space skills start`: resets a skill if necessary, and runs it.
 
 use super::info::not_found;
 use super::{Ended, Skill, hear, in_group};
@@ -8,7 +8,7 @@ use crate::live::call::{call, call_quietly};
 
 pub(super) fn start(arguments: &Call) -> Result<(), Failure> {
     let Target::Name(wanted) = &arguments.target else {
-        // Whoever knows the number of a Start knows what has to come before it.
+        // A user who names a topic of Start calls it directly, without a Reset.
         return call(arguments);
     };
     let wanted = wanted.strip_suffix(".Start").unwrap_or(wanted);

@@ -1,4 +1,4 @@
-//! `ua-space skills watch`: what happens to skills, as it happens.
+//! `ua-space skills watch`: shows transitions, progress and results of skills as they happen.
 
 use std::collections::BTreeMap;
 use std::io::{self, Write as _};
@@ -18,7 +18,7 @@ use crate::live::plain::{self, Named};
 use crate::live::run::{Step, percent, results};
 use crate::live::text::harmless;
 
-/// In the name of the value that says each transition.
+/// The suffix of the name of the transitions.
 const EVENTS: &str = ".Events";
 
 pub(super) fn watch(arguments: &WatchSkills) -> Result<(), Failure> {
@@ -65,10 +65,10 @@ fn tell(happened: &Happened, as_json: bool) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Something that happened to a skill.
+/// An event of a skill.
 #[derive(Debug, PartialEq, Serialize)]
 struct Happened {
-    /// When, by the clock of its component.
+    /// The time by the clock of the component.
     #[serde(skip_serializing_if = "Option::is_none")]
     time: Option<String>,
     skill: String,
@@ -77,7 +77,7 @@ struct Happened {
     step: Step,
 }
 
-/// What was told of each skill, by the topic of its state.
+/// The last reported event of each skill, by the topic of its state.
 #[derive(Debug, Default)]
 struct Known(BTreeMap<TopicId, Last>);
 
@@ -85,7 +85,7 @@ struct Known(BTreeMap<TopicId, Last>);
 struct Last {
     state: Option<(String, u64)>,
     progress: (u32, String),
-    /// The run whose result was told, or was there before.
+    /// The run whose result was reported, or was received first.
     result: Option<u64>,
 }
 
@@ -131,7 +131,7 @@ impl Known {
     }
 }
 
-/// Whether a skill is the wanted one, or of the wanted component.
+/// Returns true if the skill is the wanted skill, or belongs to the wanted component.
 pub(super) fn is_meant(skill: &str, only: Option<&str>) -> bool {
     let Some(only) = only else {
         return true;
@@ -147,7 +147,7 @@ impl Last {
         };
         let now = (state.to_owned(), value.number("run").unwrap_or_default());
         if self.state.as_ref() == Some(&now) {
-            // The state came before its transition.
+            // The state was received before its transition.
             return Vec::new();
         }
         self.state = Some(now);
@@ -190,7 +190,7 @@ impl Last {
     fn result(&mut self, value: &Named) -> Vec<Step> {
         let run = value.number("run").unwrap_or_default();
         let told = self.result.replace(run);
-        // The first is of before, unless the run was seen.
+        // The first received result belongs to an earlier run, unless the run was followed.
         let seen = self.state.as_ref().is_some_and(|(state, of)| {
             *of == run && matches!(state.as_str(), "Running" | "Suspended")
         });
