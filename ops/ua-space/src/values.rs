@@ -1,7 +1,8 @@
-//! Values of the builtin types as JSON and back, after OPC 10000-6, 5.4.2.
+//! Converts values of the builtin types to JSON and back, following OPC 10000-6, 5.4.2.
 //!
-//! Where that loses something it is kept: a null array has a key of its own, 64 bit integers are texts, DateTimes have
-//! seven digits. What is lost: the payload of a NaN, and which of several encodings of one NodeId was used.
+//! Information that this encoding would lose is kept: a null array has a key of its own, 64-bit
+//! integers are texts, DateTimes have seven digits. Lost are the payload of a NaN, and which of
+//! several encodings of a NodeId was used.
 
 mod show;
 mod write;
@@ -13,7 +14,7 @@ use std::fmt;
 
 use serde_json::Value;
 
-/// A value in the JSON that cannot be written, and where it stands.
+/// A JSON value that cannot be encoded, with its path.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct WrongValue {
     path: String,
@@ -37,7 +38,7 @@ impl WrongValue {
         Self::new(format!("expected {what}, found {found}"))
     }
 
-    /// Says in which part of what it stands, from the inside out.
+    /// Prepends a part to the path of the value.
     pub(crate) fn at(mut self, part: &str) -> Self {
         self.path.insert_str(0, part);
         self
@@ -65,5 +66,5 @@ impl From<uadp::DecodeError> for WrongValue {
     }
 }
 
-/// Characters of a wrong value that a message repeats.
+/// Maximum number of characters of a wrong value in a message.
 const SHOWN: usize = 40;

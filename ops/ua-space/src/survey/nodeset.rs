@@ -1,6 +1,7 @@
-//! The variables of a NodeSet, an XML file by `UANodeSet.xsd` (OPC 10000-6, F).
+//! Reads the variables of a NodeSet, an XML file by `UANodeSet.xsd` (OPC 10000-6, F).
 //!
-//! The file is not trusted: a document type is refused, so no entity is ever expanded, and sizes are bounded.
+//! The file is not trusted: a document type is refused, so no entity is ever expanded, and sizes
+//! are bounded.
 
 use std::collections::{HashMap, HashSet};
 use std::path::Path;
@@ -15,7 +16,7 @@ use super::data_types::{self, STRUCTURE};
 use super::{MOST, Nodes, UaVariable};
 use crate::exit::Failure;
 
-/// Reads the file.
+/// Reads the variables of a NodeSet file.
 pub(crate) fn survey(file: &str) -> Result<Nodes, Failure> {
     let bytes = type_files::read_bounded(Path::new(file), LARGEST)
         .map_err(|why| Failure::Io(format!("cannot read {file}: {why}")))?;
@@ -26,7 +27,7 @@ pub(crate) fn survey(file: &str) -> Result<Nodes, Failure> {
     })
 }
 
-/// What is wrong with a NodeSet, and at which byte.
+/// The fault of a NodeSet, with its byte offset.
 #[derive(Debug)]
 struct Fault {
     at: usize,
@@ -68,7 +69,7 @@ fn parse(xml: &str, place: &str) -> Result<Nodes, Fault> {
                 return Err(fault("the file ends in the middle".to_owned()));
             }
             Event::Eof => break,
-            // An empty element is told as its start and its end.
+            // An empty element is reported as its start and its end.
             Event::Empty(_) | Event::Comment(_) | Event::Decl(_) | Event::PI(_) => {}
         }
     }
@@ -78,11 +79,11 @@ fn parse(xml: &str, place: &str) -> Result<Nodes, Fault> {
     })
 }
 
-/// What was read so far.
+/// The parts of the NodeSet read so far.
 #[derive(Default)]
 struct NodeSet {
     seen: bool,
-    /// Local names of the elements that are open.
+    /// Local names of the open elements.
     path: Vec<String>,
     text: String,
     attributes: HashMap<String, String>,
@@ -91,14 +92,14 @@ struct NodeSet {
     node: Option<Node>,
     variables: Vec<(NodeIdText, Node)>,
     objects: HashMap<NodeIdText, Node>,
-    /// Types and methods: what is below them are declarations, no values.
+    /// Types and Methods; nodes below them are declarations, not values.
     types: HashSet<NodeIdText>,
-    /// Supertypes of data types.
+    /// Supertypes of DataTypes.
     supertypes: HashMap<NodeIdText, NodeIdText>,
     properties: HashSet<NodeIdText>,
 }
 
-/// The node that is open, or was.
+/// A node with its attributes and references.
 #[derive(Clone, Debug, Default)]
 struct Node {
     attributes: HashMap<String, String>,
@@ -206,7 +207,7 @@ impl NodeSet {
         Ok(())
     }
 
-    /// A node id, or the alias of one.
+    /// Parses a node id, or resolves its alias.
     fn resolve(&self, text: &str) -> Result<NodeIdText, String> {
         let text = self.aliases.get(text).map_or(text, String::as_str);
         text.parse().map_err(|_| {
@@ -258,7 +259,7 @@ impl NodeSet {
         })
     }
 
-    /// Whether the objects it is in end at a type or method.
+    /// Returns true if the chain of parent objects ends at a type or Method.
     fn is_declaration(&self, mut parent: Option<NodeIdText>) -> Result<bool, String> {
         for _ in 0..DEEPEST {
             let Some(id) = parent else { return Ok(false) };
@@ -275,7 +276,7 @@ impl NodeSet {
     }
 
     fn value(&self, node: &Node) -> Result<Option<(BuiltinType, bool)>, String> {
-        // BaseDataType and a single value, unless it says so (UANodeSet.xsd).
+        // The defaults are BaseDataType and a scalar (UANodeSet.xsd).
         let rank = node.attributes.get("ValueRank");
         let rank = rank
             .map_or(Ok(-1), |text| text.trim().parse())
@@ -308,7 +309,7 @@ impl NodeSet {
     }
 }
 
-/// Without the index of its namespace.
+/// Returns the BrowseName without its namespace index.
 fn browse_name(node: &Node) -> String {
     let text = node.attributes.get("BrowseName").map_or("", String::as_str);
     let name = text
@@ -318,10 +319,10 @@ fn browse_name(node: &Node) -> String {
     name.to_owned()
 }
 
-/// The standard's own NodeSet has a fifth of it.
+/// Maximum size of a file in bytes, about five times the NodeSet of the standard.
 const LARGEST: u64 = 64 << 20;
 const DEEPEST: usize = 64;
-/// ReferenceTypes of OPC UA's namespace.
+/// ReferenceTypes of namespace 0.
 const ORGANIZES: u32 = 35;
 const HAS_MODELLING_RULE: u32 = 37;
 const HAS_SUBTYPE: u32 = 45;
@@ -410,7 +411,7 @@ mod tests {
         assert!(refused(&odd).contains("has no entry 1"));
         let deep = format!("<UANodeSet>{}", "<a>".repeat(100_000));
         assert!(refused(&deep).contains("nested deeper"));
-        // A type that is its own supertype has no end, and no builtin type.
+        // A type that is its own supertype has no builtin type.
         let round = LINE.replace("\"false\">i=29<", "\"false\">ns=1;i=3001<");
         assert_eq!(parse(&round, "x").unwrap().variables[1].value, None);
     }

@@ -1,4 +1,4 @@
-//! The namespaces and variables of an OPC UA server that runs.
+//! Inspects the namespaces and nodes of a running OPC UA server.
 
 use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
 use std::path::PathBuf;
@@ -24,7 +24,7 @@ use super::data_types::{self, STRUCTURE};
 use super::{MOST, Nodes, UaMethod, UaServer, UaVariable, away};
 use crate::exit::Failure;
 
-/// Browses the server at `url` from its Objects folder on.
+/// Browses the server at `url`, starting at its Objects folder.
 pub(crate) async fn survey(url: &str) -> Result<Nodes, Failure> {
     let server = Connected::to(url).await?;
     let browsing = async {
@@ -48,7 +48,7 @@ pub(crate) async fn survey(url: &str) -> Result<Nodes, Failure> {
     })
 }
 
-/// Asks the server at `url` for its namespaces and for the nodes of `mapping`.
+/// Reads the namespaces of the server at `url` and the nodes of `mapping`.
 pub(crate) async fn check(url: &str, mapping: &Mapping) -> Result<LiveServer, Failure> {
     let server = Connected::to(url).await?;
     let asking = async {
@@ -86,7 +86,8 @@ pub(crate) async fn check(url: &str, mapping: &Mapping) -> Result<LiveServer, Fa
     Ok(live)
 }
 
-/// Asks a server for Methods: nothing where one can be called, else why not, for people.
+/// Checks Methods of a server. Returns `None` for each Method that can be called, otherwise the
+/// reason.
 pub(crate) async fn methods(
     access: &Access,
     wanted: &[&MethodTarget],
@@ -116,7 +117,7 @@ pub(crate) async fn methods(
     Ok(told)
 }
 
-/// Asks a server for variables: what each is, in their order.
+/// Reads variables of a server, in order.
 pub(crate) async fn remote(
     access: &Access,
     wanted: &[&ExpandedNodeIdText],
@@ -124,7 +125,7 @@ pub(crate) async fn remote(
     let server = Connected::by(access).await?;
     let asking = async {
         let namespaces = server.namespaces().await?;
-        // Where its namespace is not there, a node is asked for that nobody has.
+        // A node whose namespace does not exist at the server is not read.
         let local = |text: &&ExpandedNodeIdText| {
             let namespace = index(text, &namespaces)?;
             let identifier = text.identifier.clone();
@@ -167,7 +168,7 @@ pub(crate) async fn remote(
     Ok(live)
 }
 
-/// The index of a node's namespace at a server.
+/// Returns the index of the namespace of a node at a server.
 fn index(node: &ExpandedNodeIdText, namespaces: &[String]) -> Option<u16> {
     match &node.namespace {
         NamespaceText::Index(index) => Some(*index),
@@ -181,7 +182,7 @@ fn index(node: &ExpandedNodeIdText, namespaces: &[String]) -> Option<u16> {
 /// A session without security.
 struct Connected {
     url: String,
-    /// Its ApplicationName.
+    /// The ApplicationName of the server.
     name: String,
     session: Arc<Session>,
     limits: OperationLimits,
@@ -190,12 +191,13 @@ struct Connected {
 }
 
 impl Connected {
-    /// As an anonymous user.
+    /// Connects as an anonymous user.
     async fn to(url: &str) -> Result<Self, Failure> {
         Self::connected(url, IdentityToken::Anonymous).await
     }
 
-    /// As the mapping says. A password is told only where the mapping wants no security.
+    /// Connects with the user of the mapping. A password is sent without security only if the
+    /// mapping sets `security` to None.
     async fn by(access: &Access) -> Result<Self, Failure> {
         let url = access.endpoint.to_string();
         let plain = access.security == Some(SecurityPolicy::None);
@@ -259,7 +261,7 @@ impl Connected {
             )
         })?;
         let name = endpoint.server.application_name.text.as_ref().to_owned();
-        // Servers tell names of theirs that are not always to be resolved from here.
+        // Servers may return host names that this host cannot resolve.
         endpoint.endpoint_url = UAString::from(url);
         let (session, events) = client
             .connect_to_endpoint_directly(endpoint, identity)
@@ -280,7 +282,7 @@ impl Connected {
         Ok(connected)
     }
 
-    /// What `asking` finds, or why it does not in time.
+    /// Returns the result of `asking`, or an error after the time limit.
     async fn within<T>(
         &self,
         asking: impl Future<Output = Result<T, Failure>>,
@@ -295,7 +297,7 @@ impl Connected {
     }
 
     async fn leave(&self) {
-        // A server that does not answer any more has nothing to be told.
+        // A server that does not respond to CloseSession is left without it.
         let _answered = timeout(GOODBYE, self.session.disconnect()).await;
     }
 
@@ -313,7 +315,7 @@ impl Connected {
         }
     }
 
-    /// Asks how much the server takes in one request.
+    /// Reads the operation limits of the server.
     async fn learn_limits(&self) -> Result<(), Failure> {
         let nodes = OperationLimits::VARIABLES.map(NodeId::from);
         let values = self.read(&nodes, &[AttributeId::Value]).await?;
@@ -338,7 +340,7 @@ impl Connected {
         Ok(uris.collect())
     }
 
-    /// Why there is no such node of that NodeClass; `None` where there is.
+    /// Returns the reason why the node does not exist with this NodeClass; `None` if it exists.
     async fn is_away(
         &self,
         node: &ExpandedNodeIdText,
@@ -363,7 +365,8 @@ impl Connected {
         Ok((told != Some(class)).then(|| format!("{} has no {word} `{node}`", self.url)))
     }
 
-    /// The variables and Methods below the Objects folder. Of variables nothing below is looked at, and no property.
+    /// Browses the variables and Methods below the Objects folder, without properties and without
+    /// nodes below variables.
     async fn nodes(&self, namespaces: usize) -> Result<Found, Failure> {
         let mut found = Found::default();
         let objects = NodeId::from(ObjectId::ObjectsFolder);
@@ -403,7 +406,7 @@ impl Connected {
         Ok(found)
     }
 
-    /// What each node has below it.
+    /// Returns the forward references of each node.
     async fn below(&self, nodes: &[NodeId]) -> Result<Vec<Vec<ReferenceDescription>>, Failure> {
         let wanted: Vec<BrowseDescription> = nodes
             .iter()
@@ -445,7 +448,7 @@ impl Connected {
         Ok(all)
     }
 
-    /// The attributes of the nodes, those of one node side by side.
+    /// Reads the attributes of the nodes; the attributes of a node are consecutive.
     async fn read(
         &self,
         nodes: &[NodeId],
@@ -472,7 +475,7 @@ impl Connected {
         Ok(values)
     }
 
-    /// The builtin type of each variable, and whether it is an array.
+    /// Returns the builtin type of each variable, and whether it is an array.
     async fn value_types(
         &self,
         nodes: &[NodeId],
@@ -505,7 +508,7 @@ impl Connected {
         Ok(types)
     }
 
-    /// The builtin type a data type is of, by its supertypes.
+    /// Returns the builtin type of a DataType, by its supertypes.
     async fn builtin(&self, data_type: &NodeId) -> Result<Option<BuiltinType>, Failure> {
         let mut node = data_type.clone();
         for _ in 0..DEEPEST {
@@ -539,27 +542,27 @@ impl Connected {
     }
 }
 
-/// An Object that is to be looked into.
+/// An Object to browse.
 struct Object {
     node: NodeId,
-    /// Empty of the Objects folder.
+    /// The name; empty for the Objects folder.
     name: String,
-    /// A server of the space shows what is in the space there.
+    /// True if the Object is below the folder with which a server of the space shows the space.
     ours: bool,
 }
 
-/// What was found below the Objects folder.
+/// The nodes below the Objects folder.
 #[derive(Default)]
 struct Found {
     seen: HashSet<NodeId>,
     variables: Vec<(NodeId, UaVariable)>,
     methods: Vec<UaMethod>,
-    /// It shows the space.
+    /// True if the server shows the space.
     is_cell: bool,
 }
 
 impl Found {
-    /// Takes what is below an Object; one to be looked into if it is an Object, for the first time.
+    /// Stores a node below an Object. Returns the node if it is an Object found for the first time.
     fn take(&mut self, above: &Object, reference: ReferenceDescription) -> Option<Object> {
         let node = reference.node_id.node_id;
         let name = reference.browse_name.name.as_ref().to_owned();
@@ -606,13 +609,13 @@ impl Drop for Connected {
     }
 }
 
-/// The client makes a folder for certificates, of which it has none here.
+/// Removes the folder that the client creates for certificates, which are not used here.
 fn forget(pki: &PathBuf) {
-    // What stays is an empty folder among temporary files.
+    // If this fails, an empty folder remains among the temporary files.
     let _removed = std::fs::remove_dir_all(pki);
 }
 
-/// An endpoint without security, for anonymous users or those with a password.
+/// Returns an endpoint without security, for anonymous users or for users with a password.
 fn open_endpoint(
     endpoints: Vec<EndpointDescription>,
     anonymous: bool,

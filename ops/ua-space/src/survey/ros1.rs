@@ -1,4 +1,4 @@
-//! The graph of a ROS 1 master.
+//! Inspects the graph of a ROS 1 master.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
@@ -12,7 +12,7 @@ use tokio::time::timeout;
 use super::{MOST, away};
 use crate::exit::Failure;
 
-/// `ROS_MASTER_URI`, or what ROS takes without it.
+/// Returns `ROS_MASTER_URI`, or the default of ROS.
 pub(crate) fn master_uri() -> String {
     std::env::var("ROS_MASTER_URI")
         .ok()
@@ -20,7 +20,7 @@ pub(crate) fn master_uri() -> String {
         .unwrap_or_else(|| "http://localhost:11311".to_owned())
 }
 
-/// Asks the master at `uri`; becomes no node of the graph.
+/// Queries the master at `uri` without registering a node.
 pub(crate) async fn survey(uri: &str) -> Result<LiveSpace, Failure> {
     let asked = timeout(LIMIT, tcpros::Graph::of_master(uri, CALLER)).await;
     let graph = match asked {
@@ -47,7 +47,7 @@ pub(crate) async fn survey(uri: &str) -> Result<LiveSpace, Failure> {
     };
     for (ends, published) in [(graph.publishers, true), (graph.subscribers, false)] {
         for (name, nodes) in ends {
-            // What a bridge does there, it does for a mapping that is there already.
+            // Topics of bridges only are left out, because they follow from an existing mapping.
             if nodes.iter().all(|node| node.starts_with(BRIDGE)) || live.topics.len() >= MOST {
                 continue;
             }
@@ -64,7 +64,8 @@ pub(crate) async fn survey(uri: &str) -> Result<LiveSpace, Failure> {
     Ok(live)
 }
 
-/// The services there are but for those of bridges, each with the type its server tells. The master knows none.
+/// Returns the services except the services of bridges, each with the type from its server. The
+/// master does not know the types.
 async fn services(
     uri: &str,
     offered: BTreeMap<String, Vec<String>>,
@@ -95,12 +96,12 @@ async fn services(
             }
         }
     };
-    // Those that did not tell it by then have none.
+    // Services whose servers did not respond in time have no type.
     let _over = timeout(PROBING, asked).await;
     services
 }
 
-/// The name of a service, and its type as its server has it.
+/// Returns the name of a service, and its type from its server.
 async fn service_type(uri: String, name: String) -> (String, Option<String>) {
     let options = ServiceClientOptions {
         timeout: PROBE,
@@ -114,7 +115,7 @@ async fn service_type(uri: String, name: String) -> (String, Option<String>) {
     (name, told.filter(|told| told.parse::<TypeName>().is_ok()))
 }
 
-/// A subscriber of any type says `*`.
+/// Adds a type; a subscriber of any type has the type `*`.
 fn learn(topic: &mut LiveTopic, told: &str) {
     if told != "*" {
         topic.types.insert(told.to_owned());
@@ -122,13 +123,14 @@ fn learn(topic: &mut LiveTopic, told: &str) {
 }
 
 const CALLER: &str = "/ua_space";
-/// How `bridge-ros1` is called unless told otherwise.
+/// The default node name of `bridge-ros1`.
 const BRIDGE: &str = "/ua_bridge_ros1";
 const HELP: &str =
     "is roscore running there? ROS_MASTER_URI or the argument of --ros1 names the master";
-/// Two calls of 3 s, and the time to find the host.
+/// Two calls of 3 s, and the time to resolve the host.
 const LIMIT: Duration = Duration::from_secs(8);
-/// Servers of services that are asked for their types side by side, how long one of them has, and how long all have.
+/// Limits of the queries for service types: concurrent queries, time of one query, and time of all
+/// queries.
 const AT_ONCE: usize = 32;
 const PROBE: Duration = Duration::from_secs(2);
 const PROBING: Duration = Duration::from_secs(10);

@@ -1,4 +1,4 @@
-//! The topics and services of a DDS domain.
+//! Inspects the topics and services of a DDS domain.
 
 use std::time::Duration;
 
@@ -13,7 +13,8 @@ use tokio::time::{Instant, sleep};
 use super::{MOST, away};
 use crate::exit::Failure;
 
-/// Joins `domain` as a node, listens until nothing new was discovered for a while, `wait` at most, and leaves.
+/// Joins `domain` as a node, and leaves when discovery has brought nothing new for a while, at the
+/// latest after `wait`.
 pub(crate) async fn survey(domain: u16, wait: Duration) -> Result<LiveSpace, Failure> {
     let joined = join(domain)?;
     let end = Instant::now() + wait;
@@ -94,7 +95,7 @@ fn live(graph: &Graph) -> LiveSpace {
     live
 }
 
-/// A name that is none of ROS is kept as it is, to be told.
+/// Adds a type; a type name that is not a ROS type is kept as it is.
 fn learn(topic: &mut LiveTopic, endpoint: &Endpoint) {
     if topic.types.len() < MOST_TYPES {
         let named = TypeName::from_dds(&endpoint.type_name);
@@ -106,7 +107,8 @@ fn learn(topic: &mut LiveTopic, endpoint: &Endpoint) {
 
 const NODE: &str = "ua_space";
 const HELP: &str = "are its nodes running, with the same ROS_DOMAIN_ID, and does multicast reach them? --wait N waits longer";
-/// Peers announce themselves within a fraction of this when somebody new comes.
+/// Time without changes after which discovery counts as complete; peers announce themselves within
+/// a fraction of it when a participant joins.
 const SETTLED: Duration = Duration::from_millis(1500);
 const STEP: Duration = Duration::from_millis(50);
 const MOST_TYPES: usize = 16;

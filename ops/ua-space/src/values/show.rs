@@ -1,4 +1,4 @@
-//! Values as JSON.
+//! Converts values to JSON.
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD as BASE64;
@@ -12,7 +12,7 @@ use crate::shape::{FieldValue, Status};
 use crate::structures::Structure;
 use crate::{iso_time, node_ids, status};
 
-/// A Variant with its type.
+/// Shows a Variant with its type.
 pub(crate) fn show_variant(variant: &Variant<'_>) -> Result<FieldValue, DecodeError> {
     let mut shown = FieldValue {
         ua_type: variant.builtin_type().map(uadp::BuiltinType::id),
@@ -34,7 +34,7 @@ pub(crate) fn show_variant(variant: &Variant<'_>) -> Result<FieldValue, DecodeEr
     Ok(shown)
 }
 
-/// A DataValue; one that holds the null Variant has the UaType 0.
+/// Shows a DataValue; a null Variant has the UaType 0.
 pub(crate) fn show_data_value(data_value: &DataValue<'_>) -> Result<FieldValue, DecodeError> {
     let value = match &data_value.value {
         None => FieldValue::default(),
@@ -54,7 +54,7 @@ pub(crate) fn show_data_value(data_value: &DataValue<'_>) -> Result<FieldValue, 
     })
 }
 
-/// A value without its type.
+/// Shows a value without its type.
 pub(crate) fn show_scalar(scalar: Scalar<'_>) -> Result<Value, DecodeError> {
     Ok(match scalar {
         Scalar::Boolean(value) => json!(value),
@@ -88,7 +88,7 @@ fn show_elements(array: Array<'_>) -> Result<Value, DecodeError> {
     array.iter().map(show_scalar).collect()
 }
 
-/// The shortest decimal that reads as this Float again.
+/// Returns the shortest decimal that parses as the same Float.
 fn show_float(value: f32) -> Value {
     match value.to_string().parse::<f64>() {
         Ok(double) => show_double(double),
@@ -119,7 +119,8 @@ fn show_qualified_name(name: QualifiedName<'_>) -> Value {
     }
 }
 
-/// A known structure by the NodeId of its type and its fields, any other by the NodeId of its encoding and its body.
+/// Shows a known structure by the NodeId of its type and its fields, any other structure by the
+/// NodeId of its encoding and its body.
 fn show_extension_object(object: ExtensionObject<'_>) -> Value {
     let type_id = node_ids::text(object.type_id);
     match object.body {
@@ -173,7 +174,7 @@ fn show_diagnostic_info(info: DiagnosticInfo<'_>) -> Result<Value, DecodeError> 
     Ok(shown.into())
 }
 
-/// A shape as a value. Those given here have text keys and no foreign parts, so this does not fail.
+/// Converts a shape to JSON. The shapes used here have text keys only, so this does not fail.
 fn object(shape: impl serde::Serialize) -> Value {
     serde_json::to_value(shape).unwrap_or_default()
 }

@@ -1,4 +1,4 @@
-//! Values from JSON, in the binary encoding of OPC 10000-6, 5.2.
+//! Encodes values from JSON, in the binary encoding of OPC 10000-6, 5.2.
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD as BASE64;
@@ -17,7 +17,7 @@ use crate::structures::Structure;
 
 type Written = Result<(), WrongValue>;
 
-/// The bytes of a Variant.
+/// Returns the bytes of a Variant.
 pub(crate) fn variant_bytes(json: &FieldValue) -> Result<Vec<u8>, WrongValue> {
     let quality = json.status.is_some()
         || json.source_timestamp.is_some()
@@ -33,7 +33,7 @@ pub(crate) fn variant_bytes(json: &FieldValue) -> Result<Vec<u8>, WrongValue> {
     Ok(out)
 }
 
-/// The bytes of a DataValue.
+/// Returns the bytes of a DataValue.
 pub(crate) fn data_value_bytes(json: &FieldValue) -> Result<Vec<u8>, WrongValue> {
     let mut out = Vec::new();
     write_data_value(json, &mut out)?;
@@ -163,7 +163,8 @@ fn write_data_value(json: &FieldValue, out: &mut Vec<u8>) -> Written {
     Ok(())
 }
 
-/// Either form of a known structure, or the bytes of any.
+/// Appends a known structure, in the form with fields or with bytes, or the bytes of any other
+/// structure.
 fn write_extension_object(json: &Value, out: &mut Vec<u8>) -> Written {
     if json.is_null() {
         let null = ExtensionObject {
@@ -216,7 +217,7 @@ fn write_body(type_id: NodeId<'_>, encoding: u8, body: &Value, out: &mut Vec<u8>
     let body = match (encoding, body) {
         (0, Value::Null) => ExtensionBody::None,
         (1, Value::String(text)) => {
-            // open62541 1.5 writes the bytes themselves as text; such text is hardly ever base64.
+            // open62541 1.5 writes the bytes themselves as text, which is rarely valid base64.
             bytes = BASE64
                 .decode(text)
                 .unwrap_or_else(|_| text.clone().into_bytes());
@@ -239,7 +240,7 @@ fn decoded_structure(object: &Map<String, Value>) -> Option<&'static Structure> 
     structure_named(object.get("UaTypeId")?.as_str()?)
 }
 
-/// The known structure of a data type's NodeId.
+/// Returns the known structure with this NodeId of its DataType.
 fn structure_named(data_type: &str) -> Option<&'static Structure> {
     match OwnedNodeId::parse(data_type)?.node_id()? {
         NodeId {
@@ -284,7 +285,7 @@ fn write_diagnostic_info(json: &Value, out: &mut Vec<u8>) -> Written {
     Ok(())
 }
 
-/// Appends a value as it stands behind the encoding byte of its Variant.
+/// Appends a value as it is encoded after the encoding byte of a Variant.
 fn append(out: &mut Vec<u8>, scalar: Scalar<'_>) -> Written {
     let mut buffer = Vec::new();
     let variant = Encoded::variant(&Variant::Scalar(scalar), &mut buffer)?;
@@ -297,7 +298,7 @@ fn boolean(json: &Value) -> Result<bool, WrongValue> {
         .ok_or_else(|| WrongValue::expected("true or false", json))
 }
 
-/// A number, or one as text.
+/// Parses a number, given as a number or as text.
 fn integer<T: TryFrom<i128>>(builtin: BuiltinType, json: &Value) -> Result<T, WrongValue> {
     let text = json.as_str().and_then(|text| text.parse().ok());
     let signed = json.as_i64().map(i128::from);
@@ -373,7 +374,7 @@ fn status_code(json: &Value) -> Result<StatusCode, WrongValue> {
     Ok(StatusCode(status.code))
 }
 
-/// `7:Speed`, without number of namespace 0, or an object.
+/// Parses `7:Speed`, a name without a number for namespace 0, or an object.
 fn qualified_name(json: &Value) -> Result<QualifiedName<'_>, WrongValue> {
     let wrong = || WrongValue::expected("a QualifiedName like \"7:Speed\"", json);
     if let Some(text) = json.as_str() {
@@ -423,6 +424,7 @@ fn check_keys(object: &Map<String, Value>, known: &[&str]) -> Written {
 }
 
 const A_TIME: &str = "a time like \"2026-05-17T12:34:56.789Z\"";
-/// The NaNs of the examples of OPC 10000-6, 5.2.2.3, which open62541 writes too: the sign is set.
+/// The NaNs of the examples in OPC 10000-6, 5.2.2.3, which open62541 writes too: the sign bit is
+/// set.
 const NAN_DOUBLE: f64 = f64::from_bits(0xFFF8_0000_0000_0000);
 const NAN_FLOAT: f32 = f32::from_bits(0xFFC0_0000);
