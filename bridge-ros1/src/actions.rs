@@ -1,9 +1,10 @@
-//! Actions of the ROS 1 graph (actionlib): goals of other spaces sent to their servers, and servers for actions of other
-//! spaces.
+//! Actions of the ROS 1 graph (actionlib): sends goals of other spaces to action servers of the
+//! graph, and offers action servers for actions of other spaces.
 //!
-//! actionlib tells goals by a text, the space by 16 bytes: a goal of the space has the hex digits of its bytes as its text, and
-//! a goal of the graph with any other text the MD5 of that. actionlib has no answer to a goal: a goal counts as accepted once
-//! its server lists it as at work.
+//! actionlib identifies a goal by a text, the space by 16 bytes. A goal of the space has the
+//! hexadecimal digits of its bytes as its text. A goal of the graph with any other text has the MD5
+//! sum of the text as its bytes. actionlib has no response to a goal: a goal counts as accepted
+//! once its server lists it as active.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Arc, PoisonError};
@@ -96,7 +97,7 @@ fn unknown(definitions: &mut Definitions, name: &TypeName, error: &DefinitionErr
     definitions.explain_missing((TextKind::Action, name), error, &wanted)
 }
 
-/// The types of the topics of an action.
+/// Returns the types of the topics of an action.
 fn types(action: &ActionType) -> tcpros::actionlib::ActionType {
     let of = |message_type: &MessageType| TopicType {
         name: message_type.name().to_string(),
@@ -110,7 +111,7 @@ fn types(action: &ActionType) -> tcpros::actionlib::ActionType {
     }
 }
 
-/// A message of that type with nothing in it.
+/// Returns a message of the type with default values.
 fn empty(message_type: &Arc<MessageType>) -> Result<Bytes, String> {
     let nothing = Selection::Template {
         fields: Vec::new(),
@@ -124,17 +125,17 @@ fn empty(message_type: &Arc<MessageType>) -> Result<Bytes, String> {
     Ok(bytes.into())
 }
 
-/// How actionlib spells the id of a goal of the space.
+/// Returns the text of a goal id of the space in actionlib.
 fn spelled(id: GoalId) -> String {
     use std::fmt::Write as _;
     id.iter().fold(String::with_capacity(32), |mut text, byte| {
-        // To a String it does not fail.
+        // Writing to a String does not fail.
         let _written = write!(text, "{byte:02x}");
         text
     })
 }
 
-/// The 16 bytes for the id of a goal of the graph.
+/// Returns the 16 bytes of a goal id of the graph.
 fn read(id: &str) -> GoalId {
     let is_ours = id.len() == 32
         && id
@@ -146,7 +147,7 @@ fn read(id: &str) -> GoalId {
     }
 }
 
-/// Sends goals to one action server.
+/// Sends goals to an action server.
 #[derive(Debug)]
 pub(crate) struct Sender {
     client: Arc<tcpros::actionlib::ActionClient>,
@@ -154,7 +155,8 @@ pub(crate) struct Sender {
     unsent: Unsent,
 }
 
-/// The goals that wait for their server to connect, and whether each is withdrawn meanwhile.
+/// The goals that wait for the connection of their server, and whether each was withdrawn in the
+/// meantime.
 #[derive(Debug, Clone, Default)]
 struct Unsent(Arc<std::sync::Mutex<BTreeMap<GoalId, bool>>>);
 
@@ -163,7 +165,7 @@ impl Unsent {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Withdraws a goal. Returns false for one that does not wait.
+    /// Withdraws a goal. Returns false for a goal that is not waiting.
     fn withdraw(&self, id: GoalId) -> bool {
         let mut waiting = self.lock();
         waiting.get_mut(&id).is_some_and(|withdrawn| {
@@ -172,7 +174,7 @@ impl Unsent {
         })
     }
 
-    /// The wait is over. Returns true if the goal was withdrawn meanwhile.
+    /// Ends the wait of a goal. Returns true if the goal was withdrawn in the meantime.
     fn take(&self, id: GoalId) -> bool {
         self.lock().remove(&id).unwrap_or_default()
     }
@@ -235,24 +237,24 @@ impl ActionClient for Sender {
     }
 }
 
-/// A goal on its way to a server, or there.
+/// A goal that is sent to a server, or waits for it.
 #[derive(Debug)]
 pub(crate) struct Sent {
     client: Arc<tcpros::actionlib::ActionClient>,
     id: GoalId,
     unsent: Unsent,
-    /// How long its server may leave it undecided.
+    /// How long the server may leave the goal pending.
     patience: Duration,
     stage: Stage,
     accepted: bool,
-    /// Until when it may be undecided, where its server has it.
+    /// The time at which a goal that is pending at its server counts as accepted.
     undecided: Option<Instant>,
     events: VecDeque<GoalEvent>,
 }
 
 #[derive(Debug)]
 enum Stage {
-    /// For its server, which connects to new clients within moments.
+    /// The goal waits for its server, which connects to new clients within moments.
     Waiting {
         body: Bytes,
         until: Instant,
@@ -336,7 +338,7 @@ impl Sent {
         match event {
             Heard::State(state) => self.went(state),
             Heard::Feedback(feedback) => {
-                // Another connection than that of the status, which may be later.
+                // Feedback has a connection of its own and may arrive before the status.
                 self.accept();
                 self.events.push_back(GoalEvent::Feedback(feedback.body));
             }
@@ -357,7 +359,8 @@ impl Sent {
 
     fn went(&mut self, state: CommState) {
         match state {
-            // A SimpleActionServer at work has the next goal wait until it has stopped.
+            // A busy SimpleActionServer keeps the next goal pending until the current goal has
+            // stopped.
             CommState::Pending => self.undecided = Some(after(self.patience)),
             CommState::Active => {
                 self.accept();
@@ -427,7 +430,7 @@ fn after(wait: Duration) -> Instant {
     now.checked_add(wait).unwrap_or(now)
 }
 
-/// Serves one action for another space.
+/// An action server for an action of another space.
 #[derive(Debug)]
 pub(crate) struct Taker {
     server: Arc<Server>,
@@ -450,10 +453,10 @@ impl ActionServer for Taker {
     }
 }
 
-/// A goal of the graph that was not decided about.
+/// A goal of the graph that is not accepted or rejected yet.
 #[derive(Debug)]
 pub(crate) struct New {
-    /// `None` once it is.
+    /// `None` once the goal is accepted or rejected.
     goal: Option<ServerGoal>,
     empty_result: Bytes,
 }
@@ -497,13 +500,14 @@ impl Drop for New {
 }
 
 fn reject(goal: &ServerGoal, why: &str) {
-    // One that was recalled meanwhile has ended.
+    // A goal that was recalled in the meantime has already ended.
     if let Err(error) = goal.reject(why) {
         tracing::debug!("a goal is not rejected: {error}");
     }
 }
 
-/// A goal whose client wants it cancelled. In actionlib there is no answer to that: the goal ends as it does.
+/// A goal whose client requests its cancellation. actionlib has no response to this request; the
+/// client sees how the goal ends.
 #[derive(Debug)]
 pub(crate) struct Cancel(GoalId);
 
@@ -519,7 +523,7 @@ impl CancelRequest for Cancel {
     fn reject(self) {}
 }
 
-/// A goal of the graph that another space works on.
+/// A goal of the graph that another space executes.
 #[derive(Debug)]
 pub(crate) struct Served {
     goal: ServerGoal,
@@ -527,7 +531,7 @@ pub(crate) struct Served {
 }
 
 impl ServedGoal for Served {
-    // It is at work since it was accepted.
+    // The goal is active from its acceptance.
     fn execute(&self) {}
 
     fn feedback(&self, body: &[u8]) -> Result<(), String> {
@@ -554,11 +558,12 @@ const SUCCEEDED: i8 = 4;
 const CANCELED: i8 = 5;
 const ABORTED: i8 = 6;
 
-/// How long a server may list a goal without deciding about it, until it counts as accepted.
+/// How long a server may keep a goal pending until it counts as accepted.
 const PENDING: Duration = Duration::from_secs(1);
-/// How long a server that the master names may take to connect. One that was killed is named on, and never does.
+/// How long a server registered at the master may take to connect. A killed server stays registered
+/// and never connects.
 const CONNECTS: Duration = Duration::from_secs(5);
-/// From the end of the connection to a server until its goals are lost.
+/// Time between the loss of the connection to a server and the loss of its goals.
 const RECONNECT: Duration = Duration::from_secs(1);
 
 #[cfg(test)]

@@ -1,44 +1,46 @@
-//! Types that publishers brought with their connection headers: bounded, and released when nobody publishes them.
+//! Types from the connection headers of publishers: bounded, and released when no publisher uses
+//! them.
 
 use std::sync::{Arc, Weak};
 
 use messages::{MessageType, PeerDefinitions, TypeName};
 
-/// What is kept of the types that publishers brought, the oldest first.
+/// The types received from publishers, the oldest first.
 #[derive(Debug, Default)]
 pub(crate) struct Brought {
     entries: Vec<Entry>,
 }
 
-/// A type and what the registry was given of it.
+/// A type, with its definitions in the registry.
 #[derive(Debug)]
 pub(crate) struct Entry {
     pub(crate) name: TypeName,
     pub(crate) definitions: PeerDefinitions,
     md5: String,
-    /// Alive as long as a topic crosses as it.
+    /// Alive as long as a topic is bridged with this type.
     message_type: Weak<MessageType>,
     bytes: usize,
 }
 
-/// What is done about a type that a publisher brings.
+/// The result of a request for room for a type.
 #[derive(Debug)]
 pub(crate) enum Room {
-    /// It is known, and this is it.
+    /// The type is already stored.
     Known(Arc<MessageType>),
-    /// It is new, and those are to be forgotten, as nobody publishes them.
+    /// The type is new, and these unused entries are to be removed from the registry.
     After(Vec<Entry>),
-    /// All that is kept is in use.
+    /// All stored types are in use.
     None,
 }
 
 impl Brought {
-    /// Finds a place for a type with this text. One that `must` have it gets it in any case.
+    /// Makes room for a type, counted with its text. With `must`, there is always room.
     pub(crate) fn room_for(&mut self, found: &Arc<MessageType>, names: usize, must: bool) -> Room {
         let mut entries = self.entries.iter_mut();
         let same = |entry: &&mut Entry| entry.name == *found.name() && entry.md5 == found.md5();
         if let Some(known) = entries.find(same) {
-            // The same fields and constants, whatever the comments around them.
+            // Types with the same MD5 sum have the same fields and constants; only their comments
+            // may differ.
             let message_type = known.message_type.upgrade().unwrap_or_else(|| {
                 known.message_type = Arc::downgrade(found);
                 Arc::clone(found)
@@ -65,12 +67,12 @@ impl Brought {
         if !must && (bytes > MAX_BYTES || names > MAX_NAMES) {
             return Room::None;
         }
-        // From the back, so that the places of the others stay.
+        // Removal from the back keeps the other positions valid.
         let gone = unused.into_iter().rev().map(|at| self.entries.remove(at));
         Room::After(gone.collect())
     }
 
-    /// Takes in a type that there was room for.
+    /// Stores a type after room was made for it.
     pub(crate) fn take(&mut self, found: &Arc<MessageType>, definitions: PeerDefinitions) {
         self.entries.push(Entry {
             name: found.name().clone(),
@@ -91,12 +93,14 @@ impl Brought {
     }
 }
 
-/// What a type is counted as, in bytes. Read, its text takes some six times as much memory.
+/// Returns the size with which a type counts, in bytes. A parsed type uses about six times as much
+/// memory.
 fn weight(found: &MessageType) -> usize {
     found.name().to_string().len() + found.definition().len()
 }
 
-/// Text that publishers can have kept. A type that is not built in has about 4 kB with all it needs.
+/// Maximum size of the stored definitions. A type that is not built in has about 4 kB with its
+/// dependencies.
 pub(crate) const MAX_BYTES: usize = 4 * 1024 * 1024;
-/// Likewise names of types.
+/// Maximum number of stored type names.
 const MAX_NAMES: usize = 4096;

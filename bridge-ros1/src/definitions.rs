@@ -1,5 +1,5 @@
-//! Message definitions: those built in, those of publishers' connection headers, and those of the ROS packages the
-//! program is told of.
+//! Message definitions: built-in definitions, definitions from connection headers of publishers,
+//! and definitions from ROS packages.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -14,7 +14,8 @@ use uadp::BuiltinType;
 
 use crate::brought::{Brought, MAX_BYTES, Room};
 
-/// Finds message types by name; a type once found stays, but for those of publishers that have gone.
+/// Finds message types by name. A found type is kept, except types of publishers that have
+/// disconnected.
 #[derive(Debug)]
 pub(crate) struct Definitions {
     known: bridge_node::Definitions,
@@ -22,7 +23,8 @@ pub(crate) struct Definitions {
 }
 
 impl Definitions {
-    /// With those of the mapping's `type_paths`, and of the folders with packages that `ROS_PACKAGE_PATH` lists.
+    /// Creates the definitions with the `type_paths` of the mapping, and the package folders in
+    /// `ROS_PACKAGE_PATH`.
     pub(crate) fn new(types: Arc<TypePaths>, packages: Vec<PathBuf>) -> Self {
         let environment = Environment {
             ros1: packages,
@@ -34,13 +36,14 @@ impl Definitions {
         }
     }
 
-    /// Takes what the mapping's `type_paths` have by now.
+    /// Replaces the definitions of the `type_paths` of the mapping.
     pub(crate) fn replace(&mut self, types: &Arc<TypePaths>) {
         self.known.replace(types);
     }
 
-    /// The type a publisher has: by the text in its header, else the known type of that name and checksum. Those texts
-    /// are kept as far as there is room; one of a `mapped` topic always is.
+    /// Returns the type of a publisher: from the definition in its connection header, otherwise the
+    /// known type with this name and MD5 sum. The definition is stored if there is room; for a
+    /// `mapped` topic there always is.
     pub(crate) fn of_publisher(
         &mut self,
         header: &ConnectionHeader,
@@ -51,7 +54,8 @@ impl Definitions {
         let fits = |found: &MessageType| md5sum == "*" || found.md5() == md5sum;
         let text = header.message_definition().unwrap_or_default();
         if !text.trim().is_empty() || md5sum == EMPTY {
-            // What files have under that name is not to be taken for what this publisher sends, and stays what is written.
+            // A definition file with this name is not used for this publisher, and its type stays
+            // as reported.
             let before = self.known.find(&name).is_ok();
             match self.known.registry().read_ros1_definition(&name, text) {
                 Ok((found, definitions)) if fits(&found) => {
@@ -62,7 +66,8 @@ impl Definitions {
                     }
                     return Ok(found);
                 }
-                // Some writers of bags and bridges send a text that is not the one of their checksum.
+                // Some tools that write bags or bridge topics send a definition that does not match
+                // their MD5 sum.
                 Ok(_) | Err(_)
                     if self
                         .known
@@ -92,7 +97,7 @@ impl Definitions {
         }
     }
 
-    /// Keeps what a publisher brought, in the place of what nobody publishes any more.
+    /// Stores the definitions of a publisher, and removes definitions that no publisher uses.
     fn keep(
         &mut self,
         found: Arc<MessageType>,
@@ -109,7 +114,7 @@ impl Definitions {
             self.known.forgotten(&entry.name);
         }
         if !gone.is_empty() {
-            // What one of those brought another may need, which brought it as well.
+            // A removed type may have brought definitions that a stored type uses and brought too.
             for kept in self.brought.definitions() {
                 self.known.registry_mut().keep(kept);
             }
@@ -119,17 +124,18 @@ impl Definitions {
         Ok(found)
     }
 
-    /// The type of that name with all it needs. One that is not known yet is looked for in the packages.
+    /// Returns the type with this name and its dependencies. Unknown types are searched in the
+    /// packages.
     pub(crate) fn get(&mut self, name: &TypeName) -> Result<Arc<MessageType>, DefinitionError> {
         self.known.find(name)
     }
 
-    /// What people are to be told of an error of [`get`](Self::get), or of [`service`](Self::service).
+    /// Explains an error of [`get`](Self::get) or of [`service`](Self::service).
     pub(crate) fn explain(&mut self, kind: TextKind, error: &DefinitionError) -> String {
         self.known.explain(kind, error)
     }
 
-    /// Explains an error of a type whose definition only files bring.
+    /// Explains an error of a type whose definition comes from files only.
     pub(crate) fn explain_missing(
         &mut self,
         of: (TextKind, &TypeName),
@@ -139,17 +145,17 @@ impl Definitions {
         self.known.explain_missing(of, error, wanted)
     }
 
-    /// The service of that name, looked for likewise.
+    /// Returns the service type with this name, with the same search.
     pub(crate) fn service(&mut self, name: &TypeName) -> Result<Arc<ServiceType>, DefinitionError> {
         self.known.find_service(name)
     }
 
-    /// The action of that name, looked for likewise.
+    /// Returns the action type with this name, with the same search.
     pub(crate) fn action(&mut self, name: &TypeName) -> Result<Arc<ActionType>, DefinitionError> {
         self.known.find_action(name)
     }
 
-    /// As [`action`](Self::action), as calls and values of the space.
+    /// Like [`action`](Self::action), as calls and values of the space.
     pub(crate) fn action_calls(
         &mut self,
         name: &TypeName,
@@ -157,18 +163,18 @@ impl Definitions {
         self.known.find_action_calls(name)
     }
 
-    /// Where the definition is from that [`get`](Self::get) has, for people.
+    /// Returns the source of the definition that [`get`](Self::get) returns, for output.
     pub(crate) fn source(&self, name: &TypeName) -> &str {
         self.known.source(name)
     }
 
-    /// The ROS type that carries one value of that type, and nothing else.
+    /// Returns the ROS type that carries a single value of this builtin type.
     pub(crate) fn standard_type(&self, builtin: BuiltinType, array: bool) -> Option<TypeName> {
         self.known.registry().standard_type(builtin, array)
     }
 }
 
-/// Why what a publisher sends cannot be read.
+/// The reason why messages of a publisher cannot be read.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum Unusable {
     #[error(transparent)]
@@ -189,7 +195,7 @@ pub(crate) enum Unusable {
     },
 }
 
-/// The checksum of a definition without fields, such as std_msgs/Empty.
+/// The MD5 sum of a definition without fields, such as std_msgs/Empty.
 const EMPTY: &str = "d41d8cd98f00b204e9800998ecf8427e";
 
 #[cfg(test)]
@@ -258,7 +264,8 @@ mod tests {
         assert_eq!(found.unwrap().leaves().len(), 0);
     }
 
-    /// A connection header of a type of that number, with as many other types as fit into half a MiB.
+    /// Returns a connection header of a type with this number, with as many nested types as fit
+    /// into half a MiB.
     fn bulky(number: usize) -> ConnectionHeader {
         let rule = "=".repeat(80);
         let mut text = String::new();
@@ -296,7 +303,7 @@ mod tests {
         let refused = definitions.of_publisher(&bulky(2), false);
         assert!(matches!(refused, Err(Unusable::Full)));
         assert!(definitions.of_publisher(&bulky(2), true).is_ok());
-        // A publisher of the same type comes back, or another one of it comes.
+        // A publisher of the same type reconnects, or another publisher of the type connects.
         let again = definitions.of_publisher(&bulky(0), false).unwrap();
         assert!(Arc::ptr_eq(&first, &again));
         drop((first, again));

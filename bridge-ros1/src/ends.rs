@@ -1,4 +1,4 @@
-//! The ends of actions that a node has, of which there is one each.
+//! The action clients and servers of a node, at most one of each per action.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Weak};
@@ -6,25 +6,25 @@ use std::sync::{Arc, Weak};
 use tcpros::actionlib::ActionError;
 use tokio::sync::Mutex;
 
-/// The clients and servers of actions that are in use, by the names of the actions: a node has one of each. Who takes one up
-/// again while its predecessor is about to go has the same.
+/// The action clients and servers in use, by action name. A node has at most one of each, so a new
+/// user shares the client or server with a user that is about to be dropped.
 #[derive(Debug, Default)]
 pub(crate) struct Ends {
     pub(crate) clients: BTreeMap<String, Known<tcpros::actionlib::ActionClient>>,
     pub(crate) servers: BTreeMap<String, Known<Server>>,
 }
 
-/// A server that one after another waits for.
+/// An action server that its users lock in turn.
 pub(crate) type Server = Mutex<tcpros::actionlib::ActionServer>;
 
-/// An end of an action whose messages have that checksum.
+/// A client or server of an action with the MD5 sum of its messages.
 #[derive(Debug)]
 pub(crate) struct Known<E> {
     md5: String,
     end: Weak<E>,
 }
 
-/// The end of an action that is in use, else one that is made.
+/// Returns the client or server of an action that is in use, or makes a new one.
 pub(crate) fn shared<E>(
     known: &mut BTreeMap<String, Known<E>>,
     (action, md5): (&str, &str),

@@ -1,7 +1,8 @@
 //! The ROS 1 side of a bridge.
 //!
-//! [`Ros1Port`] ties the topics of a ROS 1 graph to the values of the space: those the mapping names, and those whose
-//! names are of the space, such as `/ua_1_2_10`. What crosses, and how its bytes look there, is not known here.
+//! [`Ros1Port`] connects topics of a ROS 1 graph with values of the space: the topics in the
+//! mapping, and topics with names of the space, such as `/ua_1_2_10`. The encoding of values in the
+//! space is not part of this crate.
 
 mod actions;
 mod brought;

@@ -1,4 +1,4 @@
-//! `bridge-ros1`: carries topics between a ROS 1 graph and the space.
+//! `bridge-ros1`: bridges topics between a ROS 1 graph and the space.
 
 use std::ffi::OsString;
 use std::path::PathBuf;
@@ -19,11 +19,11 @@ fn main() -> ExitCode {
     bridge_node::run::<BridgeRos1>(std::env::args_os())
 }
 
-/// The command line: what clap reads, and the words that ROS gives a meaning to.
+/// The command line: the arguments of clap, and the ROS arguments.
 #[derive(Debug)]
 struct BridgeRos1 {
     flags: Flags,
-    /// `from:=to` and `__name:=value`, which `roslaunch` puts anywhere.
+    /// `from:=to` and `__name:=value`, which `roslaunch` adds at any position.
     words: Vec<String>,
 }
 
@@ -103,7 +103,7 @@ impl Program for BridgeRos1 {
     type Port = Ros1Port;
 
     const NAME: &'static str = "bridge-ros1";
-    // Keys are fetched over OPC UA, and what becomes of that is told here.
+    // Keys are fetched over OPC UA; the result is logged by this program.
     const QUIET: &'static str = plant_keys::QUIET;
     const LOCAL: Local = Local::Ros1;
 
@@ -153,7 +153,7 @@ impl Program for BridgeRos1 {
     }
 }
 
-/// How the bridge appears in `rosnode list`.
+/// The name of the bridge in `rosnode list`.
 const NODE_NAME: &str = "ua_bridge_ros1";
 
 #[cfg(test)]

@@ -1,6 +1,6 @@
-//! The port: the topics of a ROS 1 graph tied to the values of the space.
+//! The port: connects the topics of a ROS 1 graph with the values of the space.
 //!
-//! One task owns everything; [`Ros1Port::recv`](Port::recv) is its only wait.
+//! A single task owns all state; [`Ros1Port::recv`](Port::recv) is its only wait.
 
 mod actions;
 mod awaited;
@@ -42,18 +42,18 @@ use crate::sink::{Open, Opening, Sink};
 use crate::source::{MAX_LATCHED, Met, Source};
 use crate::watcher::{Seen, Watcher};
 
-/// What a [`Ros1Port`] is started with.
+/// The options of a [`Ros1Port`].
 #[derive(Debug, Clone)]
 pub struct PortOptions {
-    /// The node to be, and where its master is.
+    /// The options of the node, including the URI of the master.
     pub node: NodeOptions,
     /// The space whose values are produced in the graph.
     pub own: SpaceId,
-    /// The cell.
+    /// The mapping of the cell.
     pub mapping: Arc<Mapping>,
-    /// The definitions of its `type_paths`.
+    /// The definitions of the `type_paths` of the mapping.
     pub types: Arc<TypePaths>,
-    /// Where to look for message definitions that are not built in, as `ROS_PACKAGE_PATH` lists.
+    /// Folders with message definitions that are not built in, from `ROS_PACKAGE_PATH`.
     pub packages: Vec<PathBuf>,
 }
 
@@ -65,13 +65,13 @@ pub struct Ros1Port {
     definitions: Definitions,
     watcher: Watcher,
     graph: Graph,
-    /// Topics we read. Their indices name them; the place of one that was given up is taken by another.
+    /// The subscribed topics, identified by their index. The index of a removed topic is reused.
     sources: Vec<Source>,
-    /// Such places.
+    /// The indexes free for reuse.
     vacant: Vec<usize>,
     source_of: BTreeMap<String, usize>,
     inbox: Inbox<usize>,
-    /// Topics we write.
+    /// The published topics.
     sinks: HashMap<TopicId, Sink>,
     /// Services that are called for values.
     services: Services,
@@ -81,31 +81,33 @@ pub struct Ros1Port {
     executing: Executing<Executor>,
     /// Actions of other spaces, and action servers of the graph that are executed for other spaces.
     actions: Actions,
-    /// What those are taken by.
+    /// The action clients and servers of `actions`.
     ends: Ends,
     /// The types of services with a name of the space.
     kinds: Kinds,
-    /// What `recv` hands out next; filled by one message or by one pass over the topics.
+    /// The events that `recv` returns next; filled by a message or by a comparison with the graph.
     events: VecDeque<PortEvent>,
-    /// The topic of the graph that was taken in last: the next look goes on behind it, so that each has its turn.
+    /// The topic of the graph that was added last. The next search continues after it, so every
+    /// topic gets its turn.
     taken_last: String,
-    /// The address that other nodes are told, where it is one and no name.
+    /// The address of this node as other nodes see it; `None` if it is a host name.
     address: Option<IpAddr>,
     master: String,
-    /// Whether the master answered when it was last asked.
+    /// True if the master responded to the last query.
     has_master: bool,
-    /// Topics of the graph that there was no room for, and when that was told last.
+    /// Topics of the graph that were refused because of the limit, and the time of the last log
+    /// message.
     refused: Refused,
     /// When to look at events that wait for subscribers to connect.
     flush_at: Option<tokio::time::Instant>,
 }
 
 impl Ros1Port {
-    /// Starts the node, and subscribes and publishes what the mapping names. The master may come later. Must be
-    /// called inside a tokio runtime.
+    /// Starts the node, and subscribes and publishes the topics of the mapping. The master may
+    /// become available later. Must be called inside a tokio runtime.
     ///
     /// # Errors
-    /// [`NodeError`].
+    /// [`NodeError`] if the node cannot be started or a name is invalid.
     pub fn start(options: PortOptions) -> Result<Self, NodeError> {
         let PortOptions {
             node,
@@ -175,14 +177,14 @@ impl Ros1Port {
         Ok(())
     }
 
-    /// Writes the values of another space where the mapping says.
+    /// Publishes the values of another space on the topic of the mapping.
     fn take_up_sink(&mut self, topic: TopicId) {
         let sink = Sink::new(self.policy.destination(topic));
         self.sinks.insert(topic, sink);
         self.open_sink(topic);
     }
 
-    /// The index of the source of that topic, made when there is none.
+    /// Returns the index of the source of the topic; creates the source if necessary.
     fn source(&mut self, ros_topic: String, expected: Option<TypeName>) -> usize {
         if let Some(index) = self.source_of.get(&ros_topic) {
             return *index;
@@ -210,7 +212,8 @@ impl Ros1Port {
         else {
             return Ok(());
         };
-        // Any checksum: a publisher of another is told of by us, who know the mapping, and not refused by itself.
+        // Any MD5 sum is accepted, so publishers of another type are reported with the mapping in
+        // mind instead of being refused by themselves.
         let wanted = Wanted {
             type_name: source.expected.as_ref().map(ToString::to_string),
             md5sum: None,
@@ -293,7 +296,7 @@ impl Ros1Port {
         }
     }
 
-    /// Takes a publisher in; says whether its messages can be read.
+    /// Adds a publisher. Returns true if its messages can be read.
     fn meet(&mut self, index: usize, peer: &Arc<Peer>) -> bool {
         let Some(source) = self
             .sources
@@ -310,7 +313,7 @@ impl Ros1Port {
             });
         }
         let mut met = Met::Stranger;
-        // The type first, so that the Router knows it when the topic comes alive.
+        // The type is reported first, so the Router knows it when the topic becomes live.
         let was_live = self.sources.get(index).is_some_and(Source::is_live);
         let understood = found.is_ok();
         if let Some(source) = self.sources.get_mut(index) {
@@ -363,7 +366,7 @@ impl Ros1Port {
             });
     }
 
-    /// Changes a source and reports when that makes it live or ends it.
+    /// Changes a source and reports if it becomes live or is no longer live.
     fn with_live(&mut self, index: usize, change: impl FnOnce(&mut Source)) {
         let Some(source) = self.sources.get_mut(index) else {
             return;
@@ -399,7 +402,8 @@ impl Ros1Port {
         }
     }
 
-    /// Compares the graph with what is open. `None`: there is no master, and all stays as it is.
+    /// Compares the graph with the open topics. `None` stands for an unavailable master; then the
+    /// topics stay unchanged.
     fn look(&mut self, graph: Option<Graph>) {
         self.has_master = graph.is_some();
         if let Some(graph) = graph {
@@ -455,13 +459,14 @@ impl Ros1Port {
         }
     }
 
-    /// Opens a sink in the best type there is; one that is open in a lesser type is opened anew.
+    /// Opens a sink with the best available type. A sink that is open with another type is
+    /// reopened.
     fn open_sink(&mut self, topic: TopicId) {
         let Some(sink) = self.sinks.get(&topic) else {
             return;
         };
         let ros_topic = sink.ros_topic.clone();
-        // Once it is ours, the type the master names is the one we gave.
+        // Once the topic is published by this node, the master returns the type of this node.
         let subscribed = sink.open.is_none() && self.graph.subscribers.contains_key(&ros_topic);
         let asked_for = self.graph.types.get(&ros_topic).filter(|_| subscribed);
         let mut found = None;
@@ -486,7 +491,7 @@ impl Ros1Port {
         if open_as == Some(message_type.name()) {
             return;
         }
-        // The node publishes a topic in one type.
+        // The node publishes a topic with a single type.
         sink.open = None;
         let topic_type = TopicType {
             name: message_type.name().to_string(),
@@ -529,10 +534,11 @@ impl Ros1Port {
         }
     }
 
-    /// The local type a writer says its value is of, if it is known and has the fields that are said.
+    /// Returns the local type that a writer announces for its value, if the type is known and has
+    /// the announced fields.
     fn learned(&mut self, topic: TopicId, described: &Described) -> Option<(TypeName, Selection)> {
         if ActionCalls::is_value(&described.message_type) {
-            // Whoever serves the action here takes it.
+            // Values of actions are handled by the action server.
             return None;
         }
         match self.definitions.get(&described.message_type) {
@@ -545,7 +551,7 @@ impl Ros1Port {
         }
     }
 
-    /// Logs of a topic, once, that a type is not known.
+    /// Logs once per topic that a type is unknown.
     fn tell_unknown(&mut self, topic: &str, what: &str, error: &DefinitionError) {
         let definitions = &mut self.definitions;
         self.policy.told.once(topic, "unknown type", || {
@@ -554,8 +560,8 @@ impl Ros1Port {
     }
 }
 
-/// Returns the reason for dropping the messages of a publisher with another type or definition than the topic. The MD5 sums
-/// distinguish two definitions of one name.
+/// Returns the reason for dropping the messages of a publisher with another type or definition than
+/// the topic. The MD5 sums distinguish two definitions of the same name.
 fn stranger(
     caller: &str,
     (theirs, sum): (Option<&str>, Option<&str>),
@@ -583,7 +589,8 @@ impl Port for Ros1Port {
             if let Some(event) = self.events.pop_front() {
                 return event;
             }
-            // All are cancel-safe. The graph first, so that a flood of samples does not keep new topics out.
+            // All branches are cancel-safe. The graph comes before samples, so a flood of samples does
+            // not delay new topics.
             let flush_at = self.flush_at;
             tokio::select! {
                 biased;
@@ -618,7 +625,7 @@ impl Port for Ros1Port {
         if self.actions.takes(&self.policy, sample.topic) {
             return self.actions.publish(&sample);
         }
-        // What was handed out before is for late joiners, and a service is none.
+        // A repeated value is for late joiners, and a service is not a late joiner.
         let again = sample.kept == Kept::Again;
         if again && self.services.takes(sample.topic) {
             return Ok(());
@@ -658,7 +665,7 @@ impl Port for Ros1Port {
                 return Ok(());
             }
         };
-        // What slow subscribers lose by it is reported with the next look at the graph.
+        // Losses of slow subscribers are reported with the next comparison with the graph.
         let event = (payload, latched);
         if sample.lasting || is_confirmed {
             // The router hands a command over again until a subscriber has it.
@@ -746,7 +753,7 @@ impl Port for Ros1Port {
     fn silent(&mut self, topic: TopicId, silent: bool) {
         tracing::debug!(%topic, silent, "the writer in the space");
         if let Some(sink) = self.sinks.get_mut(&topic) {
-            // The value stays with the subscribers that have it, and goes to no other.
+            // Subscribers keep the value, and new subscribers do not receive it.
             if let Some(open) = sink.open.as_ref().filter(|_| silent) {
                 open.publisher.forget_all_latched();
             }
@@ -816,7 +823,7 @@ impl Port for Ros1Port {
     }
 
     fn addresses(&self) -> Option<&[IpAddr]> {
-        // Connections end with an address of theirs, and the master has told it to all nodes.
+        // All connections use this address, which the master has announced to all nodes.
         self.address.as_ref().map(std::slice::from_ref)
     }
 
@@ -843,7 +850,7 @@ impl Port for Ros1Port {
     }
 }
 
-/// When an answer of a service came.
+/// Returns the time at which a service response arrived.
 #[expect(
     clippy::disallowed_methods,
     reason = "the stamp of an answer is taken where it is handed on"
@@ -852,7 +859,8 @@ fn utc() -> SystemTime {
     SystemTime::now()
 }
 
-/// Values that are latched side by side are known by when they were taken, and stand in this order.
+/// Returns the key of a latched value: the time at which the value was taken, which also orders the
+/// values.
 fn latch_key(instance: Timestamp) -> u64 {
     u64::try_from(instance.unix_nanos()).unwrap_or_default()
 }

@@ -1,4 +1,4 @@
-//! Services of the ROS 1 graph, as values of the space call them, and calls of the space as services.
+//! Services of the ROS 1 graph that values of the space call, and calls of the space as services.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -16,7 +16,7 @@ use uadp::BuiltinType;
 use crate::definitions::Definitions;
 use crate::ends::Ends;
 
-/// A node and what it knows of types.
+/// A node with its message definitions and action clients and servers.
 pub(crate) struct Ros1Graph<'p> {
     pub(crate) node: &'p Node,
     pub(crate) definitions: &'p mut Definitions,
@@ -127,8 +127,8 @@ impl ExecutorGraph for Ros1Graph<'_> {
     }
 }
 
-/// Calls one service, over a connection that it keeps, and over others while that is in use: a connection carries one call at
-/// a time.
+/// Calls a service over a persistent connection, and over further connections while it is in use,
+/// because a connection carries one call at a time.
 #[derive(Debug)]
 pub(crate) struct Executor {
     kept: Client,
@@ -149,7 +149,7 @@ impl ServiceCall for Executor {
     }
 }
 
-/// Calls one service.
+/// Calls a service.
 #[derive(Debug)]
 pub(crate) struct Client {
     client: ServiceClient,
@@ -192,10 +192,11 @@ impl ServiceCall for Client {
     }
 }
 
-/// No request takes as long: it ends with the time that its call may take.
+/// Time limit of a request, which is never reached: the request ends with the timeout of its call.
 const ANSWERED: Duration = Duration::from_secs(24 * 3600);
 
-/// Whether the same call may succeed later, with nobody changing anything but the service coming back.
+/// Returns true if the same call may succeed later without changes other than the return of the
+/// service.
 fn may_pass(error: &ServiceError) -> bool {
     matches!(
         error,

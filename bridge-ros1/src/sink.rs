@@ -1,4 +1,4 @@
-//! A topic of the graph that we write values of other spaces to.
+//! A topic of the graph to which values of other spaces are written.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -10,15 +10,15 @@ use mappings::Lasting;
 use messages::{MessageType, TypeName};
 use tcpros::{Latched, Publisher, PublisherOptions, RosTime};
 
-/// Where the values of one topic of another space go.
+/// The destination of the values of a topic of another space.
 #[derive(Debug)]
 pub(crate) struct Sink {
     pub(crate) ros_topic: String,
-    /// In which type.
+    /// The choice of the message type.
     pub(crate) choice: Choice,
-    /// The topic as it is written.
+    /// The publisher of the topic, if it is open.
     pub(crate) open: Option<Open>,
-    /// Since when its writer in the space is silent.
+    /// The time at which the writer in the space timed out.
     pub(crate) silent: Option<Instant>,
     lasting: Lasting,
 }
@@ -28,11 +28,12 @@ pub(crate) struct Sink {
 pub(crate) struct Open {
     pub(crate) message_type: Arc<MessageType>,
     pub(crate) publisher: Publisher,
-    /// Losses of slow subscribers that were reported.
+    /// Number of reported losses of slow subscribers.
     pub(crate) reported: u64,
-    /// Whether any subscriber was there for the last value.
+    /// True if a subscriber was present for the last value.
     pub(crate) reached: bool,
-    /// Whether its header's stamp is ours to set: only one field of the message is the value, and not the stamp.
+    /// True if the bridge sets the stamp of the header: the value is a single field of the message
+    /// other than the stamp.
     pub(crate) stamps: bool,
     /// Events that wait for subscribers to connect.
     pub(crate) opening: Option<Opening>,
@@ -120,7 +121,7 @@ impl Open {
         u64::from(published.sent_to == 0)
     }
 
-    /// The message with the time in its header, if that is not part of the value.
+    /// Returns the message with the time in its header, if the header is not part of the value.
     pub(crate) fn stamped(&self, message: Bytes, now: RosTime) -> Bytes {
         if !self.stamps {
             return message;
@@ -155,14 +156,14 @@ impl Sink {
         }
     }
 
-    /// Whether the mapping says the same of both.
+    /// Returns true if the mapping defines both sinks in the same way.
     pub(crate) fn is_like(&self, other: &Self) -> bool {
         self.ros_topic == other.ros_topic
             && self.choice.mapped() == other.choice.mapped()
             && self.lasting == other.lasting
     }
 
-    /// The types it could have, best first. `asked_for` is the one the master names.
+    /// Returns the possible types, best first. `asked_for` is the type registered at the master.
     pub(crate) fn candidates(&self, asked_for: Option<&str>) -> Vec<TypeName> {
         let refused = self
             .open
@@ -173,15 +174,17 @@ impl Sink {
         self.choice.candidates(asked_for)
     }
 
-    /// Whether what is open serves somebody, or nobody asked for anything else: it is then not to be given up.
+    /// Returns true if the open publisher has subscribers, or no subscriber requested another type;
+    /// then it is kept.
     pub(crate) fn serves(&self) -> bool {
         self.open.as_ref().is_some_and(|open| {
             open.publisher.subscribers() > 0 || open.publisher.refused_type().is_none()
         })
     }
 
-    /// The Router's queue says what waits; behind it, as much is held for a slow subscriber as for any. Whether a topic is
-    /// latched whose kind its source decides is known with its first state.
+    /// Returns the publisher options. The queue of the Router limits waiting values; the publisher
+    /// uses the default queue for slow subscribers. If the source decides whether a topic is
+    /// latched, this is known with its first state.
     pub(crate) fn options(&self) -> PublisherOptions {
         PublisherOptions {
             latch: self.lasting == Lasting::State,

@@ -1,4 +1,4 @@
-//! A topic of the graph whose values are ours to send out.
+//! A topic of the graph whose values this bridge sends to the space.
 
 use std::sync::Arc;
 
@@ -8,40 +8,42 @@ use mappings::TopicId;
 use messages::{MessageType, Selection, TypeName};
 use tcpros::{Peer, Subscription};
 
-/// A topic somebody publishes or is expected to, and which of our values its messages hold.
+/// A topic that is or may be published, and the values that its messages contain.
 #[derive(Debug)]
 pub(crate) struct Source {
     pub(crate) ros_topic: String,
-    /// The type the mapping says; without one the first publisher decides.
+    /// The type in the mapping; without it the first publisher decides.
     pub(crate) expected: Option<TypeName>,
-    /// Which values are made of a message; one unless a mapping ties several variables to one topic.
+    /// The values made of a message; a single value unless the mapping binds several variables to
+    /// the topic.
     pub(crate) values: Vec<(TopicId, Selection)>,
-    /// Whether it was found in the graph, by its name or a pattern, and not named by the mapping.
+    /// True if the topic was found in the graph by its name or a pattern, and the mapping does not
+    /// name it.
     pub(crate) found: bool,
-    /// `None` while nobody publishes a topic that was found.
+    /// `None` while a topic found in the graph is not published.
     pub(crate) subscription: Option<Subscription>,
-    /// The type its values cross as.
+    /// The type with which the values are bridged.
     pub(crate) bound: Option<Arc<MessageType>>,
-    /// Connected publishers of that type.
+    /// Connected publishers of this type.
     peers: Vec<Arc<Peer>>,
-    /// Connected publishers of another, whose messages cannot be read.
+    /// Connected publishers of another type, whose messages cannot be read.
     strangers: Vec<Arc<Peer>>,
-    /// Publishers that latch and have sent something, also while they are not connected.
+    /// Latching publishers that have sent a message, including disconnected publishers.
     latched: Vec<LatchedPeer>,
-    /// The key for the next of them.
+    /// The key of the next latching publisher.
     next_key: u32,
-    /// For how many looks at the graph nobody has published it.
+    /// Number of comparisons with the graph since the topic was last published.
     silent: u32,
 }
 
-/// A publisher that latches.
+/// A latching publisher.
 #[derive(Debug)]
 struct LatchedPeer {
     caller_id: String,
     key: PublisherKey,
-    /// What it sent last, for values that come to be made of it.
+    /// The last message, for values that are added later.
     last: Bytes,
-    /// How often the graph was looked at since its connection ended.
+    /// Number of comparisons with the graph since its connection was lost.
     looks: u32,
 }
 
@@ -66,12 +68,12 @@ impl Source {
         }
     }
 
-    /// A place without a topic.
+    /// Returns an unused entry without a topic.
     pub(crate) const fn vacant() -> Self {
         Self::new(String::new(), None, Vec::new())
     }
 
-    /// The graph has been looked at again.
+    /// Counts a comparison with the graph.
     pub(crate) const fn looked_at(&mut self) {
         self.silent = if self.is_live() {
             0
@@ -80,13 +82,14 @@ impl Source {
         };
     }
 
-    /// Whether another topic may have its place: it was found in the graph, and nobody has published it for a while,
-    /// whatever the master says.
+    /// Returns true if another topic may replace this topic: it was found in the graph and has not
+    /// been published for a while, even if the master lists a publisher.
     pub(crate) const fn gives_way(&self) -> bool {
         self.found && !self.is_live() && (self.silent > MAX_LOOKS || self.subscription.is_none())
     }
 
-    /// Of too many latched publishers, one that is not connected gives way to another that latches. Returns its key.
+    /// Removes a disconnected latching publisher if the limit is reached and `peer` is a new
+    /// latching publisher. Returns the key of the removed publisher.
     pub(crate) fn make_room(&mut self, peer: &Peer) -> Option<PublisherKey> {
         let known = |latched: &LatchedPeer| latched.caller_id == peer.caller_id;
         if self.latched.len() < MAX_LATCHED
@@ -102,8 +105,8 @@ impl Source {
         gone.map(|at| self.latched.remove(at).key)
     }
 
-    /// What the publisher of a message is called to the Router, if it latches and there is room for it. It keeps that name
-    /// over a lost connection.
+    /// Returns the key of the publisher of a message for the Router, if the publisher latches and
+    /// the limit is not reached. The key stays the same over a reconnection.
     pub(crate) fn latched_by(&mut self, peer: &Peer, message: &Bytes) -> Option<PublisherKey> {
         if !peer.header.latching() {
             return None;
@@ -127,13 +130,14 @@ impl Source {
         Some(key)
     }
 
-    /// The last message of each latched publisher.
+    /// Returns the last message of each latching publisher.
     pub(crate) fn latched(&self) -> impl Iterator<Item = (PublisherKey, &Bytes)> {
         self.latched.iter().map(|known| (known.key, &known.last))
     }
 
-    /// The latched publishers that are not connected and will not be again: the master no longer names them, or their
-    /// connection has been gone for [`MAX_LOOKS`] looks at the graph. To be asked with each.
+    /// Removes and returns the latching publishers that are lost: disconnected, and not registered
+    /// at the master or disconnected for more than [`MAX_LOOKS`] comparisons. Must be called with
+    /// each comparison.
     pub(crate) fn gone_for_good(&mut self, named: &[String]) -> Vec<PublisherKey> {
         let peers = &self.peers;
         self.latched
@@ -149,7 +153,7 @@ impl Source {
             .collect()
     }
 
-    /// Whether messages of a publisher can be read; `None` when it has not been met.
+    /// Returns true if messages of a publisher can be read; `None` if the publisher is new.
     pub(crate) fn knows(&self, peer: &Arc<Peer>) -> Option<bool> {
         if self.peers.iter().any(|known| Arc::ptr_eq(known, peer)) {
             Some(true)
@@ -160,12 +164,12 @@ impl Source {
         }
     }
 
-    /// Has publishers that were not taken in looked at again, with their next message.
+    /// Forgets publishers of another type, so they are checked again with their next message.
     pub(crate) fn forget_strangers(&mut self) {
         self.strangers.clear();
     }
 
-    /// Takes a publisher in. `found` is its type, unless there is none that can be read.
+    /// Adds a publisher. `found` is its type, `None` if the type cannot be read.
     pub(crate) fn meet(&mut self, peer: &Arc<Peer>, found: Option<Arc<MessageType>>) -> Met {
         let expected = |found: &Arc<MessageType>| {
             self.expected
@@ -192,7 +196,7 @@ impl Source {
         Met::Bound(found)
     }
 
-    /// A publisher has gone; `publishers` are left.
+    /// Removes a publisher that disconnected; `publishers` is the number of remaining connections.
     pub(crate) fn part(&mut self, peer: &Arc<Peer>, publishers: usize) {
         self.peers
             .retain(|known| publishers > 0 && !Arc::ptr_eq(known, peer));
@@ -200,31 +204,31 @@ impl Source {
             .retain(|known| publishers > 0 && !Arc::ptr_eq(known, peer));
     }
 
-    /// Whether a publisher of another type is connected.
+    /// Returns true if a publisher of another type is connected.
     pub(crate) const fn has_strangers(&self) -> bool {
         !self.strangers.is_empty()
     }
 
-    /// Whether somebody publishes it in a type that can be read.
+    /// Returns true if the topic is published with a type that can be read.
     pub(crate) const fn is_live(&self) -> bool {
         !self.peers.is_empty()
     }
 }
 
-/// About ten seconds: a publisher that died without a word to the master is not waited for any longer.
+/// About ten seconds, the time limit for a publisher that died without unregistering.
 const MAX_LOOKS: u32 = 20;
 
-/// Latched publishers of a topic that are told apart.
+/// Maximum number of latching publishers of a topic.
 pub(crate) const MAX_LATCHED: usize = 256;
 
-/// What a publisher is to a source.
+/// The result of adding a publisher.
 #[derive(Debug)]
 pub(crate) enum Met {
-    /// Of the type the values cross as.
+    /// The publisher has the type with which the values are bridged.
     Known,
-    /// The one whose type they cross as from now on.
+    /// The values are bridged with the type of this publisher from now on.
     Bound(Arc<MessageType>),
-    /// Of another type.
+    /// The publisher has another type.
     Stranger,
 }
 
@@ -338,7 +342,7 @@ mod tests {
             source.meet(peer, of("std_msgs/Bool"));
             assert!(source.latched_by(peer, &message).is_some());
         }
-        // Publishers that are made up and leave at once.
+        // Made-up publishers that disconnect at once.
         let mut gave_way = Vec::new();
         for n in 0..10 {
             let made_up = latching(&format!("/made_up{n}"));

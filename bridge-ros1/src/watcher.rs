@@ -1,4 +1,4 @@
-//! Looks at the ROS graph beside the samples, so that a slow master holds nothing up.
+//! Polls the ROS graph in separate tasks, so a slow master does not delay samples.
 
 use std::time::Duration;
 
@@ -7,16 +7,16 @@ use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 use tokio::time::sleep;
 
-/// What was seen.
+/// An event of the watcher.
 #[derive(Debug)]
 pub(crate) enum Seen {
-    /// The graph, `None` while there is no master.
+    /// The graph; `None` while the master is unavailable.
     Graph(Option<Graph>),
-    /// The node was told to shut down, for this reason.
+    /// The node was requested to shut down, with the reason.
     Ended(String),
 }
 
-/// Two small tasks; they end when it is dropped.
+/// Two small tasks that end when the watcher is dropped.
 #[derive(Debug)]
 pub(crate) struct Watcher {
     seen: mpsc::Receiver<Seen>,
@@ -25,14 +25,14 @@ pub(crate) struct Watcher {
 
 impl Watcher {
     pub(crate) fn of(node: &Node) -> Self {
-        // A look that was not taken yet delays the next: no more than one waits.
+        // A graph that was not received yet delays the next poll, so at most one graph waits.
         let (sender, seen) = mpsc::channel(1);
         let mut tasks = JoinSet::new();
         let asked = node.shutdown_requested();
         let ends = sender.clone();
         tasks.spawn(async move {
             let reason = asked.await;
-            // Nobody is left to be told when the port is gone.
+            // The port may already be dropped.
             drop(ends.send(Seen::Ended(reason)).await);
         });
         let graph = node.graph_reader();
@@ -51,7 +51,7 @@ impl Watcher {
         }
     }
 
-    /// The next look at the graph. Cancel-safe.
+    /// Returns the next event. Cancel-safe.
     pub(crate) async fn recv(&mut self) -> Seen {
         match self.seen.recv().await {
             Some(seen) => seen,
@@ -60,5 +60,6 @@ impl Watcher {
     }
 }
 
-/// How long a new topic of the space waits to be noticed; the master answers in about a millisecond.
+/// Maximum delay until a new topic of the space is found; the master responds in about a
+/// millisecond.
 const PERIOD: Duration = Duration::from_millis(500);

@@ -1,4 +1,4 @@
-//! Goals to and from nodes beside the bridge's, by a master in this process.
+//! Tests goals to and from nodes besides the bridge, with a master in this process.
 
 use std::collections::BTreeSet;
 use std::net::SocketAddr;
@@ -85,7 +85,7 @@ impl Cell {
         made.unwrap()
     }
 
-    /// A server at the robot.
+    /// Returns an action server of the robot.
     fn server(&self) -> tcpros::actionlib::ActionServer {
         let options = ActionServerOptions::new(Bytes::from_static(&[0; 4]));
         tcpros::actionlib::ActionServer::new(&self.robot, "/count", test_types(), options).unwrap()
@@ -118,7 +118,7 @@ async fn next_goal(server: &mut tcpros::actionlib::ActionServer) -> ServerGoal {
     .await
 }
 
-/// The next event but for statuses, which come when they come.
+/// Returns the next event except statuses, which may arrive at any time.
 async fn heard(goal: &mut Sent) -> Option<GoalEvent> {
     within("an event", async {
         loop {
@@ -149,7 +149,7 @@ async fn a_goal_waits_for_its_server_to_connect_and_is_followed_to_its_end() {
     let mut cell = Cell::start();
     let mut server = cell.server();
     let sender = cell.sender(WAITS);
-    // Nobody has connected yet.
+    // No server is connected yet.
     let mut goal = sender.send_goal(ID, &5i32.to_le_bytes());
     let events = tokio::spawn(async move {
         is_accepted(&mut goal).await;
@@ -180,7 +180,7 @@ async fn a_goal_is_rejected_with_the_words_of_its_server_and_one_left_undecided_
 
     let mut goal = sender.send_goal([1; 16], &1i32.to_le_bytes());
     let undecided = next_goal(&mut server).await;
-    // It counts as accepted after a while: its client is not to be kept waiting.
+    // The goal counts as accepted after a while, so its client does not wait any longer.
     is_accepted(&mut goal).await;
     undecided.reject("after all").unwrap();
     assert_eq!(heard(&mut goal).await, ended(ABORTED, "after all", 0));
@@ -253,7 +253,8 @@ async fn a_goal_without_a_server_was_not_executed_and_a_client_is_shared() {
 async fn goals_of_the_graph_are_decided_about_and_ended_here() {
     let mut cell = Cell::start();
     let mut taker = cell.graph().serve_action("/count", &test()).unwrap();
-    // One that is about to go, as when an action is given up and taken up in one go.
+    // The previous server is about to be dropped, as when an action is withdrawn and offered in one
+    // step.
     let again = cell.graph().serve_action("/count", &test());
     drop(std::mem::replace(&mut taker, again.unwrap()));
     let options = ActionClientOptions::default();

@@ -1,4 +1,5 @@
-//! Actions of other spaces, as action servers of the graph; and action servers of the graph, executed for other spaces.
+//! Offers actions of other spaces as action servers of the graph, and executes action servers of
+//! the graph for other spaces.
 
 use std::sync::Arc;
 
@@ -11,8 +12,8 @@ use super::Ros1Port;
 use crate::services::Ros1Graph;
 
 impl Ros1Port {
-    /// Offers the actions that are known. One under a name that the mapping chose gives way to a server of another node: two
-    /// would both take each goal.
+    /// Offers the known actions. An action under a name from the mapping gives way to an action
+    /// server of another node, because both servers would take each goal.
     pub(super) fn offer_actions(&mut self) {
         let (graph, own) = (&self.graph, self.node.name());
         let other = |action: &str| server(graph, own, action);
@@ -37,7 +38,7 @@ impl Ros1Port {
             definitions: &mut self.definitions,
             ends: &mut self.ends,
         };
-        // Who has which name is known from when the master has answered.
+        // The owners of names are known once the master has responded.
         let has_master = self.has_master;
         let may = |topic: TopicId, action: &str| {
             !left(topic, action) && (has_master || !is_chosen(topic, action))
@@ -51,7 +52,8 @@ impl Ros1Port {
         self.events.extend(events);
     }
 
-    /// Offers the action servers of other nodes that are actions of our space, and withdraws those that are gone.
+    /// Offers the action servers of other nodes that are actions of this space, and withdraws
+    /// actions whose servers are lost.
     pub(super) fn find_actions(&mut self) {
         let mapping = Arc::clone(self.policy.mapping());
         let mapped = Actions::mapped(&mapping, &self.policy);
@@ -80,14 +82,15 @@ impl Ros1Port {
     }
 }
 
-/// The actions that nodes other than `own` serve.
+/// Returns the actions that nodes other than `own` serve.
 pub(super) fn served<'g>(graph: &'g Graph, own: &str) -> impl Iterator<Item = &'g str> {
     let goals = graph.subscribers.keys();
     let actions = goals.filter_map(|topic| topic.strip_suffix("/goal"));
     actions.filter(move |action| server(graph, own, action).is_some())
 }
 
-/// Another node that serves that action: it takes goals and requests to cancel, and tells of both.
+/// Returns another node that serves the action: it subscribes to goal and cancel, and publishes
+/// status, feedback and result.
 pub(super) fn server<'g>(graph: &'g Graph, own: &str, action: &str) -> Option<&'g str> {
     let subscribed = |topic: &str| graph.subscribers.get(&format!("{action}/{topic}"));
     let published = |topic: &str| graph.publishers.get(&format!("{action}/{topic}"));
@@ -103,8 +106,8 @@ pub(super) fn server<'g>(graph: &'g Graph, own: &str, action: &str) -> Option<&'
     found.map(String::as_str)
 }
 
-/// The type of an action by those of its topics, as far as the master knows one: it has `*` of a topic without publishers that
-/// somebody reads as any type.
+/// Returns the type of an action from the types of its topics, as far as the master knows them. The
+/// master has the type `*` for a topic without publishers that is subscribed with any type.
 fn type_of(graph: &Graph, action: &str) -> Option<TypeName> {
     let parts = [
         ("goal", "ActionGoal"),
@@ -117,7 +120,7 @@ fn type_of(graph: &Graph, action: &str) -> Option<TypeName> {
     })
 }
 
-/// Bytes of a name that is looked at.
+/// Maximum length of a name, in bytes.
 const MAX_NAME: usize = 255;
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! The peers in the ROS graph that the mapping needs and that are missing.
+//! Lists the peers in the ROS graph that the mapping needs and that are missing.
 
 use std::collections::BTreeMap;
 use std::net::IpAddr;
@@ -21,7 +21,7 @@ impl Ros1Port {
                 )
             });
         }
-        // Without a master nothing is known; that is reported as not ready.
+        // Without a master no peers are known; this is reported as not ready.
         if !self.has_master {
             return;
         }
@@ -38,7 +38,7 @@ impl Ros1Port {
         self.add_servers(missing);
     }
 
-    /// Returns the nodes in `named` other than this one.
+    /// Returns the nodes in `named` except this node.
     fn others<'g>(
         &self,
         named: &'g BTreeMap<String, Vec<String>>,
@@ -60,7 +60,7 @@ impl Ros1Port {
         of_others.map(|(name, _)| name.as_str())
     }
 
-    /// Adds the publisher of a topic that the mapping reads.
+    /// Adds the publisher of a topic that the mapping subscribes to.
     fn add_publisher(&self, source: &Source, missing: &mut AwaitedPeers) {
         if source.found || source.values.is_empty() || source.is_live() {
             return;
@@ -82,8 +82,8 @@ impl Ros1Port {
         });
     }
 
-    /// Adds a topic that the mapping writes and no node reads, if another node publishes it or reads one with a similar
-    /// name.
+    /// Adds a topic that the mapping publishes and no node subscribes to, if another node publishes
+    /// it or subscribes to a topic with a similar name.
     fn add_mistaken(&self, sink: &Sink, missing: &mut AwaitedPeers) {
         let topic = sink.ros_topic.as_str();
         let subscribers = &self.graph.subscribers;
@@ -103,7 +103,8 @@ impl Ros1Port {
         }
     }
 
-    /// Adds the subscribers of a topic of ours that the master names and that do not connect.
+    /// Adds the subscribers of a topic of this node that are registered at the master and do not
+    /// connect.
     fn add_subscribers(&self, sink: &Sink, missing: &mut AwaitedPeers) {
         let Some(open) = &sink.open else { return };
         let publisher = &open.publisher;
@@ -162,7 +163,7 @@ fn called(mapping: &Mapping, own: SpaceId) -> impl Iterator<Item = &str> {
         })
 }
 
-/// Whether an interface of this host has the address; true if the interfaces cannot be listed.
+/// Returns true if an interface of this host has the address, or the interfaces cannot be listed.
 fn is_local(address: IpAddr) -> bool {
     let IpAddr::V4(address) = address else {
         return true;

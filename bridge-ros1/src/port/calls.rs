@@ -1,4 +1,5 @@
-//! Calls of other spaces, as services of the graph; and services of the graph, executed for other spaces.
+//! Offers calls of other spaces as services of the graph, and executes services of the graph for
+//! other spaces.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -14,8 +15,9 @@ use super::Ros1Port;
 use crate::services::{Executor, Ros1Graph};
 
 impl Ros1Port {
-    /// Offers the calls that are known as services. One under a name that the mapping chose gives way to a service of
-    /// another node: the master knows one server of a name, the last that came.
+    /// Offers the known calls as services. A call under a name from the mapping gives way to a
+    /// service of another node, because the master keeps a single server per name, the last to
+    /// register.
     pub(super) fn offer_calls(&mut self) {
         let (services, own) = (&self.graph.services, self.node.name());
         let other = |service: &str| {
@@ -43,7 +45,7 @@ impl Ros1Port {
             definitions: &mut self.definitions,
             ends: &mut self.ends,
         };
-        // Who has which name is known from when the master has answered.
+        // The owners of names are known once the master has responded.
         let has_master = self.has_master;
         let may = |topic: TopicId, service: &str| {
             !left(topic, service) && (has_master || !is_chosen(topic, service))
@@ -53,7 +55,8 @@ impl Ros1Port {
         self.events.extend(events);
     }
 
-    /// Offers the services of other nodes that are calls of our space, and withdraws those that are gone.
+    /// Offers the services of other nodes that are calls of this space, and withdraws calls whose
+    /// services are lost.
     pub(super) fn find_services(&mut self) {
         let own = self.node.name();
         let services = self.graph.services.iter();
@@ -98,10 +101,10 @@ pub(super) struct Kinds {
 
 #[derive(Debug)]
 struct Kind {
-    /// Who offered it when it was asked.
+    /// The nodes that offered the service at the last query.
     nodes: Vec<String>,
     type_name: Option<TypeName>,
-    /// Looks at the graph until it is asked again.
+    /// Number of comparisons with the graph until the next query.
     wait: u32,
     asked: bool,
 }
@@ -111,7 +114,8 @@ impl Kinds {
         self.known.get(service)?.type_name.as_ref()
     }
 
-    /// Asks those that are new, or of other nodes than before, a few at a time. Reports whom it could not be learned from.
+    /// Queries the types of new services and of services with changed nodes, a few at a time.
+    /// Returns the services whose types could not be determined, with the reasons.
     fn look<'s>(
         &mut self,
         node: &Node,
@@ -162,7 +166,7 @@ impl Kinds {
         std::mem::take(&mut self.faults)
     }
 
-    /// A type was learned, or could not be. Cancel-safe; pends while nobody is asked.
+    /// Waits for a type, or for a failed query. Cancel-safe; pends while no query is running.
     pub(super) async fn recv(&mut self) {
         let answered = match self.asking.join_next().await {
             Some(answered) => answered,
@@ -185,12 +189,12 @@ impl Kinds {
     }
 }
 
-/// Bytes of a name that is looked at.
+/// Maximum length of a name, in bytes.
 const MAX_NAME: usize = 255;
-/// Services whose type is kept.
+/// Maximum number of services with stored types.
 const MOST_KINDS: usize = 1024;
-/// Servers that are asked at a time.
+/// Maximum number of concurrent queries.
 const MOST_ASKED: usize = 16;
 const ASKED_WITHIN: Duration = Duration::from_secs(3);
-/// Looks at the graph until one that did not answer is asked again.
+/// Number of comparisons with the graph until a failed query is repeated.
 const ASKED_AGAIN: u32 = 10;

@@ -1,7 +1,8 @@
-//! Topics of the graph that the mapping does not name: they are read while there is room, since anybody can invent some.
+//! Topics of the graph that the mapping does not name. They are subscribed up to a limit, because
+//! any node can publish made-up topics.
 //!
-//! What the mapping names is never refused. Of the rest, what nobody publishes gives way to what comes, and what there is
-//! no room for is told of for as long as that lasts.
+//! Topics in the mapping are never refused. Other topics that are not published give way to new
+//! topics, and refused topics are reported as long as the limit is reached.
 
 use std::ops::Bound;
 use std::time::{Duration, Instant};
@@ -16,12 +17,13 @@ use super::Ros1Port;
 use crate::source::Source;
 
 impl Ros1Port {
-    /// Subscribes the topics that somebody publishes under a name of our space or of a pattern, and lets go of those
-    /// nobody does.
+    /// Subscribes to published topics with a name of this space or of a pattern, and removes topics
+    /// that are not published.
     pub(super) fn find_sources(&mut self) {
         let mut found = Vec::new();
         self.refused.topics = 0;
-        // Each topic has its turn, also where there are more than there is room for.
+        // The search continues after the last added topic, so each topic gets its turn even beyond
+        // the limit.
         let after = (Bound::Excluded(self.taken_last.clone()), Bound::Unbounded);
         let before = ..=self.taken_last.clone();
         let publishers = &self.graph.publishers;
@@ -39,7 +41,8 @@ impl Ros1Port {
             let typed = self.graph.types.get(ros_topic).and_then(|t| t.parse().ok());
             let made = match self.policy.found(ros_topic, typed.as_ref()) {
                 Found::Named(topic) => Ok((topic, None, Selection::Whole)),
-                // Others who publish where values of other spaces go are not a value of ours.
+                // Other publishers of topics to which values of other spaces are written do not
+                // produce values of this space.
                 Found::Made(_) | Found::Fault(_) if self.is_written(ros_topic) => continue,
                 Found::Made(made) => Ok((made.topic, made.message_type, made.selection)),
                 Found::Fault(fault) => Err(fault.to_string()),
@@ -56,7 +59,7 @@ impl Ros1Port {
                 }
             }
         }
-        // Those that are known already may have lost their subscription.
+        // Known topics may have lost their subscription.
         for index in 0..self.sources.len() {
             self.resubscribe(index);
         }
@@ -66,14 +69,14 @@ impl Ros1Port {
                 .subscription
                 .as_ref()
                 .is_some_and(|s| s.publishers() > 0);
-            // A master that has just restarted does not name all who publish.
+            // A restarted master does not list all publishers yet.
             if source.found && !published && !connected && !source.is_live() {
                 source.subscription = None;
             }
         }
     }
 
-    /// Whether values of other spaces are written there.
+    /// Returns true if values of other spaces are written to the topic.
     fn is_written(&self, ros_topic: &str) -> bool {
         let mut sinks = self.sinks.values();
         sinks.any(|sink| {
@@ -83,7 +86,7 @@ impl Ros1Port {
         })
     }
 
-    /// Subscribes a topic that was found in the graph, if somebody publishes it and it is not subscribed.
+    /// Subscribes to a topic without a subscription, if another node publishes it.
     pub(super) fn resubscribe(&mut self, index: usize) {
         let lost = |s: &&Source| s.subscription.is_none() && !s.values.is_empty();
         let Some(source) = self.sources.get(index).filter(lost) else {
@@ -102,22 +105,22 @@ impl Ros1Port {
         }
     }
 
-    /// Gives up a source, whose place may be taken by another.
+    /// Removes a source; its index may be reused.
     pub(super) fn vacate(&mut self, index: usize) {
         let Some(place) = self.sources.get_mut(index) else {
             return;
         };
-        // Nothing that was queued for it comes out of the inbox any more.
+        // Messages queued for the source do not come out of the inbox any more.
         let source = std::mem::replace(place, Source::vacant());
         self.source_of.remove(&source.ros_topic);
         self.vacant.push(index);
-        // Of one that was never bound there is nothing to tell.
+        // A source that was never bound is not reported as unbound.
         let gone = source.values.into_iter().filter(|_| source.bound.is_some());
         let gone = gone.map(|(topic, _)| PortEvent::Unbound { topic });
         self.events.extend(gone);
     }
 
-    /// What room there is for topics that the mapping does not name.
+    /// Returns the room for topics that the mapping does not name.
     pub(super) fn places(&self) -> Places {
         let found = self.sources.iter().filter(|source| source.found);
         let places = self.sources.iter().enumerate();
@@ -128,7 +131,8 @@ impl Ros1Port {
         }
     }
 
-    /// Takes in a topic the mapping does not name, unless there is no room or another one is that value already.
+    /// Adds a topic that the mapping does not name, unless the limit is reached or another topic
+    /// already produces the value.
     pub(super) fn add_found(
         &mut self,
         ros_topic: String,
@@ -159,7 +163,7 @@ impl Ros1Port {
         self.resubscribe(index);
     }
 
-    /// Tells of what there is no room for, at the first time and then every minute.
+    /// Logs refused topics, at first immediately and then every minute.
     pub(super) fn tell_refused(&mut self) {
         let Refused { topics, told } = self.refused;
         let now = bridge_node::now().monotonic;
@@ -180,20 +184,20 @@ impl Ros1Port {
 #[derive(Debug)]
 pub(super) struct Places {
     free: usize,
-    /// Sources that give way where nothing is free.
+    /// Sources that give way if there is no free room.
     silent: Vec<usize>,
 }
 
-/// What there was no room for.
+/// The refused topics.
 #[derive(Debug, Default)]
 pub(super) struct Refused {
     pub(super) topics: usize,
     told: Option<Instant>,
 }
 
-/// Bytes of the name of such a topic.
+/// Maximum length of the name of such a topic, in bytes.
 const MAX_NAME: usize = 512;
-/// Between two lines about what there is no room for.
+/// Interval between two log messages about refused topics.
 const REFUSED_AGAIN: Duration = Duration::from_secs(60);
 
 #[cfg(test)]
@@ -209,7 +213,7 @@ mod tests {
 
     fn port(mapping: &str) -> Ros1Port {
         let mut node = NodeOptions::from_env("n");
-        // Nothing listens there.
+        // No server listens at this address.
         "http://127.0.0.1:1".clone_into(&mut node.master_uri);
         node.advertise_as("127.0.0.1");
         let mapping = if mapping.is_empty() {
@@ -227,7 +231,8 @@ mod tests {
         .unwrap()
     }
 
-    /// A graph in which somebody publishes so many topics of the namespace 1, and one of the namespace 9.
+    /// Returns a graph with this number of published topics of namespace 1, and optionally one
+    /// topic of namespace 9.
     fn graph(made_up: usize, honest: bool) -> Option<Graph> {
         let made_up = (1..=made_up).map(|id| format!("/ua_1_1_{id}"));
         let topics = made_up.chain(honest.then(|| HONEST.to_owned()));
@@ -237,7 +242,7 @@ mod tests {
         })
     }
 
-    /// One value, which has a standard type to be written in.
+    /// A topic with a single value, which has a standard type.
     const HONEST: &str = "/ua_1_9_9";
 
     #[tokio::test]
@@ -247,7 +252,7 @@ mod tests {
         assert_eq!(port.source_of.len(), MAX_TOPICS);
         assert_eq!(port.refused.topics, 5000 - MAX_TOPICS);
         assert!(port.refused.told.is_some(), "the operator is told");
-        // Gone from the graph, and the next look finds that out.
+        // The topics leave the graph, and the next comparison detects it.
         port.look(graph(0, true));
         port.look(graph(0, true));
         assert!(port.source_of.contains_key(HONEST));
@@ -262,7 +267,7 @@ mod tests {
             port.look(graph(6000, true));
             assert!(port.source_of.len() <= MAX_TOPICS);
             looks += 1;
-            // Ten seconds for each turn, and two turns for 6000 topics.
+            // Each turn takes ten seconds, and 6000 topics take two turns.
             assert!(looks <= 50, "it never has its turn");
         }
         assert_eq!(port.sources.len(), MAX_TOPICS);

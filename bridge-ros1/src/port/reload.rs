@@ -1,4 +1,4 @@
-//! Going over to another mapping: what both say alike is left as it is.
+//! Switches to another mapping; parts that are equal in both mappings stay unchanged.
 
 use std::sync::Arc;
 
@@ -13,11 +13,12 @@ use crate::sink::Sink;
 use crate::source::Source;
 
 impl Ros1Port {
-    /// Everything is given up before anything is taken up, as a value or a topic may only have changed hands.
+    /// Applies the new mapping. Everything obsolete is removed before new parts are added, because
+    /// a value or topic may only have moved.
     pub(super) fn go_over_to(&mut self, mapping: &Arc<Mapping>, types: &Arc<TypePaths>) {
         let before = self.policy.replace(mapping);
         self.definitions.replace(types);
-        // A type that nobody knew may be known now.
+        // The new mapping may define a type that was unknown before.
         for source in &mut self.sources {
             source.forget_strangers();
         }
@@ -57,11 +58,12 @@ impl Ros1Port {
                 self.take_up_sink(topic);
             }
         }
-        // Topics of the space that the mapping no longer names, and those of new patterns.
+        // Topics of the space that only the previous mapping named, and topics of new patterns.
         self.find_sources();
     }
 
-    /// Lets go of the values of a topic that are no longer made of it, and of the topic where none is left.
+    /// Removes the values that the new mapping does not make of a topic, and the topic if no values
+    /// are left.
     fn give_up_values(&mut self, index: usize, read: &Read) {
         let Some(source) = self.sources.get(index) else {
             return;
@@ -87,7 +89,8 @@ impl Ros1Port {
         }
     }
 
-    /// The value of a topic that was found in the graph, if it is one by the new mapping as well.
+    /// Returns the value of a topic found in the graph, if the new mapping also makes a value of
+    /// it.
     fn still_found(&self, source: &Source) -> Option<(TopicId, Selection)> {
         let typed = source.bound.as_ref().map(|bound| bound.name());
         let typed = source.expected.as_ref().or(typed);
@@ -103,7 +106,7 @@ impl Ros1Port {
     fn give_up_sinks(&mut self) {
         let (policy, definitions) = (&self.policy, &mut self.definitions);
         let gone = self.sinks.extract_if(|topic, sink| {
-            // Its definition may be another since the files were read again.
+            // The definition may have changed when the files were read again.
             let outdated = sink.open.as_ref().is_some_and(|open| {
                 let now = definitions.get(open.message_type.name());
                 now.is_ok_and(|now| now.md5() != open.message_type.md5())
@@ -112,12 +115,12 @@ impl Ros1Port {
                 || outdated
                 || !sink.is_like(&Sink::new(policy.destination(*topic)))
         });
-        // Their publishers end here, so that their topics may be advertised in another type.
+        // The publishers end here, so their topics can be advertised with another type.
         let gone = gone.map(|(topic, _)| PortEvent::Unbound { topic });
         self.events.extend(gone);
     }
 
-    /// Makes values of a topic that the mapping reads, of which some may be made already.
+    /// Adds the values of a topic that the mapping subscribes to; some may exist already.
     fn take_up_values(
         &mut self,
         ros_topic: String,

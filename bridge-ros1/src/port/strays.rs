@@ -1,4 +1,5 @@
-//! Values of other spaces that neither the mapping names nor a subscriber wants: they are written while there is room.
+//! Values of other spaces that are neither in the mapping nor subscribed; they are published up to
+//! a limit.
 
 use std::collections::BTreeSet;
 
@@ -11,7 +12,8 @@ use super::Ros1Port;
 use crate::sink::Sink;
 
 impl Ros1Port {
-    /// Has a topic for the value; false where there is no room for one that nobody here knows.
+    /// Ensures that the value has a topic. Returns false if the value is unknown here and the limit
+    /// is reached.
     pub(super) fn take_in(&mut self, topic: TopicId) -> bool {
         if self.sinks.contains_key(&topic) {
             return true;
@@ -51,7 +53,7 @@ impl Ros1Port {
             }
             self.events.push_back(PortEvent::Unbound { topic });
         }
-        // Should they return, what is peculiar is told anew.
+        // If these values return, their problems are logged again.
         self.policy.told.forget(&names);
         admitted
     }

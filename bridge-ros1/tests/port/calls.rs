@@ -1,4 +1,4 @@
-//! Calls of other spaces, as services of the graph.
+//! Tests calls of other spaces as services of the graph.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -31,7 +31,7 @@ fn start() -> Arc<CallDescription> {
     })
 }
 
-/// A client of the robot's for the service of the call.
+/// Returns a service client of the robot for the call.
 fn client(cell: &Cell) -> ServiceClient {
     let name = "std_srvs/Trigger";
     let found = Registry::bundle(Dialect::Ros1).service(&name.parse().unwrap());
@@ -45,7 +45,7 @@ fn client(cell: &Cell) -> ServiceClient {
     client.unwrap()
 }
 
-/// Calls until the service is there; runs the port until it is asked.
+/// Calls until the service is available, and runs the port until it receives the request.
 async fn asked(cell: &mut Cell, client: &ServiceClient) -> (AskId, Asking) {
     let caller = client.clone();
     let asking = tokio::spawn(async move {
@@ -124,7 +124,7 @@ async fn a_service_goes_with_its_call_after_who_waits_was_told() {
     within("the service to go", beside(&mut cell, gone)).await;
 }
 
-/// What comes of the future while the port runs.
+/// Runs the port until the future completes.
 async fn beside<T>(cell: &mut Cell, future: impl Future<Output = T>) -> T {
     let run = async {
         loop {

@@ -1,4 +1,4 @@
-//! The port in a graph of its own: a master in this process, and nodes beside it.
+//! Tests the port in a graph of its own: a master in this process, with nodes besides the bridge.
 
 #![expect(clippy::unwrap_used, clippy::panic, reason = "test code")]
 
@@ -141,7 +141,7 @@ fn delivery(topic: &str, payload: &'static [u8]) -> Delivery {
     }
 }
 
-/// One line per event, which is what these tests compare.
+/// Returns a line for an event, which the tests compare.
 fn line(event: &PortEvent) -> String {
     match event {
         PortEvent::Bound {
@@ -261,7 +261,7 @@ async fn one_message_gives_a_sample_to_each_variable_that_reads_it() {
     let publisher = advertise(&node, "/target", "geometry_msgs/Point", true);
     let _sent = publisher.publish(Bytes::from_static(b"p"));
     let mut lines = events(&mut port, 7).await;
-    // What is written is bound from the start.
+    // A published topic is bound from the start.
     assert_eq!(lines.remove(0), "ua_2_2_3 is std_msgs/Bool data");
     let expected = [
         "ua_1_2_1 is geometry_msgs/Point x",
@@ -359,7 +359,7 @@ async fn a_value_nobody_mapped_gets_the_standard_type_or_the_one_a_subscriber_as
         {}
     })
     .await;
-    // Three values have no standard type: the topic waits for somebody who says.
+    // Three values have no standard type, so the topic waits for a subscriber with a type.
     let shape = [(BuiltinType::Double, false); 3];
     port.wanted(id("ua_2_1_2"), &shape, None);
     assert_eq!(

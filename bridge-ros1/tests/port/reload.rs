@@ -1,4 +1,4 @@
-//! Another mapping for a port that runs.
+//! Tests the reload of a mapping by a running port.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -11,10 +11,10 @@ use tokio::time::timeout;
 use crate::services::{event, offer};
 use crate::{Cell, advertise, cell, delivery, events, line, message, parsed, run_until, types};
 
-/// X and Y of /target are read, Park is written to /park.
+/// X and Y of /target are subscribed, Park is published on /park.
 const BEFORE: &str = crate::TWO_FIELDS;
 
-/// [`BEFORE`] with another word at one place.
+/// Returns [`BEFORE`] with one replacement.
 fn edited(from: &str, to: &str) -> Arc<mappings::Mapping> {
     assert!(BEFORE.contains(from));
     parsed(&BEFORE.replacen(from, to, 1))
@@ -26,7 +26,7 @@ impl Cell {
     }
 }
 
-/// What the port says within a short while, when nothing or little is expected.
+/// Returns the events within a short time, if few or no events are expected.
 async fn at_once(cell: &mut Cell) -> Vec<String> {
     let mut lines = Vec::new();
     while let Ok(event) = timeout(Duration::from_millis(100), cell.port.recv()).await {
@@ -92,7 +92,7 @@ async fn a_topic_without_values_is_let_go_and_one_that_gets_some_is_read() {
     })
     .await;
     assert_eq!(publishers[1].subscribers(), 1);
-    // And back again, as a file is that was saved too early.
+    // The previous mapping is restored, as after a file that was saved too early.
     cell.go_over(&parsed(BEFORE));
     events(&mut cell.port, 8).await;
     assert_eq!(publishers[0].subscribers(), 1);
@@ -106,7 +106,7 @@ async fn a_topic_that_went_and_came_back_is_read_once_whatever_is_edited_next() 
     cell.go_over(&parsed(&BEFORE.replace("/target", "/goal")));
     events(&mut cell.port, 2).await;
     cell.go_over(&parsed(BEFORE));
-    // Bound and live again, both of them.
+    // Both values are bound and live again.
     event(&mut cell, "ua_1_2_1", "live true").await;
     event(&mut cell, "ua_1_2_2", "live true").await;
     for name in ["Stop", "Halt"] {
@@ -197,12 +197,12 @@ variables:
     let requests = |of: &Arc<std::sync::Mutex<Vec<Bytes>>>| of.lock().unwrap().clone();
     assert_eq!(requests(&old), [Bytes::from_static(&[1])]);
     assert_eq!(requests(&new), [Bytes::from_static(&[0])]);
-    // The poll is the same in both and went on.
+    // The poll is equal in both mappings and continued.
     event(&mut cell, "ua_1_2_5", "=").await;
 
     cell.go_over(&parsed(&service("/lamp", "1h")));
     event(&mut cell, "ua_1_2_5", "unbound").await;
-    // The first call of the new poll is at once, and the next not today.
+    // The new poll calls at once, and the next call does not follow today.
     event(&mut cell, "ua_1_2_5", "=").await;
     let before = requests(&asked).len();
     let later = at_once(&mut cell).await;

@@ -1,4 +1,4 @@
-//! Services as values: calls that are made, made again and not made, and what they bring.
+//! Tests services as values: successful, repeated and omitted calls, and their results.
 
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
@@ -24,12 +24,12 @@ variables:
   - {node: ns=2;i=5, name: Told, origin: 1, ros: {poll: /ask, type: std_srvs/Trigger, every: 50ms, field: message}}
 ";
 
-/// The answer of SetBool and Trigger: success, and a text of two letters.
+/// The response of SetBool and Trigger: success, and a text of two letters.
 const FINE: &[u8] = &[1, 2, 0, 0, 0, b'o', b'k'];
-/// More than the waits before the second and third try together.
+/// Longer than the delays before the second and third attempt together.
 const A_WHILE: Duration = Duration::from_millis(1500);
 
-/// A service of the robot, and the requests it has had.
+/// Offers a service of the robot, and records its requests.
 pub(crate) fn offer(
     node: &Node,
     service: &str,
@@ -54,7 +54,7 @@ pub(crate) fn offer(
     (server.unwrap(), requests)
 }
 
-/// The next event whose line has both parts.
+/// Returns the next event whose line has both parts.
 pub(crate) async fn event(cell: &mut Cell, topic: &str, part: &str) -> String {
     within(&format!("{topic} {part}"), async {
         loop {
@@ -67,7 +67,7 @@ pub(crate) async fn event(cell: &mut Cell, topic: &str, part: &str) -> String {
     .await
 }
 
-/// Lets the port run for a while.
+/// Runs the port for a while.
 async fn for_a_while(cell: &mut Cell) {
     let run = async {
         loop {

@@ -1,4 +1,4 @@
-//! Values of other spaces that nobody here knows, more than are written.
+//! Tests more unknown values of other spaces than are published.
 
 use super::*;
 
@@ -11,7 +11,7 @@ namespaces:
 variables:
   - {node: ns=2;i=3, name: Park, type: Boolean, origin: 2}
 ";
-/// Two values have no standard type, and their topic costs the master nothing.
+/// Two values have no standard type, so their topic is not registered at the master.
 const NO_TYPE: [(BuiltinType, bool); 2] = [(BuiltinType::Double, false); 2];
 const BOOLEAN: [(BuiltinType, bool); 1] = [(BuiltinType::Boolean, false)];
 
@@ -36,7 +36,8 @@ async fn made_up_values_keep_out_none_of_the_mapping_and_give_way_when_they_fall
     port.wanted(id("ua_2_2_4"), &BOOLEAN, None);
     assert_eq!(events(port, 1).await, [refused]);
     port.silent(made_up(7), true);
-    // The Router asks again while values come; there is room when it was looked for again.
+    // The Router repeats the request while values arrive; there is room after the next search for
+    // silent values.
     let gave_way = within("room", async {
         loop {
             port.wanted(id("ua_2_2_4"), &BOOLEAN, None);
