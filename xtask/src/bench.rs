@@ -1,4 +1,4 @@
-//! `cargo xtask bench`: measurements, with optimised programs.
+//! `cargo xtask bench`: measures optimised programs.
 
 use std::{
     io::Write as _,
@@ -17,25 +17,28 @@ use crate::{
     workspace::{SHIPPED, Workspace},
 };
 
-/// Measures one hop of each bridge beside the floor and roscpp's relay, all in one run.
+/// Measures one hop of each bridge, with the floor and the relay of roscpp in the same run.
 pub(crate) fn hop(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
     let packages = ["bridge-ros1", "bridge-ros2", "system-tests"];
     measured(workspace, "bench-hop", &packages, arguments)
 }
 
-/// Measures relays of ROS 1 messages beside a raw echo, and bridge-ros1 under many topics, all in one run.
+/// Measures relays of ROS 1 messages with a raw echo, and bridge-ros1 with many topics, all in one
+/// run.
 pub(crate) fn ros1(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
     let packages = ["tcpros", "bridge-ros1", "system-tests"];
     measured(workspace, "bench-ros1", &packages, arguments)
 }
 
-/// Measures relays of DDS samples beside a UDP echo, and both bridges between ROS 1 and ROS 2, all in one run.
+/// Measures relays of DDS samples with a UDP echo, and both bridges between ROS 1 and ROS 2, all in
+/// one run.
 pub(crate) fn ros2(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
     let packages = ["bridge-ros1", "bridge-ros2", links::TARGET, "system-tests"];
     measured(workspace, "bench-ros2", &packages, arguments)
 }
 
-/// Measures ua-server beside servers of other makers, and values from the space to clients, all in one run.
+/// Measures ua-server with servers of other vendors, and values from the space to clients, all in
+/// one run.
 pub(crate) fn opcua(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
     measured(
         workspace,
@@ -45,7 +48,7 @@ pub(crate) fn opcua(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result
     )
 }
 
-/// Measures what clients wait for of skills, and many skills in one server.
+/// Measures the response times of skills, and a server with many skills.
 pub(crate) fn skills(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
     measured(
         workspace,
@@ -55,7 +58,8 @@ pub(crate) fn skills(workspace: &Workspace, arguments: &[&str]) -> anyhow::Resul
     )
 }
 
-/// Measures messages between ROS bytes and UADP fields, and what serializers in Python take for the ROS half of it.
+/// Measures conversions between ROS bytes and UADP fields, and Python serializers for the ROS half
+/// of the conversion.
 pub(crate) fn messages(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
     instructions::run(workspace, "messages", arguments, |bench| {
         step("the same messages in Python, without UADP");
@@ -82,7 +86,7 @@ pub(crate) fn messages(workspace: &Workspace, arguments: &[&str]) -> anyhow::Res
     })
 }
 
-/// Builds the packages with all their programs, then runs the one that measures.
+/// Builds the packages with all their programs, then runs the measurement.
 fn measured(
     workspace: &Workspace,
     bench: &str,

@@ -1,4 +1,4 @@
-//! `cargo xtask demo`: a story with the programs people run, in one command.
+//! `cargo xtask demo`: runs a demo story with the shipped programs in one command.
 
 use std::process::Command;
 

@@ -1,4 +1,4 @@
-//! `cargo xtask dist`: the programs as they are handed out.
+//! `cargo xtask dist`: builds the shipped programs.
 
 use std::fs;
 
@@ -11,7 +11,7 @@ use crate::{
     workspace::{SHIPPED, Workspace},
 };
 
-/// The programs that are handed out, which are called as their packages. All others are links to the last.
+/// The shipped programs, named like their packages. All other programs are links to the last.
 const PROGRAMS: [&str; 3] = ["bridge-ros1", "bridge-ros2", links::TARGET];
 
 /// Builds the programs without optimisation into `target/debug`.

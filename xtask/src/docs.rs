@@ -1,4 +1,4 @@
-//! `cargo xtask docs`: the reference pages, generated from the programs and the schema of mappings.
+//! `cargo xtask docs`: generates the reference pages from the programs and the schema of mappings.
 
 use std::{fmt::Write as _, fs, path::Path, process::Command};
 
@@ -140,7 +140,7 @@ fn verbs(help: &str) -> Vec<&str> {
     verbs.filter(|verb| *verb != "help").collect()
 }
 
-/// Returns the page of all finding codes, of the lines `CODE  text`.
+/// Returns the page of all finding codes from lines of the form `CODE  text`.
 fn findings(list: &str) -> String {
     let mut page = format!(
         "{NOTE}\n# Findings\n\n`ua-space check` prints findings with these codes. `ua-space explain \
@@ -152,7 +152,7 @@ fn findings(list: &str) -> String {
     page
 }
 
-/// Returns the page of all keys of a mapping, of its JSON Schema.
+/// Returns the page of all keys of a mapping from its JSON Schema.
 fn mapping(schema: &Value) -> String {
     let mut page = format!(
         "{NOTE}\n# Keys of a mapping\n\n[Map values](../mapping.md) explains mappings with examples. A \
@@ -166,7 +166,7 @@ fn mapping(schema: &Value) -> String {
     page
 }
 
-/// Appends the keys, or else the alternatives, of a definition of the schema.
+/// Appends the keys of a definition of the schema, or its alternatives if it has no keys.
 fn table(name: &str, definition: &Value, page: &mut String) {
     let about = definition.get("description").and_then(Value::as_str);
     let _written = write!(page, "\n## {name}\n\n");
@@ -208,7 +208,7 @@ fn table(name: &str, definition: &Value, page: &mut String) {
     let _written = writeln!(page, "{}", kind(definition));
 }
 
-/// Returns the kind of a value in words, with links to the definitions it refers to.
+/// Returns the kind of a value in words, with links to the referenced definitions.
 fn kind(value: &Value) -> String {
     if let Some(name) = value.get("$ref").and_then(Value::as_str) {
         let name = name.rsplit('/').next().unwrap_or(name);
@@ -244,7 +244,7 @@ fn kind(value: &Value) -> String {
     kinds.join(" or ")
 }
 
-/// Returns a type of JSON in the words of YAML, with its bounds.
+/// Returns a JSON type in the words of YAML, with its bounds.
 fn simple(kind: &str, value: &Value) -> String {
     let number = |key: &str| value.get(key).and_then(Value::as_number);
     match kind {
@@ -278,7 +278,8 @@ fn cell(text: &str) -> String {
     words.join(" ").replace('|', "\\|")
 }
 
-/// Returns the metrics of a source file, without its tests: texts behind `before` with that end.
+/// Returns the metrics of a source file, without its tests: texts after `before` that end with
+/// `end`.
 fn metrics<'a>(source: &'a str, before: &'a str, end: &'a str) -> impl Iterator<Item = &'a str> {
     let (source, _) = source.split_once("#[cfg(test)]").unwrap_or((source, ""));
     let behind = source.split(before).skip(1);

@@ -1,4 +1,5 @@
-//! `cargo xtask bench uadp` and `bench messages`: wall time, and instructions, which no busy machine changes.
+//! `cargo xtask bench uadp` and `bench messages`: measure wall time, and instructions, which do not
+//! depend on the load of the machine.
 
 use std::{
     collections::BTreeMap,
@@ -15,14 +16,15 @@ use crate::{
     workspace::{SHIPPED, Workspace},
 };
 
-/// More instructions than the list has, by so many percent, are a step back. Compilers differ by less.
+/// Percentage above the listed instructions that counts as a regression. Compilers differ by less.
 const TOLERANCE: u64 = 10;
-/// The difference of two runs leaves out what starting costs.
+/// The difference of two runs excludes the cost of the program start.
 const FEW: u64 = 1_000;
 const MANY: u64 = 3_000;
 
-/// Measures the crate `of`, which has a package `of-bench` in its folder `bench`. `--instructions` compares only the
-/// instructions with the list there, `--update` writes the list anew. `after` follows the wall time.
+/// Measures the crate `of`, which has a package `of-bench` in its folder `bench`. `--instructions`
+/// only compares the instructions with the list in this folder, `--update` rewrites the list.
+/// `after` runs after the measurement of wall time.
 pub(crate) fn run(
     workspace: &Workspace,
     of: &str,
@@ -46,7 +48,8 @@ pub(crate) fn run(
         must(&mut Command::new(&bench))?;
         after(&bench)?;
     }
-    // Crate by crate, which builds in a third of the time: CI counts, too.
+    // The release profile compiles crate by crate, which builds in a third of the time; CI counts
+    // instructions too.
     step("building the measurement with optimisation");
     let bench = built(workspace, &package, "release")?;
     ensure!(
@@ -95,10 +98,10 @@ fn count(bench: &PathBuf, name: &str, messages: u64) -> anyhow::Result<u64> {
     }
 }
 
-/// What the codec took when the list was last written.
+/// The instruction counts at the last update of the list.
 struct List {
     path: PathBuf,
-    /// The crate.
+    /// The name of the crate.
     of: String,
 }
 

@@ -1,4 +1,5 @@
-//! The names of `ua-bridge`: links beside the program, by which it acts as one of the programs of the plant.
+//! The names of `ua-bridge`: links to the program, which select the program of the plant that it
+//! runs as.
 
 use std::{
     fs,
@@ -9,9 +10,9 @@ use std::{
 
 use anyhow::Context as _;
 
-/// The program behind the links.
+/// The target of the links.
 pub(crate) const TARGET: &str = "ua-bridge";
-/// The names that the program acts by.
+/// The names of the links.
 pub(crate) const NAMES: [&str; 7] = [
     "ua-component",
     "ua-gds",
@@ -22,8 +23,8 @@ pub(crate) const NAMES: [&str; 7] = [
     "ua-station",
 ];
 
-/// Makes the links in a folder with `ua-bridge`. A file with the name of a link is replaced. A link never dangles in between,
-/// since tests may run beside it.
+/// Creates the links in a folder with `ua-bridge`. A file with the name of a link is replaced. Each
+/// link is replaced atomically, because tests may run at the same time.
 ///
 /// # Errors
 /// Returns an error if the folder cannot be written.

@@ -1,4 +1,4 @@
-//! `cargo xtask lint`: the checks that do not run the code.
+//! `cargo xtask lint`: runs the checks that do not execute the code.
 
 use std::{
     ffi::OsString,
@@ -15,7 +15,7 @@ use crate::{
 };
 
 const DENY: &str = "0.20.2";
-/// The advisory database is a few megabytes; a network that takes longer has it not.
+/// Time limit of the download of the advisory database, which has a few megabytes.
 const FETCH: Duration = Duration::from_secs(120);
 
 /// Checks formatting, lints and documentation. All checks run, so that one run shows every finding.
@@ -45,8 +45,8 @@ pub(crate) fn run(workspace: &Workspace) -> anyhow::Result<Ended> {
     Ok(checks.ended())
 }
 
-/// Checks licences, sources, duplicates and advisories of the dependencies, and that the workspace compiles with all
-/// crates as published, without the patches.
+/// Checks licences, sources, duplicates and advisories of the dependencies, and that the workspace
+/// compiles with all crates as published, without the patches.
 ///
 /// # Errors
 /// Returns an error if cargo cannot be started or cargo-deny cannot be built.
@@ -76,7 +76,7 @@ pub(crate) fn dependencies(workspace: &Workspace) -> anyhow::Result<Ended> {
     Ok(checks.ended())
 }
 
-/// The commands that failed, of those that ran.
+/// The commands that failed.
 #[derive(Default)]
 struct Checks {
     failed: Vec<String>,
@@ -103,11 +103,11 @@ impl Checks {
     }
 }
 
-/// cargo-deny, wherever it is.
+/// The path of cargo-deny.
 struct Deny(OsString);
 
 impl Deny {
-    /// The one in PATH, or else one of our own, built once.
+    /// Returns cargo-deny from PATH, or builds it once.
     fn find(workspace: &Workspace) -> anyhow::Result<Self> {
         if succeeds("cargo-deny", &["--version"]) {
             return Ok(Self("cargo-deny".into()));
@@ -125,7 +125,8 @@ impl Deny {
                     .cargo(&[
                         "install",
                         "--locked",
-                        // It runs for seconds and is built in a third of the time.
+                        // The program runs for seconds only, and a debug build takes a third of the
+                        // time.
                         "--debug",
                         &format!("cargo-deny@{DENY}"),
                         "--root",
@@ -149,7 +150,7 @@ impl Deny {
         command
     }
 
-    /// Brings the advisory database up to date, or says why that is not possible here.
+    /// Updates the advisory database, or returns the reason why it cannot be updated.
     fn fetch(&self, workspace: &Workspace) -> anyhow::Result<Result<(), String>> {
         step("fetching the advisory database");
         let child = self

@@ -1,4 +1,4 @@
-//! The project's own commands: `cargo xtask <verb>`.
+//! The commands of the project: `cargo xtask <verb>`.
 #![expect(
     clippy::print_stdout,
     clippy::print_stderr,

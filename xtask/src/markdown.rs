@@ -1,4 +1,4 @@
-//! Links between the Markdown pages of the project.
+//! Checks links between the Markdown pages of the project.
 
 use std::{
     collections::BTreeSet,
@@ -44,7 +44,7 @@ pub(crate) fn broken_links(root: &Path) -> anyhow::Result<Vec<String>> {
     Ok(broken)
 }
 
-/// Returns whether the file and the heading of a link exist.
+/// Returns true if the file and the heading of a link exist.
 fn has_target(root: &Path, page: &Path, text: &str, link: &str) -> anyhow::Result<bool> {
     let (path, anchor) = link.split_once('#').unwrap_or((link, ""));
     if path.is_empty() {
@@ -75,7 +75,7 @@ fn links(text: &str) -> impl Iterator<Item = &str> {
     })
 }
 
-/// Returns the anchors of all headings, as the usual hosts make them.
+/// Returns the anchors of all headings, in the form that the usual hosts generate.
 fn anchors(text: &str) -> BTreeSet<String> {
     let headings = prose(text).filter(|line| line.starts_with('#'));
     let titles = headings.map(|line| line.trim_start_matches('#').trim().to_lowercase());

@@ -1,22 +1,22 @@
-//! Who may make network namespaces, which the system tests live in.
+//! Network namespaces for the system tests, and the permission to create them.
 
 use std::{ffi::OsStr, process::Command};
 
 use crate::shell::succeeds;
 
-/// How a program gets the right to make network namespaces.
+/// The way in which a program gets the permission to create network namespaces.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Namespaces {
-    /// It has it already.
+    /// The user has the permission.
     Allowed,
-    /// In a user namespace where the user is root.
+    /// The program runs in a user namespace with the user as root.
     AsRootOfTheirOwn,
-    /// Not on this machine.
+    /// This machine does not permit it.
     Refused,
 }
 
 impl Namespaces {
-    /// Tries what this machine lets this user do.
+    /// Tests the permissions of this user on this machine.
     pub(crate) fn try_out() -> Self {
         if succeeds("unshare", &["--net", "true"]) {
             Self::Allowed
@@ -27,7 +27,8 @@ impl Namespaces {
         }
     }
 
-    /// `program`, started so that it may make namespaces where that can be had.
+    /// Returns a command that starts `program` with the permission to create namespaces, if this is
+    /// possible.
     pub(crate) fn command(self, program: impl AsRef<OsStr>) -> Command {
         match self {
             Self::Allowed | Self::Refused => Command::new(program),
@@ -39,7 +40,8 @@ impl Namespaces {
         }
     }
 
-    /// `program` in a network of its own, with nothing in it but a loopback that carries multicast.
+    /// Returns a command that starts `program` in a network of its own, which has a loopback
+    /// interface with multicast only.
     pub(crate) fn alone(self, program: impl AsRef<OsStr>) -> Command {
         let mut command = Command::new("unshare");
         if self == Self::AsRootOfTheirOwn {
@@ -55,6 +57,6 @@ impl Namespaces {
 const LOOPBACK: &str = "ip link set lo up && ip link set lo multicast on && ip route add 224.0.0.0/4 dev lo \
     && exec \"$0\" \"$@\"";
 
-/// Why the tests that need a network of their own cannot run.
+/// The reason why tests that need a network of their own cannot run.
 pub(crate) const REFUSED: &str = "this user may make no network namespace, not even in a user namespace of their own \
     (unshare --map-root-user --net); run as root, or let users have them: sysctl kernel.unprivileged_userns_clone=1";

@@ -1,9 +1,10 @@
-//! Published crates as this project changes them: their sources and the patches of `patches/NAME-VERSION/`, put together
+//! Patched crates: the published sources with the patches of `patches/NAME-VERSION/`, combined
 //! under `target/`.
 //!
-//! Cargo then builds with those folders through its configuration key `paths`. A `[patch]` table, in the manifest or in the
-//! configuration, would rewrite `Cargo.lock`, which `--locked` refuses; `paths` leaves it alone, since a path override
-//! may change the source of a package, not its dependencies.
+//! Cargo builds with these folders through its configuration key `paths`. A `[patch]` table, in the
+//! manifest or in the configuration, would rewrite `Cargo.lock`, which `--locked` refuses. `paths`
+//! does not change `Cargo.lock`, because a path override may change the source of a package but not
+//! its dependencies.
 
 use std::{
     env,
@@ -22,18 +23,19 @@ use crate::{
     workspace::Workspace,
 };
 
-/// All patched sources, ready to be built with.
+/// All patched sources, ready for builds.
 pub(crate) struct Patched {
     sources: Vec<Source>,
     features: [&'static str; 2],
 }
 
 impl Patched {
-    /// Brings the patched sources up to date. A file is written only when its contents change: cargo looks at the times of
-    /// files.
+    /// Updates the patched sources. A file is written only if its contents change, because cargo
+    /// checks modification times.
     ///
     /// # Errors
-    /// When there are patches for what is not locked, one of them does not apply, or a folder cannot be written.
+    /// Returns an error if the crate of a patch is not in Cargo.lock, a patch does not apply, or a
+    /// folder cannot be written.
     pub(crate) fn prepare(workspace: &Workspace) -> anyhow::Result<Self> {
         let features = features();
         if !features.concat().contains("security") {
@@ -53,14 +55,17 @@ impl Patched {
         &self.sources
     }
 
-    /// A command of cargo that compiles with the patched sources, in the root. The verb, such as `build`, comes first in
-    /// `arguments`, and `bridge-ros2` must be among the packages.
+    /// Returns a command of cargo that compiles with the patched sources, in the root of the
+    /// workspace. The verb, such as `build`, comes first in `arguments`, and `bridge-ros2` must be
+    /// among the packages.
     ///
-    /// Everything that is built or tested goes through here: with other flags cargo would build it all again.
+    /// All builds and tests use this command, because other flags would make cargo build everything
+    /// again.
     pub(crate) fn cargo(&self, workspace: &Workspace, arguments: &[&str]) -> Command {
         let mut command = workspace.cargo(&[]);
         let (verb, rest) = arguments.split_at(1.min(arguments.len()));
-        // Behind the verb: cargo does not hand what is before it to an external verb such as clippy.
+        // The configuration follows the verb, because cargo does not pass earlier arguments to an
+        // external verb such as clippy.
         command
             .args(verb)
             .args(self.configuration())
@@ -77,12 +82,12 @@ impl Patched {
     }
 }
 
-/// One crate, patched.
+/// A patched crate.
 pub(crate) struct Source {
     /// `NAME-VERSION`.
     name: String,
     folder: PathBuf,
-    /// Names of the tests that the patches add to its own.
+    /// Names of the tests that the patches add.
     tests: Vec<String>,
 }
 
@@ -131,16 +136,16 @@ impl Source {
         Ok(source)
     }
 
-    /// `NAME-VERSION`.
+    /// Returns `NAME-VERSION`.
     pub(crate) fn name(&self) -> &str {
         &self.name
     }
 
-    /// A command of cargo that builds the unit tests of the patched source by itself, outside of the workspace, with the
-    /// other patched sources that it depends on.
+    /// Returns a command of cargo that builds the unit tests of the patched source outside of the
+    /// workspace, with the other patched sources on which it depends.
     pub(crate) fn build_of_own_tests(&self, workspace: &Workspace, patched: &Patched) -> Command {
         let mut command = workspace.cargo(&["test", "--no-run", "--lib", "--locked"]);
-        // The tests of this crate are of all its encodings, and do not compile without them.
+        // The tests of this crate use all its encodings, and do not compile without them.
         if self.name.starts_with("async-opcua-types-") {
             command.arg("--all-features");
         }
@@ -154,14 +159,14 @@ impl Source {
         command
     }
 
-    /// The names of the tests that the patches add.
+    /// Returns the names of the tests that the patches add.
     pub(crate) fn tests(&self) -> &[String] {
         &self.tests
     }
 }
 
-/// What `bridge-ros2` may use of the patched source only. For `security` it is linked with OpenSSL: where that is not
-/// there it is left out, so that the demo runs anywhere, but never in CI, whose tests need it.
+/// Returns the features of `bridge-ros2` that need the patched sources. `security` links OpenSSL.
+/// Without OpenSSL it is left out, so the demo runs anywhere, but not in CI, whose tests need it.
 fn features() -> [&'static str; 2] {
     let is_there = env::var_os("OPENSSL_DIR").is_some()
         || succeeds("pkg-config", &["--exists", "openssl"])
@@ -174,7 +179,7 @@ fn features() -> [&'static str; 2] {
     ["--features", features]
 }
 
-/// Prepares the sources and prints how to build with them by hand.
+/// Prepares the sources and prints the command for manual builds.
 pub(crate) fn run(workspace: &Workspace) -> anyhow::Result<Ended> {
     let patched = Patched::prepare(workspace)?;
     let [config, paths] = patched.configuration();
@@ -187,7 +192,7 @@ pub(crate) fn run(workspace: &Workspace) -> anyhow::Result<Ended> {
     Ok(Ended::WELL)
 }
 
-/// A crate as its authors published it.
+/// A published crate.
 struct Published {
     /// `NAME-VERSION`.
     name: String,
@@ -195,14 +200,14 @@ struct Published {
 }
 
 impl Published {
-    /// All that are locked. Asks cargo, which fetches them when they are not there.
+    /// Returns all locked crates from cargo, which fetches missing crates.
     fn all(workspace: &Workspace) -> anyhow::Result<Vec<Self>> {
         let mut command = workspace.cargo(&[
             "metadata",
             "--format-version",
             "1",
             "--locked",
-            // Else it fetches what only other systems need.
+            // Without this flag cargo also fetches crates of other platforms.
             "--filter-platform",
         ]);
         let output = command
@@ -228,7 +233,7 @@ impl Published {
     }
 }
 
-/// The system cargo builds for.
+/// Returns the host triple of rustc.
 fn host() -> anyhow::Result<String> {
     let rustc = env::var_os("RUSTC").unwrap_or_else(|| "rustc".into());
     let output = Command::new(rustc)
@@ -241,7 +246,7 @@ fn host() -> anyhow::Result<String> {
         .context("rustc -vV does not name the host")
 }
 
-/// The patches of one crate, in their order.
+/// The patches of a crate, in order.
 struct Patches(Vec<(PathBuf, String)>);
 
 impl Patches {
@@ -259,20 +264,21 @@ impl Patches {
         Ok(Self(patches))
     }
 
-    /// Everything the patched source depends on.
+    /// Returns the text of all inputs of the patched source.
     fn text(&self, published: &Path) -> String {
         let texts: String = self.0.iter().map(|(_, text)| text.as_str()).collect();
         format!("{}\n{texts}", published.display())
     }
 
-    /// The functions behind each `#[test]` that is added.
+    /// Returns the functions after each added `#[test]`.
     fn tests(&self) -> Vec<String> {
         let mut tests = Vec::new();
         for (_, text) in &self.0 {
             let mut is_test = false;
             for line in text.lines() {
                 let added = line.strip_prefix('+');
-                // The attribute may be that of the test behind it in the published source, which a patch shows as its own.
+                // The attribute may belong to the next test of the published source, which a patch
+                // shows as unchanged.
                 let Some(source) = added.or_else(|| line.strip_prefix(' ')) else {
                     continue;
                 };
@@ -296,7 +302,8 @@ impl Patches {
             git.current_dir(folder)
                 .args(["apply", "--whitespace=nowarn"])
                 .arg(path)
-                // In a repository git would take the paths to be those of the repository, and skip them as foreign to it.
+                // In a repository git would resolve the paths from its root and skip them as
+                // foreign.
                 .env_remove("GIT_DIR")
                 .env("GIT_CEILING_DIRECTORIES", folder.parent().unwrap_or(folder));
             let output = git
@@ -315,7 +322,7 @@ impl Patches {
     }
 }
 
-/// In the order of their names.
+/// Returns the subfolders in the order of their names.
 fn subfolders(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
     let mut folders = Vec::new();
     for entry in fs::read_dir(folder).with_context(|| folder.display().to_string())? {
@@ -350,7 +357,7 @@ fn copy(from: &Path, to: &Path) -> anyhow::Result<()> {
         if entry.file_type()?.is_dir() {
             copy(&entry.path(), &target)?;
         } else {
-            // Contents only: a registry may keep its files read-only.
+            // Only the contents are copied, because a registry may keep its files read-only.
             let contents =
                 fs::read(entry.path()).with_context(|| entry.path().display().to_string())?;
             fs::write(&target, contents).with_context(|| target.display().to_string())?;
@@ -359,7 +366,7 @@ fn copy(from: &Path, to: &Path) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Gives `old` the contents of `new`. Files that are the same keep their times.
+/// Gives `old` the contents of `new`. Unchanged files keep their modification times.
 fn renew(new: &Path, old: &Path) -> anyhow::Result<()> {
     fs::create_dir_all(old).with_context(|| old.display().to_string())?;
     for entry in fs::read_dir(old).with_context(|| old.display().to_string())? {

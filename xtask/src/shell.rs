@@ -1,10 +1,10 @@
-//! Running other programs and passing on how they ended.
+//! Runs other programs and passes on their exit codes.
 
 use std::process::{Command, ExitCode, ExitStatus};
 
 use anyhow::{Context as _, bail};
 
-/// How a command ended, for the exit code of this one.
+/// The outcome of a command, which gives the exit code of this program.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Ended(u8);
 
@@ -27,25 +27,25 @@ impl From<Ended> for ExitCode {
     }
 }
 
-/// Says what is done next.
+/// Prints the next step.
 pub(crate) fn step(what: &str) {
     println!("==> {what}");
 }
 
-/// Runs a command with the user's terminal and gives its status.
+/// Runs a command with the terminal of the user and returns its status.
 ///
 /// # Errors
-/// When it does not start.
+/// Returns an error if the command does not start.
 pub(crate) fn status(command: &mut Command) -> anyhow::Result<ExitStatus> {
     command
         .status()
         .with_context(|| format!("{} does not start", command.get_program().display()))
 }
 
-/// Runs a command that has to succeed.
+/// Runs a command that must succeed.
 ///
 /// # Errors
-/// When it does not start, or fails.
+/// Returns an error if the command does not start or fails.
 pub(crate) fn run(command: &mut Command) -> anyhow::Result<()> {
     let status = status(command)?;
     if !status.success() {
@@ -54,20 +54,20 @@ pub(crate) fn run(command: &mut Command) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Whether a command runs and succeeds; what it prints is nobody's business.
+/// Returns true if a command runs and succeeds; its output is discarded.
 pub(crate) fn succeeds(program: &str, arguments: &[&str]) -> bool {
     let output = Command::new(program).args(arguments).output();
     output.is_ok_and(|output| output.status.success())
 }
 
-/// The command as one would type it.
+/// Returns the command line.
 pub(crate) fn line(command: &Command) -> String {
     let words = std::iter::once(command.get_program()).chain(command.get_args());
     let words: Vec<String> = words.map(|word| word.display().to_string()).collect();
     words.join(" ")
 }
 
-/// Whether this runs where nobody watches and nothing may be skipped.
+/// Returns true in CI, where no test may be skipped.
 pub(crate) fn is_ci() -> bool {
     std::env::var_os("CI").is_some_and(|ci| ci == "true")
 }

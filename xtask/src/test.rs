@@ -1,7 +1,7 @@
-//! `cargo xtask test`: the peers, then every test there is.
+//! `cargo xtask test`: installs the peers, then runs all tests.
 //!
-//! Tests of the package `system-tests` are processes of their own, some beside each other, since most of what they do
-//! is wait for peers. All other test programs run as `cargo test` runs them.
+//! Tests of the package `system-tests` run as separate processes, some of them concurrently,
+//! because they mostly wait for peers. All other test programs run as with `cargo test`.
 
 mod job;
 mod outcome;
@@ -29,14 +29,17 @@ use job::{Job, Lanes, Report};
 use outcome::Outcome;
 use programs::Program;
 
-/// Every target of a test run. All commands build these for the same packages, so that nothing is built twice.
+/// The targets of a test run. All commands build the same packages, so nothing is built twice.
 const TARGETS: &[&str] = &["--workspace", "--locked"];
 const SYSTEM_TESTS: &str = "system-tests";
-/// Modules of the system tests that measure what the machine can carry: a test beside them would be measured too.
+/// Modules of the system tests that measure the load of the machine; concurrent tests would be
+/// measured too.
 const ALONE: &[&str] = &["large", "rate", "ros2_fuzz", "ros2_large", "sharing"];
-/// System tests at a time, on two cores. Most of what they do is wait; more at a time were not tried.
+/// Number of concurrent system tests, chosen for two cores. The tests mostly wait; higher numbers
+/// were not tried.
 const BESIDE: usize = 3;
-/// Peers of other makers fail now and then where nothing of ours takes part. More of it than this is no accident.
+/// Maximum number of flaky tests. Peers of other vendors fail occasionally even without this
+/// project; more failures indicate a fault.
 const MOST_FLAKY: usize = 2;
 
 pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
@@ -49,7 +52,7 @@ pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<E
         return Ok(Ended::USAGE);
     }
     if options.is_empty() {
-        // What is missing skips its own tests, or fails them with CI=true; the others run.
+        // Tests of missing peers skip themselves, or fail with CI=true; the other tests run.
         peers::install(workspace);
     }
     step("building the programs and the tests (some minutes the first time)");
@@ -75,7 +78,7 @@ pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<E
     Ok(outcome.ended())
 }
 
-/// Runs the tests that the patches add to their crates, and nothing else.
+/// Runs only the tests that the patches add to their crates.
 pub(crate) fn of_all_patches(workspace: &Workspace) -> anyhow::Result<Ended> {
     let patched = Patched::prepare(workspace)?;
     let programs = of_patches(workspace, &patched)?;
@@ -96,7 +99,7 @@ fn of_patches<'a>(
 ) -> anyhow::Result<Vec<(&'a Source, Program)>> {
     let mut all = Vec::new();
     for source in patched.sources() {
-        // Without names of tests it would run all that the crate has.
+        // Without test names the program would run all tests of the crate.
         if !source.tests().is_empty() {
             let built = programs::build(source.build_of_own_tests(workspace, patched))?;
             all.extend(built.into_iter().map(|program| (source, program)));
@@ -105,11 +108,11 @@ fn of_patches<'a>(
     Ok(all)
 }
 
-/// What runs, and what of it at the same time.
+/// The jobs, grouped by their concurrency.
 struct Plan {
-    /// One after the other: they take all cores themselves.
+    /// Jobs that run in sequence, because they use all cores themselves.
     programs: Vec<Job>,
-    /// [`BESIDE`] at a time.
+    /// Jobs that run with the concurrency [`BESIDE`].
     beside: Vec<Job>,
     alone: Vec<Job>,
 }
@@ -199,7 +202,8 @@ fn job_of_patches(source: &Source, program: &Program, namespaces: Namespaces) ->
     Job::new(format!("{}, what patches/ adds", source.name()), command)
 }
 
-/// More failures than this are no accident of a peer, and trying them all again would take CI's time.
+/// Maximum number of failures that are retried. More failures are not accidents of a peer, and
+/// retrying them would take the time of CI.
 const MOST_RETRIED: usize = 10;
 
 fn minutes(time: Duration) -> String {

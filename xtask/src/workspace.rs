@@ -1,25 +1,26 @@
-//! Where things are.
+//! The paths of the workspace.
 
 use std::{env, ffi::OsString, path::PathBuf, process::Command};
 
 use anyhow::{Context as _, ensure};
 use serde_json::Value;
 
-/// The profile of what is handed out and measured as a whole, and its folder below `target`.
+/// The profile of shipped programs and whole-program measurements, and the name of its folder below
+/// `target`.
 pub(crate) const SHIPPED: &str = "shipped";
 
 /// The paths of this workspace.
 pub(crate) struct Workspace {
     pub(crate) root: PathBuf,
-    /// Where cargo builds, wherever the user has put that.
+    /// The target directory of cargo, as configured by the user.
     pub(crate) target: PathBuf,
 }
 
 impl Workspace {
-    /// Asks cargo.
+    /// Queries the paths from cargo.
     ///
     /// # Errors
-    /// When cargo does not answer.
+    /// Returns an error if `cargo metadata` fails.
     pub(crate) fn find() -> anyhow::Result<Self> {
         let output = Command::new(cargo_program())
             .args(["metadata", "--no-deps", "--format-version", "1", "--locked"])
@@ -49,15 +50,16 @@ impl Workspace {
         found.unwrap_or_else(|| self.root.join(of))
     }
 
-    /// What the peers of the tests are installed into.
+    /// Returns the folder into which the peers of the tests are installed.
     pub(crate) fn peers(&self) -> PathBuf {
         self.target.join("peers")
     }
 
     /// Returns a command of cargo in the root.
     ///
-    /// `cargo run`, which starts this program, sets variables that describe this package. Build scripts (of `ring`, for
-    /// one) run again when those change, so a cargo started by hand would build half of the workspace again.
+    /// `cargo run`, which starts this program, sets variables that describe this package. Build
+    /// scripts, for example of `ring`, run again if these variables change, so a cargo started by
+    /// hand would build half of the workspace again.
     pub(crate) fn cargo(&self, arguments: &[&str]) -> Command {
         let mut command = Command::new(cargo_program());
         for (name, _) in env::vars_os() {

@@ -1,5 +1,6 @@
-//! The peers that are compiled here: Fast DDS, Cyclone DDS and roscpp by their own libraries, from `tests/peers/dds` and
-//! `tests/peers/calls`, and the library that shifts clocks, from `tests/peers/clock`.
+//! The compiled peers: Fast DDS, Cyclone DDS and roscpp with their own libraries, from
+//! `tests/peers/dds` and `tests/peers/calls`, and the library that shifts clocks, from
+//! `tests/peers/clock`.
 
 use std::{fs, path::Path, process::Command};
 
@@ -10,12 +11,12 @@ use crate::{
     workspace::Workspace,
 };
 
-/// One program and what it is made of.
+/// A program with its sources.
 struct Program {
     name: &'static str,
-    /// Below `tests/peers/dds`.
+    /// The source files, relative to `tests/peers/dds`.
     sources: &'static [&'static str],
-    /// The types it knows, which Cyclone's own compiler turns into C.
+    /// The IDL file of its types, which the compiler of Cyclone DDS translates to C.
     types: Option<&'static str>,
     libraries: &'static [&'static str],
 }
@@ -51,7 +52,7 @@ const PROGRAMS: &[Program] = &[
             "-pthread",
         ],
     },
-    // Loaded into programs under test.
+    // Preloaded into tested programs.
     Program {
         name: "clock-shift.so",
         sources: &["../clock/shift.cpp"],
@@ -69,10 +70,10 @@ const HEADERS: &[&str] = &[
     "lines.hpp",
 ];
 
-/// Compiles what is not there yet, or was made from other sources.
+/// Compiles the programs that are missing or have changed sources.
 ///
 /// # Errors
-/// When a source cannot be read, or does not compile. The other programs are made all the same.
+/// Returns an error if a source cannot be read or compiled. The other programs are still built.
 pub(super) fn build(workspace: &Workspace) -> anyhow::Result<()> {
     let mut first = Ok(());
     for program in PROGRAMS {
@@ -101,7 +102,7 @@ impl Program {
         fs::write(&stamp, wanted).with_context(|| format!("{} cannot be written", stamp.display()))
     }
 
-    /// All that the program is made of, in one text.
+    /// Returns all sources of the program in one text.
     fn source(&self, folder: &Path) -> anyhow::Result<String> {
         let types = self.types.map(|types| format!("{types}.idl"));
         let names = self.sources.iter().chain(HEADERS).copied();

@@ -1,4 +1,4 @@
-//! Test processes: started some at a time, watched, and counted.
+//! Test processes: started with limited concurrency, monitored, and counted.
 
 use std::{
     collections::VecDeque,
@@ -10,12 +10,12 @@ use std::{
 
 use anyhow::Context as _;
 
-/// A test that takes longer than this hangs: the longest one takes a minute. Peers that it has started then are not
-/// ended with it.
+/// Time limit of a test, after which it counts as hung; the longest test takes a minute. Peers that
+/// a hung test has started are not stopped.
 const LONGEST: Duration = Duration::from_secs(600);
 const LOOK_EVERY: Duration = Duration::from_millis(20);
 
-/// One process with one test or more.
+/// A process with one test or more.
 pub(super) struct Job {
     name: String,
     command: Command,
@@ -31,13 +31,13 @@ impl Job {
         }
     }
 
-    /// Software of other makers takes part in it.
+    /// Marks the job as a test with software of other vendors.
     pub(super) fn with_peers(mut self) -> Self {
         self.has_peers = true;
         self
     }
 
-    /// Runs it to its end, or to that of the time it has.
+    /// Runs the job to its end, or to its time limit.
     fn run(mut self) -> anyhow::Result<Done> {
         #[expect(
             clippy::disallowed_methods,
@@ -55,7 +55,7 @@ impl Job {
         let (printed, status) = thread::scope(|scope| {
             let read = |pipe: &mut dyn std::io::Read| {
                 let mut bytes = Vec::new();
-                // What cannot be read is no fault of the test; what was read until then is shown.
+                // A read error is not a fault of the test; the output read so far is shown.
                 let _read = pipe.read_to_end(&mut bytes);
                 String::from_utf8_lossy(&bytes).into_owned()
             };
@@ -69,7 +69,7 @@ impl Job {
         let mut counts = Counts::of(&printed);
         let passed = ended.is_some_and(|status| status.success());
         if !passed && counts.failed == 0 {
-            // It ended without a word of its own, as by a signal.
+            // The program ended without a result, for example by a signal.
             counts.failed = 1;
         }
         Ok(Done {
@@ -83,7 +83,7 @@ impl Job {
     }
 }
 
-/// The status, or `None` of one that had to be ended.
+/// Returns the exit status, or `None` if the process was killed at the time limit.
 #[expect(
     clippy::disallowed_methods,
     reason = "waiting for a process with a deadline is looking again and again"
@@ -105,7 +105,7 @@ fn wait(child: &mut Child, start: Instant) -> std::io::Result<Option<ExitStatus>
     }
 }
 
-/// What test programs say of themselves in the end.
+/// The counts in the results of test programs.
 #[derive(Debug, Default, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Counts {
     pub(super) passed: u64,
@@ -154,7 +154,7 @@ impl Done {
         let took = self.took.as_secs_f64();
         if self.passed {
             if self.counts == Counts::default() {
-                // A program without tests, or without one that was asked for.
+                // A program without tests, or without tests that match the filters.
                 return;
             }
             let count = match self.counts.passed {
@@ -173,11 +173,11 @@ impl Done {
     }
 }
 
-/// So many jobs at a time.
+/// The number of concurrent jobs.
 pub(super) struct Lanes(pub(super) usize);
 
 impl Lanes {
-    /// Runs all, and shows each as it ends; what failed with all it printed.
+    /// Runs all jobs and prints each result as it ends, for failures with the whole output.
     pub(super) fn run(self, jobs: Vec<Job>) -> anyhow::Result<Vec<Done>> {
         let waiting = Mutex::new(VecDeque::from(jobs));
         let next = || {
@@ -207,7 +207,7 @@ impl Lanes {
     }
 }
 
-/// All that ran.
+/// The results of all jobs.
 #[derive(Default)]
 pub(super) struct Report {
     pub(super) done: Vec<Done>,
@@ -220,7 +220,7 @@ impl Report {
         self.done.extend(done);
     }
 
-    /// Takes out what failed and may be tried again; nothing where that is more than `most`.
+    /// Removes and returns the failed jobs that may be retried; none if there are more than `most`.
     pub(super) fn failed_with_peers(&mut self, most: usize) -> Vec<Job> {
         let may = |done: &Done| !done.passed && done.job.has_peers;
         if self.done.iter().filter(|done| may(done)).count() > most {
@@ -231,7 +231,7 @@ impl Report {
         again.into_iter().map(|done| done.job).collect()
     }
 
-    /// Takes the second try of tests.
+    /// Adds the results of a retry.
     pub(super) fn retry(&mut self, done: Vec<Done>) {
         let passed = done.iter().filter(|done| done.passed);
         self.flaky.extend(passed.map(|done| done.name().to_owned()));

@@ -1,4 +1,4 @@
-//! The closing lines.
+//! The summary of a test run.
 
 use std::{cmp::Reverse, fmt, time::Duration};
 
@@ -7,7 +7,7 @@ use crate::shell::Ended;
 
 const SLOWEST: usize = 20;
 
-/// What is said when all tests have run.
+/// The summary of a test run.
 pub(super) struct Outcome<'a> {
     counts: Counts,
     programs: usize,
@@ -19,8 +19,8 @@ pub(super) struct Outcome<'a> {
 }
 
 impl<'a> Outcome<'a> {
-    /// `skipped` has the reasons of the tests that did not run. More than `most_flaky` tests that passed at the second
-    /// try only are a failure.
+    /// Creates the summary. `skipped` has the reasons of skipped tests. More than `most_flaky`
+    /// tests that passed only at the second attempt are a failure.
     pub(super) fn new(report: &'a Report, skipped: Vec<&'a str>, most_flaky: usize) -> Self {
         let mut counts = Counts::default();
         for done in &report.done {
@@ -84,7 +84,7 @@ impl fmt::Display for Outcome<'_> {
             true => "ok",
             false => "FAILED",
         };
-        // A skipped test returns early, which its program counts as passed.
+        // A skipped test returns early, so its program counts it as passed.
         let skipped = u64::try_from(self.skipped.len()).unwrap_or(u64::MAX);
         writeln!(
             f,

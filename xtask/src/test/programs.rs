@@ -1,4 +1,4 @@
-//! The test programs that cargo builds, and the tests in them.
+//! The test programs that cargo builds, and their tests.
 
 use std::{
     path::{Path, PathBuf},
@@ -10,21 +10,21 @@ use serde_json::Value;
 
 use crate::{namespace::Namespaces, shell::line};
 
-/// One executable with tests.
+/// An executable with tests.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) struct Program {
     pub(super) package: String,
-    /// Of the target: `router` for `tests/router.rs`.
+    /// The name of the target: `router` for `tests/router.rs`.
     pub(super) name: String,
     executable: PathBuf,
-    /// Of the package: tests find their files from there.
+    /// The folder of the package, which is the working directory of its tests.
     folder: PathBuf,
 }
 
-/// Builds with a command of cargo and gives the programs with tests among what it made.
+/// Runs a build command of cargo and returns the built programs with tests.
 ///
 /// # Errors
-/// When cargo does not start, or fails; it has said why on stderr then.
+/// Returns an error if cargo does not start or fails; the reason is on stderr.
 pub(super) fn build(mut cargo: Command) -> anyhow::Result<Vec<Program>> {
     let output = cargo
         .arg("--message-format=json-render-diagnostics")
@@ -41,7 +41,7 @@ pub(super) fn build(mut cargo: Command) -> anyhow::Result<Vec<Program>> {
 }
 
 impl Program {
-    /// Of a message of cargo; `None` where it tells of something else.
+    /// Parses a message of cargo; `None` for messages about other things than test programs.
     fn of(message: &str) -> anyhow::Result<Option<Self>> {
         let message: Value = serde_json::from_str(message)
             .with_context(|| format!("cargo said something that is not JSON: {message}"))?;
@@ -65,7 +65,7 @@ impl Program {
         }))
     }
 
-    /// The package, and the target where it is called otherwise.
+    /// Returns the package, and the target if it has another name.
     pub(super) fn label(&self) -> String {
         let stem = self.executable.file_stem().unwrap_or_default();
         let stem = stem.to_string_lossy();
@@ -76,12 +76,12 @@ impl Program {
         }
     }
 
-    /// A run of it, as `cargo test` would start it.
+    /// Returns a command that runs the program as `cargo test` does.
     pub(super) fn command(&self, namespaces: Namespaces) -> Command {
         self.at_home(namespaces.command(&self.executable))
     }
 
-    /// The same in a network of its own.
+    /// Like `command`, in a network of its own.
     pub(super) fn alone(&self, namespaces: Namespaces) -> Command {
         self.at_home(namespaces.alone(&self.executable))
     }
@@ -93,10 +93,11 @@ impl Program {
         command
     }
 
-    /// The names of its tests that contain one of the filters, or of all where there is none.
+    /// Returns the names of its tests that contain one of the filters, or all names without
+    /// filters.
     ///
     /// # Errors
-    /// When the program does not list them.
+    /// Returns an error if the program does not list its tests.
     pub(super) fn tests(&self, filters: &[&str]) -> anyhow::Result<Vec<String>> {
         let output = Command::new(&self.executable)
             .current_dir(&self.folder)
@@ -117,7 +118,8 @@ impl Program {
     }
 }
 
-/// The name in `path+file:///..#name@version`, which is left out where the folder is called the same.
+/// Returns the name in `path+file:///..#name@version`. Cargo omits the name if it equals the name
+/// of the folder.
 fn package(id: &str, folder: &Path) -> String {
     let fragment = id.rsplit_once('#').map(|(_, fragment)| fragment);
     match fragment.and_then(|fragment| fragment.split_once('@')) {
