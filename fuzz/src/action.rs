@@ -1,12 +1,12 @@
-//! Any bytes as an Action message.
+//! Fuzzes Action messages with arbitrary bytes.
 
 use uadp::action::{
     ActionDialect, ActionEncoder, ActionEncoding, ActionFields, ActionMessage, ActionStart,
 };
 use uadp::{Extras, NetworkMessage, Variant};
 
-/// The first byte chooses the dialect, the rest is the datagram. What can be read to its end is written again and has to
-/// read the same.
+/// Decodes an Action message. The first byte selects the dialect, the rest is the datagram. A
+/// message that is decoded completely is encoded again and must decode to the same message.
 pub fn action(input: &[u8]) {
     let Some((choice, datagram)) = input.split_first() else {
         return;
@@ -50,7 +50,7 @@ pub fn action(input: &[u8]) {
         assert_eq!(one.call(), other.call());
         assert_eq!(one.header(), other.header());
         assert_eq!(one.writer_id, other.writer_id);
-        // NaN is not equal to itself, so the headers are compared by what they print.
+        // NaN is not equal to itself, so the headers are compared by their debug output.
         assert_eq!(format!("{:?}", one.action), format!("{:?}", other.action));
         let _ = one.action.timeout();
     }
@@ -66,7 +66,7 @@ fn is_readable(message: &ActionMessage<'_>) -> bool {
     }
 }
 
-/// The message from its values; `None` for what does not fit again.
+/// Encodes the message from its values; `None` if the values do not fit.
 fn write(network: &NetworkMessage<'_>, dialect: ActionDialect) -> Option<Vec<u8>> {
     let actions = network.actions(dialect).ok()?;
     let promoted: Option<Vec<Variant<'_>>> = match network.promoted_fields() {
@@ -88,7 +88,7 @@ fn write(network: &NetworkMessage<'_>, dialect: ActionDialect) -> Option<Vec<u8>
     for message in actions {
         let message = message.ok()?;
         match message.fields {
-            // Field by field, so that the padding is left out.
+            // The fields are written separately, so padding is left out.
             ActionFields::Variants(_) => {
                 let mut fields = encoder.variants(&message.header(), message.call()).ok()?;
                 for field in message.fields.variants().ok()? {

@@ -1,4 +1,5 @@
-//! A Requestor and a Responder, with somebody between them who keeps, changes, doubles and makes up what they say.
+//! Fuzzes a Requestor and a Responder with an attacker between them, who delays, changes,
+//! duplicates and forges messages.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -12,19 +13,21 @@ use uadp::{Extras, NetworkHeader, NetworkMessage, OwnedPublisherId, StatusCode};
 
 use crate::input::Input;
 
-/// More messages than this add nothing.
+/// Maximum number of messages; more messages add no coverage.
 const MESSAGES: usize = 256;
 const REQUESTS: usize = 6;
 const BYTES: usize = 4000;
-/// Requests that are over, and what each may take up.
+/// Number of completed requests, and the size of each.
 const OVER: usize = 4;
 const OVER_BYTES: usize = OVER * 100;
 /// Longer than the time of any input.
 const REMEMBER: Duration = Duration::from_secs(3600);
 
-/// Operations, a byte each: call, send, deliver, deliver changed, deliver anything, finish, refuse, abandon, let time
-/// pass. Each call ends once at most, what is held stays within the limits, no wait is in the past, and without changed
-/// messages everything is executed once at most.
+/// Runs operations, each a byte: call, send, deliver, deliver changed, deliver arbitrary bytes,
+/// finish, refuse, abandon, let time pass.
+///
+/// Each call ends at most once, stored data stays within the limits, no timeout is in the past, and
+/// without changed messages each request is executed at most once.
 pub fn calls(data: &[u8]) {
     let mut input = Input::new(data);
     let mut world = World::new(input.byte());
@@ -77,7 +80,7 @@ struct World {
     calls: Vec<CallId>,
     ended: BTreeMap<CallId, u32>,
     executions: Vec<ExecutionId>,
-    /// By the number in the arguments.
+    /// The number of executions, by the number in the arguments.
     executed: BTreeMap<u8, u32>,
     changed: bool,
 }
@@ -216,7 +219,7 @@ impl World {
         );
     }
 
-    /// All ends, and nothing is said any more.
+    /// Runs until all calls have ended and no message is due.
     fn run_out(&mut self) {
         for _ in 0..100_000 {
             self.sent.clear();
@@ -224,7 +227,7 @@ impl World {
             let waits = [self.requestor.poll_timeout(), self.responder.poll_timeout()];
             let Some(next) = waits.into_iter().flatten().min() else {
                 assert_eq!(self.ended.len(), self.calls.len(), "a call without an end");
-                // Nobody is woken to forget those that are over.
+                // No timeout is scheduled for the release of completed requests.
                 self.responder.handle_timeout(self.now + REMEMBER);
                 assert_eq!(self.responder.held(), (0, 0));
                 return;
@@ -235,7 +238,7 @@ impl World {
     }
 }
 
-/// Notes what is sent, as long as there is room.
+/// Stores a sent message, up to the limit.
 fn keep(sent: &mut Vec<Vec<u8>>, message: &ActionToSend<'_>) {
     let mut datagram = Vec::new();
     message

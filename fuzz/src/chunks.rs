@@ -1,4 +1,4 @@
-//! Wholes that travel in chunks, in any order, with others in between.
+//! Fuzzes messages in chunks that arrive in any order, mixed with other chunks.
 
 use std::time::Duration;
 
@@ -20,7 +20,7 @@ const LIMITS: ReassemblyLimits = ReassemblyLimits {
     age: Duration::from_millis(200),
 };
 
-/// More chunks than this add nothing.
+/// Maximum number of chunks; more chunks add no coverage.
 const CHUNKS: usize = 256;
 
 struct Sent {
@@ -28,15 +28,16 @@ struct Sent {
     whole: usize,
 }
 
-/// Operations, a byte each: split a whole, deliver a chunk, deliver any datagram, let time pass. What comes out whole
-/// is what was split, and what is held stays within the limits.
+/// Runs operations, each a byte: split a message, deliver a chunk, deliver an arbitrary datagram,
+/// let time pass. A reassembled message equals the split message, and stored data stays within the
+/// limits.
 pub fn chunks(data: &[u8]) {
     let mut input = Input::new(data);
     let mut reassembler = Reassembler::new(LIMITS);
     let mut wholes: Vec<Vec<u8>> = Vec::new();
     let mut sent: Vec<Sent> = Vec::new();
     let mut now = Duration::ZERO;
-    // Chunks of anybody can be put in between those of a whole: nothing is signed here.
+    // Nothing is signed here, so forged chunks may be mixed with the chunks of a message.
     let mut forged = false;
     while !input.is_empty() {
         match input.byte() % 4 {
@@ -108,7 +109,7 @@ fn split(input: &mut Input<'_>, wholes: &mut Vec<Vec<u8>>, sent: &mut Vec<Sent>)
     wholes.push(bytes);
 }
 
-/// All but the last have as much of the whole (OPC 10000-14, 7.2.4.4.4).
+/// Asserts that all chunks except the last have the same size (OPC 10000-14, 7.2.4.4.4).
 fn assert_chunks(sent: &[Sent]) {
     let sizes: Vec<usize> = sent.iter().map(|chunk| chunk.datagram.len()).collect();
     if let Some((last, others)) = sizes.split_last() {

@@ -1,11 +1,12 @@
-//! Any bytes as a datagram.
+//! Fuzzes the decoder with arbitrary bytes as a datagram.
 
 use uadp::{
     Array, DataSetMessage, DataValue, DiagnosticInfo, Extras, FieldEncoding, MessageKind,
     NetworkMessage, NetworkMessageEncoder, Scalar, Variant,
 };
 
-/// Reads everything there is in a datagram. What can be read to its end is written again and has to read the same.
+/// Decodes all parts of a datagram. A datagram that is decoded completely is encoded again and must
+/// decode to the same message.
 pub fn decode(datagram: &[u8]) {
     let Ok(network) = NetworkMessage::decode(datagram) else {
         return;
@@ -31,7 +32,7 @@ pub fn decode(datagram: &[u8]) {
     }
 }
 
-/// Visits every value, however deep; false when something cannot be read.
+/// Visits every value at any depth; returns false if a part cannot be decoded.
 fn is_readable(message: &DataSetMessage<'_>) -> bool {
     if message.is_valid() {
         let number = message.header().sequence_number;
@@ -94,7 +95,7 @@ fn visit_array(array: Array<'_>, depth: usize) -> bool {
     true
 }
 
-/// What is nested was checked when it was read, so that getting it cannot fail.
+/// Nested values were checked when they were decoded, so `get` cannot fail.
 fn visit_scalar(scalar: Scalar<'_>, depth: usize) -> bool {
     match scalar {
         Scalar::Variant(inner) => visit(inner.get().expect("checked"), depth + 1),
@@ -119,7 +120,7 @@ fn visit_diagnostic_info(info: &DiagnosticInfo<'_>, depth: usize) -> bool {
         .is_none_or(|inner| visit_diagnostic_info(&inner.get().expect("checked"), depth + 1))
 }
 
-/// The message from its values; `None` for what has no values to write or does not fit again.
+/// Encodes the message from its values; `None` if it has no values to encode or they do not fit.
 fn write(network: &NetworkMessage<'_>) -> Option<Vec<u8>> {
     let mut out = Vec::new();
     let ids: Option<Vec<u16>> = network.writer_ids().map(Iterator::collect);
@@ -205,7 +206,8 @@ fn write_message(
     }
 }
 
-/// Both say the same. NaN is not equal to itself, so values are compared by what they print.
+/// Asserts that both messages are equal. NaN is not equal to itself, so values are compared by
+/// their debug output.
 fn same(one: &NetworkMessage<'_>, other: &NetworkMessage<'_>) {
     assert_eq!(one.header(), other.header());
     let ids = |network: &NetworkMessage<'_>| network.writer_ids().map(Iterator::collect::<Vec<_>>);
@@ -225,7 +227,8 @@ fn same(one: &NetworkMessage<'_>, other: &NetworkMessage<'_>) {
     }
 }
 
-/// A matrix of fewer than two dimensions, or without elements, is written as an array.
+/// Returns the value as it is encoded: a matrix of fewer than two dimensions, or without elements,
+/// is encoded as an array.
 fn as_written(mut value: DataValue<'_>) -> DataValue<'_> {
     if let Some(Variant::Matrix(matrix)) = value.value
         && (matrix.dimensions().len() < 2 || matrix.elements().is_empty())

@@ -1,12 +1,15 @@
-//! Any text as a definition.
+//! Fuzzes message definitions with arbitrary text.
 
 use std::sync::Arc;
 
 use messages::{Dialect, MessageType, Plan, Registry, Selection, TextKind, TypeName, Wire};
 
-/// The first byte says what the text is: `m` a .msg, `s` a .srv, `a` an .action of ROS 1, in capitals of ROS 2, `I` an .idl
-/// of each of the three, and `f` the full definition of a ROS 1 connection header. A type that is made of it has a definition that makes it again; for that
-/// of a connection header what it lacks is taken from the bundle, both times.
+/// Parses a definition. The first byte selects the kind of text: `m` a .msg, `s` a .srv, `a` an
+/// .action of ROS 1, in capitals of ROS 2, `I` an .idl of each of the three, and `f` the full
+/// definition of a ROS 1 connection header.
+///
+/// A parsed type has a definition that parses to the same type. For the definition of a connection
+/// header, missing types are taken from the bundle both times.
 pub fn definition(input: &[u8]) {
     let Some((kind, text)) = input.split_first() else {
         return;
@@ -38,7 +41,7 @@ pub fn definition(input: &[u8]) {
             }
         }
         b'a' => {
-            // ROS 1 and ROS 2 make different messages of one definition.
+            // ROS 1 and ROS 2 derive different messages from the same action definition.
             if registry.add_action(&name, text).is_err() {
                 return;
             }
@@ -63,7 +66,7 @@ pub fn definition(input: &[u8]) {
     }
 }
 
-/// Of any kind; a message is described such that the description makes it again.
+/// Parses an .idl of any kind. The description of a message must give the same message.
 fn idl(registry: &mut Registry, name: &TypeName, text: &str) {
     for kind in TextKind::ALL {
         let taken = registry.add_idl(kind, name, text).is_ok();
@@ -89,14 +92,14 @@ fn idl(registry: &mut Registry, name: &TypeName, text: &str) {
     }
 }
 
-/// `others`: where the types are that its definition lacks.
+/// Checks a type; `others` has the types that its definition lacks.
 fn check(made: &Arc<MessageType>, mut others: Registry) {
     assert!(made.leaves().len() <= 4096, "flattening is bounded");
     let wire = match made.dialect() {
         Dialect::Ros1 => Wire::Ros1,
         Dialect::Ros2 => Wire::Cdr,
     };
-    // Of arrays of messages without fields there is none, which is told.
+    // Arrays of messages without fields have no plan and give an error.
     if let Ok(plan) = Plan::compile(made, &Selection::Whole, wire) {
         assert_eq!(plan.leaves(), made.leaves());
     }

@@ -1,8 +1,8 @@
-//! Any bytes as a probe or an announcement.
+//! Fuzzes probes and announcements with arbitrary bytes.
 
 use uadp::discovery::{Announced, Announcement, Probe};
 
-/// What is read is written again, and that reads and writes the same.
+/// Decodes a probe or an announcement. Its encoding must decode and encode to the same bytes.
 pub fn discovery(body: &[u8]) {
     if let Ok(probe) = Probe::decode_body(body) {
         let mut written = Vec::new();

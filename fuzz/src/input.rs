@@ -1,4 +1,4 @@
-//! Bytes taken apart: an input that ends early gives zeros.
+//! Takes an input apart; an input that ends early gives zeros.
 
 pub(crate) struct Input<'a> {
     rest: &'a [u8],
@@ -27,7 +27,7 @@ impl<'a> Input<'a> {
         u16::from_le_bytes([self.byte(), self.byte()])
     }
 
-    /// As many bytes as the next one says, or as there are.
+    /// Returns as many bytes as the next byte says, or as are left.
     pub(crate) fn bytes(&mut self) -> &'a [u8] {
         let len = usize::from(self.byte()).min(self.rest.len());
         let (bytes, rest) = self.rest.split_at(len);

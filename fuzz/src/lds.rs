@@ -1,4 +1,4 @@
-//! Any bytes as what a client says to a discovery server.
+//! Fuzzes the discovery server with arbitrary bytes from a client.
 
 use std::cell::RefCell;
 
@@ -13,7 +13,8 @@ thread_local! {
     );
 }
 
-/// It is answered by whole frames of the protocol, an ERR only as the last, and no more than it asked for.
+/// Sends bytes to the server. The server responds with complete frames of the protocol, with ERR
+/// only as the last frame, and with a bounded number of frames.
 pub fn lds(said: &[u8]) {
     let answered = discovery::fuzz::answered(said);
     let (heard, registered) = RUNTIME.with_borrow_mut(|runtime| runtime.block_on(answered));
@@ -37,7 +38,7 @@ pub fn lds(said: &[u8]) {
         frames += 1;
         rest = after;
     }
-    // Each question takes a frame of more than 32 bytes; one answer may be in several.
+    // Each request takes a frame of more than 32 bytes; a response may have several frames.
     assert!(
         frames <= 8 + said.len(),
         "{frames} frames for {}",

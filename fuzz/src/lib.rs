@@ -1,6 +1,8 @@
-//! Each function takes bytes that may be anything and panics when the code they are for does not keep its word.
+//! Fuzz targets: each function takes arbitrary bytes and panics if the tested code violates a
+//! guarantee.
 //!
-//! `libfuzzer/` feeds them with inputs that reach new code; `corpus/` holds those found, and the tests run them all.
+//! `libfuzzer/` runs the targets with inputs that reach new code. `corpus/` stores the inputs
+//! found, and the tests run them all.
 
 mod action;
 mod calls;
@@ -37,10 +39,10 @@ pub use nodeset::nodeset;
 pub use reader_state::reader_state;
 pub use secured::secured;
 
-/// Panics when the code does not keep its word on the input.
+/// A function that panics if the tested code violates a guarantee on the input.
 pub type Target = fn(&[u8]);
 
-/// The targets by their names, which are also those of their folders under `corpus/`.
+/// The targets by name, which is also the name of their folder in `corpus/`.
 pub const TARGETS: &[(&str, Target)] = &[
     ("action", action),
     ("calls", calls),

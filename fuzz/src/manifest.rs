@@ -1,8 +1,8 @@
-//! Any bytes as a manifest of a process module, or as a container of one.
+//! Fuzzes manifests of process modules, and containers with manifests, with arbitrary bytes.
 
 use mtp::{ManifestError, Module};
 
-/// A file is a manifest or has an error that names a line of it.
+/// Parses a file, which is a manifest or gives an error with a line of the file.
 pub fn manifest(input: &[u8]) {
     match Module::from_bytes(input) {
         Ok(module) => {

@@ -1,8 +1,9 @@
-//! Any text as a mapping.
+//! Fuzzes mappings with arbitrary text.
 
 use mappings::{Mapping, Severity};
 
-/// A document either runs or has an error; every finding points into the text.
+/// Parses a mapping. A document either can run or has an error, and every finding has a position in
+/// the text.
 pub fn mapping(input: &[u8]) {
     let Ok(text) = std::str::from_utf8(input) else {
         return;
@@ -14,7 +15,7 @@ pub fn mapping(input: &[u8]) {
         .filter(|found| found.severity == Severity::Error);
     assert_eq!(checked.mapping.is_none(), errors.count() > 0);
     assert!(checked.findings.len() <= 256, "findings are bounded");
-    // YAML breaks lines at a carriage return alone too.
+    // YAML also breaks lines at a single carriage return.
     let lines = 1 + text.matches(['\n', '\r']).count();
     for found in &checked.findings {
         assert!(found.at.line >= 1 && found.at.line <= lines, "{found:?}");

@@ -1,8 +1,9 @@
-//! Any bytes as a packet of mDNS, as the texts of a record, and as a URL.
+//! Fuzzes mDNS packets, texts of records, and URLs with arbitrary bytes.
 
 use crate::input::Input;
 
-/// What is heard is short and can be shown; a URL is written as it is read.
+/// Decodes a packet. Received names are short and printable, and a URL is formatted as it was
+/// parsed.
 pub fn mdns(packet: &[u8]) {
     let gone = discovery::fuzz::goodbyes(packet);
     assert!(gone.len() <= packet.len() / 12, "{} names", gone.len());

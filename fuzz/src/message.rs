@@ -1,4 +1,4 @@
-//! Any bytes as a message of any type of the bundle, on either wire.
+//! Fuzzes messages of all types of the bundle, on both wire formats, with arbitrary bytes.
 
 use std::collections::BTreeMap;
 use std::sync::LazyLock;
@@ -7,7 +7,7 @@ use messages::{Dialect, Plan, ReadError, Registry, Selection, Wire, WriteFault};
 
 use crate::tape::{Player, Recorder};
 
-/// By the digit of the ROS and the name.
+/// The plans by the digit of the ROS version and the name of the type.
 static PLANS: LazyLock<BTreeMap<String, Plan>> = LazyLock::new(|| {
     let ways = [
         (Dialect::Ros1, Wire::Ros1, 1),
@@ -26,8 +26,9 @@ static PLANS: LazyLock<BTreeMap<String, Plan>> = LazyLock::new(|| {
         .collect()
 });
 
-/// The input is `1` or `2`, the name of a type, a line feed, and the message. What is read is written again, and that
-/// reads and writes the same. Neither hands over more than the bytes can hold.
+/// Decodes a message. The input is `1` or `2`, the name of a type, a line feed, and the message.
+/// Its encoding must decode and encode to the same bytes. The number of events is bounded by the
+/// number of bytes.
 pub fn message(input: &[u8]) {
     let Some(end) = input.iter().position(|byte| *byte == b'\n') else {
         return;
@@ -50,19 +51,21 @@ pub fn message(input: &[u8]) {
             panic!("a recorder takes all, and nothing is converted")
         }
     }
-    // An element is a byte at the least, and each has an event or two around it; of a fixed array none.
+    // An element has at least one byte and up to two events around it; elements of a fixed array
+    // may have no bytes.
     let most = 4 * payload.len() + 4096;
     assert!(fields.events.len() <= most, "{}", fields.events.len());
     let mut written = Vec::new();
     if let Err(error) = plan.write(&mut Player::new(&fields.events), &mut written) {
         assert!(written.is_empty(), "a message that failed left bytes");
         match error.fault {
-            // Read of what others write, and not written.
+            // Such text is accepted from other writers but not encoded.
             WriteFault::Nul => return,
             fault => panic!("what was read is not written: {}: {fault}", error.field),
         }
     }
-    // A time is rounded and a Boolean of 2 becomes 1, so what is written may differ from what was read, but once.
+    // A time is rounded and a Boolean of 2 becomes 1, so the first encoding may differ from the
+    // input, and the second may not.
     let mut again = Recorder::default();
     plan.read(&written, &mut again)
         .expect("what was written can be read");

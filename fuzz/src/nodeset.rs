@@ -1,10 +1,11 @@
-//! Any bytes as a NodeSet2 file.
+//! Fuzzes NodeSet2 files with arbitrary bytes.
 
 use opcua::server::address_space::AddressSpace;
 use opcua::types::NamespaceMap;
 use plant_opcua::nodeset::{NodeSetError, NodeSets};
 
-/// A file is imported or has a fatal finding; each finding names a line of the file; nodes are those of its namespaces.
+/// Imports a file, which succeeds or gives a fatal finding. Each finding has a line of the file,
+/// and imported nodes exist in the address space.
 pub fn nodeset(input: &[u8]) {
     let (sets, faults) = NodeSets::of_document("fuzz.xml", input);
     let is_fatal = faults.iter().any(|fault| fault.error.is_fatal());
@@ -27,7 +28,7 @@ pub fn nodeset(input: &[u8]) {
                 assert!(space.find(node).is_some(), "{node}");
             }
         }
-        // The library leaves out nodes, for example with ArrayDimensions that are no numbers.
+        // The library leaves out nodes, for example if their ArrayDimensions are not numbers.
         Err(error) => assert!(matches!(error, NodeSetError::Values { .. }), "{error}"),
     }
     if let Ok(text) = xml_text::decode(input) {

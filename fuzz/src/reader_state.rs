@@ -1,4 +1,4 @@
-//! A DataSetReader and whatever reaches it.
+//! Fuzzes a DataSetReader with arbitrary messages.
 
 use std::time::Duration;
 
@@ -9,9 +9,11 @@ use uadp::{
 
 use crate::input::Input;
 
-/// Operations, a byte each: receive, let time pass, enable, disable, change the state above, change the metadata.
-/// A message is not taken twice in a row, nothing is taken in a state without reception, every message is counted,
-/// and the reader asks for no time that is over.
+/// Runs operations, each a byte: receive, let time pass, enable, disable, change the parent state,
+/// change the metadata.
+///
+/// A message is not accepted twice in a row, no message is accepted in a state without reception,
+/// every message is counted, and the next timeout is not in the past.
 pub fn reader_state(data: &[u8]) {
     let mut input = Input::new(data);
     let settings = ReaderSettings {
@@ -41,7 +43,7 @@ pub fn reader_state(data: &[u8]) {
                     assert_ne!(last, number, "one message was taken twice");
                     last = number;
                 } else if taken.is_ok() || number.is_none() {
-                    // What counts by other numbers starts them over.
+                    // Messages that count with other numbers reset the sequence.
                     last = None;
                 }
             }

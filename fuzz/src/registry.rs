@@ -1,4 +1,5 @@
-//! A registry of servers: registrations, announcements, tries and passing time as a list of operations.
+//! Fuzzes a registry of servers with operations: registrations, announcements, probes and passing
+//! time.
 
 use std::collections::BTreeSet;
 use std::net::{IpAddr, Ipv4Addr};
@@ -13,8 +14,8 @@ use crate::input::Input;
 
 const MOST: usize = 6;
 
-/// Who is there is told once when it comes and once when it goes; lists are bounded, numbers rise, and no wait is in the
-/// past.
+/// Runs operations on the registry. Each server is reported once when it is registered and once
+/// when it is removed, lists are bounded, record ids rise, and no timeout is in the past.
 pub fn registry(operations: &[u8]) {
     let settings = Settings {
         allow_unsecured: true,
@@ -32,7 +33,7 @@ pub fn registry(operations: &[u8]) {
         last_id: 0,
     };
     let mut input = Input::new(operations);
-    // Each takes two bytes or more.
+    // Each operation takes two bytes or more.
     while !input.is_empty() {
         played.operate(&mut input);
         played.take_events();
@@ -51,13 +52,13 @@ fn begin() -> Instant {
 struct Played {
     registry: Registry,
     now: Instant,
-    /// Who is registered by what was told.
+    /// The registered servers, according to the events.
     registered: BTreeSet<String>,
-    /// Who is on the network by what was told.
+    /// The servers on the network, according to the events.
     seen: BTreeSet<String>,
-    /// What is announced for servers by what was told.
+    /// The announcements for servers, according to the events.
     ours: BTreeSet<String>,
-    /// The records there were, and the largest number that was given.
+    /// The previous record ids, and the largest id assigned.
     ids: BTreeSet<u32>,
     last_id: u32,
 }
@@ -76,7 +77,7 @@ impl Played {
                 };
                 let there = (how & 4 != 0).then_some(how & 8 != 0);
                 let asked = asked(which, how, input);
-                // Refused or not: what is told has to fit.
+                // The registration may be refused; the events must fit either result.
                 drop(self.registry.register(asked, &channel, there, now));
             }
             1 => {
@@ -101,7 +102,7 @@ impl Played {
         }
     }
 
-    /// mDNS takes another name only where it is free.
+    /// Renames an announcement; mDNS uses another name only if it is free.
     fn renamed(&mut self, from: &str, to: &str) {
         let is_free = !self.ours.contains(to) && !self.seen.contains(to);
         if is_free && self.ours.remove(from) {

@@ -1,4 +1,4 @@
-//! A publisher and a subscriber of a SecurityGroup, with somebody between them.
+//! Fuzzes a publisher and a subscriber of a SecurityGroup with an attacker between them.
 
 use std::time::Duration;
 
@@ -9,11 +9,11 @@ use uadp::{
 
 use crate::input::Input;
 
-/// More messages than this add nothing.
+/// Maximum number of messages; more messages add no coverage.
 const MESSAGES: usize = 64;
 
-/// Operations, a byte each: seal, deliver, deliver changed, change the key, deliver anything. A message is accepted
-/// once, and only as it was sent; what was refused leaves no trace.
+/// Runs operations, each a byte: seal, deliver, deliver changed, change the key, deliver arbitrary
+/// bytes. A message is accepted once, and only unchanged; a refused message leaves no trace.
 pub fn secured(data: &[u8]) {
     let mut input = Input::new(data);
     let (policy, mode) = match input.byte() & 3 {
@@ -141,7 +141,8 @@ fn refuse(datagram: &[u8], opener: &mut Opener) {
     assert_eq!(before, format!("{opener:?}"), "refusing left a trace");
 }
 
-/// Keys of this input alone: a fuzzer keeps pieces of inputs, and a message sealed for another one would be genuine.
+/// Returns keys that depend on the input: a fuzzer combines parts of inputs, and a message sealed
+/// in another input would be genuine with common keys.
 fn keys(policy: SecurityPolicy, own: u64) -> Vec<Keys> {
     (0..3_u8)
         .map(|token| {
@@ -154,7 +155,7 @@ fn keys(policy: SecurityPolicy, own: u64) -> Vec<Keys> {
         .collect()
 }
 
-/// FNV-1a.
+/// Returns the FNV-1a hash.
 fn hash(data: &[u8]) -> u64 {
     data.iter().fold(0xCBF2_9CE4_8422_2325, |hash, byte| {
         (hash ^ u64::from(*byte)).wrapping_mul(0x100_0000_01B3)

@@ -1,11 +1,11 @@
-//! Every input that was kept, and every real datagram, through every target.
+//! Runs every target with all stored inputs and all recorded datagrams.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 
 use uadp_fuzz::TARGETS;
 
-/// Where the inputs of a target are: documents are kept beside what they are documents of.
+/// Returns the inputs of a target. Mapping documents are stored with the crate that parses them.
 fn inputs(name: &str) -> Vec<PathBuf> {
     let here = Path::new(env!("CARGO_MANIFEST_DIR"));
     let folders = match name {
@@ -41,7 +41,7 @@ fn every_kept_input_is_taken_without_a_finding() {
     }
 }
 
-/// Numbers out of a seed (Marsaglia's xorshift64), so that every run tries the same.
+/// Random numbers from a seed (Marsaglia's xorshift64), so every run tries the same inputs.
 struct Chance(u64);
 
 impl Chance {
@@ -52,7 +52,8 @@ impl Chance {
         usize::try_from(self.0 >> 1).unwrap() % bound.max(1)
     }
 
-    /// One change of those that break parsers: a byte, a length, a piece left out, doubled or of another input.
+    /// Applies a change that typically breaks parsers: a byte, a length, a piece that is removed,
+    /// duplicated or taken from another input.
     fn change(&mut self, input: &mut Vec<u8>, other: &[u8]) {
         let at = self.below(input.len() + 1);
         let piece = at..(at + self.below(16)).min(input.len());
@@ -85,8 +86,8 @@ impl Chance {
     }
 }
 
-/// `UA_FUZZ_CHANGES` inputs of each target, 2000 by default; `UA_FUZZ_SEED` says which, and `UA_FUZZ_TARGETS` of which targets
-/// alone, between commas.
+/// Runs `UA_FUZZ_CHANGES` changed inputs of each target, by default 2000. `UA_FUZZ_SEED` selects
+/// the inputs, and `UA_FUZZ_TARGETS` the targets, separated by commas.
 #[test]
 fn changed_inputs_are_taken_without_a_finding() {
     let number = |variable: &str, default: u64| {
