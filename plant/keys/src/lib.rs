@@ -1,7 +1,9 @@
-//! Keys of secured groups, fetched from a Security Key Service (OPC 10000-14, 8.3.2) for the programs of the space.
+//! Fetches keys of secured groups from a Security Key Service (OPC 10000-14, 8.3.2) for the
+//! programs of the space.
 //!
-//! Each fetch is a session of its own, signed and encrypted, in a thread of its own: what it costs to sign is more than a
-//! value should wait. The certificate of the service is trusted as that of any server is: itself, or the authority that issued it.
+//! Each fetch uses a signed and encrypted session of its own in a separate thread, because signing
+//! takes longer than a value should wait. The certificate of the service is trusted in the same way
+//! as the certificate of any server: by itself, or by the authority that issued it.
 
 use std::fmt;
 use std::path::PathBuf;
@@ -27,7 +29,7 @@ pub struct KeyArguments {
 }
 
 impl KeyArguments {
-    /// A service for the program of that name, which has no OPC UA identity beside this one.
+    /// Returns a key service for the program, which has no other OPC UA identity.
     #[must_use]
     pub fn service(&self, program: &str) -> Arc<dyn KeyService> {
         let usual = || {
@@ -43,21 +45,21 @@ impl KeyArguments {
     }
 }
 
-/// As whom keys are asked for.
+/// The identity of the program in its requests for keys.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Identity {
-    /// The ApplicationUri, which stands in the certificate too.
+    /// The ApplicationUri, which is also in the certificate.
     pub application_uri: String,
-    /// The name for people.
+    /// The ApplicationName.
     pub application_name: String,
-    /// The certificate store. What is missing of it is made at the first fetch.
+    /// The certificate store. Missing parts are created at the first fetch.
     pub pki: PathBuf,
 }
 
 /// Fetches keys, one request after the other.
 pub struct Service {
     identity: Identity,
-    /// To the thread that fetches, once there is one.
+    /// The sender to the fetching thread, once the thread is running.
     asked: Mutex<Option<mpsc::Sender<Asked>>>,
 }
 
@@ -67,7 +69,7 @@ struct Asked {
 }
 
 impl Service {
-    /// One that asks as `identity`.
+    /// Creates a service that requests keys as `identity`.
     #[must_use]
     pub const fn new(identity: Identity) -> Self {
         Self {
@@ -76,7 +78,7 @@ impl Service {
         }
     }
 
-    /// The way to the thread that fetches. One that has ended is started again.
+    /// Returns the sender to the fetching thread, which is started again if it has ended.
     fn thread(&self) -> Result<mpsc::Sender<Asked>, String> {
         let mut asked = self.asked.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(sender) = asked.as_ref().filter(|sender| !sender.is_closed()) {
@@ -115,7 +117,7 @@ impl KeyService for Service {
     }
 }
 
-/// Fetches until nobody can ask any more.
+/// Fetches keys until all senders are dropped.
 fn serve(identity: &Identity, mut requests: mpsc::Receiver<Asked>) {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
@@ -129,7 +131,7 @@ fn serve(identity: &Identity, mut requests: mpsc::Receiver<Asked>) {
     };
     runtime.block_on(async {
         while let Some(Asked { request, answer }) = requests.recv().await {
-            // Whoever asked may have gone meanwhile.
+            // The requester may have cancelled in the meantime.
             if !answer.is_closed() {
                 let fetched = fetch(identity, &request).await;
                 drop(answer.send(fetched));
@@ -138,7 +140,7 @@ fn serve(identity: &Identity, mut requests: mpsc::Receiver<Asked>) {
     });
 }
 
-/// The keys from a service, in a session that is made for it and closed again.
+/// Fetches keys in a session that is opened for the request and closed again.
 async fn fetch(identity: &Identity, request: &KeyRequest) -> Result<Fetched, String> {
     let config = ClientConfig {
         pki: Some(identity.pki.clone()),
@@ -172,7 +174,7 @@ async fn fetch(identity: &Identity, request: &KeyRequest) -> Result<Fetched, Str
     fetched.map_err(|why| format!("{why} (as {})", identity.application_uri))
 }
 
-/// Why the service gives no keys, for people.
+/// Returns the reason why the service returns no keys.
 fn told(error: &CallError, request: &KeyRequest) -> String {
     match error {
         CallError::Refused { status, .. } if *status == StatusCode::BadUserAccessDenied => {
@@ -188,7 +190,7 @@ fn told(error: &CallError, request: &KeyRequest) -> String {
     }
 }
 
-/// The output arguments of GetSecurityKeys; `None` where they are others.
+/// Reads the output arguments of GetSecurityKeys; `None` if their types differ.
 fn answer(outputs: Vec<Variant>) -> Option<Fetched> {
     let outputs: [Variant; 5] = outputs.try_into().ok()?;
     let [
@@ -217,23 +219,24 @@ fn answer(outputs: Vec<Variant>) -> Option<Fetched> {
     })
 }
 
-/// A Duration of OPC UA, in milliseconds.
+/// Converts a Duration of OPC UA, in milliseconds.
 fn duration(milliseconds: f64) -> Option<Duration> {
     let bounded = milliseconds.clamp(0.0, LONGEST_MS);
     Duration::try_from_secs_f64(bounded / 1e3).ok()
 }
 
-/// Requests that wait.
+/// Maximum number of waiting requests.
 const WAITING: usize = 64;
-/// How long the service may take for each answer.
+/// Time limit of each response of the service.
 const WITHIN: Duration = Duration::from_secs(5);
-/// How long a session may take to be there.
+/// Time limit of the connection.
 const LONGEST_CONNECT: Duration = Duration::from_secs(10);
-/// The StartingTokenId that stands for the key that is used now.
+/// The StartingTokenId that stands for the current key.
 const CURRENT: u32 = 0;
-/// How many keys beyond that are asked for: so many lifetimes the service may be away.
+/// Number of requested future keys, which is the number of key lifetimes that the service may be
+/// unavailable.
 const FUTURE_KEYS: u32 = 4;
-/// More than any service hands out.
+/// Maximum number of accepted keys, more than any service returns.
 const MOST_KEYS: usize = 64;
 /// A year.
 const LONGEST_MS: f64 = 365.0 * 86_400_000.0;
