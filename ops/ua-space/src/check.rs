@@ -69,7 +69,7 @@ pub(crate) fn check(arguments: &Check) -> Result<(), Failure> {
 fn read(file: &str) -> Result<String, Failure> {
     let read = match file {
         "-" => type_files::read_text(io::stdin().lock()),
-        // The file may be a pipe, which the user who names it fills.
+        // The file may be a pipe that the user fills.
         file => File::open(file)
             .map_err(|error| error.to_string())
             .and_then(type_files::read_text),
@@ -203,7 +203,7 @@ struct Finding<'a> {
     label: Option<&'a str>,
     #[serde(skip_serializing_if = "Option::is_none")]
     help: Option<&'a str>,
-    /// The spaces whose programs the finding stops; empty if it stops all programs.
+    /// The spaces with programs that the finding stops; empty if it stops all programs.
     #[serde(rename = "neededBy", skip_serializing_if = "Vec::is_empty")]
     needed_by: Vec<u8>,
 }

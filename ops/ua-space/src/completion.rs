@@ -45,7 +45,7 @@ pub(crate) fn complete(words: &[String]) -> Result<(), Failure> {
 /// The position of the completed word in the command line.
 struct Place {
     command: Command,
-    /// The option whose value is completed.
+    /// The option with the completed value.
     option: Option<Arg>,
     /// The number of positional words before the completed word.
     position: usize,

@@ -155,7 +155,7 @@ fn show_rest(
     }
 }
 
-/// Shows a message whose valid bit is cleared. Its contents have no meaning, so they are shown as
+/// Shows a message with a cleared valid bit. Its contents have no meaning, so they are shown as
 /// fields only if encoding them gives the same bytes.
 fn show_invalid(
     shown: shape::DataSetMessage,

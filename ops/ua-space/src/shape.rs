@@ -90,8 +90,8 @@ pub(crate) enum NetworkMessageType {
     DiscoveryAnnouncement,
 }
 
-/// A PublisherId. `value` is a text for UInt64 and String, because JSON readers may not keep all
-/// digits of a 64-bit number.
+/// A PublisherId. `value` is a text for String, and for UInt64, because JSON readers may not keep
+/// all digits of a 64-bit number.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct PublisherId {

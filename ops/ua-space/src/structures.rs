@@ -1,4 +1,5 @@
-//! Structures of the standard whose fields are shown; other structures are shown as bytes.
+//! Structures of the standard that are shown with their fields; other structures are shown as
+//! bytes.
 
 use serde_json::{Map, Value};
 use uadp::{BuiltinType, StructureReader};

@@ -78,7 +78,7 @@ pub(crate) struct Entry {
     pub(crate) found_by: BTreeSet<By>,
     /// The reason why the server was not reached or its response was not understood.
     pub(crate) fault: Option<String>,
-    /// The space whose values the program carries or publishes, if known.
+    /// The space of the values that the program carries or publishes, if known.
     pub(crate) space: Option<u16>,
     /// The number of topics received from a bridge.
     pub(crate) topics: Option<usize>,

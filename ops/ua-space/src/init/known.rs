@@ -36,8 +36,8 @@ pub(super) struct Known {
     methods: HashSet<String>,
     /// Node ids in comments, as written.
     written: HashSet<String>,
-    /// The namespace of the last node id read; nodes of namespace 0 use this number in their topic
-    /// names.
+    /// The namespace of the last node id read, as in topic names: `u16::MAX` stands for namespace
+    /// 0.
     hearing: u16,
 }
 

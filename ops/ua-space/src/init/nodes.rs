@@ -27,15 +27,15 @@ impl Indexes {
         }
     }
 
-    /// Assigns an index in the mapping to each namespace that has variables. The index is the index
-    /// at the server. For NodeSet files and for servers other than the server of the cell it starts
-    /// at 2, because index 1 is the own namespace of each server.
+    /// Assigns an index in the mapping to each namespace that has variables, preferably its index
+    /// at the server. For NodeSet files and for servers other than the server of the cell the index
+    /// is at least 2, because index 1 is the own namespace of each server.
     pub(super) fn give(&mut self, source: &Nodes) -> HashMap<u16, u16> {
         let variables = source.variables.iter();
         let used: HashSet<u16> = variables.map(|one| one.node.namespace).collect();
         let mut indexes = HashMap::new();
         // The search continues from the wanted index upwards, then from 2. Indexes are never
-        // released, so none before these positions is free.
+        // released, so earlier positions are not free.
         let (mut above, mut below) = (0, 2);
         for (index, uri) in (0..=u16::MAX).zip(&source.namespaces).skip(1) {
             if !used.contains(&index) {

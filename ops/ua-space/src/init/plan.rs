@@ -211,8 +211,8 @@ impl Planner<'_> {
         self.ua = ua.into_iter().map(Some).collect();
     }
 
-    /// Assigns numbers in the namespace of values without a node to nodes whose node id is already
-    /// used by a node of another server.
+    /// Assigns numbers in the namespace of values without a node to nodes with a node id that a
+    /// node of another server already uses.
     fn twins(&mut self, twins: Vec<UaVariable>, uri: &str, ua: &mut Vec<UaVariable>) {
         for twin in twins {
             let namespace = self.namespace(uri);

@@ -112,7 +112,7 @@ pub(super) fn registry(ros2: bool) -> Registry {
     Registry::bundle(if ros2 { Dialect::Ros2 } else { Dialect::Ros1 })
 }
 
-/// Types whose messages are not useful field by field.
+/// Types with messages that are not useful field by field.
 const BULKY: [&str; 9] = [
     "map_msgs/OccupancyGridUpdate",
     "nav_msgs/OccupancyGrid",

@@ -73,7 +73,7 @@ fn ask_for(arguments: &Call, is_told: bool) -> Result<(), Failure> {
     })
 }
 
-/// Creates the requestor, whose PublisherId is in every request. The id is a String, so it cannot
+/// Creates the requestor. Its PublisherId is in every request. The id is a String, so it cannot
 /// equal the number of a space, even for peers that accept PublisherIds of any width. It has a
 /// random part, because process ids of two hosts may be equal.
 fn requestor() -> Requestor {

@@ -1,4 +1,4 @@
-//! Structures in arrays, whose fields are defined in the announcement of a topic or call.
+//! Structures in arrays, with fields defined in the announcement of a topic or call.
 
 use serde_json::{Map, Value};
 use uadp::discovery::{DataTypeSchemaHeader, StructureField, StructureType};
@@ -111,7 +111,7 @@ impl Structure {
     }
 }
 
-/// Returns the builtin type of a field whose DataType is a builtin type.
+/// Returns the builtin type of a field if its DataType is a builtin type.
 fn builtin(field: &StructureField<'_>) -> Option<BuiltinType> {
     match (field.data_type.namespace, field.data_type.identifier) {
         (0, Identifier::Numeric(number)) => BuiltinType::from_id(number.try_into().ok()?),

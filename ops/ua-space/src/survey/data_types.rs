@@ -4,12 +4,12 @@
 use uadp::BuiltinType;
 
 /// Returns the builtin type of values of the DataType `i=number`; `None` for abstract DataTypes and
-/// for DataTypes that are not in the table, whose supertypes may have a builtin type.
+/// for DataTypes that are not in the table. Supertypes of the latter may have a builtin type.
 pub(crate) fn builtin(number: u32) -> Option<BuiltinType> {
     BuiltinType::from_id(plant_opcua::nodeset::builtin(number)?)
 }
 
-/// The DataType Structure, whose values are ExtensionObjects; a subscriber finds the fields in the
+/// The DataType Structure. Its values are ExtensionObjects; a subscriber finds the fields in the
 /// server.
 pub(crate) const STRUCTURE: u32 = 22;
 

@@ -125,7 +125,7 @@ pub(crate) async fn remote(
     let server = Connected::by(access).await?;
     let asking = async {
         let namespaces = server.namespaces().await?;
-        // A node whose namespace does not exist at the server is not read.
+        // A node is not read if its namespace does not exist at the server.
         let local = |text: &&ExpandedNodeIdText| {
             let namespace = index(text, &namespaces)?;
             let identifier = text.identifier.clone();

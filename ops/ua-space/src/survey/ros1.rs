@@ -96,7 +96,7 @@ async fn services(
             }
         }
     };
-    // Services whose servers did not respond in time have no type.
+    // Services have no type if their servers did not respond in time.
     let _over = timeout(PROBING, asked).await;
     services
 }
@@ -129,8 +129,8 @@ const HELP: &str =
     "is roscore running there? ROS_MASTER_URI or the argument of --ros1 names the master";
 /// Two calls of 3 s, and the time to resolve the host.
 const LIMIT: Duration = Duration::from_secs(8);
-/// Limits of the queries for service types: concurrent queries, time of one query, and time of all
-/// queries.
+/// Limits of the queries for service types: number of concurrent queries, time of each query, and
+/// time of all queries.
 const AT_ONCE: usize = 32;
 const PROBE: Duration = Duration::from_secs(2);
 const PROBING: Duration = Duration::from_secs(10);

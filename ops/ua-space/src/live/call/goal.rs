@@ -281,8 +281,7 @@ impl Asking<'_> {
         }
     }
 
-    /// Requests the cancellation of the goal, which is followed to its end whatever the response
-    /// is.
+    /// Requests the cancellation of the goal. The goal is followed to its end for any response.
     fn cancel_goal(&mut self, goal: &mut Goal) -> Result<(), Failure> {
         let request = cancel_request(&behind_nothing(goal.bytes));
         let cancel = Arc::clone(&goal.cancel);

@@ -8,7 +8,7 @@ use crate::live::call::{call, call_quietly};
 
 pub(super) fn start(arguments: &Call) -> Result<(), Failure> {
     let Target::Name(wanted) = &arguments.target else {
-        // A user who names a topic of Start calls it directly, without a Reset.
+        // A topic of Start is called directly, without a Reset.
         return call(arguments);
     };
     let wanted = wanted.strip_suffix(".Start").unwrap_or(wanted);

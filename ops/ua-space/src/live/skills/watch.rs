@@ -85,7 +85,7 @@ struct Known(BTreeMap<TopicId, Last>);
 struct Last {
     state: Option<(String, u64)>,
     progress: (u32, String),
-    /// The run whose result was reported, or was received first.
+    /// The run of the result that was reported, or received first.
     result: Option<u64>,
 }
 
