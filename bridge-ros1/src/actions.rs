@@ -506,8 +506,8 @@ fn reject(goal: &ServerGoal, why: &str) {
     }
 }
 
-/// A goal whose client requests its cancellation. actionlib has no response to this request; the
-/// client sees how the goal ends.
+/// A request of a client to cancel its goal. actionlib has no response to this request; the client
+/// sees how the goal ends.
 #[derive(Debug)]
 pub(crate) struct Cancel(GoalId);
 

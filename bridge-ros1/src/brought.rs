@@ -34,7 +34,7 @@ pub(crate) enum Room {
 }
 
 impl Brought {
-    /// Makes room for a type, counted with its text. With `must`, there is always room.
+    /// Makes room for a type with `names` definitions. With `must`, there is always room.
     pub(crate) fn room_for(&mut self, found: &Arc<MessageType>, names: usize, must: bool) -> Room {
         let mut entries = self.entries.iter_mut();
         let same = |entry: &&mut Entry| entry.name == *found.name() && entry.md5 == found.md5();

@@ -54,8 +54,8 @@ impl Definitions {
         let fits = |found: &MessageType| md5sum == "*" || found.md5() == md5sum;
         let text = header.message_definition().unwrap_or_default();
         if !text.trim().is_empty() || md5sum == EMPTY {
-            // A definition file with this name is not used for this publisher, and its type stays
-            // as reported.
+            // A definition known before is not used to read this publisher, but remains the
+            // definition for publishing.
             let before = self.known.find(&name).is_ok();
             match self.known.registry().read_ros1_definition(&name, text) {
                 Ok((found, definitions)) if fits(&found) => {
@@ -135,7 +135,7 @@ impl Definitions {
         self.known.explain(kind, error)
     }
 
-    /// Explains an error of a type whose definition comes from files only.
+    /// Explains an error of a type that is defined in files only.
     pub(crate) fn explain_missing(
         &mut self,
         of: (TextKind, &TypeName),

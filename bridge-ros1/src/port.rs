@@ -47,7 +47,7 @@ use crate::watcher::{Seen, Watcher};
 pub struct PortOptions {
     /// The options of the node, including the URI of the master.
     pub node: NodeOptions,
-    /// The space whose values are produced in the graph.
+    /// The space of the values produced in the graph.
     pub own: SpaceId,
     /// The mapping of the cell.
     pub mapping: Arc<Mapping>,
@@ -212,8 +212,8 @@ impl Ros1Port {
         else {
             return Ok(());
         };
-        // Any MD5 sum is accepted, so publishers of another type are reported with the mapping in
-        // mind instead of being refused by themselves.
+        // The subscription accepts any MD5 sum, so a publisher of another type connects and is
+        // logged with the expected type, instead of refusing the connection.
         let wanted = Wanted {
             type_name: source.expected.as_ref().map(ToString::to_string),
             md5sum: None,
@@ -823,7 +823,8 @@ impl Port for Ros1Port {
     }
 
     fn addresses(&self) -> Option<&[IpAddr]> {
-        // All connections use this address, which the master has announced to all nodes.
+        // Connections break if this address is removed, and the master has announced it to all
+        // nodes.
         self.address.as_ref().map(std::slice::from_ref)
     }
 

@@ -1,4 +1,4 @@
-//! A topic of the graph whose values this bridge sends to the space.
+//! A topic of the graph. This bridge sends its values to the space.
 
 use std::sync::Arc;
 
@@ -26,7 +26,7 @@ pub(crate) struct Source {
     pub(crate) bound: Option<Arc<MessageType>>,
     /// Connected publishers of this type.
     peers: Vec<Arc<Peer>>,
-    /// Connected publishers of another type, whose messages cannot be read.
+    /// Connected publishers of another type; their messages cannot be read.
     strangers: Vec<Arc<Peer>>,
     /// Latching publishers that have sent a message, including disconnected publishers.
     latched: Vec<LatchedPeer>,

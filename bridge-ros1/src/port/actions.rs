@@ -53,7 +53,7 @@ impl Ros1Port {
     }
 
     /// Offers the action servers of other nodes that are actions of this space, and withdraws
-    /// actions whose servers are lost.
+    /// actions of lost servers.
     pub(super) fn find_actions(&mut self) {
         let mapping = Arc::clone(self.policy.mapping());
         let mapped = Actions::mapped(&mapping, &self.policy);

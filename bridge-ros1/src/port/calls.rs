@@ -55,8 +55,8 @@ impl Ros1Port {
         self.events.extend(events);
     }
 
-    /// Offers the services of other nodes that are calls of this space, and withdraws calls whose
-    /// services are lost.
+    /// Offers the services of other nodes that are calls of this space, and withdraws calls of lost
+    /// services.
     pub(super) fn find_services(&mut self) {
         let own = self.node.name();
         let services = self.graph.services.iter();
@@ -115,7 +115,7 @@ impl Kinds {
     }
 
     /// Queries the types of new services and of services with changed nodes, a few at a time.
-    /// Returns the services whose types could not be determined, with the reasons.
+    /// Returns the services of unknown type, with the reasons.
     fn look<'s>(
         &mut self,
         node: &Node,

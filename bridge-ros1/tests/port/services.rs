@@ -54,7 +54,7 @@ pub(crate) fn offer(
     (server.unwrap(), requests)
 }
 
-/// Returns the next event whose line has both parts.
+/// Returns the next event with both parts in its line.
 pub(crate) async fn event(cell: &mut Cell, topic: &str, part: &str) -> String {
     within(&format!("{topic} {part}"), async {
         loop {
