@@ -31,8 +31,8 @@ const METRICS: [(&str, &str, &str); 3] = [
 ];
 
 /// Builds the programs and writes the reference pages. `--check` compares the pages instead, and
-/// checks that the page of metrics names each metric of the sources, and that the links of all pages
-/// have targets. `--no-build` takes the programs as they are.
+/// checks that the page of metrics names each metric of the sources, and that the links of all
+/// pages have targets. `--no-build` takes the programs as they are.
 ///
 /// # Errors
 /// Returns an error if a program cannot be built or run, or a page cannot be written.

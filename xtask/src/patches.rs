@@ -166,7 +166,8 @@ impl Source {
 }
 
 /// Returns the features of `bridge-ros2` that need the patched sources. `security` links OpenSSL.
-/// Without OpenSSL it is left out, so the demo runs anywhere, but not in CI, whose tests need it.
+/// Without OpenSSL it is left out, so the demo runs anywhere. CI never leaves it out, because its
+/// tests need it.
 fn features() -> [&'static str; 2] {
     let is_there = env::var_os("OPENSSL_DIR").is_some()
         || succeeds("pkg-config", &["--exists", "openssl"])

@@ -220,7 +220,8 @@ impl Report {
         self.done.extend(done);
     }
 
-    /// Removes and returns the failed jobs that may be retried; none if there are more than `most`.
+    /// Removes and returns the failed jobs that may be retried; returns no jobs if there are more
+    /// than `most`.
     pub(super) fn failed_with_peers(&mut self, most: usize) -> Vec<Job> {
         let may = |done: &Done| !done.passed && done.job.has_peers;
         if self.done.iter().filter(|done| may(done)).count() > most {

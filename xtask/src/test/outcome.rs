@@ -7,7 +7,7 @@ use crate::shell::Ended;
 
 const SLOWEST: usize = 20;
 
-/// The summary of a test run.
+/// The counts, failures and slowest tests of a test run.
 pub(super) struct Outcome<'a> {
     counts: Counts,
     programs: usize,
