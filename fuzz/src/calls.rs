@@ -1,4 +1,4 @@
-//! Fuzzes a Requestor and a Responder with an attacker between them, who delays, changes,
+//! Fuzzes a Requestor and a Responder with an attacker between them, which delays, changes,
 //! duplicates and forges messages.
 
 use std::collections::BTreeMap;
@@ -17,7 +17,7 @@ use crate::input::Input;
 const MESSAGES: usize = 256;
 const REQUESTS: usize = 6;
 const BYTES: usize = 4000;
-/// Number of completed requests, and the size of each.
+/// Maximum number of completed requests that are remembered, and the bytes of all of them.
 const OVER: usize = 4;
 const OVER_BYTES: usize = OVER * 100;
 /// Longer than the time of any input.
