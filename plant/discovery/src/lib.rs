@@ -1,7 +1,7 @@
 //! Who is there: the registry of [`registry`] with sockets around it.
 //!
 //! [`announce`] tells of a server: by mDNS to whoever is on the network, and by registration to the Local Discovery
-//! Server. [`watch`] tells who is there. [`tell_bridge`] tells of a program that carries a space. [`lds`] is the Local Discovery Server itself, the program `ua-lds`.
+//! Server. [`watch`] tells who is there. [`mdns::tell_bridge`] tells of a program that carries a space. [`lds`] is the Local Discovery Server itself, the program `ua-lds`.
 //!
 //! Reading order: `url`, `interface` and `address` (where), `mdns` and `goodbye` (announcements and what is heard of others), `wire` (OPC UA
 //! over TCP), `client` (asking by it), `line` and `liveness` (who still answers), `keeper` (all of that around one registry),

@@ -1,4 +1,4 @@
-//! The Local Discovery Server of a host: the program `ua-lds` around [`lds`](crate::lds).
+//! The Local Discovery Server of a host: the program `ua-lds` around [`lds`].
 
 use std::ffi::OsString;
 use std::net::SocketAddr;
