@@ -1,5 +1,5 @@
-//! The application behind a Publisher (OPC 10000-14, 7.2.4.6.5 and 7.2.4.6.6): what a program says of itself, and what it hears
-//! of others.
+//! The application of a Publisher (OPC 10000-14, 7.2.4.6.5 and 7.2.4.6.6): the own announcement,
+//! and the announcements of other programs.
 
 use mappings::SpaceId;
 use uadp::discovery::{
@@ -8,37 +8,38 @@ use uadp::discovery::{
 };
 use uadp::{EncodeError, LocalizedText, PublisherId, SecurityHeader, StatusCode};
 
-/// An application, as it is announced in the group.
+/// An application as announced in the group.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Application {
-    /// Its ApplicationUri.
+    /// The ApplicationUri.
     pub uri: String,
-    /// Its ProductUri; may be empty.
+    /// The ProductUri; may be empty.
     pub product_uri: String,
-    /// Its ApplicationName.
+    /// The ApplicationName.
     pub name: String,
-    /// Where its server listens; empty for a program that is none.
+    /// The DiscoveryUrls of its server; empty for a program without a server.
     pub urls: Vec<String>,
-    /// Codes of OPC 10000-12, Annex D.
+    /// The ServerCapability identifiers (OPC 10000-12, Annex D).
     pub capabilities: Vec<String>,
-    /// The ways in which its server may be talked to.
+    /// The Endpoints of its server.
     pub endpoints: Vec<Endpoint>,
 }
 
-/// A way to talk to the server of an [`Application`].
+/// An Endpoint of the server of an [`Application`].
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Endpoint {
-    /// Where.
+    /// The EndpointUrl.
     pub url: String,
-    /// The URI of its SecurityPolicy.
+    /// The SecurityPolicyUri.
     pub policy_uri: String,
-    /// Its MessageSecurityMode.
+    /// The MessageSecurityMode.
     pub mode: MessageSecurityMode,
 }
 
 impl Application {
-    /// The same as a server whose URLs may be talked to in these ways: the URI of a SecurityPolicy, and whether messages are
-    /// encrypted beside being signed; `None` where neither.
+    /// Adds an Endpoint for each URL and each of the security settings. A security setting is the
+    /// SecurityPolicyUri, and whether messages are encrypted in addition to signed; `None` for
+    /// neither.
     #[must_use]
     pub fn talked_to<'a>(
         mut self,
@@ -59,7 +60,8 @@ impl Application {
         self
     }
 
-    /// What is heard of another. `None` for what is too long to be kept, has control characters, or does not say who it is.
+    /// Reads the announcement of another application. Returns `None` if a text is too long or has
+    /// control characters, or if the ApplicationUri is empty.
     pub(crate) fn read(
         description: &ApplicationDescription<'_>,
         capabilities: List<'_, Option<&str>>,
@@ -80,7 +82,7 @@ impl Application {
         })
     }
 
-    /// Appends the whole announcement of what it is.
+    /// Appends the complete announcement of the application.
     pub(crate) fn announce(
         &self,
         (space, sequence_number): (SpaceId, u16),
@@ -99,7 +101,8 @@ impl Application {
         announcement.encode(publisher, SecurityHeader::NONE, out)
     }
 
-    /// Appends the whole announcement of its Endpoints. A program that is no server says that it cannot tell any.
+    /// Appends the complete announcement of the Endpoints. A program without a server announces
+    /// Bad_NotSupported.
     pub(crate) fn announce_endpoints(
         &self,
         (space, sequence_number): (SpaceId, u16),
@@ -151,7 +154,7 @@ fn some(texts: &[String]) -> Vec<Option<&str>> {
     texts.iter().map(|text| Some(text.as_str())).collect()
 }
 
-/// A text as it may be kept and shown.
+/// Returns the text if it is short enough and has no control characters.
 fn kept(text: Option<&str>) -> Option<String> {
     let text = text.unwrap_or_default();
     let fits = text.len() <= LONGEST_TEXT && !text.chars().any(char::is_control);

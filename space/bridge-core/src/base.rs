@@ -1,4 +1,4 @@
-//! The state of a writer that its delta frames change (OPC 10000-14, 7.2.4.5.6).
+//! The last state of a writer, to which its delta frames apply (OPC 10000-14, 7.2.4.5.6).
 
 use std::net::SocketAddr;
 
@@ -10,35 +10,36 @@ use uadp::{
 use crate::counters::Reason;
 use crate::place::Place;
 
-/// The last key frame of a writer with what its delta frames have changed since.
+/// The last key frame of a writer with the changes of the following delta frames.
 ///
-/// It holds for one sender and one ConfigurationVersion. Sequence numbers tell when a message of that writer was lost, which may
-/// have changed any field: from then on each field is in doubt until something is said of it. Without sequence numbers a loss
-/// cannot be seen, and lasts until the next key frame.
+/// It is valid for one sender and one ConfigurationVersion. A gap in the sequence numbers shows a
+/// lost message, which may have changed any field. Each field is then in doubt until a message
+/// contains it. Without sequence numbers a loss is not detected, and its effect lasts until the
+/// next key frame.
 #[derive(Debug)]
 pub(crate) struct Base {
-    /// A DataSetMessage, as [`DataSetMessage::decode`] takes it.
+    /// A DataSetMessage in the form that [`DataSetMessage::decode`] reads.
     message: Vec<u8>,
     from: SocketAddr,
     version: (Option<u32>, Option<u32>),
     sequence: Option<u16>,
-    /// Timestamp of the key frame; none once delta frames have changed it.
+    /// The Timestamp of the key frame; `None` after a delta frame.
     stamp: Option<Timestamp>,
-    /// Of each field whether it is in doubt; empty where none is.
+    /// Whether each field is in doubt; empty if no field is.
     in_doubt: Vec<bool>,
 }
 
-/// What a delta frame comes to.
+/// The result of a delta frame.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) struct Merged {
-    /// Number of fields of the DataSet.
+    /// The number of fields of the DataSet.
     pub(crate) count: usize,
-    /// The fields it says something of.
+    /// The indexes of the fields in the delta frame.
     pub(crate) said: Vec<u16>,
 }
 
 impl Base {
-    /// Of a key frame of Variants or DataValues.
+    /// Creates the state from a key frame of Variants or DataValues.
     pub(crate) fn new(message: &DataSetMessage<'_>, place: &Place) -> Self {
         let mut base = Self {
             message: Vec::new(),
@@ -52,7 +53,7 @@ impl Base {
         base
     }
 
-    /// Another key frame.
+    /// Replaces the state by another key frame.
     pub(crate) fn renew(&mut self, message: &DataSetMessage<'_>, place: &Place) {
         let header = message.header();
         self.message.clear();
@@ -72,27 +73,27 @@ impl Base {
                 && self.message.get(1..) == Some(message.payload()))
     }
 
-    /// The key frame has come once more.
+    /// Records a repetition of the key frame.
     pub(crate) const fn repeated(&mut self, place: &Place) {
         self.sequence = place.sequence;
     }
 
-    /// Bytes it takes up.
+    /// Returns the size in bytes.
     pub(crate) const fn weight(&self) -> usize {
         self.message.len() + self.in_doubt.len()
     }
 
-    /// Whether a delta frame can be put over it.
+    /// Returns whether a delta frame can be applied.
     pub(crate) fn is_of(&self, delta: &DataSetMessage<'_>, from: SocketAddr) -> bool {
         self.from == from
             && self.version == version(&delta.header())
             && self.message.first() == Some(&flags(delta.encoding()))
     }
 
-    /// Puts a delta frame over it, and appends what that comes to, a DataSetMessage, to `out`.
+    /// Applies a delta frame, and appends the resulting DataSetMessage to `out`.
     ///
     /// # Errors
-    /// The delta frame or the key frame is malformed; all fields are then in doubt.
+    /// The delta frame or the key frame is malformed. All fields are then in doubt.
     pub(crate) fn merge(
         &mut self,
         delta: &DataSetMessage<'_>,
@@ -128,13 +129,13 @@ impl Base {
         merged
     }
 
-    /// FieldCount of the key frame.
+    /// Returns the FieldCount of the key frame.
     fn count(&self) -> usize {
         let count = self.message.get(1..).and_then(|block| block.first_chunk());
         count.map_or(0, |count| u16::from_le_bytes(*count).into())
     }
 
-    /// Whether a field, or all of them, are what the writer has.
+    /// Returns whether a field, or each field for `None`, is not in doubt.
     pub(crate) fn is_sure(&self, field: Option<usize>) -> bool {
         match field {
             Some(field) => self.in_doubt.get(field) != Some(&true),
@@ -172,12 +173,13 @@ fn merged(
     Ok(Merged { count, said })
 }
 
-/// Whether it says nothing. open62541 ends its delta frames with entries for field 0 without a value.
+/// Returns whether an entry contains no change. open62541 ends its delta frames with entries for
+/// field 0 without a value.
 fn is_filler(entry: &FieldValue<'_>) -> bool {
     entry.is_filler() || (entry.index == 0 && entry.value == DataValue::default())
 }
 
-/// Appends a key frame that stands alone.
+/// Appends a key frame without NetworkMessage headers.
 fn write(
     encoding: FieldEncoding,
     fields: &[DataValue<'_>],
@@ -203,7 +205,7 @@ fn write(
     Ok(())
 }
 
-/// DataSetFlags1 of a key frame with nothing in its header (OPC 10000-14, 7.2.4.5.4).
+/// DataSetFlags1 of a key frame with an empty header (OPC 10000-14, 7.2.4.5.4).
 const fn flags(encoding: FieldEncoding) -> u8 {
     match encoding {
         FieldEncoding::Variant => 0x01,

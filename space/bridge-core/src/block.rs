@@ -1,4 +1,4 @@
-//! Blocks of fields, as they stand in a key frame: how many there are, and the fields as Variants.
+//! Blocks of fields as in a key frame: the number of fields, followed by the fields as Variants.
 
 use uadp::{
     DataSetHeader, EncodeError, FieldEncoder, NetworkHeader, NetworkMessage, NetworkMessageEncoder,
@@ -7,7 +7,7 @@ use uadp::{
 use crate::counters::{Cause, Reason};
 use crate::fields;
 
-/// A block of the fields that are written.
+/// Returns the block of the fields that `write` writes.
 pub(crate) fn block(
     write: impl FnOnce(&mut FieldEncoder<'_>) -> Result<(), (Cause, String)>,
 ) -> Result<Vec<u8>, (Cause, String)> {

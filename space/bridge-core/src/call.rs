@@ -1,4 +1,4 @@
-//! Calls as the local side has them: what one takes and gives, who asks, and what became of it.
+//! Calls as seen from the local side: their arguments and results, requests, and outcomes.
 
 use std::fmt;
 use std::time::Instant;
@@ -14,45 +14,46 @@ use uadp::{BuiltinType, StatusCode};
 use crate::constant;
 use crate::counters::Counters;
 
-/// What a call takes and gives, as its ActionMetaData say it.
+/// The arguments and results of a call, as in its ActionMetaData.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct CallDescription {
-    /// Its name for people, as `parallel-gripper.Grasp.Start`; may be empty.
+    /// The display name, such as `parallel-gripper.Grasp.Start`; may be empty.
     pub name: String,
-    /// What it is, for people; may be empty.
+    /// The description for users; may be empty.
     pub about: String,
-    /// Whether it is a call of its own, or a part of an action.
+    /// Whether the call is independent or a part of an action.
     pub role: CallRole,
-    /// What a request has in it, in this order.
+    /// The fields of a request, in this order.
     pub request: Vec<CallField>,
-    /// What an answer has in it, in this order.
+    /// The fields of a response, in this order.
     pub response: Vec<CallField>,
 }
 
-/// What a call is to an action, which takes three calls and two values of one namespace.
+/// The role of a call in an action. An action consists of three calls and two values in the same
+/// namespace.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub enum CallRole {
-    /// Nothing: it has an answer at once.
+    /// An independent call.
     #[default]
     Call,
-    /// It sends a goal.
+    /// Sends a goal.
     Goal(ActionFamily),
-    /// It cancels goals of the action with that DataSetWriterId.
+    /// Cancels goals of an action.
     Cancel {
-        /// Of the call that sends the goals.
+        /// The DataSetWriterId of the call that sends the goals.
         of: u16,
     },
-    /// It waits for the result of a goal of the action with that DataSetWriterId.
+    /// Waits for the result of a goal of an action.
     Result {
-        /// Of the call that sends the goals.
+        /// The DataSetWriterId of the call that sends the goals.
         of: u16,
     },
 }
 
-/// The DataSetWriterIds of an action beside that of its goals.
+/// The DataSetWriterIds of an action, except the DataSetWriterId of the call that sends the goals.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct ActionFamily {
-    /// The call that cancels.
+    /// The call that cancels goals.
     pub cancel: u16,
     /// The call that waits for a result.
     pub result: u16,
@@ -63,7 +64,8 @@ pub struct ActionFamily {
 }
 
 impl ActionFamily {
-    /// Those behind the DataSetWriterId of the goals, in their order; `None` where there are not as many.
+    /// Returns the four DataSetWriterIds that follow the DataSetWriterId of the goals. Returns
+    /// `None` if they exceed the range.
     #[must_use]
     pub const fn behind(goal: u16) -> Option<Self> {
         match goal.checked_add(4) {
@@ -78,174 +80,185 @@ impl ActionFamily {
     }
 }
 
-/// One field of a request or response.
+/// A field of a request or response.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct CallField {
-    /// Unique in the request or response.
+    /// The name, unique in the request or response.
     pub name: String,
-    /// The builtin type of it, or of its elements.
+    /// The builtin type of the field or of its elements.
     pub builtin: BuiltinType,
-    /// Whether it is an array.
+    /// Whether the field is an array.
     pub rank: Rank,
-    /// Of a request: it has a value of its own where the request has no fields at all.
+    /// For a field of a request: whether it has a default value, which is used if the request has
+    /// no fields.
     pub optional: bool,
-    /// What is in it where it is a message, as far as who executes the call says that. Of a call of one's own nothing is said
-    /// here.
+    /// The fields of a message in this field, if the executor announces them. `None` for calls of
+    /// this program.
     pub structure: Option<Arc<CallStructure>>,
 }
 
-/// A message in a field of a call, as the schema of its ActionMetaData defines it.
+/// A message in a field of a call, as defined by the schema of its ActionMetaData.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct CallStructure {
-    /// The name of its type, as `geometry_msgs/Point`, which is also its TypeId on the wire, in the namespace of the call.
+    /// The name of its type, such as `geometry_msgs/Point`. In the namespace of the call it is also
+    /// the TypeId on the wire.
     pub name: String,
-    /// What is in it, in this order.
+    /// The fields, in this order.
     pub fields: Vec<CallField>,
 }
 
-/// One request of the local side, by a number that the port chooses and uses once.
+/// Identifies a request of the local side. The caller chooses the number and uses it once.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct AskId(pub u64);
 
-/// What became of a request: the response in the local encoding, or why there is none.
+/// The outcome of a request: the response in the local encoding, or the reason why there is no
+/// response.
 pub type Answered<R = Vec<u8>> = Result<R, AskError>;
 
-/// Why a request has no response.
+/// The reason why a request has no response.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{text}")]
 pub struct AskError {
-    /// Whether it was executed, as far as that is known.
+    /// Whether the request was executed, as far as known.
     pub kind: AskErrorKind,
-    /// The same for machines.
+    /// The reason as StatusCode.
     pub status: StatusCode,
-    /// The same for people.
+    /// The reason as text for users.
     pub text: String,
 }
 
 /// Whether a request without response was executed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum AskErrorKind {
-    /// It was not.
+    /// The request was not executed.
     Refused,
-    /// It was, and went wrong, or its response cannot be read here.
+    /// The request was executed and failed, or its response cannot be read.
     Failed,
-    /// It may have been, or may be still.
+    /// The request may have been executed, or may still be in execution.
     Unknown,
 }
 
-/// A request of another program that the local side is to execute.
+/// A request of another program for the local side to execute.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Execution<R = Vec<u8>> {
-    /// Tells it from all others.
+    /// The unique identifier of the execution.
     pub id: ExecutionId,
-    /// Which call.
+    /// The topic of the call.
     pub topic: TopicId,
-    /// The request, in the local encoding. A block of fields is well-formed, and whether they are those of the call is for
-    /// who executes it to say.
+    /// The request in the local encoding. A block of fields is well-formed. The executor checks
+    /// whether its fields match the call.
     pub request: R,
-    /// The space that asks, if it says so.
+    /// The space of the requestor, if known.
     pub requestor: Option<SpaceId>,
-    /// Who asks does not wait any longer.
+    /// The time at which the requestor stops waiting.
     pub deadline: Instant,
 }
 
-/// What an execution came to.
+/// The outcome of an execution.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Executed {
-    /// It was executed, with this response in the local encoding.
+    /// The request was executed, with this response in the local encoding.
     Answered(Vec<u8>),
-    /// It was executed and went wrong.
+    /// The request was executed and failed.
     Failed(StatusCode),
-    /// It was not executed.
+    /// The request was not executed.
     Refused(Refusal),
-    /// Nobody knows: what executed it is gone.
+    /// Unknown, because the executor was lost.
     Lost,
 }
 
 /// A call that the local side executes.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Offered {
-    /// What it takes and gives.
+    /// The arguments and results of the call.
     pub description: CallDescription,
-    /// Whether requests from other hosts are executed too; else only those from a loopback address.
+    /// Whether requests from other hosts are executed. If false, only requests from a loopback
+    /// address are executed.
     pub open: bool,
 }
 
-/// A call that the local side executes as a ROS service: requests and responses are its messages in the local encoding.
+/// A call that the local side executes as a ROS service. Requests and responses are ROS messages in
+/// the local encoding.
 #[derive(Debug, Clone)]
 pub struct OfferedType {
-    /// What it takes and gives.
+    /// The type of the service.
     pub service_type: Arc<ServiceType>,
-    /// Its name for people, as `Conveyor.Switch`; may be empty.
+    /// The display name, such as `Conveyor.Switch`; may be empty.
     pub name: String,
-    /// What it is, for people, without the name of the type; may be empty.
+    /// The description for users without the name of the type; may be empty.
     pub about: String,
-    /// What it is to an action.
+    /// The role of the call in an action.
     pub role: CallRole,
-    /// Whether requests from other hosts are executed too; else only those from a loopback address.
+    /// Whether requests from other hosts are executed. If false, only requests from a loopback
+    /// address are executed.
     pub open: bool,
 }
 
-/// What the request of a call and the response of the type it is asked for as are made of, where not all goes by name.
+/// The assignments between the fields of a call and the fields of a service type, for fields that
+/// are not assigned by name.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct CallMap {
-    /// The fields of the call's request, of those of the type's.
+    /// The sources of the fields of the call's request: fields of the type's request.
     pub request: FieldMap,
-    /// The fields of the type's response, of those of the call's.
+    /// The sources of the fields of the type's response: fields of the call's response.
     pub response: FieldMap,
 }
 
-/// What a field of a request is made of.
+/// The source of a field of a request.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum Origin {
-    /// The field at that place of the ROS message.
+    /// The field at this index of the ROS message.
     Leaf(usize),
-    /// Always the same: a block of that one field.
+    /// A constant, as block with a single field.
     Constant(Vec<u8>),
 }
 
-/// What a value of our own space is, where no mapping says it and the local side speaks in fields.
+/// The description of a value of the own space that is not in the mapping, for a local side with
+/// fields as payload.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ValueDescription {
-    /// Its name for people, as `parallel-gripper.Grasp.State`; may be empty.
+    /// The display name, such as `parallel-gripper.Grasp.State`; may be empty.
     pub name: String,
-    /// The ROS type that the fields make, if they make one.
+    /// The ROS type of the message that the fields form, if they form a message.
     pub message_type: Option<TypeName>,
-    /// What it is, for people and programs; may be empty.
+    /// The description for users and programs; may be empty.
     pub about: String,
     /// The fields, in the order of the values.
     pub fields: Vec<Leaf>,
-    /// What its queue does when full: a state has one place and is repeated, events have several and are not.
+    /// The behavior of a full queue: the queue of a state has one item, which is repeated; the
+    /// queue of an event has several items without repetition.
     pub overflow: Overflow,
 }
 
-/// What is said of a value that is [bound by name](crate::Router::bind_as), where no mapping says it.
+/// The description of a value that is [bound by name](crate::Router::bind_as) and not in the
+/// mapping.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ValueNote {
-    /// Its name for people, as `Nav.Drive.Feedback`; may be empty.
+    /// The display name, such as `Nav.Drive.Feedback`; may be empty.
     pub name: String,
-    /// What it is, for people; may be empty.
+    /// The description for users; may be empty.
     pub about: String,
-    /// What its queue does when full: a state has one place and is repeated, events have several and are not.
+    /// The behavior of a full queue: the queue of a state has one item, which is repeated; the
+    /// queue of an event has several items without repetition.
     pub overflow: Overflow,
-    /// Of a value of another space: what is not made of the field of the same name.
+    /// For a value of another space: the sources of fields that are not assigned by name.
     pub map: FieldMap,
 }
 
-/// What became of the requests of one call.
+/// The outcomes of the requests of a call.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct CallCounters {
     /// Requests of the local side.
     pub asked: u64,
-    /// Those that were executed, whatever came out.
+    /// Requests that were executed, with any result.
     pub answered: u64,
-    /// Those that were not executed.
+    /// Requests that were not executed.
     pub refused: u64,
-    /// Those of which nobody knows.
+    /// Requests with an unknown outcome.
     pub unknown: u64,
-    /// Requests of others that were handed to the local side.
+    /// Requests of other programs that were passed to the local side.
     pub executed: u64,
-    /// Requests and responses that were dropped, or refused here, by reason.
+    /// Requests and responses that were dropped or refused by this program, by reason.
     pub drops: Counters,
 }
 
@@ -260,7 +273,7 @@ impl CallField {
         }
     }
 
-    /// A single value.
+    /// Creates a scalar field.
     #[must_use]
     pub fn scalar(name: &str, builtin: BuiltinType) -> Self {
         Self {
@@ -272,7 +285,7 @@ impl CallField {
         }
     }
 
-    /// An array.
+    /// Creates an array field.
     #[must_use]
     pub fn array(name: &str, builtin: BuiltinType) -> Self {
         Self {
@@ -281,7 +294,8 @@ impl CallField {
         }
     }
 
-    /// The same, which has a value of its own in a request without fields.
+    /// Sets the field as optional: it has a default value, which is used if the request has no
+    /// fields.
     #[must_use]
     pub fn optional(self) -> Self {
         Self {
@@ -292,27 +306,30 @@ impl CallField {
 }
 
 impl CallDescription {
-    /// Whether it can be asked for without any field.
+    /// Returns whether a request may have no fields.
     #[must_use]
     pub fn may_be_empty(&self) -> bool {
         self.request.iter().all(|field| field.optional)
     }
 
-    /// Whether it can be asked for as that ROS type: each field of the type's response is in the response of the call, and
-    /// the fields of the requests are the same, in whatever order; or the type's request has none, and the call can be
-    /// asked for so. A field of the request that is optional and that the type has not is not given. Further fields of the response
-    /// are left out. What `map` names is made as it says; where it says anything
-    /// of the request, further fields of the type's request are left out.
+    /// Checks whether the call can be requested with a ROS service type.
+    ///
+    /// Each field of the type's response needs a field of the call's response, and the fields of
+    /// the requests need to be the same in any order. A type without request fields also fits if
+    /// all fields of the call's request are optional. An optional request field that the type does
+    /// not have is sent as null. Further fields of the call's response are ignored. Fields in `map`
+    /// are assigned as specified there. If `map` assigns request fields, further fields of the
+    /// type's request are ignored.
     ///
     /// # Errors
-    /// Why not, for people.
+    /// Returns the reason for users if the type does not fit.
     pub fn fits(&self, service: &ServiceType, map: &CallMap) -> Result<(), String> {
         self.request_order(service.request(), &map.request)?;
         self.response_order(service.response(), &map.response)?;
         Ok(())
     }
 
-    /// For each field of the request what it is made of; `None` where the request goes without fields.
+    /// Returns the source of each field of the request; `None` for a request without fields.
     pub(crate) fn request_order(
         &self,
         message: &MessageType,
@@ -337,7 +354,8 @@ impl CallDescription {
                     && field.builtin == leaf.builtin
             };
             let found = leaves.iter().position(find).map(Origin::Leaf);
-            // Not given, where it has a value of its own.
+            // An optional field without a source is sent as null, so that its default value is
+            // used.
             let found = found.or_else(|| {
                 let is_left_out = field.optional
                     && path == field.name
@@ -369,7 +387,8 @@ impl CallDescription {
         }
     }
 
-    /// What of the ROS message is made of fields of the response, and for each of those its place there.
+    /// Returns the fields of the ROS message that are made from fields of the response, and the
+    /// index of the response field for each.
     pub(crate) fn response_order(
         &self,
         message: &MessageType,
@@ -426,15 +445,15 @@ impl AskError {
     }
 }
 
-/// The topic and the name for people that the name of a DataSet or Action says; an announcement has no WriterGroupId, so the
-/// topic stands in front.
+/// Splits the name of a DataSet or Action into the topic and the display name. The name starts with
+/// the topic, because an announcement has no WriterGroupId.
 #[must_use]
 pub fn split_name(name: &str) -> Option<(TopicId, &str)> {
     let (topic, name) = name.split_once(' ').unwrap_or((name, ""));
     Some((topic.parse().ok()?, name))
 }
 
-/// The name of the DataSet or Action of a topic.
+/// Returns the name of the DataSet or Action of a topic.
 pub(crate) fn join_name(topic: TopicId, name: &str) -> String {
     match name {
         "" => topic.to_string(),
@@ -442,7 +461,7 @@ pub(crate) fn join_name(topic: TopicId, name: &str) -> String {
     }
 }
 
-/// Whether values of `given` have a place in what is of `wanted`.
+/// Returns whether values of rank `given` can be assigned to a field of rank `wanted`.
 fn takes(wanted: Rank, given: Rank) -> bool {
     match (wanted, given) {
         (Rank::Scalar, Rank::Scalar) => true,

@@ -1,7 +1,7 @@
-//! What a call takes and gives, as ActionMetaData say it (OPC 10000-14, 6.2.3.10 and 7.2.4.6.11).
+//! The arguments and results of a call as ActionMetaData (OPC 10000-14, 6.2.3.10 and 7.2.4.6.11).
 //!
-//! As with values the name stands behind that of the topic, since an announcement has no WriterGroupId. A field of the request
-//! that has a value of its own has the Property `Optional`.
+//! As for values, the name starts with the topic, because an announcement has no WriterGroupId. A
+//! field of the request that has a default value has the Property `Optional`.
 
 use std::collections::BTreeMap;
 use std::hash::{DefaultHasher, Hash, Hasher};
@@ -26,14 +26,15 @@ use crate::description::{
 };
 use crate::learned::Weight;
 
-/// The ROS messages whose fields are those of a call.
+/// The ROS messages of the fields of a call.
 #[derive(Clone, Copy)]
 pub(crate) struct Types<'m> {
     pub(crate) request: &'m MessageType,
     pub(crate) response: &'m MessageType,
 }
 
-/// What is said of a call: itself, its types where it has some, the URIs of namespaces by their index, and its target.
+/// The content of an announcement: the call, its types if it has types, the namespace URIs by
+/// index, and the ActionTargetId.
 pub(crate) type Said<'s> = (
     &'s CallDescription,
     Option<Types<'s>>,
@@ -41,23 +42,24 @@ pub(crate) type Said<'s> = (
     u16,
 );
 
-/// What is announced of a call of ours.
+/// The announcement of an own call.
 #[derive(Debug)]
 pub(crate) struct CallAnnouncement {
-    /// The whole announcement, with the SequenceNumber 0.
+    /// The complete announcement with the SequenceNumber 0.
     datagram: Vec<u8>,
-    /// Where in it the body begins.
+    /// The offset of the body in the announcement.
     body_at: usize,
-    /// Of all that is said but the version.
+    /// A hash of the content without the version.
     content: u64,
     version: ConfigurationVersion,
 }
 
 impl CallAnnouncement {
-    /// Announces a call; its version is that of `before` if that says the same, else a newer one.
+    /// Creates the announcement of a call. The version is the version of `before` if the content is
+    /// the same, and newer otherwise.
     ///
     /// # Errors
-    /// [`EncodeError`] for more bytes than are sent.
+    /// Returns an [`EncodeError`] if the announcement is too large.
     pub(crate) fn new(
         topic: TopicId,
         said: Said<'_>,
@@ -88,10 +90,10 @@ impl CallAnnouncement {
         })
     }
 
-    /// Writes the announcement into an empty buffer. Where its body begins is given back.
+    /// Writes the announcement into an empty buffer and returns the offset of its body.
     pub(crate) fn write(&self, sequence_number: u16, out: &mut Vec<u8>) -> usize {
         out.extend_from_slice(&self.datagram);
-        // Behind the AnnouncementType.
+        // The SequenceNumber follows the AnnouncementType.
         let at = self.body_at + 1;
         if let Some(place) = out.get_mut(at..at + 2) {
             place.copy_from_slice(&sequence_number.to_le_bytes());
@@ -100,7 +102,7 @@ impl CallAnnouncement {
     }
 }
 
-/// The announcement, and where its body begins.
+/// Returns the announcement and the offset of its body.
 fn encode(
     topic: TopicId,
     (description, types, namespaces, target): Said<'_>,
@@ -154,19 +156,19 @@ fn encode(
 /// The request or the response.
 struct Side<'s> {
     fields: FieldList<'s>,
-    /// The message that its fields are of.
+    /// The message of its fields.
     of: Option<&'s MessageType>,
-    /// How many fields stand before it.
+    /// The number of fields that precede it.
     first: usize,
-    /// Name, description and version.
+    /// The name, description and version.
     meta_data: (&'s str, &'s str, ConfigurationVersion),
 }
 
-/// Fields and what is said of each.
+/// Fields with their metadata.
 struct FieldList<'s> {
     fields: &'s [CallField],
     sizes: Vec<Vec<u32>>,
-    /// Bytes of an array that says what the call is to an action.
+    /// The bytes of the array in the Property `ActionFamily`.
     family: Vec<u8>,
     role: CallRole,
 }
@@ -192,7 +194,7 @@ impl<'s> FieldList<'s> {
         }
     }
 
-    /// The Property that says what the call is to an action.
+    /// Returns the Property with the role of the call in an action.
     fn role(&self) -> Result<Option<KeyValuePair<'_>>, EncodeError> {
         let property = |key, value| Some(KeyValuePair { key, value });
         let of = |of| Variant::Scalar(Scalar::UInt16(of));
@@ -213,7 +215,7 @@ impl<'s> FieldList<'s> {
 }
 
 impl Side<'_> {
-    /// Hands on what is said of it.
+    /// Calls `then` with the metadata of the request or response.
     fn with<T>(
         &self,
         topic: TopicId,
@@ -275,11 +277,11 @@ impl Side<'_> {
     }
 }
 
-/// Reads what is announced of a call, and the ActionTargetId it is asked for by; its name is what stands behind that of
-/// the topic.
+/// Reads the announcement of a call and its ActionTargetId. `name` is the name of the Action
+/// without the topic.
 ///
 /// # Errors
-/// In words, what makes it useless.
+/// Returns the reason in words if the announcement cannot be used.
 pub(crate) fn read(
     action: &ActionMetaData<'_>,
     name: &str,
@@ -300,8 +302,9 @@ pub(crate) fn read(
     Ok((description, target))
 }
 
-/// The ActionTargetId of all calls of a program in one of its lives, from random bytes of that life. A request that was
-/// meant for an earlier life has another one: it may have been executed then, and is not executed again.
+/// Returns the ActionTargetId of all calls of a program instance, from the random bytes of the
+/// instance. A request to an earlier instance has a different ActionTargetId. It is not executed,
+/// because the earlier instance may have executed it.
 pub(crate) fn target_of(instance: [u8; 16]) -> u16 {
     let (pairs, _) = instance.as_chunks::<2>();
     let folded = pairs
@@ -310,7 +313,8 @@ pub(crate) fn target_of(instance: [u8; 16]) -> u16 {
     folded.max(LASTING_TARGET)
 }
 
-/// What the first field says the call is to an action. What makes no sense is a call of its own.
+/// Reads the role of the call in an action from the first field. Properties with invalid values are
+/// ignored.
 fn read_role(request: &DataSetMetaDataType<'_>) -> CallRole {
     let Some(field) = request.fields.get(0) else {
         return CallRole::Call;
@@ -381,11 +385,13 @@ fn read_fields(data_set: &DataSetMetaDataType<'_>) -> Result<Vec<CallField>, Str
     fields.collect()
 }
 
-/// Structures by their DataTypes, each with the count of all fields in it, those of structures in it included.
+/// Structures by their DataTypes, each with the number of its fields including the fields of nested
+/// structures.
 type Structures<'s> = Vec<(NodeId<'s>, (Arc<CallStructure>, usize))>;
 
-/// The structures that a schema defines. Those that cannot be known whole are left out, such as one that is in itself, and
-/// those with more in them than is believed: of structures of structures a short announcement can say any number.
+/// Reads the structures of a schema. Structures that cannot be resolved, such as recursive
+/// structures, are omitted. Structures with too many fields are also omitted, because with nested
+/// structures a short announcement can define any number of fields.
 fn read_structures<'s>(schema: &DataTypeSchemaHeader<'s>) -> Structures<'s> {
     let mut open: Vec<StructureDescription<'s>> = schema
         .structure_data_types
@@ -407,7 +413,7 @@ fn read_structures<'s>(schema: &DataTypeSchemaHeader<'s>) -> Structures<'s> {
     }
 }
 
-/// A structure of which all that is in it is known.
+/// Reads a structure, if all nested structures are in `known`.
 fn read_structure(
     described: &StructureDescription<'_>,
     known: &Structures<'_>,
@@ -484,7 +490,8 @@ impl Weight for CallDescription {
     }
 }
 
-/// Bytes of a field, with those of the structures in it that are not seen yet.
+/// Returns the size in bytes of a field with its nested structures, without the structures in
+/// `seen`.
 fn weight(field: &CallField, seen: &mut Vec<*const CallStructure>) -> usize {
     let own = field.name.len() + size_of::<CallField>();
     let Some(structure) = &field.structure else {
@@ -503,21 +510,24 @@ fn weight(field: &CallField, seen: &mut Vec<*const CallStructure>) -> usize {
     own + structure.name.len() + inner
 }
 
-/// The ActionTargetId by which each call can be asked for in every life of its program, by who is configured by hand and does
-/// not hear what is announced.
+/// The ActionTargetId that is valid for each call in every instance of its program. It is for
+/// requestors with static configuration that do not receive announcements.
 pub(crate) const LASTING_TARGET: u16 = 1;
-/// Of a field of a request: it may be left out, with all others.
+/// The Property of optional request fields: the fields may be omitted if all are omitted.
 const OPTIONAL: QualifiedName<'static> = QualifiedName {
     namespace: 0,
     name: Some("Optional"),
 };
-/// Of the first field of a request: DataSetWriterIds of an action's cancel, result, feedback and status.
+/// The Property of the first request field with the DataSetWriterIds of cancel, result, feedback
+/// and status of the action.
 const ACTION_FAMILY: QualifiedName<'static> = named("ActionFamily");
-/// How many they are.
+/// The number of DataSetWriterIds in `ActionFamily`.
 const FAMILY: usize = 4;
-/// Of the first field of a request: DataSetWriterId of the action it cancels goals of.
+/// The Property of the first request field with the DataSetWriterId of the action whose goals the
+/// call cancels.
 const CANCEL_OF: QualifiedName<'static> = named("CancelOf");
-/// Of the first field of a request: DataSetWriterId of the action it waits for results of.
+/// The Property of the first request field with the DataSetWriterId of the action whose results the
+/// call waits for.
 const RESULT_OF: QualifiedName<'static> = named("ResultOf");
 
 const fn named(name: &'static str) -> QualifiedName<'static> {
@@ -527,13 +537,13 @@ const fn named(name: &'static str) -> QualifiedName<'static> {
     }
 }
 
-/// Bytes of a description that is believed.
+/// The maximum accepted length in bytes of a description.
 const MAX_ABOUT: usize = 1_024;
-/// Fields of a request or response that are believed.
+/// The maximum accepted number of fields of a request or response.
 const MAX_CALL_FIELDS: usize = 256;
-/// Structures of a request or response that are believed.
+/// The maximum accepted number of structures of a request or response.
 const MAX_STRUCTURES: usize = 64;
-/// Fields in one structure, those of the structures in it included.
+/// The maximum number of fields in a structure, including the fields of nested structures.
 const MAX_INNER_FIELDS: usize = 4_096;
 
 #[cfg(test)]
@@ -613,7 +623,7 @@ mod tests {
         };
         let known = read_structures(&schema);
         let counts: Vec<usize> = known.iter().map(|(_, (_, count))| *count).collect();
-        // Each has twice what the one in it has, and two fields.
+        // Each structure has two fields, each of which contains the previous structure.
         assert_eq!(counts[..3], [2, 6, 14]);
         assert_eq!((known.len(), counts[10]), (11, 4094), "{counts:?}");
     }

@@ -1,4 +1,4 @@
-//! Requests and responses between a ROS service type and the fields of a call.
+//! Conversion of requests and responses between a ROS service type and the fields of a call.
 
 use std::sync::Arc;
 
@@ -11,22 +11,22 @@ use crate::counters::{Cause, Reason};
 use crate::fields::{self, Payload};
 use crate::plans::Plans;
 
-/// How the bytes of one service type become the fields of one call, and the other way.
+/// Converts between the bytes of a service type and the fields of a call of another program.
 #[derive(Debug)]
 pub(crate) struct CallPlan {
     request: Arc<Plan>,
     response: Arc<Plan>,
-    /// For each field of the request what it is made of; `None` where it goes without fields.
+    /// The source of each field of the request; `None` for a request without fields.
     request_order: Option<Vec<Origin>>,
-    /// For each field that the ROS message is made of its place in the response.
+    /// The index in the response for each field of the ROS message.
     response_order: Vec<Origin>,
 }
 
 impl CallPlan {
-    /// For calls of that kind under that type.
+    /// Compiles the conversion between a call and a service type.
     ///
     /// # Errors
-    /// Why they do not fit, for people.
+    /// Returns the reason for users if they do not fit.
     pub(crate) fn compile(
         description: &CallDescription,
         (service, map): (&ServiceType, &CallMap),
@@ -45,7 +45,7 @@ impl CallPlan {
         })
     }
 
-    /// The block of fields of a request in ROS bytes.
+    /// Converts the ROS bytes of a request to a block of fields.
     pub(crate) fn request(
         &self,
         message: &[u8],
@@ -73,7 +73,7 @@ impl CallPlan {
     }
 }
 
-/// The fields at those places, in that order.
+/// Returns a block with the fields of the given origins in their order.
 pub(crate) fn arrange(fields: &[u8], order: &[Origin]) -> Result<Vec<u8>, (Cause, String)> {
     let fields = Fields::parse(fields).map_err(fields::undecodable)?;
     let all: Vec<Variant<'_>> = fields
@@ -102,7 +102,8 @@ pub(crate) fn arrange(fields: &[u8], order: &[Origin]) -> Result<Vec<u8>, (Cause
     })
 }
 
-/// How the bytes of one service type that is executed here become the fields of its call, and the other way.
+/// Converts between the bytes of a service type and the fields of a call that the local side
+/// executes.
 #[derive(Debug)]
 pub(crate) struct ExecutedPlan {
     request: Arc<Plan>,
@@ -110,10 +111,10 @@ pub(crate) struct ExecutedPlan {
 }
 
 impl ExecutedPlan {
-    /// For a call with the fields of that type.
+    /// Compiles the conversion for a call with the fields of the type.
     ///
     /// # Errors
-    /// Why there can be none, for people.
+    /// Returns the reason for users if a plan cannot be compiled.
     pub(crate) fn compile(
         service: &ServiceType,
         (wire, plans): (Wire, &mut Plans),
@@ -134,7 +135,7 @@ impl ExecutedPlan {
         fields::write(&self.request, fields, out)
     }
 
-    /// The block of fields of a response in ROS bytes.
+    /// Converts the ROS bytes of a response to a block of fields.
     pub(crate) fn response(
         &self,
         message: &[u8],

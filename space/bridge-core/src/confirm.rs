@@ -1,8 +1,10 @@
-//! Confirmations: a bridge says that an event of another space has reached a subscriber or a service.
+//! Confirmations: a bridge confirms that an event of another space has reached a subscriber or a
+//! service.
 //!
-//! On the wire a confirmation is an Action response that answers no request (OPC 10000-14, 7.2.4.5.10): PublisherId is the space
-//! that confirms, WriterGroupId and DataSetWriterId are those of the event, RequestorId is the PublisherId of the event,
-//! ActionTargetId is 0, RequestId is the sequence number of the event, and CorrelationData is its Timestamp and PicoSeconds.
+//! A confirmation is an Action response without a request (OPC 10000-14, 7.2.4.5.10). The
+//! PublisherId is the confirming space, WriterGroupId and DataSetWriterId are the ids of the event,
+//! and the RequestorId is the PublisherId of the event. The ActionTargetId is 0, the RequestId is
+//! the sequence number of the event, and the CorrelationData is its Timestamp and PicoSeconds.
 
 use std::collections::VecDeque;
 use std::net::SocketAddr;
@@ -20,18 +22,18 @@ use uadp::{
 /// The outcome of an event that bridges confirm.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Arrival {
-    /// Each space that the mapping ties it to has confirmed it.
+    /// Each space in the mapping of the event has confirmed it.
     Confirmed,
-    /// These spaces have not confirmed it in time: whether it has arrived there is unknown.
+    /// These spaces have not confirmed the event in time. Its arrival there is unknown.
     Unknown(Vec<SpaceId>),
-    /// It was not sent.
+    /// The event was not sent.
     NotSent,
 }
 
 /// The state of a value that the local side accepted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Handover {
-    /// At least one present subscriber has it, or the service it is for.
+    /// At least one present subscriber has received the value, or the service for which it is has.
     Done,
     /// Unknown so far.
     Waiting,
@@ -42,18 +44,18 @@ pub enum Handover {
 /// The spaces that confirm the events of a topic.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Confirming {
-    /// How long an event is sent again.
+    /// The time for which an event is repeated.
     pub(crate) within: Duration,
     pub(crate) spaces: Vec<SpaceId>,
 }
 
-/// An event of ours that is not confirmed yet.
+/// An event of the own space that is not confirmed yet.
 #[derive(Debug)]
 pub(crate) struct Awaited {
     mark: Mark,
-    /// When it is given up.
+    /// The time at which the event is given up.
     pub(crate) until: Instant,
-    /// The spaces that have not confirmed it.
+    /// The spaces that have not confirmed the event.
     pub(crate) spaces: Vec<SpaceId>,
 }
 
@@ -65,11 +67,11 @@ pub(crate) struct Mark {
     pub(crate) stamp: Timestamp,
 }
 
-/// The newest event of another space, until the next one comes.
+/// The newest event of another space.
 #[derive(Debug)]
 pub(crate) struct Receipt {
     pub(crate) mark: Mark,
-    /// When it came first.
+    /// The time at which the event was first received.
     since: Instant,
     state: State,
 }
@@ -89,9 +91,9 @@ pub(crate) enum Reply {
     Confirm,
     /// Ask the local side for its handover.
     Ask,
-    /// Hand it to the local side again.
+    /// Pass the event to the local side again.
     HandOver,
-    /// Nothing.
+    /// No reaction.
     Nothing,
 }
 
@@ -101,12 +103,12 @@ pub(crate) struct Confirmer {
     from: SocketAddr,
     /// Other senders that announced the space, the newest last.
     others: VecDeque<SocketAddr>,
-    /// The time of the first confirmation of another sender since its own last one.
+    /// The time of the first confirmation of another sender after the last confirmation of `from`.
     doubted: Option<Instant>,
 }
 
 impl Confirming {
-    /// `None` where nothing confirms the values of a variable.
+    /// Returns `None` if no space confirms the values of the variable.
     pub(crate) fn of(variable: Option<&Variable>) -> Option<Box<Self>> {
         let variable = variable?;
         let within = variable.confirmed_within?;
@@ -126,12 +128,12 @@ impl Confirming {
 }
 
 impl Awaited {
-    /// Whether that space has not confirmed the event yet.
+    /// Returns whether the space has not confirmed the event yet.
     pub(crate) fn is_awaited(&self, mark: Mark, space: SpaceId) -> bool {
         self.mark == mark && self.spaces.contains(&space)
     }
 
-    /// Notes a confirmation, and returns whether it is the last one.
+    /// Records a confirmation, and returns whether it is the last missing confirmation.
     pub(crate) fn confirm(&mut self, space: SpaceId) -> bool {
         self.spaces.retain(|awaited| *awaited != space);
         self.spaces.is_empty()
@@ -147,12 +149,13 @@ impl Receipt {
         }
     }
 
-    /// Notes its handover.
+    /// Records the handover.
     pub(crate) const fn handed(&mut self, handover: Handover) {
         self.state = State::Taken(handover);
     }
 
-    /// Returns the reaction to a repetition. After `within` the writer has given the event up, and it would come late.
+    /// Returns the reaction to a repetition. After `within` the writer has given the event up, so a
+    /// delivery would be too late.
     pub(crate) fn repeated(&mut self, within: Duration, now: Instant) -> Reply {
         match self.state {
             State::Taken(Handover::Done) => Reply::Confirm,
@@ -176,7 +179,7 @@ impl Confirmer {
         }
     }
 
-    /// Notes a sender that announces the space.
+    /// Records a sender that announces the space.
     pub(crate) fn announced(&mut self, from: SocketAddr) {
         if from == self.from {
             return;
@@ -273,9 +276,10 @@ pub(crate) fn decode(response: &ActionMessage<'_>) -> Option<(TopicId, Mark)> {
 
 /// The ActionTargetId of no Action.
 const NO_TARGET: u16 = 0;
-/// How long a bridge confirms nothing before another one takes over.
+/// The time without a confirmation after which another sender takes over.
 const SILENT: Duration = Duration::from_millis(300);
-/// A doubt that is older than this is of another event.
+/// The maximum age of a doubt. An older doubt concerns another event.
 const FORGOTTEN: Duration = Duration::from_secs(2);
-/// Senders that announced a space are kept up to this number: whoever can send to the group can announce it.
+/// The maximum number of recorded senders. It is limited, because each sender in the group can
+/// announce a space.
 const MOST_OTHERS: usize = 8;

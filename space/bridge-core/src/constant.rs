@@ -1,4 +1,4 @@
-//! Constants of the mapping as fields of a request.
+//! Conversion of constants of the mapping to fields of a request.
 
 use std::fmt::Display;
 
@@ -8,14 +8,14 @@ use uadp::{BuiltinType, DateTime, FieldEncoder, Scalar};
 use crate::block;
 use crate::counters::Cause;
 
-/// The block with one field that is null: it is not given.
+/// The block with a single null field, for a field without a value.
 pub(crate) const NULL: [u8; 3] = [1, 0, 0];
 
-/// The block with the one field, of that name and type, that has that value: a number, text or Boolean, bytes as a list of numbers, or an array of
-/// those.
+/// Returns the block with a single field of the given name, type and value. The value is a number,
+/// text or Boolean, bytes as a list of numbers, or an array of these.
 ///
 /// # Errors
-/// The value is none of the field's type, for people.
+/// Returns a message for users if the value does not fit the type of the field.
 pub(crate) fn block(
     field: &impl Display,
     (builtin, rank): (BuiltinType, Rank),
@@ -77,7 +77,7 @@ fn scalar(builtin: BuiltinType, text: &str) -> Option<Scalar<'_>> {
         BuiltinType::Float => Scalar::Float(text.parse().ok()?),
         BuiltinType::Double => Scalar::Double(text.parse().ok()?),
         BuiltinType::String => Scalar::String(Some(text)),
-        // No time is always the same but that of nothing.
+        // The only constant time is 0, the null DateTime.
         BuiltinType::DateTime if text == "0" => Scalar::DateTime(DateTime::default()),
         BuiltinType::DateTime
         | BuiltinType::Guid

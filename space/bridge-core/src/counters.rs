@@ -1,92 +1,99 @@
-//! What happened to each sample: forwarded, or dropped for a named reason and counted.
+//! Counters of samples: forwarded samples, and dropped samples by reason.
 
 use std::fmt;
 
-/// Why a sample or datagram did not cross.
+/// The reason why a sample or datagram was dropped.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum Reason {
-    /// It came back to where it was produced, as every sample does that a bridge hears of itself.
+    /// The sample returned to the space that produced it. Each sample that a bridge receives from
+    /// itself is looped.
     Looped,
-    /// Somebody else sends under our space's PublisherId: two bridges serve one space.
+    /// Another sender uses the PublisherId of the own space: two bridges serve the same space.
     SpaceTaken,
-    /// A datagram whose triple is none of the space (no number, out of range, or zero).
+    /// The ids of the datagram are not in the space: not a number, out of range, or zero.
     NotInSpace,
-    /// The PublisherId has our number but another width than UInt16 (OPC 10000-14 7.2.4.4.2).
+    /// The PublisherId has the number of the own space in another width than UInt16 (OPC 10000-14
+    /// 7.2.4.4.2).
     PublisherWidth,
-    /// Bytes that break the encoding they claim to have.
+    /// The bytes violate their encoding.
     Malformed,
-    /// Well-formed, but of a kind that is not read.
+    /// The message is well-formed, but of an unsupported kind.
     Unsupported,
-    /// A DataSetMessage whose valid bit is clear.
+    /// The valid bit of the DataSetMessage is cleared.
     Invalid,
-    /// No local message type is known for the topic.
+    /// The local message type of the topic is unknown.
     Untyped,
-    /// The value is not what the topic's message type holds.
+    /// The value does not match the message type of the topic.
     Mismatch,
-    /// A sequence number that was there already.
+    /// The sequence number was already received.
     Duplicate,
-    /// Older than what was delivered.
+    /// The sample is older than the last delivered sample.
     Stale,
-    /// A key frame repeated for late joiners, which we delivered before.
+    /// A key frame repeated for late joiners, which was already delivered.
     Repeat,
-    /// The topic's queue was full and its oldest sample gave way.
+    /// The oldest sample was dropped from the full queue of the topic.
     Overflow,
-    /// Larger than is sent or put together from chunks.
+    /// The message exceeds the maximum size for sending or for reassembly from chunks.
     TooBig,
-    /// A large message of which chunks never came.
+    /// Chunks of a large message are missing.
     Incomplete,
-    /// A large message given up since others took up the room for those that are unfinished or wait for their type.
+    /// A large message was given up, because others needed the memory for messages that are
+    /// incomplete or wait for their type.
     NoRoom,
-    /// More topics than are tracked.
+    /// The maximum number of topics is reached.
     TooManyTopics,
-    /// More latched publishers of one topic than are kept for late joiners.
+    /// The maximum number of latched publishers of a topic is reached.
     TooManyPublishers,
-    /// A delta frame that cannot be put over a key frame of which nothing is missing.
+    /// A delta frame without a complete key frame to which it can be applied.
     NoKeyFrame,
-    /// A message that is read with the DataSetMetaData of its writer, which have not come.
+    /// The message cannot be read without the DataSetMetaData of its writer, which was not
+    /// received.
     Undescribed,
-    /// No sample, but what a topic is announced to consist of: nothing that is believed, or nothing that can be announced.
+    /// A metadata announcement, not a sample: a received announcement is not accepted, or an own
+    /// announcement cannot be sent.
     MetaData,
-    /// The local side did not take it.
+    /// The local side did not accept the sample.
     NotPublished,
-    /// An event, and no subscriber is present on the local side.
+    /// An event without a subscriber on the local side.
     NoSubscriber,
-    /// The socket did not take it.
+    /// The socket did not accept the datagram.
     NotSent,
-    /// A service did not take the value, or did not answer.
+    /// A service did not accept the value, or did not respond.
     CallFailed,
-    /// No sample, but a publisher or subscriber that the local side cannot be matched with, as their qualities of service
-    /// exclude each other.
+    /// Not a sample: the QoS policies of a publisher or subscriber are incompatible with the local
+    /// side.
     IncompatibleQos,
-    /// The value says nothing new, and its topic is published on change or has a deadband.
+    /// The value is unchanged, and its topic is published on change or has a deadband.
     Unchanged,
-    /// A newer value took its place before its topic's rate let it go.
+    /// A newer value replaced the value before the rate limit of the topic allowed its publication.
     Outpaced,
-    /// A request that is not executed, for what it is, where it comes from, or because there are too many; or a response that
-    /// is not told.
+    /// A request that is not executed because of its content, its source, or the number of
+    /// requests; or a response that is not sent.
     CallRefused,
-    /// A request that somebody else is to execute, or a response that nobody here waits for: both go to the whole group.
+    /// A request for another executor, or a response for another requestor. Both are sent to the
+    /// whole group.
     NotAsked,
-    /// A response of somebody who does not execute the call.
+    /// A response from a sender that does not execute the call.
     Forged,
-    /// An event that a bridge it is for has not confirmed in time: whether it has arrived is unknown.
+    /// A destination bridge has not confirmed the event in time. Its arrival is unknown.
     Unconfirmed,
-    /// In clear, where the group is secured.
+    /// The message is not secured, but the group is.
     Unsecured,
-    /// Signed alone, where the group encrypts; or encrypted and not signed.
+    /// The message is signed only, but the group encrypts; or it is encrypted and not signed.
     Downgraded,
-    /// Not written with the key of the group, or changed since.
+    /// The message was not signed with the key of the group, or it was changed.
     Signature,
-    /// It was there before, or is so far from the newest of its sender that nothing tells whether it was.
+    /// The message was already received, or is so far from the newest message of its sender that
+    /// this cannot be determined.
     Replayed,
-    /// Secured with a key that is not known here, or is out of use.
+    /// The message is secured with an unknown or expired key.
     UnknownKey,
-    /// There is no key to secure with what is to be sent.
+    /// There is no key to secure the message.
     NoKeys,
 }
 
 impl Reason {
-    /// All of them, in the order of their counters.
+    /// All reasons in the order of their counters.
     pub const ALL: [Self; 38] = [
         Self::Looped,
         Self::SpaceTaken,
@@ -128,7 +135,7 @@ impl Reason {
         Self::NoKeys,
     ];
 
-    /// The label of its counter.
+    /// Returns the label of the counter.
     #[must_use]
     pub const fn label(self) -> &'static str {
         match self {
@@ -173,7 +180,8 @@ impl Reason {
         }
     }
 
-    /// Whether it leaves a topic of another space with an older value than its writer has sent.
+    /// Returns whether the drop leaves a topic of another space with an older value than its writer
+    /// has sent.
     pub(crate) const fn is_loss(self) -> bool {
         matches!(
             self,
@@ -192,7 +200,8 @@ impl Reason {
         )
     }
 
-    /// Whether it belongs to normal traffic, so that nobody needs to be told; or is told by who counts it.
+    /// Returns whether the drop belongs to normal traffic and needs no log entry, or is logged
+    /// where it is counted.
     #[must_use]
     pub const fn is_routine(self) -> bool {
         matches!(
@@ -215,43 +224,44 @@ impl fmt::Display for Reason {
     }
 }
 
-/// What became of one sample.
+/// The result for a sample.
 #[must_use]
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Verdict {
-    /// It waits in the topic's queue for `poll_output`.
+    /// The sample waits in the queue of the topic for `poll_output`.
     Forward,
-    /// It waits in the queue, and the oldest one there was dropped for it.
+    /// The sample waits in the queue, and the oldest sample was dropped for it.
     ForwardAfterDroppingOldest,
-    /// It does not cross.
+    /// The sample is dropped.
     Drop(Reason),
 }
 
-/// Counts of one topic, or of the datagrams that belong to none.
+/// The counters of a topic, or of datagrams without a topic.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Counters {
-    /// Samples of our own space that were handed out as NetworkMessages.
+    /// Samples of the own space that were output as NetworkMessages.
     pub sent: u64,
-    /// Samples of other spaces that were handed out to the local side.
+    /// Samples of other spaces that were output to the local side.
     pub delivered: u64,
     /// Key frames repeated for late joiners.
     pub repeated: u64,
-    /// DataSetMessages of other spaces that never came, by the gaps in their sequence numbers.
+    /// DataSetMessages of other spaces that were not received, from the gaps in their sequence
+    /// numbers.
     pub missing: u64,
-    /// How often what the topic consists of was announced.
+    /// Metadata announcements sent.
     pub announced: u64,
-    /// What the writer of another space announced its topic to be, where that was new.
+    /// New metadata announcements received from the writer of another space.
     pub described: u64,
     /// Keep-alives sent.
     pub keep_alives: u64,
-    /// How often values of another space came from another address than the one before.
+    /// Changes of the source address of values of another space.
     pub sender_changed: u64,
-    /// Of the causes that occurred, in their order: most topics have few.
+    /// The drops by cause, sorted. A list, because most topics have few causes.
     dropped: Vec<(Cause, u64)>,
 }
 
-/// Why something is dropped: the reason that is counted, and which case of it, where the log tells cases apart. A case
-/// that is frequent then does not hide one that is rare.
+/// The cause of a drop: the counted reason, and a case that the log distinguishes. Frequent drops
+/// of one case do not hide rare drops of another case.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) struct Cause {
     pub(crate) reason: Reason,
@@ -271,7 +281,7 @@ impl From<(Reason, &'static str)> for Cause {
 }
 
 impl Counters {
-    /// How many were dropped for `reason`.
+    /// Returns the number of drops for `reason`.
     #[must_use]
     pub fn dropped(&self, reason: Reason) -> u64 {
         self.drops()
@@ -279,7 +289,7 @@ impl Counters {
             .unwrap_or_default()
     }
 
-    /// Every reason that occurred, with its count.
+    /// Returns each reason that occurred with its count.
     pub fn drops(&self) -> impl Iterator<Item = (Reason, u64)> {
         let reasons = self.dropped.chunk_by(|(a, _), (b, _)| a.reason == b.reason);
         reasons.filter_map(|cases| {
@@ -291,7 +301,7 @@ impl Counters {
         })
     }
 
-    /// Adds `count` drops and says how many of that cause there are now.
+    /// Adds `count` drops and returns the total for the cause.
     pub(crate) fn add(&mut self, cause: impl Into<Cause>, count: u64) -> u64 {
         let cause = cause.into();
         let place = self.dropped.binary_search_by_key(&cause, |(each, _)| *each);
@@ -308,7 +318,7 @@ impl Counters {
         })
     }
 
-    /// Takes over what was counted of a topic that is no longer followed.
+    /// Adds the counters of a topic that was removed.
     pub(crate) fn absorb(&mut self, other: &Self) {
         let Self {
             sent,
@@ -330,13 +340,14 @@ impl Counters {
         self.keep_alives += keep_alives;
         self.sender_changed += sender_changed;
         for (Cause { reason, .. }, count) in dropped {
-            // A case of its own: what is told of the others is not to be as late as if it were theirs.
+            // A separate case, so that the inherited total does not delay the log entries of other
+            // cases.
             self.add((*reason, "of a topic before"), *count);
         }
     }
 }
 
-/// Whether the `total`th occurrence is told: the 1st, 10th, 100th and so on, so that a flood stays a few lines.
+/// Returns whether the `total`th occurrence is logged: the 1st, 10th, 100th and so on.
 pub(crate) fn is_told(total: u64) -> bool {
     total
         .checked_ilog10()

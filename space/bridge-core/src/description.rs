@@ -1,10 +1,11 @@
-//! What a topic consists of, as DataSetMetaData says it (OPC 10000-14, 6.2.3.2.3).
+//! The content of a topic as DataSetMetaData (OPC 10000-14, 6.2.3.2.3).
 //!
-//! The name of the DataSet is that of the topic (`ua_1_2_10`), since an announcement has no WriterGroupId: with the
-//! PublisherId and DataSetWriterId it has, the name tells which topic it is about. The description is the name of the ROS
-//! type that the fields make, with ` as bytes` behind it where they are one ByteString with the whole message. It is
-//! missing where they make none: one value out of a message, or values that were converted on the way. A local side that
-//! speaks in fields may say more: a name for people behind that of the topic, and what the value is behind `; `.
+//! The name of the DataSet is the name of the topic (`ua_1_2_10`). An announcement has no
+//! WriterGroupId, so its PublisherId and DataSetWriterId do not identify the topic. The description
+//! is the name of the ROS type of the message that the fields form, followed by ` as bytes` if the
+//! field is a ByteString with the whole message. The type name is missing if the fields form no
+//! message: a single value of a message, or values that were converted. A local side with fields as
+//! payload may add a display name after the topic name, and a description after `; `.
 
 use std::collections::BTreeMap;
 use std::collections::hash_map::DefaultHasher;
@@ -25,23 +26,24 @@ use uadp::{
 use crate::call::{ValueDescription, join_name, split_name};
 use crate::learned::Weight;
 
-/// What the DataSetMetaData of a writer of another space says of its topic.
+/// The DataSetMetaData of a topic from a writer of another space.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Described {
-    /// The ROS type that the fields make.
+    /// The ROS type of the message that the fields form.
     pub message_type: TypeName,
-    /// The message stands in one ByteString as it is.
+    /// Whether a single ByteString contains the whole message.
     pub bytes: bool,
-    /// Its name for people; may be empty.
+    /// The display name; may be empty.
     pub name: String,
-    /// What it is, for people and programs; may be empty.
+    /// The description for users and programs; may be empty.
     pub about: String,
     /// The fields, in the order of the values.
     pub fields: Vec<Leaf>,
 }
 
 impl Described {
-    /// What of a local type of that name the fields are; `None` where that type has other fields.
+    /// Returns the selection of the fields in a local type of the same name; `None` if the type has
+    /// other fields.
     #[must_use]
     pub fn selection(&self, message_type: &MessageType) -> Option<Selection> {
         if self.bytes {
@@ -58,7 +60,7 @@ impl Described {
         if whole {
             return Some(Selection::Whole);
         }
-        // Some of them, in the order of the message.
+        // A part of the fields, in the order of the message.
         let mut rest = leaves.iter();
         let selected = self.fields.iter().map(|field| {
             let found = rest.find(|leaf| is_same(leaf, field))?;
@@ -68,7 +70,7 @@ impl Described {
         (!selected.is_empty()).then_some(Selection::Fields(selected))
     }
 
-    /// Whether values of these types, and arrays or not, are what is described.
+    /// Returns whether values of these types match the description. The flag is true for arrays.
     pub(crate) fn fits(&self, shape: &[(BuiltinType, bool)]) -> bool {
         let fields = self.fields.iter().map(|field| {
             let array = matches!(field.rank, Rank::Array { .. });
@@ -77,10 +79,10 @@ impl Described {
         fields.eq(shape.iter().copied())
     }
 
-    /// Reads what is announced of a topic; `None` where that names no ROS type.
+    /// Reads the announcement of a topic; `None` if it names no ROS type.
     ///
     /// # Errors
-    /// In words, what makes it useless.
+    /// Returns the reason in words if the announcement cannot be used.
     pub(crate) fn read(meta_data: &DataSetMetaDataType<'_>) -> Result<Option<Self>, String> {
         let Some(description) = meta_data.description.text else {
             return Ok(None);
@@ -138,10 +140,10 @@ fn read_field(field: &FieldMetaData<'_>) -> Result<Leaf, String> {
     })
 }
 
-/// Whether a field is an array.
+/// Returns whether a field is a scalar or an array.
 ///
 /// # Errors
-/// It has more dimensions, or may have.
+/// The field has or may have several dimensions.
 pub(crate) fn read_rank(field: &FieldMetaData<'_>) -> Result<Rank, String> {
     match field.value_rank {
         -1 => Ok(Rank::Scalar),
@@ -152,45 +154,47 @@ pub(crate) fn read_rank(field: &FieldMetaData<'_>) -> Result<Rank, String> {
     }
 }
 
-/// ROS 1 and ROS 2 write some names in other cases.
+/// Compares fields without case, because some names differ in case between ROS 1 and ROS 2.
 fn is_same(a: &Leaf, b: &Leaf) -> bool {
     a.builtin == b.builtin && a.rank == b.rank && a.path.eq_ignore_ascii_case(&b.path)
 }
 
-/// What is announced of a topic of our own space.
+/// The announcement of a topic of the own space.
 #[derive(Debug)]
 pub(crate) struct Description {
-    /// The whole announcement, with the SequenceNumber 0.
+    /// The complete announcement with the SequenceNumber 0.
     datagram: Vec<u8>,
-    /// Where in it the body begins.
+    /// The offset of the body in the announcement.
     body_at: usize,
-    /// Of all that is said but the version.
+    /// A hash of the content without the version.
     content: u64,
     version: ConfigurationVersion,
 }
 
-/// A topic and what makes its fields.
+/// A topic and the sources of its metadata.
 #[derive(Clone, Copy)]
 pub(crate) struct Source<'s> {
     pub(crate) topic: TopicId,
-    /// The message they are of, and what of it they are. Of values that no message is made of here, only the mapping says
-    /// what they are.
+    /// The message of the fields, and the selection of fields. `None` if no message is converted;
+    /// the mapping alone then describes the fields.
     pub(crate) message: Option<(&'s MessageType, &'s Selection)>,
     /// The fields that cross.
     pub(crate) leaves: &'s [Leaf],
-    /// What the mapping says of the value.
+    /// The variable in the mapping.
     pub(crate) variable: Option<&'s Variable>,
-    /// What the local side says of it, where it speaks in fields.
+    /// The description from the local side, if its payloads are fields.
     pub(crate) said: Option<&'s ValueDescription>,
-    /// Namespace index -> URI, as far as known.
+    /// The known namespace URIs by index.
     pub(crate) namespaces: &'s BTreeMap<u16, String>,
 }
 
 impl Description {
-    /// Describes a topic; its version is that of `before` if that says the same, else a newer one.
+    /// Creates the description of a topic. The version is the version of `before` if the content is
+    /// the same, and newer otherwise.
     ///
     /// # Errors
-    /// [`EncodeError`] for a name that is too long, and for more than [`MAX_ANNOUNCEMENT`] bytes in all.
+    /// Returns an [`EncodeError`] for a name that is too long, and for more than
+    /// [`MAX_ANNOUNCEMENT`] bytes in total.
     pub(crate) fn new(
         source: Source<'_>,
         before: Option<&Self>,
@@ -220,20 +224,20 @@ impl Description {
         })
     }
 
-    /// What the messages it describes have in their header.
+    /// Returns the MajorVersion for the headers of the described messages.
     pub(crate) const fn major_version(&self) -> u32 {
         self.version.major
     }
 
-    /// Whether the version is another than that of `before`.
+    /// Returns whether the version differs from the version of `before`.
     pub(crate) fn differs(&self, before: Option<&Self>) -> bool {
         before.is_none_or(|before| before.version != self.version)
     }
 
-    /// Writes the announcement into an empty buffer. Where its body begins is given back.
+    /// Writes the announcement into an empty buffer and returns the offset of its body.
     pub(crate) fn write(&self, sequence_number: u16, out: &mut Vec<u8>) -> usize {
         out.extend_from_slice(&self.datagram);
-        // Behind the AnnouncementType.
+        // The SequenceNumber follows the AnnouncementType.
         let at = self.body_at + 1;
         if let Some(place) = out.get_mut(at..at + 2) {
             place.copy_from_slice(&sequence_number.to_le_bytes());
@@ -243,7 +247,7 @@ impl Description {
 }
 
 impl Source<'_> {
-    /// The announcement, and where its body begins.
+    /// Returns the announcement and the offset of its body.
     fn encode(&self, version: ConfigurationVersion) -> Result<(Vec<u8>, usize), EncodeError> {
         let (_, namespace, _) = self.topic.triple();
         let description = self.description();
@@ -305,7 +309,7 @@ impl Source<'_> {
         Ok((datagram, body_at))
     }
 
-    /// Path of the message of which the fields are; empty for the whole.
+    /// Returns the path in the message to which the fields belong; empty for the whole message.
     fn within(&self) -> &str {
         match self.message {
             Some((_, Selection::Field(path) | Selection::Structure(Some(path)))) => path,
@@ -322,7 +326,7 @@ impl Source<'_> {
         }
     }
 
-    /// The message that the values make, if they make one.
+    /// Returns the type of the message that the values form, if they form a message.
     fn made(&self) -> Option<&TypeName> {
         let Some((message_type, selection)) = self.message else {
             if let Some(said) = self.said {
@@ -384,7 +388,7 @@ impl Source<'_> {
             value_rank: value_rank(leaf.rank),
             array_dimensions: list(&said.sizes),
             data_set_field_id: field_id(self.topic, index, &said.name),
-            // Only a single value has some.
+            // Empty except for a single value.
             properties: list(properties),
             ..FieldMetaData::default()
         }
@@ -414,7 +418,7 @@ impl Source<'_> {
     }
 }
 
-/// Hands on the definitions of the structures among those fields of a message.
+/// Calls `then` with the definitions of the structures among the fields of a message.
 pub(crate) fn with_structures<T>(
     message_type: &MessageType,
     leaves: &[Leaf],
@@ -444,7 +448,7 @@ pub(crate) fn with_structures<T>(
     })
 }
 
-/// The list of namespaces that has that index in it: ExtensionObjects have their TypeIds with it.
+/// Returns the list of namespaces up to the index that the TypeIds of ExtensionObjects use.
 fn namespaces_up_to(namespace: u16, uris: &BTreeMap<u16, String>) -> Vec<Option<&str>> {
     if namespace > MAX_NAMESPACES {
         return Vec::new();
@@ -454,7 +458,7 @@ fn namespaces_up_to(namespace: u16, uris: &BTreeMap<u16, String>) -> Vec<Option<
         .collect()
 }
 
-/// The message type that all who read or write the value in ROS take as a whole, and the same.
+/// Returns the message type if all ROS bindings of the value use the same type as a whole.
 fn whole_message(variable: &Variable) -> Option<&TypeName> {
     let (first, rest) = variable.bindings.split_first()?;
     let whole = |one: &Binding| one.selection == Selection::Whole;
@@ -463,7 +467,7 @@ fn whole_message(variable: &Variable) -> Option<&TypeName> {
     (known && rest.iter().all(same)).then_some(&first.message_type)
 }
 
-/// The fields of a value as the mapping says them; none where it leaves them open.
+/// Returns the fields of a value from the mapping; empty if the mapping does not define them.
 pub(crate) fn mapped_leaves(variable: &Variable) -> Vec<Leaf> {
     if whole_message(variable).is_some() {
         return variable.fields.clone();
@@ -482,7 +486,8 @@ pub(crate) fn mapped_leaves(variable: &Variable) -> Vec<Leaf> {
     }
 }
 
-/// The Properties that say what a number means (OPC 10000-8, 5.3.2, and OPC 10000-3, 5.8.3).
+/// Returns the Properties with the meaning of a number (OPC 10000-8, 5.3.2, and OPC 10000-3,
+/// 5.8.3).
 fn properties<'b>(
     meaning: &'b Meaning,
     [unit_buffer, range_buffer, texts_buffer]: &'b mut [Vec<u8>; 3],
@@ -533,7 +538,8 @@ fn properties<'b>(
     Ok(found)
 }
 
-/// The types of the messages in arrays and of those nested in them, each once.
+/// Returns the types of the messages in arrays and of the messages nested in them, without
+/// duplicates.
 fn structures<'m>(message_type: &'m MessageType, leaves: &[Leaf]) -> Vec<messages::Structure<'m>> {
     let mut all: Vec<messages::Structure<'m>> = Vec::new();
     for leaf in leaves {
@@ -549,7 +555,7 @@ fn structures<'m>(message_type: &'m MessageType, leaves: &[Leaf]) -> Vec<message
     all
 }
 
-/// What a field is called, and how many elements it has.
+/// The name, description and array sizes of a field.
 struct FieldText {
     name: String,
     description: String,
@@ -603,7 +609,8 @@ fn structure_fields<'s>(
         .collect()
 }
 
-/// The DataType of a message type and its encoding have one NodeId, which is the name of the type.
+/// Returns the DataType of a field. A message type and its encoding share a NodeId, the name of the
+/// type.
 pub(crate) fn data_type(builtin: BuiltinType, of: Option<&TypeName>, namespace: u16) -> NodeId<'_> {
     match of {
         Some(name) => NodeId::string(namespace, name.as_str()),
@@ -618,7 +625,7 @@ pub(crate) const fn value_rank(rank: Rank) -> i32 {
     }
 }
 
-/// Elements in each dimension, 0 where that is open.
+/// Returns the number of elements in each dimension; 0 for a variable length.
 pub(crate) fn sizes(rank: Rank) -> Vec<u32> {
     match rank {
         Rank::Scalar => Vec::new(),
@@ -626,7 +633,7 @@ pub(crate) fn sizes(rank: Rank) -> Vec<u32> {
     }
 }
 
-/// The null array without elements.
+/// Returns the list of the elements; the null array if there are no elements.
 pub(crate) const fn list<T>(elements: &[T]) -> List<'_, T> {
     match elements {
         [] => List::null(),
@@ -641,7 +648,7 @@ pub(crate) const fn text(text: &str) -> LocalizedText<'_> {
     }
 }
 
-/// The same whenever the field is announced.
+/// Returns the DataSetFieldId, which is the same in each announcement of the field.
 pub(crate) fn field_id(topic: TopicId, index: usize, name: &str) -> Guid {
     let mut hasher = DefaultHasher::new();
     (topic.triple(), index).hash(&mut hasher);
@@ -655,7 +662,7 @@ pub(crate) fn field_id(topic: TopicId, index: usize, name: &str) -> Guid {
     Guid(id)
 }
 
-/// Seconds since 2000-01-01 UTC (VersionTime: OPC 10000-4, 7.44).
+/// Returns the seconds since 2000-01-01 UTC (VersionTime: OPC 10000-4, 7.44).
 pub(crate) fn version_time(utc: Timestamp) -> u32 {
     let seconds = utc.unix_nanos() / 1_000_000_000 - UNIX_2000;
     u32::try_from(seconds.max(0)).unwrap_or(u32::MAX)
@@ -665,19 +672,20 @@ pub(crate) fn version_time(utc: Timestamp) -> u32 {
 const STRUCTURE: NodeId<'static> = NodeId::numeric(0, 22);
 /// Seconds from 1970 to 2000.
 const UNIX_2000: i128 = 946_684_800;
-/// What stands between the type and what else is said.
+/// The separator between the type and the description.
 const ABOUT: &str = "; ";
-/// Bytes of that that are believed.
+/// The maximum accepted length in bytes of the description after the separator.
 const MAX_ABOUT: usize = 1_024;
-/// What stands behind the type of a message that crosses as it is.
+/// The suffix of the type for messages that are carried as bytes.
 const AS_BYTES: &str = " as bytes";
-/// The one field of such a message.
+/// The name of the field of a message that is carried as bytes.
 const MESSAGE: &str = "message";
-/// Bytes of a name that is believed.
+/// The maximum accepted length in bytes of a name.
 pub(crate) const MAX_NAME: usize = 255;
-/// As many fields as a message may have.
+/// The maximum number of fields of a message.
 pub(crate) const MAX_FIELDS: usize = 4096;
-/// Of a higher index the list of namespaces would be long.
+/// The maximum namespace index for which the list of namespaces is sent. The list grows with the
+/// index.
 const MAX_NAMESPACES: u16 = 64;
-/// Bytes of the largest announcement that is sent.
+/// The maximum size in bytes of an announcement.
 pub(crate) const MAX_ANNOUNCEMENT: usize = 64 << 10;

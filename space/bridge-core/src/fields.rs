@@ -1,8 +1,9 @@
-//! Where the fields of a ROS message and those of a DataSetMessage meet.
+//! Conversion between the fields of a ROS message and the fields of a DataSetMessage.
 //!
-//! `messages` runs its plans into a sink and from a source and knows no UADP bytes; here are the sink that is a
-//! [`FieldEncoder`] and the source that reads [`Fields`]. A message in an array of messages is an ExtensionObject with
-//! a binary body, its TypeId a string NodeId of the ROS type's name in the topic's namespace.
+//! `messages` runs its plans with a sink and a source and is independent of UADP. This module has
+//! the sink that writes to a [`FieldEncoder`], and the source that reads [`Fields`]. A message in
+//! an array of messages is an ExtensionObject with a binary body. Its TypeId is a string NodeId
+//! with the name of the ROS type in the namespace of the topic.
 
 use messages::{
     Fault, Plan, ReadError, Sink, Source, SourceError, TypeName, ValueFault, WriteError, WriteFault,
@@ -14,11 +15,11 @@ use uadp::{
 
 use crate::counters::{Cause, Reason};
 
-/// A local payload, with what is needed to read it.
+/// A payload of the local side with its format.
 pub(crate) enum Payload<'a> {
-    /// A block of fields, to be copied.
+    /// A block of fields to copy.
     Block(&'a [u8]),
-    /// A ROS message.
+    /// A ROS message with its plan.
     Ros(&'a Plan, &'a [u8]),
 }
 
@@ -30,7 +31,8 @@ pub(crate) fn read(
 ) -> Result<(), (Cause, String)> {
     match payload {
         Payload::Block(block) => {
-            // Checked here, since a bad block would be an unreadable datagram for everybody.
+            // Checked before sending, because subscribers cannot read a datagram with an invalid
+            // block.
             Fields::parse(block)
                 .and_then(|fields| fields.checked_bytes())
                 .map_err(undecodable)?;
@@ -53,11 +55,12 @@ pub(crate) fn read(
     }
 }
 
-/// Writes the fields of a ROS message into a frame, as the [`Router`](crate::Router) does. `namespace` is that of the
-/// TypeIds of structures.
+/// Writes the fields of a ROS message into a frame in the same way as the
+/// [`Router`](crate::Router). `namespace` is the namespace of the TypeIds of structures.
 ///
 /// # Errors
-/// The message is none of the plan's type, or is too long for UADP; the frame is then to be thrown away.
+/// The message does not match the type of the plan, or is too long for UADP. Discard the frame in
+/// this case.
 pub fn encode_fields(
     plan: &Plan,
     message: &[u8],
@@ -67,15 +70,15 @@ pub fn encode_fields(
     plan.read(message, &mut FrameSink { frame, namespace })
 }
 
-/// Appends the ROS message that the fields make to `out`, as the [`Router`](crate::Router) does.
+/// Appends the ROS message of the fields to `out` in the same way as the [`Router`](crate::Router).
 ///
 /// # Errors
-/// The fields are not those of the plan; `out` is then as it was.
+/// The fields do not match the plan; `out` is then unchanged.
 pub fn decode_fields(plan: &Plan, fields: Fields<'_>, out: &mut Vec<u8>) -> Result<(), WriteError> {
     plan.write(&mut FieldSource::new(fields), out)
 }
 
-/// Appends the ROS message that the fields make.
+/// Appends the ROS message of the fields.
 pub(crate) fn write(
     plan: &Plan,
     fields: Fields<'_>,
@@ -87,7 +90,7 @@ pub(crate) fn write(
     })
 }
 
-/// Appends the fields as they are, once it is sure that they can be read.
+/// Appends the unchanged fields after a check that they can be read.
 pub(crate) fn copy(fields: &Fields<'_>, out: &mut Vec<u8>) -> Result<(), (Cause, String)> {
     let block = fields.checked_bytes().map_err(undecodable)?;
     out.extend_from_slice(block);
@@ -137,7 +140,7 @@ const fn write_case(fault: &WriteFault) -> &'static str {
     }
 }
 
-/// Builtin type of a field, and whether it is an array.
+/// Returns the builtin type of a field, and whether it is an array.
 pub(crate) fn shape(field: &Variant<'_>) -> (BuiltinType, bool) {
     match field {
         Variant::Null => (BuiltinType::Variant, false),
@@ -147,10 +150,10 @@ pub(crate) fn shape(field: &Variant<'_>) -> (BuiltinType, bool) {
     }
 }
 
-/// A key frame that takes what a plan reads.
+/// The sink of a plan that writes to a key frame.
 struct FrameSink<'f, 'm> {
     frame: &'f mut FieldEncoder<'m>,
-    /// That of the structures' TypeIds.
+    /// The namespace of the TypeIds of structures.
     namespace: u16,
 }
 
@@ -177,7 +180,7 @@ impl Sink for FrameSink<'_, '_> {
 
     fn array(&mut self, element: BuiltinType, count: usize) -> Result<(), EncodeError> {
         if element == BuiltinType::ExtensionObject {
-            // Messages within a message of an array: structures by value.
+            // Messages in a message of an array are encoded inline.
             self.frame.inline_structures(count)
         } else {
             self.frame.array(element, count)
@@ -202,14 +205,14 @@ impl Sink for FrameSink<'_, '_> {
     }
 }
 
-/// The fields of a key frame, given one by one to a plan that writes a message.
+/// The source of a plan that reads the fields of a key frame.
 struct FieldSource<'a> {
     fields: Fields<'a>,
-    /// What is left of the array opened last.
+    /// The remaining elements of the last opened array.
     elements: Option<Elements<'a>>,
-    /// What is left of the structures opened last.
+    /// The remaining structures of the last opened array of structures.
     structures: Option<Elements<'a>>,
-    /// The structure being read.
+    /// The open structure.
     structure: Option<StructureReader<'a>>,
 }
 
@@ -247,7 +250,7 @@ impl<'a> FieldSource<'a> {
         Ok(())
     }
 
-    /// The next field, or the next value of the structure being read, as an array.
+    /// Returns the next field, or the next value of the open structure, as an array.
     fn next_array(&mut self, expected: BuiltinType) -> Result<Array<'a>, SourceError> {
         if let Some(structure) = &mut self.structure {
             return structure.array(expected).map_err(malformed);
@@ -312,7 +315,8 @@ impl<'a> Source<'a> for FieldSource<'a> {
 
     fn array(&mut self, expected: BuiltinType) -> Result<usize, SourceError> {
         if let (Some(structure), BuiltinType::ExtensionObject) = (&mut self.structure, expected) {
-            // Messages within a message of an array stand inline: only their number is here.
+            // Messages in a message of an array are encoded inline, so only their number is read
+            // here.
             return structure
                 .length()
                 .map_err(malformed)
@@ -380,7 +384,8 @@ impl<'a> Source<'a> for FieldSource<'a> {
     }
 }
 
-/// Of a size the compiler knows, which makes it a few moves each. `N` counts the encoding byte.
+/// Appends values without their encoding bytes. The constant size `N`, which includes the encoding
+/// byte, compiles to a few move instructions per value.
 #[inline]
 fn push_untagged<const N: usize>(out: &mut Vec<u8>, variants: &[u8]) {
     let (variants, _) = variants.as_chunks::<N>();

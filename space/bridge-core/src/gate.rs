@@ -1,4 +1,4 @@
-//! Which samples of a topic go out at all: those that say something new, and not too many of them.
+//! Publishing rules of a topic: publish on change, deadband, and maximum rate.
 
 use std::time::Instant;
 
@@ -8,37 +8,37 @@ use uadp::{Array, BuiltinType, DecodeError, Fields, NetworkMessage, Scalar, Vari
 use crate::output::PublisherKey;
 use crate::writer::{Encoded, MAX_KEPT};
 
-/// What holds samples of one topic back, by the rule of its variable.
+/// Holds back samples of a topic according to the rule of its variable.
 #[derive(Debug)]
 pub(crate) struct Gate {
     rule: Publish,
-    /// The fields that went out last; empty before the first.
+    /// The fields of the last published sample; empty before the first.
     last: Vec<u8>,
-    /// Whose they were, if that publisher latches.
+    /// The publisher of the last published sample, if it latches.
     last_by: Option<PublisherKey>,
-    /// Latched publishers of which a sample has gone out.
+    /// The latched publishers with a published sample.
     met: Vec<PublisherKey>,
-    /// When the next may go out.
+    /// The earliest time of the next sample.
     opens: Option<Instant>,
-    /// The newest sample that came too early.
+    /// The newest sample that was too early.
     held: Option<Waiting>,
 }
 
-/// A sample and its publisher, if that latches.
+/// A sample and its publisher, if the publisher latches.
 pub(crate) type Waiting = (Encoded, Option<PublisherKey>);
 
-/// What becomes of a sample.
+/// The decision for a sample.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Passage {
     Passes,
-    /// It says what was said already.
+    /// The sample equals the last published sample.
     Unchanged,
-    /// It is to wait, unless a newer one takes its place.
+    /// The sample waits, unless a newer sample replaces it.
     TooEarly,
 }
 
 impl Gate {
-    /// `None` where all samples pass.
+    /// Returns `None` if the rule passes all samples.
     pub(crate) fn new(rule: Publish) -> Option<Box<Self>> {
         let gate = Self {
             rule,
@@ -51,10 +51,11 @@ impl Gate {
         (rule != Publish::default()).then(|| Box::new(gate))
     }
 
-    /// Judges a sample; one that passes is the last that went out. What waited before a sample that passes, or that says
-    /// nothing new, is not true any more and is given back.
+    /// Decides about a sample and stores it as the last published sample if it passes. A waiting
+    /// sample is outdated and returned if the new sample passes or is unchanged.
     ///
-    /// The first sample of a latched publisher passes in any case, as late joiners get the last one of each.
+    /// The first sample of a latched publisher always passes, because late joiners receive the last
+    /// sample of each publisher.
     pub(crate) fn judge(
         &mut self,
         sample: &Encoded,
@@ -74,7 +75,7 @@ impl Gate {
             }
         }
         self.say(fields, latched_by, now);
-        // That of another publisher is still true.
+        // A waiting sample of another publisher is still valid.
         let outpaced = self.held.take_if(|(_, by)| !first || *by == latched_by);
         (Passage::Passes, outpaced)
     }
@@ -91,14 +92,14 @@ impl Gate {
         self.opens = (!self.rule.period.is_zero()).then(|| now + self.rule.period);
     }
 
-    /// The sample that waits, to go out at once: nothing may come after it.
+    /// Returns the waiting sample for immediate publication, because no sample may follow it.
     pub(crate) fn hurry(&mut self, now: Instant) -> Option<Waiting> {
         let (sample, latched_by) = self.held.take()?;
         self.say(block(&sample).unwrap_or_default(), latched_by, now);
         Some((sample, latched_by))
     }
 
-    /// A latched publisher has gone: the sample of it that waits, to go out at once.
+    /// Removes a latched publisher. Returns its waiting sample for immediate publication.
     pub(crate) fn left(&mut self, publisher: PublisherKey, now: Instant) -> Option<Waiting> {
         let waits = matches!(self.held, Some((_, by)) if by == Some(publisher));
         let held = if waits { self.hurry(now) } else { None };
@@ -106,17 +107,17 @@ impl Gate {
         held
     }
 
-    /// Lets a sample wait; the one that waited before gives way.
+    /// Stores a sample as the waiting sample and returns the previous waiting sample.
     pub(crate) fn hold(&mut self, sample: Waiting) -> Option<Waiting> {
         self.held.replace(sample)
     }
 
-    /// When the sample that waits may go.
+    /// Returns the time at which the waiting sample may be published.
     pub(crate) fn due(&self) -> Option<Instant> {
         self.held.as_ref().and(self.opens)
     }
 
-    /// The sample that waited, when its time has come.
+    /// Returns the waiting sample if its time has come.
     pub(crate) fn release(&mut self, now: Instant) -> Option<Waiting> {
         if self.due().is_none_or(|due| now < due) {
             return None;
@@ -136,7 +137,7 @@ impl Gate {
     }
 }
 
-/// The fields of a sample as on the wire.
+/// Returns the encoded fields of a sample.
 fn block(sample: &Encoded) -> Result<&[u8], DecodeError> {
     let network = NetworkMessage::decode(&sample.bytes)?;
     let message = network.messages().next().transpose()?;
@@ -144,7 +145,7 @@ fn block(sample: &Encoded) -> Result<&[u8], DecodeError> {
     Ok(fields.map(|fields| fields.bytes()).unwrap_or_default())
 }
 
-/// Whether all numbers of the two differ by no more than `deadband`, and nothing else does.
+/// Returns whether all numbers differ by at most `deadband` and all other values are equal.
 fn within(one: &[u8], other: &[u8], deadband: f64) -> Result<bool, DecodeError> {
     let (mut one, mut other) = (Fields::parse(one)?, Fields::parse(other)?);
     loop {
@@ -173,7 +174,7 @@ fn near(one: &Variant<'_>, other: &Variant<'_>, deadband: f64) -> bool {
 
 fn near_scalars(one: Scalar<'_>, other: Scalar<'_>, deadband: f64) -> bool {
     match (number(one), number(other)) {
-        // Of two infinities there is no difference.
+        // The difference of two equal infinities is NaN, so equality is checked first.
         (Some(a), Some(b)) => a == b || (a - b).abs() <= deadband || (a.is_nan() && b.is_nan()),
         _ => one == other,
     }

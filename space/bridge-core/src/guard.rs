@@ -1,8 +1,8 @@
-//! Who may write and read: the SecurityGroups of a mapping, and their keys.
+//! Message security: the SecurityGroups of a mapping and their keys.
 //!
-//! Everything that is heard goes through [`Guard::open`] before anything of it is believed, and everything that is sent
-//! through [`Guard::seal`]. What carries no WriterGroupId, as probes and announcements do, belongs to the group that has no
-//! namespaces of its own, or else to the first that is secured.
+//! Every received message passes [`Guard::open`] before its content is used, and every sent message
+//! passes [`Guard::seal`]. Messages without a WriterGroupId, such as probes and announcements,
+//! belong to the group without namespaces of its own, or else to the first secured group.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -15,64 +15,65 @@ use uadp::{
 
 use crate::counters::Reason;
 
-/// Opens what is heard and seals what is sent, by the groups of a mapping.
+/// Opens received messages and seals sent messages according to the groups of a mapping.
 #[derive(Debug)]
 pub struct Guard {
     groups: Vec<Group>,
     by_namespace: BTreeMap<u16, usize>,
-    /// The group of the namespaces that none names.
+    /// The group of the namespaces that no group lists.
     rest: Option<usize>,
-    /// The group of what carries no namespace.
+    /// The group of messages without a namespace.
     discovery: Option<usize>,
-    /// The random half of the nonces of this run; nothing is sealed without.
+    /// The random part of the nonces of this program instance; nothing is sealed without it.
     mark: Option<[u8; 4]>,
-    /// What times count from.
+    /// The origin of time for the openers.
     start: Option<Instant>,
 }
 
-/// Keys of a group, as a file has them or a Security Key Service hands them out (OPC 10000-14, 8.3.2).
+/// The keys of a group, from a file or from a Security Key Service (OPC 10000-14, 8.3.2).
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct KeyDelivery {
-    /// The SecurityTokenId of the first of them, which is the current one.
+    /// The SecurityTokenId of the first key, which is the current key.
     pub first_token_id: u32,
-    /// The current key and the future ones, in their order.
+    /// The current key and the future keys, in their order.
     pub keys: Vec<Keys>,
-    /// How long until the second of them is used; without it the first is used until there are others.
+    /// The time until the second key becomes current. `None` if the first key is used until new
+    /// keys are set.
     pub time_to_next: Option<Duration>,
-    /// How long each of the others is used.
+    /// The lifetime of each further key.
     pub lifetime: Duration,
 }
 
-/// How a group is, for people.
+/// The state of a group for users.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct GroupState {
-    /// Its SecurityGroupId.
+    /// The SecurityGroupId.
     pub group: String,
-    /// What is done to its messages.
+    /// The security mode of its messages.
     pub mode: GroupMode,
-    /// The key that is used; `None` before there is one.
+    /// The SecurityTokenId of the current key; `None` before the first key.
     pub token_id: Option<u32>,
-    /// The key that comes next, if it is there already.
+    /// The SecurityTokenId of the next key, if the next key is known.
     pub next_token_id: Option<u32>,
-    /// Whether the time of the key that is used is over, and there is no other.
+    /// Whether the lifetime of the current key has passed without a next key.
     pub overdue: bool,
 }
 
-/// A message that is not taken.
+/// A rejected message.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Unopened {
-    /// Why, for its counter.
+    /// The reason, for its counter.
     pub reason: Reason,
-    /// Which case of it.
+    /// The case of the reason.
     pub case: &'static str,
-    /// For people.
+    /// The details for users.
     pub detail: String,
 }
 
 #[derive(Debug)]
 struct Group {
     described: SecurityGroup,
-    /// `None` for a group that is not secured.
+    /// `None` for a group without security.
     secured: Option<Secured>,
 }
 
@@ -80,17 +81,18 @@ struct Group {
 struct Secured {
     sealer: Sealer,
     opener: Opener,
-    /// When the next key is to be used.
+    /// The time at which the next key becomes current.
     next: Option<Instant>,
     lifetime: Duration,
     overdue: bool,
-    /// A key is used that is not known here; when that was told last.
+    /// Whether new keys are needed, because a message used an unknown key or no next key exists.
+    /// `told` is the time of the last request for keys.
     wanted: bool,
     told: Option<Instant>,
 }
 
 impl Guard {
-    /// Of those groups; `None` when there is nothing to guard.
+    /// Creates a guard for the groups; `None` if no group is secured.
     #[must_use]
     pub fn new(groups: &[SecurityGroup]) -> Option<Self> {
         let mut guard = Self {
@@ -104,14 +106,14 @@ impl Guard {
         guard.replace(groups).then_some(guard)
     }
 
-    /// Gives it random bytes of this run of the program: nothing is sealed before. Two programs with the same ones would give
-    /// each other's messages away.
+    /// Sets the random bytes of this program instance. Nothing is sealed before. Two programs with
+    /// the same bytes would use the same nonces, which breaks the encryption of both.
     pub const fn set_mark(&mut self, mark: [u8; 4]) {
         self.mark = Some(mark);
     }
 
-    /// Takes up other groups. One that is as it was, apart from its namespaces and where its keys come from, keeps its keys
-    /// and what it has heard. False when nothing is left to guard.
+    /// Replaces the groups. A group that differs only in its namespaces or its key source keeps its
+    /// keys and its replay state. Returns false if no group is secured.
     pub fn replace(&mut self, groups: &[SecurityGroup]) -> bool {
         let mut before = std::mem::take(&mut self.groups);
         self.by_namespace.clear();
@@ -138,10 +140,10 @@ impl Guard {
         self.discovery.is_some()
     }
 
-    /// Takes in the keys of a group; those of a group that is not there are nobody's.
+    /// Sets the keys of a group. Keys of unknown groups are ignored.
     ///
     /// # Errors
-    /// [`KeyError`]; the keys there were stay.
+    /// Returns a [`KeyError`]; the previous keys stay in use.
     pub fn set_keys(
         &mut self,
         group: &str,
@@ -157,7 +159,8 @@ impl Guard {
         secured.opener.update_keys(first, keys.iter().cloned())?;
         secured.sealer.update_keys(first, keys.iter().cloned())?;
         secured.lifetime = delivery.lifetime;
-        // A sealer that is ahead of who delivers waits until that is so far too.
+        // If the sealer is ahead of the delivered keys, its next key change waits until the key
+        // source has caught up.
         let ahead = secured.sealer.current_token_id().and_then(|current| {
             let mut tokens = (0_u32..).zip(tokens(first)).take(keys.len());
             Some(tokens.find(|(_, token)| *token == current)?.0)
@@ -170,7 +173,7 @@ impl Guard {
         Ok(())
     }
 
-    /// How each secured group is.
+    /// Returns the state of each secured group.
     pub fn states(&self) -> impl Iterator<Item = GroupState> {
         self.groups.iter().filter_map(|group| {
             let secured = group.secured.as_ref()?;
@@ -184,7 +187,7 @@ impl Guard {
         })
     }
 
-    /// Whether what is said in a namespace needs keys.
+    /// Returns whether messages in a namespace are secured.
     #[must_use]
     pub fn is_secured(&self, namespace: u16) -> bool {
         self.of(Some(namespace)).is_some()
@@ -195,12 +198,12 @@ impl Guard {
         self.of(Some(namespace))
     }
 
-    /// Whether what is said in one namespace is as well secured as what is said in the other.
+    /// Returns whether both namespaces belong to the same secured group, or both to none.
     pub(crate) fn is_alike(&self, one: u16, other: u16) -> bool {
         self.of(Some(one)) == self.of(Some(other))
     }
 
-    /// Whether anything is left that anybody may say.
+    /// Returns whether any namespace is not secured.
     fn is_mixed(&self) -> bool {
         let open = |at: &usize| self.secured(*at).is_none();
         self.rest.is_none_or(|at| open(&at)) || self.by_namespace.values().any(open)
@@ -210,7 +213,7 @@ impl Guard {
         self.groups.get(at)?.secured.as_ref()
     }
 
-    /// The secured group of what is said in a namespace, or in none.
+    /// Returns the secured group of messages in a namespace, or without a namespace.
     fn of(&self, namespace: Option<u16>) -> Option<usize> {
         let at = match namespace {
             Some(namespace) => self.by_namespace.get(&namespace).copied().or(self.rest),
@@ -219,12 +222,12 @@ impl Guard {
         at.filter(|at| self.secured(*at).is_some())
     }
 
-    /// What is heard, opened into `scratch` where it is secured; `None` for what is in clear and may be. Announcements and
-    /// probes in clear pass where something is left that anybody may say: whether that is what they are about is for who reads
-    /// them.
+    /// Opens a received message into `scratch` if it is secured. Returns `None` for an unsecured
+    /// message that is allowed. Unsecured announcements and probes pass if any namespace is not
+    /// secured; the caller checks whether they concern such a namespace.
     ///
     /// # Errors
-    /// What is wrong with it. Nothing of it is to be believed then.
+    /// Returns the reason of the rejection. The content must not be used then.
     pub fn open<'a>(
         &mut self,
         message: &NetworkMessage<'a>,
@@ -241,7 +244,8 @@ impl Guard {
         }
         let start = *self.start.get_or_insert(now);
         let since = now.saturating_duration_since(start);
-        // Our own comes from our own address, and is not looked at there.
+        // The receiver filters own messages by their address before this point, so the own nonce
+        // shows a replay by another sender.
         let nonce = message.security().map_or(&[][..], |header| header.nonce);
         if let Some(mark) = self.mark
             && nonce.starts_with(&mark)
@@ -261,12 +265,13 @@ impl Guard {
         };
         match secured.opener.open(message, since, scratch) {
             Ok(opened) => {
-                // Others went on to a newer key, so its time has come, where it has not come here already.
+                // Another sender uses a newer key, so the own sealer switches to this key too, if
+                // it has not yet.
                 if opened.key_changed
                     && let Some(used) = secured.opener.current_token_id()
                     && secured.sealer.move_to(used)
                 {
-                    // Keys of a file are used until there are others.
+                    // Keys from a file have no lifetime and are used until new keys are set.
                     let timed = secured.lifetime > Duration::ZERO;
                     secured.next = timed.then(|| now + secured.lifetime);
                     secured.overdue = false;
@@ -281,12 +286,13 @@ impl Guard {
         }
     }
 
-    /// Appends what is sent to `out`, sealed; false where it goes in clear, and nothing was appended.
+    /// Appends the sealed message to `out`. Returns false without appending if the message is sent
+    /// unsecured.
     ///
     /// # Errors
-    /// Why it cannot be sent.
+    /// Returns the reason why the message cannot be sent.
     pub fn seal(&mut self, datagram: &[u8], out: &mut Vec<u8>) -> Result<bool, Unopened> {
-        // What nobody knows the group of is not said in clear either.
+        // A message of an unknown group is not sent unsecured either.
         let message = NetworkMessage::decode(datagram).map_err(|error| Unopened {
             reason: Reason::Malformed,
             case: "seal",
@@ -331,10 +337,10 @@ impl Guard {
         Ok(true)
     }
 
-    /// Bytes that a message may be longer by, once it is sealed.
+    /// The maximum number of bytes by which sealing makes a message longer.
     pub const OVERHEAD: usize = Seal::OVERHEAD;
 
-    /// When [`turn`](Self::turn) is wanted next.
+    /// Returns the time of the next [`turn`](Self::turn).
     pub(crate) fn due(&self) -> Option<Instant> {
         let groups = self.groups.iter();
         groups
@@ -342,7 +348,8 @@ impl Guard {
             .min()
     }
 
-    /// Goes on to the next keys whose time has come. Where there is none, the last goes on.
+    /// Switches to the next key of each group if its time has come. If there is no next key, the
+    /// last key stays in use.
     pub fn turn(&mut self, now: Instant) {
         let groups = self.groups.iter_mut();
         for secured in groups.filter_map(|group| group.secured.as_mut()) {
@@ -355,8 +362,9 @@ impl Guard {
         }
     }
 
-    /// A group whose keys are out of date: somebody uses one that is not known here, or there is no next one. Not told again
-    /// for some time: anybody can send what looks so.
+    /// Returns a group with keys that are out of date: a message used an unknown key, or the next
+    /// key is missing. A group is not returned again for some time, because any sender can cause
+    /// this.
     pub fn wanted(&mut self, now: Instant) -> Option<String> {
         self.groups.iter_mut().find_map(|group| {
             let secured = group.secured.as_mut()?;
@@ -413,12 +421,12 @@ impl Secured {
     }
 }
 
-/// The SecurityTokenIds from one on. Behind the highest comes 1.
+/// Returns the SecurityTokenIds from `first` on. The highest id is followed by 1.
 fn tokens(first: u32) -> impl Iterator<Item = u32> {
     std::iter::successors(Some(first), |token| Some(token.checked_add(1).unwrap_or(1)))
 }
 
-/// The policy whose keys a group has.
+/// Returns the SecurityPolicy of the keys of a group.
 #[must_use]
 pub const fn policy_of(policy: GroupPolicy) -> SecurityPolicy {
     match policy {
@@ -427,7 +435,7 @@ pub const fn policy_of(policy: GroupPolicy) -> SecurityPolicy {
     }
 }
 
-/// What is told of a message that is not opened, and as what it counts.
+/// Returns the reason, case and details of a rejected message.
 #[expect(
     clippy::wildcard_enum_match_arm,
     reason = "the rest is told by its own words"
@@ -453,7 +461,8 @@ fn unopened(error: SecurityError, group: &str) -> Unopened {
     }
 }
 
-/// Runs of programs, with each of their namespaces, that are followed for each key: nothing of them can be sent again by others.
+/// The maximum number of senders per key with replay detection. Each program instance counts once
+/// for each of its namespaces.
 const MAX_SENDERS: usize = 4_096;
-/// So long a group is not asked for anew.
+/// The minimum time between two requests for the keys of a group.
 const ASK_AGAIN: Duration = Duration::from_secs(5);

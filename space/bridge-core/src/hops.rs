@@ -1,34 +1,37 @@
-//! How long samples took, hop by hop, read off the stamps that are on the wire anyway.
+//! The delays of samples by hop, computed from the timestamps in the messages.
 
 use hdrhistogram::Histogram;
 use uadp::Timestamp;
 
-/// One stretch of a sample's way.
+/// A part of the path of a sample.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Hop {
-    /// From the local side's message to the NetworkMessage, in this program (tPB of a producer's bridge).
+    /// From the message of the local side to the NetworkMessage, in this program (tPB of the
+    /// producer's bridge).
     Out,
-    /// The same stretch in the producer's bridge, read from the stamps of its messages.
+    /// The same part in the producer's bridge, computed from the timestamps of its messages.
     Origin,
-    /// From the producer's bridge to this program, through the PubSub network (tTR0). Between two hosts it holds
-    /// only as far as their clocks agree.
+    /// From the producer's bridge to this program through the PubSub network (tTR0). Between two
+    /// hosts it is only as accurate as the synchronization of their clocks.
     Network,
-    /// From the datagram's arrival to the local publication, in this program (tPB of a consumer's bridge).
+    /// From the arrival of the datagram to the local publication, in this program (tPB of the
+    /// consumer's bridge).
     In,
 }
 
-/// The delays of one hop.
+/// The delays of a hop.
 #[derive(Debug, Clone)]
 pub struct Delays {
-    /// In nanoseconds; two significant digits.
+    /// The delays in nanoseconds with two significant digits.
     histogram: Histogram<u64>,
-    /// Delays below zero, which only clocks that disagree can make.
+    /// The number of negative delays, which result only from unsynchronized clocks.
     negative: u64,
 }
 
 impl Delays {
     fn new() -> Self {
-        // Two significant digits from 1 ns to 1 h: the bounds are valid constants, so the fallback is never taken.
+        // Two significant digits from 1 ns to 1 h: the bounds are valid constants, so the fallback
+        // is never taken.
         let histogram = Histogram::new_with_bounds(1, 3_600_000_000_000, 2)
             .or_else(|_| Histogram::new(2))
             .unwrap_or_else(|_| unreachable!("two significant digits are valid"));
@@ -45,32 +48,34 @@ impl Delays {
         }
     }
 
-    /// How many delays were recorded.
+    /// Returns the number of recorded delays.
     #[must_use]
     pub fn count(&self) -> u64 {
         self.histogram.len()
     }
 
-    /// How many were below zero and left out: the clocks of the two hosts disagree.
+    /// Returns the number of negative delays that were not recorded because the clocks of the two
+    /// hosts disagree.
     #[must_use]
     pub const fn negative(&self) -> u64 {
         self.negative
     }
 
-    /// The delay, in microseconds, that the share `quantile` (0..=1) of samples did not exceed. 0 without samples.
+    /// Returns the delay in microseconds that the share `quantile` (0..=1) of samples did not
+    /// exceed; 0 without samples.
     #[must_use]
     pub fn quantile_us(&self, quantile: f64) -> f64 {
         microseconds(self.histogram.value_at_quantile(quantile))
     }
 
-    /// The largest delay, in microseconds. 0 without samples.
+    /// Returns the largest delay in microseconds; 0 without samples.
     #[must_use]
     pub fn max_us(&self) -> f64 {
         microseconds(self.histogram.max())
     }
 }
 
-/// The delays of every hop this program can see.
+/// The delays of all hops that this program can measure.
 #[derive(Debug, Clone)]
 pub struct Hops {
     out: Delays,
@@ -89,7 +94,7 @@ impl Hops {
         }
     }
 
-    /// The delays of one hop.
+    /// Returns the delays of a hop.
     #[must_use]
     pub const fn of(&self, hop: Hop) -> &Delays {
         match hop {

@@ -1,4 +1,5 @@
-//! What the fields of a writer's DataSet are: names, and what RawData is read with (OPC 10000-14, 7.2.4.5.11).
+//! The fields of a writer's DataSet: their names, and the information for reading RawData (OPC
+//! 10000-14, 7.2.4.5.11).
 
 use std::net::{Ipv4Addr, SocketAddr};
 
@@ -10,7 +11,7 @@ use uadp::{BuiltinType, ConfigurationVersion, DataSetHeader, RawField};
 use crate::description::{MAX_FIELDS, MAX_NAME};
 use crate::learned::Weight;
 
-/// The fields of a DataSet, as its writer announced them, or as the mapping has them.
+/// The fields of a DataSet, as announced by its writer or as defined in the mapping.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) struct Layout {
     from: SocketAddr,
@@ -28,10 +29,10 @@ struct Field {
 }
 
 impl Layout {
-    /// What the sender at that address announced.
+    /// Reads the announcement of the sender at the address `from`.
     ///
     /// # Errors
-    /// In words, what makes it useless.
+    /// Returns the reason in words if the announcement cannot be used.
     pub(crate) fn read(
         meta_data: &DataSetMetaDataType<'_>,
         from: SocketAddr,
@@ -65,7 +66,7 @@ impl Layout {
         })
     }
 
-    /// The fields of a mapped value: what has no length in ROS has none here.
+    /// Returns the fields of a mapped value. Strings have no maximum length, as in ROS.
     pub(crate) fn mapped(variable: &Variable) -> Self {
         let fields = variable.fields.iter().map(|leaf| {
             let (value_rank, array_dimensions) = match leaf.rank {
@@ -88,23 +89,25 @@ impl Layout {
         }
     }
 
-    /// Whether the sender at that address announced it.
+    /// Returns whether the sender at the address announced this layout.
     pub(crate) fn is_of(&self, from: SocketAddr) -> bool {
         self.from == from
     }
 
-    /// Whether messages with this header have these fields, as far as they say.
+    /// Returns whether messages with this header have these fields. Headers without a version
+    /// match.
     pub(crate) fn is_current(&self, header: &DataSetHeader) -> bool {
         self.version.compare(header) != VersionMatch::Major
     }
 
-    /// The place of the field of a name.
+    /// Returns the index of the field with the name.
     pub(crate) fn place_of(&self, name: &str) -> Option<u16> {
         let at = self.fields.iter().position(|field| field.name == name)?;
         u16::try_from(at).ok()
     }
 
-    /// What RawData is read with. Structures are left out: what they are made of is not kept.
+    /// Returns the information for reading RawData. Structures have no definition, because it is
+    /// not stored.
     pub(crate) fn raw_fields(&self) -> Vec<RawField<'_>> {
         let fields = self.fields.iter().map(|field| RawField {
             value_rank: field.value_rank,
@@ -126,5 +129,5 @@ impl Weight for Layout {
     }
 }
 
-/// OPC UA sets no limit; nobody has more.
+/// A sanity limit; OPC UA defines none.
 const MAX_DIMENSIONS: usize = 16;

@@ -1,4 +1,4 @@
-//! What writers of other spaces announced of their topics, within bounds.
+//! Bounded storage for the announcements of other spaces about their topics.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -6,24 +6,25 @@ use std::time::{Duration, Instant};
 
 use mappings::TopicId;
 
-/// What is known of topics from their DataSetMetaData. Whoever sends to the group can announce, so what is kept is
-/// bounded in number and bytes, and forgotten when it is not announced again.
+/// The announced metadata of topics. Each sender in the group can announce, so the storage is
+/// bounded in number and bytes, and announcements expire if they are not repeated.
 #[derive(Debug)]
 pub(crate) struct Learned<T> {
     known: HashMap<TopicId, Known<T>>,
     weight: usize,
-    /// When one of that rank found no room last: those that come soon after are not looked for room again.
+    /// The last time an announcement of this rank found no room. Announcements of this rank or
+    /// lower are rejected without another search for a short time after it.
     full: Option<(Instant, Rank)>,
 }
 
-/// Which topics have precedence, the later ones.
+/// The precedence of topics. Later variants take precedence over earlier variants.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum Rank {
-    /// Nobody sends its values, or does so no longer.
+    /// The values of the topic are not received, or not received any more.
     Stray,
-    /// Somebody sends its values.
+    /// The values of the topic are received.
     Heard,
-    /// The mapping names it.
+    /// The mapping contains the topic.
     Mapped,
 }
 
@@ -33,9 +34,9 @@ struct Known<T> {
     until: Instant,
 }
 
-/// What takes up memory.
+/// An object that occupies memory.
 pub(crate) trait Weight {
-    /// Roughly the bytes it takes up.
+    /// Returns the approximate size in bytes.
     fn weight(&self) -> usize;
 }
 
@@ -49,20 +50,20 @@ impl<T> Default for Learned<T> {
     }
 }
 
-/// What is new about an announcement.
+/// The effect of an announcement.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum News {
-    /// It says what is known already.
+    /// The announcement equals the stored one.
     Same,
-    /// It says something new.
+    /// The announcement is new or differs.
     Other,
-    /// There is no room for it.
+    /// There is no room for the announcement.
     Full,
 }
 
 impl<T: Weight + PartialEq> Learned<T> {
-    /// Takes note of what a topic is, for some time. Where there is no room, those of the lowest rank give way to one of a
-    /// higher.
+    /// Stores the description of a topic for a limited time. If there is no room, announcements of
+    /// lower ranks are removed, lowest rank first.
     pub(crate) fn learn(
         &mut self,
         topic: TopicId,
@@ -101,13 +102,13 @@ impl<T: Weight + PartialEq> Learned<T> {
         News::Other
     }
 
-    /// What is known of a topic.
+    /// Returns the description of a topic, unless it has expired.
     pub(crate) fn get(&self, topic: TopicId, now: Instant) -> Option<&Arc<T>> {
         let known = self.known.get(&topic)?;
         (known.until > now).then_some(&known.described)
     }
 
-    /// What was said of a topic last, be it long ago.
+    /// Returns the last description of a topic, even if it has expired.
     pub(crate) fn last(&self, topic: TopicId) -> Option<&Arc<T>> {
         self.known.get(&topic).map(|known| &known.described)
     }
@@ -134,15 +135,16 @@ impl<T: Weight + PartialEq> Learned<T> {
     }
 }
 
-/// Topics described at a time.
+/// The maximum number of described topics.
 const MAX_TOPICS: usize = 4096;
-/// Bytes of all descriptions.
+/// The maximum number of bytes of all descriptions.
 const MAX_WEIGHT: usize = 8 << 20;
-/// How long it stays full once it is.
+/// The time without another search after no room was found.
 const LOOK_AGAIN: Duration = Duration::from_secs(1);
-/// Announcements that may be lost before what they say is forgotten.
+/// The number of consecutive announcements that may be lost before a description expires.
 const MISSED: u32 = 3;
-/// Writers may announce more rarely than we do.
+/// The minimum lifetime of a description, because writers may announce more rarely than this
+/// bridge.
 const LEAST: Duration = Duration::from_secs(300);
 
 #[cfg(test)]

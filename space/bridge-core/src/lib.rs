@@ -1,13 +1,15 @@
-//! What crosses between a space and UADP, and what does not.
+//! Conversion between the local side of a space and OPC UA PubSub (UADP), and the rules for the
+//! messages that may cross.
 //!
-//! The [`Router`] is sans-IO: time and bytes go in through `handle_*`, values come out of
-//! [`poll_output`](Router::poll_output), and [`poll_timeout`](Router::poll_timeout) says when to come back. There is
-//! no socket, clock or task in here. After every `handle_*` drain `poll_output`; when `poll_timeout` has passed, call
-//! [`handle_timeout`](Router::handle_timeout). Where samples may share datagrams, those that are there are handled first, but
-//! for one whose topic [is full](Router::is_full).
+//! The [`Router`] is sans-IO: time and bytes go in through `handle_*`, outputs come out of
+//! [`poll_output`](Router::poll_output), and [`poll_timeout`](Router::poll_timeout) returns the
+//! time of the next [`handle_timeout`](Router::handle_timeout). The crate has no sockets, clocks or
+//! tasks. Drain `poll_output` after each `handle_*`, and call `handle_timeout` when the time of
+//! `poll_timeout` has passed. If samples may share datagrams, handle all waiting samples before
+//! draining `poll_output`, except samples of a topic that [is full](Router::is_full).
 //!
-//! The checks run in the order header, loop, route, payload, so that looped and unmapped traffic costs a header read
-//! and no allocation.
+//! The checks run in the order header, loop, route, payload, so that looped and unmapped traffic
+//! costs a header read and no allocation.
 
 mod application;
 mod base;

@@ -1,42 +1,43 @@
-//! Why nothing loops: the space in a name is where the value is produced, and where the call is executed.
+//! The rule that prevents loops: the space in a name is the space that produces the value or
+//! executes the call.
 
 use std::collections::BTreeSet;
 
 use mappings::{SpaceId, TopicId};
 
-/// Which side of a bridge something was heard on.
+/// The side of a bridge on which a message was received.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Side {
-    /// The bridge's own space: a ROS graph, or the address space of an OPC UA server.
+    /// The own space of the bridge: a ROS graph, or the address space of an OPC UA server.
     Local,
     /// The OPC UA PubSub space.
     Ua,
 }
 
-/// What under a name is heard.
+/// The kind of a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum What {
-    /// A value, or what is said of a value or call. It comes from where the name says.
+    /// A value, or metadata of a value or call. It comes from the space in its name.
     Value,
-    /// A request. It goes to where the name says.
+    /// A request. It goes to the space in its name.
     Request,
-    /// A response. It comes from where the name says.
+    /// A response. It comes from the space in its name.
     Response,
 }
 
-/// Which namespaces of its space a program alone writes. A namespace number (WriterGroupId) belongs to one program; space 0
-/// has several programs, every other space one.
+/// The namespaces of its space that only this program writes. A namespace number (WriterGroupId)
+/// belongs to one program. Space 0 has several programs, every other space has exactly one.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub enum Owned {
-    /// All of them.
+    /// All namespaces.
     #[default]
     All,
-    /// These.
+    /// The given namespaces.
     Only(BTreeSet<u16>),
 }
 
 impl Owned {
-    /// Whether that namespace is among them.
+    /// Returns whether the program owns the namespace.
     #[must_use]
     pub fn has(&self, namespace: u16) -> bool {
         match self {
@@ -45,7 +46,7 @@ impl Owned {
         }
     }
 
-    /// Whether that topic is of what a program of space `own` alone writes.
+    /// Returns whether a program of space `own` owns the namespace of the topic.
     #[must_use]
     pub fn is_home(&self, own: SpaceId, topic: TopicId) -> bool {
         let (_, namespace, _) = topic.triple();
@@ -53,13 +54,14 @@ impl Owned {
     }
 }
 
-/// Whether something under a name may cross a bridge from the side it was heard on. `home` says whether the bridge alone
-/// writes what the name stands for, which is [`Owned::is_home`].
+/// Returns whether a message may cross a bridge from the side on which it was received. `home` is
+/// [`Owned::is_home`]: whether only this bridge writes the topic or executes the call.
 ///
-/// Values: from its own side a bridge takes only what is produced there, from the UA side only what is produced elsewhere.
-/// So a value crosses UA once and enters each other space once, with any set of bridges of distinct spaces, and no memory
-/// or hop count is needed. Calls: a request crosses only towards where it is executed, a response only away from there. So a
-/// request crosses UA once and is executed in one place.
+/// Values: a bridge takes from its local side only values that are produced there, and from the UA
+/// side only values that are produced elsewhere. With any set of bridges of distinct spaces, a
+/// value therefore crosses UA once and enters each other space once. No memory and no hop count is
+/// needed. Calls: a request crosses only towards its executor, a response only away from it. A
+/// request therefore crosses UA once and is executed in one place.
 #[must_use]
 pub const fn may_cross(home: bool, heard_on: Side, what: What) -> bool {
     match (what, heard_on) {

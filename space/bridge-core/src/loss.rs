@@ -1,4 +1,4 @@
-//! What is published once when the commander of a topic is lost.
+//! The reaction to the loss of the commander of a topic, which is published once.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -9,13 +9,14 @@ use uadp::{BuiltinType, DateTime, Fields, Timestamp};
 
 use crate::fields;
 
-/// The reaction to the loss of the commander of one topic, and whether it is due.
+/// The reaction to the loss of the commander of a topic, and whether it is due.
 #[derive(Debug)]
 pub(crate) struct Loss {
     reaction: Reaction,
-    /// How long a value holds that is not renewed.
+    /// The time for which a value is valid without renewal.
     hold: Option<Duration>,
-    /// When the last value since the last reaction was delivered; `None` while nothing of the commander moves the robot.
+    /// The time of the last delivered value after the last reaction; `None` while no value of the
+    /// commander is in effect.
     delivered: Option<Instant>,
 }
 
@@ -62,7 +63,7 @@ impl Stop {
     /// Writes the message.
     ///
     /// # Errors
-    /// The reason in words.
+    /// Returns the reason in words.
     pub(crate) fn write(&self, now: Timestamp, out: &mut Vec<u8>) -> Result<(), String> {
         if !self.is_stamped {
             let written = self.plan.write(&mut NoFields, out);
@@ -78,10 +79,11 @@ impl Stop {
 }
 
 impl Loss {
-    /// What the mapping says of a topic, in its local type; `None` where it says nothing.
+    /// Returns the reaction from the mapping in the local type of the topic; `None` if the mapping
+    /// has no reaction.
     ///
     /// # Errors
-    /// [`PlanError`] when the message cannot be made in that type.
+    /// Returns a [`PlanError`] if the message cannot be made in this type.
     pub(crate) fn new(
         mapping: &Mapping,
         topic: TopicId,
@@ -108,33 +110,34 @@ impl Loss {
         }))
     }
 
-    /// The same, after another mapping or type: the last value was delivered when it was.
+    /// Keeps the time of the last delivered value after a change of the mapping or the type.
     pub(crate) fn following(self, before: Option<&Self>) -> Self {
         let delivered = before.and_then(|before| before.delivered);
         Self { delivered, ..self }
     }
 
-    /// Takes note of a value that is delivered.
+    /// Records a delivered value.
     pub(crate) const fn deliver(&mut self, now: Instant) {
         self.delivered = Some(now);
     }
 
-    /// When the last value is over.
+    /// Returns the time at which the last value expires.
     pub(crate) fn due(&self) -> Option<Instant> {
         Some(self.delivered? + self.hold?)
     }
 
-    /// The reaction, if a value was delivered since the last one.
+    /// Returns the reaction if a value was delivered after the last reaction.
     pub(crate) fn take(&mut self) -> Option<Reaction> {
         self.delivered.take()?;
         Some(self.reaction.clone())
     }
 }
 
-/// The value that makes a topic call its service, where some topic has that for a reaction.
+/// Returns the value with which a topic calls its service, if this call is the reaction of another
+/// topic.
 ///
 /// # Errors
-/// [`PlanError`] when the value cannot be made in the type it comes in.
+/// Returns a [`PlanError`] if the value cannot be made in its type.
 pub(crate) fn trigger(
     mapping: &Mapping,
     topic: TopicId,
@@ -163,5 +166,5 @@ pub(crate) fn trigger(
     Stop::new(message_type, Selection::Template { fields, rest }, wire).map(Some)
 }
 
-/// The stamp of a header, in messages that begin with one.
+/// The header stamp of messages that start with a header.
 const STAMP: &str = "header.stamp";

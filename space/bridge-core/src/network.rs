@@ -1,5 +1,5 @@
-//! The NetworkMessages a bridge sends: one DataSetMessage each unless told otherwise, since common subscribers handle
-//! only the first of several.
+//! The NetworkMessages that a bridge sends. By default each has a single DataSetMessage, because
+//! common subscribers handle only the first of several.
 
 use mappings::{SpaceId, TopicId};
 use uadp::{
@@ -12,7 +12,8 @@ use crate::counters::{Cause, Reason};
 use crate::fields;
 use crate::writer::Encoded;
 
-/// Writes the one NetworkMessage of a sample. The stamp of sending is patched in when it is polled.
+/// Writes the NetworkMessage of a sample. The time of sending is patched in when the message is
+/// polled.
 pub(crate) fn encode(
     encoded: &mut Encoded,
     topic: TopicId,
@@ -38,7 +39,7 @@ pub(crate) fn encode(
     Ok(())
 }
 
-/// Writes one NetworkMessage with the DataSetMessages of several, all of one WriterGroup.
+/// Writes one NetworkMessage with several DataSetMessages of the same WriterGroup.
 pub(crate) fn join<'a>(
     bytes: &mut Vec<u8>,
     utc: Timestamp,
@@ -55,7 +56,8 @@ pub(crate) fn join<'a>(
     message.finish()
 }
 
-/// Holds a DataSetMessage that is too big for a datagram to `max_message` bytes.
+/// Checks that a DataSetMessage has at most `max_message` bytes. It is called for DataSetMessages
+/// that are too big for a datagram.
 pub(crate) fn check_size(encoded: &Encoded, max_message: u32) -> Result<(), String> {
     let size = encoded.data_set_message().len();
     if u32::try_from(size).is_ok_and(|size| size <= max_message) {
@@ -67,7 +69,8 @@ pub(crate) fn check_size(encoded: &Encoded, max_message: u32) -> Result<(), Stri
     ))
 }
 
-/// Writes the chunk of a sample that begins `offset` bytes into its DataSetMessage; where the next one begins.
+/// Writes the chunk that starts at `offset` bytes in the DataSetMessage of a sample. Returns the
+/// offset of the next chunk.
 pub(crate) fn chunk(
     bytes: &mut Vec<u8>,
     topic: TopicId,
@@ -93,7 +96,7 @@ pub(crate) fn chunk(
     Ok(chunks.offset())
 }
 
-/// The chunks of an announcement that is larger than a datagram.
+/// Returns the chunks of an announcement that is larger than a datagram.
 pub(crate) fn announcement_chunks(
     space: SpaceId,
     sequence_number: u16,
@@ -134,7 +137,7 @@ pub(crate) fn announcement_chunks(
     }
 }
 
-/// Writes a keep-alive; the stamp of sending is patched in when it is polled.
+/// Writes a keep-alive. The time of sending is patched in when the message is polled.
 pub(crate) fn keep_alive(
     mut bytes: Vec<u8>,
     topic: TopicId,
@@ -173,7 +176,8 @@ fn network_header(space: u16, namespace: u16, utc: Timestamp) -> NetworkHeader<'
     }
 }
 
-/// The header of a sample taken from the local side at `taken`, of that quality.
+/// Returns the header of a sample with the time `taken` at which the local side provided it, and
+/// its status.
 pub(crate) fn data_set_header(
     sequence: u16,
     (taken, status): (Timestamp, u16),

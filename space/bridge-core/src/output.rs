@@ -1,4 +1,4 @@
-//! What comes out of a Router.
+//! The outputs of a Router.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -12,195 +12,209 @@ use crate::confirm::Arrival;
 use crate::counters::Reason;
 use crate::description::Described;
 
-/// What the Router wants done.
+/// An action that the Router requests from its caller.
 #[derive(Debug)]
 #[non_exhaustive]
 pub enum Output {
-    /// A NetworkMessage to send. Give the buffer back with [`Router::recycle`](crate::Router::recycle).
+    /// A NetworkMessage to send. Return the buffer with
+    /// [`Router::recycle`](crate::Router::recycle).
     Datagram {
-        /// The topic it carries.
+        /// The topic of the first DataSetMessage.
         topic: TopicId,
-        /// The topics of its other DataSetMessages, in their order, where the mapping lets several share a datagram. One
-        /// that has several of them is here as often.
+        /// The topics of the other DataSetMessages in their order, if the mapping lets several
+        /// share a datagram. A topic with several DataSetMessages is listed once for each of them.
         with: Vec<TopicId>,
         /// The whole UDP payload.
         bytes: Vec<u8>,
     },
-    /// A discovery NetworkMessage to send, as a [`Datagram`](Self::Datagram) is: what a topic consists of, or the question
-    /// for that.
+    /// A discovery NetworkMessage to send in the same way as a [`Datagram`](Self::Datagram): a
+    /// metadata announcement or a probe for metadata.
     Discovery {
         /// The whole UDP payload.
         bytes: Vec<u8>,
     },
     /// A sample of another space to publish.
     Delivery(Delivery),
-    /// A value of another space came whose local type is not known, or its writer says anew what it is: find a type and
-    /// [`bind`](crate::Router::bind) it.
+    /// A value of another space was received with an unknown local type, or its writer announced a
+    /// changed type. Find a type and [`bind`](crate::Router::bind) it.
     Unbound {
-        /// Which value.
+        /// The topic of the value.
         topic: TopicId,
-        /// Builtin type, and whether it is an array, of each of its fields. Null counts as a scalar
-        /// [`BuiltinType::Variant`].
+        /// The builtin type of each field, and whether the field is an array. Null counts as a
+        /// scalar [`BuiltinType::Variant`].
         shape: Vec<(BuiltinType, bool)>,
-        /// What its writer says it is, if that is what the values are.
+        /// The announced description, if the values match it.
         described: Option<Arc<Described>>,
     },
-    /// A topic of another space has had no good value for `receive_timeout`, or has one again. Good is a sample that the
-    /// local side took ([`Router::published`](crate::Router::published)), its repetition, or a keep-alive with nothing dropped
-    /// before it.
+    /// A topic of another space has had no good value for `receive_timeout`, or has a good value
+    /// again. Good are samples that the local side accepted
+    /// ([`Router::published`](crate::Router::published)), their repetitions, and keep-alives
+    /// without a dropped value before them.
     Silent {
-        /// Which value.
+        /// The topic of the value.
         topic: TopicId,
-        /// Whether it is silent now.
+        /// Whether the topic is silent.
         silent: bool,
-        /// Why the last value was dropped, where the writer is heard all the same. Only a value ends such a silence.
+        /// The reason why the last value was dropped, if the writer is received nevertheless. Only
+        /// a value ends such a silence.
         dropped: Option<Reason>,
     },
-    /// The commander of a topic has ended or timed out: what the mapping says under `on_loss` is delivered.
+    /// The commander of a topic has ended or timed out. The reaction under `on_loss` in the mapping
+    /// is delivered.
     CommanderLost {
-        /// Which value.
+        /// The topic of the value.
         topic: TopicId,
     },
-    /// Of the values a topic of another space has side by side, one is no longer repeated: who comes late is not to
-    /// get it any more.
+    /// A value of a topic with several simultaneous values is no longer repeated. Late joiners must
+    /// not receive it.
     Retired {
-        /// Which topic.
+        /// The topic of the value.
         topic: TopicId,
         /// [`Delivery::instance`] of the value.
         instance: Timestamp,
     },
-    /// A request or response to send, as a [`Datagram`](Self::Datagram) is.
+    /// A request or response to send in the same way as a [`Datagram`](Self::Datagram).
     Action {
-        /// The call.
+        /// The topic of the call.
         topic: TopicId,
         /// The whole UDP payload.
         bytes: Vec<u8>,
     },
-    /// What became of a request of the local side. Each has one, unless it was given up.
+    /// The outcome of a request of the local side. Each request has exactly one outcome, unless it
+    /// was given up.
     Answer {
-        /// Which request.
+        /// The identifier of the request.
         ask: AskId,
-        /// Of which call.
+        /// The topic of the call.
         topic: TopicId,
-        /// The response, or why there is none.
+        /// The response, or the reason why there is no response.
         answer: Answered,
     },
-    /// A call of another program can be asked for, or is another than before.
+    /// A call of another program can be requested, or its description has changed.
     CallKnown {
-        /// Which call.
+        /// The topic of the call.
         topic: TopicId,
-        /// What it takes and gives.
+        /// The arguments and results of the call.
         description: Arc<CallDescription>,
     },
-    /// Nobody executes that call any longer.
+    /// The call has no executor any more.
     CallGone {
-        /// Which call.
+        /// The topic of the call.
         topic: TopicId,
     },
-    /// A request for the local side to execute. Each is to be ended with [`Router::executed`](crate::Router::executed).
+    /// A request for the local side to execute. End each execution with
+    /// [`Router::executed`](crate::Router::executed).
     Execute(Execution),
-    /// Who asked does not want it any longer: it is to be cancelled where that can be done, and ended all the same.
+    /// The requestor does not need the execution any more. Cancel it if possible, and end it in any
+    /// case.
     Abandoned {
-        /// Which execution.
+        /// The identifier of the execution.
         execution: ExecutionId,
-        /// Of which call.
+        /// The topic of the call.
         topic: TopicId,
     },
-    /// The outcome of the newest event of a topic of ours that bridges [confirm](mappings::Variable::confirmed_within).
+    /// The outcome of the newest event of an own topic that bridges
+    /// [confirm](mappings::Variable::confirmed_within).
     Settled {
-        /// Which value.
+        /// The topic of the event.
         topic: TopicId,
         /// The outcome.
         arrival: Arrival,
     },
-    /// A value that the local side accepted is to be confirmed: report its handover with
+    /// A value that the local side accepted needs a confirmation. Report its handover with
     /// [`Router::handed`](crate::Router::handed).
     HandoverWanted {
-        /// Which value.
+        /// The topic of the value.
         topic: TopicId,
         /// [`Delivery::instance`] of the value.
         instance: Timestamp,
     },
-    /// Somebody else writes a namespace of ours: nothing of ours is sent in it as long as that is so.
+    /// Another sender writes an own namespace. The Router sends nothing in this namespace in the
+    /// meantime.
     Taken {
-        /// Which namespace.
+        /// The number of the namespace.
         namespace: u16,
-        /// Who; nobody any more without one.
+        /// The address of the other sender; `None` when it has stopped.
         by: Option<SocketAddr>,
     },
-    /// The keys of a secured group are out of date: somebody uses one that is not known here, or there is no next one.
+    /// The keys of a secured group are out of date: a message uses an unknown key, or the next key
+    /// is missing.
     KeysWanted {
-        /// Its SecurityGroupId.
+        /// The SecurityGroupId of the group.
         group: String,
     },
-    /// Something to log.
+    /// An event to log.
     Notice(Notice),
 }
 
-/// A latched publisher of the local side, among those of its topic.
+/// Identifies a latched publisher of the local side among the publishers of its topic.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct PublisherKey(pub u32);
 
-/// A message heard on the local side.
+/// A message received on the local side.
 #[derive(Debug, Clone, Copy)]
 pub struct Heard<'a> {
-    /// Which value it is.
+    /// The topic of the value.
     pub topic: TopicId,
-    /// It, in the local encoding.
+    /// The message in the local encoding.
     pub payload: &'a [u8],
-    /// When it came.
+    /// The time of reception.
     pub received: Timestamp,
-    /// The publisher, if it latches: its last message then stays for late joiners beside those of others, until
-    /// [`Router::left`](crate::Router::left). Of all messages without, the last one stays.
+    /// The publisher, if it latches. Its last message then stays available for late joiners, beside
+    /// the messages of other publishers, until [`Router::left`](crate::Router::left). Of all
+    /// messages without a latching publisher, only the last stays.
     pub latched_by: Option<PublisherKey>,
 }
 
-/// What a value is to the others of its topic.
+/// The relation of a value to the other values of its topic.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kept {
-    /// It takes the place of all before it, as the values of a state do.
+    /// The value replaces all previous values, as for a state.
     Alone,
-    /// It lives beside others, as the messages of several latched publishers do, until it is
+    /// The value exists beside others, as for several latched publishers, until it is
     /// [retired](Output::Retired).
     Beside,
-    /// As `Beside`, and it was handed out before: for late joiners only.
+    /// As `Beside`, but the value was already delivered: it is for late joiners only.
     Again,
 }
 
-/// One value of another space on its way to the local side.
+/// A value of another space for the local side.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Delivery {
-    /// Which value.
+    /// The topic of the value.
     pub topic: TopicId,
-    /// Its bytes in the local encoding.
+    /// The bytes of the value in the local encoding.
     pub payload: Vec<u8>,
-    /// When the producer's bridge took the sample: the DataSetMessage Timestamp, or the SourceTimestamp of the DataValue that
-    /// is the value.
+    /// The time at which the producing bridge took the sample: the DataSetMessage Timestamp, or the
+    /// SourceTimestamp of the DataValue that is the value.
     pub source: Option<Timestamp>,
-    /// The DataSetMessage Status, or that of the DataValue that is the value if that is worse: the upper 16 bits of an OPC UA
-    /// StatusCode, 0 is Good.
+    /// The upper 16 bits of an OPC UA StatusCode; 0 is Good. It is the DataSetMessage Status, or
+    /// the worse Status of the DataValue that is the value.
     pub status: u16,
-    /// When its datagram arrived here; of a sample that waited for its local type, when that was known.
+    /// The arrival time of the datagram. For a sample that waited for its local type, the time at
+    /// which the type became known.
     pub arrived: Timestamp,
-    /// The DataSetMessage Timestamp, where it tells this value from all others of the topic.
+    /// The DataSetMessage Timestamp, if it distinguishes this value from all other values of the
+    /// topic.
     pub instance: Option<Timestamp>,
-    /// What it is to the others.
+    /// The relation to the other values of the topic.
     pub kept: Kept,
-    /// Whether subscribers that come late get it: it is a state, and no event.
+    /// Whether late joiners receive the value: true for a state, false for an event.
     pub lasting: bool,
 }
 
-/// A drop worth a line in the log. One that is repeated for the same cause is told at its 1st, 10th, 100th ... occurrence.
+/// A drop to log. Repetitions for the same cause are reported at the 1st, 10th, 100th ...
+/// occurrence.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Notice {
-    /// The topic, if it is about one.
+    /// The topic, if the drop concerns a topic.
     pub topic: Option<TopicId>,
-    /// Who sent it, if it came as a datagram.
+    /// The sender, if the dropped value was received in a datagram.
     pub from: Option<SocketAddr>,
-    /// Why.
+    /// The reason of the drop.
     pub reason: Reason,
-    /// How often it happened for that cause by now.
+    /// The number of drops for this cause so far.
     pub total: u64,
-    /// What exactly, in words.
+    /// The details in words.
     pub detail: String,
 }

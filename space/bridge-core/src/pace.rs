@@ -1,25 +1,26 @@
-//! How fast chunks go out.
+//! The rate limit for chunks.
 
 use std::time::{Duration, Instant};
 
-/// Spreads the chunks of large messages over time, so that they overrun neither a link nor a receiver's socket
-/// buffer. What fits into one datagram is not paced.
+/// Spreads the chunks of large messages over time, so that they overrun neither a link nor the
+/// socket buffer of a receiver. Messages in a single datagram are not limited.
 ///
-/// The pace is [`RATE`](Self::RATE) on average, with up to [`BURST`](Self::BURST) ahead of it.
+/// The average rate is [`RATE`](Self::RATE), with bursts of up to [`BURST`](Self::BURST).
 #[derive(Debug, Default)]
 pub(crate) struct Pace {
-    /// When all that was sent would have gone out at just the rate.
+    /// The time at which all sent bytes would have been transmitted at exactly `RATE`.
     done: Option<Instant>,
 }
 
 impl Pace {
-    /// Bytes per second: what a gigabit link carries with something to spare.
+    /// Bytes per second: below the capacity of a gigabit link.
     pub(crate) const RATE: u64 = 100_000_000;
-    /// Bytes that may go at once: what accumulates while a timer rings some milliseconds late. The socket buffers the
-    /// bridges ask for hold many times that; those a system grants by default hold about half of it.
+    /// Bytes of a burst: the amount that accumulates while a timer is some milliseconds late. The
+    /// socket buffers that the bridges request hold many times this amount; default socket buffers
+    /// hold about half of it.
     const BURST: u64 = 256 << 10;
 
-    /// When the next chunk may go.
+    /// Returns the time at which the next chunk may be sent.
     pub(crate) fn opens(&self) -> Option<Instant> {
         self.done?.checked_sub(Self::time_of(Self::BURST))
     }
@@ -28,14 +29,14 @@ impl Pace {
         self.opens().is_none_or(|opens| opens <= now)
     }
 
-    /// Takes note of bytes sent.
+    /// Records sent bytes.
     pub(crate) fn spend(&mut self, bytes: usize, now: Instant) {
         let time = Self::time_of(u64::try_from(bytes).unwrap_or(u64::MAX));
         let from = self.done.map_or(now, |done| done.max(now));
         self.done = Some(from + time);
     }
 
-    /// How long so many bytes take.
+    /// Returns the transmission time of `bytes` bytes.
     pub(crate) fn time_of(bytes: u64) -> Duration {
         Duration::from_nanos(bytes.saturating_mul(1_000_000_000 / Self::RATE))
     }

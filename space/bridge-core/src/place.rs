@@ -1,33 +1,34 @@
-//! The place of a DataSetMessage among the others of its writer.
+//! The position of a DataSetMessage in the sequence of its writer.
 
 use std::net::SocketAddr;
 use std::time::Duration;
 
 use uadp::Timestamp;
 
-/// What the header of a DataSetMessage says of its place among the others.
+/// The position of a DataSetMessage in the sequence of its writer, from its headers.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Place {
     pub(crate) sequence: Option<u16>,
     pub(crate) stamp: Option<Timestamp>,
-    /// Whether the stamp has PicoSeconds, as all bridges send: two samples of one writer then never share it.
+    /// Whether the stamp has PicoSeconds. All bridges send them, and two samples of one writer then
+    /// never share a stamp.
     pub(crate) fine: bool,
-    /// When its NetworkMessage was sent.
+    /// The time at which the NetworkMessage was sent.
     pub(crate) sent: Option<Timestamp>,
     pub(crate) from: SocketAddr,
-    /// How long the writer may hold a sample back before it sends it.
+    /// The maximum time for which the writer may hold back a sample before sending it.
     pub(crate) held_back: Duration,
-    /// Whether the stamps may be of clients of an OPC UA server, whose clocks are their own.
+    /// Whether the stamps may come from clients of an OPC UA server, which have their own clocks.
     pub(crate) by_clients: bool,
 }
 
 impl Place {
-    /// The stamp, where it tells one sample of the writer from all others.
+    /// Returns the stamp if it distinguishes the sample from all other samples of the writer.
     pub(crate) fn instance(&self) -> Option<Timestamp> {
         self.stamp.filter(|_| self.fine)
     }
 
-    /// Whether the sample was taken just before it was sent, as no repetition is.
+    /// Returns whether the sample was taken just before it was sent. False for repetitions.
     pub(crate) fn is_fresh(&self) -> bool {
         let (Some(stamp), Some(sent)) = (self.stamp, self.sent) else {
             return false;
@@ -35,8 +36,9 @@ impl Place {
         (0..FRESH).contains(&(sent.unix_nanos() - stamp.unix_nanos()))
     }
 
-    /// Whether the sample was taken so long before it was sent that it is a stored value. Both stamps are of the writer, so
-    /// no clocks are compared. Stamps that were never filled in say nothing.
+    /// Returns whether the sample is a stored value, because it was taken long before it was sent.
+    /// Both stamps are from the writer, so no clocks are compared. Stamps that were never filled in
+    /// are not evaluated.
     pub(crate) fn is_stored(&self) -> bool {
         let (Some(stamp), Some(sent), true) = (self.stamp, self.sent, self.fine) else {
             return false;
@@ -47,8 +49,8 @@ impl Place {
     }
 }
 
-/// How many nanoseconds after it was taken a sample is sent at most that is no repetition; those that a rate held back or
-/// that are long in their chunks are not among them.
+/// The maximum time in nanoseconds between taking and sending a sample that is not a repetition.
+/// Samples that a rate limit held back and samples with long transmission in chunks exceed it.
 const FRESH: i128 = 100_000_000;
-/// How many nanoseconds after it was taken a sample is sent at least that is a stored value.
+/// The minimum time in nanoseconds between taking and sending a stored value.
 const STORED: i128 = 500_000_000;

@@ -1,30 +1,32 @@
-//! Plans that topics share.
+//! Cache of compiled plans that topics share.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Weak};
 
 use messages::{MessageType, Plan, PlanError, Selection, TypeName, Wire};
 
-/// The plans in use: thousands of topics may be of one type.
+/// The plans in use. They are shared, because thousands of topics may have the same type.
 #[derive(Debug, Default)]
 pub(crate) struct Plans {
     known: HashMap<(TypeName, Selection), Known>,
-    /// How many there may be before those nobody has are looked for.
+    /// The number of plans at which unused plans are removed.
     limit: usize,
 }
 
 #[derive(Debug)]
 struct Known {
-    /// What it was made of, which is another after the type's definition has changed.
+    /// The type from which the plan was compiled. A changed definition is a different
+    /// `MessageType`.
     message_type: Weak<MessageType>,
     plan: Weak<Plan>,
 }
 
 impl Plans {
-    /// The plan for that part of the type, compiled unless another topic has it.
+    /// Returns the plan for a selection of the type. The plan is compiled unless another topic uses
+    /// it.
     ///
     /// # Errors
-    /// [`PlanError`] when the selection is not in the type.
+    /// Returns a [`PlanError`] if the selection is not in the type.
     pub(crate) fn plan(
         &mut self,
         message_type: &Arc<MessageType>,
@@ -76,7 +78,7 @@ mod tests {
         let first = plan(&known, &frame);
         assert!(Arc::ptr_eq(&first, &plan(&known, &frame)));
         assert!(!Arc::ptr_eq(&first, &plan(&known, &Selection::Whole)));
-        // Read anew, it may have other fields.
+        // After another read of its definition, the type may have other fields.
         assert!(!Arc::ptr_eq(&first, &plan(&read(), &frame)));
     }
 }

@@ -1,11 +1,11 @@
-//! The bounded queue of one topic.
+//! The bounded queue of a topic.
 
 use std::collections::VecDeque;
 
 use mappings::Overflow;
 
-/// Samples of one topic that wait to be polled, bounded in number and in bytes. When full, the oldest give way, never
-/// the newest: nothing ever blocks a producer.
+/// The samples of a topic that wait to be polled, bounded in number and in bytes. A full queue
+/// drops its oldest samples, never the newest, and never blocks a producer.
 #[derive(Debug)]
 pub(crate) struct Queue<T> {
     items: VecDeque<(T, usize)>,
@@ -26,7 +26,7 @@ impl<T> Queue<T> {
         }
     }
 
-    /// Appends a sample of so many bytes and gives back the oldest ones that had to go.
+    /// Appends a sample of `bytes` bytes and returns the oldest samples that were dropped for it.
     pub(crate) fn push(&mut self, item: T, bytes: usize) -> Vec<T> {
         let mut dropped = Vec::new();
         while self.items.len() >= self.depth
@@ -45,12 +45,12 @@ impl<T> Queue<T> {
         Some(item)
     }
 
-    /// What [`pop`](Self::pop) gives next.
+    /// Returns the next item of [`pop`](Self::pop).
     pub(crate) fn front(&self) -> Option<&T> {
         self.items.front().map(|(item, _)| item)
     }
 
-    /// Whether the next push makes an older sample give way, were it a small one.
+    /// Returns whether the next push drops an older sample even if the new sample is small.
     pub(crate) fn is_full(&self) -> bool {
         self.items.len() >= self.depth
     }
@@ -60,7 +60,7 @@ impl<T> Queue<T> {
     }
 }
 
-/// Of one topic, beside a newest sample that is larger: twice the largest message that crosses unless told otherwise.
+/// The maximum size of a queue without its newest sample: twice the default maximum message size.
 const MAX_BYTES: usize = 128 << 20;
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! What is remembered of one DataSetWriter of another space.
+//! The state of a DataSetWriter of another space.
 
 use std::collections::VecDeque;
 use std::net::SocketAddr;
@@ -15,119 +15,121 @@ use crate::place::Place;
 use crate::settings::Local;
 use crate::writer::MAX_KEPT;
 
-/// The state of a topic we receive.
+/// The state of a received topic.
 #[derive(Debug)]
 pub(crate) struct Reader {
-    /// Sequence number of the newest DataSetMessage taken.
+    /// The sequence number of the newest accepted DataSetMessage.
     sequence: Option<u16>,
-    /// The Timestamp of the last one that was no repetition.
+    /// The Timestamp of the last sample that was not a repetition.
     stamp: Option<Timestamp>,
-    /// Who sent it; `None` before the first.
+    /// The sender of the last message; `None` before the first.
     from: Option<SocketAddr>,
-    /// How often that was another than before, since it was asked.
+    /// The number of sender changes since the last call of [`take_moved`](Self::take_moved).
     moved: u64,
-    /// When anything was last heard of the writer, keep-alives included.
+    /// The time of the last message of the writer, including keep-alives.
     heard: Instant,
-    /// When the topic's value was last known to hold: the local side took one, or the writer repeated it or had nothing new.
+    /// The last time at which the value was valid: the local side accepted a value, or the writer
+    /// repeated it or sent a keep-alive.
     good: Instant,
-    /// Why the newest message since then was dropped.
+    /// The reason why the newest message after this time was dropped.
     dropped: Option<Reason>,
-    /// Whether the topic is held to be silent.
+    /// Whether the topic is silent.
     silent: bool,
-    /// The samples that were handed on, in this order, as far as their stamps are fine enough to tell them apart; at
-    /// most [`MAX_KNOWN`].
+    /// The delivered samples in their order, if their stamps are precise enough to distinguish
+    /// them; at most [`MAX_KNOWN`].
     known: VecDeque<Known>,
-    /// `Some` while the writer repeats several values side by side, as it does for several latched publishers: when it
-    /// last repeated another than the newest.
+    /// The last time at which the writer repeated a value other than the newest. `Some` while the
+    /// writer repeats several values, as for several latched publishers.
     several: Option<Instant>,
-    /// Whether the writer repeats its values as states, which is learnt from its messages.
+    /// Whether the writer repeats its values as states, which is learned from its messages.
     lasting: bool,
-    /// Whether the writer was seen to send a sample right after it was taken, so that its stamps tell stored values from
-    /// new ones.
+    /// Whether the writer has sent a sample right after it was taken. Its stamps then distinguish
+    /// stored values from new values.
     prompt: bool,
-    /// Whether different values came under the same stamp, so that the stamp identifies no sample.
+    /// Whether different values had the same stamp, so that the stamp does not identify a sample.
     still: bool,
-    /// Whether the writer has ended or timed out since its last message, so that it may number its messages anew.
+    /// Whether the writer has ended or timed out after its last message, so that its sequence
+    /// numbers may restart.
     over: bool,
-    /// A stored value that was found to be no state.
+    /// A stored value that turned out not to be a state.
     withdrawn: Option<Timestamp>,
     /// A sample that waits for its local type.
     pub(crate) held: Option<Box<Held>>,
-    /// The newest event, where this space confirms it.
+    /// The newest event, if this space confirms it.
     pub(crate) receipt: Option<Receipt>,
-    /// The state that delta frames change.
+    /// The state to which delta frames apply.
     pub(crate) base: Option<Box<Base>>,
     /// Whether the writer has sent a delta frame.
     pub(crate) deltas: bool,
-    /// Whether the local side lacks the value: it was not handed on, or not taken.
+    /// Whether the local side lacks the value, because it was not delivered or not accepted.
     pub(crate) owed: bool,
-    /// When the writer was last asked what the fields of its messages are.
+    /// The time of the last request to the writer for the fields of its messages.
     pub(crate) asked_layout: Option<Instant>,
-    /// When the port was last asked for the local type.
+    /// The time of the last request to the port for the local type.
     pub(crate) asked: Option<Instant>,
-    /// Builtin type of each field, and whether it is an array, of a sample of the present version.
+    /// The builtin type of each field in the current version, and whether the field is an array.
     pub(crate) shape: Option<Vec<(BuiltinType, bool)>>,
-    /// The major version its messages have (OPC 10000-14, 6.2.3.2.6).
+    /// The MajorVersion of its messages (OPC 10000-14, 6.2.3.2.6).
     major_version: Option<u32>,
-    /// When what it is said to be was last taken, and how often it was another by then.
+    /// The time of the last accepted change of the announced type, and the number of changes.
     renamed: Option<(Instant, u32)>,
-    /// What the port is to be told of the topic.
+    /// The pending notifications of the port about the topic.
     pub(crate) news: News,
 }
 
-/// What the port is to be told of a topic, in this order.
+/// The pending notifications of the port about a topic, in this order.
 #[derive(Debug, Default)]
 pub(crate) struct News {
-    /// Whether the topic stands in the Router's list of those with news.
+    /// Whether the topic is in the Router's list of topics with news.
     pub(crate) queued: bool,
-    /// Whether its writer is silent has changed.
+    /// Whether the silence of the writer has changed.
     pub(crate) silence: bool,
-    /// It is to be asked for a local type.
+    /// The pending request for a local type.
     pub(crate) ask: Option<Ask>,
 }
 
-/// When the port is asked for the local type of a topic.
+/// The condition for a request to the port for the local type of a topic.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Ask {
-    /// Where its writer says what it is: there is a type.
+    /// Only if the writer announces its type, because a local type exists.
     IfDescribed,
-    /// In any case: there is none.
+    /// Always, because no local type exists.
     Always,
 }
 
-/// A sample that was handed on.
+/// A delivered sample.
 #[derive(Debug)]
 struct Known {
     stamp: Timestamp,
     heard: Instant,
     repeated: bool,
-    /// Whether it is one of the topic's values now.
+    /// Whether the sample is a current value of the topic.
     live: bool,
-    /// How it was handed on.
+    /// The way in which the sample was delivered.
     handed: Handed,
 }
 
-/// How a sample was handed to the local side.
+/// The way in which a sample was delivered to the local side.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Handed {
-    /// Not at all: it was stored by its writer, and may be an event.
+    /// Not delivered: the writer stored it, and it may be an event.
     No,
-    /// To present subscribers.
+    /// Delivered to present subscribers.
     Once,
-    /// For subscribers that come late, too.
+    /// Delivered to present subscribers and late joiners.
     Lasting,
 }
 
-/// How the values of a topic reach the local side.
+/// The way in which the values of a topic are delivered to the local side.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Handling {
-    /// The last value is shown, event or state.
+    /// The last value is shown, whether event or state.
     Shown,
-    /// Each value is published once into ROS.
+    /// Each value is published once in ROS.
     Event,
-    /// The value is published into ROS and stored there for subscribers that come late.
+    /// The value is published in ROS and stored for late joiners.
     State,
-    /// A state where its writer repeats it as one, else an event.
+    /// A state if its writer repeats it as a state, else an event.
     AsSource,
 }
 
@@ -142,18 +144,18 @@ impl Handling {
     }
 }
 
-/// What a message that is taken is to the others of its writer.
+/// The relation of an accepted message to the other messages of its writer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Admitted {
-    /// Messages that are missing before it.
+    /// The number of messages that are missing before it.
     pub(crate) missing: u16,
-    /// What it is to the topic's other values.
+    /// The relation to the topic's other values.
     pub(crate) kept: Kept,
-    /// Whether subscribers that come late get it.
+    /// Whether late joiners receive the value.
     pub(crate) lasting: bool,
 }
 
-/// A sample that came before its local type was known; the newest one is kept.
+/// A sample received before its local type was known. Only the newest sample is held.
 #[derive(Debug)]
 pub(crate) struct Held {
     pub(crate) fields: Vec<u8>,
@@ -161,17 +163,17 @@ pub(crate) struct Held {
     pub(crate) instance: Option<Timestamp>,
     pub(crate) status: u16,
     pub(crate) lasting: bool,
-    /// When an event is too old to be handed on, and a large sample is removed.
+    /// The time at which an event is too old for delivery, and at which a large sample is removed.
     pub(crate) until: Instant,
 }
 
 impl Held {
-    /// Whether it counts against the bytes that large samples share.
+    /// Returns whether the sample counts towards the limit for large samples.
     pub(crate) const fn is_large(&self) -> bool {
         self.fields.len() > MAX_SMALL
     }
 
-    /// When the sample is removed, if it is large.
+    /// Returns the time at which the sample is removed, if it is large.
     pub(crate) fn expires(&self) -> Option<Instant> {
         self.is_large().then_some(self.until)
     }
@@ -213,49 +215,49 @@ impl Reader {
         }
     }
 
-    /// When anything was last heard of the writer.
+    /// Returns the time of the last message of the writer.
     pub(crate) const fn heard_at(&self) -> Instant {
         self.heard
     }
 
-    /// Whether anything was ever heard of the writer.
+    /// Returns whether the writer has ever been received.
     pub(crate) const fn was_heard(&self) -> bool {
         self.from.is_some()
     }
 
-    /// Whether the topic is held to be silent.
+    /// Returns whether the topic is silent.
     pub(crate) const fn is_silent(&self) -> bool {
         self.silent
     }
 
-    /// How often its values came from another address than before, since this was asked.
+    /// Returns the number of sender changes since the last call.
     pub(crate) const fn take_moved(&mut self) -> u64 {
         std::mem::replace(&mut self.moved, 0)
     }
 
-    /// Takes note that the writer lives.
+    /// Records a message of the writer.
     pub(crate) const fn heard(&mut self, now: Instant) {
         self.heard = now;
     }
 
-    /// Takes note that the topic has a good value, and says whether it was silent before.
+    /// Records that the topic has a good value. Returns whether it was silent before.
     pub(crate) fn is_good(&mut self, now: Instant) -> bool {
         self.good = now;
         self.dropped = None;
         std::mem::take(&mut self.silent)
     }
 
-    /// Takes note that the writer lives and says nothing else: its last value holds, unless a newer one was dropped. Says
-    /// whether the topic was silent before and is not now.
+    /// Records a sign of life without a value: the last value is valid unless a newer value was
+    /// dropped. Returns whether this ends a silence.
     pub(crate) fn lives(&mut self, now: Instant) -> bool {
         match self.dropped {
-            // Those say nothing against the value there is.
+            // Duplicate and stale messages do not affect the current value.
             None | Some(Reason::Duplicate | Reason::Stale) => self.is_good(now),
             Some(_) => false,
         }
     }
 
-    /// Takes note that a message of the writer was dropped, if that leaves the topic with an old value.
+    /// Records that a message of the writer was dropped, if the topic is left with an old value.
     pub(crate) const fn dropped(&mut self, reason: Reason) {
         let says_nothing = matches!(reason, Reason::Duplicate | Reason::Stale);
         if reason.is_loss() && !(says_nothing && self.dropped.is_some()) {
@@ -263,13 +265,15 @@ impl Reader {
         }
     }
 
-    /// Whether what comes from there may be of the writer: of one that was not heard for `timeout` nobody knows.
+    /// Returns whether the sender may be the writer. If the writer was not received for `timeout`,
+    /// any sender may be.
     pub(crate) fn may_be(&self, from: SocketAddr, now: Instant, timeout: Duration) -> bool {
         self.from.is_none_or(|known| known == from)
             || now.saturating_duration_since(self.heard) >= timeout
     }
 
-    /// Takes note of the version of a message, and says whether what was known of the content is no longer true.
+    /// Records the version of a message. Returns whether the version has changed, so that the known
+    /// content is invalid.
     pub(crate) fn is_changed(&mut self, major_version: Option<u32>) -> bool {
         let before = std::mem::replace(&mut self.major_version, major_version);
         let changed = before.is_some() && before != major_version;
@@ -279,9 +283,12 @@ impl Reader {
         changed
     }
 
-    /// Whether the topic may be said to be something now, and something else if anything is `known` of it: the port opens
-    /// it anew for that, and whoever can send under the writer's address could have it do nothing else. The first word is
-    /// taken, and the first other one; from then on each is waited for twice as long as the one before.
+    /// Returns whether an announced type of the topic may be applied; `known` tells that a type was
+    /// known before.
+    ///
+    /// Each change makes the port reopen the topic, and any sender that forges the writer's address
+    /// can announce changes. The first type and the first change are accepted at once. Each further
+    /// change is accepted only after twice the waiting time of the previous change.
     pub(crate) fn may_be_renamed(&mut self, known: bool, now: Instant) -> bool {
         let (since, times) = match self.renamed {
             Some(renamed) => renamed,
@@ -305,12 +312,12 @@ impl Reader {
         true
     }
 
-    /// Whether the topic has just been without a good value for `timeout`. True once per silence.
+    /// Returns true once per silence, when the topic has had no good value for `timeout`.
     pub(crate) fn fell_silent(&mut self, now: Instant, timeout: Duration) -> bool {
         let fell = !self.silent && now.saturating_duration_since(self.good) >= timeout;
         self.silent |= fell;
         if fell {
-            // Who comes back may send something else.
+            // After its return the writer may send other content.
             self.shape = None;
             self.over = true;
             self.receipt = None;
@@ -318,7 +325,7 @@ impl Reader {
         fell
     }
 
-    /// Takes note that the writer says it has ended, and says whether the topic was not silent before.
+    /// Records that the writer announced its end. Returns whether the topic was not silent before.
     pub(crate) fn leave(&mut self) -> bool {
         self.shape = None;
         self.over = true;
@@ -326,25 +333,27 @@ impl Reader {
         !std::mem::replace(&mut self.silent, true)
     }
 
-    /// Why the newest message since the last good value was dropped, if one was.
+    /// Returns the reason why the newest message after the last good value was dropped, if it was.
     pub(crate) const fn loss(&self) -> Option<Reason> {
         self.dropped
     }
 
-    /// When silence is to be looked for again; `None` while the topic is silent.
+    /// Returns the time of the next check for silence; `None` while the topic is silent.
     pub(crate) fn due(&self, timeout: Duration) -> Option<Instant> {
         (!self.silent).then(|| self.good + timeout)
     }
 
     /// Admits a message into the sequence.
     ///
-    /// The order of the sequence numbers is that of OPC 10000-14, 7.2.3. A writer that starts over looks old by its
-    /// numbers; its stamps or its new address show it. A writer whose clock was set back seems to repeat older
-    /// values; that its numbers go on and the sample is fresh tells.
+    /// The order of sequence numbers is as in OPC 10000-14, 7.2.3. A restarted writer has numbers
+    /// that look old; its stamps or its new address show the restart. A writer with a clock that
+    /// was set back seems to repeat older values; the continued sequence numbers and a fresh sample
+    /// show the difference.
     ///
     /// # Errors
-    /// The reason to drop it: it came before under this number, a newer one came before, it repeats a value that the local
-    /// side has, or it is a stored value that may be an event.
+    /// Returns the reason to drop the message: its number was already received, a newer message was
+    /// received, it repeats a value that the local side has, or it is a stored value that may be an
+    /// event.
     pub(crate) fn admit(
         &mut self,
         place: Place,
@@ -361,7 +370,7 @@ impl Reader {
         let mut next = false;
         let missing = match (self.sequence, place.sequence) {
             (Some(last), Some(sequence)) => match SequenceOrder::of_u16(last, sequence) {
-                // The local side does not have it yet.
+                // The local side does not have the value yet.
                 SequenceOrder::Same if handling == Handling::Shown && self.owed => 0,
                 SequenceOrder::Same if !restarted => return Err(self.again(&place)),
                 SequenceOrder::Older { .. } if !restarted => return Err(Reason::Stale),
@@ -390,13 +399,13 @@ impl Reader {
         let stamp = place.instance().filter(|_| !self.still);
         let same = stamp.is_none_or(|stamp| self.is_same(stamp, message));
         if !same {
-            // Another value under the same stamp.
+            // Another value has the same stamp.
             self.still = true;
             self.known.clear();
         }
         let stamp = stamp.filter(|_| same);
         let kept = match stamp {
-            // Newer than all before, as nearly every sample is.
+            // The sample is newer than all previous samples, as nearly every sample is.
             Some(stamp) if self.several.is_none() && self.stamp.is_none_or(|last| stamp > last) => {
                 Kept::Alone
             }
@@ -427,8 +436,8 @@ impl Reader {
         })
     }
 
-    /// The newest message came once more under its number: its writer sends events again in case they were lost, and stored
-    /// values for readers that show them.
+    /// Handles a repetition of the newest message under its own number. Writers repeat events in
+    /// case they are lost, and stored values for readers that show them.
     fn again(&mut self, place: &Place) -> Reason {
         let (Some(stamp), Some(last)) = (place.instance(), self.stamp) else {
             return Reason::Duplicate;
@@ -442,20 +451,22 @@ impl Reader {
         Reason::Repeat
     }
 
-    /// Whether a sample was handed on, as its stamp says. After the end of a writer that tells a datagram which the network
-    /// held back from the first one of a writer that starts over. A stored value of the latter is no event.
+    /// Returns whether a sample was delivered, by its stamp. After the end of a writer this
+    /// distinguishes a datagram delayed by the network from the first datagram of a restarted
+    /// writer. A stored value of a restarted writer is not an event.
     fn came_before(&self, place: &Place, handling: Handling) -> bool {
         let is_known = |stamp| self.known.iter().any(|known| known.stamp == stamp);
         let stored = place.is_stored() && handling != Handling::Event;
         !stored && place.instance().is_some_and(is_known)
     }
 
-    /// The value that the local side is to store no longer.
+    /// Returns the value that the local side must not store any more.
     pub(crate) const fn take_withdrawn(&mut self) -> Option<Timestamp> {
         self.withdrawn.take()
     }
 
-    /// Whether a message under the stamp of the newest one has its value, as far as that is known.
+    /// Returns whether a message with the stamp of the newest message has the same value, if both
+    /// values are known.
     fn is_same(&self, stamp: Timestamp, message: Option<&DataSetMessage<'_>>) -> bool {
         if self.stamp != Some(stamp) {
             return true;
@@ -466,7 +477,8 @@ impl Reader {
         }
     }
 
-    /// Whether a sample that follows the last one was taken before it, by a clock that was set back in between.
+    /// Returns whether a sample that follows the last sample was taken before it, because the clock
+    /// was set back.
     fn is_set_back(&self, place: Place) -> bool {
         let older = matches!((place.stamp, self.stamp), (Some(new), Some(last)) if new < last);
         let known = || {
@@ -477,7 +489,7 @@ impl Reader {
         older && place.is_fresh() && !known()
     }
 
-    /// What a sample is that may be a repetition.
+    /// Determines the relation of a sample that may be a repetition.
     fn recognise(
         &mut self,
         (stamp, place): (Timestamp, &Place),
@@ -487,7 +499,7 @@ impl Reader {
         let newest = self.stamp == Some(stamp);
         let older = self.stamp.is_some_and(|last| stamp < last);
         let known = self.known.iter_mut().find(|known| known.stamp == stamp);
-        // An older value is repeated after a newer one: they live side by side.
+        // An older value is repeated after a newer value, so the writer has several values.
         if (known.is_some() && !newest) || (known.is_none() && older) {
             self.several = Some(now);
         }
@@ -500,12 +512,12 @@ impl Reader {
         };
         known.heard = now;
         known.repeated = true;
-        // Only states are repeated under numbers of their own.
+        // Only states are repeated under new sequence numbers.
         self.lasting = true;
         let handed = known.handed;
         match (handling, handed) {
             (Handling::Event, _) if place.is_stored() => Err(Reason::Repeat),
-            // The same event twice under one stamp.
+            // The same event is sent twice with the same stamp.
             (Handling::Event, _) | (_, Handed::No) => {
                 self.known.retain(|known| known.stamp != stamp);
                 Ok(match self.several {
@@ -519,8 +531,8 @@ impl Reader {
         }
     }
 
-    /// Takes note that a sample is handed on, so that its repetitions are known. Gives the one that had to be
-    /// forgotten for it, if that was still one of the topic's values.
+    /// Records that a sample is delivered, so that its repetitions are recognised. Returns the
+    /// sample that was removed from the record for it, if that sample is still a current value.
     pub(crate) fn delivered(
         &mut self,
         instance: Option<Timestamp>,
@@ -555,12 +567,13 @@ impl Reader {
                 return None;
             }
             Kept::Alone => {
-                // Of one value at a time only the last one can be live.
+                // A topic with a single value has no other current value than the last.
                 if let Some(last) = self.known.back_mut() {
                     last.live = false;
                 }
             }
-            // Where a newer one came before, it is a repetition that we know the first of only now.
+            // A newer sample was received before, so this is a repetition of a sample that was
+            // missed.
             Kept::Beside => repeated = self.known.iter().any(|known| known.stamp > stamp),
         }
         let evicted = (self.known.len() >= MAX_KNOWN).then(|| self.evict());
@@ -577,15 +590,15 @@ impl Reader {
             .map(|known| known.stamp)
     }
 
-    /// The local side no longer stores any value of the writer, which has ended or timed out. A repetition brings the value
-    /// back.
+    /// Marks all values as not stored by the local side, because the writer has ended or timed out.
+    /// A repetition brings the value back.
     pub(crate) fn withdraw(&mut self) {
         for known in &mut self.known {
             known.live = false;
         }
     }
 
-    /// Removes the oldest one; among several values rather one that was never repeated.
+    /// Removes the oldest sample; with several values preferably a sample that was never repeated.
     fn evict(&mut self) -> Option<Known> {
         let seldom = match self.several {
             Some(_) => self.known.iter().position(|known| !known.repeated),
@@ -594,8 +607,8 @@ impl Reader {
         self.known.remove(seldom.unwrap_or(0))
     }
 
-    /// Among several values, the next one that the writer has not repeated for `after` while it did others. To be
-    /// asked after each key frame until there is none.
+    /// Returns the next of several values that the writer has not repeated for `after` while it
+    /// repeated others. Call it after each key frame until it returns `None`.
     pub(crate) fn retire(&mut self, now: Instant, after: Duration) -> Option<Timestamp> {
         let several = self.several?;
         let ended = now.saturating_duration_since(several) >= after;
@@ -617,13 +630,14 @@ impl Reader {
         None
     }
 
-    /// Forgets that a sample was handed on: it was not after all, and its repetition is welcome.
+    /// Records that a sample was not delivered after all, so that its repetition is accepted.
     pub(crate) fn forget(&mut self, instance: Option<Timestamp>) {
         self.owed = true;
         self.known.retain(|known| Some(known.stamp) != instance);
     }
 
-    /// Forgets what was handed on: the local type changed, and the next repetition is wanted.
+    /// Removes all records of delivered samples, because the local type has changed and the next
+    /// repetition is needed.
     pub(crate) fn forget_all(&mut self) {
         self.owed = true;
         self.known.clear();
@@ -632,12 +646,14 @@ impl Reader {
     }
 }
 
-/// The size up to which a sample of each topic may wait for its local type: whoever sends to the group can invent topics, and
-/// all of them together must not hold more than some megabytes.
+/// The maximum size of a sample that may wait for its local type in each topic. It is small,
+/// because any sender in the group can invent topics, and all of them together must not occupy more
+/// than some megabytes.
 const MAX_SMALL: usize = 4_096;
-/// Samples whose repetitions are known: as many as a writer keeps.
+/// The number of samples with recognised repetitions: as many as a writer keeps.
 const MAX_KNOWN: usize = MAX_KEPT;
-/// How long the second other word on what a topic is has to wait for, and how often that is doubled.
+/// The waiting time of the second change of an announced type, and the maximum number of its
+/// doublings.
 const RENAME_AFTER: Duration = Duration::from_secs(10);
 const MOST_DOUBLINGS: u32 = 8;
 
@@ -661,7 +677,7 @@ mod tests {
         }
     }
 
-    /// Admits a message that is shown.
+    /// Admits a message for [`Handling::Shown`].
     fn admit(reader: &mut Reader, place: Place, now: Instant) -> Result<(u16, Kept), Reason> {
         let admitted = reader.admit(place, None, Handling::Shown, now)?;
         Ok((admitted.missing, admitted.kept))
@@ -735,10 +751,10 @@ mod tests {
             assert_eq!(admit(&mut reader, place(7, 1000)), Ok(Kept::Alone));
             assert_eq!(admit(&mut reader, place(8, 2000)), Ok(Kept::Alone));
             assert!(reader.leave());
-            // The network held both back.
+            // Both datagrams were delayed by the network.
             assert_eq!(admit(&mut reader, place(7, 1000)), Err(Reason::Stale));
             assert_eq!(admit(&mut reader, place(8, 2000)), Err(Reason::Repeat));
-            // The next writer starts over, with a clock that was set back.
+            // The next writer starts with a clock that was set back.
             assert_eq!(admit(&mut reader, place(0, 500)).err(), None);
         }
     }
@@ -782,7 +798,7 @@ mod tests {
 
     const PERIOD: Duration = Duration::from_secs(1);
 
-    /// Plays a key frame through, as the Router does.
+    /// Admits and delivers a key frame as the Router does.
     fn hear(reader: &mut Reader, sequence: u16, stamp: i128, now: Instant) -> Result<Kept, Reason> {
         let place = place(sequence, stamp);
         let (_, kept) = admit(reader, place, now)?;
@@ -845,7 +861,8 @@ mod tests {
         let mut retired = Vec::new();
         for turn in 0..12_u32 {
             let now = start + PERIOD * turn;
-            // From turn 4 on an update of the first takes its place, from turn 8 on the second has gone.
+            // From turn 4 an update replaces the first value; from turn 8 the second value is not
+            // repeated.
             let first = if turn < 4 { 1000 } else { 3000 };
             for stamp in [first, 2000].into_iter().filter(|s| turn < 8 || *s != 2000) {
                 sequence += 1;
@@ -881,7 +898,8 @@ mod tests {
         assert_eq!(next, Ok(Kept::Alone));
         let repeated = hear(sent_at(4, 901 * second, 902 * second));
         assert_eq!(repeated, Err(Reason::Repeat));
-        // What was taken before and is sent only now is another value beside it, as of several latched publishers.
+        // A sample that was taken earlier and sent later is another value, as for several latched
+        // publishers.
         let beside = hear(sent_at(5, 890 * second, 903 * second));
         assert_eq!(beside, Ok(Kept::Beside));
     }
@@ -915,7 +933,7 @@ mod tests {
                 assert!(hear(&mut reader, sequence, stamp, now).is_ok());
             }
         }
-        // Handed on first, and once more when it turns out that it stays beside the others.
+        // Delivered first, and again when it turns out to be one of several values.
         assert!(heard_anew <= 2, "{heard_anew}");
     }
 

@@ -1,19 +1,20 @@
-//! Room for what whoever is on the network can make up.
+//! Limits for state that any sender on the network can create.
 
 use std::time::{Duration, Instant};
 
-/// Places for things that strangers can make up, such as names of topics. When they are used up, the owner looks which of
-/// those there are can go, but not at every stranger that comes: looking takes time.
+/// A limit for items that any sender can create, such as names of topics. When the limit is
+/// reached, the owner looks for items to remove. Because this takes time, it happens at most once
+/// per interval instead of for each new item.
 #[derive(Debug, Clone)]
 pub struct Room {
     most: usize,
     left: usize,
-    /// When the owner may look again.
+    /// The earliest time of the next search.
     look_at: Option<Instant>,
 }
 
 impl Room {
-    /// As many places.
+    /// Creates a limit of `most` items.
     #[must_use]
     pub const fn new(most: usize) -> Self {
         Self {
@@ -23,19 +24,20 @@ impl Room {
         }
     }
 
-    /// Whether it is time to look what can go: no place is left, and the last look was a while ago.
+    /// Returns whether the owner should look for items to remove: the limit is reached, and the
+    /// interval after the last search has passed.
     #[must_use]
     pub fn wants_look(&self, now: Instant) -> bool {
         self.left == 0 && self.look_at.is_none_or(|at| now >= at)
     }
 
-    /// The owner looked: so many are there now.
+    /// Records a search of the owner that left `there` items.
     pub fn looked(&mut self, there: usize, now: Instant) {
         self.left = self.most.saturating_sub(there);
         self.look_at = Some(now + LOOK_AGAIN);
     }
 
-    /// Takes a place, if one is left.
+    /// Takes a free item. Returns false if the limit is reached.
     #[must_use]
     pub const fn take(&mut self) -> bool {
         match self.left.checked_sub(1) {

@@ -1,4 +1,4 @@
-//! The Router: verdicts on samples, queues per topic, repetitions and silences.
+//! The Router: checks samples, queues them per topic, repeats values, and detects silent topics.
 
 mod announce;
 mod applications;
@@ -52,61 +52,64 @@ use discovery::Discovery;
 use own::Claims;
 use told::About;
 
-/// Decides what crosses between one space and UADP. See the crate's page for how it is driven.
+/// Decides which messages cross between a space and UADP. The crate documentation describes its
+/// use.
 #[derive(Debug)]
 pub struct Router {
     settings: Settings,
     owned: Owned,
     mapping: Arc<Mapping>,
     topics: HashMap<TopicId, Topic>,
-    /// For topics that nobody here knows.
+    /// The limit for topics that are unknown to the mapping and the local side.
     room: Room,
     plans: Plans,
-    /// Topics with something in their queue, served in turn: a camera cannot starve a button.
+    /// Topics with items to poll, served in turn, so that a topic with large messages does not
+    /// block a topic with small messages.
     ready: VecDeque<TopicId>,
-    /// Topics in the midst of a large message, which wait for `pace`.
+    /// Topics with a partly sent large message, which wait for `pace`.
     paced: VecDeque<TopicId>,
     pace: Pace,
-    /// Chunks of large messages of other spaces; `None` before the first one.
+    /// The received chunks of large messages; `None` before the first chunk.
     chunks: Option<Box<Chunks>>,
-    /// What topics consist of, announced and learned; `None` before there is any.
+    /// Own and received metadata; `None` before the first use.
     discovery: Option<Box<Discovery>>,
-    /// Calls asked for and executed; `None` before there is any.
+    /// Requested and executed calls; `None` before the first use.
     calls: Option<Box<Calls>>,
-    /// Random bytes that tell our requests from those of others.
+    /// Random bytes that distinguish own requests from requests of other programs.
     instance: [u8; 16],
-    /// The namespaces of ours in which nothing is sent; `None` where there is none.
+    /// The own namespaces in which nothing is sent; `None` if there are none.
     claims: Option<Box<Claims>>,
-    /// The secured groups; `None` where there is none.
+    /// The secured groups; `None` if there are none.
     guard: Option<Box<Guard>>,
-    /// Whether what is handled came in clear.
+    /// Whether the message in processing was received unsecured.
     in_clear: bool,
-    /// Who confirms for each other space.
+    /// The sender of the confirmations of each other space.
     confirmers: BTreeMap<SpaceId, Confirmer>,
-    /// Topics of ours of which it is known what became of the newest event.
+    /// Own topics with a known outcome of the newest event.
     settled: VecDeque<TopicId>,
-    /// What is told besides samples.
+    /// Outputs other than samples and calls.
     told: VecDeque<Output>,
-    /// Topics of other spaces of which the port is to be told something, each once.
+    /// Topics of other spaces with notifications for the port, without duplicates.
     news: VecDeque<TopicId>,
-    /// Whether they have the next turn, before those that are ready.
+    /// Whether `news` is polled before `ready` next time.
     news_first: bool,
-    /// Whether a value went before a call the last time.
+    /// Whether a value was polled before a call last time.
     value_first: bool,
     timers: BinaryHeap<Reverse<(Instant, TopicId)>>,
-    /// Bytes of the key frames kept for delta frames.
+    /// The size in bytes of the key frames stored for delta frames.
     base_bytes: usize,
-    /// Topics of which a large sample may wait for its local type.
+    /// Topics with a large sample that may wait for its local type.
     large_held: Vec<TopicId>,
-    /// Buffers given back by [`recycle`](Self::recycle).
+    /// Buffers returned by [`recycle`](Self::recycle).
     spare: Vec<Vec<u8>>,
-    /// Datagrams and messages that belong to no topic, and topics that are no longer followed.
+    /// Counters of datagrams and messages without a topic, and of removed topics.
     others: Counters,
     hops: Hops,
 }
 
 impl Router {
-    /// A Router for one space. `mapping` says how each topic queues and how often values are repeated.
+    /// Creates a Router for a space. `mapping` defines the queue of each topic and the period of
+    /// repetitions.
     #[must_use]
     pub fn new(settings: Settings, mapping: Arc<Mapping>) -> Self {
         let guard = Guard::new(mapping.security()).map(Box::new);
@@ -142,11 +145,11 @@ impl Router {
         }
     }
 
-    /// Ties a topic to its local message type, compiled once. A topic bound anew starts afresh with the new type; a
-    /// sample that was waiting for a type goes out.
+    /// Binds a topic to its local message type and compiles the plan. Binding again restarts the
+    /// topic with the new type. A sample that waited for a type is delivered.
     ///
     /// # Errors
-    /// [`PlanError`] when the selection is not in the type; the topic stays as it was.
+    /// Returns a [`PlanError`] if the selection is not in the type; the topic is then unchanged.
     pub fn bind(
         &mut self,
         topic: TopicId,
@@ -157,12 +160,13 @@ impl Router {
         let wire = match self.settings.local {
             Local::Ros1 => Wire::Ros1,
             Local::Cdr => Wire::Cdr,
-            // A side that speaks in fields needs no plan.
+            // A local side with fields as payload needs no plan.
             Local::Fields => return Ok(()),
         };
         let plan = self.plans.plan(message_type, selection, wire)?;
         let reactions = self.reactions(topic, (message_type, selection), wire)?;
-        // A message as bytes is in the dialect of its origin; that of an OPC UA origin is taken as it is.
+        // A message as bytes has the encoding of its origin. Bytes from an OPC UA origin are used
+        // without conversion.
         let origin = match topic.space {
             SpaceId::UA => None,
             space if space.is_ros2() => Some(Dialect::Ros2),
@@ -199,7 +203,7 @@ impl Router {
         Ok(())
     }
 
-    /// What is done about a topic of another space when a commander is lost.
+    /// Returns the reactions of a topic of another space to the loss of a commander.
     fn reactions(
         &self,
         topic: TopicId,
@@ -213,13 +217,14 @@ impl Router {
         Ok((loss, trigger(&self.mapping, topic, of.0, wire)?))
     }
 
-    /// A sample was heard on the local side.
+    /// Handles a sample received on the local side.
     pub fn handle_local(&mut self, heard: Heard<'_>, now: Now) -> Verdict {
         self.handle_local_as(heard, GOOD, now)
     }
 
-    /// As [`handle_local`](Self::handle_local), of a side that knows the quality of its samples: the upper 16 bits of a
-    /// StatusCode, which go out as the Status of the DataSetMessage (OPC 10000-14, 7.2.4.5.4).
+    /// Handles a sample as [`handle_local`](Self::handle_local) does, with the quality of the
+    /// sample: the upper 16 bits of a StatusCode, which are sent as the Status of the
+    /// DataSetMessage (OPC 10000-14, 7.2.4.5.4).
     pub fn handle_local_as(&mut self, heard: Heard<'_>, status: u16, now: Now) -> Verdict {
         let topic = heard.topic;
         let verdict = self.take_local(heard, status, now);
@@ -251,7 +256,7 @@ impl Router {
             ..
         }) = self.follow(topic, None, now)
         else {
-            // None of our own space.
+            // Not a topic of the own space.
             return Verdict::Drop(Reason::Looped);
         };
         let sample = match (local, plan) {
@@ -305,7 +310,7 @@ impl Router {
         }
     }
 
-    /// Counts a sample that waited until a newer one made it old.
+    /// Counts a waiting sample that a newer sample replaced.
     fn outpaced(&mut self, topic: TopicId, sample: Option<Waiting>) {
         if let Some((outpaced, _)) = sample {
             self.recycle(outpaced.bytes);
@@ -313,7 +318,7 @@ impl Router {
         }
     }
 
-    /// Queues a sample that is encoded, under the next sequence number.
+    /// Queues an encoded sample under the next sequence number.
     fn forward(
         &mut self,
         topic: TopicId,
@@ -332,7 +337,7 @@ impl Router {
         else {
             return Verdict::Drop(Reason::Looped);
         };
-        // The number is used up only by a message that goes out.
+        // Only a sent message uses up a sequence number.
         encoded.number(writer.next_sequence());
         let message = if large {
             Message::Large(Arc::new(encoded))
@@ -374,7 +379,8 @@ impl Router {
         }
     }
 
-    /// A latched publisher of a topic of our own space has gone for good: its last message is no longer repeated.
+    /// Removes a latched publisher of a topic of the own space. Its last message is not repeated
+    /// any more.
     pub fn left(&mut self, topic: TopicId, publisher: PublisherKey, now: Now) {
         let held = self
             .topics
@@ -392,11 +398,11 @@ impl Router {
         }
     }
 
-    /// Whether a topic of our own space has a producer. Without one its value is no longer repeated, so that
-    /// readers see it fall silent; the next sample revives it.
+    /// Sets whether a topic of the own space has a producer. Without a producer its value is not
+    /// repeated, so that readers detect the silence. The next sample sets a producer again.
     pub fn set_live(&mut self, topic: TopicId, live: bool, now: Now) {
         if !live {
-            // What waits is the last there is.
+            // The waiting sample is the last sample.
             let held = self
                 .topics
                 .get_mut(&topic)
@@ -415,7 +421,7 @@ impl Router {
                 entry.announce_at = entry.announce_at.map(|_| now.monotonic);
             }
             if live && self.settings.local == Local::Fields {
-                // No local type will say what it is.
+                // No local type will describe the topic.
                 self.describe(topic, None, now);
             }
             self.settle_arrival(topic);
@@ -423,7 +429,7 @@ impl Router {
         }
     }
 
-    /// Repeats values, sends keep-alives and notices silences that are due by `now`.
+    /// Repeats values, sends keep-alives, and detects silent topics that are due by `now`.
     pub fn handle_timeout(&mut self, now: Now) {
         while let Some(Reverse((at, topic))) = self.timers.peek().copied() {
             if at > now.monotonic {
@@ -434,7 +440,7 @@ impl Router {
                 continue;
             };
             if entry.timer != Some(at) {
-                // An entry that a later one replaced.
+                // A later entry has replaced this entry.
                 continue;
             }
             entry.timer = None;
@@ -453,7 +459,7 @@ impl Router {
         }
     }
 
-    /// When [`handle_timeout`](Self::handle_timeout) is wanted next.
+    /// Returns the time of the next [`handle_timeout`](Self::handle_timeout).
     #[must_use]
     pub fn poll_timeout(&self) -> Option<Instant> {
         let timer = self.timers.peek().map(|Reverse((at, _))| *at);
@@ -473,13 +479,14 @@ impl Router {
             .min()
     }
 
-    /// The local side took a delivery of the topic: its time in this program ends at `now`, and the value is good.
+    /// Records that the local side published a delivery of the topic at `now`. The value is good.
     pub fn published(&mut self, topic: TopicId, arrived: Timestamp, now: Now) {
         self.hops.record(Hop::In, arrived, now.utc);
         self.is_good(topic, now);
     }
 
-    /// The local side did not take a delivery, given by its topic and instance: its repetition is welcome.
+    /// Records that the local side did not publish a delivery with the topic and instance. Its
+    /// repetition will be delivered.
     pub fn not_published(
         &mut self,
         topic: TopicId,
@@ -493,20 +500,21 @@ impl Router {
         });
     }
 
-    /// A value of the topic was not taken by the service it is for, or the service that should say it did not answer.
+    /// Records that a service did not accept a value of the topic, or did not respond.
     pub fn call_failed(&mut self, topic: TopicId, detail: &str) {
         self.count(About::topic(topic), Reason::CallFailed, 1, || {
             detail.to_owned()
         });
     }
 
-    /// A publisher or subscriber of the topic cannot be matched on the local side.
+    /// Records a publisher or subscriber of the topic with QoS policies that are incompatible with
+    /// the local side.
     pub fn unmatched(&mut self, topic: TopicId) {
         self.count(About::topic(topic), Reason::IncompatibleQos, 1, String::new);
     }
 
-    /// Counts samples that were lost before the Router saw them, such as in a queue of the port or the kernel. Which values
-    /// of its writer are received does not depend on them.
+    /// Counts samples that were lost before they reached the Router, such as in a queue of the port
+    /// or the kernel. They do not affect the state of a writer.
     pub fn lost(
         &mut self,
         topic: Option<TopicId>,
@@ -518,7 +526,7 @@ impl Router {
         });
     }
 
-    /// What a port dropped that belongs to no topic.
+    /// Counts drops of a port that belong to no topic.
     pub fn dropped(&mut self, reason: Reason, count: u64, why: &'static str) {
         let about = About {
             topic: None,
@@ -527,7 +535,8 @@ impl Router {
         self.count(about, (reason, why), count, || why.to_owned());
     }
 
-    /// Takes back the buffer of a datagram or payload that has been used, so that the next one needs no allocation.
+    /// Returns the buffer of a datagram or payload after use, so that the next output needs no
+    /// allocation.
     pub fn recycle(&mut self, mut buffer: Vec<u8>) {
         if self.spare.len() < SPARE_BUFFERS && buffer.capacity() <= SPARE_CAPACITY {
             buffer.clear();
@@ -535,20 +544,20 @@ impl Router {
         }
     }
 
-    /// The counters of each topic, in no order.
+    /// Returns the counters of each topic in no particular order.
     pub fn topics(&self) -> impl Iterator<Item = (TopicId, &Counters)> {
         self.topics
             .iter()
             .map(|(topic, entry)| (*topic, &entry.counters))
     }
 
-    /// The counters of datagrams and messages that belong to no topic, and of topics that are no longer followed.
+    /// Returns the counters of datagrams and messages without a topic, and of removed topics.
     #[must_use]
     pub const fn others(&self) -> &Counters {
         &self.others
     }
 
-    /// The delays seen so far.
+    /// Returns the measured delays.
     #[must_use]
     pub const fn hops(&self) -> &Hops {
         &self.hops
@@ -599,7 +608,7 @@ impl Router {
                     Idle::KeepAlive => {
                         writer.spoke(now.monotonic);
                         let expected = writer.expected_sequence();
-                        // What waits says more.
+                        // Waiting items contain more information than a keep-alive.
                         let buffer = self.spare.pop().unwrap_or_default();
                         if !entry.has_more()
                             && let Some(datagram) = keep_alive(buffer, topic, expected, now.utc)
@@ -607,7 +616,7 @@ impl Router {
                             entry.counters.keep_alives += 1;
                             let item = Item::Message(Message::Datagram(datagram));
                             let bytes = item.bytes();
-                            // Nothing waits that could give way.
+                            // The queue is empty, so nothing is dropped.
                             drop(entry.queue.push(item, bytes));
                         }
                     }
@@ -623,12 +632,13 @@ impl Router {
     /// Sends a sample that waited.
     fn let_go(&mut self, topic: TopicId, held: Option<Waiting>, now: Now) {
         if let Some((held, latched_by)) = held {
-            // Whether it went first or another gave way is counted there.
+            // `forward` counts drops itself.
             let _verdict = self.forward(topic, held, (now.utc, latched_by), now);
         }
     }
 
-    /// The commander of a topic is lost: delivers what the mapping says, if a value was delivered since it did so last.
+    /// Delivers the reaction to the loss of a commander from the mapping, if a value was delivered
+    /// after the last reaction.
     pub(super) fn lose(&mut self, topic: TopicId, now: Now) {
         let loss = self.topics.get_mut(&topic).and_then(|of| of.loss.as_mut());
         let Some(reaction) = loss.and_then(|loss| loss.take()) else {
@@ -672,7 +682,7 @@ impl Router {
         );
     }
 
-    /// Puts the topic on the timer list at the time it wants to be looked at.
+    /// Adds the topic to the timer list with its next due time.
     fn schedule(&mut self, topic: TopicId) {
         let (key_frames, keep_alives, silence) = self.periods();
         let Some(entry) = self.topics.get_mut(&topic) else {
@@ -694,7 +704,7 @@ impl Router {
                 due.chain(held).min()
             }
         };
-        // An earlier entry stays: it finds nothing due and asks again, which spares the list an entry per sample.
+        // An earlier entry stays and finds nothing due. This avoids a new entry for each sample.
         if let Some(due) = due
             && entry.timer.is_none_or(|at| due < at)
         {
@@ -712,7 +722,7 @@ impl Router {
         )
     }
 
-    /// Queues an item, and says whether the oldest one had to go for it.
+    /// Queues an item. Returns whether older items were dropped for it.
     fn push(&mut self, topic: TopicId, item: Item) -> bool {
         let Some(entry) = self.topics.get_mut(&topic) else {
             return false;
@@ -730,7 +740,7 @@ impl Router {
         for item in dropped {
             match item {
                 Item::Message(Message::Datagram(Encoded { bytes, .. })) => self.recycle(bytes),
-                // It is kept for repeating, or its last owner frees it.
+                // The message is kept for repetition, or freed with its last reference.
                 Item::Message(Message::Large(_)) => {}
                 Item::Delivery(Delivery {
                     payload, instance, ..
@@ -746,7 +756,7 @@ impl Router {
         true
     }
 
-    /// Takes note that a delivery did not get through.
+    /// Records that a value was not delivered.
     fn forget(&mut self, topic: TopicId, instance: Option<Timestamp>) {
         if let Some(Topic {
             role: Role::Theirs(reader),
@@ -760,7 +770,7 @@ impl Router {
     fn sizes(&self) -> (u16, u32) {
         let pubsub = self.mapping.pubsub();
         let room = match self.guard {
-            // What is sealed is longer.
+            // Sealing makes messages longer.
             Some(_) => u16::try_from(Guard::OVERHEAD).unwrap_or_default(),
             None => 0,
         };
@@ -768,7 +778,7 @@ impl Router {
         (max_datagram, pubsub.max_message)
     }
 
-    /// Counts a sample of the local side that does not cross.
+    /// Counts a dropped sample of the local side.
     fn refuse(&mut self, topic: TopicId, cause: impl Into<Cause>, detail: String) -> Verdict {
         let cause = cause.into();
         self.count(About::topic(topic), cause, 1, || detail);
@@ -780,8 +790,8 @@ impl Router {
     }
 }
 
-/// The upper half of the StatusCode Good.
+/// The upper 16 bits of the StatusCode Good.
 const GOOD: u16 = 0;
-/// Buffers kept for reuse, and how large each may have grown.
+/// The maximum number of buffers kept for reuse, and the maximum capacity of each.
 const SPARE_BUFFERS: usize = 64;
 const SPARE_CAPACITY: usize = 128 * 1024;

@@ -1,4 +1,4 @@
-//! What a Router is told about its place.
+//! The settings of a Router.
 
 use std::net::SocketAddr;
 use std::time::Instant;
@@ -6,34 +6,35 @@ use std::time::Instant;
 use mappings::SpaceId;
 use uadp::Timestamp;
 
-/// Who a Router works for.
+/// The space and local side of a Router.
 #[derive(Debug, Clone)]
 pub struct Settings {
-    /// The space it serves.
+    /// The space that the Router serves.
     pub own: SpaceId,
-    /// What the payloads of its local side are.
+    /// The payload format of the local side.
     pub local: Local,
-    /// The address its own datagrams come from; an unspecified IP matches any. With it, a second bridge of the same
-    /// space is noticed.
+    /// The source address of the own datagrams; an unspecified IP matches any. It is needed to
+    /// detect a second bridge of the same space.
     pub source: Option<SocketAddr>,
 }
 
-/// What a payload of the local side is.
+/// The payload format of a local side.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Local {
-    /// A ROS 1 message body, without its length.
+    /// A ROS 1 message body without its length.
     Ros1,
     /// A CDR with its 4 byte encapsulation header.
     Cdr,
-    /// A block of OPC UA fields as [`Fields::bytes`](uadp::Fields::bytes) gives it: an OPC UA server's side.
+    /// A block of OPC UA fields as returned by [`Fields::bytes`](uadp::Fields::bytes), for an OPC
+    /// UA server.
     Fields,
 }
 
-/// The two clocks, read once per turn of the shell.
+/// The two clocks. The caller reads them once per iteration.
 #[derive(Debug, Clone, Copy)]
 pub struct Now {
-    /// For waiting.
+    /// The clock for timers.
     pub monotonic: Instant,
-    /// For the stamps on the wire.
+    /// The clock for timestamps in messages.
     pub utc: Timestamp,
 }

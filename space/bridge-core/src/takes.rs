@@ -1,16 +1,16 @@
-//! How much of a foreign DataSet a topic is.
+//! The part of a foreign DataSet that a topic uses.
 
 use mappings::Variable;
 
-/// What of the fields of foreign messages a topic takes.
+/// The fields of foreign messages that a topic uses.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(crate) enum Takes {
-    /// All of them.
+    /// All fields.
     #[default]
     All,
-    /// One, and the mapping does not say which.
+    /// A single field that the mapping does not name.
     One,
-    /// The one the mapping names.
+    /// The field that the mapping names.
     Named,
 }
 

@@ -1,4 +1,4 @@
-//! Everything the Router keeps for one topic.
+//! The state of the Router for a topic.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -20,76 +20,79 @@ use crate::takes::Takes;
 use crate::transcoder::Transcoder;
 use crate::writer::{Encoded, Message, Writer};
 
-/// One topic of the space, seen from one bridge: of our own space, or of another.
+/// A topic of the own space or of another space.
 #[derive(Debug)]
 pub(crate) struct Topic {
     pub(crate) role: Role,
-    /// How its bytes become fields or the other way. `None` until the local type is known, and for a local side
-    /// that speaks in fields.
+    /// Converts between bytes and fields. `None` until the local type is known, and for a local
+    /// side with fields as payload.
     pub(crate) plan: Option<Arc<Plan>>,
-    /// The type and selection that the plan was made of.
+    /// The type and selection from which the plan was compiled.
     pub(crate) bound: Option<Box<(Arc<MessageType>, Selection)>>,
-    /// For bytes of the other ROS, what makes them ours, or why nothing does.
+    /// Converts bytes of the other ROS version to the local type, or the reason why no conversion
+    /// exists.
     pub(crate) transcoder: Option<Box<Result<Transcoder, String>>>,
-    /// What makes the message of the fields by their names, where no mapping names the value.
+    /// Makes the message from fields by their names, for values that are not in the mapping.
     pub(crate) by_name: Option<Box<ByName>>,
     pub(crate) queue: Queue<Item>,
-    /// A large message of which chunks are still to be sent, before anything of the queue.
+    /// A large message with chunks that are still to be sent. They are sent before all items of the
+    /// queue.
     pub(crate) sending: Option<Sending>,
     pub(crate) overflow: Overflow,
-    /// Whether its last value is stored for readers that come late.
+    /// Whether the last value is stored for late joiners.
     pub(crate) lasting: Lasting,
-    /// What of the fields of messages of another space is taken.
+    /// The selection of fields from messages of another space.
     pub(crate) takes: Takes,
-    /// How long its writer may hold a sample back for its rate.
+    /// The maximum time for which the writer may hold back a sample because of its rate limit.
     pub(crate) held_back: Duration,
-    /// The reaction to the loss of its commander.
+    /// The reaction to the loss of the commander.
     pub(crate) loss: Option<Box<Loss>>,
-    /// The value that calls the service of the topic, where that is the reaction to the loss of a commander.
+    /// The value that calls the service of the topic, if this call is the reaction to the loss of a
+    /// commander.
     pub(crate) trigger: Option<Box<Stop>>,
-    /// The spaces that confirm its events.
+    /// The spaces that confirm the events of the topic.
     pub(crate) confirming: Option<Box<Confirming>>,
-    /// What holds samples of our own space back.
+    /// Holds back samples of the own space.
     pub(crate) gate: Option<Box<Gate>>,
-    /// What is announced of it, if it is of our own space and its type is known.
+    /// The metadata to announce, for a topic of the own space with a known type.
     pub(crate) description: Option<Box<Description>>,
-    /// What the local side says it is, where it speaks in fields.
+    /// The description from the local side, if its payloads are fields.
     pub(crate) said: Option<Box<ValueDescription>>,
-    /// When it is to be announced again.
+    /// The time of the next announcement.
     pub(crate) announce_at: Option<Instant>,
     pub(crate) counters: Counters,
-    /// Whether it stands in the Router's list of topics with something to poll.
+    /// Whether the topic is in the Router's list of topics with items to poll.
     pub(crate) ready: bool,
-    /// The instant the Router's timer list holds for it.
+    /// The time of the topic's entry in the Router's timer list.
     pub(crate) timer: Option<Instant>,
 }
 
-// In Boxes, because the Router's table of topics has room for up to twice as many as there are.
+// Boxed, because the capacity of the Router's table of topics is up to twice the number of topics.
 #[derive(Debug)]
 pub(crate) enum Role {
-    /// Produced here: we are its DataSetWriter.
+    /// Produced in this space: the Router is its DataSetWriter.
     Ours(Box<Writer>),
-    /// Produced elsewhere.
+    /// Produced in another space.
     Theirs(Box<Reader>),
 }
 
-/// A sample on its way out.
+/// A sample that waits to be polled.
 #[derive(Debug)]
 pub(crate) enum Item {
     Message(Message),
     Delivery(Delivery),
 }
 
-/// A large message on its way.
+/// A large message that is partly sent.
 #[derive(Debug)]
 pub(crate) struct Sending {
     pub(crate) message: Arc<Encoded>,
-    /// Where in its DataSetMessage the next chunk begins.
+    /// The offset of the next chunk in the DataSetMessage.
     pub(crate) offset: usize,
 }
 
 impl Item {
-    /// How much of the queue's bytes it takes.
+    /// Returns the number of bytes that count towards the queue's limit.
     pub(crate) fn bytes(&self) -> usize {
         match self {
             Self::Message(Message::Datagram(encoded)) => encoded.bytes.len(),
@@ -126,7 +129,8 @@ impl Topic {
         }
     }
 
-    /// The next thing of the queue, or of the round of repetitions, which are written into `spare` buffers.
+    /// Returns the next item of the queue, or else the next repetition, which is written into a
+    /// buffer of `spare`.
     pub(crate) fn take(&mut self, spare: &mut Vec<Vec<u8>>) -> Option<Item> {
         if let Some(item) = self.queue.pop() {
             return Some(item);
@@ -139,7 +143,8 @@ impl Topic {
         Some(Item::Message(again))
     }
 
-    /// As [`take`](Self::take), if that is a datagram whose DataSetMessage has so many bytes at most.
+    /// Returns the next item as [`take`](Self::take) does, if it is a datagram with a
+    /// DataSetMessage of at most `most` bytes.
     pub(crate) fn take_within(&mut self, most: usize, spare: &mut Vec<Vec<u8>>) -> Option<Encoded> {
         self.next_size().filter(|size| *size <= most)?;
         match self.take(spare) {
@@ -148,7 +153,7 @@ impl Topic {
         }
     }
 
-    /// Bytes of the DataSetMessage of what is taken next, if that is a datagram.
+    /// Returns the size in bytes of the next DataSetMessage, if it is sent as a datagram.
     fn next_size(&self) -> Option<usize> {
         if self.sending.is_some() {
             return None;
@@ -164,7 +169,7 @@ impl Topic {
         }
     }
 
-    /// Takes over what is done when a commander is lost. A value that moves the robot stays known.
+    /// Sets the reaction to the loss of a commander. The time of the last delivered value is kept.
     pub(crate) fn react(&mut self, (loss, trigger): (Option<Loss>, Option<Stop>)) {
         let before = self.loss.take();
         let loss = loss.map(|loss| loss.following(before.as_deref()));
@@ -172,7 +177,7 @@ impl Topic {
         self.trigger = trigger.map(Box::new);
     }
 
-    /// Whether there is something to poll.
+    /// Returns whether there is an item to poll.
     pub(crate) fn has_more(&self) -> bool {
         !self.queue.is_empty()
             || self.sending.is_some()

@@ -1,4 +1,4 @@
-//! Messages that cross as they are, between the two kinds of ROS.
+//! Conversion of messages that are carried as bytes between ROS 1 and ROS 2.
 
 use std::sync::Arc;
 
@@ -10,7 +10,7 @@ use uadp::{
 use crate::counters::{Cause, Reason};
 use crate::fields::{self, Payload};
 
-/// Makes the bytes of a message of the other ROS those of the local type of the same name.
+/// Converts the bytes of a message of the other ROS version into the local type of the same name.
 #[derive(Debug)]
 pub(crate) struct Transcoder {
     from: Plan,
@@ -19,10 +19,11 @@ pub(crate) struct Transcoder {
 }
 
 impl Transcoder {
-    /// For messages that are written in `origin` and read as `local`.
+    /// Compiles the conversion of messages in the encoding of `origin` to the type `local`.
     ///
     /// # Errors
-    /// Both sides by name, when the other ROS has no such type among the common interfaces, or other fields in it.
+    /// Names both sides if the other ROS version has no such type among the common interfaces, or
+    /// has other fields in it.
     pub(crate) fn compile(
         origin: Dialect,
         local: &Arc<MessageType>,
@@ -53,7 +54,7 @@ impl Transcoder {
         })
     }
 
-    /// Appends the local message to `out`; `scratch` holds the fields on the way.
+    /// Appends the local message to `out`; `scratch` holds the intermediate fields.
     pub(crate) fn run(
         &self,
         mut fields: Fields<'_>,

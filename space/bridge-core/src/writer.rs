@@ -1,4 +1,4 @@
-//! What is remembered of one DataSetWriter of our own space.
+//! The state of a DataSetWriter of the own space.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -10,84 +10,87 @@ use crate::confirm::{Arrival, Awaited, Confirming, Mark};
 use crate::output::PublisherKey;
 use crate::pace::Pace;
 
-/// The state of a topic we send.
+/// The state of a sent topic.
 #[derive(Debug)]
 pub(crate) struct Writer {
     /// The sequence number of the next DataSetMessage.
     sequence: u16,
-    /// When the last sample was taken, as its message says.
+    /// The time at which the last sample was taken, as in its message.
     taken: Option<Timestamp>,
-    /// When anything was last sent for it.
+    /// The time of the last sent message of the topic.
     sent: Instant,
-    /// When its value was last sent; with several, when they were last repeated.
+    /// The time at which the value was last sent; with several values, the start of the last
+    /// repetition.
     value_sent: Instant,
-    /// Whether the topic has a producer. Without one nothing is repeated, so that readers see it fall silent.
+    /// Whether the topic has a producer. Without a producer nothing is repeated, so that readers
+    /// detect the silence.
     live: bool,
-    /// What is repeated, in the order it was taken: the last sample, or that of each latched publisher. Empty for
-    /// topics of events, and before the first sample.
+    /// The samples to repeat in the order in which they were taken: the last sample, or the last
+    /// sample of each latched publisher. Empty for topics of events, and before the first sample.
     kept: Vec<Kept>,
-    /// Which of those is to be repeated next in this round; past the end, none.
+    /// The index of the next sample in the current round of repetitions; past the end if the round
+    /// is complete.
     next: usize,
-    /// Whether anything was sent at all.
+    /// Whether any sample was sent.
     started: bool,
-    /// The newest event, while it is sent again in case it is lost.
+    /// The newest event, while it is repeated in case it is lost.
     again: Option<Again>,
-    /// The outcome of the newest event, if others confirm it.
+    /// The outcome of the newest event, if other spaces confirm it.
     arrival: Option<Arrival>,
     /// Whether the outcome was not reported yet.
     is_news: bool,
 }
 
-/// An event that is sent again under its sequence number: twice if it is one datagram, and until it is confirmed where that is
-/// awaited.
+/// An event that is repeated under its sequence number: twice for a single datagram, or until it is
+/// confirmed if a confirmation is awaited.
 #[derive(Debug)]
 struct Again {
-    /// The message, unless it is kept as the last value, too.
+    /// The message, unless it is also kept as the last value.
     message: Option<Encoded>,
     /// The message, if it is large.
     large: Option<Arc<Encoded>>,
-    /// The confirmations that are missing.
+    /// The missing confirmations.
     awaited: Option<Awaited>,
-    /// When it was sent first.
+    /// The time at which it was first sent.
     since: Instant,
-    /// How often it was sent again.
+    /// The number of repetitions.
     times: usize,
-    /// Whether its next time has come.
+    /// Whether the next repetition is due.
     is_due: bool,
 }
 
-/// The last sample of one latched publisher, or of all that do not latch.
+/// The last sample of a latched publisher, or of all publishers that do not latch.
 #[derive(Debug)]
 struct Kept {
     publisher: Option<PublisherKey>,
-    /// Whether it is repeated as a state: under a new sequence number. The last event is repeated under its own for
-    /// readers that show it; readers that have it drop it.
+    /// Whether it is repeated as a state, under a new sequence number. The last event is repeated
+    /// under its own number for readers that show it; readers that already have it drop it.
     is_state: bool,
     message: Message,
 }
 
-/// What carries one sample.
+/// The message of a sample.
 #[derive(Debug)]
 pub(crate) enum Message {
-    /// One NetworkMessage.
+    /// A single NetworkMessage.
     Datagram(Encoded),
-    /// More than a datagram holds; it goes in chunks, cut from this one buffer.
+    /// A message larger than a datagram. Its chunks are read from this shared buffer.
     Large(Arc<Encoded>),
 }
 
-/// A NetworkMessage with one DataSetMessage, and where its numbers stand.
+/// A NetworkMessage with a single DataSetMessage, and the offsets of its variable numbers.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Encoded {
     pub(crate) bytes: Vec<u8>,
-    /// Position of the NetworkMessage Timestamp, which PicoSeconds follow.
+    /// The offset of the NetworkMessage Timestamp, which is followed by PicoSeconds.
     pub(crate) timestamp_at: usize,
-    /// Position of the DataSetMessage.
+    /// The offset of the DataSetMessage.
     pub(crate) payload_at: usize,
-    /// Position of the DataSetMessage's sequence number.
+    /// The offset of the DataSetMessage's sequence number.
     pub(crate) sequence_at: usize,
 }
 
-/// What a writer does next, left alone.
+/// The next action of a writer without new samples.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Idle {
     Repeat,
@@ -95,7 +98,7 @@ pub(crate) enum Idle {
 }
 
 impl Message {
-    /// For keeping: of a large one the same buffer.
+    /// Returns a copy to keep. A large message shares its buffer.
     fn share(&self) -> Self {
         match self {
             Self::Datagram(encoded) => Self::Datagram(encoded.clone()),
@@ -110,7 +113,7 @@ impl Message {
         }
     }
 
-    /// How long sending it takes, if that is worth a thought.
+    /// Returns the transmission time; zero for a datagram.
     fn time(&self) -> Duration {
         match self {
             Self::Datagram(_) => Duration::ZERO,
@@ -132,12 +135,12 @@ impl Encoded {
         );
     }
 
-    /// The DataSetMessage alone.
+    /// Returns the DataSetMessage.
     pub(crate) fn data_set_message(&self) -> &[u8] {
         self.bytes.get(self.payload_at..).unwrap_or_default()
     }
 
-    /// The DataSetMessage's sequence number.
+    /// Returns the sequence number of the DataSetMessage.
     pub(crate) fn sequence(&self) -> u16 {
         let number = self.bytes.get(self.sequence_at..).unwrap_or_default();
         number
@@ -145,8 +148,8 @@ impl Encoded {
             .map_or(0, |number| u16::from_le_bytes(*number))
     }
 
-    /// Returns the identity of the DataSetMessage among all of its writer. Its sequence number is followed by Timestamp and
-    /// PicoSeconds in all that is sent here.
+    /// Returns the identity of the DataSetMessage among all messages of its writer. In all sent
+    /// messages the sequence number is followed by Timestamp and PicoSeconds.
     fn mark(&self) -> Option<Mark> {
         let stamp = self.bytes.get(self.sequence_at.checked_add(2)?..)?;
         let (ticks, rest) = stamp.split_first_chunk()?;
@@ -181,16 +184,18 @@ impl Writer {
         }
     }
 
-    /// The number for the next DataSetMessage.
+    /// Returns the number of the next DataSetMessage and advances it.
     pub(crate) const fn next_sequence(&mut self) -> u16 {
         let sequence = self.sequence;
         self.sequence = sequence.wrapping_add(1);
         sequence
     }
 
-    /// The stamp for a sample taken at `taken`: that, or just after the sample before if it is not later.
+    /// Returns the stamp of a sample taken at `taken`, or a stamp just after the previous sample if
+    /// `taken` is not later.
     ///
-    /// Two samples never share a stamp, since readers know repetitions by it. A clock that was set back is followed.
+    /// Two samples never share a stamp, because readers recognise repetitions by it. A clock that
+    /// was set back is followed.
     pub(crate) fn stamp(&mut self, taken: Timestamp) -> Timestamp {
         let stamp = match self.taken.map(|last| last.unix_nanos()) {
             Some(last) if (0..STEP_BACK).contains(&(last - taken.unix_nanos())) => {
@@ -202,12 +207,13 @@ impl Writer {
         stamp
     }
 
-    /// The number a keep-alive carries: that of the next message to expect (OPC 10000-14 7.2.4.5.8).
+    /// Returns the sequence number of a keep-alive: the number of the next expected message (OPC
+    /// 10000-14 7.2.4.5.8).
     pub(crate) const fn expected_sequence(&self) -> u16 {
         self.sequence
     }
 
-    /// Takes note of a sample sent.
+    /// Records a sent sample.
     pub(crate) fn sent(&mut self, now: Instant) {
         self.sent = now;
         self.live = true;
@@ -217,8 +223,8 @@ impl Writer {
         }
     }
 
-    /// Keeps a sample for repeating, in the place of the one before of that publisher. Says whether the oldest one
-    /// gave way, since there are [`MAX_KEPT`].
+    /// Keeps a sample for repetition in place of the previous sample of the publisher. Returns
+    /// whether the oldest sample was removed because [`MAX_KEPT`] was reached.
     pub(crate) fn keep(
         &mut self,
         (publisher, is_state): (Option<PublisherKey>, bool),
@@ -260,20 +266,20 @@ impl Writer {
             }
         }
         if self.kept.len() == 1 {
-            // It is just being sent.
+            // The sample is being sent at this moment.
             self.next = usize::MAX;
         }
         gave_way
     }
 
-    /// No longer repeats anything.
+    /// Removes all samples to repeat.
     pub(crate) fn keep_nothing(&mut self) {
         self.kept.clear();
         self.end_again();
         self.next = usize::MAX;
     }
 
-    /// No longer repeats the sample of a publisher that has gone.
+    /// Removes the sample of a publisher that has left.
     pub(crate) fn forget(&mut self, publisher: PublisherKey) {
         let found = self
             .kept
@@ -285,34 +291,35 @@ impl Writer {
         }
     }
 
-    /// Takes note that something was sent that is no value: a keep-alive, or a piece of one.
+    /// Records a sent message without a value: a keep-alive or a chunk.
     pub(crate) const fn spoke(&mut self, now: Instant) {
         self.sent = now;
     }
 
-    /// Begins to repeat what is kept.
+    /// Starts a round of repetitions.
     pub(crate) const fn begin_round(&mut self, now: Instant) {
         self.next = 0;
         self.sent = now;
         self.value_sent = now;
     }
 
-    /// Whether the round is not over.
+    /// Returns whether the round of repetitions is incomplete.
     pub(crate) fn repeats(&self) -> bool {
         self.next < self.kept.len() || self.is_again_due()
     }
 
-    /// What the round repeats next, unless it is large and still on its way.
+    /// Returns the next message of the round of repetitions, if it may share a datagram.
     pub(crate) fn next_repeated(&self) -> Option<&Message> {
         if self.is_again_due() {
-            // Alone: it is short and must not wait.
+            // A repeated event is sent alone, because it is short and must not wait.
             return None;
         }
         self.kept.get(self.next).map(|kept| &kept.message)
     }
 
-    /// The newest event once more if its time has come, else the next sample of the round: a state with a fresh sequence
-    /// number, an event under its own. `buffer` gives one to write a datagram into.
+    /// Returns the newest event if its repetition is due, else the next sample of the round: a
+    /// state with a new sequence number, an event with its own. `buffer` returns a buffer for the
+    /// datagram.
     pub(crate) fn repeat(&mut self, buffer: impl FnOnce() -> Vec<u8>) -> Option<Message> {
         if self.is_again_due() {
             return self.event_again(buffer);
@@ -322,7 +329,7 @@ impl Writer {
         let kept = loop {
             let kept = self.kept.get_mut(self.next)?;
             self.next += 1;
-            // One that is still on its way needs no repetition.
+            // A message that is still being sent needs no repetition.
             let Some(sequence) = (match &mut kept.message {
                 Message::Large(last) => Arc::get_mut(last).map(|last| {
                     if kept.is_state {
@@ -356,7 +363,7 @@ impl Writer {
         })
     }
 
-    /// The newest event, once more.
+    /// Returns the newest event for repetition.
     fn event_again(&mut self, buffer: impl FnOnce() -> Vec<u8>) -> Option<Message> {
         let again = self.again.as_mut()?;
         again.is_due = false;
@@ -364,7 +371,7 @@ impl Writer {
             let kept = self.kept.iter().filter(
                 |kept| matches!(&kept.message, Message::Large(kept) if Arc::ptr_eq(kept, large)),
             );
-            // One that is still on its way needs no repetition.
+            // A message that is still being sent needs no repetition.
             let is_sent = Arc::strong_count(large) == 1 + kept.count();
             return is_sent.then(|| Message::Large(Arc::clone(large)));
         }
@@ -387,13 +394,13 @@ impl Writer {
         message
     }
 
-    /// Whether it is time to send the newest event again.
+    /// Returns whether a repetition of the newest event is due.
     fn is_again_due(&self) -> bool {
         self.again.as_ref().is_some_and(|again| again.is_due)
     }
 
-    /// Plans to send a sample again if it is an event of one datagram, or `confirmed`. It replaces the event before, which is not
-    /// sent again.
+    /// Plans the repetition of a sample if it is an event in a single datagram or `confirmed`. It
+    /// replaces the previous event, which is not repeated any more.
     pub(crate) fn send_again(
         &mut self,
         message: &Message,
@@ -438,7 +445,7 @@ impl Writer {
         copy.sequence_at = message.sequence_at;
     }
 
-    /// When the newest event is sent again next.
+    /// Returns the time of the next repetition of the newest event.
     pub(crate) fn again_at(&self) -> Option<Instant> {
         let again = self.again.as_ref()?;
         let Some(awaited) = &again.awaited else {
@@ -454,7 +461,8 @@ impl Writer {
         Some((again.since + at).min(awaited.until))
     }
 
-    /// Returns whether the newest event is to be sent again now. An overdue event is given up, because it would come late.
+    /// Returns whether to repeat the newest event. An overdue event is given up, because it would
+    /// come late.
     pub(crate) fn look_again(&mut self, now: Instant) -> bool {
         if self.again_at().is_none_or(|at| at > now) {
             return false;
@@ -473,7 +481,7 @@ impl Writer {
         again.times += 1;
         again.is_due = true;
         if again.awaited.is_some() {
-            // Times that were missed are not made up for.
+            // Missed repetitions are skipped.
             while self.again_at().is_some_and(|at| at <= now) {
                 if let Some(again) = &mut self.again {
                     again.times += 1;
@@ -483,7 +491,8 @@ impl Writer {
         true
     }
 
-    /// Stops to repeat the newest event. The outcome is unknown for spaces that have not confirmed it.
+    /// Stops the repetition of the newest event. The outcome is unknown for spaces that have not
+    /// confirmed it.
     fn end_again(&mut self) {
         let awaited = self.again.take().and_then(|again| again.awaited);
         if let Some(awaited) = awaited {
@@ -492,7 +501,7 @@ impl Writer {
         }
     }
 
-    /// A newer sample than the newest event waits for its time: the event is not sent again.
+    /// Stops the repetition of the newest event, because a newer sample waits for its publication.
     pub(crate) fn supersede(&mut self) {
         self.supersede_arrival();
         self.again = None;
@@ -502,14 +511,14 @@ impl Writer {
         (self.arrival, self.is_news) = (None, false);
     }
 
-    /// Returns whether the confirmation of that event by that space is missing.
+    /// Returns whether the confirmation of an event by a space is missing.
     pub(crate) fn is_awaited(&self, mark: Mark, space: SpaceId) -> bool {
         let again = self.again.as_ref();
         let awaited = again.and_then(|again| again.awaited.as_ref());
         awaited.is_some_and(|awaited| awaited.is_awaited(mark, space))
     }
 
-    /// Notes that a space has confirmed the newest event.
+    /// Records that a space has confirmed the newest event.
     pub(crate) fn confirm(&mut self, space: SpaceId) {
         let Some(again) = &mut self.again else { return };
         if !again
@@ -550,13 +559,13 @@ impl Writer {
         }
     }
 
-    /// Whether the topic has a producer.
+    /// Returns whether the topic has a producer.
     pub(crate) const fn is_live(&self) -> bool {
         self.live
     }
 
-    /// When the writer has to speak again, and how. Large values are repeated so seldom that this takes up no more
-    /// than a tenth of the pace of chunks.
+    /// Returns the time and kind of the next message without a new sample. Large values are
+    /// repeated so rarely that they use at most a tenth of the pace of chunks.
     pub(crate) fn due(
         &self,
         key_frames: Duration,
@@ -571,12 +580,12 @@ impl Writer {
             self.value_sent + key_frames.max(sending.saturating_mul(10)),
             Idle::Repeat,
         );
-        // A repeated key frame says all that a keep-alive says.
+        // A repeated key frame contains all information of a keep-alive.
         let repeats_first = !self.kept.is_empty() && repeat.0 <= keep_alive.0;
         Some(if repeats_first { repeat } else { keep_alive })
     }
 
-    /// What was kept at `at` is elsewhere or gone; the round goes on behind it.
+    /// Adjusts the round after the sample at `at` was moved or removed.
     const fn leave_round(&mut self, at: usize) {
         if self.next != usize::MAX && at < self.next {
             self.next -= 1;
@@ -584,16 +593,19 @@ impl Writer {
     }
 }
 
-/// When an event is sent again after it was sent first.
+/// The times of the repetitions of an event after it was first sent.
 const AGAIN: [Duration; 2] = [Duration::from_millis(30), Duration::from_millis(80)];
-/// How often after that while it is not confirmed, and how often if it is large.
+/// The period of further repetitions of an event that is not confirmed, for small and for large
+/// messages.
 const AWAITED: Duration = Duration::from_millis(50);
 const LARGE_AWAITED: Duration = Duration::from_millis(250);
-/// From then on it is not sent again unless it is to be confirmed.
+/// The maximum age of an event for a repetition, unless a confirmation is awaited.
 const AGAIN_WITHIN: Duration = Duration::from_millis(150);
-/// Samples kept per topic: more latched publishers of one topic are not known of any graph.
+/// The maximum number of kept samples per topic. It exceeds the number of latched publishers of a
+/// topic in known graphs.
 pub(crate) const MAX_KEPT: usize = 32;
-/// Samples of one topic come from several publishers, whose stamps may cross by as much; in nanoseconds.
+/// The maximum difference in nanoseconds by which stamps of several publishers of a topic may be
+/// out of order.
 const STEP_BACK: i128 = 1_000_000_000;
 
 fn patch(bytes: &mut [u8], at: usize, with: &[u8]) {
@@ -634,7 +646,7 @@ mod tests {
         gave_way
     }
 
-    /// The sequence number and the last byte of each repetition.
+    /// Returns the sequence number and the last byte of each repetition.
     fn round(writer: &mut Writer) -> Vec<(u16, u8)> {
         std::iter::from_fn(|| writer.repeat(Vec::new))
             .map(|message| match message {

@@ -1,4 +1,4 @@
-//! What topics of our own space consist of, as it is announced.
+//! Announcements of the metadata of topics of the own space.
 
 use mappings::TopicId;
 use messages::{MessageType, Selection};
@@ -14,8 +14,8 @@ use crate::settings::Now;
 use crate::topic::{Role, Topic};
 
 impl Router {
-    /// The type of a topic of our own space is known: it is announced, and again whenever it changes. Without a message it is
-    /// as the mapping says.
+    /// Announces a topic of the own space with a known type, and again after each change. Without
+    /// `message` the mapping or the local side describes the topic.
     pub(super) fn describe(
         &mut self,
         topic: TopicId,
@@ -45,7 +45,7 @@ impl Router {
             (None, _) if !mapped.is_empty() => &mapped,
             (Some(_), None) => return,
             (None, _) => {
-                // The mapping has left it open again.
+                // Neither the mapping nor the local side describes the fields any more.
                 return self.forget_described(topic);
             }
         };
@@ -82,7 +82,7 @@ impl Router {
         self.schedule(topic);
     }
 
-    /// Plans to announce a topic again, where that is due and it has a producer.
+    /// Plans the next announcement of a topic, if it is due and the topic has a producer.
     pub(super) fn announce_again(&mut self, topic: TopicId, now: Now) {
         let period = self.mapping.pubsub().metadata_period;
         let Some(Topic {
@@ -120,7 +120,7 @@ impl Router {
         self.send_announcement(topic, sequence_number, (bytes, body_at), now);
     }
 
-    /// Sends an announcement about a topic, in chunks where it is larger than a datagram.
+    /// Sends an announcement about a topic, in chunks if it is larger than a datagram.
     pub(super) fn send_announcement(
         &mut self,
         topic: TopicId,
@@ -145,7 +145,7 @@ impl Router {
         self.recycle(bytes);
     }
 
-    /// Answers for a DataSetWriter that we do not have.
+    /// Responds to a probe for a DataSetWriter that does not exist.
     pub(super) fn deny(&mut self, writer_id: u16, sequence_number: u16) {
         let announcement = Announcement {
             sequence_number,

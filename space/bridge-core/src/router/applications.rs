@@ -1,4 +1,4 @@
-//! Which applications there are in the group: asked for and answered (OPC 10000-14, 7.2.4.6.12).
+//! Discovery of the applications in the group (OPC 10000-14, 7.2.4.6.12).
 
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
@@ -17,11 +17,11 @@ use crate::counters::Reason;
 use crate::output::Output;
 use crate::settings::Now;
 
-/// Our own application, and those of others.
+/// The own application, and the applications of other programs.
 #[derive(Debug, Default)]
 pub(super) struct Applications {
     own: Option<Application>,
-    /// When all are asked.
+    /// The timer of the probe to all applications.
     asking: Option<ProbeTimer>,
     heard: BTreeMap<(SpaceId, SocketAddr), (Application, Instant)>,
 }
@@ -33,14 +33,15 @@ impl Applications {
 }
 
 impl Router {
-    /// Takes the description of this program: it is announced once, and to everyone who asks for applications or for its
-    /// Endpoints, and the other applications are asked for once. A program without values is known to others by it.
+    /// Sets the description of this program. It is announced once, and in response to probes for
+    /// applications or for its Endpoints. The other applications are probed once. A program without
+    /// values is discovered by this description.
     pub fn introduce(&mut self, own: Application, now: Now) {
         let discovery = self.discovery(now);
         let since = discovery.since_start(now);
         discovery.applications.own = Some(own);
         let subject = Subject::ApplicationInformation;
-        // An announcement that is planned already says it all.
+        // A planned announcement already contains the information.
         let _planned = discovery
             .announcer
             .announce(subject, Included::default(), since)
@@ -48,7 +49,7 @@ impl Router {
         self.ask_applications(now);
     }
 
-    /// Asks once which applications there are, unless they are just being asked.
+    /// Probes for all applications once, unless a probe is in progress.
     pub(super) fn ask_applications(&mut self, now: Now) {
         let random = u32::try_from(now.utc.unix_nanos() & 0xFFFF_FFFF).unwrap_or_default();
         let discovery = self.discovery(now);
@@ -64,13 +65,13 @@ impl Router {
         discovery.reckon();
     }
 
-    /// The other applications of the group that were heard of: the space each publishes for, and where it is.
+    /// Returns the known other applications of the group with the space and the address of each.
     pub fn applications(&self) -> impl Iterator<Item = (SpaceId, SocketAddr, &Application)> {
         let heard = self.discovery.iter().flat_map(|of| &of.applications.heard);
         heard.map(|((space, from), (application, _))| (*space, *from, application))
     }
 
-    /// Takes a question that is for no Publisher in particular. False for all else.
+    /// Handles a probe without a particular Publisher. Returns false for all other messages.
     pub(super) fn is_for_all(
         &mut self,
         message: &NetworkMessage<'_>,
@@ -90,7 +91,7 @@ impl Router {
         true
     }
 
-    /// Somebody asks what we are, or all.
+    /// Handles a probe for the own application or for all applications.
     pub(super) fn is_asked(&mut self, probe: &Probe<'_>, now: Now) {
         let discovery = self.discovery(now);
         let since = discovery.since_start(now);
@@ -105,7 +106,7 @@ impl Router {
         discovery.reckon();
     }
 
-    /// Asks who there is, when it is time.
+    /// Sends the probe to all applications if it is due.
     pub(super) fn ask_all(&mut self, discovery: &mut Discovery, (since, random): (Duration, u32)) {
         let Some(asking) = &mut discovery.applications.asking else {
             return;
@@ -124,7 +125,7 @@ impl Router {
         }
     }
 
-    /// Tells what we are, or where our Endpoints are.
+    /// Announces the own application or its Endpoints.
     pub(super) fn tell_application(
         &mut self,
         discovery: &Discovery,
@@ -158,7 +159,7 @@ impl Router {
         }
     }
 
-    /// Takes in what another says it is.
+    /// Stores the announced application of another program.
     pub(super) fn meet_application(
         &mut self,
         (description, capabilities): (&ApplicationDescription<'_>, List<'_, Option<&str>>),
@@ -180,7 +181,7 @@ impl Router {
         let heard = &mut self.discovery(now).applications.heard;
         let key = (space, from);
         if heard.len() >= MOST_APPLICATIONS && !heard.contains_key(&key) {
-            // Whoever was heard longest ago is most likely gone.
+            // The program that was received longest ago is most likely to have ended.
             let oldest = heard.iter().min_by_key(|(_, (_, at))| *at);
             if let Some(oldest) = oldest.map(|(key, _)| *key) {
                 heard.remove(&oldest);
@@ -190,5 +191,6 @@ impl Router {
     }
 }
 
-/// Whoever can send to the group can make applications up.
+/// The maximum number of stored applications. It is limited, because any sender in the group can
+/// invent applications.
 const MOST_APPLICATIONS: usize = 256;

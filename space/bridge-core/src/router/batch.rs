@@ -1,4 +1,4 @@
-//! Several DataSetMessages in one datagram.
+//! Datagrams with several DataSetMessages.
 
 use mappings::{Overflow, TopicId};
 
@@ -11,7 +11,8 @@ use crate::settings::Now;
 use crate::writer::Encoded;
 
 impl Router {
-    /// The datagram of a sample, and of what else waits in its WriterGroup as far as the mapping lets them share one.
+    /// Returns the datagram of a sample, together with other waiting samples of its WriterGroup if
+    /// the mapping allows it.
     pub(super) fn datagram(
         &mut self,
         topic: TopicId,
@@ -47,7 +48,8 @@ impl Router {
         }
     }
 
-    /// Takes what can go with `first` from the topics that are ready, in the order they are; the others stay in theirs.
+    /// Takes samples that fit into the datagram of `first` from the ready topics in their order.
+    /// Other topics keep their position.
     fn gather(&mut self, topic: TopicId, first: &Encoded) -> Vec<(TopicId, Encoded)> {
         let mut gathered = Vec::new();
         let pubsub = self.mapping.pubsub();
@@ -56,7 +58,7 @@ impl Router {
         let room = usize::from(pubsub.max_datagram)
             .min(ETHERNET)
             .saturating_sub(overhead);
-        // That there are several costs the first one its place among the Sizes.
+        // With several messages, the first message also has an entry in Sizes.
         let mut len = first.bytes.len() + SIZE;
         let mut passed = Vec::new();
         while 1 + gathered.len() < most && passed.len() < MAX_PASSED {
@@ -102,16 +104,18 @@ impl Router {
     }
 }
 
-/// Whether the datagram has a sample of `topic`. A second one of a topic that keeps the latest would take the place of
-/// the first as soon as the datagram is read, and of several latched publishers only one would ever be heard.
+/// Returns whether the datagram already contains a sample of `topic`. A second sample of a topic
+/// that keeps the latest would replace the first as soon as the datagram is read, so only one of
+/// several latched publishers would ever be received.
 fn is_in(topic: TopicId, first: TopicId, others: &[(TopicId, Encoded)]) -> bool {
     topic == first || others.iter().any(|(other, _)| *other == topic)
 }
 
-/// The UDP payload that fits an Ethernet frame: what shares a datagram is not to be lost together for being cut up by IP.
+/// The UDP payload that fits into an Ethernet frame. Larger datagrams are fragmented by IP, and the
+/// loss of a fragment loses all samples in the datagram.
 const ETHERNET: usize = 1472;
-/// Bytes of a DataSetWriterId in the payload header, and of a place in the Sizes.
+/// The size in bytes of a DataSetWriterId in the payload header, and of an entry in Sizes.
 const ID: usize = 2;
 const SIZE: usize = 2;
-/// Topics that wait and cannot join, looked at for one datagram.
+/// The maximum number of ready topics that are skipped for a datagram.
 const MAX_PASSED: usize = 64;

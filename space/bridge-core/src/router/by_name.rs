@@ -1,4 +1,4 @@
-//! Values that no mapping names, bound by the names of their fields.
+//! Values that are not in the mapping, bound by the names of their fields.
 
 use std::sync::Arc;
 
@@ -15,18 +15,19 @@ use crate::fields;
 use crate::settings::Now;
 use crate::topic::{Role, Topic};
 
-/// How the fields of a value of another space become a message, whatever their order is.
+/// Converts the fields of a value of another space to a message, in any order of the fields.
 #[derive(Debug)]
 pub(crate) struct ByName {
     message_type: Arc<MessageType>,
-    /// What is not made of the field of the same name.
+    /// The assignments of fields that are not assigned by name.
     map: FieldMap,
-    /// What its writer says it is, and the places of the fields that are taken, in the order of the message.
+    /// The description from the writer, and the indexes of the used fields in the order of the
+    /// message.
     arranged: Option<(Arc<Described>, Vec<Origin>)>,
 }
 
 impl ByName {
-    /// Appends the message that the fields make.
+    /// Appends the message of the fields.
     pub(crate) fn write(
         &self,
         plan: &Plan,
@@ -45,12 +46,14 @@ impl ByName {
 }
 
 impl Router {
-    /// As [`bind`](Self::bind), for a value that no mapping names. One of ours is the whole message, and `note` says what is
-    /// announced of it. Of another space it is made of the fields of the same names, or as `note` says, once its writer has said
-    /// what they are, which it is asked.
+    /// Binds a value that is not in the mapping. Otherwise it works as [`bind`](Self::bind).
+    ///
+    /// An own value is the whole message, and `note` is announced with it. A value of another space
+    /// is converted by the names of its fields, or by the assignments in `note`, as soon as the
+    /// description of its writer is known. The writer is probed for the description.
     ///
     /// # Errors
-    /// [`PlanError`] when the type cannot be read.
+    /// Returns a [`PlanError`] if the type cannot be read.
     pub fn bind_as(
         &mut self,
         topic: TopicId,
@@ -94,7 +97,8 @@ impl Router {
         Ok(())
     }
 
-    /// Looks how the fields of a value make its message, if it is one that goes by their names. False for all others.
+    /// Assigns the fields of a value to its message, if the value is bound by name. Returns false
+    /// for other values.
     pub(super) fn arrange(&mut self, topic: TopicId, now: Now) -> bool {
         let learned = self.discovery.as_ref().map(|discovery| &discovery.learned);
         let described = learned.and_then(|learned| learned.get(topic, now.monotonic));
@@ -131,7 +135,7 @@ impl Router {
     }
 }
 
-/// What of the message is made of the fields, and for each of those its place among them.
+/// Returns the selection of fields in the message, and the index of the source field for each.
 fn order(
     described: &Described,
     (message_type, map): (&MessageType, &FieldMap),

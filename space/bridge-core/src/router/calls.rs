@@ -1,7 +1,8 @@
-//! Calls: asking for those of other programs.
+//! Calls of other programs: requests and their responses.
 //!
-//! A request is repeated until it is answered, and executed once: [`uadp::action`] sees to both. Here is what that needs of
-//! the space: who executes a call and from where (`learn`), what our own are (`execute`), and the bytes of both sides.
+//! A request is repeated until it is answered, and is executed once; [`uadp::action`] implements
+//! both. This module adds the parts that concern the space: the executor of each call and its
+//! address (`learn`), the own calls (`execute`), and the payloads of both sides.
 
 mod chunks;
 mod execute;
@@ -39,48 +40,49 @@ use crate::settings::{Local, Now};
 /// The calls of a Router.
 #[derive(Debug)]
 pub(super) struct Calls {
-    /// What its times count from.
+    /// The origin of time for the requestor and the responder.
     start: Instant,
     requestor: Requestor,
-    /// It answers to the group; the address says whose room a request takes up.
+    /// Responses are sent to the group. The address is used for limits per sender.
     responder: Responder<SocketAddr>,
-    /// ActionTargetId of our own in this life of the program.
+    /// The ActionTargetId of the own calls in this program instance.
     target: u16,
     table: HashMap<TopicId, Call>,
-    /// Who executes the calls of a namespace.
+    /// The executors of the calls of each namespace.
     groups: HashMap<(SpaceId, u16), Group>,
-    /// Bytes of what is known of calls.
+    /// The size in bytes of the known call descriptions.
     weight: usize,
     asked: BTreeMap<CallId, Asked>,
     asks: HashMap<AskId, CallId>,
     executions: BTreeMap<ExecutionId, Running>,
-    /// What the port is to be told, in this order: never more than calls and requests there are.
+    /// The outputs for the port in their order. Their number is limited by the number of calls and
+    /// requests.
     news: VecDeque<Output>,
-    /// Requests and responses that fit no datagram.
+    /// Requests and responses that are larger than a datagram.
     chunking: Chunking,
-    /// When our own are announced again.
+    /// The time of the next announcement of the own calls.
     announce_at: Option<Instant>,
-    /// When it is looked who fell silent.
+    /// The time of the next check for silent executors.
     look_at: Option<Instant>,
-    /// When there is something to do.
+    /// The time of the next action.
     due: Option<Instant>,
 }
 
-/// One call.
+/// The state of a call.
 #[derive(Debug, Default)]
 struct Call {
-    /// What is known of one of another program.
+    /// The description of a call of another program.
     known: Option<Known>,
-    /// What the local side asks for it as.
+    /// The local type of the call.
     bound: Option<Bound>,
-    /// One of our own.
+    /// The state of an own call.
     own: Option<Own>,
-    /// Requests of ours that are not answered.
+    /// The number of own requests without response.
     open: usize,
     counters: CallCounters,
 }
 
-/// A call's ROS type here.
+/// The local ROS type of a call.
 #[derive(Debug)]
 struct Bound {
     service: Arc<ServiceType>,
@@ -89,12 +91,12 @@ struct Bound {
     plan: Option<Result<Arc<CallPlan>, String>>,
 }
 
-/// A request of ours.
+/// A request of the local side.
 #[derive(Debug)]
 struct Asked {
     ask: AskId,
     topic: TopicId,
-    /// What its response is read with, where the local side speaks ROS.
+    /// The plan for its response, if the local side uses ROS messages.
     plan: Option<Arc<CallPlan>>,
 }
 
@@ -155,7 +157,7 @@ impl Calls {
         self.asked.get(&id).map(|asked| asked.topic)
     }
 
-    /// The request is over: it counts no longer as open.
+    /// Removes a completed request.
     fn close(&mut self, id: CallId) -> Option<Asked> {
         let asked = self.asked.remove(&id)?;
         self.asks.remove(&asked.ask);
@@ -167,8 +169,9 @@ impl Calls {
 }
 
 impl Router {
-    /// Gives it random bytes of this run. It seals with them what is sent in secured groups, and they tell its requests from
-    /// those of other programs of the space and of its own earlier runs. To be given before the first call is known.
+    /// Sets the random bytes of this program instance. They are used to seal messages in secured
+    /// groups, and to distinguish own requests from requests of other programs of the space and of
+    /// earlier instances. Call it before the first call is known.
     pub fn set_instance(&mut self, instance: [u8; 16]) {
         self.instance = instance;
         self.mark_guard();
@@ -181,25 +184,27 @@ impl Router {
             .get_or_insert_with(|| Box::new(Calls::new(own, instance, timeout, now.monotonic)))
     }
 
-    /// What is counted of each call that is known, asked for or executed here, in no order.
+    /// Returns the counters of each call that is known, requested or executed, in no particular
+    /// order.
     pub fn calls(&self) -> impl Iterator<Item = (TopicId, &CallCounters)> {
         let all = self.calls.iter().flat_map(|calls| &calls.table);
         all.map(|(topic, call)| (*topic, &call.counters))
     }
 
-    /// What a call of another program is, if somebody executes it.
+    /// Returns the description of a call of another program, if the call has an executor.
     #[must_use]
     pub fn described_call(&self, topic: TopicId) -> Option<&Arc<CallDescription>> {
         let known = self.calls.as_ref()?.table.get(&topic)?.known.as_ref()?;
         (!known.gone).then_some(&known.description)
     }
 
-    /// The local side asks for a call under that type, whose messages are made as `map` says. It may not be known yet: then its executing side is asked what it is,
-    /// and whether it fits turns out later.
+    /// Binds a call to the service type with which the local side requests it. `map` assigns fields
+    /// that are not assigned by name. If the call is not known yet, its executor is probed, and the
+    /// type is checked when its description arrives.
     ///
     /// # Errors
-    /// Why the call as it is known cannot be asked for under that type, for people. It stays bound all the same: it may
-    /// become another.
+    /// Returns the reason for users if the known call does not fit the type. The call stays bound
+    /// nevertheless, because its description may change.
     pub fn bind_call(
         &mut self,
         topic: TopicId,
@@ -227,7 +232,7 @@ impl Router {
         }
     }
 
-    /// Makes the plan of a call that is known and bound.
+    /// Compiles the plan of a call that is known and bound.
     fn compile(&mut self, topic: TopicId) -> Result<(), String> {
         let wire = self.wire();
         let call = self.calls.as_mut();
@@ -251,7 +256,7 @@ impl Router {
         outcome
     }
 
-    /// The local side no longer asks for a call. What was asked is answered.
+    /// Unbinds a call. Pending requests are still answered.
     pub fn unbind_call(&mut self, topic: TopicId) {
         let calls = self.calls.as_mut();
         if let Some(call) = calls.and_then(|calls| calls.table.get_mut(&topic)) {
@@ -259,15 +264,16 @@ impl Router {
         }
     }
 
-    /// The local side has somebody who would ask for a call: where it is not known, its executing side is asked what it is.
+    /// Records that the local side has a client for a call. If the call is not known, its executor
+    /// is probed.
     pub fn want_call(&mut self, topic: TopicId, now: Now) {
         if self.described_call(topic).is_none() && !self.is_home(topic) {
             self.plan_probe(topic, now);
         }
     }
 
-    /// Asks for a call. What becomes of it comes as an [`Output::Answer`], within `timeout` or soon after, unless it is
-    /// [given up](Self::give_up). `ask` is used once.
+    /// Sends a request. The outcome is output as [`Output::Answer`] within `timeout` or soon after,
+    /// unless the request is [given up](Self::give_up). Each `ask` is used once.
     pub fn ask(
         &mut self,
         ask: AskId,
@@ -387,7 +393,7 @@ impl Router {
         }
     }
 
-    /// Nobody waits for that answer any longer: it does not come, and whoever executes the request is told so.
+    /// Gives up a request. It has no outcome, and its executor is informed.
     pub fn give_up(&mut self, ask: AskId, now: Now) {
         let Some(calls) = &mut self.calls else {
             return;
@@ -400,12 +406,12 @@ impl Router {
         }
     }
 
-    /// A request or response could not be sent: it is sent again.
+    /// Records that a request or response could not be sent. It is sent again.
     pub fn not_called(&mut self, topic: TopicId, reason: Reason, detail: &str) {
         self.count_call(topic, None, (reason, "socket"), || detail.to_owned());
     }
 
-    /// Requests and responses of that Publisher, or for it.
+    /// Handles the requests and responses in a message from or to the Publisher of `space`.
     pub(super) fn handle_actions(
         &mut self,
         message: &NetworkMessage<'_>,
@@ -467,7 +473,7 @@ impl Router {
         }
         match heard {
             Ok(uadp::action::Heard::Done(id, outcome)) => {
-                // It may be another life of the program, whose announcement was missed.
+                // The program may have restarted, and its announcement may have been lost.
                 if let Outcome::Unknown(Unknown::Lost) = outcome {
                     self.plan_probe(topic, now);
                 }
@@ -479,12 +485,13 @@ impl Router {
                     format!("{from} answers for {topic}, which it does not execute")
                 });
             }
-            // Answers go to the group, those to others and those that are repeated too.
+            // Responses go to the whole group, including responses to other requestors and repeated
+            // responses.
             Err(_) => self.count_call(topic, Some(from), Reason::NotAsked, String::new),
         }
     }
 
-    /// Tells what became of a request.
+    /// Outputs the outcome of a request.
     fn conclude(&mut self, id: CallId, outcome: Outcome<'_>) {
         let Some(asked) = self.calls.as_mut().and_then(|calls| calls.close(id)) else {
             return;
@@ -528,7 +535,8 @@ impl Router {
         }
     }
 
-    /// What is to be told of requests that nobody answered and executions that nobody waits for.
+    /// Outputs requests that were given up without response, and executions with requestors that
+    /// stopped waiting.
     pub(super) fn settle(&mut self, now: Now) {
         while let Some((id, why)) = self
             .calls
@@ -552,7 +560,7 @@ impl Router {
         }
     }
 
-    /// Announces and gives up what is due.
+    /// Sends announcements and gives up requests that are due.
     pub(super) fn look_at_calls(&mut self, now: Now) {
         let Some(calls) = &mut self.calls else {
             return;
@@ -570,7 +578,7 @@ impl Router {
         self.settle(now);
     }
 
-    /// What the port is to be told of calls, or the next request or response that is to be sent.
+    /// Returns the next output for the port about calls, or the next request or response to send.
     pub(super) fn next_action(&mut self, now: Now) -> Option<Output> {
         loop {
             if let Some(chunk) = self.next_chunk(now) {
@@ -611,7 +619,7 @@ impl Router {
                 request.map(|request| (Of::message(&request), encode(&request, bytes)))
             });
             match next {
-                // What timed out meanwhile is told.
+                // Timeouts that occurred in the meantime are output.
                 None => {
                     self.settle(now);
                     let calls = self.calls.as_mut()?;
@@ -634,7 +642,7 @@ impl Router {
         }
     }
 
-    /// As [`count`](Self::count), for a call.
+    /// Counts a drop of a call as [`count`](Self::count) does for a topic.
     fn count_call(
         &mut self,
         topic: TopicId,
@@ -657,16 +665,16 @@ impl Router {
     }
 }
 
-/// A request, and what its response is read with.
+/// A request and the plan for its response.
 type Begun = (CallId, Option<Arc<CallPlan>>);
 
-/// What comes of a look at the calls.
+/// The next output about calls.
 enum Told {
     News(Output),
     Datagram(TopicId, Of),
 }
 
-/// Writes the NetworkMessage, and says of which call it is.
+/// Encodes the NetworkMessage and returns the topic of its call.
 fn encode(
     action: &ActionToSend<'_>,
     bytes: &mut Vec<u8>,
@@ -692,7 +700,7 @@ fn encode(
     (topic, written)
 }
 
-/// Appends a response as the local side has it.
+/// Appends a response in the local encoding.
 fn read(
     fields: ActionFields<'_>,
     plan: Option<&CallPlan>,
@@ -725,11 +733,14 @@ fn unknown(why: Unknown) -> AskError {
 const BAD: u32 = 0x8000_0000;
 /// Bad_DecodingError (OPC 10000-6, A.2).
 const BAD_DECODING_ERROR: StatusCode = StatusCode(0x8007_0000);
-/// Requests for one call that wait for their answer.
+/// The maximum number of requests for a call without response.
 const MAX_OPEN: usize = 256;
-/// Requests that are executed at a time: those that wait for the results of actions among them.
+/// The maximum number of concurrent executions, including calls that wait for the results of
+/// actions.
 const MAX_EXECUTING: usize = 1_024;
-/// Bytes of a request's fields from which on it may fit no datagram: the smallest `max_datagram` less headers.
+/// The size in bytes of the fields from which a request may not fit into a datagram: the smallest
+/// `max_datagram` without headers.
 const LARGE: usize = 128;
-/// Bytes of the fields of a request or response; those that do not fit a datagram go in chunks.
+/// The maximum size in bytes of the fields of a request or response. Fields larger than a datagram
+/// are sent in chunks.
 const MAX_BLOCK: usize = 16 << 20;
