@@ -1,4 +1,4 @@
-//! Large messages of other spaces, put together from their chunks.
+//! Large messages of other spaces, reassembled from their chunks.
 
 use std::net::SocketAddr;
 use std::time::{Duration, Instant};
@@ -20,7 +20,7 @@ use crate::topic::{Role, Topic};
 #[derive(Debug)]
 pub(super) struct Chunks {
     reassembler: Reassembler<SocketAddr>,
-    /// What its times count from.
+    /// The origin of time for the reassembler.
     start: Instant,
 }
 
@@ -30,13 +30,14 @@ impl Chunks {
         let bytes = usize::try_from(whole).unwrap_or(usize::MAX);
         let limits = ReassemblyLimits {
             whole,
-            // Of each sender two of the largest at a time with their bookkeeping, or very many smaller ones. Of all the
-            // double, so that one sender alone pushes out nothing of the others.
+            // Per sender: two of the largest messages with their overhead, or very many smaller
+            // messages. In total twice as much, so that a single sender does not displace messages
+            // of other senders.
             total: bytes.saturating_mul(5),
             total_per_sender: bytes.saturating_mul(5) / 2,
             open: 2 * MAX_OPEN,
             open_per_sender: MAX_OPEN,
-            // One in progress, and one of which a chunk was lost.
+            // A message in progress, and a message with a lost chunk.
             open_per_writer: 2,
             pieces: bytes / LEAST_PIECE,
             age: pubsub.receive_timeout,
@@ -47,12 +48,12 @@ impl Chunks {
         }
     }
 
-    /// Whether some message is not complete.
+    /// Returns whether a message is incomplete.
     pub(super) const fn is_open(&self) -> bool {
         self.reassembler.held() > 0
     }
 
-    /// When the oldest one has waited long enough.
+    /// Returns the time at which the oldest incomplete message expires.
     pub(super) fn due(&self) -> Option<Instant> {
         Some(self.start + self.reassembler.poll_timeout()?)
     }
@@ -63,7 +64,7 @@ impl Chunks {
 }
 
 impl Router {
-    /// A chunk of another space: kept until its message is complete, which is then handled like any.
+    /// Stores a chunk of another space. A complete message is handled as any other message.
     pub(super) fn handle_chunk(
         &mut self,
         message: &NetworkMessage<'_>,
@@ -80,7 +81,7 @@ impl Router {
         if topic.is_some_and(|topic| !self.hear(topic, from, now)) {
             return;
         }
-        // Taken out while the message it gives is handled, so that this needs no copy.
+        // Taken out of `self` during the handling of the complete message, to avoid a copy.
         let mut chunks = self
             .chunks
             .take()
@@ -103,7 +104,7 @@ impl Router {
                     }
                     Err(error) => self.drop_undecoded(Some(topic), from, &error),
                 },
-                // Without a payload header it is an encoded NetworkMessage that was cut up.
+                // Without a payload header the chunks contain an encoded NetworkMessage.
                 None => match NetworkMessage::decode(whole.bytes) {
                     Ok(message) if message.is_chunk() => {
                         self.drop_undecoded(None, from, &CHUNK_IN_CHUNKS);
@@ -129,14 +130,15 @@ impl Router {
             }
         }
         if large {
-            // The next one of this size may never come, and its buffer would be kept for it.
+            // The buffer is freed, because another message of this size may never be received.
             drop(chunks.reassembler.take_whole());
         }
         self.count_given_up(&mut chunks.reassembler);
         self.chunks = Some(chunks);
     }
 
-    /// Whether a message came in chunks of a namespace that is secured otherwise than its own.
+    /// Returns whether a message was sent in chunks of a namespace with another security than its
+    /// own namespace.
     fn is_smuggled(&self, message: &NetworkMessage<'_>, chunked_in: u16) -> bool {
         let Some(guard) = &self.guard else {
             return false;
@@ -147,7 +149,7 @@ impl Router {
         !data || !alike
     }
 
-    /// Gives up the messages whose chunks have not come in time.
+    /// Gives up messages with overdue chunks.
     pub(super) fn expire_chunks(&mut self, now: Now) {
         if self.chunks.as_ref().and_then(|chunks| chunks.due()) > Some(now.monotonic) {
             return;
@@ -160,7 +162,7 @@ impl Router {
         }
     }
 
-    /// Takes note that the writer of a topic lives; false when there is no room to follow it.
+    /// Records a message of the writer of a topic. Returns false if there is no room for the topic.
     fn hear(&mut self, topic: TopicId, from: SocketAddr, now: Now) -> bool {
         let Some(Topic {
             role: Role::Theirs(reader),
@@ -249,10 +251,12 @@ fn told(refusal: ChunkRefusal, most: u32) -> String {
     }
 }
 
-/// The buffer of a whole message is used again up to this size, which is more than that of images.
+/// The maximum size of a buffer that is reused for complete messages. It exceeds the size of
+/// images.
 const MAX_SPARE: usize = 16 << 20;
 const CHUNK_IN_CHUNKS: DecodeError = DecodeError::Misread("a chunk in chunks");
-/// Messages of one sender unfinished at a time: datagrams of so many large topics may come in turn.
+/// The maximum number of incomplete messages per sender. Datagrams of this many large topics may be
+/// interleaved.
 const MAX_OPEN: usize = 512;
-/// The least bytes a chunk carries on average: the smallest datagram less its headers.
+/// The minimum average number of bytes per chunk: the smallest datagram without its headers.
 const LEAST_PIECE: usize = 256;

@@ -16,16 +16,17 @@ use crate::settings::Now;
 use crate::topic::{Role, Topic};
 
 impl Router {
-    /// Returns whether a delivery is to be confirmed. The caller then reports its [`Handover`] with
-    /// [`handed`](Self::handed).
+    /// Returns whether a delivery needs a confirmation. The caller then reports its [`Handover`]
+    /// with [`handed`](Self::handed).
     #[must_use]
     pub fn is_to_confirm(&self, topic: TopicId, instance: Option<Timestamp>) -> bool {
         self.receipt(topic)
             .is_some_and(|receipt| Some(receipt.mark.stamp) == instance)
     }
 
-    /// Takes the handover of a delivery that is [to be confirmed](Self::is_to_confirm). A delivery that has arrived is confirmed. A
-    /// delivery without a subscriber is handed over again when its writer repeats it in time.
+    /// Handles the handover of a delivery that [needs a confirmation](Self::is_to_confirm). A
+    /// delivery that has arrived is confirmed. A delivery without a subscriber is delivered again
+    /// when its writer repeats it in time.
     pub fn handed(&mut self, topic: TopicId, instance: Option<Timestamp>, handover: Handover) {
         let Some(Topic {
             role: Role::Theirs(reader),
@@ -54,8 +55,8 @@ impl Router {
         }
     }
 
-    /// Follows the newest event of a topic that is confirmed here, and answers its repetitions. The repetition of an event
-    /// without a subscriber is admitted.
+    /// Tracks the newest event of a topic that this space confirms, and answers its repetitions.
+    /// The repetition of an event without a subscriber is admitted.
     pub(super) fn receive(
         &mut self,
         topic: TopicId,
@@ -119,7 +120,7 @@ impl Router {
         }
     }
 
-    /// Notes a sender that announces a space.
+    /// Records a sender that announces a space.
     pub(super) fn meet_confirmer(&mut self, space: SpaceId, from: SocketAddr) {
         self.confirmers
             .entry(space)
@@ -179,7 +180,7 @@ impl Router {
         true
     }
 
-    /// Probes for applications if a bridge that is to confirm the newest event is unknown.
+    /// Probes for applications if a bridge that confirms the newest event is unknown.
     pub(super) fn look_for_confirmers(&mut self, topic: TopicId, now: Now) {
         let confirming = self.topics.get(&topic);
         let confirming = confirming.and_then(|of| of.confirming.as_deref());
@@ -234,7 +235,7 @@ impl Router {
             return;
         }
         if reason == Reason::Unchanged {
-            // The arrival of the sample before holds for this one.
+            // The arrival of the previous sample is valid for this sample.
             self.settled.push_back(topic);
         } else {
             self.tell(Output::Settled {

@@ -1,4 +1,5 @@
-//! Messages whose fields are not taken as they stand: DataValues, RawData, delta frames, and one field of several.
+//! Messages with fields that need conversion: DataValues, RawData, delta frames, and a selected
+//! field of several.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -19,16 +20,16 @@ use crate::settings::Now;
 use crate::takes::Takes;
 use crate::topic::{Role, Topic};
 
-/// What of the fields of a message is taken.
+/// The selection of fields in a message.
 enum Choice {
     All,
-    /// The only one, or the one at that place.
+    /// The only field, or the field at the index.
     One(Option<u16>),
     Place(u16),
 }
 
 impl Choice {
-    /// The place of the one that is taken of so many.
+    /// Returns the index of the selected field in a message of `count` fields.
     fn place(&self, count: usize) -> Result<Option<usize>, Refusal> {
         let place = match *self {
             Self::All => return Ok(None),
@@ -49,10 +50,10 @@ impl Choice {
     }
 }
 
-/// Why a message is not taken, and in words.
+/// The reason why a message is rejected, with details.
 type Refusal = (Reason, String);
 
-/// What a DataValue that is the value says of it.
+/// The status and timestamp of a DataValue that is the value.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Quality {
     pub(super) status: Option<StatusCode>,
@@ -70,8 +71,9 @@ impl Quality {
         }
     }
 
-    /// The status of the sample: that of the message, or that of its value if that is worse. The upper half of a StatusCode,
-    /// whose two highest bits are the severity (OPC 10000-4, 7.39.1).
+    /// Returns the status of the sample: the status of the message, or of its value if that is
+    /// worse. It is the upper half of a StatusCode; its two highest bits are the severity (OPC
+    /// 10000-4, 7.39.1).
     pub(super) fn status(self, message: u16) -> u16 {
         let status = self.status.unwrap_or(StatusCode::GOOD);
         let value = u16::try_from(status.0 >> 16).unwrap_or(u16::MAX);
@@ -83,7 +85,7 @@ impl Quality {
 }
 
 impl Router {
-    /// Keeps a key frame for delta frames to come, and says what of its fields is taken.
+    /// Stores a key frame for later delta frames, and returns the selection of its fields.
     pub(super) fn take_base(
         &mut self,
         topic: TopicId,
@@ -123,7 +125,7 @@ impl Router {
         *takes
     }
 
-    /// The fields of a message, where they are taken as they stand.
+    /// Returns the fields of a message if they need no conversion.
     pub(super) fn plain<'a>(
         message: &DataSetMessage<'a>,
         takes: Takes,
@@ -144,8 +146,8 @@ impl Router {
         is_taken.then_some(fields)
     }
 
-    /// Writes what is taken of a message, a key frame of Variants that stands alone, into an empty buffer. `None` where it
-    /// says nothing new.
+    /// Writes the selected fields of a message into an empty buffer, as a key frame of Variants
+    /// without NetworkMessage headers. Returns `None` if the message contains nothing new.
     pub(super) fn content(
         &mut self,
         topic: TopicId,
@@ -172,7 +174,7 @@ impl Router {
         }
     }
 
-    /// What of the fields of a message with this header is taken.
+    /// Returns the selection of fields in a message with this header.
     fn choice(
         &self,
         topic: TopicId,
@@ -210,13 +212,14 @@ impl Router {
         }
     }
 
-    /// What the sender at that address announced of a topic.
+    /// Returns the layout of a topic if the sender announced it.
     fn announced(&self, topic: TopicId, from: SocketAddr) -> Option<&Arc<Layout>> {
         let layout = self.discovery.as_ref()?.layout(topic)?;
         Some(layout).filter(|layout| layout.is_of(from))
     }
 
-    /// RawData, by what its writer announced, else by what the mapping says the fields are.
+    /// Converts RawData with the layout announced by its writer, or else with the layout in the
+    /// mapping.
     fn raw(
         &self,
         topic: TopicId,
@@ -245,7 +248,7 @@ impl Router {
         raw(message.payload(), &layout, choice, out)
     }
 
-    /// A delta frame, put over the last key frame.
+    /// Applies a delta frame to the last key frame.
     fn delta(
         &mut self,
         topic: TopicId,
@@ -309,7 +312,7 @@ impl Router {
         flatten(&whole, choice, out).map(Some)
     }
 
-    /// Forgets the key frame of a silent writer that has never sent a delta frame.
+    /// Removes the key frame of a silent writer that has never sent a delta frame.
     pub(super) fn forget_base(&mut self, topic: TopicId) {
         if let Some(Topic {
             role: Role::Theirs(reader),
@@ -322,7 +325,7 @@ impl Router {
         }
     }
 
-    /// A key frame came that the local side has: delta frames may follow it all the same.
+    /// Stores a key frame that the local side already has, because delta frames may follow it.
     pub(super) fn follow_again(
         &mut self,
         topic: TopicId,
@@ -343,7 +346,7 @@ impl Router {
         }
     }
 
-    /// Counts a message whose content is not taken, and asks its writer what it is where that is what lacks.
+    /// Counts a message with rejected content, and probes its writer if metadata is missing.
     pub(super) fn refuse_content(
         &mut self,
         topic: TopicId,
@@ -362,8 +365,8 @@ impl Router {
     }
 }
 
-/// Whether a payload is exactly what the layout of a mapping says. Nobody announced that layout, and a message of more fields
-/// could pass for a padded one.
+/// Checks that a payload has exactly the layout of the mapping. No writer announced this layout,
+/// and a message of more fields could pass for a padded message.
 fn fits(payload: &[u8], layout: &Layout) -> Result<(), Refusal> {
     let fields = layout.raw_fields();
     let layout = raw_layout(&fields)?;
@@ -408,7 +411,7 @@ fn raw(
                     frame.variant(&Variant::Array(Array::null(array.element())))?;
                 }
                 RawValue::Array(array) => {
-                    // Of a matrix of texts the elements in row-major order, as ROS has them.
+                    // For a matrix of texts, the elements in row-major order as in ROS.
                     frame.array(array.element(), array.len())?;
                     for element in array {
                         frame.element(element)?;
@@ -421,8 +424,8 @@ fn raw(
     Ok(Quality::default())
 }
 
-/// Variants or DataValues. Of a DataValue without a value, and of one of several that is bad, the status stands in its place,
-/// as a writer of Variants has it (OPC 10000-14, 7.2.4.5.5).
+/// Converts Variants or DataValues. A DataValue without a value is replaced by its status, and so
+/// is a bad value among several, as in a writer of Variants (OPC 10000-14, 7.2.4.5.5).
 fn flatten(
     message: &DataSetMessage<'_>,
     choice: &Choice,
@@ -460,7 +463,7 @@ fn taken<T>(values: &[T], one: Option<usize>) -> &[T] {
     }
 }
 
-/// Writes a key frame of Variants that stands alone.
+/// Writes a key frame of Variants without NetworkMessage headers.
 fn write(
     out: &mut Vec<u8>,
     fields: impl FnOnce(&mut FieldEncoder<'_>) -> Result<(), EncodeError>,
@@ -481,7 +484,8 @@ fn write(
 
 /// The severity of a Bad StatusCode (OPC 10000-4, 7.39.1).
 const STATUS_BAD: u32 = 0x8000_0000;
-/// A key frame is kept for delta frames up to the size of a datagram.
+/// The maximum size of a stored key frame: the size of a datagram.
 const MAX_BASE: usize = 1 << 16;
-/// And all of them up to this: whoever sends to the group can invent topics.
+/// The maximum size of all stored key frames. It is limited, because any sender in the group can
+/// invent topics.
 const MAX_BASES: usize = 16 << 20;

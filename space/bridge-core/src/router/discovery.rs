@@ -1,4 +1,4 @@
-//! What topics consist of: announced for those of our own space, learned and asked for of the others.
+//! Metadata of topics: announcements of own topics, and discovery of the topics of other spaces.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 use std::net::SocketAddr;
@@ -26,31 +26,31 @@ use crate::reader::Ask;
 use crate::settings::{Local, Now};
 use crate::topic::{Role, Topic};
 
-/// What is planned to be announced and asked, and what was learned.
+/// Planned announcements and probes, and received metadata.
 #[derive(Debug)]
 pub(super) struct Discovery {
-    /// What its times count from.
+    /// The origin of time for the timers.
     start: Instant,
     pub(super) announcer: Announcer,
-    /// Topics of our own space by their DataSetWriterId: all that a probe names.
+    /// Topics of the own space by DataSetWriterId, because a probe contains only DataSetWriterIds.
     pub(super) writers: BTreeMap<u16, Vec<TopicId>>,
-    /// Calls of ours by their DataSetWriterId.
+    /// Own calls by DataSetWriterId.
     pub(super) actions: BTreeMap<u16, Vec<TopicId>>,
-    /// Spaces that are asked which calls they have.
+    /// The spaces that are probed for their calls.
     pub(super) rolls: BTreeMap<SpaceId, ProbeTimer>,
-    /// Namespaces whose program was asked that when it was first heard.
+    /// Namespaces with a program that was already probed for its calls.
     pub(super) met: HashSet<(SpaceId, u16)>,
-    /// Publishers that are asked.
+    /// The Publishers that are probed for metadata.
     probing: BTreeMap<SpaceId, Probing>,
     pub(super) learned: Learned<Described>,
-    /// What the fields are, as announced, for messages that do not say it.
+    /// The announced fields, for messages that do not describe their fields.
     layouts: Learned<Layout>,
     pub(super) applications: Applications,
-    /// When there is something to do: looked up at every turn, and computed when something changes.
+    /// The time of the next action. It is read in every iteration and computed only after changes.
     due: Option<Instant>,
 }
 
-/// What one Publisher is asked for.
+/// The pending probe of a Publisher.
 #[derive(Debug)]
 struct Probing {
     timer: ProbeTimer,
@@ -60,7 +60,7 @@ struct Probing {
 impl Discovery {
     fn new(own: SpaceId, start: Instant) -> Self {
         let limits = AnnounceLimits {
-            // Those who are asked at once do not answer at once.
+            // Programs that receive the same probe respond at different times.
             gather: Duration::from_millis(50 + u64::from(own.get() % 50)),
             ..AnnounceLimits::default()
         };
@@ -79,7 +79,7 @@ impl Discovery {
         }
     }
 
-    /// What the fields of a topic were last said to be.
+    /// Returns the last announced fields of a topic.
     pub(super) fn layout(&self, topic: TopicId) -> Option<&Arc<Layout>> {
         self.layouts.last(topic)
     }
@@ -104,7 +104,7 @@ impl Discovery {
         let since = self.since_start(now);
         let (_, _, writer_id) = topic.triple();
         let subject = Subject::DataSetMetaData(writer_id);
-        // One that is planned already says it all.
+        // A planned announcement already contains the information.
         let _planned = self
             .announcer
             .announce(subject, Included::default(), since)
@@ -112,7 +112,7 @@ impl Discovery {
         self.reckon();
     }
 
-    /// A topic of a Publisher is no longer to be asked for.
+    /// Removes topics of a Publisher from its pending probe.
     pub(super) fn answered(&mut self, space: SpaceId, is_it: impl Fn(TopicId) -> bool) {
         if let Some(probing) = self.probing.get_mut(&space) {
             probing.topics.retain(|topic| !is_it(*topic));
@@ -131,12 +131,12 @@ impl Router {
             .get_or_insert_with(|| Box::new(Discovery::new(own, now.monotonic)))
     }
 
-    /// When [`discover`](Self::discover) is wanted.
+    /// Returns the time of the next call of [`discover`](Self::discover).
     pub(super) fn discovery_due(&self) -> Option<Instant> {
         self.discovery.as_ref()?.due
     }
 
-    /// Announces and asks what is due.
+    /// Sends due announcements and probes.
     pub(super) fn discover(&mut self, now: Now) {
         if self.discovery_due().is_none_or(|due| due > now.monotonic) {
             return;
@@ -167,12 +167,12 @@ impl Router {
             for topic in calls.into_iter().flatten() {
                 self.announce_call(*topic, due.sequence_number, now);
             }
-            // Where others write the same space, it may be theirs.
+            // If several programs share the space, another program may have the writer.
             if values.is_none() && calls.is_none() && self.owned == Owned::All {
                 self.deny(writer_id, due.sequence_number);
             }
         }
-        // Anything is random enough to ask at another time than others do.
+        // The clock is random enough to probe at another time than other programs.
         let random = u32::try_from(now.utc.unix_nanos() & 0xFFFF_FFFF).unwrap_or_default();
         let spaces: Vec<SpaceId> = discovery.probing.keys().copied().collect();
         for space in spaces {
@@ -196,7 +196,7 @@ impl Router {
         self.discovery = Some(discovery);
     }
 
-    /// Asks a Publisher what some of its topics consist of.
+    /// Probes a Publisher for the metadata of some of its topics.
     fn probe(&mut self, space: SpaceId, topics: &BTreeSet<TopicId>) {
         let ids: BTreeSet<u16> = topics.iter().map(|topic| topic.triple().2).collect();
         let ids: Vec<u16> = ids.into_iter().take(MAX_ASKED).collect();
@@ -210,14 +210,15 @@ impl Router {
         }
     }
 
-    /// Plans to ask what a topic of another space consists of.
+    /// Plans a probe for the metadata of a topic of another space.
     pub(super) fn ask_what(&mut self, topic: TopicId, now: Now) {
         if self.is_learned(topic) {
             self.plan_probe(topic, now);
         }
     }
 
-    /// Plans to ask what the fields of a topic are, whose messages cannot be read without; not for each of them.
+    /// Plans a probe for the fields of a topic if its messages cannot be read without them. The
+    /// rate of these probes is limited.
     pub(super) fn ask_layout(&mut self, topic: TopicId, now: Now) {
         let Some(Topic {
             role: Role::Theirs(reader),
@@ -244,14 +245,15 @@ impl Router {
                 timer: ProbeTimer::new(since, random, ProbeLimits::default()),
                 topics: BTreeSet::new(),
             });
-        // The others are announced from time to time.
+        // Other topics are announced periodically.
         if probing.topics.len() < MAX_ASKED {
             probing.topics.insert(topic);
         }
         discovery.reckon();
     }
 
-    /// Whether what a topic is locally may come from its writer: the mapping does not say it.
+    /// Returns whether the local type of a topic may come from its writer, because the mapping does
+    /// not define it.
     fn is_learned(&self, topic: TopicId) -> bool {
         let own = self.settings.own;
         let bound = self.mapping.variable(topic).is_some_and(|variable| {
@@ -261,7 +263,7 @@ impl Router {
         self.settings.local != Local::Fields && !bound
     }
 
-    /// A probe or an announcement of that Publisher, or for it.
+    /// Handles a probe or an announcement from or to the Publisher of `space`.
     pub(super) fn handle_discovery(
         &mut self,
         message: &NetworkMessage<'_>,
@@ -271,7 +273,7 @@ impl Router {
         if message.message_type() == NetworkMessageType::Probe {
             match Probe::decode(message) {
                 Ok(Probe::DataSetMetaData(ids)) => self.handle_probe(ids, space, now),
-                // Our own question is heard too.
+                // Own probes are received, too.
                 Ok(Probe::PubSubConnections { .. }) if !self.is_source(from) => {
                     self.handle_roll(space, now);
                 }
@@ -282,7 +284,7 @@ impl Router {
                         self.is_asked(&probe, now);
                     }
                 }
-                // Of configurations there is nothing to tell.
+                // Probes for configurations are not supported.
                 Ok(_) => self.drop_undecoded(None, from, &DISCOVERY),
                 Err(error) => self.drop_undecoded(None, from, &error),
             }
@@ -310,7 +312,7 @@ impl Router {
             discovery.announcer.handle_probe(&probe, since);
         }
         if let Some(probing) = discovery.probing.get_mut(&asked) {
-            // One pass: a datagram has room for 32 000 ids, and each pass decodes all of them.
+            // A single pass: a datagram has room for 32 000 ids, and each pass decodes all of them.
             let mut missing: BTreeSet<u16> = probing.topics.iter().map(|t| t.triple().2).collect();
             for id in ids {
                 missing.remove(&id);
@@ -323,7 +325,7 @@ impl Router {
         discovery.reckon();
     }
 
-    /// Takes in what a writer of another space says of its topic.
+    /// Handles the announcement of a writer of another space.
     pub(super) fn learn(
         &mut self,
         announcement: &Announcement<'_>,
@@ -412,7 +414,8 @@ impl Router {
         }
     }
 
-    /// The topic of another program that is announced; what says that there is none is taken in, and what is nonsense counted.
+    /// Returns the announced topic of another program. Handles announcements that a topic does not
+    /// exist, and counts invalid announcements.
     fn subject_of(
         &mut self,
         (writer_id, status): (u16, StatusCode),
@@ -438,7 +441,7 @@ impl Router {
         None
     }
 
-    /// Whether what is said of a topic from there may be the word of its writer.
+    /// Returns whether the sender may announce the topic as its writer.
     fn may_say(&mut self, topic: TopicId, from: SocketAddr, now: Now) -> bool {
         let timeout = self.mapping.pubsub().receive_timeout;
         let Some(Topic {
@@ -451,7 +454,7 @@ impl Router {
         if reader.may_be(from, now.monotonic, timeout) {
             return true;
         }
-        // Where the mapping has the say, who begins anew at another port is not worth a word.
+        // If the mapping defines the type, a restart at another port is not worth a log entry.
         if self.is_learned(topic) {
             let about = About {
                 topic: Some(topic),
@@ -464,7 +467,7 @@ impl Router {
         false
     }
 
-    /// Keeps what the fields of a topic are said to be.
+    /// Stores the announced fields of a topic.
     fn learn_layout(
         &mut self,
         topic: TopicId,
@@ -485,8 +488,8 @@ impl Router {
         }
     }
 
-    /// Takes in that a Publisher has no such DataSetWriter: its topics are no longer asked for, but for those whose values
-    /// somebody else sends.
+    /// Handles the announcement that a Publisher does not have a DataSetWriter. Its topics are not
+    /// probed any more, except topics with values from another sender.
     fn learn_of_none(&mut self, writer_id: u16, (space, from): (SpaceId, SocketAddr), now: Now) {
         let timeout = self.mapping.pubsub().receive_timeout;
         let probing = self.discovery.as_ref();
@@ -512,7 +515,8 @@ impl Router {
             .answered(space, |topic| denied.contains(&topic));
     }
 
-    /// Keeps what a topic is said to be; what is no type is not kept, and nothing else is.
+    /// Stores the description of a topic. An announcement without a ROS type removes the stored
+    /// description.
     fn take_note(&mut self, topic: TopicId, described: Option<Described>, now: Now) -> News {
         let until = (now.monotonic, self.mapping.pubsub().metadata_period);
         let Some(discovery) = &mut self.discovery else {
@@ -526,7 +530,8 @@ impl Router {
         discovery.learned.learn(topic, described, until, rank)
     }
 
-    /// Whether a topic that has values may be what it is said to be from now on: always what it is known as.
+    /// Returns whether a topic with values may change to the description. The known description is
+    /// always accepted.
     fn may_be_renamed(&mut self, topic: TopicId, described: &Described, now: Now) -> bool {
         let learned = self.discovery.as_ref().map(|discovery| &discovery.learned);
         let known = learned.and_then(|learned| learned.last(topic));
@@ -543,8 +548,9 @@ impl Router {
         }
     }
 
-    /// Has the port find the local type of a topic with values of that shape, with what is known of it; or, where it has a
-    /// type, look at what its writer says of them.
+    /// Returns the request to the port for the local type of a topic with values of the given
+    /// shape, together with the known description. For a topic that already has a type, it requests
+    /// a check of the description.
     pub(super) fn asked(
         &mut self,
         topic: TopicId,
@@ -579,7 +585,7 @@ impl Router {
         })
     }
 
-    /// An announcement or probe could not be sent.
+    /// Counts an announcement or probe that could not be sent.
     pub fn not_announced(&mut self, reason: Reason, detail: &str) {
         let about = About {
             topic: None,
@@ -591,12 +597,12 @@ impl Router {
 
 /// The severity of a Bad StatusCode (OPC 10000-4, 7.39.1).
 const STATUS_BAD: u32 = 0x8000_0000;
-/// How long a writer that has not said what the fields of its messages are is left alone.
+/// The minimum time between two probes of a writer for the fields of its messages.
 const ASK_LAYOUT_AGAIN: Duration = Duration::from_secs(10);
-/// Topics of one Publisher that are asked for at a time: those fit any datagram.
+/// The maximum number of topics in a probe of a Publisher, which fits into any datagram.
 const MAX_ASKED: usize = 200;
 
-/// Which topics have precedence where there is no room for what is known of all.
+/// Returns the precedence of topics when there is no room for all descriptions.
 fn rank(
     topics: &HashMap<TopicId, Topic>,
     mapping: &Mapping,

@@ -1,5 +1,5 @@
-//! Which topics are followed: those of our own space, of the mapping and of the port whatever there is, others while there
-//! is room.
+//! The set of tracked topics. Topics of the own space, of the mapping and of the port are always
+//! tracked, other topics only up to a limit.
 
 use std::net::SocketAddr;
 use std::time::Instant;
@@ -17,7 +17,8 @@ use crate::topic::{Role, Topic};
 use crate::writer::Writer;
 
 impl Router {
-    /// The topic's entry, made when it is new; `None` of one that nobody here knows, when there is no room for more such.
+    /// Returns the entry of a topic and creates it if necessary. Returns `None` for an unknown
+    /// topic if the limit is reached.
     pub(super) fn entry(
         &mut self,
         topic: TopicId,
@@ -37,7 +38,8 @@ impl Router {
         self.follow(topic, Some(from), now)
     }
 
-    /// The topic's entry, made when it is new: for those that are bounded by the mapping or the port.
+    /// Returns the entry of a topic and creates it if necessary. It is for topics that the mapping
+    /// or the port limits.
     pub(super) fn follow(
         &mut self,
         topic: TopicId,
@@ -48,7 +50,7 @@ impl Router {
             let variable = self.mapping.variable(topic);
             let rules = match variable {
                 Some(found) => (found.overflow, found.lasting),
-                // A command, unless the local side says that it is a state.
+                // A command, unless the local side describes it as a state.
                 None if topic.space == SpaceId::UA && self.is_home(topic) => {
                     (Overflow::default(), Lasting::Event)
                 }
@@ -78,7 +80,8 @@ impl Router {
         self.topics.get_mut(&topic)
     }
 
-    /// When anything was last heard of each topic of other spaces that was heard at all.
+    /// Returns the time of the last message of each topic of another space that was received at
+    /// least once.
     pub fn heard(&self) -> impl Iterator<Item = (TopicId, Instant)> {
         self.topics
             .iter()
@@ -96,8 +99,9 @@ impl Router {
         self.room.take()
     }
 
-    /// Forgets topics of other spaces that fell silent, that the mapping does not name and the port has no type for, those
-    /// first that are silent longest; says how many such topics there are then. What was counted of them stays.
+    /// Removes silent topics of other spaces that are not in the mapping and have no local type,
+    /// beginning with the longest silence. Returns the number of remaining topics of this kind. The
+    /// counters of removed topics are kept in total.
     fn let_strays_go(&mut self, now: Instant) -> usize {
         let (_, _, silence) = self.periods();
         let mut strays = 0_usize;
@@ -131,7 +135,8 @@ impl Router {
     }
 }
 
-/// Topics of other spaces that nobody here knows. Triples are free to invent for whoever sends to the group; memory is not.
+/// The maximum number of unknown topics of other spaces. It limits memory, because any sender in
+/// the group can invent topics.
 pub(super) const MAX_STRAYS: usize = 16_384;
-/// Of them, how many go at a time.
+/// The maximum number of unknown topics that are removed at a time.
 const MOST_LET_GO: usize = MAX_STRAYS / 8;

@@ -1,4 +1,4 @@
-//! What is heard and sent in secured groups.
+//! Messages of secured groups.
 
 use std::net::SocketAddr;
 
@@ -10,10 +10,10 @@ use crate::output::Output;
 use crate::settings::Now;
 
 impl Router {
-    /// Gives a secured group its keys. Those of a group that is not in the mapping are not kept.
+    /// Sets the keys of a secured group. Keys of a group that is not in the mapping are ignored.
     ///
     /// # Errors
-    /// [`KeyError`]; the keys there were stay.
+    /// Returns a [`KeyError`]; the previous keys stay in use.
     pub fn set_keys(
         &mut self,
         group: &str,
@@ -26,18 +26,18 @@ impl Router {
         }
     }
 
-    /// How each secured group is.
+    /// Returns the state of each secured group.
     pub fn groups(&self) -> impl Iterator<Item = GroupState> {
         self.guard.iter().flat_map(|guard| guard.states())
     }
 
-    /// Whether what is said in a namespace needs keys.
+    /// Returns whether messages in a namespace are secured.
     pub(super) fn is_secured(&self, namespace: u16) -> bool {
         let guard = self.guard.as_ref();
         guard.is_some_and(|guard| guard.is_secured(namespace))
     }
 
-    /// Follows the groups of the mapping.
+    /// Applies the groups of the mapping.
     pub(super) fn renew_guard(&mut self) {
         let groups = self.mapping.security();
         match &mut self.guard {
@@ -53,7 +53,7 @@ impl Router {
         }
     }
 
-    /// Gives the guard its random bytes, where there are any.
+    /// Sets the random bytes of the guard, if they are known.
     pub(super) fn mark_guard(&mut self) {
         let [a, b, c, d, ..] = self.instance;
         let random = self.instance.iter().any(|byte| *byte != 0);
@@ -62,14 +62,14 @@ impl Router {
         }
     }
 
-    /// A datagram where there are secured groups.
+    /// Handles a datagram if there are secured groups.
     pub(super) fn handle_guarded(
         &mut self,
         message: &NetworkMessage<'_>,
         from: SocketAddr,
         now: Now,
     ) {
-        // Our own, heard again: to open it would cost as much as one of others.
+        // An own message that was received again. It is not opened, to save time.
         if message.is_sealed() && self.settings.source.is_some() && self.is_source(from) {
             let about = About::sender(from);
             self.count(about, crate::Reason::Looped, 1, String::new);
@@ -106,7 +106,8 @@ impl Router {
         }
     }
 
-    /// Whether what was just heard says it in clear of a namespace that is secured, which is counted.
+    /// Returns whether the current message is unsecured but concerns a secured namespace, and
+    /// counts it.
     pub(super) fn is_unsaid(&mut self, namespace: Option<u16>, from: SocketAddr) -> bool {
         let secured = namespace.is_none_or(|namespace| self.is_secured(namespace));
         let unsaid = self.in_clear && secured;
@@ -122,7 +123,7 @@ impl Router {
         unsaid
     }
 
-    /// Seals what goes out; `None` for what cannot be sent, which is counted.
+    /// Seals an output. Returns `None` for a message that cannot be sent, and counts it.
     #[expect(
         clippy::wildcard_enum_match_arm,
         reason = "all but datagrams are for this program"

@@ -1,4 +1,4 @@
-//! Samples that wait for their local type: the newest of each topic.
+//! Samples that wait for their local type: the newest sample of each topic.
 
 use std::time::Duration;
 
@@ -14,7 +14,7 @@ use crate::settings::Now;
 use crate::topic::{Role, Topic};
 
 impl Router {
-    /// Keeps a sample until its local type is known, in place of the one before.
+    /// Stores a sample until its local type is known, in place of the previous sample.
     pub(super) fn hold(&mut self, topic: TopicId, sample: &Sample<'_>, now: Now) {
         let held = Box::new(Held {
             fields: sample.fields.bytes().to_vec(),
@@ -77,7 +77,8 @@ impl Router {
         }
     }
 
-    /// Removes a large sample whose type was not known in time. A state comes with its next repetition.
+    /// Removes a large sample if its type was not known in time. A state is received again with its
+    /// next repetition.
     pub(super) fn expire_held(&mut self, topic: TopicId, now: Now) {
         let over = |held: &mut Box<Held>| held.expires().is_some_and(|at| at <= now.monotonic);
         let expired = self.held_of(topic).and_then(|held| held.take_if(over));
@@ -86,7 +87,8 @@ impl Router {
         }
     }
 
-    /// Delivers a sample that waited for its local type; an event only while it is young.
+    /// Delivers a sample that waited for its local type. An event is delivered only before it is
+    /// too old.
     pub(super) fn deliver_held(&mut self, topic: TopicId, held: &Held, now: Now) {
         if !held.lasting && held.until <= now.monotonic {
             self.came_too_early(topic, held);
@@ -102,7 +104,7 @@ impl Router {
             kept: Kept::Alone,
             lasting: held.lasting,
             status: held.status,
-            // The wait is no delay of this program.
+            // The waiting time is not a delay of this program.
             arrived: now.utc,
         };
         self.deliver(topic, &sample, now);
@@ -116,7 +118,8 @@ impl Router {
     }
 }
 
-/// How long an event may wait for its local type.
+/// The maximum time for which an event may wait for its local type.
 const MAX_WAIT: Duration = Duration::from_secs(1);
-/// How many topics may have a large sample waiting. All of them together have no more bytes than the largest message.
+/// The maximum number of topics with a waiting large sample. Their total size is limited to the
+/// maximum message size.
 const MAX_LARGE: usize = 64;

@@ -1,4 +1,5 @@
-//! Which namespaces of the space this program alone writes, and what it does where somebody else writes them.
+//! The namespaces of the space that only this program writes, and the handling of other programs
+//! that write them.
 
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
@@ -15,7 +16,7 @@ use crate::output::Output;
 use crate::settings::Now;
 use crate::topic::{Role, Topic};
 
-/// The namespaces of ours in which nothing is sent for now.
+/// The own namespaces in which nothing is sent at the moment.
 #[derive(Debug, Default)]
 pub(super) struct Claims {
     of: BTreeMap<u16, Claim>,
@@ -23,14 +24,14 @@ pub(super) struct Claims {
 
 #[derive(Debug, Clone, Copy)]
 enum Claim {
-    /// Whether somebody else writes it is listened for until then.
+    /// The program waits until this time for messages of another writer.
     Listening { until: Instant },
-    /// Somebody else does.
+    /// Another program writes the namespace.
     Taken { heard: Instant },
 }
 
 impl Claims {
-    /// When a namespace may be free.
+    /// Returns the earliest time at which a namespace may be free.
     pub(super) fn due(&self, silence: Duration) -> Option<Instant> {
         let due = self.of.values().map(|claim| claim.ends(silence));
         due.min()
@@ -47,8 +48,8 @@ impl Claim {
 }
 
 impl Router {
-    /// Says which namespaces of the space this program alone writes; at first it is all of them. What it wrote in others, or
-    /// heard in these, it forgets.
+    /// Sets the namespaces of the space that only this program writes; initially all. Topics of the
+    /// other namespaces and received topics of these namespaces are removed.
     pub fn set_owned(&mut self, owned: Owned, now: Now) {
         if owned == self.owned {
             return;
@@ -69,7 +70,7 @@ impl Router {
         }
     }
 
-    /// Whether that topic is of what this program alone writes.
+    /// Returns whether only this program writes the topic.
     pub(super) fn is_home(&self, topic: TopicId) -> bool {
         self.owned.is_home(self.settings.own, topic)
     }
@@ -78,9 +79,10 @@ impl Router {
         may_cross(self.is_home(topic), heard_on, what)
     }
 
-    /// Listens for a moment if somebody else writes our namespaces, of which it asks, before anything is sent in them. Where
-    /// somebody does, nothing is sent until that one has been silent for `receive_timeout`. Does nothing for a program that
-    /// has its space for itself.
+    /// Probes for other writers of the own namespaces, and waits for a moment before anything is
+    /// sent in them. If another program writes a namespace, nothing is sent in it until that
+    /// program has been silent for `receive_timeout`. Has no effect for a program that does not
+    /// share its space.
     pub fn claim(&mut self, now: Now) {
         let Owned::Only(namespaces) = &self.owned else {
             return;
@@ -108,11 +110,11 @@ impl Router {
         }
     }
 
-    /// Somebody else writes a namespace of ours.
+    /// Records a message of another program in an own namespace.
     pub(super) fn contend(&mut self, namespace: u16, from: SocketAddr, now: Now) {
         let claims = self.claims.as_mut();
         let Some(claim) = claims.and_then(|claims| claims.of.get_mut(&namespace)) else {
-            // It is ours since before that one came.
+            // This program used the namespace before the other program.
             return;
         };
         let before = std::mem::replace(
@@ -127,7 +129,7 @@ impl Router {
         }
     }
 
-    /// Whether nothing of the topic is sent for now.
+    /// Returns whether nothing of the topic may be sent at the moment.
     pub(super) fn is_withheld(&self, topic: TopicId) -> bool {
         let (_, namespace, _) = topic.triple();
         let claims = self.claims.as_ref();
@@ -136,14 +138,15 @@ impl Router {
         })
     }
 
-    /// Whether somebody else was there first in a namespace of ours.
+    /// Returns whether another program has used an own namespace before this program.
     pub(super) fn is_taken(&self, namespace: u16) -> bool {
         let claims = self.claims.as_ref();
         let claim = claims.and_then(|claims| claims.of.get(&namespace));
         matches!(claim, Some(Claim::Taken { .. }))
     }
 
-    /// Leaves what waits of the topic where it is, while it is not known whether the namespace is free, or drops it.
+    /// Keeps the waiting items of a topic while it is unknown whether the namespace is free, or
+    /// drops them if it is taken.
     pub(super) fn withhold(&mut self, topic: TopicId) {
         let (_, namespace, _) = topic.triple();
         let claim = self.claims.as_ref();
@@ -166,7 +169,7 @@ impl Router {
         }
     }
 
-    /// Begins to send in the namespaces that are free.
+    /// Starts to send in free namespaces.
     pub(super) fn look_at_claims(&mut self, now: Now) {
         let (_, _, silence) = self.periods();
         let Some(claims) = &mut self.claims else {
@@ -191,7 +194,8 @@ impl Router {
         }
     }
 
-    /// Sends what waits in a namespace, and announces what is in it; where other things were dropped, with what was kept.
+    /// Sends the waiting items of a namespace, and announces its topics and calls. If items were
+    /// dropped, the kept values are repeated.
     fn send_again(&mut self, namespace: u16, dropped: bool, now: Now) {
         let ours = |(topic, entry): (&TopicId, &Topic)| {
             let (_, of, _) = topic.triple();
@@ -218,7 +222,7 @@ impl Router {
         self.announce_calls(now);
     }
 
-    /// No longer follows a topic. What was counted of it stays.
+    /// Removes a topic and keeps its counters in total.
     fn drop_topic(&mut self, topic: TopicId) {
         let Some(entry) = self.topics.remove(&topic) else {
             return;
@@ -233,5 +237,5 @@ impl Router {
     }
 }
 
-/// Those who write the same namespace answer within 100 ms.
+/// The time to wait for other writers of a namespace, which respond within 100 ms.
 const LISTEN: Duration = Duration::from_millis(300);

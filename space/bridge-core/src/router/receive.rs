@@ -1,4 +1,4 @@
-//! From a datagram to the queues: header, loop rule, sequence, route, payload, in this order.
+//! Processing of received datagrams: header, loop rule, sequence, route, payload, in this order.
 
 use std::net::SocketAddr;
 use std::time::Duration;
@@ -22,7 +22,8 @@ use crate::settings::{Local, Now};
 use crate::topic::{Item, Role, Topic};
 
 impl Router {
-    /// A datagram came from the UA side. What its messages hold is queued; what is wrong with it is counted.
+    /// Handles a datagram from the UA side. The values of its messages are queued, and errors are
+    /// counted.
     pub fn handle_datagram(&mut self, datagram: &[u8], from: SocketAddr, now: Now) {
         match NetworkMessage::decode(datagram) {
             Ok(message) if self.guard.is_some() => self.handle_guarded(&message, from, now),
@@ -54,7 +55,8 @@ impl Router {
         }
         let namespace = header.group.and_then(|group| group.writer_group_id);
         if self.is_ours(space, namespace) {
-            // A large request for a call of ours bears our PublisherId, as a small one does.
+            // A large request for an own call has the PublisherId of the own space, as a small
+            // request has.
             let request = message.is_chunk() && !message.is_sealed() && self.calls.is_some();
             match (request && message.writer_ids().is_none(), namespace) {
                 (true, Some(namespace)) if self.may_request(namespace, from) => {
@@ -76,7 +78,8 @@ impl Router {
             self.count(About::sender(from), Reason::NotInSpace, 1, String::new);
             return;
         };
-        // A chunk without a payload header may be of an answer, and who answers need not send values.
+        // A chunk without a payload header may belong to a response, which is not a value of the
+        // responding program.
         let may_be_value = !message.is_chunk() || message.writer_ids().is_some();
         if let Some(calls) = &mut self.calls
             && may_be_value
@@ -103,7 +106,7 @@ impl Router {
         }
     }
 
-    /// Gives the space a NetworkMessage comes from, or counts why it is none of ours to read.
+    /// Returns the space of a NetworkMessage, or counts the reason why it cannot be read.
     fn space_of(&mut self, header: &NetworkHeader<'_>, from: SocketAddr) -> Option<SpaceId> {
         let (number, exact) = number_of(header.publisher_id);
         let Some(space) = u16::try_from(number).ok().and_then(SpaceId::new) else {
@@ -122,13 +125,13 @@ impl Router {
         None
     }
 
-    /// Says from which address our own datagrams come by now: the network interface may be another.
+    /// Sets the source address of own datagrams after a change of the network interface.
     pub fn set_source(&mut self, source: SocketAddr) {
         self.settings.source = Some(source);
     }
 
-    /// Whether messages of that group are of what this program alone writes. One without a group is of our space only where
-    /// all of it is ours.
+    /// Returns whether only this program writes messages of the group. A message without a group
+    /// counts as own only if this program owns the whole space.
     fn is_ours(&self, space: SpaceId, namespace: Option<u16>) -> bool {
         let home = namespace.map_or(self.owned == Owned::All, |namespace| {
             self.owned.has(namespace)
@@ -136,7 +139,8 @@ impl Router {
         !may_cross(space == self.settings.own && home, Side::Ua, What::Value)
     }
 
-    /// Counts what is said in our own name: by ourselves, or by a rival.
+    /// Counts a message in the name of this program, from this program itself or from another
+    /// sender.
     pub(super) fn drop_own(&mut self, namespace: Option<u16>, from: SocketAddr, now: Now) {
         let own = self.settings.own;
         if self.is_source(from) {
@@ -147,7 +151,7 @@ impl Router {
         if let Some(namespace) = shared {
             self.contend(namespace, from, now);
         }
-        // That nothing of ours is sent for it was told with that.
+        // `Output::Taken` already reported that nothing is sent in the namespace.
         let told = shared.is_some_and(|namespace| self.is_taken(namespace));
         self.count(About::sender(from), Reason::SpaceTaken, 1, || match shared {
             Some(_) if told => String::new(),
@@ -161,7 +165,8 @@ impl Router {
         });
     }
 
-    /// Whether our own datagrams come from there, as far as that is known.
+    /// Returns whether the address is the source of own datagrams, or may be if the source is
+    /// unknown.
     pub(super) fn is_source(&self, from: SocketAddr) -> bool {
         self.settings.source.is_none_or(|source| {
             source.port() == from.port()
@@ -169,7 +174,8 @@ impl Router {
         })
     }
 
-    /// One DataSetMessage of another space: into the sequence, and on if it brings something new.
+    /// Handles a DataSetMessage of another space: checks its sequence, and processes its content if
+    /// it is new.
     pub(super) fn handle_message(
         &mut self,
         topic: TopicId,
@@ -207,11 +213,11 @@ impl Router {
         };
         place.held_back = *held_back;
         reader.heard(now.monotonic);
-        // A keep-alive says nothing of the content.
+        // A keep-alive contains no version of the content.
         let changed = message.kind != MessageKind::KeepAlive
             && reader.is_changed(message.header().major_version);
         let mut admitted = match message.kind {
-            // It says that the writer lives, and that is all.
+            // A keep-alive is only a sign of life.
             MessageKind::KeepAlive => None,
             MessageKind::KeyFrame | MessageKind::DeltaFrame | MessageKind::Event => {
                 let handling = Handling::of(local, *lasting);
@@ -238,7 +244,7 @@ impl Router {
         self.retire(topic, now);
         let entry = self.topics.get(&topic);
         if entry.is_some_and(|entry| entry.timer.is_none()) {
-            // The port has it since before its writer was heard.
+            // The port created the topic before its writer was received.
             self.schedule(topic);
         }
         if let Some(instance) = withdrawn {
@@ -263,7 +269,7 @@ impl Router {
         }
     }
 
-    /// A message that is due in its sequence: on with its fields.
+    /// Processes the fields of a message that was admitted to the sequence.
     fn take_in(
         &mut self,
         topic: TopicId,
@@ -315,7 +321,7 @@ impl Router {
         self.recycle(content);
     }
 
-    /// The topic has a good value.
+    /// Records that the topic has a good value.
     pub(super) fn is_good(&mut self, topic: TopicId, now: Now) {
         if let Some(Topic {
             role: Role::Theirs(reader),
@@ -327,7 +333,7 @@ impl Router {
         }
     }
 
-    /// The writer of a topic has nothing new to say.
+    /// Records a message of the writer without a new value.
     fn lives(&mut self, topic: TopicId, now: Now) {
         if let Some(Topic {
             role: Role::Theirs(reader),
@@ -339,13 +345,13 @@ impl Router {
         }
     }
 
-    /// The silence of a topic has ended.
+    /// Reports the end of the silence of a topic.
     pub(super) fn tell_returned(&mut self, topic: TopicId) {
         self.tell_silence(topic);
         self.schedule(topic);
     }
 
-    /// Hands a sample on, or keeps it until its local type is known.
+    /// Delivers a sample, or holds it until its local type is known.
     fn route(&mut self, topic: TopicId, sample: &Sample<'_>, now: Now) {
         let typed = self.settings.local == Local::Fields;
         let Some(Topic {
@@ -357,13 +363,13 @@ impl Router {
             return;
         };
         let anew = !typed && reader.shape.is_none();
-        // Until there is a type, the next sample may say more: a value that is null says nothing.
+        // Until a type is known, each sample updates the shape, because a null value has no type.
         if anew || (!typed && plan.is_none()) {
             let fields = sample.fields.clone().filter_map(Result::ok);
             reader.shape = Some(fields.map(|field| fields::shape(&field)).collect());
         }
         if typed || plan.is_some() {
-            // Looked up once for each shape, and not for each sample.
+            // Checked once for each shape instead of for each sample.
             if anew {
                 self.tell_described(topic);
             }
@@ -380,7 +386,8 @@ impl Router {
         if asks {
             self.tell_unbound(topic);
         }
-        // Not yet a loss: the newest one waits. It is not told, since the port names topics without a type.
+        // Not a loss yet, because the newest sample waits. It is not logged, because the port
+        // reports topics without a type.
         self.is_good(topic, now);
         self.count(About::topic(topic), Reason::Untyped, 1, String::new);
     }
@@ -429,7 +436,7 @@ impl Router {
         }
         if let Err((cause, detail)) = written {
             self.recycle(payload);
-            // Its repetition is none of a value that the local side has.
+            // The local side does not have the value, so its repetition must be delivered.
             self.forget(topic, sample.instance);
             self.count(About::topic(topic), cause, 1, || detail);
             return;
@@ -466,7 +473,7 @@ impl Router {
         );
     }
 
-    /// Tells of values that are no longer repeated beside others.
+    /// Reports values that are not repeated any more beside others.
     fn retire(&mut self, topic: TopicId, now: Now) {
         let after = self
             .mapping
@@ -487,10 +494,10 @@ impl Router {
         }
     }
 
-    /// Records the delays of a sample. A stored value, or a sample held back by its rate, waited on purpose: only its delay in
-    /// the network counts.
+    /// Records the delays of a sample. A stored value, or a sample held back by its rate limit,
+    /// waited intentionally; only its network delay is recorded.
     fn record_way(&mut self, place: &Place, sent: Option<Timestamp>, now: Now) {
-        // Stacks that never fill the stamps send zeros.
+        // Some stacks send zeros in timestamps that they do not fill.
         let filled = |stamp: &Timestamp| stamp.time.0 != 0;
         let Some(sent) = sent.filter(filled) else {
             return;
@@ -522,7 +529,7 @@ impl Router {
     }
 }
 
-/// A message's content on its way to the local side.
+/// The content of a message for the local side.
 pub(super) struct Sample<'a> {
     pub(super) fields: Fields<'a>,
     pub(super) source: Option<Timestamp>,
@@ -533,7 +540,7 @@ pub(super) struct Sample<'a> {
     pub(super) arrived: Timestamp,
 }
 
-/// The number of a PublisherId, and whether it is a UInt16.
+/// Returns the number of a PublisherId, and whether it is a UInt16.
 pub(super) fn number_of(publisher: Option<PublisherId<'_>>) -> (u64, bool) {
     match publisher {
         Some(PublisherId::UInt16(number)) => (u64::from(number), true),
@@ -544,7 +551,7 @@ pub(super) fn number_of(publisher: Option<PublisherId<'_>>) -> (u64, bool) {
     }
 }
 
-/// When a NetworkMessage was sent.
+/// Returns the time at which a NetworkMessage was sent.
 pub(super) fn sent(header: &NetworkHeader<'_>) -> Option<Timestamp> {
     header.timestamp.map(|time| Timestamp {
         time,
@@ -577,8 +584,8 @@ const fn reason_of(error: &DecodeError) -> Reason {
     }
 }
 
-/// A value that lives beside others is held to be gone when it was not repeated for so many key frame periods: two
-/// lost datagrams are ridden out.
+/// The number of key frame periods without repetition after which one of several values is retired.
+/// Two lost datagrams are tolerated.
 const MISSED_ROUNDS: u32 = 3;
-/// How long the port is left alone with a topic it found no type for.
+/// The minimum time between two requests to the port for the type of a topic.
 const ASK_AGAIN: Duration = Duration::from_secs(1);

@@ -1,4 +1,4 @@
-//! Another mapping for a Router that runs.
+//! Replacement of the mapping at run time.
 
 use std::sync::Arc;
 
@@ -15,18 +15,18 @@ use crate::takes::Takes;
 use crate::topic::{Item, Role, Topic};
 
 impl Router {
-    /// The mapping that runs.
+    /// Returns the current mapping.
     #[must_use]
     pub const fn mapping(&self) -> &Arc<Mapping> {
         &self.mapping
     }
 
-    /// Puts another mapping in the place of the one there is. A topic whose variable is the same goes on as it is; where
-    /// its queue or what is published of it differs, that changes and its sequence numbers go on; where what is said of it
-    /// differs, it is announced anew.
+    /// Replaces the mapping. A topic with the same variable continues unchanged. If its queue or
+    /// its publishing rule differs, it is changed and the sequence numbers continue. If its
+    /// metadata differs, it is announced again.
     ///
-    /// What a variable is tied to is the port's affair: it [`unbind`](Self::unbind)s what it gives up and
-    /// [`bind`](Self::bind)s what it takes up.
+    /// The port handles changed bindings: it calls [`unbind`](Self::unbind) for removed bindings
+    /// and [`bind`](Self::bind) for new bindings.
     pub fn replace_mapping(&mut self, mapping: Arc<Mapping>, now: Now) {
         let before = std::mem::replace(&mut self.mapping, mapping);
         self.renew_chunks(before.pubsub());
@@ -62,7 +62,7 @@ impl Router {
                 entry.confirming = Confirming::of(is);
                 entry.held_back = is.map(|is| is.publish.period).unwrap_or_default();
                 if let Role::Theirs(reader) = &mut entry.role {
-                    // Another field may be the value now.
+                    // The selected field may have changed.
                     reader.owed = true;
                 }
             }
@@ -72,21 +72,22 @@ impl Router {
             }
             let (was, is) = (before.variable(topic), self.mapping.variable(topic));
             let meant = was.map(|v| &v.meaning) != is.map(|v| &v.meaning);
-            // Only there does the mapping alone say what the values are.
+            // For this kind of local side only the mapping describes the values.
             let typed = self.settings.local == Local::Fields && was != is;
             if renamed || meant || typed {
                 self.describe_again(topic, now);
             }
-            // The periods may be shorter now.
+            // The periods may be shorter.
             self.schedule(topic);
         }
     }
 
-    /// The local side no longer has this topic, or will [`bind`](Self::bind) it to something else. A topic of our own space
-    /// falls silent until its next sample, which takes the next sequence number. Of another space, the next value asks
-    /// for a local type again. Its counters stay.
+    /// Removes the binding of a topic that the local side does not have any more, or before it is
+    /// [bound](Self::bind) to something else. A topic of the own space is silent until its next
+    /// sample, which uses the next sequence number. For a topic of another space, the next value
+    /// requests a local type again. The counters are kept.
     pub fn unbind(&mut self, topic: TopicId, now: Now) {
-        // What waits for its time is the last there is.
+        // The sample that waits for its time is the last sample.
         self.regate(topic, now);
         let Some(entry) = self.topics.get_mut(&topic) else {
             return;
@@ -112,7 +113,7 @@ impl Router {
         }
     }
 
-    /// Drops what waits for the local side: it is in the type that was.
+    /// Drops the deliveries that wait for the local side, because they have the previous type.
     pub(super) fn drop_deliveries(&mut self, topic: TopicId, why: &str) {
         let Some(entry) = self.topics.get_mut(&topic) else {
             return;
@@ -126,7 +127,7 @@ impl Router {
         }
     }
 
-    /// Describes a topic of our own space by the mapping there is now.
+    /// Updates the description of a topic of the own space after a change of the mapping.
     fn describe_again(&mut self, topic: TopicId, now: Now) {
         if !self.is_home(topic) {
             return;
@@ -142,7 +143,7 @@ impl Router {
         }
     }
 
-    /// Takes over what the mapping there is now says of lost commanders.
+    /// Updates the reaction to the loss of a commander after a change of the mapping.
     fn react_again(&mut self, topic: TopicId) {
         let wire = match self.settings.local {
             Local::Ros1 => Wire::Ros1,
@@ -155,12 +156,12 @@ impl Router {
         };
         let reactions = self.reactions(topic, (message_type, selection), wire);
         if let (Some(entry), Ok(reactions)) = (self.topics.get_mut(&topic), reactions) {
-            // The check of the mapping says what cannot be made.
+            // The check of the mapping reports reactions that cannot be made.
             entry.react(reactions);
         }
     }
 
-    /// Lets the samples that wait stand in a queue of another kind.
+    /// Replaces the queue of a topic and keeps the waiting samples.
     pub(super) fn requeue(&mut self, topic: TopicId, (overflow, lasting): (Overflow, Lasting)) {
         let Some(entry) = self.topics.get_mut(&topic) else {
             return;
@@ -176,12 +177,12 @@ impl Router {
         self.settle_arrival(topic);
         let waiting: Vec<Item> = std::iter::from_fn(|| before.pop()).collect();
         for item in waiting {
-            // Whether another gave way for it is counted there.
+            // `push` counts dropped items itself.
             let _gave_way = self.push(topic, item);
         }
     }
 
-    /// Puts the rule of the mapping in the place of the one there is; what that held back goes out.
+    /// Replaces the publishing rule of a topic. A held sample is sent.
     fn regate(&mut self, topic: TopicId, now: Now) {
         let Some(Topic {
             role: Role::Ours(_),
@@ -197,7 +198,8 @@ impl Router {
         self.let_go(topic, held, now);
     }
 
-    /// What is put together of chunks obeys the new limits. What is not complete is given up where they differ.
+    /// Applies changed limits for the reassembly of chunks. If they differ, incomplete messages are
+    /// given up.
     fn renew_chunks(&mut self, before: &PubSub) {
         let limits = |pubsub: &PubSub| (pubsub.max_message, pubsub.receive_timeout);
         if limits(before) == limits(self.mapping.pubsub()) {

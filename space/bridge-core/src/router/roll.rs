@@ -1,4 +1,5 @@
-//! Which calls other programs have, and what is said of values and calls that come and go.
+//! Discovery of the calls of other programs, and announcements of added and removed values and
+//! calls.
 
 use std::collections::BTreeSet;
 use std::net::SocketAddr;
@@ -16,8 +17,8 @@ use crate::settings::{Local, Now};
 use crate::topic::{Role, Topic};
 
 impl Router {
-    /// The local side says what a value of ours is: it is announced, and again whenever it changes. Only for a local side that
-    /// speaks in fields; what the mapping says of it does not count then.
+    /// Sets the description of an own value, and announces it now and after each change. It is for
+    /// a local side with fields as payload, and replaces the description in the mapping.
     pub fn describe_value(&mut self, topic: TopicId, description: ValueDescription, now: Now) {
         if self.settings.local != Local::Fields || !self.is_home(topic) {
             return;
@@ -34,7 +35,7 @@ impl Router {
         self.describe(topic, None, now);
     }
 
-    /// A topic of ours is no longer announced.
+    /// Stops the announcements of an own topic.
     pub(super) fn forget_described(&mut self, topic: TopicId) {
         if let Some(entry) = self.topics.get_mut(&topic) {
             entry.said = None;
@@ -57,7 +58,7 @@ impl Router {
         discovery.announcer.set_actions(actions);
     }
 
-    /// Plans to announce a call of ours.
+    /// Plans the announcement of an own call.
     pub(super) fn plan_action(&mut self, topic: TopicId, now: Now) {
         let (_, _, writer_id) = topic.triple();
         let discovery = self.discovery(now);
@@ -69,7 +70,7 @@ impl Router {
             discovery.announcer.set_actions(actions);
         }
         let subject = Subject::ActionMetaData(writer_id);
-        // One that is planned already says it all.
+        // A planned announcement already contains the information.
         let _planned = discovery
             .announcer
             .announce(subject, Included::default(), since)
@@ -77,7 +78,8 @@ impl Router {
         discovery.reckon();
     }
 
-    /// Somebody asks a space which calls it has: who asks for its connections asks for what can be done over them.
+    /// Handles a probe for the PubSubConnections of a space, which is also used as a probe for its
+    /// calls.
     pub(super) fn handle_roll(&mut self, asked: SpaceId, now: Now) {
         if let Some(discovery) = &mut self.discovery {
             let since = discovery.since_start(now);
@@ -91,8 +93,8 @@ impl Router {
         }
     }
 
-    /// A program begins: the spaces that the mapping has, and those there are without one, are asked for their calls. Else
-    /// it would know them once they are announced again.
+    /// Probes the spaces of the mapping and the default spaces for their calls when the program
+    /// starts. Otherwise the calls would be known only after their next periodic announcement.
     pub fn call_the_roll(&mut self, now: Now) {
         let declared = self.mapping.spaces().iter().map(|space| space.id);
         let usual = [0, 1, 2].into_iter().filter_map(SpaceId::new);
@@ -104,8 +106,8 @@ impl Router {
         }
     }
 
-    /// A program of space 0 is heard for the first time, which may have calls: it is asked for them. The programs of other
-    /// spaces tell of each call when it comes.
+    /// Probes a program of space 0 for its calls when it is first received. Programs of other
+    /// spaces announce each new call.
     pub(super) fn meet(&mut self, topic: TopicId, now: Now) {
         if topic.space != SpaceId::UA {
             return;
@@ -132,7 +134,7 @@ impl Router {
         discovery.reckon();
     }
 
-    /// Asks the spaces that are to be asked which calls they have.
+    /// Sends the due probes for calls.
     pub(super) fn call_rolls(
         &mut self,
         discovery: &mut Discovery,
@@ -166,7 +168,7 @@ impl Router {
         }
     }
 
-    /// A call that was asked for is known.
+    /// Completes the probes for a call that is known.
     pub(super) fn answered(&mut self, topic: TopicId, now: Now) {
         let discovery = self.discovery(now);
         discovery.answered(topic.space, |other| other == topic);
@@ -176,7 +178,7 @@ impl Router {
         }
     }
 
-    /// A program says that it has a value or call no longer.
+    /// Handles the announcement that a program does not have a value or call any more.
     pub(super) fn unlearn(&mut self, topic: TopicId, from: SocketAddr, now: Now) {
         let timeout = self.mapping.pubsub().receive_timeout;
         if let Some(Topic {
@@ -199,5 +201,5 @@ impl Router {
     }
 }
 
-/// Namespaces that are asked for their calls when they are first heard.
+/// The maximum number of namespaces that are probed for their calls when they are first received.
 const MAX_MET: usize = 4_096;

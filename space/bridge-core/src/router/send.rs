@@ -1,4 +1,4 @@
-//! From the queues to the datagrams: topic by topic in turn, large messages in chunks at their pace.
+//! Output from the queues to datagrams: topics in turn, large messages in chunks at their pace.
 
 use mappings::TopicId;
 
@@ -11,7 +11,8 @@ use crate::topic::{Item, Role, Sending};
 use crate::writer::Message;
 
 impl Router {
-    /// The next thing to do, topic by topic in turn. `None`: nothing until the next `handle_*`.
+    /// Returns the next output, topic by topic in turn. `None`: no output until the next
+    /// `handle_*`.
     pub fn poll_output(&mut self, now: Now) -> Option<Output> {
         loop {
             let output = self.next_output(now)?;
@@ -24,7 +25,7 @@ impl Router {
         }
     }
 
-    /// As [`poll_output`](Self::poll_output), in clear.
+    /// Returns the next output of [`poll_output`](Self::poll_output) before it is sealed.
     fn next_output(&mut self, now: Now) -> Option<Output> {
         if let Some(told) = self.told.pop_front() {
             return Some(told);
@@ -35,7 +36,8 @@ impl Router {
         if self.calls.is_none() {
             return self.next_value(now);
         }
-        // In turn, and a value first: what an action reports before its end is not overtaken by that.
+        // Values and calls alternate, beginning with a value, so that the result of an action does
+        // not overtake its last feedback.
         self.value_first = !self.value_first;
         let next = if self.value_first {
             self.next_value(now).or_else(|| self.next_action(now))
@@ -48,9 +50,9 @@ impl Router {
         next
     }
 
-    /// What is told of values, and what is sent and delivered of them.
+    /// Returns the next notification about a topic, or the next sample to send or deliver.
     fn next_value(&mut self, now: Now) -> Option<Output> {
-        // In turn, so that many topics nobody knows do not keep the values of the others waiting.
+        // They alternate, so that many unknown topics do not block the values of other topics.
         self.news_first = !self.news_first;
         let next = if self.news_first {
             self.next_news(now).or_else(|| self.next_item(now))
@@ -60,9 +62,9 @@ impl Router {
         next.or_else(|| self.told.pop_front())
     }
 
-    /// The next thing of the queues.
+    /// Returns the next item of the queues.
     fn next_item(&mut self, now: Now) -> Option<Output> {
-        // One for one: among those that are ready it waits its turn again.
+        // A single topic per call; it then waits for its turn among the ready topics.
         if !self.paced.is_empty() && self.pace.is_open(now.monotonic) {
             self.ready.extend(self.paced.pop_front());
         }
@@ -78,14 +80,14 @@ impl Router {
         None
     }
 
-    /// Whether so many samples of the topic wait to be polled that the next one makes the oldest give way.
+    /// Returns whether the queue of the topic is full, so that the next sample drops the oldest.
     #[must_use]
     pub fn is_full(&self, topic: TopicId) -> bool {
         let entry = self.topics.get(&topic);
         entry.is_some_and(|entry| entry.queue.is_full())
     }
 
-    /// Takes one thing of a topic, and puts it back in line if it has more.
+    /// Takes an item of a topic, and requeues the topic if it has more items.
     fn take_turn(&mut self, topic: TopicId, now: Now) -> Option<Output> {
         if self.claims.is_some() && self.is_withheld(topic) {
             self.withhold(topic);
@@ -122,7 +124,7 @@ impl Router {
         }
     }
 
-    /// The next chunk of the topic's large message, if the pace lets it go.
+    /// Returns the next chunk of the topic's large message, if the pace allows it.
     fn send_chunk(&mut self, topic: TopicId, now: Now) -> Option<Output> {
         if !self.pace.is_open(now.monotonic) {
             self.paced.push_back(topic);
@@ -163,8 +165,8 @@ impl Router {
         }
     }
 
-    /// A datagram could not be sent: counts it under `reason`, with what was said, for one of its topics. What is left of
-    /// a large message is not sent either.
+    /// Records a datagram that could not be sent, and counts it under `reason` with `detail` for
+    /// one of its topics. The rest of a large message is not sent either.
     pub fn not_sent(&mut self, topic: TopicId, reason: Reason, detail: &str) {
         if let Some(entry) = self.topics.get_mut(&topic) {
             entry.sending = None;

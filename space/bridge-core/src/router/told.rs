@@ -1,4 +1,4 @@
-//! What is told besides samples: drops to log, and what the port is to know of topics of other spaces.
+//! Outputs other than samples: drops to log, and notifications about topics of other spaces.
 
 use std::net::SocketAddr;
 
@@ -12,7 +12,7 @@ use crate::settings::Now;
 use crate::topic::{Role, Topic};
 
 impl Router {
-    /// Counts drops, and tells of them at the 1st, 10th, 100th ... occurrence of their cause.
+    /// Counts drops, and reports them at the 1st, 10th, 100th ... occurrence of their cause.
     pub(super) fn count(
         &mut self,
         About { topic, from }: About,
@@ -29,7 +29,7 @@ impl Router {
         self.count_only(About { topic, from }, cause, count, detail);
     }
 
-    /// As [`count`](Self::count), for drops that leave the reader of the topic as it is.
+    /// Counts drops as [`count`](Self::count) does, without an effect on the reader of the topic.
     pub(super) fn count_only(
         &mut self,
         About { topic, from }: About,
@@ -47,7 +47,8 @@ impl Router {
         self.tell_of_drop(About { topic, from }, cause, (before, total), detail);
     }
 
-    /// Tells of drops for a cause, of which there were so many before and are so many now.
+    /// Reports drops for a cause if a logged occurrence lies between the previous and the new
+    /// total.
     pub(super) fn tell_of_drop(
         &mut self,
         About { topic, from }: About,
@@ -71,7 +72,7 @@ impl Router {
         }
     }
 
-    /// Has something told, unless so much waits already that it is only counted.
+    /// Queues an output. If the queue is full, the output is only counted.
     pub(super) fn tell(&mut self, output: Output) {
         if self.told.len() < MAX_TOLD {
             self.told.push_back(output);
@@ -80,18 +81,20 @@ impl Router {
         }
     }
 
-    /// The writer of a topic fell silent, or speaks again: the port is told how it is by then.
+    /// Notifies the port that the silence of a topic has changed. The notification contains the
+    /// state at the time of its output.
     pub(super) fn tell_silence(&mut self, topic: TopicId) {
         self.tell_of(topic, |reader| reader.news.silence = true);
     }
 
-    /// Has the port find the local type of a topic, with what is known of it by then. What is asked already is not asked
-    /// twice.
+    /// Requests the local type of a topic from the port, with the description known at the time of
+    /// output. A pending request is not repeated.
     pub(super) fn tell_unbound(&mut self, topic: TopicId) {
         self.tell_of(topic, |reader| reader.news.ask = Some(Ask::Always));
     }
 
-    /// A topic that is open may have other values than before: has the port look at what its writer said of them, if it did.
+    /// Requests a check of the writer's description from the port, because the values of an open
+    /// topic may have changed.
     pub(super) fn tell_described(&mut self, topic: TopicId) {
         self.tell_of(topic, |reader| {
             reader.news.ask.get_or_insert(Ask::IfDescribed);
@@ -111,7 +114,7 @@ impl Router {
         }
     }
 
-    /// What is told next of any topic.
+    /// Returns the next notification about any topic.
     pub(super) fn next_news(&mut self, now: Now) -> Option<Output> {
         while let Some(topic) = self.news.front().copied() {
             if let Some(told) = self.news_of(topic, now) {
@@ -129,7 +132,7 @@ impl Router {
         None
     }
 
-    /// What is told next of a topic; its values come after it.
+    /// Returns the next notification about a topic, which precedes its values.
     pub(super) fn news_of(&mut self, topic: TopicId, now: Now) -> Option<Output> {
         let Some(Topic {
             role: Role::Theirs(reader),
@@ -148,7 +151,7 @@ impl Router {
         }
         let ask = reader.news.ask.take()?;
         let Some(shape) = reader.shape.clone() else {
-            // Its values are others since: the next one asks at once.
+            // The values have changed; the next value requests the type at once.
             reader.asked = None;
             return None;
         };
@@ -156,7 +159,7 @@ impl Router {
     }
 }
 
-/// What a drop is about.
+/// The topic and sender of a drop.
 #[derive(Clone, Copy)]
 pub(super) struct About {
     pub(super) topic: Option<TopicId>,
@@ -179,7 +182,9 @@ impl About {
     }
 }
 
-/// What waits to be told, beside the news of topics: whoever sends to the group can give cause for more than is taken.
+/// The maximum number of queued outputs, except notifications about topics. It is limited, because
+/// any sender in the group can cause outputs.
 const MAX_TOLD: usize = 4_096;
-/// How far a sudden jump of a counter is searched for a decade to be told at.
+/// The maximum number of occurrences that are searched for a logged occurrence after a jump of a
+/// counter.
 const MAX_TOLD_STEPS: usize = 1_000;

@@ -1,4 +1,5 @@
-//! Requests and responses that fit no datagram: cut up, and sent at the pace of all chunks.
+//! Requests and responses that are larger than a datagram: split into chunks, and sent at the pace
+//! of all chunks.
 
 use std::collections::{BTreeMap, VecDeque};
 
@@ -14,30 +15,31 @@ use crate::counters::Reason;
 use crate::output::Output;
 use crate::settings::Now;
 
-/// What is sent in chunks. Of each call's message there is one at a time, so that there is no more of it than the Requestor and
-/// the Responder hold.
+/// The messages to send in chunks. Each request or response is queued at most once, so the queue is
+/// limited by the state of the Requestor and the Responder.
 #[derive(Debug, Default)]
 pub(super) struct Chunking {
-    /// Messages in the order in which they were due. One goes after another: of each sender a receiver keeps few that are
-    /// incomplete.
+    /// Messages in the order in which they were due. They are sent one after another, because a
+    /// receiver stores few incomplete messages per sender.
     waiting: VecDeque<Large>,
-    /// The MessageSequenceNumber of the next one.
+    /// The last assigned MessageSequenceNumber.
     next: u16,
-    /// Those given, for repetitions, and the same in the order in which they were given.
+    /// The assigned MessageSequenceNumbers for repetitions, and their messages in the order of
+    /// assignment.
     numbers: BTreeMap<Of, u16>,
     given: VecDeque<Of>,
-    /// A value's chunk was let go in between.
+    /// Whether a chunk of a value was sent after the last chunk of a call.
     gave_way: bool,
 }
 
-/// Of which call a message is.
+/// Identifies a message by the number of its call.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum Of {
     Request(u64),
     Response(u64),
 }
 
-/// A message on its way.
+/// A partly sent message.
 #[derive(Debug)]
 struct Large {
     topic: TopicId,
@@ -61,8 +63,9 @@ impl Chunking {
         self.waiting.is_empty()
     }
 
-    /// Takes a message in, unless one of that call has not gone out yet. A repetition has the number that it had before, so that
-    /// its chunks fill in those that were lost (OPC 10000-14, 7.2.4.4.4).
+    /// Queues a message, unless a message of the same call is still queued. A repetition has the
+    /// MessageSequenceNumber of the first transmission, so that its chunks replace lost chunks (OPC
+    /// 10000-14, 7.2.4.4.4).
     fn push(&mut self, topic: TopicId, of: Of, bytes: Vec<u8>) {
         if self.waiting.iter().any(|large| large.of == of) {
             return;
@@ -109,7 +112,8 @@ impl Chunking {
 }
 
 impl Large {
-    /// What is cut up is the whole NetworkMessage, since the ActionHeader stands in it (OPC 10000-14, 7.2.4.4.4).
+    /// Appends the next chunk. The whole NetworkMessage is split, because it contains the
+    /// ActionHeader (OPC 10000-14, 7.2.4.4.4).
     fn write(&mut self, most: usize, out: &mut Vec<u8>) -> Result<(), ChunkError> {
         let (space, namespace, _) = self.topic.triple();
         let header = NetworkHeader {
@@ -139,25 +143,25 @@ impl Large {
 }
 
 impl Router {
-    /// Bytes of a datagram.
+    /// Returns the maximum size of a datagram in bytes.
     pub(super) fn most(&self) -> usize {
         self.sizes().0.into()
     }
 
-    /// Takes in a request or response that fits no datagram.
+    /// Queues a request or response that is larger than a datagram.
     pub(super) fn cut_up(&mut self, topic: TopicId, of: Of, bytes: Vec<u8>) {
         if let Some(calls) = &mut self.calls {
             calls.chunking.push(topic, of, bytes);
         }
     }
 
-    /// Whether a chunk of a request or response waits for the pace.
+    /// Returns whether a chunk of a request or response waits for the pace.
     pub(in super::super) fn is_chunking(&self) -> bool {
         let calls = self.calls.as_ref();
         calls.is_some_and(|calls| !calls.chunking.is_empty())
     }
 
-    /// The next chunk, if the pace lets it go; in turn with those of values.
+    /// Returns the next chunk if the pace allows it, alternating with the chunks of values.
     pub(super) fn next_chunk(&mut self, now: Now) -> Option<Output> {
         let values_wait = !self.paced.is_empty();
         let most = self.most();
@@ -185,5 +189,6 @@ impl Router {
     }
 }
 
-/// Numbers that are remembered: of more calls than wait for an answer at a time.
+/// The maximum number of stored MessageSequenceNumbers. It exceeds the number of calls that wait
+/// for a response at the same time.
 const MOST_NUMBERS: usize = 2_048;

@@ -1,4 +1,4 @@
-//! Calls of our own: announced, and executed by the local side.
+//! Calls of this program: announced, and executed by the local side.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -26,11 +26,11 @@ use crate::loop_rule::{Side, What};
 use crate::output::Output;
 use crate::settings::Now;
 
-/// A call of ours.
+/// A call of this program.
 #[derive(Debug)]
 pub(super) struct Own {
     open: bool,
-    /// What its bytes are read and written with, where the local side speaks ROS.
+    /// The plan for its payloads, if the local side uses ROS messages.
     plan: Option<Arc<ExecutedPlan>>,
     announcement: Option<CallAnnouncement>,
 }
@@ -40,23 +40,25 @@ pub(super) struct Own {
 pub(super) struct Running {
     pub(super) topic: TopicId,
     deadline: Instant,
-    /// As the request was read, so that a call that is another meanwhile changes nothing.
+    /// The plan with which the request was read. A later change of the call does not affect the
+    /// execution.
     plan: Option<Arc<ExecutedPlan>>,
 }
 
 impl Router {
-    /// The local side executes a call from now on, or it is another than before: it is announced. One of a namespace that is
-    /// not ours is not taken.
+    /// Adds or changes a call that the local side executes, and announces it. Calls of namespaces
+    /// that this program does not own are ignored.
     pub fn offer(&mut self, topic: TopicId, offered: Offered, now: Now) {
         let Offered { description, open } = offered;
         self.offer_as(topic, (&description, None), (open, None), now);
     }
 
-    /// As [`offer`](Self::offer), for a ROS service of the local side: its requests are handed out, and its responses taken, as
-    /// its messages in the local encoding.
+    /// Adds a ROS service of the local side as [`offer`](Self::offer) does. Requests and responses
+    /// are ROS messages in the local encoding.
     ///
     /// # Errors
-    /// Why the type cannot be executed, for people. A local side that speaks in fields has none.
+    /// Returns the reason for users if the type cannot be executed, or if the payloads of the local
+    /// side are fields.
     pub fn offer_type(
         &mut self,
         topic: TopicId,
@@ -130,8 +132,8 @@ impl Router {
         }
     }
 
-    /// The local side no longer executes a call, or no longer has a value, of its own: that is announced. Requests that are
-    /// executed go on.
+    /// Removes an own call or value that the local side does not have any more, and announces the
+    /// removal. Running executions continue.
     pub fn withdraw(&mut self, topic: TopicId, now: Now) {
         if !self.is_home(topic) {
             return;
@@ -148,7 +150,8 @@ impl Router {
         }
     }
 
-    /// As [`withdraw`](Self::withdraw), for all calls of ours and all values that no mapping says: the program ends.
+    /// Removes all own calls, and all own values that are not in the mapping, before the end of the
+    /// program. Each is removed as in [`withdraw`](Self::withdraw).
     pub fn withdraw_all(&mut self, now: Now) {
         let calls = self.calls.iter().flat_map(|calls| &calls.table);
         let calls = calls.filter(|(_, call)| call.own.is_some());
@@ -162,7 +165,7 @@ impl Router {
         }
     }
 
-    /// Says that there is nothing under that name.
+    /// Announces that the topic does not exist.
     fn announce_none(&mut self, topic: TopicId) {
         let (space, _, writer_id) = topic.triple();
         let announcement = Announcement {
@@ -186,7 +189,7 @@ impl Router {
         }
     }
 
-    /// Plans to announce all calls of ours.
+    /// Plans the announcements of all own calls.
     pub(in super::super) fn announce_calls(&mut self, now: Now) {
         let period = self.mapping.pubsub().metadata_period;
         let Some(calls) = &mut self.calls else {
@@ -200,7 +203,7 @@ impl Router {
         }
     }
 
-    /// Announces a call of ours.
+    /// Announces an own call.
     pub(in super::super) fn announce_call(&mut self, topic: TopicId, sequence: u16, now: Now) {
         if self.is_withheld(topic) {
             return;
@@ -216,7 +219,8 @@ impl Router {
         self.send_announcement(topic, sequence, (bytes, body_at), now);
     }
 
-    /// A request: for the local side, if it is one of ours and may be executed.
+    /// Handles a request, and passes it to the local side if it is for an own call and may be
+    /// executed.
     pub(super) fn handle_request(
         &mut self,
         topic: TopicId,
@@ -229,7 +233,7 @@ impl Router {
         }
         let (_, namespace, _) = topic.triple();
         let origin = self.origin(namespace, from);
-        // A sender that has the keys is known, whatever its address.
+        // A sender with the keys of the group is trusted at any address.
         let known = origin.group != STRANGERS;
         let group = self.mapping.pubsub().address;
         let Some(calls) = &mut self.calls else {
@@ -243,10 +247,11 @@ impl Router {
             .responder
             .handle_judged(request, (origin, verdict), since);
         match requested {
-            // A life of this program before may have executed it, of which nothing is known.
+            // An earlier instance of this program may have executed the request with an unknown
+            // result.
             Ok(Requested::Execute(id)) if !calls.is_of_this_life(request) => {
                 let lost = Outcome::Unknown(uadp::action::Unknown::Lost);
-                // Whom it is told is who asks for it again.
+                // The requestor receives the outcome when it repeats the request.
                 let _told = calls.responder.finish(id, lost, since).is_ok();
                 let cause = (Reason::CallRefused, "earlier life");
                 self.count_call(topic, Some(from), cause, || {
@@ -278,7 +283,8 @@ impl Router {
                 }
             }
             Ok(Requested::Repeated(_) | Requested::Closed(_)) => {}
-            // A repetition of a refused request, or its acknowledgement: the refusal itself is counted.
+            // A repetition of a refused request, or its acknowledgement. The refusal itself is
+            // already counted.
             Err(RequestDrop::Refused) => {
                 self.count_call(topic, Some(from), Reason::NotAsked, String::new);
             }
@@ -289,8 +295,8 @@ impl Router {
         }
     }
 
-    /// Returns whether any call of ours in the namespace may be requested from there, so that room may be taken for the chunks
-    /// of a request.
+    /// Returns whether the sender may request any own call in the namespace, so that memory may be
+    /// used for the chunks of a request.
     pub(in super::super) fn may_request(&self, namespace: u16, from: SocketAddr) -> bool {
         let calls = self.calls.iter().flat_map(|calls| &calls.table);
         let is_open = |(topic, call): (&TopicId, &super::Call)| {
@@ -299,8 +305,9 @@ impl Router {
         self.origin(namespace, from).group != STRANGERS || calls.into_iter().any(is_open)
     }
 
-    /// Returns whose room a request takes up. The members of a secured group are known by their keys and the programs of this
-    /// host by their ports. A stranger has one room for all ports of its host.
+    /// Returns the origin of a request, to which its memory is charged. Members of a secured group
+    /// are distinguished by their addresses, as are programs of this host. A sender on another host
+    /// shares one limit with all ports of its host.
     fn origin(&self, namespace: u16, from: SocketAddr) -> RequestOrigin<SocketAddr> {
         let guard = self.guard.as_ref();
         let secured = guard.and_then(|guard| guard.group_of(namespace));
@@ -320,7 +327,7 @@ impl Router {
         }
     }
 
-    /// The request as the local side has it.
+    /// Returns the request in the local encoding.
     fn read_request(
         &mut self,
         plan: Option<&ExecutedPlan>,
@@ -347,7 +354,7 @@ impl Router {
             Ok(block) => block,
             Err((cause, detail)) => {
                 let since = calls.since_start(now);
-                // Whom it is told is who asks for it again.
+                // The requestor receives the refusal when it repeats the request.
                 let refused = calls.responder.refuse(id, Refusal::InvalidArgument, since);
                 let _told = refused.is_ok();
                 return self.count_call(topic, None, cause, || detail);
@@ -374,7 +381,7 @@ impl Router {
         }));
     }
 
-    /// What an execution came to; who asked is told.
+    /// Ends an execution with its outcome, which is sent to the requestor.
     pub fn executed(&mut self, execution: ExecutionId, outcome: Executed, now: Now) {
         let Some(calls) = &mut self.calls else {
             return;
@@ -418,7 +425,7 @@ impl Router {
         }
         match finished {
             Ok(()) => {}
-            // It is what was asked for.
+            // An abandoned execution ends as requested.
             Err(FinishRefusal::Abandoned) => {
                 self.count_call(topic, None, Reason::NotAsked, String::new);
             }
@@ -434,25 +441,25 @@ impl Router {
 }
 
 impl super::Calls {
-    /// Whether a request was meant for this life of the program: one that was started anew is asked by another target once
-    /// it has said so.
+    /// Returns whether a request is for this instance of the program. After the announcement of a
+    /// new instance, requestors use its new ActionTargetId.
     fn is_of_this_life(&self, request: &ActionMessage<'_>) -> bool {
         [self.target, LASTING_TARGET].contains(&request.target_id)
     }
 
-    /// Forgets executions of which nothing was heard long after their deadline.
+    /// Removes executions that did not end for a long time after their deadline.
     pub(super) fn forget_executions(&mut self, now: Instant) {
         self.executions
             .retain(|_, running| running.deadline + FORGOTTEN > now);
     }
 }
 
-/// A request as the local side has it, or why it has it not.
+/// A request in the local encoding, or the reason why it cannot be converted.
 type ReadRequest = Result<Vec<u8>, (Cause, String)>;
-/// The fields of a request, and what they are read with where the local side speaks ROS.
+/// The fields of a request, and the plan to read them if the local side uses ROS messages.
 type Executable<'a> = (&'a [u8], Option<Arc<ExecutedPlan>>);
 
-/// The fields of a request that may be executed.
+/// Returns the fields of a request if it may be executed.
 fn may_be_executed<'a>(
     own: Option<&Own>,
     request: &ActionMessage<'a>,
@@ -479,24 +486,25 @@ fn may_be_executed<'a>(
         .map_err(|error| (Refusal::InvalidArgument, "fields", error.to_string()))
 }
 
-/// Whether who wants its answer at that ResponseAddress (OPC 10000-14, 7.2.4.4.2) gets it by what is sent to the group: the
-/// group's own address is meant, none, or one of the host that asks. To answer where anybody says would attack whom it names.
+/// Returns whether a response to the group reaches the ResponseAddress (OPC 10000-14, 7.2.4.4.2).
+/// The address must be empty, the address of the group, or on the host of the requestor. Responses
+/// to arbitrary addresses could be misused for attacks on other hosts.
 fn is_answered_at(wanted: &str, (from, group): (SocketAddr, SocketAddr)) -> bool {
     let wanted = wanted.trim();
     let at = PubSub::parse_address(wanted);
     wanted.is_empty() || at.is_some_and(|at| at == group || at.ip() == from.ip())
 }
 
-/// Group of the requests of other hosts in clear.
+/// The group of unsecured requests from other hosts.
 const STRANGERS: usize = 0;
-/// Group of the requests of this host in clear.
+/// The group of unsecured requests from this host.
 const LOOPBACK: usize = 1;
-/// Group of the requests of the first secured group.
+/// The group of requests in the first secured group.
 const SECURED: usize = 2;
 /// Bad_EncodingError (OPC 10000-6, A.2).
 const BAD_ENCODING_ERROR: StatusCode = StatusCode(0x8006_0000);
-/// As a Responder has them.
+/// The default and the maximum timeout, as in a Responder.
 const TIMEOUT: Duration = Duration::from_secs(60);
 const MAX_TIMEOUT: Duration = Duration::from_secs(3600);
-/// So long after its deadline an execution is not answered any more.
+/// The time after its deadline at which an execution is removed.
 const FORGOTTEN: Duration = Duration::from_secs(60);

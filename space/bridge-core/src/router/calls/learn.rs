@@ -1,4 +1,5 @@
-//! Calls of other programs: what they are, who executes them, and since when nobody does.
+//! Calls of other programs: their descriptions, their executors, and the detection of lost
+//! executors.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -16,42 +17,44 @@ use crate::learned::Weight;
 use crate::output::Output;
 use crate::settings::Now;
 
-/// What is known of a call.
+/// The known state of a call.
 #[derive(Debug)]
 pub(super) struct Known {
     pub(super) description: Arc<CallDescription>,
-    /// Who executes it.
+    /// The address of the executor.
     pub(super) from: SocketAddr,
-    /// ActionTargetId of it in this life of that program.
+    /// The ActionTargetId in the current instance of the executor.
     pub(super) target: u16,
-    /// When that was last said.
+    /// The time of the last announcement.
     said: Instant,
-    /// When it was last another than before.
+    /// The time of the last change of the description.
     changed: Instant,
-    /// The port holds it to be gone.
+    /// Whether the port was informed that the call is gone.
     pub(super) gone: bool,
 }
 
-/// Who executes the calls of a namespace: one program, which in most cases sends values there too.
+/// The executor of the calls of a namespace: a single program, which usually also sends values in
+/// the namespace.
 #[derive(Debug)]
 pub(super) struct Group {
     from: SocketAddr,
-    /// When it last said something of a call.
+    /// The time of the last announcement of a call.
     said: Instant,
-    /// When values of it were last heard. `None` where it has none, or said so after the last of them had ended.
+    /// The time of the last received value. `None` if the program sends no values, or announced its
+    /// calls after its values had ended.
     heard: Option<Instant>,
-    /// It is silent.
+    /// Whether the program is lost.
     gone: bool,
-    /// Since when it was asked what its calls are, and nothing is heard of it: somebody else says that it has them, or it
-    /// executes nothing.
+    /// The time of the first unanswered probe: another program announces the calls, or the program
+    /// does not execute requests.
     doubted: Option<Instant>,
-    /// It was asked what its calls are, since its values are missing.
+    /// Whether the program was probed because its values are missing.
     asked: bool,
 }
 
 impl Group {
-    /// Whether its values are missing for so long that it is to be asked whether it lives. The values of a producer that has
-    /// left end, and the program that executes the calls may be there all the same.
+    /// Returns whether the program must be probed because its values are missing. Its values also
+    /// end when their producer leaves, while the program still executes calls.
     fn is_to_be_asked(&self, now: Instant, missing: Duration) -> bool {
         !self.gone && !self.asked && self.lacks_values(now, missing)
     }
@@ -61,7 +64,8 @@ impl Group {
             .is_some_and(|heard| now.saturating_duration_since(heard) >= missing)
     }
 
-    /// It said what its calls are. One whose values are missing sends none until the next of them comes.
+    /// Records an announcement of a call. If values are missing, the program is treated as a
+    /// program without values until the next value is received.
     fn lives(&mut self, now: Instant, missing: Duration) {
         if self.lacks_values(now, missing) {
             self.heard = None;
@@ -70,7 +74,7 @@ impl Group {
         (self.doubted, self.asked) = (None, false);
     }
 
-    /// Whether nothing is heard of it any more.
+    /// Returns whether the program is lost.
     fn is_silent(&self, now: Instant, (silence, forgotten): (Duration, Duration)) -> bool {
         let since = |at: Instant| now.saturating_duration_since(at);
         if self.doubted.is_some_and(|at| since(at) >= silence) {
@@ -84,7 +88,7 @@ impl Group {
 }
 
 impl Calls {
-    /// A message of values of that namespace came.
+    /// Records a received message with values of the namespace.
     #[inline]
     pub(in super::super) fn heard(
         &mut self,
@@ -106,7 +110,7 @@ impl Calls {
         }
     }
 
-    /// The program that executes a call spoke of it.
+    /// Records a response of the executor of a call.
     pub(super) fn spoke(&mut self, topic: TopicId) {
         let (_, namespace, _) = topic.triple();
         if let Some(group) = self.groups.get_mut(&(topic.space, namespace)) {
@@ -114,7 +118,7 @@ impl Calls {
         }
     }
 
-    /// The program of a namespace is back: its calls are there again.
+    /// Restores the calls of a namespace after the return of its executor.
     fn revive(&mut self, of: (SpaceId, u16), now: Instant) {
         for (topic, call) in &mut self.table {
             let (_, namespace, _) = topic.triple();
@@ -133,7 +137,7 @@ impl Calls {
         self.reckon();
     }
 
-    /// Whether there is room for one more.
+    /// Returns whether there is room for another call. Removes lost and unused calls if necessary.
     fn has_room(&mut self, weight: usize) -> bool {
         let full = |calls: &Self| {
             calls.table.len() >= MAX_CALLS || calls.weight.saturating_add(weight) > MAX_WEIGHT
@@ -154,7 +158,7 @@ impl Calls {
 }
 
 impl Router {
-    /// Takes in what a program says of one of its calls.
+    /// Handles the announcement of a call of another program.
     pub(in super::super) fn learn_call(
         &mut self,
         action: &ActionMetaData<'_>,
@@ -175,7 +179,7 @@ impl Router {
             return self.drop_own(Some(namespace), from, now);
         }
         if !self.may_execute((space, namespace), from, now) {
-            // Who does execute them answers; who does not within the time is gone.
+            // The executor answers the probe. An executor that does not answer in time is lost.
             self.plan_probe(topic, now);
             let cause = (Reason::MetaData, "sender");
             return self.count_call(topic, Some(from), cause, || {
@@ -192,7 +196,7 @@ impl Router {
         }
     }
 
-    /// Whether what is said from there may be of the program that executes the calls of that namespace.
+    /// Returns whether the sender may be the executor of the calls of the namespace.
     fn may_execute(&mut self, of: (SpaceId, u16), from: SocketAddr, now: Now) -> bool {
         let silences = self.silences();
         let Some(group) = self
@@ -225,7 +229,7 @@ impl Router {
         let back = before.is_none_or(|known| known.gone);
         let changed = before.map(|known| known.changed);
         if !same && changed.is_some_and(|at| now.monotonic < at + CHANGE_AFTER) {
-            // Once it may be another, it is asked what it is.
+            // The probe makes the program announce the call again when a change is accepted.
             self.plan_probe(topic, now);
             let cause = (Reason::MetaData, "too often");
             return self.count_call(topic, Some(from), cause, || {
@@ -248,7 +252,7 @@ impl Router {
             asked: false,
         });
         if group.from != from {
-            // A program that was started anew.
+            // The program has restarted.
             (group.from, group.heard) = (from, None);
         }
         group.lives(now.monotonic, missing);
@@ -292,7 +296,8 @@ impl Router {
         }
     }
 
-    /// Asks what the values of an action are: the first feedback may come with the first goal, and is none before that is known.
+    /// Probes for the metadata of the values of an action. The first feedback may be sent with the
+    /// first goal, and is dropped if its type is unknown.
     fn ask_of_values(&mut self, topic: TopicId, role: CallRole, now: Now) {
         let CallRole::Goal(family) = role else {
             return;
@@ -305,7 +310,7 @@ impl Router {
         }
     }
 
-    /// Takes in that a program no longer executes a call.
+    /// Removes a call that its executor does not offer any more.
     pub(in super::super) fn unlearn_call(&mut self, topic: TopicId, from: SocketAddr) {
         let calls = self.calls.as_mut();
         if let Some(calls) = calls
@@ -318,8 +323,8 @@ impl Router {
         }
     }
 
-    /// Who executes a call has let requests for it go unanswered until it was taken for lost: unless it says soon what its calls
-    /// are, they are gone.
+    /// Handles an executor that did not answer requests before their timeout. Its calls are lost
+    /// unless it answers a probe soon.
     pub(super) fn doubt(&mut self, topic: TopicId, now: Now) {
         let (_, namespace, _) = topic.triple();
         let calls = self.calls.as_mut();
@@ -330,16 +335,19 @@ impl Router {
         }
     }
 
-    /// Who sends values is gone when they are missing and it does not say, asked, that it has none any more; who sends none,
-    /// when its announcements are; and either when it is asked in vain.
+    /// Returns the timeouts for executors with values and without values.
+    ///
+    /// An executor that sends values is lost when values are overdue and it does not answer a
+    /// probe. An executor without values is lost when its announcements are overdue. Either is lost
+    /// when it does not answer a probe.
     fn silences(&self) -> (Duration, Duration) {
         let pubsub = self.mapping.pubsub();
         let forgotten = pubsub.metadata_period.saturating_mul(MISSED);
         (pubsub.receive_timeout, forgotten)
     }
 
-    /// How long no value comes before a program is asked whether it lives: early enough for an answer, and never before the
-    /// next keep-alive is overdue.
+    /// Returns the time without values after which a program is probed. It leaves enough time for
+    /// an answer, and is longer than the keep-alive period.
     fn missing(&self) -> Duration {
         let pubsub = self.mapping.pubsub();
         let period = pubsub.keep_alive_period;
@@ -347,7 +355,7 @@ impl Router {
         overdue.max(pubsub.receive_timeout / 2)
     }
 
-    /// Tells of the calls that nobody executes any longer.
+    /// Detects lost executors and reports their calls.
     pub(super) fn look_for_silence(&mut self, now: Now) {
         let silences @ (_, forgotten) = self.silences();
         let missing = self.missing();
@@ -376,7 +384,7 @@ impl Router {
                     asked.push(*topic);
                 }
             }
-            // One of its calls is asked for in the name of all.
+            // A single call is probed for all calls of the program.
             let group = calls.groups.get_mut(&(topic.space, namespace));
             if !known.gone
                 && let Some(group) = group
@@ -391,13 +399,15 @@ impl Router {
             .retain(|_, group| now.monotonic.saturating_duration_since(group.said) < forgotten);
         let some = !calls.groups.is_empty() || !calls.executions.is_empty();
         calls.look_at = some.then(|| now.monotonic + LOOK);
-        // Somebody else may have them, or they are back, or they are there without values.
+        // Another program may execute the calls, or their executor has returned, or it executes
+        // calls without sending values.
         for topic in asked {
             self.plan_probe(topic, now);
         }
     }
 
-    /// Forgets what is known of calls that are ours now, and what we offer of those that are not.
+    /// Removes the descriptions of calls that became own calls, and own calls that became calls of
+    /// other programs.
     pub(in super::super) fn sort_calls(&mut self, now: Now) {
         let (owned, own) = (self.owned.clone(), self.settings.own);
         let Some(calls) = &mut self.calls else {
@@ -417,12 +427,13 @@ impl Router {
     }
 }
 
-/// Announcements that may be lost before a call is held to be gone.
+/// The number of announcements that may be lost before a call is considered lost.
 const MISSED: u32 = 3;
-/// How often it is looked who is silent.
+/// The period of the check for lost executors.
 const LOOK: Duration = Duration::from_millis(500);
-/// A call is not another more often than that: the port may have to offer it anew each time.
+/// The minimum time between two changes of a call. After each change the port may have to create
+/// the call again.
 const CHANGE_AFTER: Duration = Duration::from_secs(1);
-/// Calls there may be, and bytes of what they take and give.
+/// The maximum number of calls, and the maximum number of bytes of their descriptions.
 const MAX_CALLS: usize = 4_096;
 const MAX_WEIGHT: usize = 4 << 20;
