@@ -66,7 +66,8 @@ impl Base {
         self.in_doubt.clear();
     }
 
-    /// Returns whether a key frame has the fields of the last key frame under this stamp; true for any other stamp.
+    /// Returns whether a key frame has the fields of the last key frame under this stamp; true for
+    /// any other stamp.
     pub(crate) fn is_same(&self, message: &DataSetMessage<'_>, stamp: Timestamp) -> bool {
         self.stamp != Some(stamp)
             || (self.message.first() == Some(&flags(message.encoding()))

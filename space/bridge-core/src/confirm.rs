@@ -191,8 +191,9 @@ impl Confirmer {
         self.others.push_back(from);
     }
 
-    /// Returns whether a confirmation of an awaited event counts: its sender is the first that announced the space. Another
-    /// sender that announced the space takes over when the first sender confirms nothing for [`SILENT`], as after a restart.
+    /// Returns whether a confirmation of an awaited event counts: its sender is the first that
+    /// announced the space. Another sender that announced the space takes over when the first
+    /// sender confirms nothing for [`SILENT`], as after a restart.
     pub(crate) fn counts(&mut self, from: SocketAddr, now: Instant) -> bool {
         if from == self.from {
             self.doubted = None;

@@ -193,7 +193,8 @@ impl Guard {
         self.of(Some(namespace)).is_some()
     }
 
-    /// Returns the index of the secured group of a namespace; `None` where the namespace is not secured.
+    /// Returns the index of the secured group of a namespace; `None` where the namespace is not
+    /// secured.
     pub(crate) fn group_of(&self, namespace: u16) -> Option<usize> {
         self.of(Some(namespace))
     }

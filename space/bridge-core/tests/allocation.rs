@@ -1,4 +1,5 @@
-//! Messages move between ROS bytes and fields without an allocation, once the buffers were used.
+//! Messages are converted between ROS bytes and fields without an allocation after the first use of
+//! the buffers.
 use std::sync::Arc;
 use std::time::Instant;
 

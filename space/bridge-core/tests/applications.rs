@@ -1,4 +1,5 @@
-//! Which applications there are in the group: what programs tell who asks, and what they keep of it.
+//! Discovery of applications in the group: announcements in response to probes, and the limits of
+//! stored applications.
 
 use crate::cell;
 
@@ -28,7 +29,7 @@ fn application(name: &str, url: Option<&str>) -> Application {
     }
 }
 
-/// A bridge, and a component at the same group, that say what they are.
+/// Creates a bridge and a component in the same group, which announce their applications.
 fn cell() -> Cell {
     let mut cell = Cell::new(vec![Program::new(1, Local::Ros1), component(7)]);
     let now = cell.now();
@@ -65,7 +66,7 @@ fn who_begins_learns_who_is_there_and_is_told_of_once() {
     assert_eq!(cell.datagrams_of(0).len(), before, "nobody asks any more");
 }
 
-/// What a program has announced.
+/// Returns the announcements of a program.
 fn announced(cell: &mut Cell, at: usize) -> Vec<Vec<u8>> {
     let mut all = cell.datagrams_of(at);
     all.retain(|datagram| {
@@ -75,7 +76,7 @@ fn announced(cell: &mut Cell, at: usize) -> Vec<Vec<u8>> {
     all
 }
 
-/// Somebody of another host says something to all.
+/// Sends a datagram from another host to all programs.
 fn say(cell: &mut Cell, port: u16, datagram: &[u8]) {
     let from = SocketAddr::from(([10, 0, 0, 9], port));
     for at in 0..cell.programs.len() {
@@ -119,7 +120,7 @@ fn endpoints_are_told_by_servers_and_others_say_that_they_have_none() {
     }
 }
 
-/// Somebody's word of what it is.
+/// Returns the announcement of an application.
 fn told(uri: &str) -> Vec<u8> {
     let description = ApplicationDescription {
         application_uri: Some(uri),

@@ -1,4 +1,5 @@
-//! Messages that cross as they are, between spaces of one ROS and of both.
+//! Messages that are carried as bytes, between spaces of the same ROS version and of different
+//! versions.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -17,7 +18,7 @@ fn now() -> Now {
     }
 }
 
-/// A bridge of space 1 for ROS 1, of another for ROS 2.
+/// Creates a bridge: ROS 1 for space 1, ROS 2 for other spaces.
 fn bridge(space: u16) -> (Router, Registry) {
     let (local, dialect) = match space {
         1 => (Local::Ros1, Dialect::Ros1),
@@ -32,7 +33,8 @@ fn bridge(space: u16) -> (Router, Registry) {
     (router, Registry::bundle(dialect))
 }
 
-/// What a bridge of space `to` publishes when one of space `from` hears `message`, the topic bound `as: bytes` in both.
+/// Returns the message that a bridge of space `to` publishes when a bridge of space `from` receives
+/// `message`. Both bind the topic `as: bytes`.
 fn cross(
     (from, to): (u16, u16),
     types: impl Fn(&mut Registry) -> Arc<MessageType>,

@@ -1,4 +1,4 @@
-//! The calls and values of an action between Routers, where both sides have types of their own.
+//! The calls and values of an action between Routers with different types on both sides.
 use crate::cell;
 
 use std::num::NonZeroU16;
@@ -51,7 +51,7 @@ fn field(path: &str) -> Assigned {
     Assigned::Field(path.to_owned())
 }
 
-/// A ROS 2 bridge that executes the action of that type, and a ROS 1 bridge.
+/// Creates a ROS 2 bridge that executes an action of the type, and a ROS 1 bridge.
 fn executed(calls: &ActionCalls) -> Cell {
     let mut cell = Cell::new(vec![
         Program::new(1, Local::Ros1),
@@ -103,11 +103,11 @@ fn deliveries(cell: &mut Cell) -> Vec<Vec<u8>> {
 
 const COUNT: &str =
     "int32 order\n---\nint32 last\nfloat64 share\n---\nint32 so_far\nfloat64 share\nstring step\n";
-/// The same in another order, under other names, and less of it.
+/// A part of the same fields in another order and under other names.
 const WATCH: &str =
     "int32 goal\n---\nfloat64 part\nint32 last\n---\nfloat64 share\nint32 done\nuint8 kind\n";
 
-/// Feedback in ROS 2.
+/// Returns feedback in ROS 2.
 fn feedback(so_far: i32) -> Vec<u8> {
     let mut bytes = vec![0, 1, 0, 0];
     bytes.extend([7; 16]);
@@ -118,7 +118,7 @@ fn feedback(so_far: i32) -> Vec<u8> {
     bytes
 }
 
-/// The same as the ROS 1 type has it.
+/// Returns the same feedback in the ROS 1 type.
 fn watched(done: i32) -> Vec<u8> {
     let mut bytes = vec![7; 16];
     bytes.extend(0.5_f64.to_le_bytes());
@@ -147,7 +147,7 @@ fn feedback_in_a_row_is_told_whole_once_and_by_the_names_of_its_fields() {
             now,
         )
         .unwrap();
-    // What its writer says it is has been asked for.
+    // The description of its writer has been probed.
     cell.run(ms(500));
     for so_far in 1..=5 {
         say(&mut cell, &feedback(so_far));
@@ -155,7 +155,7 @@ fn feedback_in_a_row_is_told_whole_once_and_by_the_names_of_its_fields() {
     cell.run(ms(100));
     let expected: Vec<Vec<u8>> = (1..=5).map(watched).collect();
     assert_eq!(deliveries(&mut cell), expected);
-    // It is no state: it is not repeated.
+    // An event is not repeated.
     cell.run(ms(5_000));
     assert_eq!(deliveries(&mut cell), Vec::<Vec<u8>>::new());
     assert_eq!(cell.dropped(ASKING, Reason::Mismatch), 0);
@@ -164,7 +164,7 @@ fn feedback_in_a_row_is_told_whole_once_and_by_the_names_of_its_fields() {
 #[test]
 fn the_first_feedback_is_told_where_the_action_was_known_before_it_was_offered() {
     let mut cell = executed(&actions(Dialect::Ros2, "demo_msgs/Count", COUNT));
-    // One that comes later has not heard what is announced at the start.
+    // A program that starts later has not received the first announcements.
     cell.kill(ASKING);
     cell.start(ASKING, Program::new(1, Local::Ros1));
     let now = cell.now();
@@ -226,7 +226,7 @@ fn a_goal_and_its_result_are_made_as_a_map_says() {
     cell.ask(ASKING, AskId(2), (of(GOAL + 2), &[3; 16]), ms(3_000));
     cell.run(ms(50));
     let execution = cell.executions(EXECUTING).pop().unwrap();
-    // The status, an empty text, and behind it what follows the status in the message of ROS 2.
+    // The status, an empty text, and the fields after the status in the message of ROS 2.
     let mut response = vec![0, 1, 0, 0, 4, 0, 0, 0, 1, 0, 0, 0, 0];
     response.extend([0; 3]);
     response.extend(8_i32.to_le_bytes());

@@ -1,7 +1,11 @@
-//! Any set of programs around one group, which loses, doubles, delays and reorders datagrams, one of which may die midway and be
-//! started anew: a request is executed at most once in all lives of a program, where its name says and never at home, who asked
-//! is told what is so, and then there is silence. Bridges of ROS 1 and
-//! ROS 2, which offer and ask with the type of a service, and programs that speak in fields are mixed.
+//! Property tests of calls with any set of programs in a group that loses, duplicates, delays and
+//! reorders datagrams.
+//!
+//! A program may end at any time and may be restarted. A request is executed at most once in all
+//! instances of a program, only by the program in its name, and never by the requesting program
+//! itself. The requestor receives the true outcome, and no messages are sent afterwards. The
+//! programs are bridges of ROS 1 and ROS 2, which offer and request calls with the type of a
+//! service, and programs with fields as payload.
 use crate::cell;
 
 use std::collections::BTreeMap;
@@ -17,7 +21,8 @@ use messages::{Dialect, Registry, ServiceType};
 use proptest::prelude::*;
 use uadp::{BuiltinType, Scalar, Variant};
 
-/// How the group is: per mille of datagrams that are lost, doubled and late, and whether they come in another order.
+/// The behavior of the group: lost, duplicated and delayed datagrams per mille, and whether
+/// datagrams are reordered.
 #[derive(Debug, Clone, Copy)]
 struct Weather {
     lost: u32,
@@ -27,7 +32,7 @@ struct Weather {
     seed: u32,
 }
 
-/// Xorshift: enough to be different each time. A number below 1000.
+/// Returns a pseudorandom number below 1000 (xorshift).
 const fn drawn(seed: &mut u32) -> u32 {
     *seed ^= *seed << 13;
     *seed ^= *seed >> 17;
@@ -82,7 +87,8 @@ fn description() -> CallDescription {
     }
 }
 
-/// A request or response as that side has it: all end in the four bytes of the number.
+/// Returns a request or response in the encoding of the local side. Each ends with the four bytes
+/// of the number.
 fn number(local: Local, number: u32) -> Vec<u8> {
     match local {
         Local::Fields => block(&[Variant::Scalar(Scalar::UInt32(number))]),
@@ -100,7 +106,8 @@ fn service(dialect: Dialect) -> Arc<ServiceType> {
     registry.service(&name).unwrap()
 }
 
-/// Offers the call of a program, and has it ask for those of the others under the type of its side.
+/// Offers the call of a program, and binds the calls of the other programs with the type of its
+/// local side.
 fn join(cell: &mut Cell, (at, local): (usize, Local), own: TopicId, others: &[TopicId]) {
     let dialect = match local {
         Local::Fields => {
@@ -171,7 +178,7 @@ proptest! {
         weather.fill(&mut cell);
 
         let mut answers: BTreeMap<u32, Vec<_>> = BTreeMap::new();
-        // By request: where, and in which life.
+        // By request: the executing program and its instance.
         let mut executed: BTreeMap<u32, Vec<(usize, u32)>> = BTreeMap::new();
         let mut lives = vec![0_u32; spaces.len()];
         let mut wanted = BTreeMap::new();
@@ -229,11 +236,12 @@ proptest! {
             }
         }
         for at in 0..spaces.len() {
-            // What a program says that was started anew at another port, the others do not believe before its former life is over.
+            // Announcements of a program that was restarted at another port are accepted only after
+            // its previous instance is lost.
             let doubts = death.is_some_and(|(who, _, again)| again && who != at);
             prop_assert!(cell.dropped(at, Reason::Forged) == 0 || doubts);
         }
-        // Answers that nobody acknowledged are said again for a while.
+        // Responses without acknowledgement are repeated for a while.
         cell.run(ms(15_000));
         let before = actions(&mut cell);
         cell.run(ms(10_000));

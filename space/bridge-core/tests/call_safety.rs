@@ -1,4 +1,4 @@
-//! What calls do on a network that loses, and to peers that lie or die.
+//! Calls on a network that loses datagrams, and with peers that send false messages or end.
 use crate::cell;
 
 use std::cell::Cell as Shared;
@@ -39,7 +39,8 @@ fn offered(open: bool) -> Offered {
     }
 }
 
-/// A bridge of space 1 and a component with the namespace 7, whose call is known in the bridge.
+/// Creates a bridge of space 1 and a component with the namespace 7. The bridge knows the call of
+/// the component.
 fn plugged_in() -> Cell {
     let mut cell = Cell::new(vec![Program::new(1, Local::Fields), component(7)]);
     cell.offer(GRIPPER, start(), offered(true));
@@ -48,13 +49,13 @@ fn plugged_in() -> Cell {
     cell
 }
 
-/// So many bytes, which differ from place to place.
+/// Returns a request or response of the given number of distinct 32-bit numbers.
 fn large(bytes: u32) -> Vec<u8> {
     let bytes: Vec<u8> = (0..bytes).flat_map(|at| at.to_le_bytes()).collect();
     cell::block(&[Variant::Scalar(Scalar::ByteString(Some(&bytes)))])
 }
 
-/// A datagram that asks for the call, as a program of another maker sends it.
+/// Returns a datagram with a request for the call as sent by a program of another vendor.
 fn request(response_address: Option<&str>, request_id: u16) -> Vec<u8> {
     let (space, namespace, writer_id) = start().triple();
     let address = ActionAddress {
@@ -89,7 +90,8 @@ fn request(response_address: Option<&str>, request_id: u16) -> Vec<u8> {
 #[test]
 fn a_request_that_wants_its_answer_elsewhere_is_refused_and_counted() {
     let from = SocketAddr::from(([192, 0, 2, 9], 5_000));
-    // The group by its number, with and without its port, nothing, and the host that asks.
+    // The address of the group with and without its port, no address, and the host of the
+    // requestor.
     let allowed = [
         None,
         Some(""),
@@ -128,12 +130,14 @@ fn a_request_that_wants_its_answer_elsewhere_is_refused_and_counted() {
 #[test]
 fn the_chunks_of_a_repetition_fill_in_those_that_were_lost() {
     let mut cell = plugged_in();
-    // Every seventh is lost, which are others in each repetition: none comes whole.
+    // Every seventh chunk is lost. Each repetition loses other chunks, and no transmission is
+    // complete.
     let count = Rc::new(Shared::new(0_u32));
     let counting = Rc::clone(&count);
     cell.copies = Box::new(move |bytes| {
         let chunk = NetworkMessage::decode(bytes).and_then(|message| message.chunk());
-        // The first has the ActionHeader: what differs in it would begin another message.
+        // The first chunk contains the ActionHeader; a difference in it would start another
+        // message.
         if chunk.is_ok_and(|chunk| chunk.offset > 0) {
             counting.set(counting.get() + 1);
             usize::from(!counting.get().is_multiple_of(7))
@@ -141,7 +145,7 @@ fn the_chunks_of_a_repetition_fill_in_those_that_were_lost() {
             1
         }
     });
-    // 31 chunks and 32.
+    // 31 and 32 chunks.
     let (asked, answer) = (large(500_000), large(510_000));
     cell.ask(BRIDGE, AskId(1), (start(), &asked), ms(10_000));
     cell.run(ms(900));
@@ -169,7 +173,8 @@ fn chunks_of_calls_go_out_at_the_pace_of_chunks() {
     assert!(cell.executions(GRIPPER).is_empty(), "half of it is there");
     cell.run(ms(60));
     assert_eq!(cell.executions(GRIPPER).len(), 1);
-    // Nothing is sent twice while it is under way, though it takes as long as a repetition waits.
+    // Nothing is sent twice during its transmission, which takes as long as the interval of
+    // repetitions.
     let all = sent(&mut cell) - before;
     assert!(all < 11_000_000, "{all} bytes for 10 MB");
 }
@@ -215,7 +220,7 @@ fn who_lets_a_request_go_unheard_is_gone_until_it_speaks_again() {
     assert_eq!(answer.unwrap_err().kind, AskErrorKind::Unknown);
     cell.run(ms(4_000));
     assert_eq!(cell.gone(BRIDGE), [start()]);
-    // The next one is refused at once, and not after as long again.
+    // The next request is refused at once instead of after another timeout.
     cell.ask(BRIDGE, AskId(2), (start(), &[0, 0]), ms(10_000));
     let (_, answer) = cell.answers(BRIDGE).pop().unwrap();
     assert_eq!(answer.unwrap_err().kind, AskErrorKind::Refused);
@@ -228,7 +233,7 @@ fn who_lets_a_request_go_unheard_is_gone_until_it_speaks_again() {
 #[test]
 fn what_was_asked_of_a_program_before_it_was_started_anew_is_not_executed_again() {
     let mut cell = plugged_in();
-    // No answer arrives: who asks goes on to ask, and knows nothing of what becomes of it.
+    // No response arrives: the requestor repeats its request and does not learn the outcome.
     let mute = Rc::new(Shared::new(true));
     let muted = Rc::clone(&mute);
     cell.copies = Box::new(move |bytes| {
@@ -256,7 +261,8 @@ fn what_was_asked_of_a_program_before_it_was_started_anew_is_not_executed_again(
     let (_, told) = cell.answers(BRIDGE).pop().unwrap();
     assert_eq!(told.unwrap_err().kind, AskErrorKind::Unknown);
 
-    // Once it has said what it is, it is asked as any other, and by who is configured by hand too.
+    // After its announcement, the program receives requests as usual, also from requestors with
+    // static configuration.
     cell.run(ms(90_000));
     cell.ask(BRIDGE, AskId(2), (start(), &large(2)), ms(3_000));
     cell.run(ms(50));
@@ -287,21 +293,21 @@ fn who_missed_that_a_program_was_started_anew_asks_what_it_is_when_that_shows() 
     let (_, told) = cell.answers(BRIDGE).pop().unwrap();
     assert_eq!(told.unwrap_err().kind, AskErrorKind::Unknown);
     assert_eq!(cell.executions(GRIPPER).len(), 0);
-    // Not with the next announcement, which comes after 30 s.
+    // Earlier than the next announcement, which comes after 30 s.
     cell.run(ms(2_000));
     cell.ask(BRIDGE, AskId(2), (start(), &[0, 0]), ms(3_000));
     cell.run(ms(50));
     assert_eq!(cell.executions(GRIPPER).len(), 1);
 }
 
-/// Lets a stranger request the call so many times, each under an id of its own.
+/// Sends `count` requests of a stranger with distinct ids.
 fn flood(cell: &mut Cell, count: u16, from: SocketAddr) {
     for id in 0..count {
         cell.hear(GRIPPER, &request(None, id), from);
     }
 }
 
-/// Requests and responses that a program has sent.
+/// Returns the number of requests and responses that a program has sent.
 fn actions_of(cell: &mut Cell, at: usize) -> usize {
     let sent = cell.datagrams_of(at);
     sent.iter().filter(|bytes| cell::is_action(bytes)).count()
@@ -317,7 +323,7 @@ fn refused_requests_of_a_stranger_are_answered_once_each_and_no_more_than_there_
     flood(&mut cell, 3, stranger);
     cell.run(ms(5_000));
     assert_eq!(actions_of(&mut cell, GRIPPER), before + 3);
-    // Other ports of its host are no other sender.
+    // Other ports of the same host count as the same sender.
     for port in 0..8 {
         let stranger = SocketAddr::from(([192, 0, 2, 9], 6_000 + port));
         for id in 0..300 {

@@ -1,4 +1,5 @@
-//! Calls between Routers: asked for in one space, executed in another, answered to who asked.
+//! Calls between Routers: requested in one space, executed in another, with the response to the
+//! requestor.
 use crate::cell;
 
 use std::sync::Arc;
@@ -24,7 +25,7 @@ fn service(dialect: Dialect, name: &str) -> Arc<ServiceType> {
     Registry::bundle(dialect).service(&name).unwrap()
 }
 
-/// Start of a skill whose parameters all have values of their own.
+/// Returns the Start call of a skill with default values for all parameters.
 fn grasp() -> CallDescription {
     CallDescription {
         name: "gripper.Grasp.Start".to_owned(),
@@ -46,7 +47,8 @@ fn offered(description: CallDescription) -> Offered {
     }
 }
 
-/// A bridge of space 1 and a component with the namespace 7, whose call is known in the bridge.
+/// Creates a bridge of space 1 and a component with the namespace 7. The bridge knows the call of
+/// the component.
 fn plugged_in(local: Local) -> Cell {
     let mut cell = Cell::new(vec![Program::new(1, local), component(7)]);
     cell.offer(GRIPPER, start(), offered(grasp()));
@@ -55,7 +57,7 @@ fn plugged_in(local: Local) -> Cell {
     cell
 }
 
-/// The fields of a block.
+/// Returns the fields of a block.
 fn told(block: &[u8]) -> Vec<String> {
     let fields = Fields::parse(block).unwrap();
     fields
@@ -74,7 +76,7 @@ fn succeeded(run: u32) -> Executed {
 
 #[test]
 fn a_ros_service_call_starts_a_skill_and_is_answered() {
-    // success, and the message behind its length.
+    // `success`, and the length and text of `message`.
     let ros1 = [&[1][..], &6_u32.to_le_bytes(), b"grasps"].concat();
     // Padded to four bytes.
     let cdr = [
@@ -139,7 +141,7 @@ fn a_type_that_lacks_what_the_call_wants_is_refused_with_the_name_of_the_field()
     let set_bool = service(Dialect::Ros1, "std_srvs/SetBool");
     let why = grasp().fits(&set_bool, &CallMap::default()).unwrap_err();
     assert!(why.contains("`data`"), "{why}");
-    // What may be left out is, and nothing else.
+    // Only optional fields may be omitted.
     let mut also = grasp();
     also.request
         .push(CallField::scalar("data", BuiltinType::Boolean));
@@ -253,7 +255,7 @@ fn bad_outcomes_are_told_as_what_they_are() {
             AskErrorKind::Refused,
         ),
         (Executed::Lost, AskErrorKind::Unknown),
-        // No block of fields.
+        // Not a block of fields.
         (Executed::Answered(vec![1]), AskErrorKind::Failed),
     ];
     for (number, (outcome, kind)) in (1..).zip(outcomes) {
@@ -301,7 +303,7 @@ fn a_forged_answer_is_not_believed_whether_from_a_third_space_or_a_third_address
     cell.run(ms(50));
     let execution = cell.executions(GRIPPER).pop().unwrap();
     cell.executed(GRIPPER, execution.id, succeeded(1));
-    // What it says is caught, and said by somebody else first.
+    // The response is captured, and another sender sends it first.
     let said = cell.datagrams_of(GRIPPER);
     let answer = said
         .into_iter()
@@ -310,7 +312,7 @@ fn a_forged_answer_is_not_believed_whether_from_a_third_space_or_a_third_address
     let stranger = "127.0.0.1:999".parse().unwrap();
     cell.hear(BRIDGE, &answer, stranger);
     let mut third = answer.clone();
-    // PublisherId of the Responder, a UInt16 behind the flags.
+    // The PublisherId of the Responder, a UInt16 after the flags.
     let at = third.windows(2).position(|bytes| *bytes == [0, 0]).unwrap();
     third[at] = 3;
     let other = cell.programs[2].address;
@@ -396,7 +398,7 @@ fn a_component_that_dies_is_gone_when_its_values_are_missing_and_back_when_it_is
     let (_, answer) = cell.answers(BRIDGE).pop().unwrap();
     assert_eq!(answer.unwrap_err().kind, AskErrorKind::Refused);
 
-    // At another port, as it is with a program that was started anew.
+    // At another port, as after the restart of a program.
     let again = component(7).at_port(7_777);
     cell.start(GRIPPER, again);
     cell.offer(GRIPPER, start(), offered(grasp()));
@@ -459,7 +461,7 @@ fn a_program_whose_last_value_has_no_producer_any_more_keeps_its_calls_until_it_
     cell.run(ms(50));
     assert_eq!(cell.executions(GRIPPER).len(), 1);
 
-    // Once it has values again, it is missed as soon as before.
+    // With values again, its loss is detected as fast as before.
     cell.say(GRIPPER, topic(0, 7, 101), "Ready");
     cell.run(ms(5_000));
     cell.kill(GRIPPER);
@@ -497,11 +499,12 @@ fn who_comes_late_learns_the_calls_that_are_there_by_asking() {
     cell.say(0, topic(0, 7, 101), "Ready");
     cell.run(ms(5_000));
     cell.programs.push(Program::new(2, Local::Fields));
-    // The next key frame comes within a second, and what is asked for then within another.
+    // The next key frame is received within a second, and the response to the probe within another
+    // second.
     cell.run(ms(2_000));
     assert_eq!(cell.known(1), [start()]);
 
-    // Or because somebody wants that one.
+    // Or after a request for the call.
     let mut cell = Cell::new(vec![component(7)]);
     cell.offer(0, start(), offered(grasp()));
     cell.run(ms(5_000));
@@ -511,7 +514,7 @@ fn who_comes_late_learns_the_calls_that_are_there_by_asking() {
     cell.run(ms(1_000));
     assert_eq!(cell.known(1), [start()]);
 
-    // Or because a program that begins asks all.
+    // Or after the probe of a starting program.
     cell.programs.push(Program::new(3, Local::Cdr));
     let now = cell.now();
     cell.programs[2].router.call_the_roll(now);
@@ -621,14 +624,15 @@ fn a_server_shows_the_values_of_components_beside_its_own() {
     assert_eq!(cell.texts(0, theirs), ["Ready"]);
     assert_eq!(cell.texts(GRIPPER, ours), ["mine"]);
     assert_eq!(cell.dropped(0, Reason::SpaceTaken), 0);
-    // Somebody else in its own namespace is another matter.
+    // Another program in its own namespace is handled differently.
     cell.programs.push(component(2).at_port(7_777));
     cell.say(2, ours, "rival");
     cell.run(ms(100));
     assert_eq!(cell.texts(0, ours), Vec::<String>::new());
     assert!(cell.dropped(0, Reason::SpaceTaken) > 0);
 
-    // The mapping says it has 7 too: what it heard there is forgotten, and that it is in use told.
+    // After a change the mapping assigns namespace 7 to it, too: received values of the namespace
+    // are removed, and the conflict is reported.
     let now = cell.now();
     let both = Owned::Only([2, 7].into());
     cell.programs[0].router.set_owned(both, now);
@@ -661,7 +665,7 @@ fn a_request_and_a_response_of_a_megabyte_cross_in_chunks() {
     // They are repeated, and executed once.
     cell.run(ms(500));
     assert!(cell.executions(GRIPPER).is_empty());
-    // Chunks of an answer are not values, which would be missed.
+    // Chunks of a response do not count as values, so no values are missing.
     cell.run(ms(50_000));
     assert_eq!(cell.gone(BRIDGE), []);
 }
@@ -687,7 +691,7 @@ fn a_service_of_ros_2_is_asked_for_from_ros_1_under_another_type_as_a_map_says()
     cell.run(ms(200));
     let described = cell.programs[asking].router.described_call(call).unwrap();
     assert_eq!(described.about, "std_srvs/SetBool; switches the belt");
-    // Always on; of the answer the text is left out by the map, and something else said.
+    // The request is always true, and the map replaces the text of the response.
     let assign = |target: &str, value| Assignment {
         target: target.to_owned(),
         value,
@@ -708,7 +712,7 @@ fn a_service_of_ros_2_is_asked_for_from_ros_1_under_another_type_as_a_map_says()
     cell.ask(asking, AskId(1), (call, &[]), ms(3_000));
     cell.run(ms(50));
     let execution = cell.executions(executing).pop().unwrap();
-    // A CDR with one Boolean, padded.
+    // A CDR with a single Boolean and padding.
     assert_eq!(execution.request, [0, 1, 0, 0, 1, 0, 0, 0]);
     let response = [&[0, 1, 0, 0, 1, 0, 0, 0][..], &1_u32.to_le_bytes(), &[0; 4]].concat();
     cell.executed(executing, execution.id, Executed::Answered(response));

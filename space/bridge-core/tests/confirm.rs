@@ -1,4 +1,4 @@
-//! Events that bridges confirm, on a network that loses datagrams, with a clock that moves when told.
+//! Events that bridges confirm, on a network that loses datagrams, with a manual clock.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -43,7 +43,7 @@ fn later(now: Now, time: Duration) -> Now {
     }
 }
 
-/// The field of an OPC UA write.
+/// Returns the field of an OPC UA write.
 fn field(value: u32) -> Vec<u8> {
     let mut block = 1_u16.to_le_bytes().to_vec();
     block.push(BuiltinType::UInt32.id());
@@ -51,18 +51,18 @@ fn field(value: u32) -> Vec<u8> {
     block
 }
 
-/// The number that is the message of a delivery.
+/// Returns the number in the message of a delivery.
 fn number(delivery: &Delivery) -> u32 {
     u32::from_le_bytes(*delivery.payload.last_chunk().unwrap())
 }
 
-/// One program of the group.
+/// A program of the group.
 struct Program {
     router: Router,
     port: u16,
-    /// What its local side has got.
+    /// The values that its local side has received.
     got: Vec<u32>,
-    /// What it says of that.
+    /// The handover that the local side reports for them.
     handover: Handover,
     arrivals: Vec<(TopicId, Arrival)>,
 }
@@ -118,7 +118,7 @@ impl Program {
         let _verdict = self.router.handle_local(heard, now);
     }
 
-    /// What it sends by now.
+    /// Handles the due timeouts and outputs, and returns the datagrams that the program sends.
     fn turn(&mut self, now: Now) -> Vec<Vec<u8>> {
         self.router.handle_timeout(now);
         let mut sent = Vec::new();
@@ -152,17 +152,17 @@ impl Program {
     }
 }
 
-/// Programs on one network.
+/// Programs in a network.
 struct Cell {
     programs: Vec<Program>,
     now: Now,
-    /// Says which datagrams are lost: program of the sender, and of the receiver.
+    /// Returns whether a datagram is lost, by the ports of its sender and its receiver.
     loses: Box<dyn FnMut(u16, u16) -> bool>,
     datagrams: usize,
 }
 
 impl Cell {
-    /// A server and a bridge for each of these spaces, which have found one another.
+    /// Creates a server, and a bridge for each of the spaces, which have discovered each other.
     fn new(of: TopicId, spaces: &[u16]) -> Self {
         let now = start();
         let all = std::iter::once(&0).chain(spaces);
@@ -219,7 +219,7 @@ fn unknown(space: u16) -> Arrival {
     Arrival::Unknown(vec![SpaceId::new(space).unwrap()])
 }
 
-/// Loses a fifth of the datagrams, the same in each run.
+/// Returns a function that loses a fifth of the datagrams, the same in each run.
 fn loses_a_fifth(seed: u64) -> Box<dyn FnMut(u16, u16) -> bool> {
     let mut state = seed;
     Box::new(move |_, _| {
@@ -251,7 +251,7 @@ fn a_confirmed_event_is_sent_as_often_as_any_other() {
         let of = topic(of);
         let mut cell = Cell::new(of, &[1]);
         let before = cell.datagrams;
-        // The bridge asserts that what is delivered is to be confirmed.
+        // The bridge asserts that each delivery needs a confirmation.
         if confirmations == 0 {
             cell.programs.truncate(1);
         }
@@ -293,7 +293,7 @@ fn a_value_that_nobody_has_in_time_is_unknown_and_does_not_come_later() {
     let counted = cell.programs[0].router.topics();
     let counted: u64 = counted.map(|(_, of)| of.dropped(Reason::Unconfirmed)).sum();
     assert_eq!(counted, 1);
-    // A copy that the network held back.
+    // A copy that the network delayed.
     cell.programs[1].handover = Handover::Done;
     for datagram in &held_back {
         let now = cell.now;
@@ -330,7 +330,7 @@ fn a_newer_write_goes_out_at_once_and_ends_the_repetition_of_the_one_before() {
     cell.run(Duration::from_secs(2));
     assert_eq!(cell.programs[1].got, [2]);
     assert_eq!(cell.arrivals(), [Arrival::Confirmed]);
-    // A newer one that waits for its turn does so, too.
+    // The same holds for a newer event that waits for its publication time.
     let of = topic("ua_0_2_13");
     let mut cell = Cell::new(of, &[1]);
     cell.write(of, 1);
@@ -384,7 +384,7 @@ fn a_confirmation_of_another_sender_than_the_one_that_announced_the_space_is_ign
     let of = topic("ua_0_2_10");
     for announces in [false, true] {
         let mut cell = Cell::new(of, &[1]);
-        // The bridge is there and its local side has not got the value yet.
+        // The bridge is present, but its local side has not received the value yet.
         cell.programs[1].handover = Handover::Waiting;
         let mut forger = Program::new(1, 666, of, cell.now);
         if announces {

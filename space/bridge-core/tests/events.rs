@@ -1,4 +1,5 @@
-//! Events, states and commands on their way into ROS, on a network that loses datagrams, with a clock that moves when told.
+//! Delivery of events, states and commands to ROS on a network that loses datagrams, with a manual
+//! clock.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -50,7 +51,7 @@ fn router(own: u16, local: Local) -> Router {
     Router::new(settings, Arc::new(Mapping::default()))
 }
 
-/// A bridge of that space which knows the topic as a std_msgs/UInt32.
+/// Creates a bridge of the space that binds the topic to std_msgs/UInt32.
 fn bridge(own: u16, of: TopicId, now: Now) -> Router {
     let (local, dialect) = match own {
         1 => (Local::Ros1, Dialect::Ros1),
@@ -64,7 +65,7 @@ fn bridge(own: u16, of: TopicId, now: Now) -> Router {
     router
 }
 
-/// The field of an OPC UA write.
+/// Returns the field of an OPC UA write.
 fn field(value: u32) -> Vec<u8> {
     let mut block = 1_u16.to_le_bytes().to_vec();
     block.push(BuiltinType::UInt32.id());
@@ -82,7 +83,7 @@ fn say(router: &mut Router, of: TopicId, payload: &[u8], latched: bool, now: Now
     let _verdict = router.handle_local(heard, now);
 }
 
-/// What the producer sends by now.
+/// Returns the datagrams that the producer sends at this time.
 fn sent(router: &mut Router, now: Now) -> Vec<Vec<u8>> {
     router.handle_timeout(now);
     let outputs = std::iter::from_fn(|| router.poll_output(now));
@@ -94,7 +95,7 @@ fn sent(router: &mut Router, now: Now) -> Vec<Vec<u8>> {
         .collect()
 }
 
-/// What a consumer publishes of these datagrams.
+/// Returns the deliveries that a consumer publishes from the datagrams.
 fn taken(router: &mut Router, datagrams: &[Vec<u8>], from: u16, now: Now) -> Vec<Delivery> {
     for datagram in datagrams {
         router.handle_datagram(datagram, address(from), now);
@@ -112,7 +113,7 @@ fn taken(router: &mut Router, datagrams: &[Vec<u8>], from: u16, now: Now) -> Vec
     deliveries
 }
 
-/// The last four bytes, which are the number.
+/// Returns the number in the last four bytes.
 fn number(delivery: &Delivery) -> u32 {
     u32::from_le_bytes(*delivery.payload.last_chunk().unwrap())
 }
@@ -121,7 +122,7 @@ fn dropped(router: &Router, reason: Reason) -> u64 {
     router.topics().map(|(_, of)| of.dropped(reason)).sum()
 }
 
-/// Pseudo-random numbers, the same in each run.
+/// Pseudorandom numbers, the same in each run.
 struct Dice(u64);
 
 impl Dice {
@@ -138,7 +139,8 @@ impl Dice {
     }
 }
 
-/// A network that holds each datagram back for up to 150 ms, so that they overtake one another, and brings a fifth twice.
+/// A network that delays each datagram by up to 150 ms, so that datagrams overtake each other, and
+/// duplicates a fifth of them.
 struct Network {
     dice: Dice,
     under_way: Vec<(Instant, Vec<u8>)>,
@@ -152,7 +154,7 @@ impl Network {
         }
     }
 
-    /// Puts what was sent under way, with a delay for each datagram.
+    /// Starts the transmission of datagrams with a delay for each.
     fn send(&mut self, datagrams: Vec<Vec<u8>>, now: Now) {
         for datagram in datagrams {
             for _ in 0..1 + u64::from(self.dice.loses_a_fifth()) {
@@ -163,7 +165,7 @@ impl Network {
         }
     }
 
-    /// Returns the datagrams whose delay is over, in the order of their arrival.
+    /// Returns the datagrams with an elapsed delay in the order of their arrival.
     fn arrived(&mut self, now: Now) -> Vec<Vec<u8>> {
         let (mut arrived, rest): (Vec<_>, Vec<_>) = std::mem::take(&mut self.under_way)
             .into_iter()
@@ -216,7 +218,7 @@ fn on_a_network_that_delays_and_reorders_no_event_and_no_command_comes_twice_or_
         let mut came = Vec::new();
         let (bursts, each) = (100_u32, 20_u32);
         for burst in 0..bursts {
-            // From 1 kHz to the rate at which each is sent three times.
+            // From 1 kHz to the rate at which each event is sent three times.
             let gap = [1, 5, 20, 35, 60, 120][usize::try_from(burst).unwrap() % 6];
             for value in 0..each {
                 let value = burst * each + value;
@@ -231,7 +233,8 @@ fn on_a_network_that_delays_and_reorders_no_event_and_no_command_comes_twice_or_
                     now = later(now, Duration::from_millis(1));
                 }
             }
-            // At times the last one is repeated for readers that show it, too, and at times the producer ends.
+            // In some rounds the last event is also repeated for readers that show it, and in some
+            // rounds the producer ends.
             let ends = burst % 3 == 0;
             if ends {
                 sender.set_live(of, false, now);
@@ -272,7 +275,8 @@ fn a_newer_sample_ends_the_repetition_of_the_one_before() {
 fn the_first_event_of_a_producer_that_starts_over_is_never_taken_for_old() {
     let of = topic("ua_0_2_10");
     let begin = start();
-    // By its stamp, by its address, and with a clock that was set back after it had timed out.
+    // By its stamp, by its address, and with a clock that was set back after the producer had timed
+    // out.
     for (after, clock, port) in [(1, 0, 1), (1, -3600, 2), (10, -3600, 1)] {
         let mut now = begin;
         let mut robot = bridge(1, of, now);
@@ -303,7 +307,7 @@ fn an_event_of_ros_is_published_once_and_shown_to_readers_that_come_late() {
     let mut present = bridge(2, of, now);
     say(&mut robot, of, &5_u32.to_le_bytes(), false, now);
     let mut came = taken(&mut present, &sent(&mut robot, now), 1, now);
-    // Two readers that come late: a bridge, and a server that shows the value.
+    // Two late readers: a bridge, and a server that shows the value.
     let mut late = bridge(2, of, now);
     let mut server = router(0, Local::Fields);
     let mut published = Vec::new();
@@ -363,12 +367,12 @@ fn a_latched_value_reaches_a_bridge_that_starts_late_and_is_stored_there() {
         came.extend(taken(&mut present, &sent, 1, now));
         stored.extend(taken(&mut late, &sent, 1, now));
     }
-    // Once for the subscribers that are present, and once to be stored.
+    // Once for the present subscribers, and once to be stored.
     let kinds: Vec<_> = came.iter().map(|one| (one.kept, one.lasting)).collect();
     assert_eq!(kinds, [(Kept::Alone, false), (Kept::Again, true)]);
     let kinds: Vec<_> = stored.iter().map(|one| (one.kept, one.lasting)).collect();
     assert_eq!(kinds, [(Kept::Alone, true)]);
-    // The next one is known to be a state at once.
+    // The next value is known to be a state at once.
     say(&mut robot, of, &6_u32.to_le_bytes(), true, now);
     let next = taken(&mut present, &sent(&mut robot, now), 1, now);
     assert!(matches!(&next[..], [one] if one.lasting && number(one) == 6));
@@ -410,7 +414,7 @@ fn values_under_a_stamp_that_stands_still_are_all_taken_by_their_numbers() {
                     ..DataSetHeader::default()
                 };
                 let frame = frame(&header, u32::from(value));
-                // Each of them comes twice.
+                // Each datagram is received twice.
                 came.extend(taken(&mut reader, &[frame.clone(), frame], 1, now));
             }
             let came: Vec<_> = came.iter().map(number).collect();
@@ -436,7 +440,7 @@ fn an_older_number_after_a_newer_one_is_dropped_and_counted() {
     assert_eq!(dropped(&robot, Reason::Stale), 1);
 }
 
-/// A key frame of ua_2_9_11 by a foreign writer: one UInt32.
+/// Returns a key frame of ua_2_9_11 from a foreign writer with a single UInt32.
 fn frame(header: &DataSetHeader, value: u32) -> Vec<u8> {
     let network = NetworkHeader {
         publisher_id: Some(PublisherId::UInt16(2)),
@@ -485,7 +489,7 @@ variables:
   - {node: ns=2;i=14, name: Motor, origin: 0, type: Boolean, on_loss: false, ros: {space: 1, call: /motor, type: std_srvs/SetBool, field: data}}
 ";
 
-/// A bridge of space 1 with that mapping, the topic bound to this type.
+/// Creates a bridge of space 1 with the mapping, which binds the topic to the type.
 fn commanded(of: TopicId, type_name: &str, selection: &Selection, now: Now) -> Router {
     let checked = Mapping::from_yaml(COMMANDS, "cell.yaml");
     let settings = Settings {
@@ -506,7 +510,7 @@ fn commanded(of: TopicId, type_name: &str, selection: &Selection, now: Now) -> R
     router
 }
 
-/// The fields of numbers.
+/// Returns the fields of numbers.
 fn doubles(values: &[f64]) -> Vec<u8> {
     let mut block = u16::try_from(values.len()).unwrap().to_le_bytes().to_vec();
     for value in values {
@@ -571,7 +575,7 @@ fn a_value_that_is_not_renewed_is_held_no_longer_than_the_mapping_says() {
     let mut server = router(0, Local::Fields);
     let mut stops = Vec::new();
     for step in 0..200_u32 {
-        // Renewed each 100 ms for a second; the program itself stays.
+        // Renewed every 100 ms for a second; the program itself continues.
         if step % 10 == 0 && step < 100 {
             say(
                 &mut server,
@@ -594,7 +598,7 @@ fn a_value_that_is_not_renewed_is_held_no_longer_than_the_mapping_says() {
         panic!("{} stops", stops.len())
     };
     assert!((140..=142).contains(step), "{step}");
-    // Behind `seq` the stamp of the header is the time of the loss.
+    // After `seq`, the stamp of the header is the time of the loss.
     let seconds = u32::from_le_bytes(stop.payload[4..8].try_into().unwrap());
     assert_eq!(seconds, 1_700_000_001);
 }
@@ -650,7 +654,8 @@ fn a_service_is_called_once_more_when_the_commander_of_a_value_that_calls_it_is_
     assert_eq!(came, [(of, &[1][..]), (of, &[0][..])]);
 }
 
-/// A bridge of ROS 2 that knows no type, which has heard an event of `size` characters of ROS 1, and that event.
+/// Returns a ROS 2 bridge without known types that has received an event of `size` characters from
+/// ROS 1, and the characters.
 fn heard_before_its_type(of: TopicId, size: usize, now: Now) -> (Router, Vec<u8>) {
     let mut producer = router(1, Local::Ros1);
     let text = Registry::bundle(Dialect::Ros1).get(&"std_msgs/String".parse().unwrap());
@@ -671,7 +676,7 @@ fn heard_before_its_type(of: TopicId, size: usize, now: Now) -> (Router, Vec<u8>
     (consumer, characters)
 }
 
-/// What the bridge publishes once it knows that the topic is a std_msgs/String.
+/// Returns the deliveries that the bridge publishes after the topic was bound to std_msgs/String.
 fn typed(router: &mut Router, of: TopicId, now: Now) -> Vec<Delivery> {
     let text = Registry::bundle(Dialect::Ros2).get(&"std_msgs/String".parse().unwrap());
     router

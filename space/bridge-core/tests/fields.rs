@@ -1,4 +1,4 @@
-//! Every type of the bundle crosses UADP as the fields its leaves say, and returns.
+//! Every type of the bundle is converted to UADP fields according to its leaves, and back.
 use crate::inventor;
 
 use bridge_core::{decode_fields, encode_fields};
@@ -61,7 +61,8 @@ fn random_messages_of_every_type_cross_and_return() {
     assert!(types > 250, "{types}");
 }
 
-/// The message types of `test_msgs` with arrays of messages without fields, and one that ends in such arrays.
+/// The message types of `test_msgs` with arrays of messages without fields, and a type that ends in
+/// such arrays.
 const WITH_EMPTY_ELEMENTS: [(&str, &str); 4] = [
     ("nothing_msgs/Constants", "int32 ONE=1\n"),
     (
@@ -130,7 +131,8 @@ fn what_one_datagram_claims_of_messages_without_fields_is_bounded() {
         let mut out = Vec::new();
         decode_fields(&plan, fields(&datagram), &mut out).map(|()| out.len())
     };
-    // The fixed three, the count and the elements of a byte each, and the encapsulation, to a multiple of four.
+    // The fixed three, the count and the elements of a byte each, and the encapsulation, padded to
+    // a multiple of four.
     assert_eq!(claim(5).unwrap(), 4 + 16);
     assert_eq!(claim(65_533).unwrap(), 4 + 65_544);
     claim(65_534).unwrap_err();

@@ -1,4 +1,5 @@
-//! What writers of other makers send, as the local side gets it: datagrams of open62541 and asyncua, and what they may do next.
+//! Delivery of messages from writers of other vendors: captured datagrams of open62541 and asyncua,
+//! and generated datagrams of other valid forms.
 
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
@@ -15,14 +16,15 @@ use uadp::{
     SecurityHeader, StatusCode, Timestamp, Variant,
 };
 
-/// A Router that hears foreign writers, and a clock.
+/// A Router that receives messages of foreign writers, and a clock.
 struct Bench {
     router: Router,
     now: Now,
 }
 
 impl Bench {
-    /// The OPC UA side. `variable` is the rest of the one that is mapped, under `topic`.
+    /// Creates the OPC UA side. `variable` is the rest of the definition of the mapped variable
+    /// under `topic`.
     fn mapped(topic: &str, variable: &str) -> Self {
         let topic: TopicId = topic.parse().unwrap();
         let (space, namespace, id) = topic.triple();
@@ -60,7 +62,7 @@ impl Bench {
         self.router.handle_timeout(self.now);
     }
 
-    /// What comes of a datagram.
+    /// Returns the deliveries of a datagram.
     fn hear(&mut self, datagram: &[u8]) -> Vec<Delivery> {
         self.router.handle_datagram(datagram, PEER, self.now);
         self.deliveries()
@@ -90,7 +92,7 @@ impl Bench {
         topics.map(|(_, counters)| counters.dropped(reason)).sum()
     }
 
-    /// A writer at that address says what its fields are.
+    /// Announces the fields of a writer at the address.
     fn announce(&mut self, topic: &str, (major, from): (u32, SocketAddr), fields: &[(&str, u8)]) {
         let id: TopicId = topic.parse().unwrap();
         let (space, _, writer_id) = id.triple();
@@ -126,12 +128,12 @@ impl Bench {
     }
 }
 
-/// Where the datagrams of other makers are.
+/// Returns the directory of the datagrams of other vendors.
 fn vectors() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../../uadp/tests/vectors")
 }
 
-/// A captured datagram, with PublisherId 2 in place of the 2234 that is none of the space.
+/// Returns a captured datagram. PublisherId 2234, which is not a space, is replaced by 2.
 fn vector(name: &str) -> Vec<u8> {
     let text = std::fs::read_to_string(vectors().join(format!("{name}.hex"))).unwrap();
     let digits = text.trim().as_bytes().chunks(2);
@@ -150,7 +152,7 @@ fn messages_of(datagram: &[u8]) -> Vec<DataSetMessage<'_>> {
     network.messages().map(Result::unwrap).collect()
 }
 
-/// A DataSetMessage of the writer 2/5/10.
+/// Returns a DataSetMessage of the writer 2/5/10.
 fn message(
     header: &DataSetHeader,
     write: impl FnOnce(&mut NetworkMessageEncoder<'_>, &DataSetHeader),
@@ -208,7 +210,7 @@ fn numbered(sequence: u16) -> DataSetHeader {
     }
 }
 
-/// The fields of a delivery, in words.
+/// Returns the fields of a delivery as text.
 fn told(delivery: &Delivery) -> String {
     let fields = Fields::parse(&delivery.payload).unwrap();
     let fields = fields.map(|field| match field.unwrap() {
@@ -247,7 +249,7 @@ fn the_delta_frames_of_open62541_are_put_over_its_key_frames() {
         (5.0, 22),
     ];
     let expected = expected.map(|(double, number)| {
-        // Its delta frames end with nulls for field 0, which are no values.
+        // The delta frames end with nulls for field 0, which are not values.
         format!("Boolean(true), String(Some(\"cell\")), Double({double:?}), Int32(202605{number})")
     });
     assert_eq!(heard, expected);
@@ -413,7 +415,8 @@ fn raw_data_is_read_with_the_metadata_of_its_writer_and_no_other() {
     let heard = bench.hear(&datagram(3));
     assert_eq!(all_told(&heard), ["Double(2.5), Int32(20260517)"]);
 
-    // What a stranger said before the writer was heard is not the writer's either.
+    // An announcement of a stranger before the first message of the writer does not count for the
+    // writer either.
     let mut bench = Bench::zero_configuration();
     bench.announce(topic, (1, STRANGER), &fields);
     assert_eq!(bench.hear(&datagram(4)).len(), 0);
@@ -589,7 +592,7 @@ fn a_key_frame_is_kept_for_delta_frames_up_to_its_size_and_that_of_all() {
         "there is no room for all"
     );
     assert_eq!(bench.hear(&changes[0]).len(), 1);
-    // Those that have never sent one make room when they fall silent.
+    // Writers that have never sent a delta frame make room when they become silent.
     bench.wait(Duration::from_secs(3));
     let (whole, change) = frame(301, 1);
     bench.hear(&whole);
@@ -659,7 +662,7 @@ fn another_field_may_be_taken_while_the_program_runs() {
     assert_eq!(all_told(&heard), ["UInt32(4)"]);
 }
 
-/// Vectors that are counted as unsupported: the secured ones.
+/// The vectors that are counted as unsupported: the secured messages.
 const NOT_READ: [&str; 6] = [
     "wire_encrypt_aes128_r0",
     "wire_encrypt_aes128_r1",

@@ -1,4 +1,5 @@
-//! Messages too big for a datagram: cut, paced, put together, and what a bad network may do to them.
+//! Messages larger than a datagram: split, paced, reassembled, and sent through an unreliable
+//! network.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -18,7 +19,7 @@ const BUTTON: &str = "ua_1_5_12";
 /// Small, so that a message of some kilobytes has several chunks.
 const SMALL_DATAGRAMS: &str = "pubsub: {max_datagram: 512, max_message: 1}\n";
 
-/// A bridge of ROS 1 and one of another space, and a clock that moves only when told.
+/// A ROS 1 bridge and a bridge of another space with a manual clock.
 struct Pair {
     sender: Router,
     reader: Router,
@@ -69,7 +70,7 @@ impl Pair {
         self.sender.handle_local(heard, self.now)
     }
 
-    /// What the sender has to send at this moment.
+    /// Returns the datagrams that the sender may send at this moment.
     fn burst(&mut self) -> Vec<(TopicId, Vec<u8>)> {
         std::iter::from_fn(|| self.sender.poll_output(self.now))
             .filter_map(|output| match output {
@@ -79,7 +80,7 @@ impl Pair {
             .collect()
     }
 
-    /// What it sends until no chunk waits any more, and how long that took.
+    /// Returns all datagrams until no chunk waits any more, and the time that this took.
     fn all(&mut self) -> (Vec<(TopicId, Vec<u8>)>, Duration) {
         let start = self.now.monotonic;
         let mut all = self.burst();
@@ -134,7 +135,7 @@ fn bind(router: &mut Router, name: &str, now: Now) {
         .unwrap();
 }
 
-/// A ROS 1 std_msgs/String of `size` characters that differ with `seed` and place.
+/// Returns a ROS 1 std_msgs/String of `size` characters that differ with `seed` and position.
 fn text(size: usize, seed: u8) -> Vec<u8> {
     let mut message = (size as u32).to_le_bytes().to_vec();
     message.extend((0..size).map(|at| b'a' + ((at + usize::from(seed)) % 23) as u8));
@@ -271,7 +272,7 @@ fn a_value_whose_chunk_was_lost_comes_with_its_repetition() {
     for (_, bytes) in &datagrams {
         assert_eq!(pair.hear(bytes), []);
     }
-    // The first repetition may be of an event, the second shows that it is a state.
+    // The first repetition may belong to an event, the second shows that it is a state.
     pair.wait(Duration::from_secs(1));
     pair.sender.handle_timeout(pair.now);
     for (_, bytes) in pair.all().0 {
@@ -354,7 +355,8 @@ fn a_message_that_would_be_too_big_is_refused_at_its_first_chunk() {
 }
 
 proptest! {
-    /// Two cameras and a button, their datagrams in any order and some twice: each message comes once and as it was.
+    /// Two cameras and a button, with reordered and duplicated datagrams: each message is delivered
+    /// once and unchanged.
     #[test]
     fn chunks_in_any_order_and_doubled_make_each_message_once(
         sizes in (600..6_000_usize, 600..6_000_usize),

@@ -1,5 +1,5 @@
-//! Any set of bridges around one group: a value enters every other space once, never comes home, and then there is
-//! silence.
+//! Property tests with any set of bridges in a group: a value enters every other space once and
+//! never returns to its own space, and no messages are sent afterwards.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::net::SocketAddr;
@@ -12,13 +12,13 @@ use messages::{Dialect, Registry, Selection};
 use proptest::prelude::*;
 use uadp::{Keys, SecurityPolicy, Timestamp};
 
-/// A cell: one bridge per space, a group that every datagram returns from to everybody, and local graphs that echo
-/// every publication to the bridge itself.
+/// A simulated cell: a bridge per space, a group that delivers every datagram to all bridges
+/// including its sender, and local graphs that echo every publication to the bridge itself.
 struct Cell {
     bridges: BTreeMap<SpaceId, Router>,
-    /// What is under way: a datagram on the group, or a message in a local graph.
+    /// The pending events: datagrams in the group, and messages in local graphs.
     under_way: VecDeque<Event>,
-    /// Which values a space's graph was given by its bridge.
+    /// The values that each bridge published in the graph of its space.
     delivered: BTreeMap<(SpaceId, TopicId), Vec<Vec<u8>>>,
     datagrams: usize,
     clock: i128,
@@ -103,7 +103,7 @@ impl Cell {
         });
     }
 
-    /// Lets everything under way happen. Panics when it does not end.
+    /// Handles all pending events. Panics if they do not end.
     fn run(&mut self) {
         for _ in 0..10_000 {
             let Some(event) = self.under_way.pop_front() else {
@@ -157,7 +157,7 @@ impl Cell {
                     let topic = delivery.topic;
                     let payloads = self.delivered.entry((space, topic)).or_default();
                     payloads.push(delivery.payload.clone());
-                    // The graph echoes what the bridge published to the bridge itself.
+                    // The graph echoes the publication of the bridge to the bridge itself.
                     let payload = delivery.payload;
                     self.under_way.push_back(Event::Message {
                         space,

@@ -1,4 +1,4 @@
-//! The tests of the router, one program so that they are linked once.
+//! The tests of the router, in a single program to save link time.
 #![expect(
     clippy::cast_possible_truncation,
     clippy::indexing_slicing,

@@ -1,4 +1,4 @@
-//! What bridges tell each other their topics consist of.
+//! Exchange of topic metadata between bridges.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -10,7 +10,7 @@ use messages::{Dialect, Registry, Selection, TypeName};
 use uadp::discovery::{Announced, Announcement, DataSetMetaDataType, List, Probe};
 use uadp::{BuiltinType, NetworkMessage, PublisherId, SecurityHeader, StatusCode, Timestamp};
 
-/// A bridge without a ROS graph: the Router of one space.
+/// A bridge without a ROS graph: the Router of a space.
 struct Bridge {
     router: Router,
     address: SocketAddr,
@@ -68,7 +68,7 @@ impl Bridge {
         std::iter::from_fn(|| self.router.poll_output(now)).collect()
     }
 
-    /// Everything that is sent in so much time, in order.
+    /// Returns all datagrams that are sent within the time, in their order.
     fn sent_within(&mut self, time: Duration, clock: &mut Now) -> Vec<Vec<u8>> {
         let end = clock.monotonic + time;
         let mut sent = Vec::new();
@@ -96,7 +96,7 @@ impl Bridge {
         }
     }
 
-    /// What the port was told of types it is to find.
+    /// Returns the requests to the port for local types.
     fn told(&mut self, now: Now) -> Vec<(TopicId, Option<Described>)> {
         let told = self.outputs(now).into_iter();
         told.filter_map(|output| match output {
@@ -132,7 +132,7 @@ fn clock() -> Now {
     }
 }
 
-/// Does something with every DataSetMetaData among datagrams.
+/// Calls `with` for each DataSetMetaData in the datagrams.
 fn each_meta_data(datagrams: &[Vec<u8>], mut with: impl FnMut(u16, &DataSetMetaDataType<'_>)) {
     for datagram in datagrams {
         let message = NetworkMessage::decode(datagram).unwrap();
@@ -322,7 +322,8 @@ fn an_unanswered_reader_gives_up() {
     assert_eq!(probes.len(), 8);
 }
 
-/// What one probe costs that names as many DataSetWriters as a datagram has room for, while that many topics are missing.
+/// Measures the processing time of a probe with as many DataSetWriterIds as fit into a datagram,
+/// for `missing` missing topics.
 #[expect(clippy::disallowed_methods, reason = "what is tested is a cost")]
 fn cost_of_a_long_probe(missing: u16) -> Duration {
     let (mut writer, mut reader, mut now) = (Bridge::new(1, ""), Bridge::new(2, ""), clock());
@@ -338,7 +339,7 @@ fn cost_of_a_long_probe(missing: u16) -> Duration {
     let values: Vec<Vec<u8>> = values.cloned().collect();
     reader.hear(&writer, &values, now);
     assert_eq!(reader.told(now).len(), usize::from(missing));
-    // Those that are missing come last.
+    // The missing topics come last.
     let ids: Vec<u16> = (1..=32_000).rev().collect();
     let mut probe = Vec::new();
     let publisher = Some(PublisherId::UInt16(1));
@@ -410,7 +411,7 @@ fn a_topic_that_is_said_to_be_now_this_and_now_that_is_told_of_ever_more_rarely(
     let sent = writer.sent_within(SECOND / 2, &mut now);
     reader.hear(&writer, &sent, now);
     let mut is_told = |kind: &str, now: &mut Now| {
-        // Anybody who sends under the writer's address.
+        // Any sender with the address of the writer.
         let mut spoofed = Bridge::new(1, "");
         spoofed.bind("ua_1_5_10", kind, &Selection::Whole, *now);
         let said = spoofed.sent_within(SECOND / 2, now);
@@ -424,7 +425,7 @@ fn a_topic_that_is_said_to_be_now_this_and_now_that_is_told_of_ever_more_rarely(
     };
     let taken = |kind: &str| (vec![kind.to_owned()], 0);
     let nothing = Vec::<String>::new();
-    // The first word came with the value, and the next is taken at once.
+    // The first description came with the value, and the next description is accepted at once.
     let first = is_told(vector, &mut now);
     assert_eq!(first, taken(vector));
     assert_eq!(is_told(point, &mut now), taken(point));
@@ -525,12 +526,12 @@ fn what_is_written_in_opc_ua_is_announced_as_the_mapping_says_it() {
     assert_eq!(said[1], (2, None, vec![("Level".to_owned(), 11, -1, 1)]));
     assert_eq!(said[2], (3, None, vec![("Names".to_owned(), 12, 1, 0)]));
 
-    // A bridge without a mapping knows what it is before the first value came.
+    // A bridge without a mapping knows the type before the first value.
     let mut bridge = Bridge::new(2, "");
     bridge.hear(&server, &sent, now);
     assert_eq!(bridge.refused(), 0);
 
-    // Again each period, and at once where the mapping says something else of it.
+    // Announced again in each period, and at once after a change in the mapping.
     let period = Mapping::default().pubsub().metadata_period;
     let again = server.sent_within(period + Duration::from_secs(1), &mut now);
     assert_eq!(announced(&again), 3);
@@ -658,7 +659,7 @@ fn several_fields_make_their_message_again_on_the_other_side() {
             Output::Delivery(delivery) => Some(delivery.payload),
             _ => None,
         });
-    // What was not selected is zero.
+    // Fields that were not selected are zero.
     speed[8..16].fill(0);
     let cdr = [&[0, 1, 0, 0][..], &speed].concat();
     assert_eq!(delivered, Some(cdr));

@@ -1,4 +1,4 @@
-//! Values that are held back: on change, within a deadband, faster than a rate.
+//! Values that are held back: publish on change, deadband, and maximum rate.
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -7,7 +7,7 @@ use mappings::{Mapping, SpaceId, TopicId};
 use messages::{Dialect, Registry, Selection};
 use uadp::{NetworkMessage, Scalar, Timestamp, Variant};
 
-/// A bridge of one variable of Doubles with those rules.
+/// A bridge with a single variable of type Double and the given publishing rules.
 struct Bench {
     router: Router,
     now: Now,
@@ -40,7 +40,7 @@ impl Bench {
             .unwrap();
         router.bind(topic, &double, &Selection::Whole, now).unwrap();
         let mut bench = Self { router, now, topic };
-        // What it consists of is announced before.
+        // The metadata is announced before.
         bench.wait(Duration::from_secs(1));
         assert_eq!(bench.sent(), []);
         bench
@@ -60,7 +60,7 @@ impl Bench {
         self.router.handle_local(heard, self.now)
     }
 
-    /// Lets time pass that nobody has looked at yet.
+    /// Advances the clock without handling timeouts.
     fn pass(&mut self, time: Duration) {
         self.now.monotonic += time;
         let nanos = self.now.utc.unix_nanos() + i128::try_from(time.as_nanos()).unwrap();
@@ -72,7 +72,7 @@ impl Bench {
         self.router.handle_timeout(self.now);
     }
 
-    /// Sequence number and value of each datagram.
+    /// Returns the sequence number and value of each datagram.
     fn sent(&mut self) -> Vec<(u16, f64)> {
         std::iter::from_fn(|| self.router.poll_output(self.now))
             .filter_map(|output| match output {
@@ -189,7 +189,7 @@ fn a_value_that_waits_gives_way_to_one_that_comes_when_its_time_is_over() {
         assert_eq!(bench.say(value), Verdict::Forward);
     }
     assert_eq!(bench.sent(), [(0, 1.0)]);
-    // The timer has not rung yet.
+    // The timeout has not been handled yet.
     bench.pass(100 * MS);
     assert_eq!(bench.say(3.0), Verdict::Forward);
     bench.wait(500 * MS);
@@ -215,7 +215,8 @@ fn late_joiners_get_the_last_value_of_each_latched_publisher_but_of_none_that_le
     let key = PublisherKey;
     for rules in ["publish: on_change", "at_most: 2 Hz"] {
         let mut bench = Bench::new(rules);
-        // The same value from two publishers, and another one, at once.
+        // The same value from two publishers and another value from a third publisher at the same
+        // time.
         for (publisher, value) in [(1, 5.0), (2, 5.0), (3, 6.0)] {
             let verdict = bench.say_by(Some(key(publisher)), value);
             assert_eq!(verdict, Verdict::Forward, "{rules}");
@@ -229,7 +230,7 @@ fn late_joiners_get_the_last_value_of_each_latched_publisher_but_of_none_that_le
         repeated.sort_by(f64::total_cmp);
         repeated.dedup();
         assert_eq!(repeated, [5.0, 6.0], "{rules}");
-        // It starts anew under another key and latches what it had.
+        // The publisher restarts under another key and latches the same value.
         assert_eq!(bench.say_by(Some(key(9)), 7.0), Verdict::Forward, "{rules}");
         let sent: Vec<f64> = bench.sent().into_iter().map(|(_, value)| value).collect();
         assert!(sent.contains(&7.0), "{rules}: {sent:?}");

@@ -1,4 +1,4 @@
-//! Another mapping for a Router that runs.
+//! Replacement of the mapping of a running Router.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -74,7 +74,7 @@ impl Bench {
         let _verdict = self.router.handle_local(heard, self.now);
     }
 
-    /// Writers whose DataSetMetaData goes out within two seconds.
+    /// Returns the writers with DataSetMetaData announced within two seconds.
     fn announced(&mut self) -> Vec<u16> {
         let mut announced = Vec::new();
         for _ in 0..20 {
@@ -94,7 +94,8 @@ impl Bench {
         announced
     }
 
-    /// Writer, sequence number and value of what goes out; a keep-alive has none.
+    /// Returns the writer, sequence number and value of each sent message; a keep-alive has no
+    /// value.
     fn sent(&mut self) -> Vec<(u16, u16, Option<u32>)> {
         let outputs = std::iter::from_fn(|| self.router.poll_output(self.now));
         let datagrams = outputs.filter_map(|output| match output {
@@ -166,7 +167,8 @@ fn a_queue_a_rule_and_a_period_change_without_a_new_binding() {
     for value in [2, 2, 3, 3] {
         bench.say(1, value);
     }
-    // Of a state the last one waits; both of another value took a number.
+    // Only the last sample of a state waits. The two samples with changed values each used a
+    // sequence number.
     assert_eq!(bench.sent(), [(1, 4, Some(3))]);
     let quick = "key_frame_period: 100ms, keep_alive_period: 100ms";
     bench

@@ -1,4 +1,4 @@
-//! What a bridge does with samples, datagrams and time, seen from outside.
+//! The handling of samples, datagrams and time by a bridge, tested through its public API.
 
 use std::net::SocketAddr;
 use std::num::NonZeroU16;
@@ -17,7 +17,7 @@ use uadp::{
     NetworkMessage, NetworkMessageEncoder, PublisherId, Scalar, SecurityHeader, Timestamp, Variant,
 };
 
-/// One bridge under test and a clock that moves only when told.
+/// A bridge under test with a manual clock.
 struct Bench {
     router: Router,
     now: Now,
@@ -66,7 +66,7 @@ impl Bench {
             .collect()
     }
 
-    /// The local side takes what was handed to it.
+    /// Accepts the deliveries on the local side.
     fn take(&mut self, outputs: &[Output]) {
         for output in outputs {
             if let Output::Delivery(delivery) = output {
@@ -123,7 +123,7 @@ impl Bench {
     }
 }
 
-/// What a foreign writer sends: one UInt32 in a key frame.
+/// A key frame of a foreign writer with a single UInt32.
 struct Frame {
     publisher: PublisherId<'static>,
     group: u16,
@@ -420,7 +420,7 @@ fn every_message_of_a_datagram_is_handled_and_a_bad_one_hides_none() {
     message.finish().unwrap();
     bench.hear(&bytes);
     assert_eq!(bench.deliveries().len(), 3);
-    // The type byte of the second message's field: no such builtin type.
+    // The type byte of the second message's field: not a builtin type.
     let second = bytes.len() - 8 - 5;
     assert_eq!(bytes[second], BuiltinType::UInt32.id());
     bytes[second] = 0x3f;
@@ -441,7 +441,7 @@ fn what_the_codec_reads_and_the_space_does_not_carry_is_counted_as_unsupported()
         message.finish().unwrap();
         bytes
     };
-    // A key frame whose SecurityHeader calls it signed.
+    // A key frame with a SecurityHeader that marks it as signed.
     let unsecured = Extras {
         security: Some(SecurityHeader::NONE),
         ..Extras::default()
@@ -449,7 +449,7 @@ fn what_the_codec_reads_and_the_space_does_not_carry_is_counted_as_unsupported()
     let mut signed = written(&unsecured, &|message| {
         message.key_frame(&frame.header).unwrap().finish().unwrap();
     });
-    // Flags, token and an empty nonce stand in front of the payload.
+    // Flags, token and an empty nonce precede the payload.
     let security_flags = NetworkMessage::decode(&signed).unwrap().payload_offset() - 6;
     signed[security_flags] |= 1;
     let probes = [
@@ -523,7 +523,7 @@ fn a_state_is_repeated_with_its_time_and_its_readers_deliver_it_once() {
     let mut sender = Bench::new(1, Local::Ros1);
     let mut reader = Bench::new(2, Local::Fields);
     sender.bind(topic("ua_1_5_10"), "std_msgs/UInt32");
-    // What it consists of is announced meanwhile.
+    // The metadata is announced in the meantime.
     sender.wait(SECOND);
     sender.router.handle_timeout(sender.now);
     let state = Heard {

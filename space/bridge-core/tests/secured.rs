@@ -1,4 +1,4 @@
-//! Secured groups between Routers: who has the keys is heard, and nobody else.
+//! Secured groups between Routers: only programs with the keys are accepted.
 use crate::cell;
 
 use std::sync::Arc;
@@ -15,12 +15,12 @@ use uadp::{BuiltinType, Keys, NetworkMessage, Scalar, SecurityPolicy, Variant};
 
 const WRITER: usize = 0;
 const READER: usize = 1;
-/// One that has no key, or another.
+/// A program without a key, or with another key.
 const THIRD: usize = 2;
 
 const ENCRYPTED: &str = "security: [{group: cell, keys: {file: k}}]";
 const SIGNED: &str = "security: [{group: cell, mode: sign, keys: {file: k}}]";
-/// Namespace 9 is for everybody.
+/// Namespace 9 is not secured.
 const MIXED: &str =
     "security: [{group: cell, keys: {file: k}}, {group: all, mode: none, namespaces: [9]}]";
 
@@ -37,7 +37,7 @@ fn delivery(first_token_id: u32, keys: &[u8]) -> KeyDelivery {
     }
 }
 
-/// A program of that mapping.
+/// Applies the mapping to a program.
 fn follows(cell: &mut Cell, at: usize, yaml: &str) {
     let mapping = Mapping::from_yaml(yaml, "cell.yaml").mapping.unwrap();
     let now = cell.now();
@@ -54,7 +54,8 @@ fn give(cell: &mut Cell, at: usize, delivery: &KeyDelivery) {
         .unwrap();
 }
 
-/// Components of the namespaces 7, 8 and 9 that speak in fields; the first two have the key.
+/// Creates components of the namespaces 7, 8 and 9 with fields as payload. The first two have the
+/// key.
 fn secured(yaml: &str) -> Cell {
     let mut cell = Cell::new(vec![component(7), component(8), component(9)]);
     for at in [WRITER, READER] {
@@ -68,7 +69,7 @@ fn said() -> TopicId {
     topic(0, 7, 10)
 }
 
-/// The newest value a program got.
+/// Returns the newest value that a program received.
 fn last(cell: &mut Cell, at: usize, topic: TopicId) -> Option<String> {
     cell.texts(at, topic).pop()
 }
@@ -137,7 +138,7 @@ fn what_was_recorded_is_refused_also_after_its_sender_restarted() {
     assert_eq!(last(&mut cell, READER, said()).as_deref(), Some("old"));
     let recorded = cell.datagrams_of(WRITER);
     let from = cell.programs[WRITER].address;
-    // Another run has other random bytes, and counts from 1.
+    // Another instance has other random bytes, and counts from 1.
     let mut instance = [9; 16];
     instance[0] = 77;
     cell.start(WRITER, component(7));
@@ -193,7 +194,7 @@ fn keys_change_while_values_run_and_none_is_lost() {
     }
     tokens.dedup();
     assert_eq!(tokens, [1, 2, 3, 4]);
-    // Nobody hands out more: the last one goes on, and that is told.
+    // Without new keys the last key stays in use, and this is reported.
     cell.run(ms(1_000));
     cell.say(WRITER, said(), "late");
     cell.run(ms(10));
@@ -232,7 +233,7 @@ fn programs_whose_times_differ_a_little_use_each_key_for_its_lifetime_and_no_sho
     says(&mut cell, 350);
     assert_eq!(token(&cell, WRITER), (4, false));
     assert_eq!(token(&cell, READER), (4, false));
-    // A service that is behind is waited for.
+    // The program waits for a key service that is behind.
     give(&mut cell, WRITER, &timed(3, &[3, 4, 5, 6, 7], ms(50)));
     give(&mut cell, READER, &timed(3, &[3, 4, 5, 6, 7], ms(50)));
     says(&mut cell, 140);
@@ -274,7 +275,7 @@ fn a_namespace_for_everybody_stays_so_beside_a_secured_one() {
     cell.run(ms(100));
     assert_eq!(last(&mut cell, READER, open).as_deref(), Some("hello"));
     assert_eq!(last(&mut cell, READER, said()).as_deref(), Some("secret"));
-    // What it says of another namespace is not believed.
+    // Its messages in another namespace are rejected.
     let forged = topic(0, 4, 10);
     cell.programs[THIRD] = component(4);
     cell.say(THIRD, forged, "forged");
@@ -303,7 +304,7 @@ fn offer(cell: &mut Cell) {
     cell.run(ms(300));
 }
 
-/// Has a program ask; what it is answered, where it is.
+/// Sends a request of a program and returns the response, if it is received.
 fn ask(cell: &mut Cell, at: usize, text: &str) -> Option<Vec<u8>> {
     let request = cell::block(&[Variant::Scalar(Scalar::String(Some(text)))]);
     cell.ask(at, AskId(1), (start(), &request), ms(2_000));
@@ -353,7 +354,7 @@ fn a_group_that_is_no_longer_secured_speaks_in_clear_after_a_reload() {
     cell.say(WRITER, said(), "plain");
     cell.run(ms(100));
     assert_eq!(last(&mut cell, THIRD, said()).as_deref(), Some("plain"));
-    // And a group that is as it was keeps its keys.
+    // An unchanged group keeps its keys.
     let mut cell = secured(ENCRYPTED);
     let other = "security: [{group: cell, namespaces: [7, 8], keys: {file: other}}]";
     follows(&mut cell, WRITER, other);
@@ -365,7 +366,7 @@ fn a_group_that_is_no_longer_secured_speaks_in_clear_after_a_reload() {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(200))]
 
-    /// Whoever has no key changes, cuts or repeats what it heard, and nothing comes of it.
+    /// A sender without a key changes, truncates or repeats received messages without any effect.
     #[test]
     fn nothing_that_was_changed_is_believed(
         text in "[a-z]{1,40}",

@@ -60,7 +60,7 @@ fn registry(space: u16) -> Registry {
     })
 }
 
-/// The bridge of a space, its topics bound as the cell says.
+/// Creates the bridge of a space, which binds its topics according to the mapping.
 fn bridge(space: u16, now: Now) -> Router {
     let mapping = mapping(CELL);
     let mut router = router(space, &mapping);
@@ -74,7 +74,7 @@ fn bridge(space: u16, now: Now) -> Router {
     router
 }
 
-/// What is published in space 2 when space 1 hears `payload`.
+/// Returns the message that is published in space 2 when space 1 receives `payload`.
 fn cross(topic: &str, payload: &[u8]) -> Result<Vec<u8>, String> {
     let now = now();
     carried(
@@ -86,7 +86,8 @@ fn cross(topic: &str, payload: &[u8]) -> Result<Vec<u8>, String> {
     )
 }
 
-/// What `reader` publishes when `sender` hears `payload`, or why the sender drops it.
+/// Returns the message that `reader` publishes when `sender` receives `payload`, or the reason why
+/// the sender drops it.
 fn carried(
     sender: &mut Router,
     reader: &mut Router,
@@ -160,8 +161,8 @@ fn an_inverted_boolean_crosses_as_the_other() {
     assert_eq!(cross("ua_1_2_11", &[0]).unwrap(), [0, 1, 0, 0, 1, 0, 0, 0]);
 }
 
-/// What space 2 makes of the Twist of a topic that a pattern makes a value of, with `chosen` of it, when it reads the
-/// values as `taken`.
+/// Returns the Twist that space 2 publishes for a topic with a value from a pattern. The pattern
+/// selects `chosen`, and space 2 reads the values as `taken`.
 fn by_pattern(chosen: &str, taken: &Selection) -> Vec<u8> {
     let mapping = mapping(&format!(
         "spaces: [{{id: 1}}, {{id: 2}}]\nnamespaces: {{2: urn:my-plant:line}}\npatterns:\n  \

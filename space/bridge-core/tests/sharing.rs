@@ -1,4 +1,4 @@
-//! Samples that share a datagram, where the mapping lets them.
+//! Samples that share a datagram if the mapping allows it.
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -10,13 +10,13 @@ use messages::{Dialect, Registry, Selection};
 use proptest::prelude::*;
 use uadp::{NetworkMessage, Scalar, Timestamp, Variant};
 
-/// A bridge of texts in the namespaces 2 and 3, and a clock that moves when told.
+/// A bridge of texts in the namespaces 2 and 3 with a manual clock.
 struct Bench {
     router: Router,
     now: Now,
 }
 
-/// A datagram: its topics as the Router gives them, and what it holds.
+/// A datagram with its topics as returned by the Router, and its content.
 #[derive(Debug, PartialEq)]
 struct Sent {
     topics: Vec<TopicId>,
@@ -29,7 +29,7 @@ struct Message {
     topic: TopicId,
     sequence: u16,
     taken: Timestamp,
-    /// `None` of a keep-alive.
+    /// `None` for a keep-alive.
     text: Option<String>,
 }
 
@@ -45,7 +45,7 @@ impl Bench {
         );
         for namespace in [2, 3] {
             for id in FIRST..FIRST + topics {
-                // Odd ones are events.
+                // Topics with odd ids are events.
                 let queue = match id % 2 {
                     0 => "keep_latest",
                     _ => "{drop_oldest: 20}",
@@ -74,7 +74,7 @@ impl Bench {
         bench
     }
 
-    /// As many as 32 messages share a datagram.
+    /// Creates a bridge with up to 32 messages per datagram.
     fn sharing() -> Self {
         Self::of(1, "messages_per_datagram: 32")
     }
@@ -95,7 +95,7 @@ impl Bench {
         self.router.handle_timeout(self.now);
     }
 
-    /// Says what takes no other's place.
+    /// Publishes a text that does not replace a waiting text.
     fn say(&mut self, topic: TopicId, text: &str) {
         assert_eq!(self.say_by(None, topic, text), Verdict::Forward);
     }
@@ -118,7 +118,7 @@ impl Bench {
                 Output::Datagram { topic, with, bytes } => {
                     Some((std::iter::once(topic).chain(with).collect(), bytes))
                 }
-                // What they consist of is announced, and what gave way is told.
+                // Announcements of metadata, and notices of dropped samples.
                 _ => None,
             })
             .collect()
@@ -197,7 +197,7 @@ fn messages(message: &NetworkMessage<'_>) -> Vec<Message> {
         .collect()
 }
 
-/// The texts of each datagram.
+/// Returns the texts of each datagram.
 fn texts(sent: &[Sent]) -> Vec<Vec<&str>> {
     sent.iter()
         .map(|sent| {
@@ -232,7 +232,7 @@ fn what_waits_of_a_namespace_shares_a_datagram_and_keeps_its_numbers_and_times()
     ] {
         bench.wait(Duration::from_millis(1));
         if text == "c" {
-            // What is queued is polled before its place is taken.
+            // Queued samples are polled before newer samples replace them.
             assert_eq!(texts(&bench.sent()), [["a", "b"], ["p", "q"]]);
         }
         bench.say(topic(namespace, id), text);
@@ -310,7 +310,7 @@ fn events_of_a_topic_share_a_datagram_in_their_order_and_states_have_one_value_i
     }
     assert_eq!(texts(&bench.sent()), [["a", "b", "c"]]);
 
-    // A state with two latched publishers, whose values are repeated side by side.
+    // A state with two latched publishers and repeated values of both.
     let state = topic(2, 10);
     for (publisher, text) in [(1, "one"), (2, "two")] {
         let by = Some(PublisherKey(publisher));
@@ -358,8 +358,8 @@ fn a_topic_is_full_when_the_next_sample_takes_the_place_of_one_that_waits() {
 proptest! {
     #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::with_cases(100) })]
 
-    /// Whatever is said between two looks at the outputs, the other side gets each text once and in the order of its
-    /// topic, as it does without sharing.
+    /// With any samples between two polls of the outputs, the other side receives each text once
+    /// and in the order of its topic, as without sharing.
     #[test]
     fn what_shares_a_datagram_is_delivered_as_if_each_went_alone(
         said in proptest::collection::vec((2_u16..4, 0..FEW, 0_usize..900, any::<bool>()), 1..120),

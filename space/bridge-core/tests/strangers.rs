@@ -1,4 +1,4 @@
-//! What who can send to the group and does not belong to the cell does to it, which is little.
+//! The limited effects of senders in the group that do not belong to the cell.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -84,7 +84,7 @@ impl Bridge {
         self.router.handle_datagram(&datagram, from, self.now);
     }
 
-    /// Made-up topics of space 9 speak, more than are followed.
+    /// Sends values of invented topics of space 9, more than the bridge tracks.
     fn flood(&mut self) {
         for number in 0..17_000 {
             self.hear(made_up(number), STRANGER);
@@ -110,7 +110,7 @@ impl Bridge {
     }
 }
 
-/// A key frame with one UInt32.
+/// Returns a key frame with a single UInt32.
 fn frame(topic: TopicId, header: DataSetHeader, sent: Option<Timestamp>) -> Vec<u8> {
     let (space, group, writer) = topic.triple();
     let network = NetworkHeader {
@@ -208,7 +208,7 @@ fn made_up_topics_give_way_when_they_fell_silent() {
         assert!(bridge.follows(robot), "{local:?}");
         assert!(bridge.router.topics().count() < before);
         assert!(local == Local::Fields || bridge.follows(bound));
-        // A second flood is let in as far as others have gone, and goes in its turn.
+        // A second flood is accepted only up to the freed room, and is removed in turn.
         bridge.flood();
         let _told = bridge.outputs();
         assert!(bridge.follows(robot));

@@ -1,4 +1,5 @@
-//! Confirmations of events: sent for events of other spaces, and awaited for events of this program.
+//! Confirmations of events: sent for events of other spaces, and awaited for events of this
+//! program.
 
 use std::net::SocketAddr;
 

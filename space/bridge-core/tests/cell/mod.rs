@@ -1,4 +1,4 @@
-//! Programs around one group, with a clock that moves when told.
+//! A simulated group of programs with a manual clock.
 #![allow(dead_code, reason = "each test file uses some of it")]
 
 use std::collections::{BTreeMap, VecDeque};
@@ -16,23 +16,23 @@ use uadp::{
     Variant,
 };
 
-/// Who hears the datagrams of whom, in which order and how often; all hear each once by default.
+/// Returns the number of copies of a datagram that are delivered; 1 by default.
 pub(crate) type Network = Box<dyn FnMut(&[u8]) -> usize>;
-/// How long a datagram is under way.
+/// Returns the transmission delay of a datagram.
 pub(crate) type Delay = Box<dyn FnMut() -> Duration>;
 
 pub(crate) struct Cell {
     pub(crate) programs: Vec<Program>,
-    /// What is under way on the group: from where, and what.
+    /// The datagrams in transmission with their senders.
     under_way: VecDeque<(SocketAddr, Vec<u8>)>,
-    /// Those that are late, by when they come and in which order they were sent.
+    /// The delayed datagrams by their arrival time and their sending order.
     late: BTreeMap<(Duration, u64), (SocketAddr, Vec<u8>)>,
     sent: u64,
-    /// How often each datagram comes.
+    /// The number of copies of each datagram.
     pub(crate) copies: Network,
-    /// How late each of them is; not at all by default.
+    /// The delay of each copy; zero by default.
     pub(crate) delay: Delay,
-    /// Whether what is under way is taken from the end, by turns.
+    /// Whether every second datagram is taken from the end.
     pub(crate) reorders: bool,
     turn: usize,
     started: Instant,
@@ -70,7 +70,7 @@ impl Program {
         }
     }
 
-    /// Another program, or another life of one.
+    /// Changes the port, as for another program or for a restarted program.
     pub(crate) fn at_port(mut self, port: u16) -> Self {
         self.address.set_port(port);
         self.router.set_source(self.address);
@@ -85,7 +85,7 @@ impl Program {
     }
 }
 
-/// What is random elsewhere.
+/// Returns a fixed instance id in place of random bytes.
 fn instance(address: SocketAddr) -> [u8; 16] {
     let mut instance = [7; 16];
     for (place, byte) in instance.iter_mut().zip(address.port().to_le_bytes()) {
@@ -94,7 +94,7 @@ fn instance(address: SocketAddr) -> [u8; 16] {
     instance
 }
 
-/// A program that writes one namespace of space 0.
+/// Creates a program that writes a single namespace of space 0.
 pub(crate) fn component(namespace: u16) -> Program {
     let address = SocketAddr::from(([127, 0, 0, 1], 20_000 + namespace));
     Program::at(0, Local::Fields, address).owning(&[namespace])
@@ -125,7 +125,7 @@ impl Cell {
         }
     }
 
-    /// Lets everything happen that is due within that time.
+    /// Runs all events that are due within the time.
     pub(crate) fn run(&mut self, time: Duration) {
         let end = self.passed + time;
         for _ in 0..200_000 {
@@ -155,7 +155,7 @@ impl Cell {
         panic!("no end of it");
     }
 
-    /// Everybody hears what is under way.
+    /// Delivers the datagrams in transmission to all programs.
     fn carry(&mut self) {
         for at in 0..self.programs.len() {
             self.drain(at);
@@ -236,7 +236,7 @@ impl Cell {
         self.programs[at].router.describe_value(topic, what, now);
     }
 
-    /// Has a program that speaks in fields say a text.
+    /// Publishes a text from a program with fields as payload.
     pub(crate) fn say(&mut self, at: usize, topic: TopicId, text: &str) {
         let now = self.now();
         let payload = block(&[Variant::Scalar(Scalar::String(Some(text)))]);
@@ -268,7 +268,7 @@ impl Cell {
         self.drain(at);
     }
 
-    /// Takes what a program was told and `pick` picks.
+    /// Removes and returns the outputs of a program that `pick` selects.
     fn take<T>(&mut self, at: usize, pick: impl Fn(&Output) -> Option<T>) -> Vec<T> {
         let outputs = &mut self.programs[at].outputs;
         let taken = outputs.iter().filter_map(&pick).collect();
@@ -317,7 +317,7 @@ impl Cell {
         })
     }
 
-    /// Which namespaces are taken, and which are free again.
+    /// Returns the namespaces that were taken (`true`) or became free (`false`).
     pub(crate) fn taken(&mut self, at: usize) -> Vec<(u16, bool)> {
         self.take(at, |output| match output {
             Output::Taken { namespace, by } => Some((*namespace, by.is_some())),
@@ -325,7 +325,7 @@ impl Cell {
         })
     }
 
-    /// What a program that speaks in fields was given of a topic.
+    /// Returns the texts that a program with fields as payload received for a topic.
     pub(crate) fn texts(&mut self, at: usize, topic: TopicId) -> Vec<String> {
         self.take(at, |output| match output {
             Output::Delivery(delivery) if delivery.topic == topic => {
@@ -338,7 +338,7 @@ impl Cell {
         })
     }
 
-    /// All that a program sent.
+    /// Returns all datagrams that a program sent.
     pub(crate) fn datagrams_of(&mut self, at: usize) -> Vec<Vec<u8>> {
         self.drain(at);
         self.programs[at].sent.clone()
@@ -349,7 +349,7 @@ impl Cell {
         all.get(&topic).copied().cloned().unwrap_or_default()
     }
 
-    /// How often something was dropped for that reason, of whatever.
+    /// Returns the number of drops for the reason over all topics and calls.
     pub(crate) fn dropped(&self, at: usize, reason: Reason) -> u64 {
         let router = &self.programs[at].router;
         let calls = router.calls().map(|(_, call)| call.drops.dropped(reason));
@@ -362,7 +362,7 @@ pub(crate) fn is_action(bytes: &[u8]) -> bool {
     NetworkMessage::decode(bytes).is_ok_and(|message| message.is_action())
 }
 
-/// A block of fields.
+/// Returns a block of fields.
 pub(crate) fn block(fields: &[Variant<'_>]) -> Vec<u8> {
     let mut bytes = Vec::new();
     let mut message =
