@@ -12,7 +12,7 @@ use crate::place::Place;
 
 /// The last key frame of a writer with the changes of the following delta frames.
 ///
-/// It is valid for one sender and one ConfigurationVersion. A gap in the sequence numbers shows a
+/// It is valid for a single sender and ConfigurationVersion. A gap in the sequence numbers shows a
 /// lost message, which may have changed any field. Each field is then in doubt until a message
 /// contains it. Without sequence numbers a loss is not detected, and its effect lasts until the
 /// next key frame.
@@ -206,7 +206,7 @@ fn write(
     Ok(())
 }
 
-/// DataSetFlags1 of a key frame with an empty header (OPC 10000-14, 7.2.4.5.4).
+/// Returns DataSetFlags1 of a key frame with an empty header (OPC 10000-14, 7.2.4.5.4).
 const fn flags(encoding: FieldEncoding) -> u8 {
     match encoding {
         FieldEncoding::Variant => 0x01,

@@ -523,11 +523,11 @@ const OPTIONAL: QualifiedName<'static> = QualifiedName {
 const ACTION_FAMILY: QualifiedName<'static> = named("ActionFamily");
 /// The number of DataSetWriterIds in `ActionFamily`.
 const FAMILY: usize = 4;
-/// The Property of the first request field with the DataSetWriterId of the action whose goals the
-/// call cancels.
+/// The Property of the first request field with the DataSetWriterId of the action that has its
+/// goals cancelled by the call.
 const CANCEL_OF: QualifiedName<'static> = named("CancelOf");
-/// The Property of the first request field with the DataSetWriterId of the action whose results the
-/// call waits for.
+/// The Property of the first request field with the DataSetWriterId of the action that provides the
+/// results for the call.
 const RESULT_OF: QualifiedName<'static> = named("ResultOf");
 
 const fn named(name: &'static str) -> QualifiedName<'static> {

@@ -33,7 +33,7 @@ pub enum Arrival {
 /// The state of a value that the local side accepted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Handover {
-    /// At least one present subscriber has received the value, or the service for which it is has.
+    /// At least one present subscriber, or the service of the value, has received it.
     Done,
     /// Unknown so far.
     Waiting,

@@ -10,7 +10,7 @@ pub enum Reason {
     Looped,
     /// Another sender uses the PublisherId of the own space: two bridges serve the same space.
     SpaceTaken,
-    /// The ids of the datagram are not in the space: not a number, out of range, or zero.
+    /// The ids of the datagram do not identify a topic: not a number, out of range, or zero.
     NotInSpace,
     /// The PublisherId has the number of the own space in another width than UInt16 (OPC 10000-14
     /// 7.2.4.4.2).

@@ -193,13 +193,13 @@ impl Guard {
         self.of(Some(namespace)).is_some()
     }
 
-    /// Returns the index of the secured group of a namespace; `None` where the namespace is not
+    /// Returns the index of the secured group of a namespace; `None` if the namespace is not
     /// secured.
     pub(crate) fn group_of(&self, namespace: u16) -> Option<usize> {
         self.of(Some(namespace))
     }
 
-    /// Returns whether both namespaces belong to the same secured group, or both to none.
+    /// Returns whether both namespaces belong to the same secured group, or are both not secured.
     pub(crate) fn is_alike(&self, one: u16, other: u16) -> bool {
         self.of(Some(one)) == self.of(Some(other))
     }

@@ -129,5 +129,5 @@ impl Weight for Layout {
     }
 }
 
-/// A sanity limit; OPC UA defines none.
+/// A plausibility limit, because OPC UA does not limit the number of dimensions.
 const MAX_DIMENSIONS: usize = 16;

@@ -53,7 +53,7 @@ impl<T> Default for Learned<T> {
 /// The effect of an announcement.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum News {
-    /// The announcement equals the stored one.
+    /// The announcement equals the stored announcement.
     Same,
     /// The announcement is new or differs.
     Other,

@@ -26,7 +26,8 @@ pub enum What {
 }
 
 /// The namespaces of its space that only this program writes. A namespace number (WriterGroupId)
-/// belongs to one program. Space 0 has several programs, every other space has exactly one.
+/// belongs to a single program. Space 0 has several programs, every other space has a single
+/// program.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub enum Owned {
     /// All namespaces.

@@ -65,8 +65,8 @@ pub enum Output {
         /// The topic of the value.
         topic: TopicId,
     },
-    /// A value of a topic with several simultaneous values is no longer repeated. Late joiners must
-    /// not receive it.
+    /// A value of a topic with several simultaneous values is not repeated any more. Late joiners
+    /// must not receive it.
     Retired {
         /// The topic of the value.
         topic: TopicId,

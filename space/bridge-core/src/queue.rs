@@ -60,7 +60,8 @@ impl<T> Queue<T> {
     }
 }
 
-/// The maximum size of a queue without its newest sample: twice the default maximum message size.
+/// The maximum size of a queue in bytes, unless its newest sample alone is larger: twice the
+/// default maximum message size.
 const MAX_BYTES: usize = 128 << 20;
 
 #[cfg(test)]

@@ -97,7 +97,7 @@ pub(crate) enum Ask {
     Always,
 }
 
-/// A delivered sample.
+/// A sample that was delivered, or that was not delivered because its writer had stored it.
 #[derive(Debug)]
 struct Known {
     stamp: Timestamp,
@@ -283,7 +283,7 @@ impl Reader {
         changed
     }
 
-    /// Returns whether an announced type of the topic may be applied; `known` tells that a type was
+    /// Returns whether an announced type of the topic may be applied. `known` is whether a type was
     /// known before.
     ///
     /// Each change makes the port reopen the topic, and any sender that forges the writer's address
@@ -460,7 +460,7 @@ impl Reader {
         !stored && place.instance().is_some_and(is_known)
     }
 
-    /// Returns the value that the local side must not store any more.
+    /// Returns the stamp of the value that the local side must not store any more.
     pub(crate) const fn take_withdrawn(&mut self) -> Option<Timestamp> {
         self.withdrawn.take()
     }
@@ -532,7 +532,8 @@ impl Reader {
     }
 
     /// Records that a sample is delivered, so that its repetitions are recognised. Returns the
-    /// sample that was removed from the record for it, if that sample is still a current value.
+    /// stamp of the sample that was removed from the record for it, if that sample is still a
+    /// current value.
     pub(crate) fn delivered(
         &mut self,
         instance: Option<Timestamp>,
@@ -607,7 +608,7 @@ impl Reader {
         self.known.remove(seldom.unwrap_or(0))
     }
 
-    /// Returns the next of several values that the writer has not repeated for `after` while it
+    /// Returns the stamp of the next value that the writer has not repeated for `after` while it
     /// repeated others. Call it after each key frame until it returns `None`.
     pub(crate) fn retire(&mut self, now: Instant, after: Duration) -> Option<Timestamp> {
         let several = self.several?;

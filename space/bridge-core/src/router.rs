@@ -77,15 +77,15 @@ pub struct Router {
     calls: Option<Box<Calls>>,
     /// Random bytes that distinguish own requests from requests of other programs.
     instance: [u8; 16],
-    /// The own namespaces in which nothing is sent; `None` if there are none.
+    /// The own namespaces in which nothing is sent; `None` without such namespaces.
     claims: Option<Box<Claims>>,
-    /// The secured groups; `None` if there are none.
+    /// The secured groups; `None` without secured groups.
     guard: Option<Box<Guard>>,
     /// Whether the message in processing was received unsecured.
     in_clear: bool,
     /// The sender of the confirmations of each other space.
     confirmers: BTreeMap<SpaceId, Confirmer>,
-    /// Own topics with a known outcome of the newest event.
+    /// Own topics with an outcome of the newest event that is not reported yet.
     settled: VecDeque<TopicId>,
     /// Outputs other than samples and calls.
     told: VecDeque<Output>,

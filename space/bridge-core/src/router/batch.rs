@@ -104,9 +104,9 @@ impl Router {
     }
 }
 
-/// Returns whether the datagram already contains a sample of `topic`. A second sample of a topic
-/// that keeps the latest would replace the first as soon as the datagram is read, so only one of
-/// several latched publishers would ever be received.
+/// Returns whether the datagram already contains a sample of `topic`. In a topic that keeps the
+/// latest sample, a second sample would replace the first as soon as the datagram is read. Of
+/// several latched publishers, only the last would then be received.
 fn is_in(topic: TopicId, first: TopicId, others: &[(TopicId, Encoded)]) -> bool {
     topic == first || others.iter().any(|(other, _)| *other == topic)
 }

@@ -49,8 +49,8 @@ impl Router {
     /// Binds a value that is not in the mapping. Otherwise it works as [`bind`](Self::bind).
     ///
     /// An own value is the whole message, and `note` is announced with it. A value of another space
-    /// is converted by the names of its fields, or by the assignments in `note`, as soon as the
-    /// description of its writer is known. The writer is probed for the description.
+    /// is converted by the names of its fields, or by the assignments in `note`. The conversion
+    /// starts when the description of its writer is known; the writer is probed for it.
     ///
     /// # Errors
     /// Returns a [`PlanError`] if the type cannot be read.

@@ -48,8 +48,9 @@ impl Claim {
 }
 
 impl Router {
-    /// Sets the namespaces of the space that only this program writes; initially all. Topics of the
-    /// other namespaces and received topics of these namespaces are removed.
+    /// Sets the namespaces of the space that only this program writes; initially all. Own topics in
+    /// namespaces that are not owned any more, and received topics in newly owned namespaces, are
+    /// removed.
     pub fn set_owned(&mut self, owned: Owned, now: Now) {
         if owned == self.owned {
             return;

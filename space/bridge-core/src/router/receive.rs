@@ -213,7 +213,7 @@ impl Router {
         };
         place.held_back = *held_back;
         reader.heard(now.monotonic);
-        // A keep-alive contains no version of the content.
+        // A keep-alive does not describe the content.
         let changed = message.kind != MessageKind::KeepAlive
             && reader.is_changed(message.header().major_version);
         let mut admitted = match message.kind {

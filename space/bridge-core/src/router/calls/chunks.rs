@@ -28,7 +28,7 @@ pub(super) struct Chunking {
     /// assignment.
     numbers: BTreeMap<Of, u16>,
     given: VecDeque<Of>,
-    /// Whether a chunk of a value was sent after the last chunk of a call.
+    /// Whether the queue has given way to a chunk of a value after its last chunk.
     gave_way: bool,
 }
 

@@ -305,9 +305,9 @@ impl Router {
         self.origin(namespace, from).group != STRANGERS || calls.into_iter().any(is_open)
     }
 
-    /// Returns the origin of a request, to which its memory is charged. Members of a secured group
-    /// are distinguished by their addresses, as are programs of this host. A sender on another host
-    /// shares one limit with all ports of its host.
+    /// Returns the origin of a request, to which its memory is charged. Members of a secured group,
+    /// which have its keys, and programs of this host are distinguished by address and port. All
+    /// ports of another host share a limit.
     fn origin(&self, namespace: u16, from: SocketAddr) -> RequestOrigin<SocketAddr> {
         let guard = self.guard.as_ref();
         let secured = guard.and_then(|guard| guard.group_of(namespace));
