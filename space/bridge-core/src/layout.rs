@@ -1,5 +1,5 @@
-//! The fields of a writer's DataSet: their names, and the information for reading RawData (OPC
-//! 10000-14, 7.2.4.5.11).
+//! The fields of a writer's DataSet: their names, and the information for reading RawData
+//! (OPC 10000-14, 7.2.4.5.11).
 
 use std::net::{Ipv4Addr, SocketAddr};
 
@@ -66,7 +66,7 @@ impl Layout {
         })
     }
 
-    /// Returns the fields of a mapped value. Strings have no maximum length, as in ROS.
+    /// Returns the fields of a mapped value. Only arrays with a fixed length in ROS have a length.
     pub(crate) fn mapped(variable: &Variable) -> Self {
         let fields = variable.fields.iter().map(|leaf| {
             let (value_rank, array_dimensions) = match leaf.rank {

@@ -535,7 +535,7 @@ impl Router {
         self.count(about, (reason, why), count, || why.to_owned());
     }
 
-    /// Returns the buffer of a datagram or payload after use, so that the next output needs no
+    /// Takes back the buffer of a datagram or payload after use, so that the next output needs no
     /// allocation.
     pub fn recycle(&mut self, mut buffer: Vec<u8>) {
         if self.spare.len() < SPARE_BUFFERS && buffer.capacity() <= SPARE_CAPACITY {
@@ -704,7 +704,8 @@ impl Router {
                 due.chain(held).min()
             }
         };
-        // An earlier entry stays and finds nothing due. This avoids a new entry for each sample.
+        // An earlier entry stays: it finds nothing due and schedules the topic again. This avoids a
+        // new entry for each sample.
         if let Some(due) = due
             && entry.timer.is_none_or(|at| due < at)
         {

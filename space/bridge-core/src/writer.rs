@@ -207,8 +207,8 @@ impl Writer {
         stamp
     }
 
-    /// Returns the sequence number of a keep-alive: the number of the next expected message (OPC
-    /// 10000-14 7.2.4.5.8).
+    /// Returns the sequence number of a keep-alive: the number of the next expected message
+    /// (OPC 10000-14 7.2.4.5.8).
     pub(crate) const fn expected_sequence(&self) -> u16 {
         self.sequence
     }

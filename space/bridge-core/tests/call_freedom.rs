@@ -3,9 +3,9 @@
 //!
 //! A program may end at any time and may be restarted. A request is executed at most once in all
 //! instances of a program, only by the program in its name, and never by the requesting program
-//! itself. The requestor receives the true outcome, and no messages are sent afterwards. The
-//! programs are bridges of ROS 1 and ROS 2, which offer and request calls with the type of a
-//! service, and programs with fields as payload.
+//! itself. The requestor receives the true outcome, and no requests or responses are sent
+//! afterwards. The programs are bridges of ROS 1 and ROS 2, which offer and request calls with the
+//! type of a service, and programs with fields as payload.
 use crate::cell;
 
 use std::collections::BTreeMap;

@@ -72,8 +72,8 @@ impl Quality {
     }
 
     /// Returns the status of the sample: the status of the message, or of its value if that is
-    /// worse. It is the upper half of a StatusCode; its two highest bits are the severity (OPC
-    /// 10000-4, 7.39.1).
+    /// worse. It is the upper half of a StatusCode; its two highest bits are the severity
+    /// (OPC 10000-4, 7.39.1).
     pub(super) fn status(self, message: u16) -> u16 {
         let status = self.status.unwrap_or(StatusCode::GOOD);
         let value = u16::try_from(status.0 >> 16).unwrap_or(u16::MAX);
@@ -424,8 +424,9 @@ fn raw(
     Ok(Quality::default())
 }
 
-/// Converts Variants or DataValues. A DataValue without a value is replaced by its status, and so
-/// is a bad value among several, as in a writer of Variants (OPC 10000-14, 7.2.4.5.5).
+/// Converts Variants or DataValues. A bad DataValue without a value, and a bad DataValue among
+/// several, are replaced by their status as in a writer of Variants (OPC 10000-14, 7.2.4.5.5).
+/// Other DataValues without a value are null.
 fn flatten(
     message: &DataSetMessage<'_>,
     choice: &Choice,

@@ -87,8 +87,8 @@ impl Router {
         }
     }
 
-    /// Delivers a sample that waited for its local type. An event is delivered only before it is
-    /// too old.
+    /// Delivers a sample that waited for its local type. An event is delivered only until it is too
+    /// old.
     pub(super) fn deliver_held(&mut self, topic: TopicId, held: &Held, now: Now) {
         if !held.lasting && held.until <= now.monotonic {
             self.came_too_early(topic, held);

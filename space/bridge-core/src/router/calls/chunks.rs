@@ -39,7 +39,7 @@ pub(super) enum Of {
     Response(u64),
 }
 
-/// A partly sent message.
+/// A message that is sent in chunks.
 #[derive(Debug)]
 struct Large {
     topic: TopicId,
@@ -64,8 +64,8 @@ impl Chunking {
     }
 
     /// Queues a message, unless a message of the same call is still queued. A repetition has the
-    /// MessageSequenceNumber of the first transmission, so that its chunks replace lost chunks (OPC
-    /// 10000-14, 7.2.4.4.4).
+    /// MessageSequenceNumber of the first transmission, so that its chunks replace lost chunks
+    /// (OPC 10000-14, 7.2.4.4.4).
     fn push(&mut self, topic: TopicId, of: Of, bytes: Vec<u8>) {
         if self.waiting.iter().any(|large| large.of == of) {
             return;
