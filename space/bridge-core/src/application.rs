@@ -17,7 +17,7 @@ pub struct Application {
     pub product_uri: String,
     /// The ApplicationName.
     pub name: String,
-    /// The DiscoveryUrls of its server; empty for a program without a server.
+    /// The DiscoveryUrls, at which its server listens; empty for a program without a server.
     pub urls: Vec<String>,
     /// The ServerCapability identifiers (OPC 10000-12, Annex D).
     pub capabilities: Vec<String>,

@@ -33,7 +33,7 @@ pub struct CallDescription {
 /// namespace.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub enum CallRole {
-    /// An independent call.
+    /// An independent call, which is answered at once.
     #[default]
     Call,
     /// Sends a goal.

@@ -67,7 +67,7 @@ pub(crate) struct Mark {
     pub(crate) stamp: Timestamp,
 }
 
-/// The newest event of another space.
+/// The newest event of another space. The next event replaces it.
 #[derive(Debug)]
 pub(crate) struct Receipt {
     pub(crate) mark: Mark,

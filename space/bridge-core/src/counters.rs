@@ -347,7 +347,8 @@ impl Counters {
     }
 }
 
-/// Returns whether the `total`th occurrence is logged: the 1st, 10th, 100th and so on.
+/// Returns whether the `total`th occurrence is logged: the 1st, 10th, 100th and so on, so that a
+/// flood causes few log entries.
 pub(crate) fn is_told(total: u64) -> bool {
     total
         .checked_ilog10()

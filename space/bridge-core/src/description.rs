@@ -1,11 +1,12 @@
 //! The content of a topic as DataSetMetaData (OPC 10000-14, 6.2.3.2.3).
 //!
 //! The name of the DataSet is the name of the topic (`ua_1_2_10`). An announcement has no
-//! WriterGroupId, so its PublisherId and DataSetWriterId do not identify the topic. The description
-//! is the name of the ROS type of the message that the fields form. It ends with ` as bytes` if the
-//! field is a ByteString with the whole message. The type name is missing if the fields do not form
-//! a message: a single value of a message, or values that were converted. A local side with fields
-//! as payload may add a display name after the topic name, and a description after `; `.
+//! WriterGroupId, so the topic is identified by this name together with the PublisherId and
+//! DataSetWriterId. The description is the name of the ROS type of the message that the fields
+//! form. It ends with ` as bytes` if the field is a ByteString with the whole message. The type
+//! name is missing if the fields do not form a message: a single value of a message, or values that
+//! were converted. A local side with fields as payload may add a display name after the topic name,
+//! and a description after `; `.
 
 use std::collections::BTreeMap;
 use std::collections::hash_map::DefaultHasher;

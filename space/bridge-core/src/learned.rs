@@ -62,8 +62,9 @@ pub(crate) enum News {
 }
 
 impl<T: Weight + PartialEq> Learned<T> {
-    /// Stores the description of a topic for a limited time. If there is no room, announcements of
-    /// lower ranks are removed, lowest rank first.
+    /// Stores the description of a topic for a limited time. If there is no room, expired
+    /// announcements are removed first, and then announcements of lower ranks, beginning with the
+    /// lowest rank.
     pub(crate) fn learn(
         &mut self,
         topic: TopicId,
