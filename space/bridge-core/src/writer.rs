@@ -308,7 +308,8 @@ impl Writer {
         self.next < self.kept.len() || self.is_again_due()
     }
 
-    /// Returns the next message of the round of repetitions, if it may share a datagram.
+    /// Returns the next sample of the round of repetitions; `None` if a repetition of the newest
+    /// event is due.
     pub(crate) fn next_repeated(&self) -> Option<&Message> {
         if self.is_again_due() {
             // A repeated event is sent alone, because it is short and must not wait.

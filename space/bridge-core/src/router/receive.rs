@@ -78,8 +78,8 @@ impl Router {
             self.count(About::sender(from), Reason::NotInSpace, 1, String::new);
             return;
         };
-        // A chunk without a payload header may belong to a response, which is not a value of the
-        // responding program.
+        // A chunk without a payload header may belong to a response, and the responding program
+        // need not send values.
         let may_be_value = !message.is_chunk() || message.writer_ids().is_some();
         if let Some(calls) = &mut self.calls
             && may_be_value
@@ -125,7 +125,8 @@ impl Router {
         None
     }
 
-    /// Sets the source address of own datagrams after a change of the network interface.
+    /// Sets the source address of own datagrams, for example after a change of the network
+    /// interface.
     pub fn set_source(&mut self, source: SocketAddr) {
         self.settings.source = Some(source);
     }

@@ -77,7 +77,7 @@ impl Router {
             if renamed || meant || typed {
                 self.describe_again(topic, now);
             }
-            // The periods may be shorter.
+            // The new mapping may have shorter periods.
             self.schedule(topic);
         }
     }

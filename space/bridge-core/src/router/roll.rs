@@ -17,8 +17,8 @@ use crate::settings::{Local, Now};
 use crate::topic::{Role, Topic};
 
 impl Router {
-    /// Sets the description of an own value, and announces it now and after each change. It is for
-    /// a local side with fields as payload, and replaces the description in the mapping.
+    /// Sets the description of an own value, and announces it at once and after each change. It is
+    /// for a local side with fields as payload, and replaces the description in the mapping.
     pub fn describe_value(&mut self, topic: TopicId, description: ValueDescription, now: Now) {
         if self.settings.local != Local::Fields || !self.is_home(topic) {
             return;
