@@ -1,8 +1,9 @@
 //! Actions between a ROS graph and the space.
 //!
-//! An action server of the graph that is a call of our own space, by the mapping or by its name (`/ua_1_2_70`), is executed for
-//! others: a goal is a request, and so are cancelling and waiting for a result; feedback and the statuses of goals are values.
-//! The action of another space is offered as an action server of the graph.
+//! An action server of the graph is executed for other spaces if it is a call of the own space, by
+//! the mapping or by its name (`/ua_1_2_70`). Sending a goal, cancelling and waiting for a result
+//! are requests; feedback and goal statuses are values. An action of another space is offered as an
+//! action server of the graph.
 
 mod block;
 mod encoding;
@@ -39,7 +40,8 @@ use crate::port::{Delivery, Execution};
 use crate::present::{self, Present};
 use crate::{Asker, PortEvent};
 
-/// The actions of one bridge: those of its graph that it executes for others, and those of other spaces that it offers.
+/// The actions of one bridge: actions of its graph that are executed for other spaces, and actions
+/// of other spaces that are offered in its graph.
 #[derive(Debug)]
 pub struct Actions {
     executors: Executors,
@@ -60,22 +62,23 @@ impl Default for Actions {
     }
 }
 
-/// What the graph has, executed for others.
+/// Actions of the graph, executed for other spaces.
 impl Actions {
-    /// Whether an action of that name is one of our own space by its name, so that its type has to be found out.
+    /// Returns whether the name of an action makes it a call of the own space, so that its type has
+    /// to be found out.
     #[must_use]
     pub fn is_named(policy: &Policy, action: &str) -> bool {
         present::named(policy, action).is_some()
     }
 
-    /// The names of the actions that the mapping has executed in our own space.
+    /// Returns the names of the actions that the mapping has executed in the own space.
     #[must_use]
     pub fn mapped<'m>(mapping: &'m Mapping, policy: &Policy) -> BTreeSet<&'m str> {
         present::mapped(mapping, policy, CallKind::Action)
     }
 
-    /// Compares the action servers there are, each with its type as far as that is known, with those that are offered to
-    /// others, and begins to offer `most` at most.
+    /// Compares the present action servers, each with its type if known, with the actions that are
+    /// offered to other spaces. Starts to offer at most `most` further actions.
     pub fn reconcile<G: ActionGraph>(
         &mut self,
         graph: &mut G,
@@ -86,72 +89,75 @@ impl Actions {
         executors.reconcile((graph, policy), (present, most), report)
     }
 
-    /// Whether it executes that call: a part of an action.
+    /// Returns whether a call is executed here as a part of an action.
     #[must_use]
     pub fn serves(&self, topic: TopicId) -> bool {
         self.executors.serves(topic)
     }
 
-    /// Executes a request for a part of an action. What becomes of it comes from [`recv`](Self::recv).
+    /// Executes a request for a part of an action. The outcome is reported by [`recv`](Self::recv).
     ///
     /// # Errors
-    /// Why it is not executed.
+    /// The reason why the request is refused.
     pub fn execute(&mut self, execution: Execution) -> Result<(), Refusal> {
         self.executors.execute(execution)
     }
 
-    /// The caller of an execution has given it up. An accepted goal goes on. A goal that its server has not decided about is
-    /// cancelled as soon as it is accepted.
+    /// Handles a caller that gives up an execution. An accepted goal goes on. A goal that its
+    /// server has not decided about is cancelled as soon as it is accepted.
     pub fn abandoned(&mut self, execution: ExecutionId) {
         self.executors.abandoned(execution);
     }
 
-    /// The goals whose cancellation is pending, a line each.
+    /// Returns the goals whose cancellation is pending, a line each.
     #[must_use]
     pub fn pending(&self) -> Vec<String> {
         self.executors.pending()
     }
 }
 
-/// What other spaces have, offered here.
+/// Actions of other spaces, offered in the graph.
 impl Actions {
-    /// A call of another space is known, or is another than before.
+    /// Adds or updates a call of another space.
     pub fn known(&mut self, topic: TopicId, described: &Arc<CallDescription>) {
         self.facades.known(topic, described);
     }
 
-    /// A call is gone. Its action server stays for `receive_timeout`, after which its goals are aborted.
+    /// Notes that a call is lost. Its action server stays for `receive_timeout`, after which its
+    /// goals are aborted.
     pub fn gone(&mut self, topic: TopicId, now: Instant) {
         self.facades.gone(topic, now);
     }
 
-    /// Withdraws the action servers of actions that are gone. To be called now and then.
+    /// Withdraws the action servers of actions that are lost. To be called periodically.
     pub fn tidy(&mut self, policy: &Policy, now: Instant) {
         for event in self.facades.tidy(policy, now) {
-            // What stays bound has no consequence but its place.
+            // A binding that remains if the queue is full costs memory only.
             drop(self.report.try_send(event));
         }
     }
 
-    /// The actions that are known and have a name of the mapping here, with that.
+    /// Returns the known actions that have a name in this space by the mapping, with the name.
     #[must_use]
     pub fn chosen(&self, policy: &Policy) -> Vec<(TopicId, String)> {
         self.facades.chosen(policy)
     }
 
-    /// Whether any action waits to be offered.
+    /// Returns whether any action waits to be offered.
     #[must_use]
     pub fn is_waiting(&self) -> bool {
         self.facades.is_waiting()
     }
 
-    /// Withdraws the servers of the actions that are left to others, by their names here, and has them wait.
+    /// Withdraws the servers of the actions that are left to other bridges, by their names in this
+    /// space. The actions wait to be offered again.
     pub fn leave(&mut self, to_others: impl Fn(TopicId, &str) -> bool) {
         self.facades.leave(to_others);
     }
 
-    /// Offers actions that wait and `may` be offered under their names here, at most so many. `asker` makes what asks a call
-    /// ([`Calls::asker`](crate::Calls::asker)). Reports the types of their calls and values.
+    /// Offers at most `most` waiting actions that `may` be offered under their names in this space.
+    /// `asker` returns the [`Asker`] of a call ([`Calls::asker`](crate::Calls::asker)). Reports the
+    /// types of their calls and values.
     pub fn offer_waiting<G: ActionGraph>(
         &mut self,
         with: (&mut G, &mut Policy),
@@ -163,30 +169,31 @@ impl Actions {
         facades.offer_waiting(with, (asker, report), may, most)
     }
 
-    /// The names of the action servers that are there.
+    /// Returns the names of the offered action servers.
     #[must_use]
     pub fn offered(&self) -> BTreeMap<TopicId, &str> {
         self.facades.offered()
     }
 
-    /// Whether the values of a topic are for an action server here: they are no topic of the graph by themselves.
+    /// Returns whether the values of a topic belong to an action server offered here. Such values
+    /// are not published as a topic of the graph.
     #[must_use]
     pub fn takes(&self, policy: &Policy, topic: TopicId) -> bool {
         self.facades.takes(policy, topic)
     }
 
-    /// Takes a value of a topic that it [takes](Self::takes).
+    /// Delivers a value of a topic for which [`takes`](Self::takes) returns true.
     ///
     /// # Errors
-    /// A short reason under which it is counted as dropped.
+    /// A short reason under which the value is counted as dropped.
     pub fn publish(&mut self, value: &Delivery) -> Result<(), &'static str> {
         self.facades.publish(value)
     }
 }
 
-/// Both.
+/// Both directions.
 impl Actions {
-    /// Has everything looked at again: definitions or the mapping may be others.
+    /// Checks all actions again, because definitions or the mapping may have changed.
     pub fn look_again<G: ActionGraph>(
         &mut self,
         graph: &mut G,
@@ -196,15 +203,15 @@ impl Actions {
         self.executors.look_again(graph)
     }
 
-    /// What came of executions, and what goals report. Cancel-safe.
+    /// Returns the outcomes of executions and the reports of goals. Cancel-safe.
     pub async fn recv(&mut self) -> Vec<PortEvent> {
         std::future::poll_fn(|cx| self.poll_recv(cx)).await
     }
 
-    /// As [`recv`](Self::recv), for ports that poll.
+    /// Polls for the events of [`recv`](Self::recv), for ports that poll.
     pub fn poll_recv(&mut self, cx: &mut Context<'_>) -> Poll<Vec<PortEvent>> {
         let mut events = Vec::new();
-        // Pending without a taken one only where the next is waited for.
+        // Returns pending without an event only after the channel has registered the waker.
         while events.len() < MOST_AT_A_TIME
             && let Poll::Ready(Some(event)) = self.reports.poll_recv(cx)
         {
@@ -220,9 +227,9 @@ impl Actions {
     }
 }
 
-/// What came of executions and waits to be taken.
+/// The maximal number of queued reports.
 const MOST_REPORTS: usize = 256;
-/// What is taken of it at a time.
+/// The maximal number of reports returned at a time.
 const MOST_AT_A_TIME: usize = 64;
 
 #[cfg(test)]

@@ -1,14 +1,15 @@
-//! Peers that a program waits for: publishers, servers and other spaces that the mapping needs and that are missing.
+//! Peers that a program waits for: publishers, servers and other spaces that the mapping needs and
+//! that are missing.
 //!
-//! Pure: the run loop collects the missing peers each second and passes the time. A peer is reported once it has been
-//! missing for [`GRACE`], and withdrawn when it arrives.
+//! Pure: the run loop collects the missing peers each second and passes the time. A peer is
+//! reported once it has been missing for [`GRACE`], and withdrawn when it arrives.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::time::{Duration, Instant};
 
-/// The peers that are missing at one moment, each with the reason. Holds at most `MOST_PEERS`; further peers are
-/// counted.
+/// The peers that are missing at one moment, each with the reason. Holds at most `MOST_PEERS`;
+/// further peers are counted.
 #[derive(Debug, Default)]
 pub struct AwaitedPeers {
     reasons: BTreeMap<String, String>,
@@ -16,8 +17,8 @@ pub struct AwaitedPeers {
 }
 
 impl AwaitedPeers {
-    /// Adds a missing peer, such as `topic /start`. `reason` is a short statement, such as `no publisher`; it is called
-    /// only while there is room.
+    /// Adds a missing peer, such as `topic /start`. `reason` is a short statement, such as `no
+    /// publisher`; it is called only while there is room.
     pub fn add(&mut self, peer: impl Into<String>, reason: impl FnOnce() -> String) {
         if self.reasons.len() >= MOST_PEERS {
             self.omitted += 1;
@@ -26,7 +27,8 @@ impl AwaitedPeers {
         self.reasons.entry(peer.into()).or_insert_with(reason);
     }
 
-    /// Adds a missing peer whose name may be misspelt: the reason names the nearest of the `known` names.
+    /// Adds a missing peer whose name may be misspelt: the reason names the nearest of the `known`
+    /// names.
     pub fn add_named<'k>(
         &mut self,
         (kind, name): (&str, &str),
@@ -128,7 +130,8 @@ impl PeerWatch {
         }
     }
 
-    /// Returns the peers that were reported as missing, each with its reason: `topic /start (no publisher)`.
+    /// Returns the peers that were reported as missing, each with its reason: `topic /start (no
+    /// publisher)`.
     pub(crate) fn reported(&self) -> Vec<String> {
         let reported = self.peers.iter().filter_map(|(peer, missing)| {
             let reason = missing.reported.as_ref()?;
@@ -171,7 +174,7 @@ mod tests {
         missing
     }
 
-    /// Looks each second from `from` to `to`; returns the log lines with their seconds.
+    /// Updates each second from `from` to `to`; returns the log lines with their seconds.
     fn look(
         watch: &mut PeerWatch,
         start: Instant,

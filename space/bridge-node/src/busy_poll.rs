@@ -1,30 +1,32 @@
-//! Looking for the next sample instead of sleeping until it comes, where samples follow each other closely.
+//! Busy polling for the next sample instead of sleeping until it arrives, if samples follow each
+//! other closely.
 //!
-//! Waking a thread costs more than all a bridge does with a small sample where an idle core is halted, as in most
-//! virtual machines, and the wait until it runs is most of a round trip. In a closed loop the next sample is there before
-//! the core has gone to sleep and come back. But what looks takes a core: where programs that hand samples to each other
-//! have no core each, they wait for those that look.
+//! On an idle core that is halted, as in most virtual machines, waking a thread costs more than all
+//! the work of a bridge for a small sample. The wait until the thread runs is most of a round trip.
+//! In a closed loop the next sample arrives before the core has gone to sleep and come back. Busy
+//! polling takes a whole core: if programs that exchange samples do not have a core each, they wait
+//! for the polling programs.
 
 use std::time::{Duration, Instant};
 
-/// Whether a loop that has nothing to do goes on looking, for a short while after each sample.
+/// Decides whether an idle loop keeps polling for a short while after each sample.
 ///
-/// It takes no time from a quiet bridge: it begins after 16 samples less than 500 us apart, and looking in
-/// vain for a whole window takes that much credit away again. What it costs at most is a window for every 16
-/// samples, and all of one core while each window ends with a sample.
+/// It takes no time from a quiet bridge: polling starts after 16 samples less than 500 us apart,
+/// and each window without a sample takes away that much credit. The maximal cost is one window for
+/// every 16 samples, or one core while each window ends with a sample.
 #[derive(Debug)]
 pub struct BusyPoll {
     window: Duration,
-    /// One for each sample that came soon after the one before.
+    /// Incremented by each sample that arrives soon after the previous sample.
     credit: u32,
-    /// When the last sample came.
+    /// Time of the last sample.
     last: Option<Instant>,
-    /// When there was nothing left to do after it.
+    /// Time when the loop became idle after the last sample.
     idle: Option<Instant>,
 }
 
 impl BusyPoll {
-    /// Looks for as long as `window` after each sample; never, if that is zero.
+    /// Polls for up to `window` after each sample; never, if `window` is zero.
     #[must_use]
     pub const fn new(window: Duration) -> Self {
         Self {
@@ -35,7 +37,7 @@ impl BusyPoll {
         }
     }
 
-    /// Takes note of a sample.
+    /// Records a sample.
     pub fn arrived(&mut self, at: Instant) {
         if self.window.is_zero() {
             return;
@@ -51,7 +53,7 @@ impl BusyPoll {
         self.idle = None;
     }
 
-    /// Whether to look again now, rather than to sleep. `clock` is read only when it matters.
+    /// Returns whether to poll again instead of sleeping. `clock` is read only if necessary.
     pub fn looks(&mut self, clock: impl FnOnce() -> Instant) -> bool {
         if self.credit < WORTH_IT {
             return false;
@@ -66,11 +68,12 @@ impl BusyPoll {
     }
 }
 
-/// Samples further apart are nothing to stay awake for.
+/// Samples further apart than this do not start polling.
 const SHORT: Duration = Duration::from_micros(500);
-/// How many samples less than 500 us apart are worth one window.
+/// Number of samples less than 500 us apart that pay for one window.
 const WORTH_IT: u32 = 16;
-/// So that one window in vain does not end it in the midst of a loop.
+/// The maximal credit. It covers two windows, so that one window without a sample does not end
+/// polling in the middle of a loop.
 const MOST: u32 = 2 * WORTH_IT;
 
 #[cfg(test)]
@@ -80,8 +83,8 @@ mod tests {
 
     const WINDOW: Duration = Duration::from_micros(200);
 
-    /// Samples `apart` from each other, looked for after each until the next; returns how long that was in all, and when
-    /// it ended.
+    /// Feeds samples `apart` from each other, and polls after each until the next. Returns the
+    /// total time of polling, and the time of its end.
     fn stream(
         poll: &mut BusyPoll,
         from: Instant,

@@ -1,7 +1,9 @@
-//! Calls of other spaces, offered as services of a ROS graph: under their names (`/ua_0_7_105`), or as the mapping says.
+//! Calls of other spaces, offered as services of a ROS graph: under their names (`/ua_0_7_105`), or
+//! as the mapping sets it.
 //!
-//! Under which type is [`policy`](crate::policy)'s matter, how a service is offered the graph's; what is asked goes to the
-//! Router as [`PortEvent::Ask`], and its answer comes back by [`answered`](Calls::answered).
+//! The module [`policy`](crate::policy) chooses the type, and the graph offers the service.
+//! Requests go to the Router as [`PortEvent::Ask`], and the responses come back through
+//! [`answered`](Calls::answered).
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
@@ -19,18 +21,18 @@ use tracing::{debug, info};
 use crate::policy::{Policy, call_type};
 use crate::{PortEvent, ServiceGraph};
 
-/// A ROS graph that services can be offered in.
+/// A ROS graph that can offer services.
 pub trait CallGraph: ServiceGraph {
     /// An offered service, which is withdrawn when this is dropped.
     type Server: Send;
 
-    /// Whether a caller can be told that its call failed, and why.
+    /// Whether a caller can receive the failure of its call, with the reason.
     const TELLS_FAULTS: bool;
 
     /// Offers a service: each request goes to `asker`.
     ///
     /// # Errors
-    /// Why there can be none, for people.
+    /// The reason why the service cannot be offered, as text for the user.
     fn offer(
         &mut self,
         service: &str,
@@ -39,15 +41,16 @@ pub trait CallGraph: ServiceGraph {
     ) -> Result<Self::Server, String>;
 }
 
-/// The calls of other spaces that a port knows, and what its graph asks them.
+/// The calls of other spaces that a port knows, and the open requests of its graph.
 #[derive(Debug)]
 pub struct Calls<S> {
     known: BTreeMap<TopicId, Known<S>>,
-    /// Services of calls that are gone, since when: who waits for an answer is still told.
+    /// Services of lost calls, with the time of the loss: callers that wait for a response still
+    /// receive the failure.
     leaving: Vec<(Instant, TopicId, S)>,
-    /// What clients look for.
+    /// The calls that clients look for.
     wanted: BTreeSet<TopicId>,
-    /// What was asked and is not answered.
+    /// The open requests.
     asked: HashMap<AskId, Asked>,
     said: mpsc::Receiver<Said>,
     say: mpsc::Sender<Said>,
@@ -62,31 +65,31 @@ struct Known<S> {
 
 #[derive(Debug)]
 enum State<S> {
-    /// To be offered when there is time for it.
+    /// To be offered later.
     Waiting,
-    /// There is no service type for it here, or no room.
+    /// Not offered: its service type is unknown here, or the limit is reached.
     Refused,
     Offered {
-        /// As what.
+        /// The name, type and field maps under which the call is offered.
         target: Target,
         service_type: Arc<ServiceType>,
         server: S,
     },
 }
 
-/// As what a call is offered.
+/// Name, type and field maps under which a call is offered.
 #[derive(Debug, Clone, PartialEq, Eq)]
 struct Target {
-    /// Of the service.
+    /// Name of the service.
     name: String,
-    /// Where the mapping says it.
+    /// The type that the mapping sets, if any.
     type_name: Option<TypeName>,
     map: Arc<CallMap>,
     timeout: Duration,
 }
 
 impl Target {
-    /// As the mapping says it, else under the name of the topic.
+    /// Returns the target of the mapping; without one, the name of the topic.
     fn of(topic: TopicId, policy: &Policy) -> Self {
         let call = policy.mapping().call(topic);
         let timeout = call.map_or(ANSWERED_WITHIN, |call| call.timeout);
@@ -114,21 +117,22 @@ impl Target {
 struct Asked {
     topic: TopicId,
     answer: oneshot::Sender<Result<Bytes, AskFault>>,
-    /// An answer that says no, where the caller can be told in no other way.
+    /// The type of a response that reports failure, if the caller cannot receive it in any other
+    /// way.
     says_no: Option<Arc<MessageType>>,
 }
 
-/// Asks one call of another space, on behalf of whoever calls its service.
+/// Sends requests to one call of another space, on behalf of the callers of its service.
 #[derive(Debug, Clone)]
 pub struct Asker {
     topic: TopicId,
-    /// Of one that asks for a part of an action: how long it waits.
+    /// The timeout of a request for a part of an action; `None` for a service.
     timeout: Option<Duration>,
     say: mpsc::Sender<Said>,
     next: Arc<AtomicU64>,
 }
 
-/// What the services of a port say to it.
+/// A message of the services of a port to the port.
 #[derive(Debug)]
 enum Said {
     Ask {
@@ -141,7 +145,8 @@ enum Said {
     GivenUp(AskId),
 }
 
-/// Says that an answer is no longer waited for, unless it came. Its place in the queue was taken with that of the question.
+/// Reports that a caller does not wait for a response any more, unless the response has arrived.
+/// Its place in the queue is reserved together with the place of the request.
 struct GiveUp {
     ask: AskId,
     place: Option<mpsc::OwnedPermit<Said>>,
@@ -155,28 +160,28 @@ impl Drop for GiveUp {
     }
 }
 
-/// Why a question has no answer.
+/// The reason why a request has no response.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct AskFault {
-    /// Whether it was executed, as far as that is known.
+    /// Whether the request was executed, as far as that is known.
     pub(crate) kind: AskErrorKind,
-    /// For people.
+    /// Text for the user.
     pub(crate) text: String,
 }
 
 impl Asker {
-    /// The same, of which an answer is waited for that long.
+    /// Sets the timeout of requests.
     #[must_use]
     pub fn within(self, timeout: Duration) -> Self {
         let timeout = Some(timeout);
         Self { timeout, ..self }
     }
 
-    /// Asks with a request as the messages of that ROS are on the wire; the answer is likewise. Dropping the future gives
-    /// the question up. Ends in bounded time, as every call of the space does.
+    /// Sends a request in the wire format of the ROS; the response has the same format. Dropping
+    /// the future gives up the request. Ends in bounded time, as every call of the space does.
     ///
     /// # Errors
-    /// Why there is no answer, for people.
+    /// The reason why there is no response, as text for the user.
     pub fn ask(
         &self,
         request: Bytes,
@@ -185,7 +190,8 @@ impl Asker {
         async move { answer.await.map_err(|fault| fault.text) }
     }
 
-    /// As [`ask`](Self::ask), with what is known of whether it was executed.
+    /// Sends a request as [`ask`](Self::ask) does. The error also holds whether the request was
+    /// executed.
     pub(crate) fn ask_for(
         &self,
         request: Bytes,
@@ -248,7 +254,7 @@ impl<S: Send> Default for Calls<S> {
 }
 
 impl<S: Send> Calls<S> {
-    /// A call of another space is known, or what is said of it has changed. It is offered by
+    /// Adds or updates a call of another space. It is offered by
     /// [`offer_waiting`](Self::offer_waiting).
     pub fn known(&mut self, topic: TopicId, described: Arc<CallDescription>) {
         match self.known.get_mut(&topic) {
@@ -264,7 +270,7 @@ impl<S: Send> Calls<S> {
         }
     }
 
-    /// A call is gone: its service is withdrawn, a little later where somebody waits for an answer.
+    /// Removes a call. Its service is withdrawn, a little later if callers wait for a response.
     pub fn gone(&mut self, topic: TopicId, now: Instant) {
         let Some(known) = self.known.remove(&topic) else {
             return;
@@ -274,14 +280,14 @@ impl<S: Send> Calls<S> {
             if self.asked.values().any(|asked| asked.topic == topic) {
                 self.leaving.push((now, topic, server));
             }
-            // Its place is another's.
+            // Refused calls can take the free place.
             if self.known.len() >= MOST_CALLS {
                 self.wait_anew();
             }
         }
     }
 
-    /// Lets go of the services of calls that are gone, once everybody who waited was told.
+    /// Withdraws the services of lost calls, once all waiting callers have received the failure.
     pub fn tidy(&mut self, now: Instant) {
         let asked = &mut self.asked;
         self.leaving.retain(|(since, topic, _)| {
@@ -295,7 +301,7 @@ impl<S: Send> Calls<S> {
         });
     }
 
-    /// Has the calls that are not offered looked at again.
+    /// Lets refused calls wait to be offered again.
     fn wait_anew(&mut self) {
         for known in self.known.values_mut() {
             if let State::Refused = known.state {
@@ -304,13 +310,13 @@ impl<S: Send> Calls<S> {
         }
     }
 
-    /// Has calls looked at again, as definitions or the mapping may be others: those that are not offered, and those whose
-    /// type is another now.
+    /// Checks calls again, because definitions or the mapping may have changed: calls that are not
+    /// offered, and calls whose type or target has changed.
     pub fn look_again<G: CallGraph<Server = S>>(&mut self, graph: &mut G, policy: &Policy) {
         for (topic, known) in &mut self.known {
             let again = match &known.state {
                 State::Waiting | State::Refused => true,
-                // A file that cannot be read for the moment changes nothing.
+                // A file that is temporarily unreadable changes nothing.
                 State::Offered {
                     target,
                     service_type,
@@ -327,7 +333,7 @@ impl<S: Send> Calls<S> {
         }
     }
 
-    /// The services that are there.
+    /// Returns the offered services.
     pub fn servers(&self) -> impl Iterator<Item = &S> {
         let offered = self.known.values().filter_map(|known| match &known.state {
             State::Offered { server, .. } => Some(server),
@@ -336,7 +342,7 @@ impl<S: Send> Calls<S> {
         offered.chain(self.leaving.iter().map(|(_, _, server)| server))
     }
 
-    /// The calls that are known and have a name of the mapping here, with that.
+    /// Returns the known calls that have a name in this space by the mapping, with the name.
     #[must_use]
     pub fn chosen(&self, policy: &Policy) -> Vec<(TopicId, String)> {
         let mapped = policy.mapping().asked_in(policy.own());
@@ -348,14 +354,15 @@ impl<S: Send> Calls<S> {
             .collect()
     }
 
-    /// Whether any call waits to be offered.
+    /// Returns whether any call waits to be offered.
     #[must_use]
     pub fn is_waiting(&self) -> bool {
         let mut known = self.known.values();
         known.any(|known| matches!(known.state, State::Waiting))
     }
 
-    /// Withdraws the services of the calls that are left to others, by their names here, and has them wait.
+    /// Withdraws the services of the calls that are left to other bridges, by their names in this
+    /// space. The calls wait to be offered again.
     pub fn leave(&mut self, to_others: impl Fn(TopicId, &str) -> bool) {
         for (topic, known) in &mut self.known {
             if let State::Offered { target, .. } = &known.state
@@ -366,18 +373,19 @@ impl<S: Send> Calls<S> {
         }
     }
 
-    /// Asks for what the mapping says of other spaces, and nobody here knows.
+    /// Requests the calls of other spaces that the mapping names and that are unknown here.
     pub fn ask_for_mapped(&self, policy: &Policy) -> Vec<PortEvent> {
         let mapped = policy.mapping().asked_in(policy.own());
         let unknown = mapped.filter(|(call, _)| !self.known.contains_key(&call.topic));
-        // Behind them an action has values.
+        // The topics of an action behind its calls are values.
         let topics = unknown.flat_map(|(call, _)| call.topics().take(CALLS_OF_ACTION));
         topics
             .map(|topic| PortEvent::CallWanted { topic })
             .collect()
     }
 
-    /// Asks for what clients here look for, once while they are there.
+    /// Requests the calls that clients in this graph look for, once for as long as the clients
+    /// look.
     pub fn looked_for(&mut self, mut topics: BTreeSet<TopicId>) -> Vec<PortEvent> {
         while topics.len() > MOST_CALLS {
             topics.pop_last();
@@ -391,8 +399,8 @@ impl<S: Send> Calls<S> {
         events
     }
 
-    /// Offers calls that wait and `may` be offered under their names here, at most so many. Reports the types of their
-    /// services.
+    /// Offers at most `most` waiting calls that `may` be offered under their names in this space.
+    /// Reports the types of their services.
     pub fn offer_waiting<G: CallGraph<Server = S>>(
         &mut self,
         graph: &mut G,
@@ -412,7 +420,7 @@ impl<S: Send> Calls<S> {
                 continue;
             };
             if known.described.role != CallRole::Call {
-                // A part of an action is no service of its own.
+                // A part of an action is not a service by itself.
                 known.state = State::Refused;
                 continue;
             }
@@ -423,7 +431,7 @@ impl<S: Send> Calls<S> {
                 });
                 continue;
             }
-            // One name has one service.
+            // A name has only one service.
             self.leaving.retain(|(_, left, _)| *left != topic);
             let asker = Asker {
                 topic,
@@ -465,17 +473,17 @@ impl<S: Send> Calls<S> {
         events
     }
 
-    /// What the services were asked next. Cancel-safe.
+    /// Returns the next request of the services. Cancel-safe.
     pub async fn recv<G: CallGraph<Server = S>>(&mut self) -> PortEvent {
         std::future::poll_fn(|cx| self.poll_recv::<G>(cx)).await
     }
 
-    /// As [`recv`](Self::recv), for ports that poll.
+    /// Polls for the events of [`recv`](Self::recv), for ports that poll.
     pub fn poll_recv<G: CallGraph<Server = S>>(&mut self, cx: &mut Context<'_>) -> Poll<PortEvent> {
         loop {
             let said = match self.said.poll_recv(cx) {
                 Poll::Ready(Some(said)) => said,
-                // Never `None` while we hold a sender ourselves.
+                // Never `None`, because `self` holds a sender.
                 Poll::Ready(None) | Poll::Pending => return Poll::Pending,
             };
             match said {
@@ -486,7 +494,8 @@ impl<S: Send> Calls<S> {
                     timeout,
                     answer,
                 } => {
-                    // One that was withdrawn meanwhile answers by the end of its sender.
+                    // The request of a service that was withdrawn meanwhile fails when its sender
+                    // is dropped.
                     let Some((timeout, says_no)) = self.how_asked::<G>(topic, timeout) else {
                         continue;
                     };
@@ -512,7 +521,8 @@ impl<S: Send> Calls<S> {
         }
     }
 
-    /// How long the answer to a request is waited for, and the type of an answer that says no, where there is one.
+    /// Returns the timeout of a request, and the type of a response that reports failure, if there
+    /// is one.
     fn how_asked<G: CallGraph<Server = S>>(
         &self,
         topic: TopicId,
@@ -534,7 +544,8 @@ impl<S: Send> Calls<S> {
         }
     }
 
-    /// Asks a part of an action, which is no service of its own; its [`timeout`](Asker::within) is to be given.
+    /// Returns the [`Asker`] of a part of an action, which is not a service by itself. Set its
+    /// timeout with [`within`](Asker::within).
     #[must_use]
     pub fn asker(&self, topic: TopicId) -> Asker {
         Asker {
@@ -545,7 +556,7 @@ impl<S: Send> Calls<S> {
         }
     }
 
-    /// Hands an answer to who asked.
+    /// Passes a response to its caller.
     pub fn answered(&mut self, ask: AskId, answer: Answered<Bytes>) {
         let Some(asked) = self.asked.remove(&ask) else {
             return;
@@ -567,14 +578,15 @@ impl Asked {
     fn fail(self, kind: AskErrorKind, why: &str) {
         debug!(topic = %self.topic, why, "a call came to nothing");
         let no = self.says_no.and_then(|response| no(&response, why));
-        // Who asked may have gone.
+        // The caller may have given up.
         let text = why.to_owned();
         drop(self.answer.send(no.ok_or(AskFault { kind, text })));
     }
 }
 
-/// The response that says no, with the reason, in services of a ROS that has no word for failure: one of the type
-/// `std_srvs/Trigger`, or of another with nothing but `success` and `message`.
+/// Encodes the response that reports failure with the reason, for services of a ROS without call
+/// errors. The response type has to consist of `success` and `message` only, as in
+/// `std_srvs/Trigger`.
 fn no(response: &Arc<MessageType>, why: &str) -> Option<Bytes> {
     let paths: Vec<&str> = response
         .leaves()
@@ -598,17 +610,18 @@ fn no(response: &Arc<MessageType>, why: &str) -> Option<Bytes> {
     Some(bytes.into())
 }
 
-/// Goal, cancel and result.
+/// The calls of an action: goal, cancel and result.
 const CALLS_OF_ACTION: usize = 3;
-/// Calls that are offered as services: anybody in the space can announce some.
+/// The maximal number of calls offered as services: any publisher in the space can announce calls.
 const MOST_CALLS: usize = 1024;
-/// What who waits is told when the one who executes a call is gone.
+/// The failure text for waiting callers of a lost call.
 const GONE: &str = "whoever executes the call is gone; it is not known whether it was executed";
-/// From when on that is told: the Router may have an answer yet.
+/// How long after the loss of a call the waiting callers receive the failure: the Router may still
+/// receive a response.
 const ANSWERED_AFTER: Duration = Duration::from_secs(1);
-/// How long a service stays when its call is gone, so that it can be told.
+/// How long the service of a lost call stays, so that its callers can receive the failure.
 const LEFT_AFTER: Duration = Duration::from_secs(2);
-/// How long a call may take: services of ROS have no deadline of their own.
+/// Time limit of a call: services of ROS have no deadline of their own.
 const ANSWERED_WITHIN: Duration = Duration::from_secs(30);
-/// Questions of all services that are under way.
+/// The maximal number of open requests of all services.
 const MOST_ASKED: usize = 512;

@@ -1,11 +1,11 @@
-//! The one place that reads the clocks.
+//! The only module that reads the clocks.
 
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use bridge_core::Now;
 use uadp::Timestamp;
 
-/// Both clocks, now.
+/// Reads both clocks.
 #[must_use]
 #[expect(clippy::disallowed_methods, reason = "the shell's one clock read")]
 pub fn now() -> Now {
@@ -15,15 +15,16 @@ pub fn now() -> Now {
     }
 }
 
-/// A system time as OPC UA has it. Times before 1970 are taken as 1970.
+/// Converts a system time to an OPC UA time. Times before 1970 become 1970.
 #[must_use]
 pub fn timestamp(at: SystemTime) -> Timestamp {
     let since = at.duration_since(UNIX_EPOCH).unwrap_or_default();
     Timestamp::from_unix_nanos(i128::try_from(since.as_nanos()).unwrap_or(i128::MAX))
 }
 
-/// Returns the fault of a clock that is not set, such as that of a computer without a battery before it has asked a
-/// time server. Values get wrong times then, and certificates of others are not valid yet.
+/// Returns the fault of a clock that is not set, such as the clock of a computer without a battery
+/// before it has reached a time server. Values then get wrong times, and certificates of other
+/// participants are not valid yet.
 #[must_use]
 pub(crate) fn fault(utc: Timestamp) -> Option<String> {
     let first_day = timestamp(UNIX_EPOCH + PLAUSIBLE);

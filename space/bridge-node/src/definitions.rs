@@ -22,7 +22,8 @@ pub struct Definitions {
 }
 
 impl Definitions {
-    /// With the built-in definitions of one ROS, those of the mapping's `type_paths`, and the ROS installations there are.
+    /// With the built-in definitions of one ROS, those of the mapping's `type_paths`, and the ROS
+    /// installations there are.
     #[must_use]
     pub fn new(dialect: Dialect, types: Arc<TypePaths>, environment: Environment) -> Self {
         Self {
@@ -110,9 +111,10 @@ impl Definitions {
         found.map(Arc::new)
     }
 
-    /// What people are to be told of an error of [`find`](Self::find), or of [`find_service`](Self::find_service) for the
-    /// kind of services: with the known name that may be meant. Only for what is shown, as it compares all names; of many
-    /// unknown ones, which peers can make up, only the first are compared.
+    /// What people are to be told of an error of [`find`](Self::find), or of
+    /// [`find_service`](Self::find_service) for the kind of services: with the known name that may
+    /// be meant. Only for what is shown, as it compares all names; of many unknown ones, which
+    /// peers can make up, only the first are compared.
     pub fn explain(&mut self, kind: TextKind, error: &DefinitionError) -> String {
         let DefinitionError::Unknown { name, needed_by } = error else {
             return error.to_string();
@@ -132,8 +134,8 @@ impl Definitions {
         }
     }
 
-    /// Explains an error of a type whose definition only files bring. `wanted` says which file is needed; a file that is there
-    /// and is of the other ROS is named instead.
+    /// Explains an error of a type whose definition only files bring. `wanted` says which file is
+    /// needed; a file that is there and is of the other ROS is named instead.
     pub fn explain_missing(
         &mut self,
         (kind, name): (TextKind, &TypeName),
@@ -208,7 +210,8 @@ fn tell_differing(name: &TypeName, file: &str, only_file: &[String], only_built_
     );
 }
 
-/// Unknown names that are compared with the known ones, from one change of the definitions to the next.
+/// Unknown names that are compared with the known ones, from one change of the definitions to the
+/// next.
 const MOST_SUGGESTIONS: u32 = 64;
 /// Types of peers whose origin is kept in mind.
 const MOST_PEERS: usize = 4096;

@@ -1,7 +1,8 @@
 //! Services of the graph as calls of the space: others ask, a service here executes.
 //!
-//! A service is a call where the mapping says so, or where it has the name of one of our own space (`/ua_1_2_61`). It is
-//! offered while it is there. Each execution is a task of its own, so that a slow service holds nothing up.
+//! A service is a call where the mapping says so, or where it has the name of one of our own space
+//! (`/ua_1_2_61`). It is offered while it is there. Each execution is a task of its own, so that a
+//! slow service holds nothing up.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
@@ -94,7 +95,8 @@ impl<C> Default for Executing<C> {
 }
 
 impl<C: ServiceCall + Sync> Executing<C> {
-    /// Whether a service of that name is a call of our own space by its name, so that its type has to be found out.
+    /// Whether a service of that name is a call of our own space by its name, so that its type has
+    /// to be found out.
     #[must_use]
     pub fn is_named(policy: &Policy, service: &str) -> bool {
         present::named(policy, service).is_some()
@@ -105,7 +107,8 @@ impl<C: ServiceCall + Sync> Executing<C> {
         present::mapped(mapping, policy, CallKind::Service)
     }
 
-    /// Compares the services there are with those that are offered as calls, and begins to offer `most` at most.
+    /// Compares the services there are with those that are offered as calls, and begins to offer
+    /// `most` at most.
     pub fn reconcile<G: ExecutorGraph<Executor = C>>(
         &mut self,
         graph: &mut G,
@@ -194,7 +197,8 @@ impl<C: ServiceCall + Sync> Executing<C> {
         self.served.contains_key(&topic)
     }
 
-    /// Calls the service of a call that is executed here. What becomes of it comes from [`recv`](Self::recv).
+    /// Calls the service of a call that is executed here. What becomes of it comes from
+    /// [`recv`](Self::recv).
     ///
     /// # Errors
     /// Why it is not called.
@@ -251,7 +255,8 @@ impl<C: ServiceCall + Sync> Executing<C> {
     }
 }
 
-/// One execution. It goes on when its call is withdrawn, and ends in the time that its client gives a call.
+/// One execution. It goes on when its call is withdrawn, and ends in the time that its client gives
+/// a call.
 async fn run<C: ServiceCall + Sync>(
     client: Arc<C>,
     (execution, request): (ExecutionId, Bytes),

@@ -2,8 +2,8 @@
 
 use std::process::ExitCode;
 
-/// Why a program cannot run or had to end: what to tell, and the exit code of `sysexits.h` that says whose it is to
-/// mend.
+/// Why a program cannot run or had to end: what to tell, and the exit code of `sysexits.h` that
+/// says whose it is to mend.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{message}")]
 pub struct Failure {

@@ -1,4 +1,5 @@
-//! The keys of secured groups: read from files, looked at again from time to time, and fetched from Security Key Services.
+//! The keys of secured groups: read from files, looked at again from time to time, and fetched from
+//! Security Key Services.
 
 mod fetch;
 mod file;
@@ -85,7 +86,8 @@ impl KeyRing {
         Ok(())
     }
 
-    /// Looks after the keys of the groups of a mapping from now on. Those of files are read by their keepers.
+    /// Looks after the keys of the groups of a mapping from now on. Those of files are read by
+    /// their keepers.
     pub(crate) fn follow(&mut self, mapping: &Mapping) {
         let groups = mapping.security();
         let stays = |keeper: &Keeper| groups.contains(&keeper.group);

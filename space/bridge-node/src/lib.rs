@@ -1,7 +1,9 @@
-//! What the programs of the space share: the port trait, the run loop, arguments, logging and metrics.
+//! Shared parts of the bridge programs: the port trait, the run loop, arguments, logging and
+//! metrics.
 //!
-//! A program implements [`Program`] and [`Port`], and its `main` is [`run`]. This crate does not know which ROS it
-//! serves (that is the port) nor how UADP bytes look (that is `bridge-core`).
+//! A program implements [`Program`] and [`Port`], and its `main` is [`run`]. This crate is
+//! independent of the ROS version (the port handles it) and of the UADP encoding (`bridge-core`
+//! handles it).
 
 pub mod actions;
 mod arguments;

@@ -1,5 +1,5 @@
-//! Log lines for people (text) or for machines (one JSON object a line), on stderr; and what a program warns of, for
-//! whoever in it publishes that elsewhere.
+//! Log lines for people (text) or for machines (one JSON object a line), on stderr; and what a
+//! program warns of, for whoever in it publishes that elsewhere.
 
 mod limit;
 
@@ -27,8 +27,8 @@ pub enum LogFormat {
     Json,
 }
 
-/// Starts logging. `UA_LOG` sets levels as `debug` or `info,bridge_core=trace`; `quiet` holds the directives that
-/// hush what a library says without need.
+/// Starts logging. `UA_LOG` sets levels as `debug` or `info,bridge_core=trace`; `quiet` holds the
+/// directives that hush what a library says without need.
 pub(crate) fn start(format: LogFormat, quiet: &str) {
     let levels = std::env::var("UA_LOG").unwrap_or_else(|_| "info".to_owned());
     let filter = EnvFilter::builder().parse_lossy(format!("{quiet},{levels}"));
@@ -58,12 +58,13 @@ pub(crate) fn start(format: LogFormat, quiet: &str) {
     }
 }
 
-/// Writes each event as one line, whatever its texts hold: names, reasons and errors come from peers, and a line break in
-/// one of them would make a line of their own.
+/// Writes each event as one line, whatever its texts hold: names, reasons and errors come from
+/// peers, and a line break in one of them would make a line of their own.
 #[derive(Debug)]
 struct OneLine<W> {
     to: W,
-    /// Whether events are coloured, by the control character that begins a sequence. Those in texts are escaped before.
+    /// Whether events are coloured, by the control character that begins a sequence. Those in texts
+    /// are escaped before.
     colour: bool,
 }
 
@@ -83,7 +84,8 @@ impl<W: Write> Write for OneLine<W> {
     }
 }
 
-/// Adds the number of suppressed messages to a line: a further field of JSON, or of a line for people.
+/// Adds the number of suppressed messages to a line: a further field of JSON, or of a line for
+/// people.
 fn with_suppressed(line: &str, suppressed: u64) -> Cow<'_, str> {
     match (suppressed, line.strip_suffix('}')) {
         (0, _) => Cow::Borrowed(line),
@@ -94,8 +96,8 @@ fn with_suppressed(line: &str, suppressed: u64) -> Cow<'_, str> {
     }
 }
 
-/// The text with its control characters, line breaks, and marks that turn the direction of what is around them escaped,
-/// but for those that `stay`.
+/// The text with its control characters, line breaks, and marks that turn the direction of what is
+/// around them escaped, but for those that `stay`.
 fn escaped(text: &str, stay: impl Fn(char) -> bool) -> Cow<'_, str> {
     let breaks = |c: char| match c {
         '\u{2028}' | '\u{2029}' | '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}' => true,
@@ -136,8 +138,9 @@ pub trait LogSink: Send + Sync + 'static {
     fn hear(&self, record: LogRecord);
 }
 
-/// Has `sink` hear every warning and error of our own crates from now on, for as long as it is there. Those of
-/// libraries are left out: a sink that uses the library would hear of its own doing.
+/// Has `sink` hear every warning and error of our own crates from now on, for as long as it is
+/// there. Those of libraries are left out: a sink that uses the library would hear of its own
+/// doing.
 pub fn hear_log(sink: &Arc<impl LogSink>) {
     let sink: Arc<dyn LogSink> = Arc::clone(sink) as _;
     let mut sinks = SINKS.write().unwrap_or_else(PoisonError::into_inner);

@@ -160,8 +160,8 @@ fn key(used: &TypeUse) -> (Dialect, TextKind, TypeName) {
     (used.dialect, used.kind, used.name.clone())
 }
 
-/// The files and the environment of this process. Remembers each file and folder it was asked for, and how that was
-/// before it was read.
+/// The files and the environment of this process. Remembers each file and folder it was asked for,
+/// and how that was before it was read.
 #[derive(Debug)]
 struct Disk<'r> {
     /// What runs, for definitions that cannot be had.
@@ -270,9 +270,10 @@ impl MappingFile {
         }
     }
 
-    /// Reads the mapping for the first time and prints its findings, as they are for a program of the `spaces` it says of a
-    /// mapping. Without a file: zero configuration. `None`: with `only_check`, it was checked and can run; where it does not
-    /// say which spaces the program serves, for everybody.
+    /// Reads the mapping for the first time and prints its findings, as they are for a program of
+    /// the `spaces` it says of a mapping. Without a file: zero configuration. `None`: with
+    /// `only_check`, it was checked and can run; where it does not say which spaces the program
+    /// serves, for everybody.
     ///
     /// # Errors
     /// A file that cannot be read, or a mapping that cannot run.
@@ -342,13 +343,13 @@ impl MappingFile {
         &self.running
     }
 
-    /// Reads the files again whenever one of them was saved, and at each SIGHUP, and tells `shells` of what is to run. Never
-    /// ends.
+    /// Reads the files again whenever one of them was saved, and at each SIGHUP, and tells `shells`
+    /// of what is to run. Never ends.
     ///
-    /// The files are looked at, not listened to: that sees what inotify does not, as a folder of a container that is
-    /// mounted anew and files on a network, costs a handful of system calls, and is how a file that is being written is
-    /// waited for in any case. Of the definitions, of which there may be thousands, a bounded number has its turn with
-    /// each look.
+    /// The files are looked at, not listened to: that sees what inotify does not, as a folder of a
+    /// container that is mounted anew and files on a network, costs a handful of system calls, and
+    /// is how a file that is being written is waited for in any case. Of the definitions, of which
+    /// there may be thousands, a bounded number has its turn with each look.
     pub(crate) async fn follow(mut self, mut hangup: Signal, shells: watch::Sender<Running>) {
         let mut looks = interval(LOOK);
         looks.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -379,7 +380,8 @@ impl MappingFile {
                 known: Arc::clone(&self.known),
             };
             turn = turn.wrapping_add(1);
-            // One at a time: what is saved meanwhile differs from what was seen before the reading, and a signal is kept.
+            // One at a time: what is saved meanwhile differs from what was seen before the reading,
+            // and a signal is kept.
             let looked = look.take_elsewhere().await;
             if looked.gone && !self.gone {
                 self.lose();
@@ -507,7 +509,8 @@ impl MappingFile {
         about.variables = mapping.variables().len();
         about.reloads += 1;
         about.stale = reason(reading.types.kept());
-        // A copy, made by this thread: that of the thread that read lies among what it left, whose room would stay taken.
+        // A copy, made by this thread: that of the thread that read lies among what it left, whose
+        // room would stay taken.
         self.running.mapping = Arc::new(mapping.clone());
         self.running.types = reading.types;
         self.known = Arc::new(reading.known);
@@ -536,8 +539,8 @@ fn tell(findings: &[Diagnostic]) {
 }
 
 impl Reading {
-    /// Types that are not built in are the rule with robots of a make, and what comes of them is told when they are met.
-    /// Says whether there are such findings, which are taken out.
+    /// Types that are not built in are the rule with robots of a make, and what comes of them is
+    /// told when they are met. Says whether there are such findings, which are taken out.
     fn leave_to_the_run(&mut self, file: &Path) -> bool {
         let findings = &mut self.checked.findings;
         let before = findings.len();
@@ -573,8 +576,8 @@ fn seconds() -> i64 {
 
 /// How often the files are looked at. One that was the same twice is no longer being written.
 const LOOK: Duration = Duration::from_millis(250);
-/// After so many looks, ten seconds, folders of definitions that could not be listed are looked into again, whatever can
-/// be seen of them.
+/// After so many looks, ten seconds, folders of definitions that could not be listed are looked
+/// into again, whatever can be seen of them.
 const AGAIN: usize = 40;
 /// Faulty definitions named in one go; more are of one cause.
 const MOST_TOLD: usize = 10;

@@ -31,7 +31,8 @@ pub trait Told: Send + 'static {
     /// What keeps it from its work, a line each; nothing where it can do it. For /readyz.
     fn not_ready(&self) -> Vec<String>;
 
-    /// Returns the peers that the program waits for, a line each. The program is ready without them. For /readyz.
+    /// Returns the peers that the program waits for, a line each. The program is ready without
+    /// them. For /readyz.
     fn waiting_for(&self) -> Vec<String> {
         Vec::new()
     }
@@ -56,8 +57,8 @@ pub async fn serve_pages<T: Told>(address: Option<SocketAddr>) -> Result<Request
     Ok(requests.unwrap_or_else(never))
 }
 
-/// Listens at `address` and gives each of so many run loops its requests to answer. Without an address there are
-/// never any.
+/// Listens at `address` and gives each of so many run loops its requests to answer. Without an
+/// address there are never any.
 pub(crate) async fn serve<T: Told>(
     address: Option<SocketAddr>,
     loops: usize,
@@ -110,8 +111,9 @@ async fn accept<T: Told>(listener: TcpListener, ask: Ask<T>) {
     }
 }
 
-/// The open connections in the order in which they came. Who comes is always let in: where there are too many, the
-/// oldest gives way, of the same address if that has its share. A request takes milliseconds, so what is old is idle.
+/// The open connections in the order in which they came. Who comes is always let in: where there
+/// are too many, the oldest gives way, of the same address if that has its share. A request takes
+/// milliseconds, so what is old is idle.
 #[derive(Debug, Default)]
 struct Crowd {
     open: VecDeque<(IpAddr, AbortHandle)>,

@@ -21,23 +21,24 @@ use crate::awaited::AwaitedPeers;
 
 /// The local side of a bridge: a ROS 1 graph, a DDS domain, or an OPC UA address space.
 ///
-/// The shell polls [`recv`](Self::recv) beside the socket, and hands over what the Router lets pass. Topic names are
-/// resolved once, when a port subscribes; the samples carry the [`TopicId`].
+/// The shell polls [`recv`](Self::recv) beside the socket, and hands over what the Router lets
+/// pass. Topic names are resolved once, when a port subscribes; the samples carry the [`TopicId`].
 pub trait Port: Send + 'static {
-    /// The next thing that happened on this side. Cancel-safe: dropping the future loses nothing. Pends while there
-    /// is nothing.
+    /// The next thing that happened on this side. Cancel-safe: dropping the future loses nothing.
+    /// Pends while there is nothing.
     fn recv(&mut self) -> impl Future<Output = PortEvent> + Send;
 
     /// Publishes a sample of another space. Never waits.
     ///
-    /// `payload` is a ROS 1 message body without its length, a CDR with its 4 byte encapsulation header, or a block
-    /// of OPC UA fields, as the port's [`Local`](bridge_core::Local) says.
+    /// `payload` is a ROS 1 message body without its length, a CDR with its 4 byte encapsulation
+    /// header, or a block of OPC UA fields, as the port's [`Local`](bridge_core::Local) says.
     ///
     /// # Errors
     /// A short reason under which the sample is counted as dropped.
     fn publish(&mut self, sample: Delivery) -> Result<(), &'static str>;
 
-    /// Returns the handover of the last [published](Self::publish) value of a topic that is confirmed.
+    /// Returns the handover of the last [published](Self::publish) value of a topic that is
+    /// confirmed.
     fn handover(&self, topic: TopicId) -> Handover {
         let _shown_at_once = topic;
         Handover::Done
@@ -48,9 +49,10 @@ pub trait Port: Send + 'static {
         let _nobody_waits = (topic, arrival);
     }
 
-    /// The Router heard a value of another space whose local type is not known yet, or what its writer says it is. The
-    /// port finds a type (mapping, then a local subscriber's, then what is described, then the standard type of the value)
-    /// and answers with [`PortEvent::Bound`], now or when a subscriber comes; it is asked again while values arrive.
+    /// The Router heard a value of another space whose local type is not known yet, or what its
+    /// writer says it is. The port finds a type (mapping, then a local subscriber's, then what is
+    /// described, then the standard type of the value) and answers with [`PortEvent::Bound`], now
+    /// or when a subscriber comes; it is asked again while values arrive.
     fn wanted(
         &mut self,
         topic: TopicId,
@@ -58,12 +60,13 @@ pub trait Port: Send + 'static {
         described: Option<&Described>,
     );
 
-    /// A topic of another space has had no good value for its receive timeout, or has one again: its writer is not heard, or
-    /// all it sends is dropped, be it by [`publish`](Self::publish).
+    /// A topic of another space has had no good value for its receive timeout, or has one again:
+    /// its writer is not heard, or all it sends is dropped, be it by [`publish`](Self::publish).
     fn silent(&mut self, topic: TopicId, silent: bool);
 
-    /// Of the values a topic has side by side, one is no longer there for who comes late: the one delivered with that
-    /// [`instance`](Delivery::instance). Nothing to do for a side that keeps the last value only.
+    /// Of the values a topic has side by side, one is no longer there for who comes late: the one
+    /// delivered with that [`instance`](Delivery::instance). Nothing to do for a side that keeps
+    /// the last value only.
     fn retired(&mut self, topic: TopicId, instance: Timestamp) {
         let _one_value = (topic, instance);
     }
@@ -83,28 +86,31 @@ pub trait Port: Send + 'static {
         let _never_asked = (ask, topic, answer);
     }
 
-    /// Executes a request for a call that was reported as [`PortEvent::Offer`]: what it came to is reported as
-    /// [`PortEvent::Executed`]. Never waits. False where it is not executed, for which nothing is to be reported.
+    /// Executes a request for a call that was reported as [`PortEvent::Offer`]: what it came to is
+    /// reported as [`PortEvent::Executed`]. Never waits. False where it is not executed, for which
+    /// nothing is to be reported.
     fn execute(&mut self, execution: Execution) -> bool {
         let _never_offered = execution;
         false
     }
 
-    /// Who asked for an execution does not want it any longer. It is to be reported as executed all the same.
+    /// Who asked for an execution does not want it any longer. It is to be reported as executed all
+    /// the same.
     fn abandoned(&mut self, execution: ExecutionId, topic: TopicId) {
         let _goes_on = (execution, topic);
     }
 
-    /// Somebody else writes a namespace of ours, and nothing of ours is sent in it; or, without anybody, no longer. The
-    /// program is not ready meanwhile, and that is told.
+    /// Somebody else writes a namespace of ours, and nothing of ours is sent in it; or, without
+    /// anybody, no longer. The program is not ready meanwhile, and that is told.
     fn taken(&mut self, namespace: u16, by: Option<SocketAddr>) {
         let _told_by_the_shell = (namespace, by);
     }
 
-    /// Another mapping takes the place of the one there is. What both say alike goes on undisturbed; what only the old one
-    /// says is given up ([`PortEvent::Unbound`]), and what only the new one says taken up. Returns what is not changed
-    /// while the program runs, by its keys in the mapping and with the reason, for people. `types` are the definitions of
-    /// its `type_paths`, which may be others although the mapping is the same.
+    /// Another mapping takes the place of the one there is. What both say alike goes on
+    /// undisturbed; what only the old one says is given up ([`PortEvent::Unbound`]), and what only
+    /// the new one says taken up. Returns what is not changed while the program runs, by its keys
+    /// in the mapping and with the reason, for people. `types` are the definitions of its
+    /// `type_paths`, which may be others although the mapping is the same.
     fn reload(&mut self, mapping: &Arc<Mapping>, types: &Arc<TypePaths>) -> Vec<String>;
 
     /// What the Router has counted by now, told every second: for sides that show it.
@@ -112,13 +118,14 @@ pub trait Port: Send + 'static {
         let _shown_by_the_shell = router;
     }
 
-    /// What keeps this side from doing its work now, such as a ROS master that does not answer: for people.
+    /// What keeps this side from doing its work now, such as a ROS master that does not answer: for
+    /// people.
     fn hindrance(&self) -> Option<String> {
         None
     }
 
-    /// Adds the peers of this side that the mapping needs and that are missing, such as a topic without a publisher. The
-    /// run loop asks each second.
+    /// Adds the peers of this side that the mapping needs and that are missing, such as a topic
+    /// without a publisher. The run loop asks each second.
     fn add_awaited(&self, missing: &mut AwaitedPeers) {
         let _needs_no_peers = missing;
     }
@@ -133,23 +140,26 @@ pub trait Port: Send + 'static {
         None
     }
 
-    /// The program is to end: what this side works on elsewhere is to be cancelled as far as it ends with the program. The
-    /// shell goes on until nothing is [pending](Self::pending), 5 s at most. Never waits.
+    /// The program is to end: what this side works on elsewhere is to be cancelled as far as it
+    /// ends with the program. The shell goes on until nothing is [pending](Self::pending), 5 s at
+    /// most. Never waits.
     fn closing(&mut self) {}
 
-    /// Lists goals and runs with a pending cancellation, a line each: they are being cancelled, and their end is not known.
+    /// Lists goals and runs with a pending cancellation, a line each: they are being cancelled, and
+    /// their end is not known.
     fn pending(&self) -> Vec<String> {
         Vec::new()
     }
 
-    /// What the program tells whoever asks the group which applications there are. `None` of one that is no server: what it
-    /// is says the shell.
+    /// What the program tells whoever asks the group which applications there are. `None` of one
+    /// that is no server: what it is says the shell.
     fn application(&self) -> Option<Application> {
         None
     }
 
-    /// The addresses of this host that this side has taken for good when it started, all there were where the list is
-    /// empty: its library cannot go over to others. `None` where it goes by itself.
+    /// The addresses of this host that this side has taken for good when it started, all there were
+    /// where the list is empty: its library cannot go over to others. `None` where it goes by
+    /// itself.
     fn addresses(&self) -> Option<&[IpAddr]> {
         None
     }
@@ -158,7 +168,8 @@ pub trait Port: Send + 'static {
     fn shutdown(self) -> impl Future<Output = ()> + Send;
 }
 
-/// A server that a side has a link to, by its name in the mapping, and what came and went over it since the start.
+/// A server that a side has a link to, by its name in the mapping, and what came and went over it
+/// since the start.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
 pub struct LinkState {
     /// What the mapping calls it.
@@ -180,7 +191,8 @@ pub struct LinkState {
     pub values: u64,
     /// Values that were written there.
     pub written: u64,
-    /// Values that were not: the server refused them, they waited too long, or they gave way to newer ones.
+    /// Values that were not: the server refused them, they waited too long, or they gave way to
+    /// newer ones.
     pub not_written: u64,
     /// What cannot be had there, by its name in the mapping, and why.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
@@ -197,10 +209,11 @@ pub struct Delivery {
     pub topic: TopicId,
     /// Its bytes in the port's encoding.
     pub payload: Bytes,
-    /// When its producer's bridge took it (the DataSetMessage Timestamp, or the SourceTimestamp of a DataValue), where the writer
-    /// says so.
+    /// When its producer's bridge took it (the DataSetMessage Timestamp, or the SourceTimestamp of
+    /// a DataValue), where the writer says so.
     pub source: Option<Timestamp>,
-    /// The status of the message or of its DataValue: the upper 16 bits of an OPC UA StatusCode, 0 for Good.
+    /// The status of the message or of its DataValue: the upper 16 bits of an OPC UA StatusCode, 0
+    /// for Good.
     pub status: u16,
     /// The DataSetMessage Timestamp, where it tells this value from all others of the topic.
     pub instance: Option<Timestamp>,
@@ -213,7 +226,8 @@ pub struct Delivery {
 /// What a port reports.
 #[derive(Debug)]
 pub enum PortEvent {
-    /// The local type of a topic is known, for the first time or anew: values can be transcoded from now on.
+    /// The local type of a topic is known, for the first time or anew: values can be transcoded
+    /// from now on.
     Bound {
         /// Which value.
         topic: TopicId,
@@ -231,7 +245,8 @@ pub enum PortEvent {
         /// What is said of it, and how it queues.
         note: ValueNote,
     },
-    /// The local side no longer has a topic, or will bind it to something else: the mapping has changed.
+    /// The local side no longer has a topic, or will bind it to something else: the mapping has
+    /// changed.
     Unbound {
         /// Which value.
         topic: TopicId,
@@ -244,8 +259,8 @@ pub enum PortEvent {
         payload: Bytes,
         /// When it came.
         received: Timestamp,
-        /// Who published it, if that publisher latches: the same for as long as it is there, and for no other of the
-        /// topic.
+        /// Who published it, if that publisher latches: the same for as long as it is there, and
+        /// for no other of the topic.
         latched_by: Option<PublisherKey>,
     },
     /// As `Sample`, of a side that knows the quality of its values.
@@ -293,8 +308,8 @@ pub enum PortEvent {
         /// How many.
         count: u64,
     },
-    /// A publisher or subscriber of the topic asks for or offers what excludes ours, so that nothing passes between them.
-    /// Counted; the port tells of it.
+    /// A publisher or subscriber of the topic asks for or offers what excludes ours, so that
+    /// nothing passes between them. Counted; the port tells of it.
     Unmatched {
         /// Which value.
         topic: TopicId,
@@ -327,7 +342,8 @@ pub enum PortEvent {
         /// Which call.
         topic: TopicId,
     },
-    /// The local side has somebody who would ask for a call: what it is is asked of who executes it.
+    /// The local side has somebody who would ask for a call: what it is is asked of who executes
+    /// it.
     CallWanted {
         /// Which call.
         topic: TopicId,
@@ -355,7 +371,8 @@ pub enum PortEvent {
         /// What it is.
         offered: Offered,
     },
-    /// As `Offer`, for a ROS service: requests are handed out, and responses taken, as its messages.
+    /// As `Offer`, for a ROS service: requests are handed out, and responses taken, as its
+    /// messages.
     OfferTyped {
         /// Which call: of a namespace that the program owns.
         topic: TopicId,
@@ -374,7 +391,7 @@ pub enum PortEvent {
         /// Its outcome.
         outcome: Executed,
     },
-    /// The port cannot go on, such as a ROS 1 node that was told to shut down because another took its name. The
-    /// program ends with this message.
+    /// The port cannot go on, such as a ROS 1 node that was told to shut down because another took
+    /// its name. The program ends with this message.
     Ended(String),
 }

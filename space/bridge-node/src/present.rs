@@ -1,5 +1,5 @@
-//! Which services and actions of a graph are executed for the space: those that the mapping names, and those that have the
-//! name of a call of our own space (`/ua_1_2_61`).
+//! Which services and actions of a graph are executed for the space: those that the mapping names,
+//! and those that have the name of a call of our own space (`/ua_1_2_61`).
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -47,7 +47,8 @@ pub(crate) fn mapped<'m>(
     targets.map(|(_, target)| target.name.as_str()).collect()
 }
 
-/// Those of that kind that are there, by the mapping or by their names. One of another type than the mapping says is not.
+/// Those of that kind that are there, by the mapping or by their names. One of another type than
+/// the mapping says is not.
 pub(crate) fn found<'p>(
     policy: &'p Policy,
     present: &'p Present,

@@ -60,7 +60,8 @@ pub trait Program: Parser {
     /// The arguments all programs have.
     fn arguments(&self) -> &Arguments;
 
-    /// Whether it listens for a moment for somebody else in its namespaces before it sends anything in them.
+    /// Whether it listens for a moment for somebody else in its namespaces before it sends anything
+    /// in them.
     const CLAIMS: bool = false;
 
     /// A mapping made in code, in place of a file: for programs with a configuration of their own.
@@ -84,14 +85,15 @@ pub trait Program: Parser {
         None
     }
 
-    /// Tells of a space that it carries elsewhere than in the group, as by mDNS, for as long as what this gives is kept.
-    /// `None` where it does not.
+    /// Tells of a space that it carries elsewhere than in the group, as by mDNS, for as long as
+    /// what this gives is kept. `None` where it does not.
     fn tell(&self, carried: &Carried<'_>) -> Option<Box<dyn Send + Sync>> {
         let _nobody = carried;
         None
     }
 
-    /// The spaces it serves, none of them twice: each with a local side, a Router and a place in the group of its own.
+    /// The spaces it serves, none of them twice: each with a local side, a Router and a place in
+    /// the group of its own.
     ///
     /// # Errors
     /// When neither the arguments nor the mapping say which, or they contradict each other.
@@ -141,8 +143,8 @@ pub struct Context {
     pub own: SpaceId,
 }
 
-/// Runs a program from its command line to its end. `arguments` begin with the name of the program, as those of
-/// [`std::env::args_os`] do.
+/// Runs a program from its command line to its end. `arguments` begin with the name of the program,
+/// as those of [`std::env::args_os`] do.
 #[must_use]
 pub fn run<P: Program>(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
     let program: P = match service::parse(arguments) {
@@ -202,7 +204,8 @@ fn serve<P: Program>(program: P, file: MappingFile) -> Result<(), Failure> {
             let shell = prepare(&program, &changes, (own, several), requests);
             let shell = shell.instrument(span.clone());
             let ended = shell.await?.run(told(stop.clone()));
-            // As tasks of their own: waking the future given to `block_on` costs a system call each time.
+            // As tasks of their own: waking the future given to `block_on` costs a system call each
+            // time.
             shells.spawn(ended.instrument(span));
         }
         let mut ended = Ok(());
@@ -307,7 +310,8 @@ async fn told(mut stop: watch::Receiver<bool>) {
     let _told_or_alone = stop.wait_for(|stop| *stop).await;
 }
 
-/// What a program is that is no server. Its ApplicationUri is that of the certificate it fetches keys with.
+/// What a program is that is no server. Its ApplicationUri is that of the certificate it fetches
+/// keys with.
 fn plain(program: &str, own: SpaceId) -> Application {
     let host = std::fs::read_to_string(HOST_NAME).unwrap_or_default();
     let host = match host.trim() {

@@ -1,7 +1,8 @@
-//! Restarts the program as the same process, with the same arguments: libraries read the certificate of a server once.
+//! Restarts the program as the same process, with the same arguments: libraries read the
+//! certificate of a server once.
 //!
-//! The program ends as after SIGTERM, with goodbyes to the space and to clients, and executes its own file again. The process
-//! id stays.
+//! The program ends as after SIGTERM, with goodbyes to the space and to clients, and executes its
+//! own file again. The process id stays.
 
 use std::env;
 use std::os::unix::process::CommandExt as _;

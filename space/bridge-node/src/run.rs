@@ -136,7 +136,8 @@ impl<P: Port> Shell<P> {
         debug!(status = %status.json(), "the last status");
     }
 
-    /// All branches of the `select!` are cancel-safe: a socket and bounded channels that hold what was not taken.
+    /// All branches of the `select!` are cancel-safe: a socket and bounded channels that hold what
+    /// was not taken.
     async fn carry(
         &mut self,
         stop: impl Future<Output = ()> + Send,
@@ -156,7 +157,8 @@ impl<P: Port> Shell<P> {
             self.arm(timer.as_mut());
             let yields = std::mem::take(&mut more) || self.busy.looks(|| now().monotonic);
             tokio::select! {
-                // One more look at everything else: something is left of a long drain, or the next sample is near.
+                // One more look at everything else: something is left of a long drain, or the next
+                // sample is near.
                 () = tokio::task::yield_now(), if yields => {}
                 () = &mut stop => return Ok(()),
                 heard = self.udp.recv(&mut buffer) => more = self.heard_all(heard, &mut buffer),
@@ -179,8 +181,9 @@ impl<P: Port> Shell<P> {
         }
     }
 
-    /// A datagram and those that wait behind it, a bounded number, each carried on before the next is looked at. Under a
-    /// flood everybody else is then asked once for many of them. Says whether more may wait.
+    /// A datagram and those that wait behind it, a bounded number, each carried on before the next
+    /// is looked at. Under a flood everybody else is then asked once for many of them. Says whether
+    /// more may wait.
     fn heard_all(
         &mut self,
         first: io::Result<(usize, std::net::SocketAddr)>,
@@ -202,8 +205,8 @@ impl<P: Port> Shell<P> {
         true
     }
 
-    /// As [`heard_all`](Self::heard_all), of what the port reports. Where samples may share a datagram, those that wait
-    /// here are taken before any is sent.
+    /// As [`heard_all`](Self::heard_all), of what the port reports. Where samples may share a
+    /// datagram, those that wait here are taken before any is sent.
     async fn port_events(&mut self, first: PortEvent) -> Result<bool, Failure> {
         let mut event = first;
         for _ in 0..TAKEN_AT_ONCE {
@@ -224,7 +227,8 @@ impl<P: Port> Shell<P> {
         Ok(true)
     }
 
-    /// Says whether more than was carried out may wait; samples that are to share a datagram are left out of that.
+    /// Says whether more than was carried out may wait; samples that are to share a datagram are
+    /// left out of that.
     fn port_event_and_drain(&mut self, event: PortEvent) -> Result<bool, Failure> {
         if self.router.mapping().pubsub().messages_per_datagram == 1 {
             self.port_event(event)?;
@@ -443,7 +447,8 @@ impl<P: Port> Shell<P> {
         self.router.unbind(topic, now());
     }
 
-    /// Carries out what the Router wants done, a bounded number of things; says whether more may wait.
+    /// Carries out what the Router wants done, a bounded number of things; says whether more may
+    /// wait.
     #[expect(
         clippy::wildcard_enum_match_arm,
         reason = "those of calls, and those this program does not know"
@@ -588,8 +593,8 @@ fn tell(notice: &Notice) {
     warn!(topic, from, reason = %reason, total, "dropped: {detail}");
 }
 
-/// Outputs carried out before everybody else has a turn: where sending is slower than the Router's pace for large
-/// messages, there is always one more.
+/// Outputs carried out before everybody else has a turn: where sending is slower than the Router's
+/// pace for large messages, there is always one more.
 const DRAINED_AT_ONCE: usize = 64;
 /// Datagrams, or events of the port, that are carried on one behind the other.
 const TAKEN_AT_ONCE: usize = 32;

@@ -1,4 +1,5 @@
-//! A program of the plant that carries no space: from its command line to its end, without a mapping and a run loop.
+//! A program of the plant that carries no space: from its command line to its end, without a
+//! mapping and a run loop.
 
 use std::ffi::OsString;
 use std::process::ExitCode;
@@ -29,8 +30,8 @@ pub trait Service: Parser {
     ) -> impl Future<Output = Result<(), Failure>>;
 }
 
-/// Runs a program from its command line to its end, on one thread. `arguments` begin with the name of the program, as
-/// those of [`std::env::args_os`] do.
+/// Runs a program from its command line to its end, on one thread. `arguments` begin with the name
+/// of the program, as those of [`std::env::args_os`] do.
 #[must_use]
 pub fn run_service<S: Service>(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
     let service: S = match parse(arguments) {

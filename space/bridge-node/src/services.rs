@@ -1,8 +1,8 @@
-//! Services of the graph as values of the space: calls made for values that arrive, calls made by the clock, and what
-//! they bring.
+//! Services of the graph as values of the space: calls made for values that arrive, calls made by
+//! the clock, and what they bring.
 //!
-//! Each variable that calls and each service that is polled has a task of its own, so that no call holds up another or
-//! the port.
+//! Each variable that calls and each service that is polled has a task of its own, so that no call
+//! holds up another or the port.
 
 mod caller;
 mod pending;
@@ -41,7 +41,8 @@ pub trait ServiceGraph {
     /// Why there is none, for people.
     fn service_type(&mut self, name: &TypeName) -> Result<Arc<ServiceType>, String>;
 
-    /// The message type that carries one value of that type, and nothing else; `None` when there is none.
+    /// The message type that carries one value of that type, and nothing else; `None` when there is
+    /// none.
     ///
     /// # Errors
     /// Why its definition is not known, for people.
@@ -85,7 +86,8 @@ pub struct Services {
 #[derive(Debug)]
 struct Callee {
     pending: Arc<Pending>,
-    /// Where the request is the same each time: that request, and the value that calls, if not any does.
+    /// Where the request is the same each time: that request, and the value that calls, if not any
+    /// does.
     constant: Option<(Bytes, Option<Vec<u8>>)>,
     task: AbortHandle,
 }
@@ -131,8 +133,8 @@ impl Polled {
 }
 
 impl Services {
-    /// Starts what the mapping ties to services. Reports the types of the values; a binding that cannot be served is
-    /// told of.
+    /// Starts what the mapping ties to services. Reports the types of the values; a binding that
+    /// cannot be served is told of.
     pub fn start(
         graph: &mut impl ServiceGraph,
         own: SpaceId,
@@ -155,8 +157,8 @@ impl Services {
         (services, events)
     }
 
-    /// The types of the services that the mapping calls, as far as they are known. One whose file cannot be read for the
-    /// moment is what it was.
+    /// The types of the services that the mapping calls, as far as they are known. One whose file
+    /// cannot be read for the moment is what it was.
     fn called_types(
         &self,
         graph: &mut impl ServiceGraph,
@@ -179,9 +181,9 @@ impl Services {
         types
     }
 
-    /// Ends what only `before` ties to services and starts what only `after` does; what both have alike goes on.
-    /// Reports the values that are given up, then the types of those taken up; a binding that cannot be served is told
-    /// of.
+    /// Ends what only `before` ties to services and starts what only `after` does; what both have
+    /// alike goes on. Reports the values that are given up, then the types of those taken up; a
+    /// binding that cannot be served is told of.
     pub fn reload(
         &mut self,
         graph: &mut impl ServiceGraph,
@@ -421,14 +423,16 @@ impl Services {
         self.callers.contains_key(&topic)
     }
 
-    /// Returns the handover of the newest value of a topic that calls a service; `None` for other topics.
+    /// Returns the handover of the newest value of a topic that calls a service; `None` for other
+    /// topics.
     #[must_use]
     pub fn handover(&self, topic: TopicId) -> Option<Handover> {
         let callee = self.callers.get(&topic)?;
         Some(callee.pending.handover())
     }
 
-    /// Hands a value to the service of its topic; `None` when it has none. Else says how many older values gave way.
+    /// Hands a value to the service of its topic; `None` when it has none. Else says how many older
+    /// values gave way.
     #[must_use]
     pub fn hand_over(&self, topic: TopicId, value: &Bytes) -> Option<u64> {
         let callee = self.callers.get(&topic)?;

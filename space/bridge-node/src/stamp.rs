@@ -2,8 +2,9 @@
 
 use messages::{Leaf, MessageType, Selection};
 
-/// Whether a message that is made of `selection` alone begins with a header whose stamp nobody gives, so that it is to
-/// be the time of the graph. A message that crosses as a whole keeps its own.
+/// Whether a message that is made of `selection` alone begins with a header whose stamp nobody
+/// gives, so that it is to be the time of the graph. A message that crosses as a whole keeps its
+/// own.
 #[must_use]
 pub fn wants_stamp(message_type: &MessageType, selection: Option<&Selection>) -> bool {
     let is_stamp = |leaf: &Leaf| leaf.path == STAMP;

@@ -1,4 +1,5 @@
-//! What a program says of itself: counters per topic and delays per hop, as JSON and for Prometheus.
+//! What a program says of itself: counters per topic and delays per hop, as JSON and for
+//! Prometheus.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -100,7 +101,8 @@ struct TopicStatus {
     keep_alives: u64,
     missing: u64,
     sender_changed: u64,
-    /// Our own datagrams that the group brought back, and values that the local side heard of itself: no drops.
+    /// Our own datagrams that the group brought back, and values that the local side heard of
+    /// itself: no drops.
     looped: u64,
     dropped: BTreeMap<&'static str, u64>,
 }

@@ -1,6 +1,8 @@
-//! The calls and values of an action as blocks of OPC UA fields, without a look into goals, feedback and results.
+//! Calls and values of an action as blocks of OPC UA fields. The content of goals, feedback and
+//! results is opaque.
 //!
-//! A block is the number of its fields (UInt16) and a Variant each (OPC 10000-6, 5.2.2.16). An id is a ByteString of 16 bytes.
+//! A block is the number of its fields (UInt16) followed by a Variant for each field (OPC 10000-6,
+//! 5.2.2.16). An id is a ByteString of 16 bytes.
 
 use bytes::{BufMut, Bytes, BytesMut};
 use uadp::{DateTime, Fields, Scalar, Timestamp, Variant};
@@ -8,7 +10,8 @@ use uadp::{DateTime, Fields, Scalar, Timestamp, Variant};
 use super::graph::{CancelAnswer, GoalId, NO_GOAL};
 use super::wire::{CancelRequest, GoalAnswer};
 
-/// The id, and the block of what is behind it. A null or empty id is [`NO_GOAL`], and so is one that is not given.
+/// Splits a block into the id and the block of the fields behind it. A missing, null or empty id is
+/// [`NO_GOAL`].
 pub(super) fn split(block: &[u8]) -> Option<(GoalId, Bytes)> {
     let (count, rest) = block.split_first_chunk()?;
     let Some(count) = u16::from_le_bytes(*count).checked_sub(1) else {
@@ -36,7 +39,7 @@ pub(super) fn split(block: &[u8]) -> Option<(GoalId, Bytes)> {
     Some((id, body.freeze()))
 }
 
-/// The block of the id and the fields behind it.
+/// Returns the block of the id and the fields behind it.
 pub(super) fn join(id: GoalId, body: &[u8]) -> Option<Bytes> {
     let (count, rest) = body.split_first_chunk()?;
     let mut block = Writer::of(u16::from_le_bytes(*count).checked_add(1)?);
@@ -63,7 +66,7 @@ pub(super) fn read_cancel_request(block: &[u8]) -> Option<CancelRequest> {
         Some(Variant::Scalar(Scalar::DateTime(time))) => Some(Timestamp::from(time)),
         Some(Variant::Scalar(_) | Variant::Array(_) | Variant::Matrix(_)) => return None,
     };
-    // In a message of ROS a time that is not set is the beginning of 1970.
+    // In a ROS message a time that is not set is the beginning of 1970.
     let until = until.filter(|until| until.unix_nanos() != 0);
     Some(CancelRequest { id, until })
 }
@@ -75,7 +78,7 @@ pub(super) fn cancel_answer(answer: &CancelAnswer) -> Bytes {
     block.0.freeze()
 }
 
-/// The answer with a result, which is a block itself.
+/// Encodes the response with a result, which is a block itself.
 pub(super) fn result_answer((status, message): (i8, &str), result: &[u8]) -> Option<Bytes> {
     let (count, rest) = result.split_first_chunk()?;
     let mut block = Writer::of(u16::from_le_bytes(*count).checked_add(2)?);
@@ -85,7 +88,7 @@ pub(super) fn result_answer((status, message): (i8, &str), result: &[u8]) -> Opt
     Some(block.0.freeze())
 }
 
-/// The value with the statuses of goals.
+/// Encodes the value with the goal statuses.
 pub(super) fn statuses(goals: &[(GoalId, i8)]) -> Bytes {
     let ids: Vec<GoalId> = goals.iter().map(|(id, _)| *id).collect();
     let of_goals = goals.iter().map(|(_, status)| status.cast_unsigned());
@@ -141,7 +144,7 @@ const SBYTE: u8 = 2;
 const STRING: u8 = 12;
 const DATE_TIME: u8 = 13;
 const BYTE_STRING: u8 = 15;
-/// Bytes of an id.
+/// Length of an id in bytes.
 const ID: i32 = 16;
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! How the calls and values of an action that is executed here are on the wire of its port.
+//! Encoding of the calls and values of an action that is executed here, on the wire of its port.
 
 use std::sync::Arc;
 
@@ -12,17 +12,17 @@ use super::wire::{self, CancelRequest, GoalAnswer};
 /// The encoding of one action.
 #[derive(Debug, Clone)]
 pub(super) enum Encoding {
-    /// As messages of either ROS, of these types.
+    /// ROS 1 or ROS 2 messages of these types.
     Ros(Wire, Arc<ActionCalls>),
-    /// As blocks of OPC UA fields.
+    /// Blocks of OPC UA fields.
     Fields {
-        /// The fields of a result with nothing in them.
+        /// The fields of an empty result.
         empty_result: Bytes,
     },
 }
 
 impl Encoding {
-    /// The id, and the goal behind it.
+    /// Splits a request into the id and the goal behind it.
     pub(super) fn split(&self, request: &[u8]) -> Option<(GoalId, Bytes)> {
         match self {
             Self::Ros(wire, _) => wire::split(*wire, request),
@@ -30,7 +30,7 @@ impl Encoding {
         }
     }
 
-    /// Feedback behind its id.
+    /// Joins an id and the feedback behind it.
     pub(super) fn join(&self, id: GoalId, body: &[u8]) -> Option<Bytes> {
         match self {
             Self::Ros(wire, _) => wire::join(*wire, id, body),
@@ -66,7 +66,8 @@ impl Encoding {
         }
     }
 
-    /// The answer with a result. `None` where the result is none of that encoding.
+    /// Encodes the response with a result. Returns `None` if the result does not have this
+    /// encoding.
     pub(super) fn result_answer(&self, said: (i8, &str), result: &[u8]) -> Option<Bytes> {
         match self {
             Self::Ros(wire, _) => wire::result_answer(*wire, said, result),
@@ -74,7 +75,8 @@ impl Encoding {
         }
     }
 
-    /// The answer without a result: all its fields are zero or empty. `None` where there can be none.
+    /// Encodes the response without a result: all fields of the result are zero or empty. Returns
+    /// `None` if the response cannot be encoded.
     pub(super) fn empty_result_answer(&self, said: (i8, &str)) -> Option<Bytes> {
         match self {
             Self::Ros(wire, calls) => wire::empty_result_answer(*wire, calls, said).ok(),
@@ -82,7 +84,7 @@ impl Encoding {
         }
     }
 
-    /// The value with the statuses of goals.
+    /// Encodes the value with the goal statuses.
     pub(super) fn statuses(&self, goals: &[(GoalId, i8)]) -> Bytes {
         match self {
             Self::Ros(wire, _) => wire::statuses(*wire, goals),

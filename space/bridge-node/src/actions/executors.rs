@@ -1,4 +1,4 @@
-//! The action servers of the graph that are executed for the space: which they are, and the task of each.
+//! The action servers of the graph that are executed for the space, and the task of each.
 
 use std::collections::{BTreeMap, HashMap};
 use std::num::NonZeroU16;
@@ -22,17 +22,17 @@ use crate::policy::Policy;
 use crate::port::Execution;
 use crate::present::{self, Present};
 
-/// What of a graph's actions is executed for the space.
+/// The actions of the graph that are executed for the space.
 #[derive(Debug, Default)]
 pub(super) struct Executors {
     served: HashMap<TopicId, Served>,
-    /// Those that cannot be served as they are.
+    /// Actions that cannot be served with their present settings.
     refused: HashMap<TopicId, Wanted>,
-    /// The parts of those that are served: of which, and what.
+    /// The calls of the served actions: the action that each belongs to, and its part.
     parts: HashMap<TopicId, (TopicId, Part)>,
-    /// Where what is executed was begun, and as what.
+    /// The running executions, each with its action and part.
     running: HashMap<ExecutionId, (TopicId, Part)>,
-    /// How many of them wait for a result.
+    /// Number of running executions that wait for a result.
     held: usize,
     tasks: JoinSet<()>,
     pending: AllPending,
@@ -44,13 +44,13 @@ struct Served {
     family: ActionFamily,
     calls: Arc<ActionCalls>,
     commands: mpsc::Sender<Command>,
-    /// Whether its server is there.
+    /// Whether the server of the action is present.
     offered: Arc<AtomicBool>,
-    /// Since when it is not.
+    /// Time since which the server of the action is missing.
     gone: Option<Instant>,
 }
 
-/// An action server, and what is said of it.
+/// An action server and its metadata.
 #[derive(Debug, Clone, PartialEq, Eq)]
 struct Wanted {
     action: String,
@@ -79,7 +79,7 @@ impl Executors {
             if let Some(served) = self.served.get_mut(&topic) {
                 if served.gone.take().is_some() {
                     events.extend(served.offer(topic));
-                    // Where it has much to do, it tells them at the next change.
+                    // If the queue is full, the task publishes the statuses at the next change.
                     drop(served.commands.try_send(Command::TellStatuses));
                 }
                 continue;
@@ -107,8 +107,9 @@ impl Executors {
         events
     }
 
-    /// Withdraws those that are wanted otherwise, and those whose servers are not there. What became of the goals of the latter
-    /// can still be asked for once they are there again.
+    /// Withdraws actions whose settings have changed, and actions whose servers are missing. The
+    /// outcomes of the goals of a missing server can be requested again after its return, for up to
+    /// [`KEPT`].
     fn withdraw_missing(&mut self, wanted: &BTreeMap<TopicId, Wanted>) -> Vec<PortEvent> {
         let now = now().monotonic;
         let mut events = Vec::new();
@@ -126,13 +127,14 @@ impl Executors {
         let (served, before) = (&self.served, self.parts.len());
         self.parts.retain(|_, (of, _)| served.contains_key(of));
         if self.parts.len() < before {
-            // They may have been in the way of others.
+            // The removed parts may have blocked refused actions.
             self.refused.clear();
         }
         events
     }
 
-    /// Whether a topic that an action would take is a variable's, or that of an action that is served.
+    /// Returns whether a topic that an action would occupy belongs to a variable or to a served
+    /// action.
     fn is_taken(&self, mapping: &Mapping, topic: TopicId) -> bool {
         let is_behind = |served: &TopicId| {
             let (of, (space, namespace, id)) = (served.triple(), topic.triple());
@@ -205,7 +207,7 @@ impl Executors {
         Ok(events)
     }
 
-    /// Has everything looked at again: definitions may be others.
+    /// Checks all actions again, because definitions may have changed.
     pub(super) fn look_again<G: ActionGraph>(&mut self, graph: &mut G) -> Vec<PortEvent> {
         self.refused.clear();
         let other = self.served.extract_if(|_, served| {
@@ -219,12 +221,12 @@ impl Executors {
         events
     }
 
-    /// Whether that call is a part of an action that is executed.
+    /// Returns whether a call is a part of an executed action.
     pub(super) fn serves(&self, topic: TopicId) -> bool {
         self.parts.contains_key(&topic)
     }
 
-    /// Hands a request to the task of its action.
+    /// Passes a request to the task of its action.
     pub(super) fn execute(&mut self, execution: Execution) -> Result<(), Refusal> {
         let part = self.parts.get(&execution.topic);
         let (action, part) = *part.ok_or(Refusal::NotExecutable)?;
@@ -246,19 +248,21 @@ impl Executors {
         self.pending.lines(now().monotonic)
     }
 
-    /// An execution has come to its end.
+    /// Removes an execution that has ended.
     pub(super) fn ended(&mut self, execution: ExecutionId) {
         if let Some((_, Part::Result)) = self.running.remove(&execution) {
             self.held -= 1;
         }
     }
 
-    /// Who asked for an execution does not want it any longer.
+    /// Handles a caller that gives up an execution.
     pub(super) fn abandoned(&mut self, execution: ExecutionId) {
         let running = self.running.get(&execution);
         if let Some(served) = running.and_then(|(action, _)| self.served.get(action)) {
             let commands = served.commands.clone();
-            // It waits for its turn and is not lost: a goal may have to be withdrawn. There are as many as executions at most.
+            // The command waits for a place in the queue instead of being dropped, because a goal
+            // may have to be withdrawn. The number of waiting commands is bounded by the number of
+            // executions.
             self.tasks.spawn(async move {
                 let _is_over = commands.send(Command::Abandoned(execution)).await.is_err();
             });
@@ -267,7 +271,7 @@ impl Executors {
 }
 
 impl Served {
-    /// The three calls and two values.
+    /// Offers the three calls and the two values of the action.
     fn offer(&self, topic: TopicId) -> Vec<PortEvent> {
         self.offered.store(true, Ordering::Release);
         let (_, _, goal) = topic.triple();
@@ -340,20 +344,20 @@ impl Served {
     }
 }
 
-/// The topic of another DataSetWriterId in the same namespace.
+/// Returns the topic of another DataSetWriterId in the same namespace.
 pub(super) fn beside(topic: TopicId, id: u16) -> Option<TopicId> {
     let (space, namespace, _) = topic.triple();
     TopicId::new(space, namespace, id)
 }
 
-/// Whether both are the same on the wire.
+/// Returns whether both are the same on the wire.
 pub(super) fn is_same(one: &ActionCalls, other: &ActionCalls) -> bool {
     one.goal().is_same(other.goal())
         && one.result().is_same(other.result())
         && one.feedback().is_same(other.feedback())
 }
 
-/// What is to be offered of the action servers there are.
+/// Returns the present action servers that are to be offered, by topic.
 fn wanted(policy: &Policy, present: &Present) -> BTreeMap<TopicId, Wanted> {
     let silence = policy.mapping().pubsub().receive_timeout;
     let found = present::found(policy, present, CallKind::Action);
@@ -373,20 +377,22 @@ fn wanted(policy: &Policy, present: &Present) -> BTreeMap<TopicId, Wanted> {
     wanted.collect()
 }
 
-/// Feedback is events: as many wait.
+/// Feedback messages are events: up to 100 of them are queued.
 pub(super) const EVENTS: Overflow = Overflow::DropOldest(match NonZeroU16::new(100) {
     Some(waiting) => waiting,
     None => NonZeroU16::MIN,
 });
-/// How long the server of an action may take for its word on a goal, where the mapping does not say it.
+/// Time limit for the decision of an action server about a goal, unless the mapping sets it.
 const ANSWER: Duration = Duration::from_secs(30);
-/// Identifiers that an action takes behind its own.
+/// Number of identifiers that an action occupies behind its own.
 const FAMILY: u16 = 4;
-/// Actions that are offered to other spaces: anybody in a graph can invent names.
+/// The maximal number of actions offered to other spaces: any node in a graph can invent names.
 const MOST_SERVED: usize = 256;
-/// Requests of one action that wait to be looked at; one more is refused as busy.
+/// The maximal number of queued requests of one action; a further request is refused as busy.
 pub(super) const MOST_COMMANDS: usize = 256;
-/// Requests that wait for results of all actions: others have places left.
+/// The maximal number of requests that wait for results, over all actions: other requests keep free
+/// places.
 pub(super) const MOST_HELD: usize = 512;
-/// How long the goals of a server that is gone are kept, so that their ends can be asked for once it is there again.
+/// How long the goals of a missing server are kept, so that their outcomes can be requested after
+/// its return.
 const KEPT: Duration = Duration::from_secs(15 * 60);

@@ -1,5 +1,5 @@
-//! One action of another space, served in the graph: a task that takes goals from its clients, asks for them in the space, and
-//! hands on what becomes of them.
+//! One action of another space, served in the graph: a task that receives goals from its clients,
+//! sends them to the space, and forwards feedback and results.
 
 use std::collections::HashMap;
 use std::time::{Duration, Instant};
@@ -19,40 +19,41 @@ use crate::calls::AskFault;
 use crate::clock::now;
 use crate::{Asker, PortEvent};
 
-/// What asks in the space, and how long for.
+/// The senders of the requests of an action, and their timeouts.
 #[derive(Debug, Clone)]
 pub(super) struct Asks {
     pub(super) wire: Wire,
     pub(super) goal: Asker,
     pub(super) cancel: Asker,
     pub(super) result: Asker,
-    /// How long a goal waits for who executes the action to be back.
+    /// How long a goal waits for the executor of the action to return.
     pub(super) silence: Duration,
-    /// Since when it is gone.
+    /// Time since which the executor is lost.
     pub(super) gone: watch::Receiver<Option<Instant>>,
 }
 
-/// The task.
+/// The task of one served action.
 #[derive(Debug)]
 pub(super) struct Facade<A> {
     pub(super) asks: Asks,
     pub(super) server: A,
     /// Feedback of all goals of the action.
     pub(super) values: mpsc::Receiver<Bytes>,
-    /// The topic of that.
+    /// The topic of the feedback.
     pub(super) feedback: TopicId,
     pub(super) report: mpsc::Sender<PortEvent>,
 }
 
 impl<A: ActionServer> Facade<A> {
-    /// Serves until it is aborted. The goals that are open then are aborted here, and go on in the space.
+    /// Serves until the task is aborted. Open goals are then aborted in this graph, and go on in
+    /// the space.
     pub(super) async fn run(mut self) {
         let mut goals: HashMap<GoalId, mpsc::Sender<Bytes>> = HashMap::new();
         let mut tasks = JoinSet::new();
         let mut cancels = JoinSet::new();
         let (ends, mut ended) = mpsc::channel::<oneshot::Sender<()>>(MOST_GOALS);
         loop {
-            // All are cancel-safe.
+            // All branches are cancel-safe.
             tokio::select! {
                 event = self.server.recv() => match event {
                     ServerEvent::Goal(new) => {
@@ -89,7 +90,8 @@ impl<A: ActionServer> Facade<A> {
         }
     }
 
-    /// Goals of others have feedback too.
+    /// Forwards feedback to its goal. Ignores feedback of goals that other clients of the action
+    /// have sent.
     fn hand_on(&self, goals: &HashMap<GoalId, mpsc::Sender<Bytes>>, value: &[u8]) {
         let Some((id, body)) = wire::split(self.asks.wire, value) else {
             return;
@@ -98,7 +100,7 @@ impl<A: ActionServer> Facade<A> {
             return;
         };
         if let Err(mpsc::error::TrySendError::Full(_)) = goal.try_send(body) {
-            // Where nothing more can be reported either, that is counted with the next.
+            // If the queue of reports is full, the loss is not counted.
             drop(self.report.try_send(PortEvent::Lost {
                 topic: Some(self.feedback),
                 reason: Reason::Overflow,
@@ -109,7 +111,7 @@ impl<A: ActionServer> Facade<A> {
     }
 }
 
-/// Why a goal is not taken.
+/// Returns the reason why a goal is rejected, if it is.
 fn refusal(goals: &HashMap<GoalId, mpsc::Sender<Bytes>>, id: GoalId) -> Option<&'static str> {
     if goals.contains_key(&id) {
         return Some("there is a goal of that id");
@@ -117,14 +119,14 @@ fn refusal(goals: &HashMap<GoalId, mpsc::Sender<Bytes>>, id: GoalId) -> Option<&
     (goals.len() >= MOST_GOALS).then_some("as many goals as may be are open")
 }
 
-/// How a goal comes by what is reported of it.
+/// The channels through which a goal receives feedback.
 struct Told {
     feedback: mpsc::Receiver<Bytes>,
-    /// Asks for all that has come so far.
+    /// Requests delivery of all feedback received so far.
     ends: mpsc::Sender<oneshot::Sender<()>>,
 }
 
-/// Sees one goal through to its end.
+/// Drives one goal to its end.
 async fn drive<N: NewGoal>(asks: Asks, new: N, told: Told) {
     let id = new.id();
     let Some(goal) = begin(&asks, id, new).await else {
@@ -141,7 +143,7 @@ async fn drive<N: NewGoal>(asks: Asks, new: N, told: Told) {
     }
 }
 
-/// Has a goal accepted where it is executed, and then by the server here.
+/// Sends a goal to its executor, and accepts it in this graph once the executor has accepted it.
 async fn begin<N: NewGoal>(asks: &Asks, id: GoalId, new: N) -> Option<N::Goal> {
     let Some(request) = wire::join(asks.wire, id, new.body()) else {
         new.reject("the goal does not read");
@@ -158,7 +160,8 @@ async fn begin<N: NewGoal>(asks: &Asks, id: GoalId, new: N) -> Option<N::Goal> {
         .ok()
 }
 
-/// Hands feedback on until the goal has ended. What was reported before the end comes before it.
+/// Forwards feedback until the goal has ended. Feedback reported before the end is forwarded before
+/// it.
 async fn follow(asks: &Asks, id: GoalId, goal: &impl ServedGoal, told: Told) -> End {
     let Told { mut feedback, ends } = told;
     let mut end = Box::pin(wait(asks, id));
@@ -169,7 +172,7 @@ async fn follow(asks: &Asks, id: GoalId, goal: &impl ServedGoal, told: Told) -> 
             end = &mut end => break end,
         }
     };
-    // What came before the end may still wait where it is told apart by goals.
+    // Feedback from before the end may still be queued in the task that assigns it to goals.
     let (all, handed_on) = oneshot::channel();
     if ends.send(all).await.is_ok() {
         drop(handed_on.await);
@@ -186,8 +189,8 @@ fn hand_to(goal: &impl ServedGoal, feedback: &[u8]) {
     }
 }
 
-/// Asks for a goal, once more where it is not known whether it was heard, as one of the same id is the same goal, and where
-/// it was not but somebody executes the action again.
+/// Sends a goal. Sends it a second time if it is unknown whether the first request arrived, because
+/// goals with the same id are the same goal, or if it was refused and the executor has returned.
 async fn send(asks: &Asks, id: GoalId, request: Bytes) -> Result<(), String> {
     let ask = || asks.goal.ask_for(request.clone());
     let answer = match ask().await {
@@ -208,7 +211,7 @@ async fn send(asks: &Asks, id: GoalId, request: Bytes) -> Result<(), String> {
         }) => return Err(text),
         Err(AskFault { text, .. }) => text,
     };
-    // It may be at work, and nobody would know.
+    // The goal may be running without any client that knows of it.
     let request = wire::CancelRequest { id, until: None };
     let request = wire::cancel_request(asks.wire, request);
     let cancel = asks.cancel.clone().within(CANCEL_WITHIN);
@@ -216,13 +219,13 @@ async fn send(asks: &Asks, id: GoalId, request: Bytes) -> Result<(), String> {
     Err(text)
 }
 
-/// Whether a goal was refused since who executes the action is gone, and is back before it is given up: a server that is started
-/// anew is gone for a moment.
+/// Returns whether a goal was refused because the executor was lost, and the executor returns
+/// before the timeout: a restarted server is lost for a moment.
 async fn comes_back(asks: &Asks, fault: &AskFault) -> bool {
     if fault.kind != AskErrorKind::Refused {
         return false;
     }
-    // Where it is gone, that is heard within moments of the refusal.
+    // The loss of the executor is noticed within moments of the refusal.
     sleep(FIRST_PAUSE).await;
     let mut gone = asks.gone.clone();
     let Some(since) = *gone.borrow_and_update() else {
@@ -233,7 +236,7 @@ async fn comes_back(asks: &Asks, fault: &AskFault) -> bool {
     back.await.is_ok_and(|told| told.is_ok())
 }
 
-/// The end of a goal.
+/// The outcome of a goal.
 struct End {
     status: i8,
     message: String,
@@ -250,7 +253,7 @@ impl End {
     }
 }
 
-/// Waits for the end of a goal, or until who executes it is gone for too long.
+/// Waits for the end of a goal, or until its executor is lost for too long.
 async fn wait(asks: &Asks, id: GoalId) -> End {
     let request = wire::result_request(asks.wire, id);
     let result = asks.result.clone().within(RESULT_WITHIN);
@@ -273,7 +276,7 @@ async fn wait(asks: &Asks, id: GoalId) -> End {
             }
             Err(fault) => fault,
         };
-        // It was silent for as long as it may be, or has said goodbye: of its goals it knows nothing any more.
+        // The executor timed out or has said goodbye. It does not know its earlier goals any more.
         if asks.gone.borrow().is_some() {
             return End::aborted(format!(
                 "who executes the action is gone; the goal may go on: {}",
@@ -282,7 +285,7 @@ async fn wait(asks: &Asks, id: GoalId) -> End {
         }
         match fault.kind {
             AskErrorKind::Failed => return End::aborted(fault.text),
-            // It asked for as long as it may, or nobody is heard for the moment.
+            // The request reached its time limit, or the executor is silent for the moment.
             AskErrorKind::Refused | AskErrorKind::Unknown => sleep(pause).await,
         }
         pause = (pause * 2).min(LAST_PAUSE);
@@ -296,7 +299,7 @@ fn or(text: String, otherwise: &str) -> String {
     }
 }
 
-/// Asks to cancel a goal. One that is not known there may be on its way.
+/// Requests to cancel a goal. A goal that is unknown to the executor may be on its way.
 async fn cancel<C: CancelRequest>(asks: Asks, request: C) {
     let id = request.id();
     let agreed = timeout(CANCEL_WITHIN, async {
@@ -315,7 +318,7 @@ async fn cancel<C: CancelRequest>(asks: Asks, request: C) {
     }
 }
 
-/// The code of the answer; `None` where there is none.
+/// Returns the code of the response; `None` without a response.
 async fn ask_to_cancel(asks: &Asks, id: GoalId) -> Option<i8> {
     let request = wire::CancelRequest { id, until: None };
     let request = wire::cancel_request(asks.wire, request);
@@ -324,17 +327,17 @@ async fn ask_to_cancel(asks: &Asks, id: GoalId) -> Option<i8> {
     Some(wire::read_cancel_answer(asks.wire, &answer)?.code)
 }
 
-/// Goals of one action that are open here.
+/// The maximal number of open goals of one action.
 const MOST_GOALS: usize = 1000;
-/// Requests to cancel that are under way.
+/// The maximal number of concurrent requests to cancel.
 const MOST_CANCELS: usize = 64;
-/// Feedback of a goal that waits to be told.
+/// The maximal number of queued feedback messages of a goal.
 const MOST_FEEDBACK: usize = 100;
-/// How long a request for a result is held at a time.
+/// Timeout of one request for a result.
 const RESULT_WITHIN: Duration = Duration::from_secs(30);
-/// How long it is tried to cancel a goal: a server of ROS 2 answers its client within 5 s.
+/// Time limit for cancelling a goal: an action server of ROS 2 answers its client within 5 s.
 const CANCEL_WITHIN: Duration = Duration::from_secs(4);
-/// Before it is asked anew, doubling from the first to the last.
+/// Pauses between repeated requests, doubling from the first to the last.
 const FIRST_PAUSE: Duration = Duration::from_millis(100);
 const LAST_PAUSE: Duration = Duration::from_secs(1);
 /// `action_msgs/GoalStatus`, STATUS_UNKNOWN and STATUS_ABORTED.

@@ -1,4 +1,4 @@
-//! The actions of other spaces that are served in the graph: which they are, and the task of each.
+//! The actions of other spaces that are served in the graph, and the task of each.
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
@@ -19,11 +19,11 @@ use crate::policy::{Policy, action_type};
 use crate::port::Delivery;
 use crate::{Asker, PortEvent};
 
-/// The actions of other spaces, as they are known.
+/// The known actions of other spaces.
 #[derive(Debug, Default)]
 pub(super) struct Facades {
     known: BTreeMap<TopicId, Known>,
-    /// Values of actions, and of which each is.
+    /// Topics of the values of actions, each with its action.
     values: HashMap<TopicId, TopicId>,
     tasks: JoinSet<()>,
 }
@@ -37,9 +37,9 @@ struct Known {
 
 #[derive(Debug)]
 enum State {
-    /// To be offered when there is time for it.
+    /// To be offered later.
     Waiting,
-    /// There is no type for it here, or no room.
+    /// Not offered: its type is unknown here, or the limit is reached.
     Refused,
     Offered(Box<Offered>),
 }
@@ -49,7 +49,7 @@ struct Offered {
     target: Target,
     calls: Arc<ActionCalls>,
     feedback: mpsc::Sender<Bytes>,
-    /// Since when who executes it is gone.
+    /// Time since which the executor of the action is lost.
     gone: watch::Sender<Option<Instant>>,
     task: AbortHandle,
 }
@@ -60,21 +60,21 @@ impl Drop for Offered {
     }
 }
 
-/// As what an action is offered.
+/// Name, type and field maps under which an action is offered.
 #[derive(Debug, Clone, PartialEq, Eq)]
 struct Target {
     name: String,
-    /// Where the mapping says it.
+    /// The type that the mapping sets, if any.
     type_name: Option<TypeName>,
     goal: Arc<CallMap>,
     result: Arc<CallMap>,
     feedback: FieldMap,
-    /// How long the word on a goal is waited for.
+    /// Time limit for the decision about a goal.
     timeout: Duration,
 }
 
 impl Target {
-    /// As the mapping says it, else under the name of the topic.
+    /// Returns the target of the mapping; without one, the name of the topic.
     fn of(topic: TopicId, policy: &Policy) -> Self {
         let call = policy.mapping().call(topic);
         let call = call.filter(|call| call.kind == CallKind::Action);
@@ -154,7 +154,7 @@ impl Facades {
         }
     }
 
-    /// See [`Actions::tidy`](super::Actions::tidy). Reports what is no longer asked for.
+    /// See [`Actions::tidy`](super::Actions::tidy). Reports the calls and values that are unbound.
     pub(super) fn tidy(&mut self, policy: &Policy, now: Instant) -> Vec<PortEvent> {
         while self.tasks.try_join_next().is_some() {}
         let silence = policy.mapping().pubsub().receive_timeout;
@@ -178,7 +178,7 @@ impl Facades {
             }
         }
         if !events.is_empty() {
-            // Its place is another's.
+            // Refused actions can take the free place.
             self.wait_anew();
         }
         events
@@ -198,7 +198,7 @@ impl Facades {
         }
     }
 
-    /// The actions that are known and have a name of the mapping here, with that.
+    /// Returns the known actions that have a name in this space by the mapping, with the name.
     pub(super) fn chosen(&self, policy: &Policy) -> Vec<(TopicId, String)> {
         let mapped = policy.mapping().asked_in(policy.own());
         let known = mapped.filter(|(call, _)| {
@@ -224,7 +224,7 @@ impl Facades {
         }
     }
 
-    /// Those that are served, by their names here.
+    /// Returns the served actions by their names in this space.
     pub(super) fn offered(&self) -> BTreeMap<TopicId, &str> {
         let offered = self.known.iter();
         let offered = offered.filter_map(|(topic, known)| match &known.state {
@@ -286,12 +286,12 @@ impl Facades {
         events
     }
 
-    /// Has actions looked at again, as definitions or the mapping may be others.
+    /// Checks actions again, because definitions or the mapping may have changed.
     pub(super) fn look_again<G: ActionGraph>(&mut self, graph: &mut G, policy: &Policy) {
         for (topic, known) in &mut self.known {
             let again = match &known.state {
                 State::Waiting | State::Refused => true,
-                // A file that cannot be read for the moment changes nothing.
+                // A file that is temporarily unreadable changes nothing.
                 State::Offered(offered) => {
                     let now = graph.action_calls(offered.calls.goal().name());
                     offered.target != Target::of(*topic, policy)
@@ -304,12 +304,13 @@ impl Facades {
         }
     }
 
-    /// Whether the values of that topic are an action's: anybody may say that one of the mapping is.
+    /// Returns whether the values of a topic belong to an action. A variable of the mapping does
+    /// not, because any publisher can claim it for an action.
     pub(super) fn takes(&self, policy: &Policy, topic: TopicId) -> bool {
         self.values.contains_key(&topic) && policy.mapping().variable(topic).is_none()
     }
 
-    /// Hands feedback to the task of its action.
+    /// Passes feedback to the task of its action.
     pub(super) fn publish(&self, value: &Delivery) -> Result<(), &'static str> {
         let known = self.values.get(&value.topic);
         let known = known.and_then(|of| Some((*of, self.known.get(of)?)));
@@ -321,13 +322,15 @@ impl Facades {
                 let told = offered.feedback.try_send(value.payload.clone());
                 told.map_err(|_| "action is slow")
             }
-            // Which goals there are is of interest to who asks for them, and that one is told.
+            // Statuses of goals are not forwarded: the server in this graph reports the statuses of
+            // its own goals.
             State::Offered(_) | State::Waiting | State::Refused => Ok(()),
         }
     }
 }
 
-/// What a facade is made with: what asks, where it reports, how long it waits, and where it runs.
+/// Parameters of a facade: the function that returns an [`Asker`], the channel for reports, the
+/// timeout of a lost executor, and the task set.
 type With<'w, F> = (
     &'w F,
     &'w mpsc::Sender<PortEvent>,
@@ -336,14 +339,14 @@ type With<'w, F> = (
 );
 
 impl Known {
-    /// What of the values of its family the mapping has as a variable.
+    /// Returns the value of the family that the mapping declares as a variable, if any.
     fn variable(&self, topic: TopicId, mapping: &Mapping) -> Option<TopicId> {
         let values = [self.family.feedback, self.family.status];
         let mut values = values.into_iter().filter_map(|id| beside(topic, id));
         values.find(|value| mapping.variable(*value).is_some())
     }
 
-    /// Begins to serve the action. Reports the types of its calls and values.
+    /// Starts to serve the action. Reports the types of its calls and values.
     fn offer<G: ActionGraph, F: Fn(TopicId) -> Asker>(
         &mut self,
         graph: &mut G,
@@ -421,7 +424,7 @@ impl Known {
         Ok(events)
     }
 
-    /// What is no longer asked for.
+    /// Returns the events that unbind the calls and values of the action.
     fn unbind(&self, topic: TopicId) -> Vec<PortEvent> {
         let of = |id| beside(topic, id);
         let calls = [Some(topic), of(self.family.cancel), of(self.family.result)];
@@ -435,13 +438,14 @@ impl Known {
     }
 }
 
-/// Actions of other spaces that are known: anybody in the space can announce some.
+/// The maximal number of known actions of other spaces: any publisher in the space can announce
+/// actions.
 const MOST_KNOWN: usize = 1024;
-/// Those that are served here.
+/// The maximal number of actions served here.
 const MOST_OFFERED: usize = 256;
-/// Feedback of one action that waits to be handed on.
+/// The maximal number of queued feedback messages of one action.
 const MOST_VALUES: usize = 256;
-/// How long after its goals were given up a server goes: they are told by it.
+/// How long a server stays after its goals were given up, so that it can report their ends.
 const LEFT_AFTER: Duration = Duration::from_secs(2);
-/// How long the word on a goal is waited for, where the mapping does not say it.
+/// Time limit for the decision about a goal, unless the mapping sets it.
 const ANSWERED_WITHIN: Duration = Duration::from_secs(30);

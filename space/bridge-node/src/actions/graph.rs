@@ -1,7 +1,7 @@
-//! What a ROS graph with actions is to the policy: clients that send goals, servers that take them.
+//! The interface of a ROS graph with actions: clients that send goals, servers that receive them.
 //!
-//! Bytes are messages of that ROS, as its port has them: bodies of ROS 1 without length, CDR in little endian with its
-//! encapsulation header.
+//! Payloads are messages of that ROS, as its port encodes them: ROS 1 bodies without length, or CDR
+//! in little endian with the encapsulation header.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -13,30 +13,31 @@ use uadp::Timestamp;
 use crate::ServiceGraph;
 use crate::services::{CallFault, Ran};
 
-/// Tells a goal from all others. In ROS 2 the UUID; in ROS 1, where ids are texts, 32 hex digits of these bytes, and of any
-/// other text its MD5.
+/// Identifies a goal. In ROS 2 it is the UUID. In ROS 1, where ids are strings, it is the value of
+/// an id of 32 hex digits, or the MD5 of any other id.
 pub type GoalId = [u8; 16];
 
-/// The id of no goal.
+/// The id that means "no goal".
 pub const NO_GOAL: GoalId = [0; 16];
 
-/// A ROS graph with actions, as a port has it. How its messages are on the wire is [`ServiceGraph::WIRE`].
+/// A ROS graph with actions, as implemented by a port. [`ServiceGraph::WIRE`] is the encoding of
+/// its messages.
 pub trait ActionGraph: ServiceGraph {
-    /// Sends goals to one action.
+    /// The client of one action.
     type Sender: ActionClient;
-    /// Takes goals for one action.
+    /// The server of one action.
     type Taker: ActionServer;
 
-    /// The calls and values that an action of that type is.
+    /// Returns the calls and values of an action type.
     ///
     /// # Errors
-    /// Why the type is not known, for people.
+    /// The reason why the type is not known, as text for the user.
     fn action_calls(&mut self, name: &TypeName) -> Result<Arc<ActionCalls>, String>;
 
-    /// What sends goals to the server of an action. The server is there, or was a moment ago.
+    /// Creates a client of an action. The server is present, or was a moment ago.
     ///
     /// # Errors
-    /// Why there can be none, for people.
+    /// The reason why the client cannot be created, as text for the user.
     fn action_client(
         &mut self,
         action: &str,
@@ -44,173 +45,175 @@ pub trait ActionGraph: ServiceGraph {
         waits: Waits,
     ) -> Result<Self::Sender, String>;
 
-    /// Serves an action, until what is given back is dropped.
+    /// Serves an action until the returned server is dropped.
     ///
     /// # Errors
-    /// Why it cannot be served, for people.
+    /// The reason why the action cannot be served, as text for the user.
     fn serve_action(&mut self, action: &str, type_name: &TypeName) -> Result<Self::Taker, String>;
 }
 
-/// How long who sends goals waits.
+/// Timeouts of an action client.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Waits {
-    /// For the server's word on a goal, or on a request to cancel.
+    /// Timeout of the server's decision on a goal, and of its response to a request to cancel.
     pub answer: Duration,
-    /// For a server that is not heard any more, until its goals are lost.
+    /// Timeout of a silent server, after which its goals are lost.
     pub silence: Duration,
 }
 
-/// What happened to a goal that was sent.
+/// An event of a goal that was sent.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum GoalEvent {
-    /// Its server works on it, or will. Once, and before what follows.
+    /// The server has accepted the goal. Reported once, before the events below.
     Accepted(Timestamp),
-    /// How far it is, as `action_msgs/GoalStatus` has it: 1 accepted, 2 executing, 3 canceling.
+    /// The status of the goal as in `action_msgs/GoalStatus`: 1 accepted, 2 executing, 3 canceling.
     Status(i8),
     /// An `X_Feedback`.
     Feedback(Bytes),
-    /// Its server has not decided about it for as long as it may take. It is withdrawn: cancelled as soon as it is accepted.
-    /// What becomes of it follows. With the reason, for people.
+    /// The server has not decided about the goal in time. The goal is withdrawn: it is cancelled as
+    /// soon as it is accepted. The outcome follows. Carries the reason, as text for the user.
     Overdue(String),
-    /// It was withdrawn, and its server, which has accepted it, refuses to cancel it.
+    /// The goal was withdrawn, and the server, which has accepted it, refuses to cancel it.
     CancelRefused,
-    /// It has ended: the last event.
+    /// The goal has ended: the last event.
     Ended {
-        /// As `action_msgs/GoalStatus` has it: 4 succeeded, 5 canceled, 6 aborted.
+        /// Status as in `action_msgs/GoalStatus`: 4 succeeded, 5 canceled, 6 aborted.
         status: i8,
-        /// What the server says of it, for people; may be empty.
+        /// Message of the server, as text for the user; may be empty.
         message: String,
-        /// In ROS 1 an `XResult`. In ROS 2 an `X_GetResult_Response`, since what follows a status is aligned by it.
+        /// In ROS 1 an `XResult`. In ROS 2 an `X_GetResult_Response`, because the status affects
+        /// the alignment of the fields behind it.
         result: Bytes,
     },
-    /// Its server does not take it: the last event.
+    /// The server has rejected the goal: the last event.
     Rejected(String),
-    /// Nothing more will be heard of it: the last event.
+    /// No further event of the goal can be received: the last event.
     Lost {
-        /// Why, for people.
+        /// The reason, as text for the user.
         text: String,
-        /// Whether the server has, or had, it.
+        /// Whether the server has, or had, the goal.
         ran: Ran,
     },
 }
 
-/// Which goals to cancel.
+/// The goals of a request to cancel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum CancelWhat {
-    /// All that the server has.
+    /// All goals of the server.
     All,
-    /// This one.
+    /// One goal.
     Goal(GoalId),
 }
 
-/// What a server says to a request to cancel.
+/// The response of a server to a request to cancel.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct CancelAnswer {
-    /// As `action_msgs/CancelGoal` has it: 0 none, 1 rejected, 2 unknown goal, 3 terminated.
+    /// Code as in `action_msgs/CancelGoal`: 0 none, 1 rejected, 2 unknown goal, 3 terminated.
     pub code: i8,
     /// The goals that are being cancelled, as far as they are known.
     pub goals: Vec<GoalId>,
 }
 
-/// Sends goals to one action. Its goals go on when it is dropped.
+/// Sends goals to one action. The goals go on when the client is dropped.
 pub trait ActionClient: Send + Sync + 'static {
     /// A goal that was sent.
     type Goal: SentGoal;
 
-    /// Sends a goal, an `X_Goal`, under that id. Never waits: what becomes of it is told by the goal. Called on a tokio
-    /// runtime.
+    /// Sends a goal, an `X_Goal`, with an id. Never waits: the returned goal reports the events.
+    /// Called on a tokio runtime.
     fn send_goal(&self, id: GoalId, body: &[u8]) -> Self::Goal;
 
-    /// Asks the server to cancel goals. Ends within [`Waits::answer`]. A goal that the server has not decided about is
-    /// withdrawn: it is not sent, or is cancelled as soon as it is accepted. The answer then is that it is being cancelled.
+    /// Requests the server to cancel goals. Ends within [`Waits::answer`]. A goal that the server
+    /// has not decided about is withdrawn: it is not sent, or is cancelled as soon as it is
+    /// accepted. The response is then that the goal is being cancelled.
     ///
     /// # Errors
-    /// [`CallFault`], where there is no answer.
+    /// [`CallFault`], if there is no response.
     fn cancel(
         &self,
         what: CancelWhat,
     ) -> impl Future<Output = Result<CancelAnswer, CallFault>> + Send;
 }
 
-/// A goal that was sent. Dropping it ends the interest in it, and does not cancel it.
+/// A goal that was sent. Dropping it ends the reports of its events, and does not cancel it.
 pub trait SentGoal: Send + 'static {
-    /// The next event; `None` after the last. Cancel-safe. Ends within [`Waits::silence`] and a little more once the server
-    /// is not heard any more.
+    /// Returns the next event; `None` after the last. Cancel-safe. Ends shortly after
+    /// [`Waits::silence`] if the server is silent.
     fn recv(&mut self) -> impl Future<Output = Option<GoalEvent>> + Send;
 }
 
-/// What clients want of a server.
+/// A request of a client to a server.
 #[derive(Debug)]
 pub enum ServerEvent<N, C> {
     /// A new goal, to be accepted or rejected.
     Goal(N),
-    /// A goal should be cancelled, which is to be agreed to or not.
+    /// A request to cancel a goal, to be accepted or rejected.
     Cancel(C),
 }
 
-/// Takes goals for one action. Dropping it withdraws the action.
+/// Receives goals for one action. Dropping it withdraws the action.
 pub trait ActionServer: Send + 'static {
     /// A goal to decide about.
     type New: NewGoal;
     /// A request to cancel a goal.
     type Cancel: CancelRequest;
 
-    /// The next event. Cancel-safe.
+    /// Returns the next event. Cancel-safe.
     fn recv(&mut self) -> impl Future<Output = ServerEvent<Self::New, Self::Cancel>> + Send;
 }
 
-/// A goal to decide about. One that is dropped is rejected.
+/// A goal to decide about. Dropping it rejects the goal.
 pub trait NewGoal: Send + 'static {
     /// A goal that was accepted.
     type Goal: ServedGoal;
 
-    /// The goal's id.
+    /// Returns the id of the goal.
     fn id(&self) -> GoalId;
 
-    /// The `X_Goal`.
+    /// Returns the `X_Goal`.
     fn body(&self) -> &Bytes;
 
-    /// Accepts it.
+    /// Accepts the goal.
     ///
     /// # Errors
-    /// Why that cannot be, for people.
+    /// The reason why the goal cannot be accepted, as text for the user.
     fn accept(self) -> impl Future<Output = Result<Self::Goal, String>> + Send;
 
-    /// Rejects it, with the reason where the client can be told.
+    /// Rejects the goal, with the reason if the client can receive it.
     fn reject(self, why: &str);
 }
 
-/// A request to cancel a goal. One that is dropped is rejected: the goal goes on.
+/// A request to cancel a goal. Dropping it rejects the request: the goal goes on.
 pub trait CancelRequest: Send + 'static {
-    /// Of which goal.
+    /// Returns the id of the goal.
     fn id(&self) -> GoalId;
 
-    /// Agrees to it; the goal is to be ended all the same.
+    /// Accepts the request; the goal still has to be ended by [`ServedGoal::end`].
     ///
     /// # Errors
-    /// Why that cannot be, for people.
+    /// The reason why the request cannot be accepted, as text for the user.
     fn accept(self) -> Result<(), String>;
 
-    /// Does not agree.
+    /// Rejects the request.
     fn reject(self);
 }
 
-/// A goal that was accepted. One that is dropped before its end is aborted.
+/// An accepted goal. Dropping it before its end aborts the goal.
 pub trait ServedGoal: Send + Sync + 'static {
-    /// Work has begun; of no consequence where it has already.
+    /// Marks the goal as executing; no effect if it is executing already.
     fn execute(&self);
 
-    /// Reports progress, an `X_Feedback`. Never waits.
+    /// Publishes feedback, an `X_Feedback`. Never waits.
     ///
     /// # Errors
-    /// Why it cannot be, for people.
+    /// The reason why the feedback cannot be published, as text for the user.
     fn feedback(&self, body: &[u8]) -> Result<(), String>;
 
-    /// Ends it: 4 succeeded, 5 canceled, anything else aborted. One that ended as canceled without its clients having
-    /// asked for that is aborted where the ROS knows no such end. `result` is as in [`GoalEvent::Ended`]; without one the
-    /// client has the empty one.
+    /// Ends the goal: 4 succeeded, 5 canceled, any other value aborted. A canceled goal whose
+    /// clients have not requested to cancel it is aborted if the ROS has no such end. `result` is
+    /// as in [`GoalEvent::Ended`]; without a result the client receives the empty result.
     ///
     /// # Errors
-    /// Why it cannot be, for people; the goal is not ended then.
+    /// The reason why the goal cannot be ended, as text for the user; the goal is not ended then.
     fn end(&self, status: i8, message: &str, result: Option<&[u8]>) -> Result<(), String>;
 }

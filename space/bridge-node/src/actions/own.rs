@@ -1,4 +1,5 @@
-//! Actions that a program executes itself, without a ROS graph: those of a port that speaks in fields.
+//! Actions that a program executes itself, without a ROS graph, for ports whose payloads are
+//! fields.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -26,16 +27,18 @@ use crate::PortEvent;
 use crate::clock::now;
 use crate::port::Execution;
 
-/// What an action takes and gives, in fields.
+/// The fields of an action and its metadata.
 #[derive(Debug, Clone)]
 pub struct OwnAction {
-    /// Of its goals; the four identifiers behind it are its own too ([`ActionFamily::behind`]).
+    /// Topic of the goals; the four identifiers behind it belong to the action too
+    /// ([`ActionFamily::behind`]).
     pub topic: TopicId,
-    /// Its name for people, as `gripper.Grasp.Goal`; its parts have something behind it.
+    /// Display name, such as `gripper.Grasp.Goal`; the names of its parts have a suffix.
     pub name: String,
-    /// What it is, for people; begins with a ROS type where it is one, as in `ua_msgs/Grasp; GraspSkillType`.
+    /// Description for users; starts with the ROS type if there is one, as in `ua_msgs/Grasp;
+    /// GraspSkillType`.
     pub about: String,
-    /// Whether goals from other hosts are taken too; else only those from a loopback address.
+    /// Whether goals from other hosts are accepted; else only goals from a loopback address.
     pub open: bool,
     /// The fields of a goal, without its id: each is called `goal.<name>`.
     pub goal: Vec<CallField>,
@@ -43,19 +46,20 @@ pub struct OwnAction {
     pub result: Vec<CallField>,
     /// The fields of feedback: each is called `feedback.<name>`.
     pub feedback: Vec<Leaf>,
-    /// A block of the fields of a result with nothing in them.
+    /// A block of the fields of an empty result.
     pub empty_result: Bytes,
 }
 
-/// The actions of one program. Goals, feedback and results are blocks of the fields that the action says.
+/// The actions of one program. Goals, feedback and results are blocks of the fields that the action
+/// declares.
 #[derive(Debug)]
 pub struct OwnActions {
     commands: HashMap<TopicId, mpsc::Sender<Command>>,
-    /// The calls of each: of which, and what.
+    /// The calls of the actions: the action that each belongs to, and its part.
     parts: HashMap<TopicId, (TopicId, Part)>,
-    /// What is executed of them.
+    /// The running executions, each with its action and part.
     running: HashMap<ExecutionId, (TopicId, Part)>,
-    /// How many of that wait for a result.
+    /// Number of running executions that wait for a result.
     held: usize,
     reports: mpsc::Receiver<PortEvent>,
     report: mpsc::Sender<PortEvent>,
@@ -78,8 +82,9 @@ impl Default for OwnActions {
 }
 
 impl OwnActions {
-    /// Offers an action, whose goals go to `client`, in the place of what was offered as it. Reports its calls and values. Needs a tokio runtime. `None` where there are
-    /// no identifiers behind that of its goals.
+    /// Offers an action whose goals go to `client`, and replaces an earlier action of the same
+    /// topic. Returns the events of its calls and values, or `None` if there are no identifiers
+    /// behind the identifier of its goals. Needs a tokio runtime.
     pub fn add<C: ActionClient>(
         &mut self,
         action: &OwnAction,
@@ -103,7 +108,7 @@ impl OwnActions {
             latched_by: None,
         });
         let (commands, told) = mpsc::channel(MOST_COMMANDS);
-        // Those that others took the place of.
+        // Reap the tasks of replaced actions.
         while self.tasks.try_join_next().is_some() {}
         let serving = Action {
             encoding,
@@ -112,7 +117,7 @@ impl OwnActions {
             status,
             offered: Arc::new(AtomicBool::new(true)),
             report: self.report.clone(),
-            // Its program shows the skills behind the goals.
+            // The program itself shows the skills behind the goals.
             pending: Pending::default(),
         };
         self.tasks.spawn(Serving::new(serving, client).run(told));
@@ -127,16 +132,16 @@ impl OwnActions {
         Some(events)
     }
 
-    /// Whether it executes that call: a part of an action.
+    /// Returns whether a call is executed here as a part of an action.
     #[must_use]
     pub fn serves(&self, topic: TopicId) -> bool {
         self.parts.contains_key(&topic)
     }
 
-    /// Executes a request for a part of an action. What becomes of it comes from [`recv`](Self::recv).
+    /// Executes a request for a part of an action. The outcome is reported by [`recv`](Self::recv).
     ///
     /// # Errors
-    /// Why it is not executed.
+    /// The reason why the request is refused.
     pub fn execute(&mut self, execution: Execution) -> Result<(), Refusal> {
         let part = self.parts.get(&execution.topic);
         let (action, part) = *part.ok_or(Refusal::NotExecutable)?;
@@ -152,25 +157,28 @@ impl OwnActions {
         Ok(())
     }
 
-    /// The caller of an execution has given it up. An accepted goal goes on. A goal whose run has not begun is cancelled.
+    /// Handles a caller that gives up an execution. An accepted goal goes on. A goal whose run has
+    /// not started is cancelled.
     pub fn abandoned(&mut self, execution: ExecutionId) {
         let running = self.running.get(&execution);
         if let Some(commands) = running.and_then(|(action, _)| self.commands.get(action)) {
             let commands = commands.clone();
-            // It waits for its turn and is not lost. There are as many as executions at most.
+            // The command waits for a place in the queue instead of being dropped. The number of
+            // waiting commands is bounded by the number of executions.
             self.tasks.spawn(async move {
                 let _is_over = commands.send(Command::Abandoned(execution)).await.is_err();
             });
         }
     }
 
-    /// What came of executions, and what goals report. Cancel-safe; pends without any.
+    /// Returns the next outcome of an execution or report of a goal. Cancel-safe; pends while there
+    /// is no event.
     pub async fn recv(&mut self) -> PortEvent {
         std::future::poll_fn(|cx| self.poll_recv(cx)).await
     }
 
     fn poll_recv(&mut self, cx: &mut Context<'_>) -> Poll<PortEvent> {
-        // Never `None` while we hold a sender ourselves.
+        // Never `None`, because `self` holds a sender.
         let Poll::Ready(Some(event)) = self.reports.poll_recv(cx) else {
             return Poll::Pending;
         };
@@ -214,7 +222,7 @@ impl OwnAction {
         let values = values
             .into_iter()
             .map(|((topic, part, suffix), fields, overflow)| {
-                // Without a type nobody in a graph would take note of what the fields are.
+                // A node of a graph ignores values without a type.
                 let message_type = own_type.as_ref().and_then(|of| {
                     TypeName::new(of.package(), &format!("{}{suffix}", of.name())).ok()
                 });
@@ -268,7 +276,8 @@ impl OwnAction {
         let calls = [
             (cancel, ".Cancel", CallRole::Cancel { of }, cancels),
             (result, ".Result", CallRole::Result { of }, waits),
-            // Last, since it is by this one that the others are found.
+            // The call of the goals comes last, because the other calls and values are found
+            // through it.
             (goal, "", CallRole::Goal(family), sends),
         ];
         let calls = calls.map(|(topic, part, role, (request, response))| {
@@ -287,5 +296,5 @@ impl OwnAction {
     }
 }
 
-/// 16 bytes that tell a goal.
+/// Name of the field with the 16 bytes that identify a goal.
 const GOAL_ID: &str = "goal_id";

@@ -8,15 +8,15 @@ use mappings::TopicId;
 
 use super::graph::GoalId;
 
-/// The withdrawn goals of one action that its server has neither ended nor begun to cancel.
+/// The withdrawn goals of one action that its server has neither ended nor started to cancel.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Pending(Arc<Mutex<Goals>>);
 
-/// The withdrawn goals of all actions of a program, also of those that are served no longer.
+/// The withdrawn goals of all actions of a program, including actions that are not served any more.
 #[derive(Debug, Default)]
 pub(super) struct AllPending(Vec<(TopicId, Weak<Mutex<Goals>>)>);
 
-/// Each with the time of its withdrawal.
+/// Each goal with the time of its withdrawal.
 type Goals = Vec<(GoalId, Instant)>;
 
 impl Pending {

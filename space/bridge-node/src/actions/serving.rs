@@ -1,4 +1,5 @@
-//! One action server of the graph, executed for the space: a task that sends goals, and answers who asks about them.
+//! One action server of the graph, executed for the space: a task that sends goals and answers
+//! requests about them.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -23,7 +24,7 @@ use crate::clock::now;
 use crate::port::Execution;
 use crate::services::{CallFault, Ran};
 
-/// What a request is for.
+/// The part of an action that a request is for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Part {
     Goal,
@@ -31,36 +32,36 @@ pub(super) enum Part {
     Result,
 }
 
-/// What the task of an action is told.
+/// A command to the task of an action.
 #[derive(Debug)]
 pub(super) enum Command {
     Execute(Part, Execution),
     Abandoned(ExecutionId),
-    /// The statuses of goals are taken from now on.
+    /// Publishes the goal statuses, because they can be delivered from this moment on.
     TellStatuses,
 }
 
-/// What an action is, and where its values go.
+/// The parameters of an action, and the destinations of its values.
 #[derive(Debug)]
 pub(super) struct Action {
     pub(super) encoding: Encoding,
-    /// Of its goals.
+    /// Topic of the goals.
     pub(super) topic: TopicId,
     pub(super) feedback: TopicId,
     pub(super) status: TopicId,
-    /// Whether its values are taken: its server is there.
+    /// Whether the values are delivered: the server of the action is present.
     pub(super) offered: Arc<AtomicBool>,
     pub(super) report: mpsc::Sender<PortEvent>,
-    /// Its goals whose cancellation is pending.
+    /// The goals whose cancellation is pending.
     pub(super) pending: Pending,
 }
 
-/// The task.
+/// The task of one executed action.
 pub(super) struct Serving<C> {
     action: Action,
     client: Arc<C>,
     goals: Goals,
-    /// What goals and requests to cancel come to.
+    /// Events of goals, and outcomes of requests to cancel.
     news: mpsc::Receiver<News>,
     tell: mpsc::Sender<News>,
     tasks: JoinSet<()>,
@@ -84,13 +85,13 @@ impl<C: ActionClient> Serving<C> {
         }
     }
 
-    /// Serves until the command channel closes. Every waiting request is answered as lost then. Accepted goals go on. Withdrawn
-    /// goals are followed until they have ended.
+    /// Serves until the command channel closes. Every waiting request is then answered as lost.
+    /// Accepted goals go on. Withdrawn goals are followed until they have ended.
     pub(super) async fn run(mut self, mut commands: mpsc::Receiver<Command>) {
         let mut ticks = tokio::time::interval(TICK);
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
-            // All are cancel-safe.
+            // All branches are cancel-safe.
             let is_over = tokio::select! {
                 command = commands.recv() => match command {
                     Some(Command::Execute(part, execution)) => self.execute(part, execution).await,
@@ -98,7 +99,7 @@ impl<C: ActionClient> Serving<C> {
                     Some(Command::TellStatuses) => self.tell_statuses().await,
                     None => Err(Over),
                 },
-                // Never `None` while we hold a sender ourselves.
+                // Never `None`, because `self` holds a sender.
                 Some(news) = self.news.recv() => self.take(news).await,
                 // A component may have a thousand actions, most of them without any goal.
                 _ = ticks.tick(), if !self.goals.is_empty() => self.tidy().await,
@@ -179,7 +180,7 @@ impl<C: ActionClient> Serving<C> {
         let Some(id) = self.action.encoding.read_result_request(&request) else {
             return self.refuse(run, Refusal::InvalidArgument).await;
         };
-        // In time for the answer to get there.
+        // Leaves time for the response to arrive.
         let until = deadline.checked_sub(BEFORE_DEADLINE).unwrap_or(deadline);
         match self.goals.want(id, run, until) {
             Wanted::Waits => Ok(()),
@@ -196,7 +197,7 @@ impl<C: ActionClient> Serving<C> {
         }
     }
 
-    /// The answer of a goal without a result.
+    /// Returns the response for a goal without a result.
     fn no_result(&self, status: i8, why: &str) -> Executed {
         match self.empty(status, why) {
             Some(answer) => answered(&answer),
@@ -239,7 +240,7 @@ impl<C: ActionClient> Serving<C> {
                     };
                     return self.cancelled(run, Ok(answer)).await;
                 }
-                // One of the graph's own clients may have sent it.
+                // A client of the graph itself may have sent the goal.
                 Progress::Unknown | Progress::Open => vec![CancelWhat::Goal(id)],
             },
             CancelRequest {
@@ -274,7 +275,8 @@ impl<C: ActionClient> Serving<C> {
         Ok(())
     }
 
-    /// Withdraws a goal: it is cancelled as soon as its server accepts it. Requests for the goal are answered as unknown.
+    /// Withdraws a goal: it is cancelled as soon as its server accepts it. Requests for the goal
+    /// end with an unknown outcome.
     async fn withdraw(&mut self, id: GoalId) -> Result<(), Over> {
         let asked = self.goals.withdraw(id, now().monotonic);
         self.cancel_in_time(id);
@@ -376,7 +378,7 @@ impl<C: ActionClient> Serving<C> {
         self.finish_all(asked, &Executed::Lost).await
     }
 
-    /// Logs what became of a goal that was withdrawn before it was accepted.
+    /// Logs the end of a goal that was withdrawn before it was accepted.
     fn report_end(&self, id: GoalId, end: &str) {
         if self.goals.is_withdrawn(id) {
             let action = self.action.topic;
@@ -415,7 +417,7 @@ impl<C: ActionClient> Serving<C> {
         self.tell_failure(text).await
     }
 
-    /// Who asked does not wait any longer.
+    /// Handles a caller that gives up its request.
     async fn abandoned(&mut self, execution: ExecutionId) -> Result<(), Over> {
         if self.goals.give_up(execution) {
             return self.refuse(execution, Refusal::NotExecutable).await;
@@ -423,7 +425,7 @@ impl<C: ActionClient> Serving<C> {
         match self.goals.give_up_asking(execution, now().monotonic) {
             GivenUp::NotAsked => Ok(()),
             GivenUp::ByOne => self.finish(execution, Executed::Lost).await,
-            // It would begin when nobody expects it any more.
+            // The goal would start when no caller expects it any more.
             GivenUp::ByAll(goal) => {
                 self.cancel_in_time(goal);
                 self.finish(execution, Executed::Lost).await
@@ -433,7 +435,7 @@ impl<C: ActionClient> Serving<C> {
 
     async fn tidy(&mut self) -> Result<(), Over> {
         let (late, forgotten) = self.goals.tidy(now().monotonic);
-        // They ask anew.
+        // The callers repeat their requests.
         let not_yet = Executed::Refused(Refusal::NotExecutable);
         self.finish_all(late, &not_yet).await?;
         match forgotten {
@@ -481,17 +483,18 @@ impl<C: ActionClient> Serving<C> {
         self.report(PortEvent::CallFailed { topic, detail }).await
     }
 
-    /// Waits while the port has much to take: what comes meanwhile waits, and feedback gives way, in the client.
+    /// Waits while the queue of the port is full: events are queued meanwhile, and the client drops
+    /// feedback.
     async fn report(&self, event: PortEvent) -> Result<(), Over> {
         let report = &self.action.report;
         report.send(event).await.map_err(|_| Over)
     }
 }
 
-/// The port is gone.
+/// The port is closed.
 struct Over;
 
-/// Hands on what happens to one goal.
+/// Forwards the events of one goal.
 async fn follow<G: SentGoal>(id: GoalId, mut goal: G, tell: mpsc::Sender<News>) {
     let mut is_open = true;
     while is_open {
@@ -513,7 +516,7 @@ async fn follow<G: SentGoal>(id: GoalId, mut goal: G, tell: mpsc::Sender<News>) 
     }
 }
 
-/// Cancels one after the other. Where one is being cancelled, that is what is said.
+/// Cancels goals one after the other. If any goal is being cancelled, the response reports success.
 async fn cancel_each<C: ActionClient>(
     client: &C,
     what: Vec<CancelWhat>,
@@ -554,7 +557,7 @@ const fn failed(ran: Ran) -> Executed {
     }
 }
 
-/// One that nobody has chosen before.
+/// Returns a random id.
 fn new_id() -> GoalId {
     use std::hash::{BuildHasher, RandomState};
     let random = || RandomState::new().hash_one(now().utc.unix_nanos());
@@ -565,19 +568,19 @@ fn new_id() -> GoalId {
     id
 }
 
-/// How long before its deadline one who waits for a result is told to ask anew.
+/// How long before its deadline a request for a result is refused, so that its caller repeats it.
 const BEFORE_DEADLINE: Duration = Duration::from_secs(1);
-/// How often it is looked who waits too long.
+/// Interval of the checks for requests that wait too long.
 const TICK: Duration = Duration::from_millis(250);
-/// What of goals waits to be taken in.
+/// The maximal number of queued events of goals.
 const MOST_NEWS: usize = 64;
 /// `action_msgs/GoalStatus`, STATUS_UNKNOWN.
 const UNKNOWN: i8 = 0;
-/// Of a goal that was rejected, or never sent: `action_msgs/GoalStatus` has no status for it, since a server of ROS 2 keeps
-/// none of such a goal.
+/// Status of a goal that was rejected or never sent. `action_msgs/GoalStatus` has no status for it,
+/// because a server of ROS 2 does not keep such a goal.
 const NEVER_RAN: i8 = -1;
 /// `action_msgs/CancelGoal`, ERROR_NONE and ERROR_GOAL_TERMINATED.
 const NONE: i8 = 0;
 const TERMINATED: i8 = 3;
-/// Bad_UnexpectedError (OPC 10000-6, A.2): the server says that it failed.
+/// Bad_UnexpectedError (OPC 10000-6, A.2): the server reports a failure.
 const BAD_UNEXPECTED_ERROR: StatusCode = StatusCode(0x8001_0000);

@@ -1,6 +1,7 @@
-//! The goals of an action that is executed here: what became of each, and who waits for it.
+//! The goals of an action that is executed here: the state of each goal, and the requests that wait
+//! for it.
 //!
-//! No IO and no clock: requests and events come in, answers come out.
+//! No IO and no clock: requests and events are the input, responses are the output.
 
 use std::collections::{HashMap, VecDeque};
 use std::time::{Duration, Instant};
@@ -12,40 +13,40 @@ use uadp::Timestamp;
 use super::graph::GoalId;
 use super::wire::GoalAnswer;
 
-/// Goals by their ids, the ended ones for a while.
+/// The goals by id. Ended goals are kept for a while.
 #[derive(Debug, Default)]
 pub(super) struct Goals {
     known: HashMap<GoalId, Goal>,
-    /// In the order in which they came.
+    /// The ids in the order of arrival.
     order: VecDeque<GoalId>,
-    /// Bytes of the results that are kept.
+    /// Total size of the kept results in bytes.
     kept: usize,
 }
 
 #[derive(Debug)]
 struct Goal {
     state: State,
-    /// When it was accepted; zero before.
+    /// Time of acceptance; zero before.
     stamp: Timestamp,
-    /// Who waits for its result.
+    /// Requests that wait for the result.
     waiting: Vec<Waiting>,
-    /// Since when it is withdrawn: it is to be cancelled as soon as its server has accepted it.
+    /// Time of withdrawal: the goal is to be cancelled as soon as its server has accepted it.
     withdrawn: Option<Instant>,
-    /// The server refuses to cancel it.
+    /// Whether the server refuses to cancel the goal.
     is_refused: bool,
 }
 
 #[derive(Debug)]
 enum State {
-    /// The server has not decided. Who asked.
+    /// The server has not decided. Holds the requests for the goal.
     Sent(Vec<ExecutionId>),
-    /// With the status of `action_msgs/GoalStatus`.
+    /// Holds the status of `action_msgs/GoalStatus`.
     Running(i8),
     Rejected {
         why: String,
         since: Instant,
     },
-    /// The answer to those who ask for the result.
+    /// Holds the response to requests for the result.
     Ended {
         status: i8,
         answer: Bytes,
@@ -56,46 +57,46 @@ enum State {
 #[derive(Debug, Clone, Copy)]
 struct Waiting {
     execution: ExecutionId,
-    /// When it is told to ask anew.
+    /// When the request is refused, so that its caller repeats it.
     until: Instant,
 }
 
-/// What a request for a goal comes to.
+/// The outcome of a request for a goal.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) enum Asked {
-    /// It is to be sent; the answer comes when the server has decided.
+    /// The goal is to be sent; the response follows the decision of the server.
     Send,
-    /// It was sent before; the answer comes likewise.
+    /// The goal was sent before; the response follows the decision of the server.
     Waits,
-    /// It was decided before.
+    /// The server has decided before.
     Answer(GoalAnswer),
-    /// It was withdrawn, and is not sent again.
+    /// The goal was withdrawn, and is not sent again.
     Withdrawn,
-    /// There is no room for one more.
+    /// The limit of goals or requests is reached.
     Full,
 }
 
-/// What a request for a result comes to.
+/// The outcome of a request for a result.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) enum Wanted {
-    /// The answer comes at the end of the goal.
+    /// The response follows the end of the goal.
     Waits,
-    /// It has ended.
+    /// The goal has ended.
     Answer(Bytes),
-    /// There is no such goal.
+    /// The goal is unknown.
     NoGoal,
-    /// It was rejected, or never sent: with the reason.
+    /// The goal was rejected or never sent. Holds the reason.
     Rejected(String),
-    /// As many wait as may.
+    /// The limit of waiting requests is reached.
     Full,
 }
 
-/// How far a goal is that is to be cancelled.
+/// The progress of a goal that is to be cancelled.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Progress {
-    /// None of the space.
+    /// Not a goal of the space.
     Unknown,
-    /// Its server has not decided.
+    /// The server has not decided about the goal.
     Undecided,
     Open,
     Ended,
@@ -113,12 +114,12 @@ pub(super) enum GivenUp {
 }
 
 impl Goals {
-    /// Whether no goal is known, and so nobody waits and nothing is to be forgotten.
+    /// Returns whether no goal is known: no request waits, and no goal can expire.
     pub(super) fn is_empty(&self) -> bool {
         self.known.is_empty()
     }
 
-    /// Somebody asks for a goal.
+    /// Handles a request for a goal.
     pub(super) fn ask(&mut self, id: GoalId, execution: ExecutionId) -> Asked {
         if let Some(goal) = self.known.get_mut(&id) {
             let answer = |accepted, message: &str| {
@@ -155,7 +156,7 @@ impl Goals {
         Asked::Send
     }
 
-    /// Whether one more has room, be it for one that has ended.
+    /// Returns whether there is room for one more goal. Removes the oldest ended goal if necessary.
     fn has_room(&mut self) -> bool {
         if self.known.len() < MOST_GOALS {
             return true;
@@ -169,7 +170,7 @@ impl Goals {
         true
     }
 
-    /// Forgets the goal at that place of the order.
+    /// Removes the goal at an index of the order.
     fn forget(&mut self, place: usize) {
         let id = self.order.remove(place);
         if let Some(goal) = id.and_then(|id| self.known.remove(&id)) {
@@ -177,7 +178,7 @@ impl Goals {
         }
     }
 
-    /// Forgets the oldest that ended, but for one, while the results take too much.
+    /// Removes the oldest ended goals, except for `but`, while the results exceed the limit.
     fn make_room(&mut self, but: GoalId) {
         while self.kept > MOST_BYTES {
             let known = &self.known;
@@ -189,7 +190,7 @@ impl Goals {
         }
     }
 
-    /// The server works on the goal. Returns who asked for it.
+    /// Marks the goal as accepted by the server. Returns the requests for the goal.
     pub(super) fn accepted(
         &mut self,
         id: GoalId,
@@ -211,7 +212,8 @@ impl Goals {
         Some((asked, answer))
     }
 
-    /// The server does not take the goal. Returns who asked for it, and who waits for its result.
+    /// Marks the goal as rejected by the server. Returns the requests for the goal, and the
+    /// requests for its result.
     pub(super) fn rejected(
         &mut self,
         id: GoalId,
@@ -233,8 +235,8 @@ impl Goals {
         Some((asked, answer, goal.take_waiting()))
     }
 
-    /// Notes that the goal was never sent. Returns the requests for the goal and for its result. The goal may be sent anew,
-    /// unless it was withdrawn.
+    /// Removes a goal that was never sent. Returns the requests for the goal and for its result.
+    /// The goal may be sent again, unless it was withdrawn.
     pub(super) fn failed(
         &mut self,
         id: GoalId,
@@ -256,7 +258,7 @@ impl Goals {
         (asked, goal.take_waiting())
     }
 
-    /// How far the server is. False where that is not new.
+    /// Sets the status of a running goal. Returns false if the status has not changed.
     pub(super) fn status(&mut self, id: GoalId, status: i8) -> bool {
         match self.known.get_mut(&id).map(|goal| &mut goal.state) {
             Some(State::Running(known)) => std::mem::replace(known, status) != status,
@@ -264,7 +266,8 @@ impl Goals {
         }
     }
 
-    /// The goal has ended. Returns who waits for its result, and who asked for it where that was not known before.
+    /// Marks the goal as ended. Returns the requests for its result, and the requests for the goal
+    /// that were not answered before.
     pub(super) fn ended(
         &mut self,
         id: GoalId,
@@ -291,7 +294,7 @@ impl Goals {
         (waiting, asked)
     }
 
-    /// Somebody asks for the result of a goal, and waits for it until then.
+    /// Handles a request for the result of a goal that waits until `until`.
     pub(super) fn want(&mut self, id: GoalId, execution: ExecutionId, until: Instant) -> Wanted {
         let waiting: usize = self.known.values().map(|goal| goal.waiting.len()).sum();
         match self.known.get_mut(&id) {
@@ -312,7 +315,7 @@ impl Goals {
         }
     }
 
-    /// Somebody does not wait for a result any longer. False where that one did not.
+    /// Removes a request for a result. Returns false if the request was not waiting.
     pub(super) fn give_up(&mut self, execution: ExecutionId) -> bool {
         self.known.values_mut().any(|goal| {
             let before = goal.waiting.len();
@@ -321,7 +324,7 @@ impl Goals {
         })
     }
 
-    /// Withdraws a goal that its server has not decided about. Returns who asked for it.
+    /// Withdraws a goal that its server has not decided about. Returns the requests for the goal.
     pub(super) fn withdraw(&mut self, id: GoalId, now: Instant) -> Vec<ExecutionId> {
         let Some(goal) = self.known.get_mut(&id) else {
             return Vec::new();
@@ -335,7 +338,7 @@ impl Goals {
         }
     }
 
-    /// The goals that their server has not decided about.
+    /// Returns the goals that their server has not decided about.
     pub(super) fn undecided(&self) -> Vec<GoalId> {
         let sent = self.order.iter().filter(|id| {
             let goal = self.known.get(*id);
@@ -344,8 +347,8 @@ impl Goals {
         sent.copied().collect()
     }
 
-    /// Removes a request that waits for the decision about a goal. A goal without requests is withdrawn, since it would begin
-    /// late.
+    /// Removes a request that waits for the decision about a goal. A goal without requests is
+    /// withdrawn, because it would start late.
     pub(super) fn give_up_asking(&mut self, execution: ExecutionId, now: Instant) -> GivenUp {
         for (id, goal) in &mut self.known {
             let State::Sent(asked) = &mut goal.state else {
@@ -365,22 +368,22 @@ impl Goals {
         GivenUp::NotAsked
     }
 
-    /// The server refuses to cancel a withdrawn goal.
+    /// Notes that the server refuses to cancel a withdrawn goal.
     pub(super) fn cancel_refused(&mut self, id: GoalId) {
         if let Some(goal) = self.known.get_mut(&id) {
             goal.is_refused = true;
         }
     }
 
-    /// Whether a goal is to be cancelled as soon as it is accepted.
+    /// Returns whether a goal is to be cancelled as soon as it is accepted.
     pub(super) fn is_withdrawn(&self, id: GoalId) -> bool {
         self.known
             .get(&id)
             .is_some_and(|goal| goal.withdrawn.is_some())
     }
 
-    /// The withdrawn goals of which the server has not said that it cancels them, or refuses to, and since when. The oldest
-    /// come first.
+    /// Returns the withdrawn goals that the server has neither started nor refused to cancel, each
+    /// with the time of withdrawal, oldest goal first.
     pub(super) fn pending(&self) -> Vec<(GoalId, Instant)> {
         let pending = self.order.iter().filter_map(|id| {
             let goal = self.known.get(id).filter(|goal| !goal.is_refused)?;
@@ -394,7 +397,7 @@ impl Goals {
         pending.collect()
     }
 
-    /// How far a goal is.
+    /// Returns the progress of a goal.
     pub(super) fn progress(&self, id: GoalId) -> Progress {
         match self.known.get(&id).map(|goal| &goal.state) {
             None => Progress::Unknown,
@@ -404,7 +407,7 @@ impl Goals {
         }
     }
 
-    /// The goals that have not ended and were accepted then or before.
+    /// Returns the running goals that were accepted at `until` or before.
     pub(super) fn open_until(&self, until: Timestamp) -> Vec<GoalId> {
         let open = self.known.iter().filter(|(_, goal)| {
             matches!(goal.state, State::Running(_)) && goal.stamp.unix_nanos() <= until.unix_nanos()
@@ -412,7 +415,7 @@ impl Goals {
         open.map(|(id, _)| *id).collect()
     }
 
-    /// The newest goals with their statuses, the oldest of them first.
+    /// Returns the statuses of the newest goals, oldest goal first.
     pub(super) fn statuses(&self) -> Vec<(GoalId, i8)> {
         let newest = self.order.iter().rev();
         let newest = newest.filter_map(|id| {
@@ -428,7 +431,8 @@ impl Goals {
         newest
     }
 
-    /// Forgets goals that ended long ago. Returns who waits too long for a result, and whether any goal was forgotten.
+    /// Removes goals that ended long ago. Returns the requests for results that wait too long, and
+    /// whether any goal was removed.
     pub(super) fn tidy(&mut self, now: Instant) -> (Vec<ExecutionId>, bool) {
         let known = &mut self.known;
         let before = known.len();
@@ -449,7 +453,8 @@ impl Goals {
         (late, forgotten)
     }
 
-    /// Everybody who waits for a goal or a result: nothing more is heard of any.
+    /// Removes and returns all waiting requests for goals and results, because no further event can
+    /// arrive.
     pub(super) fn all_waiting(&mut self) -> Vec<ExecutionId> {
         let mut all = Vec::new();
         for goal in self.known.values_mut() {
@@ -463,7 +468,7 @@ impl Goals {
 }
 
 impl State {
-    /// Of the result that is kept.
+    /// Returns the size of the kept result.
     const fn bytes(&self) -> usize {
         match self {
             Self::Ended { answer, .. } => answer.len(),
@@ -486,15 +491,17 @@ impl Goal {
     }
 }
 
-/// Goals of one action that are known; ended ones give way to new ones.
+/// The maximal number of known goals of one action; ended goals give way to new goals.
 const MOST_GOALS: usize = 1000;
-/// Bytes of the results of one action that are kept; the oldest give way, and the newest stays whatever its size.
+/// The maximal size in bytes of the kept results of one action. The oldest results give way; the
+/// newest is kept whatever its size.
 const MOST_BYTES: usize = 64 << 20;
 /// How long a goal is known after its end.
 const KEPT: Duration = Duration::from_secs(15 * 60);
-/// Who waits for results of one action: each request is held up by a place of the Responder.
+/// The maximal number of requests that wait for results of one action: each occupies a place of the
+/// Responder.
 const MOST_WAITING: usize = 128;
-/// Goals in the value with the statuses.
+/// The maximal number of goals in the value with the statuses.
 const MOST_STATUSES: usize = 100;
 /// `action_msgs/GoalStatus`, STATUS_ACCEPTED.
 const ACCEPTED: i8 = 1;
@@ -531,14 +538,14 @@ mod tests {
         let now = crate::now().monotonic;
         goals.ended(id(1), (4, Bytes::new()), now);
         assert_eq!(goals.ask(id(1), run(4)), Asked::Answer(answer));
-        // Rejected ones too.
+        // A rejected goal is answered again too.
         goals.ask(id(2), run(5));
         let (asked, answer, _) = goals.rejected(id(2), "no".to_owned(), now).unwrap();
         assert_eq!((asked, answer.accepted), (vec![run(5)], false));
         assert_eq!(goals.ask(id(2), run(6)), Asked::Answer(answer));
         let why = "no".to_owned();
         assert_eq!(goals.want(id(2), run(7), now), Wanted::Rejected(why));
-        // One that never came to be may.
+        // A goal that was never sent may be sent again.
         goals.ask(id(3), run(8));
         assert_eq!(goals.failed(id(3), "none", now), (vec![run(8)], vec![]));
         assert_eq!(goals.ask(id(3), run(9)), Asked::Send);
@@ -555,7 +562,7 @@ mod tests {
         assert_eq!(goals.give_up_asking(run(2), now), GivenUp::ByAll(id(1)));
         assert_eq!(goals.give_up_asking(run(2), now), GivenUp::NotAsked);
         assert_eq!(goals.pending(), [(id(1), now)]);
-        // Asking anew does not revive it.
+        // A repeated request does not revive the goal.
         assert_eq!(goals.ask(id(1), run(3)), Asked::Withdrawn);
         let soon = now + Duration::from_secs(30);
         assert_eq!(goals.want(id(1), run(4), soon), Wanted::Waits);

@@ -1,4 +1,4 @@
-//! The policy of both sides in one process: what a graph without a network says, and what it is told.
+//! The policy of both sides in one process, with graphs that have no network.
 
 use std::collections::HashMap;
 use std::sync::Mutex;
@@ -27,17 +27,18 @@ fn of_goals() -> TopicId {
     GOAL.parse().unwrap()
 }
 
-/// The graph on either side. What its servers are asked and its clients are told goes through channels.
+/// The graph on either side. Requests to its servers and events for its clients go through
+/// channels.
 struct Fake {
     registry: Registry,
     sent: mpsc::Sender<Sent>,
     cancels: mpsc::Sender<Cancel>,
-    /// What serves the actions of other spaces takes its events from here.
+    /// The events of the server of an action of another space.
     events: Mutex<Option<mpsc::Receiver<ServerEvent<New, Request>>>>,
     served: Arc<Mutex<Vec<String>>>,
 }
 
-/// A goal that a server of the graph has.
+/// A goal that a server of the graph has received.
 struct Sent {
     id: GoalId,
     body: Bytes,
@@ -175,7 +176,7 @@ impl ActionServer for Server {
     }
 }
 
-/// What a client of the graph is told.
+/// An event that a client of the graph receives.
 #[derive(Debug, PartialEq, Eq)]
 enum Told {
     Accepted,
@@ -249,7 +250,7 @@ impl CancelRequest for Request {
     }
 }
 
-/// A bridge of space 1 that executes, one of space 2 that offers, and what is between them.
+/// A bridge of space 1 that executes, a bridge of space 2 that offers, and the space between them.
 struct Space {
     graph: Fake,
     executing: Actions,
@@ -265,7 +266,7 @@ struct Space {
     clients: mpsc::Sender<ServerEvent<New, Request>>,
     statuses: Vec<Bytes>,
     served: Arc<Mutex<Vec<String>>>,
-    /// Nobody is known to execute anything.
+    /// Whether no executor is known.
     deserted: bool,
 }
 
@@ -304,7 +305,7 @@ impl Space {
         }
     }
 
-    /// With the action offered in both spaces.
+    /// Returns a space with the action offered in both spaces.
     fn offered() -> Self {
         Self::offered_by(QUICK)
     }
@@ -340,7 +341,7 @@ impl Space {
         self.offering.offer_waiting(with, asker, |_, _| true, 8)
     }
 
-    /// Carries what passes between the two until that comes.
+    /// Carries messages between the two bridges until `what` completes.
     async fn until<T>(&mut self, what: impl Future<Output = T>) -> T {
         let mut what = Box::pin(timeout(Duration::from_secs(20), what));
         loop {
@@ -443,7 +444,7 @@ impl Space {
         }
     }
 
-    /// A client of the graph of space 2 has a goal.
+    /// Sends a goal from a client of the graph of space 2.
     async fn client(&mut self) -> mpsc::Receiver<Told> {
         let (told, heard) = mpsc::channel(16);
         let body = Bytes::copy_from_slice(&7_i32.to_le_bytes());
@@ -454,7 +455,7 @@ impl Space {
         heard
     }
 
-    /// The server in space 1 has it.
+    /// Returns the goal that the server in space 1 receives.
     async fn server(&mut self) -> Sent {
         let mut sent = std::mem::replace(&mut self.sent, mpsc::channel(1).1);
         let goal = self.until(sent.recv()).await.unwrap();
@@ -466,7 +467,7 @@ impl Space {
         self.until(heard.recv()).await.unwrap()
     }
 
-    /// As [`client`](Self::client), until both sides have the goal at work.
+    /// Sends a goal as [`client`](Self::client) does, and waits until it is accepted on both sides.
     async fn running(&mut self) -> (Sent, mpsc::Receiver<Told>) {
         let mut heard = self.client().await;
         let goal = self.server().await;
@@ -476,7 +477,8 @@ impl Space {
         (goal, heard)
     }
 
-    /// A client in space 2 asks to cancel the goal, and hears whether that is agreed to.
+    /// Sends a request to cancel the goal from a client in space 2. Returns the receiver of the
+    /// response.
     async fn cancel(&mut self) -> oneshot::Receiver<bool> {
         let (agreed, heard) = oneshot::channel();
         let clients = self.clients.clone();
@@ -504,7 +506,7 @@ fn offers(events: &[PortEvent]) -> impl Iterator<Item = (TopicId, &OfferedType)>
     })
 }
 
-/// As it is announced.
+/// Returns the description of a call as it is announced.
 fn describe(offered: &OfferedType) -> Arc<CallDescription> {
     let fields = |message: &MessageType| {
         let leaves = message.leaves().iter();
@@ -550,7 +552,7 @@ async fn a_goal_goes_to_its_server_and_its_feedback_and_result_come_back() {
     goal.say.send(ended).await.unwrap();
     let end = Told::Ended(4, "done".to_owned(), Some(number(42)));
     assert_eq!(space.told(&mut heard).await, end);
-    // Accepted, then ended.
+    // The status is accepted, then succeeded.
     let status = |status: u8| {
         let mut value = vec![16, 0, 0, 0];
         value.extend(ID);
@@ -569,7 +571,7 @@ async fn a_goal_that_its_server_does_not_take_is_rejected_with_the_reason() {
     goal.say.send(rejected).await.unwrap();
     let told = space.told(&mut heard).await;
     assert_eq!(told, Told::Rejected("too far".to_owned()));
-    // One that nobody has is refused.
+    // A rejected goal is rejected again.
     let mut heard = space.client().await;
     let Told::Rejected(_) = space.told(&mut heard).await else {
         panic!("a goal that was rejected is rejected again");
@@ -597,7 +599,7 @@ async fn a_goal_is_cancelled_where_its_server_agrees() {
     goal.say.send(ended).await.unwrap();
     let end = Told::Ended(5, String::new(), Some(number(3)));
     assert_eq!(space.told(&mut heard).await, end);
-    // One that has ended is not: nobody is asked.
+    // A request to cancel an ended goal is rejected without asking the server.
     let agreed = space.cancel().await;
     assert!(!space.until(agreed).await.unwrap());
 }
@@ -632,7 +634,7 @@ async fn a_goal_whose_server_dies_ends_with_the_reason() {
         panic!("it is aborted");
     };
     assert_eq!(why, "the server has left");
-    // And of one that was never sent the client hears that.
+    // The client of a goal that was never sent receives the reason.
     let mut space = Space::offered();
     let mut heard = space.client().await;
     let goal = space.server().await;
@@ -684,7 +686,7 @@ async fn a_goal_waits_for_a_server_that_is_started_anew_and_is_rejected_where_no
 async fn the_goals_of_a_bridge_that_is_gone_are_aborted_and_its_server_withdrawn() {
     let mut space = Space::offered();
     let (_goal, mut heard) = space.running().await;
-    // It is not heard: nothing is answered any more.
+    // The bridge is silent: requests are not answered any more.
     space.executing = Actions::default();
     space.offering.gone(of_goals(), now().monotonic);
     let end = async {
@@ -696,7 +698,7 @@ async fn the_goals_of_a_bridge_that_is_gone_are_aborted_and_its_server_withdrawn
             }
         }
     };
-    // What it asked for fails, as with a responder that is silent.
+    // Its open requests fail, as with a silent responder.
     let asked: Vec<AskId> = space.asked.values().copied().collect();
     for ask in asked {
         let silent = AskError {
@@ -786,7 +788,7 @@ async fn who_executes_chooses_an_id_and_several_may_wait_for_a_result() {
         .asker(result)
         .within(Duration::from_millis(1200))
         .ask(wire::result_request(Wire::Ros1, goal.id));
-    // Its time is nearly over.
+    // The deadline of the request is close.
     let why = space.until(short).await.unwrap_err();
     assert!(why.starts_with("not executed"), "{why}");
     let ended = GoalEvent::Ended {
@@ -801,7 +803,7 @@ async fn who_executes_chooses_an_id_and_several_may_wait_for_a_result() {
         assert_eq!((outcome.status, outcome.message), (6, "no way".to_owned()));
         assert_eq!(outcome.result, number(8));
     }
-    // All goals at once, by their time.
+    // A request to cancel all goals that were accepted until a time.
     let cancel = executors::beside(of_goals(), 71).unwrap();
     let request = wire::CancelRequest {
         id: NO_GOAL,
@@ -811,7 +813,7 @@ async fn who_executes_chooses_an_id_and_several_may_wait_for_a_result() {
     let asked = asked.ask(wire::cancel_request(Wire::Ros1, request));
     let answer = space.until(asked).await.unwrap();
     let answer = wire::read_cancel_answer(Wire::Ros1, &answer).unwrap();
-    // None is open any more.
+    // No goal is open any more.
     assert_eq!((answer.code, answer.goals.len()), (0, 0));
 }
 
@@ -858,7 +860,7 @@ async fn a_variable_of_the_mapping_is_no_value_of_an_action() {
     let variable = "variables: [{node: ns=2;i=73, name: Speed, origin: 1}]\n";
     let mut space = Space::new(&format!("{QUICK}namespaces: {{2: urn:test}}\n{variable}"));
     assert!(space.reconcile().is_empty(), "its feedback would be that");
-    // Who has another mapping says so all the same.
+    // A bridge with another mapping announces the action all the same.
     let events = Space::new(QUICK).reconcile();
     space.announce(&events);
     assert!(space.offer().is_empty());
@@ -881,7 +883,8 @@ async fn actions_that_would_have_the_same_calls_are_not_both_offered() {
         goals
     };
     let events = space.reconcile();
-    // The first takes 66 to 70, so the one at 70 goes without, and 75 is of the one at 73.
+    // The first action occupies 66 to 70, so the action at 70 is not offered, and 75 belongs to the
+    // action at 73.
     assert_eq!(offered(&events), [66, 73]);
     assert_eq!(space.reconcile().len(), 0);
 }

@@ -1,6 +1,7 @@
-//! The calls and values of an action as the messages of either ROS, without a look into goals, feedback and results.
+//! Calls and values of an action as ROS 1 or ROS 2 messages. The content of goals, feedback and
+//! results is opaque.
 //!
-//! What is read is written by the Router, in little endian; what is written is read by it.
+//! The Router writes and reads the messages, in little endian.
 
 use std::sync::Arc;
 
@@ -10,17 +11,17 @@ use uadp::Timestamp;
 
 use super::graph::{CancelAnswer, GoalId};
 
-/// The answer to a goal.
+/// The response to a goal.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct GoalAnswer {
     pub(super) accepted: bool,
     pub(super) id: GoalId,
-    /// When it was accepted.
+    /// Time of acceptance.
     pub(super) stamp: Timestamp,
     pub(super) message: String,
 }
 
-/// A result as a facade hands it on.
+/// A result as a facade forwards it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Outcome {
     pub(super) status: i8,
@@ -29,16 +30,16 @@ pub(super) struct Outcome {
     pub(super) result: Bytes,
 }
 
-/// Which goals a request to cancel means.
+/// The goals that a request to cancel selects.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct CancelRequest {
-    /// All zero: any.
+    /// All zero: any goal.
     pub(super) id: GoalId,
-    /// `None`: any; else those that were accepted then or before.
+    /// `None`: any goal; else goals that were accepted at this time or before.
     pub(super) until: Option<Timestamp>,
 }
 
-/// A goal or feedback behind its id.
+/// Joins an id and the goal or feedback behind it.
 pub(super) fn join(wire: Wire, id: GoalId, body: &[u8]) -> Option<Bytes> {
     let (head, rest) = body.split_at_checked(header(wire))?;
     let mut bytes = BytesMut::with_capacity(body.len() + id.len());
@@ -48,7 +49,8 @@ pub(super) fn join(wire: Wire, id: GoalId, body: &[u8]) -> Option<Bytes> {
     Some(bytes.freeze())
 }
 
-/// The id, and the goal or feedback behind it. 16 bytes change no alignment of CDR.
+/// Splits a message into the id and the goal or feedback behind it. 16 bytes do not change the
+/// alignment of CDR.
 pub(super) fn split(wire: Wire, message: &[u8]) -> Option<(GoalId, Bytes)> {
     let (head, rest) = message.split_at_checked(header(wire))?;
     let (id, rest) = rest.split_first_chunk()?;
@@ -56,14 +58,14 @@ pub(super) fn split(wire: Wire, message: &[u8]) -> Option<(GoalId, Bytes)> {
     Some((*id, body.into()))
 }
 
-/// A request for the result of a goal.
+/// Encodes a request for the result of a goal.
 pub(super) fn result_request(wire: Wire, id: GoalId) -> Bytes {
     let mut out = Writer::new(wire);
     out.raw(&id);
     out.finish()
 }
 
-/// The goal whose result is asked for.
+/// Returns the goal whose result is requested.
 pub(super) fn read_result_request(wire: Wire, message: &[u8]) -> Option<GoalId> {
     Reader::new(wire, message)?.id()
 }
@@ -123,8 +125,9 @@ pub(super) fn read_cancel_answer(wire: Wire, message: &[u8]) -> Option<CancelAns
     Some(CancelAnswer { code, goals })
 }
 
-/// The answer with a result. In ROS 2 what is behind the status of an `X_GetResult_Response` begins at an offset of 1, seen
-/// from its multiples of 8; so it does behind a text of such a length, and stays as it is.
+/// Encodes the response with a result. In ROS 2 the fields behind the status of an
+/// `X_GetResult_Response` start at an offset of 1 modulo 8. The message text is padded to a
+/// multiple of 8 bytes, so that the fields behind it have the same offset and are copied unchanged.
 pub(super) fn result_answer(
     wire: Wire,
     (status, message): (i8, &str),
@@ -146,10 +149,10 @@ pub(super) fn result_answer(
     Some(out.finish())
 }
 
-/// The answer without a result of a server: all fields of the result are zero or empty.
+/// Encodes the response without a result of a server: all fields of the result are zero or empty.
 ///
 /// # Errors
-/// Why there can be none, for people.
+/// The reason why the response cannot be encoded, as text for the user.
 pub(super) fn empty_result_answer(
     wire: Wire,
     calls: &Arc<ActionCalls>,
@@ -172,7 +175,8 @@ pub(super) fn empty_result_answer(
     Ok(bytes.into())
 }
 
-/// The answer to a facade: of [`ActionCalls::result`] in ROS 1, of [`ActionCalls::outcome`] in ROS 2.
+/// Decodes the response to a facade: the type [`ActionCalls::result`] in ROS 1,
+/// [`ActionCalls::outcome`] in ROS 2.
 pub(super) fn read_outcome(wire: Wire, message: &Bytes) -> Option<Outcome> {
     let mut read = Reader::new(wire, message)?;
     let status = read.code()?;
@@ -194,7 +198,7 @@ pub(super) fn read_outcome(wire: Wire, message: &Bytes) -> Option<Outcome> {
     })
 }
 
-/// The value with the statuses of goals.
+/// Encodes the value with the goal statuses.
 pub(super) fn statuses(wire: Wire, goals: &[(GoalId, i8)]) -> Bytes {
     let ids: Vec<GoalId> = goals.iter().map(|(id, _)| *id).collect();
     let statuses: Vec<u8> = goals
@@ -207,7 +211,7 @@ pub(super) fn statuses(wire: Wire, goals: &[(GoalId, i8)]) -> Bytes {
     out.finish()
 }
 
-/// Bytes in front of a message.
+/// Returns the number of header bytes in front of a message.
 const fn header(wire: Wire) -> usize {
     match wire {
         Wire::Ros1 => 0,
@@ -259,7 +263,7 @@ impl Writer {
         match self.wire {
             Wire::Ros1 => self.sequence(text.as_bytes()),
             Wire::Cdr => {
-                // A text of CDR ends with a zero, and so has none within.
+                // A string of CDR ends with a zero byte, and so contains none.
                 let text = text.replace('\0', " ");
                 self.length(text.len() + 1);
                 self.raw(text.as_bytes());
@@ -281,7 +285,7 @@ impl Writer {
 struct Reader<'m> {
     wire: Wire,
     message: &'m [u8],
-    /// Place of what is read next.
+    /// Position of the next read.
     at: usize,
 }
 
@@ -401,7 +405,7 @@ mod tests {
 
     #[test]
     fn a_result_of_ros_2_is_the_same_behind_any_text() {
-        // status, 7 bytes of padding, y; and no sequence before it.
+        // The response is the status, 7 bytes of padding, and y, without a sequence before it.
         let response = [&[0, 1, 0, 0, 4][..], &[0; 7], &1.5_f64.to_le_bytes()].concat();
         let name = "demo_msgs/Y".parse().unwrap();
         let mut registry = Registry::bundle(Dialect::Ros2);

@@ -1,4 +1,5 @@
-//! Keys from a Security Key Service: fetched at the start, before they run out, and when somebody uses one that is not known.
+//! Keys from a Security Key Service: fetched at the start, before they run out, and when somebody
+//! uses one that is not known.
 
 use std::fmt;
 use std::pin::Pin;
@@ -54,7 +55,8 @@ pub type Fetching<'a> = Pin<Box<dyn Future<Output = Result<Fetched, String>> + S
 
 /// Fetches keys; what knows how to is the program, as this crate knows no OPC UA sessions.
 pub trait KeyService: fmt::Debug + Send + Sync {
-    /// The keys of a group from now on, or why there are none, for people. Has an end within a minute.
+    /// The keys of a group from now on, or why there are none, for people. Has an end within a
+    /// minute.
     fn fetch<'a>(&'a self, request: &'a KeyRequest) -> Fetching<'a>;
 }
 
@@ -137,8 +139,8 @@ fn tell_failure(request: &KeyRequest, failures: u32, why: &str) {
     );
 }
 
-/// When to ask again: after half the lifetime of a key (OPC 10000-14, 8.3.2), which is soon enough to hear of one that is
-/// withdrawn, and not all the time.
+/// When to ask again: after half the lifetime of a key (OPC 10000-14, 8.3.2), which is soon enough
+/// to hear of one that is withdrawn, and not all the time.
 fn rest(delivery: &KeyDelivery) -> Duration {
     (delivery.lifetime / 2).clamp(LEAST_REST, MOST_REST)
 }

@@ -28,7 +28,8 @@ struct Written {
 /// The keys of a group, in the order of the file.
 ///
 /// # Errors
-/// When the file cannot be read, others can read it too, or what stands in it are no keys of the group. No key is told.
+/// When the file cannot be read, others can read it too, or what stands in it are no keys of the
+/// group. No key is told.
 pub(super) fn read(path: &Path, group: &SecurityGroup) -> Result<KeyDelivery, Failure> {
     let name = path.display();
     let unreadable = |error: std::io::Error| {

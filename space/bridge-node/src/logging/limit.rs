@@ -1,5 +1,6 @@
-//! Limits the log lines that one callsite writes. Messages of peers cause most log lines, so a peer in a loop could
-//! fill a disk. A place that knows its cause limits by it with `LogLimit`; this is the bound for all.
+//! Limits the log lines that one callsite writes. Messages of peers cause most log lines, so a peer
+//! in a loop could fill a disk. A place that knows its cause limits by it with `LogLimit`; this is
+//! the bound for all.
 
 use std::cell::Cell;
 use std::collections::HashMap;
@@ -13,7 +14,8 @@ use tracing_subscriber::layer::{Context, Filter};
 
 use crate::clock::now;
 
-/// Admits [`MOST`] messages per callsite and [`PERIOD`]. Debug and trace levels are not limited: the operator asked for them.
+/// Admits [`MOST`] messages per callsite and [`PERIOD`]. Debug and trace levels are not limited:
+/// the operator asked for them.
 #[derive(Debug, Default)]
 pub(super) struct PerCallsite {
     throttles: Mutex<HashMap<Identifier, Throttle>>,

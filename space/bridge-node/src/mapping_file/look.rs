@@ -125,11 +125,12 @@ impl Look {
         })
     }
 
-    /// Looks at the files, and reads them if they are other ones that are no longer being written. The definitions do not
-    /// keep a mapping from being read, and are waited for so long only.
+    /// Looks at the files, and reads them if they are other ones that are no longer being written.
+    /// The definitions do not keep a mapping from being read, and are waited for so long only.
     fn take(self) -> Looked {
         let mapping = again(&self.files.mapping);
-        // Written to until just now, or about to be: a file that is saved is gone or empty for a moment.
+        // Written to until just now, or about to be: a file that is saved is gone or empty for a
+        // moment.
         let at = mapping.get(&self.file).copied().flatten();
         let is_there = at.is_some_and(|at| at.len > 0);
         let settled = self.before.mapping.as_ref() == Some(&mapping);
@@ -161,7 +162,8 @@ impl Look {
         }
     }
 
-    /// How the definition files are, where that is not how they were read, and whether they have been waited for.
+    /// How the definition files are, where that is not how they were read, and whether they have
+    /// been waited for.
     fn types(&self) -> (Option<(Stamps, usize)>, bool) {
         let before = self.before.types.as_ref();
         if before.is_none() && !self.files.types_differ(self.turn) {
@@ -182,14 +184,16 @@ impl Look {
 const SLOW: Duration = Duration::from_secs(5);
 /// After so many looks, five seconds, definitions that do not stay the same are read as they are.
 const PATIENCE: usize = 20;
-/// Definition files and folders looked at with each look: some 1000 a second, of which each costs a microsecond or two.
+/// Definition files and folders looked at with each look: some 1000 a second, of which each costs a
+/// microsecond or two.
 const LOOKED_AT_ONCE: usize = 256;
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    /// A mapping with definitions, in a folder of its own that goes away with it, that is looked at again and again.
+    /// A mapping with definitions, in a folder of its own that goes away with it, that is looked at
+    /// again and again.
     struct Looks {
         folder: PathBuf,
         files: Arc<Seen>,

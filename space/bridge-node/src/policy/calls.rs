@@ -5,9 +5,9 @@ use std::sync::Arc;
 use bridge_core::{CallDescription, CallMap};
 use messages::{ActionCalls, ServiceType, TypeName};
 
-/// The type of the service that a call is offered as: what the mapping says; else what the one who executes it says
-/// (at the beginning of what is said about it, as in `my_msgs/Weigh; Weighs the part`); else one of `std_srvs` that has its
-/// fields. `find` finds the type of a name.
+/// The type of the service that a call is offered as: what the mapping says; else what the one who
+/// executes it says (at the beginning of what is said about it, as in `my_msgs/Weigh; Weighs the
+/// part`); else one of `std_srvs` that has its fields. `find` finds the type of a name.
 ///
 /// # Errors
 /// Why there is none, for people.
@@ -50,8 +50,8 @@ pub fn call_type(
     })
 }
 
-/// The type of the action that a family of calls is offered as: what the mapping says, else what the one who executes it says
-/// of its goals. `find` finds the type of a name.
+/// The type of the action that a family of calls is offered as: what the mapping says, else what
+/// the one who executes it says of its goals. `find` finds the type of a name.
 ///
 /// # Errors
 /// Why there is none, for people.

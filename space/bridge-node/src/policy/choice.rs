@@ -3,8 +3,8 @@
 use bridge_core::Described;
 use messages::{MessageType, Selection, TypeName};
 
-/// What is known of the type of one topic of another space: what the mapping says, what the writer of the value says, and
-/// what the value is.
+/// What is known of the type of one topic of another space: what the mapping says, what the writer
+/// of the value says, and what the value is.
 #[derive(Debug, Clone, Default)]
 pub struct Choice {
     /// What the mapping ties it to; it decides alone.
@@ -12,7 +12,8 @@ pub struct Choice {
     // In Boxes, as a mapped value of which nothing was heard has none of these.
     /// What the writer of the value says of it.
     described: Option<Box<Described>>,
-    /// The type it says, where it is known here and has those fields, and what of the message they are.
+    /// The type it says, where it is known here and has those fields, and what of the message they
+    /// are.
     learned: Option<Box<(TypeName, Selection)>>,
     /// The std_msgs type of the value, if it is one value and there is such a type.
     standard: Option<TypeName>,
@@ -56,8 +57,8 @@ impl Choice {
         self.mapped.as_ref()
     }
 
-    /// The types it could have, best first: the mapping's; what subscribers ask for; what its writer says; the standard
-    /// type of the value.
+    /// The types it could have, best first: the mapping's; what subscribers ask for; what its
+    /// writer says; the standard type of the value.
     #[must_use]
     pub fn candidates(&self, asked_for: impl IntoIterator<Item = TypeName>) -> Vec<TypeName> {
         if let Some((message_type, _)) = &self.mapped {
@@ -104,9 +105,9 @@ impl Choice {
         }
     }
 
-    /// Takes what was heard of the value. `open` is the type in which it is written by now, and whether somebody here
-    /// subscribes to it: the type that somebody subscribed to stays, whatever of it the value is; without a word nothing
-    /// changes.
+    /// Takes what was heard of the value. `open` is the type in which it is written by now, and
+    /// whether somebody here subscribes to it: the type that somebody subscribed to stays, whatever
+    /// of it the value is; without a word nothing changes.
     #[must_use]
     pub fn hear(&mut self, word: Word, open: Option<(&TypeName, bool)>) -> Step {
         let Word {

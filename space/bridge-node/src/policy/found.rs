@@ -21,7 +21,8 @@ pub enum Found {
 }
 
 impl Policy {
-    /// What a topic is, by its full name (`/ua_1_5_3`, `/turtle1/pose`) and its type, where that is known.
+    /// What a topic is, by its full name (`/ua_1_5_3`, `/turtle1/pose`) and its type, where that is
+    /// known.
     #[must_use]
     pub fn found(&self, ros_topic: &str, typed: Option<&TypeName>) -> Found {
         let name = ros_topic.strip_prefix('/').unwrap_or_default();

@@ -1,7 +1,9 @@
-//! What the ports of both ROS decide alike: which topics of a graph are values of the space, in which type values of
-//! other spaces are written, what gives way, what another mapping changes, and what is told once.
+//! What the ports of both ROS decide alike: which topics of a graph are values of the space, in
+//! which type values of other spaces are written, what gives way, what another mapping changes, and
+//! what is told once.
 //!
-//! No IO and no clock: a port says what there is in its graph, and carries out what comes of it with its library.
+//! No IO and no clock: a port says what there is in its graph, and carries out what comes of it
+//! with its library.
 
 mod calls;
 mod choice;
@@ -74,16 +76,16 @@ impl Policy {
         std::mem::replace(&mut self.mapping, Arc::clone(mapping))
     }
 
-    /// Whether a value is one that can be made up by anybody on the network: the mapping does not name it, and nobody
-    /// here subscribes to it.
+    /// Whether a value is one that can be made up by anybody on the network: the mapping does not
+    /// name it, and nobody here subscribes to it.
     #[must_use]
     pub fn is_stray(&self, topic: TopicId, subscribed: bool) -> bool {
         !subscribed && self.mapping.variable(topic).is_none()
     }
 
-    /// Room for one more stray. `strays` are those there are, each with since when its writer is silent; they are only
-    /// looked at when no place is left, and then those give way first that are silent longest, at most
-    /// [`MOST_LET_GO`] of them. One whose writer is heard never does.
+    /// Room for one more stray. `strays` are those there are, each with since when its writer is
+    /// silent; they are only looked at when no place is left, and then those give way first that
+    /// are silent longest, at most [`MOST_LET_GO`] of them. One whose writer is heard never does.
     pub fn admit_stray<I>(&mut self, now: Instant, strays: impl FnOnce(&Self) -> I) -> Admission
     where
         I: IntoIterator<Item = (Option<Instant>, TopicId)>,
@@ -100,8 +102,8 @@ impl Policy {
         }
     }
 
-    /// What of a message of the type that the writer of a value says it is the value is. `None`, and told once, where the
-    /// type has other fields here.
+    /// What of a message of the type that the writer of a value says it is the value is. `None`,
+    /// and told once, where the type has other fields here.
     pub fn learned(
         &mut self,
         topic: TopicId,
@@ -119,7 +121,8 @@ impl Policy {
     }
 }
 
-/// Returns the strays that give way, longest silent first, at most [`MOST_LET_GO`]. A stray whose writer is heard does not.
+/// Returns the strays that give way, longest silent first, at most [`MOST_LET_GO`]. A stray whose
+/// writer is heard does not.
 #[must_use]
 pub fn longest_silent(
     strays: impl IntoIterator<Item = (Option<Instant>, TopicId)>,
@@ -132,7 +135,8 @@ pub fn longest_silent(
     silent.into_iter().map(|(_, topic)| topic).collect()
 }
 
-/// Whether the type of a topic is another than the Router knows by now: what it wrote is still in the old one.
+/// Whether the type of a topic is another than the Router knows by now: what it wrote is still in
+/// the old one.
 #[must_use]
 pub fn type_changes(waiting: &VecDeque<PortEvent>, topic: TopicId) -> bool {
     waiting.iter().any(|event| {
@@ -154,10 +158,11 @@ pub const fn is_bad(status: u16) -> bool {
 pub const TYPE_CHANGES: &str = "type changes";
 /// Why an event is not written. It is counted, and is no fault.
 pub const NO_SUBSCRIBER: &str = "no subscriber is present";
-/// Topics of the space that the mapping does not name and that are read: anybody in a graph can invent names. Likewise
-/// those that are written, of values nobody here knows.
+/// Topics of the space that the mapping does not name and that are read: anybody in a graph can
+/// invent names. Likewise those that are written, of values nobody here knows.
 pub const MAX_TOPICS: usize = 4096;
-/// How many strays are given up at a time: a master is told of each, and RustDDS takes commands from a bounded queue.
+/// How many strays are given up at a time: a master is told of each, and RustDDS takes commands
+/// from a bounded queue.
 pub const MOST_LET_GO: usize = MAX_TOPICS / 32;
 
 #[cfg(test)]

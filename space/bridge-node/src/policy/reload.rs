@@ -12,8 +12,8 @@ use uadp::Timestamp;
 use super::Policy;
 use crate::PortEvent;
 
-/// The topics the mapping reads, by the names the graph has for them: the type each is to have, and the values made of
-/// it.
+/// The topics the mapping reads, by the names the graph has for them: the type each is to have, and
+/// the values made of it.
 pub type Read = BTreeMap<String, (TypeName, Vec<(TopicId, Selection)>)>;
 
 /// Where the values of a topic of another space go.
@@ -30,8 +30,8 @@ pub struct Destination {
 }
 
 impl Policy {
-    /// What the mapping reads. `resolve` makes of a topic of the mapping the name the graph has for it; a topic it fails
-    /// at is told of and left out.
+    /// What the mapping reads. `resolve` makes of a topic of the mapping the name the graph has for
+    /// it; a topic it fails at is told of and left out.
     pub fn read<E: std::fmt::Display>(&self, resolve: impl Fn(&str) -> Result<String, E>) -> Read {
         let mut read = Read::new();
         for (variable, binding) in self.mapping.bindings(self.own) {
@@ -53,7 +53,8 @@ impl Policy {
         read
     }
 
-    /// Where the values of another space go: to what the mapping ties them to, else to a topic of their name.
+    /// Where the values of another space go: to what the mapping ties them to, else to a topic of
+    /// their name.
     #[must_use]
     pub fn destination(&self, topic: TopicId) -> Destination {
         let variable = self.mapping.variable(topic);
@@ -94,8 +95,9 @@ impl Policy {
     }
 }
 
-/// The values that are made of a topic by the mapping that is gone over to: what that says of it, if the type is the one
-/// the topic has; else, where it does not name the topic, what was `found` of it.
+/// The values that are made of a topic by the mapping that is gone over to: what that says of it,
+/// if the type is the one the topic has; else, where it does not name the topic, what was `found`
+/// of it.
 #[must_use]
 pub fn still_made(
     named: Option<&(TypeName, Vec<(TopicId, Selection)>)>,
@@ -110,8 +112,8 @@ pub fn still_made(
     }
 }
 
-/// What a port reports of a value that comes to be made of a topic that is read already: what is latched there was sent
-/// before and will not be again.
+/// What a port reports of a value that comes to be made of a topic that is read already: what is
+/// latched there was sent before and will not be again.
 pub fn taken_up<'l>(
     (topic, selection): (TopicId, Selection),
     message_type: &Arc<MessageType>,

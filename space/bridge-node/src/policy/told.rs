@@ -9,7 +9,8 @@ use tracing::warn;
 pub struct Told(BTreeSet<(String, &'static str)>);
 
 impl Told {
-    /// Logs something about a topic the first time it happens; says whether it was. `what` names the kind of it.
+    /// Logs something about a topic the first time it happens; says whether it was. `what` names
+    /// the kind of it.
     pub fn once(
         &mut self,
         topic: &str,

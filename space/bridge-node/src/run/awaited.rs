@@ -13,7 +13,8 @@ use crate::clock::now;
 use crate::port::Port;
 
 impl<P: Port> Shell<P> {
-    /// Compares the peers that the mapping needs with those that are there, and logs the difference.
+    /// Compares the peers that the mapping needs with those that are there, and logs the
+    /// difference.
     pub(super) fn look_for_peers(&mut self) {
         let now = now().monotonic;
         let mut missing = AwaitedPeers::default();
@@ -33,7 +34,8 @@ impl<P: Port> Shell<P> {
     }
 }
 
-/// Adds the spaces that the program needs values or calls of and receives nothing from, and the calls that nobody offers.
+/// Adds the spaces that the program needs values or calls of and receives nothing from, and the
+/// calls that nobody offers.
 fn add_spaces(
     router: &Router,
     own: SpaceId,
@@ -112,8 +114,8 @@ enum Presence {
     Silent,
 }
 
-/// Returns the spaces that anything was received from. A program without values is known by the description of its
-/// application or by its calls.
+/// Returns the spaces that anything was received from. A program without values is known by the
+/// description of its application or by its calls.
 fn received_spaces(
     router: &Router,
     timeout: Duration,

@@ -1,4 +1,5 @@
-//! What passes between the port and the Router about calls, and about what a program without a mapping has.
+//! What passes between the port and the Router about calls, and about what a program without a
+//! mapping has.
 
 use std::sync::Arc;
 

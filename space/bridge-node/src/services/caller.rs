@@ -23,7 +23,8 @@ pub trait ServiceCall: Send + 'static {
     /// [`CallFault`]; a call ends in bounded time.
     fn call(&self, request: Bytes) -> impl Future<Output = Result<Bytes, CallFault>> + Send;
 
-    /// Whether the service has the request of the call that is under way, as far as that is known before its answer.
+    /// Whether the service has the request of the call that is under way, as far as that is known
+    /// before its answer.
     fn has_request(&self) -> bool {
         false
     }
@@ -34,7 +35,8 @@ pub trait ServiceCall: Send + 'static {
 pub struct CallFault {
     /// For people.
     pub text: String,
-    /// Whether the same call may succeed later, with nobody changing anything but the service coming back.
+    /// Whether the same call may succeed later, with nobody changing anything but the service
+    /// coming back.
     pub may_pass: bool,
     /// Whether the service ran.
     pub ran: Ran,
@@ -89,8 +91,8 @@ impl<C: ServiceCall> Caller<C> {
         }
     }
 
-    /// Calls with each request in turn. A state (`insist`) is tried until the service takes it or a newer value has
-    /// come, an event once.
+    /// Calls with each request in turn. A state (`insist`) is tried until the service takes it or a
+    /// newer value has come, an event once.
     pub(super) async fn serve(mut self, pending: Arc<Pending>, insist: bool) {
         loop {
             let mut request = pending.take().await;

@@ -9,10 +9,11 @@ use bytes::Bytes;
 use mappings::Overflow;
 use tokio::sync::Notify;
 
-/// The bounded queue between the port and the task that calls one service. When it is full, the oldest gives way.
+/// The bounded queue between the port and the task that calls one service. When it is full, the
+/// oldest gives way.
 ///
-/// `None` stands for a value that calls nothing: of a state it says that no earlier one is to be called for any more, of
-/// events nothing.
+/// `None` stands for a value that calls nothing: of a state it says that no earlier one is to be
+/// called for any more, of events nothing.
 #[derive(Debug)]
 pub(super) struct Pending {
     depth: usize,
@@ -91,7 +92,8 @@ impl Pending {
         }
     }
 
-    /// The oldest with its number, when there is one. Cancel-safe: it is taken only when it is returned.
+    /// The oldest with its number, when there is one. Cancel-safe: it is taken only when it is
+    /// returned.
     pub(super) async fn take(&self) -> (u64, Option<Bytes>) {
         loop {
             let next = self.lock().requests.pop_front();
