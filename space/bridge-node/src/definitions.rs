@@ -1,4 +1,5 @@
-//! Type definitions for a port: those built in, those in files, and those that peers bring.
+//! Type definitions for a port: built-in definitions, definitions from files, and definitions from
+//! peers.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -10,20 +11,20 @@ use messages::{
 use tracing::{info, warn};
 use type_files::{Environment, TypeFiles, TypePaths};
 
-/// Finds types by name; a definition once read stays until all are read again.
+/// Finds types by name. A definition stays cached until all definitions are read again.
 #[derive(Debug)]
 pub struct Definitions {
     library: Library,
     files: TypeFiles,
-    /// Who brought those that are from peers.
+    /// The sources of the definitions from peers.
     peers: BTreeMap<TypeName, String>,
-    /// How many names that are not known are still compared with those that are.
+    /// How many further unknown names are compared with the known names.
     suggestions: u32,
 }
 
 impl Definitions {
-    /// With the built-in definitions of one ROS, those of the mapping's `type_paths`, and the ROS
-    /// installations there are.
+    /// Creates the definitions of one ROS from the built-in definitions, the `type_paths` of the
+    /// mapping, and the installed ROS distributions.
     #[must_use]
     pub fn new(dialect: Dialect, types: Arc<TypePaths>, environment: Environment) -> Self {
         Self {
@@ -34,7 +35,7 @@ impl Definitions {
         }
     }
 
-    /// Takes what the `type_paths` have by now. What peers brought stays.
+    /// Replaces the definitions of the `type_paths`. Definitions from peers stay.
     pub fn replace(&mut self, types: &Arc<TypePaths>) {
         self.suggestions = MOST_SUGGESTIONS;
         if self.files.paths().is_none() && types.is_none() {
@@ -44,28 +45,28 @@ impl Definitions {
         self.files.replace(Arc::clone(types));
     }
 
-    /// What is known by now.
+    /// Returns the registry of the known definitions.
     #[must_use]
     pub const fn registry(&self) -> &Registry {
         self.library.registry()
     }
 
-    /// For definitions that come another way than by files.
+    /// Returns the registry for definitions that do not come from files.
     pub const fn registry_mut(&mut self) -> &mut Registry {
         self.library.registry_mut()
     }
 
-    /// The type of that name with all it needs; files are read, once.
+    /// Returns the type of a name with all its nested types. Files are read once.
     ///
     /// # Errors
-    /// [`DefinitionError`]; a file that does not parse is logged and counts as not there.
+    /// [`DefinitionError`]. A file that does not parse is logged and ignored.
     pub fn find(&mut self, name: &TypeName) -> Result<Arc<MessageType>, DefinitionError> {
         let found = self.library.message(name, &mut self.files);
         self.tell();
         found
     }
 
-    /// The service of that name, found likewise.
+    /// Returns the service type of a name, as [`find`](Self::find) does.
     ///
     /// # Errors
     /// As [`find`](Self::find).
@@ -75,20 +76,20 @@ impl Definitions {
         found
     }
 
-    /// The action of ROS 1 of that name, found likewise.
+    /// Returns the ROS 1 action type of a name, as [`find`](Self::find) does.
     ///
     /// # Errors
-    /// As [`find`](Self::find), of one of its messages.
+    /// As [`find`](Self::find), for one of the messages of the action.
     pub fn find_action(&mut self, name: &TypeName) -> Result<Arc<ActionType>, DefinitionError> {
         let found = self.library.action(name, &mut self.files);
         self.tell();
         found
     }
 
-    /// The action of ROS 2 of that name, found likewise.
+    /// Returns the messages of the ROS 2 action of a name, as [`find`](Self::find) does.
     ///
     /// # Errors
-    /// As [`find`](Self::find), of one of its messages.
+    /// As [`find`](Self::find), for one of the messages of the action.
     pub fn find_action_messages(
         &mut self,
         name: &TypeName,
@@ -98,10 +99,11 @@ impl Definitions {
         found
     }
 
-    /// The action of either ROS of that name as calls and values of the space, found likewise.
+    /// Returns the ROS 1 or ROS 2 action of a name as calls and values of the space, as
+    /// [`find`](Self::find) does.
     ///
     /// # Errors
-    /// As [`find`](Self::find), of one of its messages.
+    /// As [`find`](Self::find), for one of the messages of the action.
     pub fn find_action_calls(
         &mut self,
         name: &TypeName,
@@ -111,10 +113,10 @@ impl Definitions {
         found.map(Arc::new)
     }
 
-    /// What people are to be told of an error of [`find`](Self::find), or of
-    /// [`find_service`](Self::find_service) for the kind of services: with the known name that may
-    /// be meant. Only for what is shown, as it compares all names; of many unknown ones, which
-    /// peers can make up, only the first are compared.
+    /// Explains an error of [`find`](Self::find), or of [`find_service`](Self::find_service) for
+    /// the kind of services, as text for the user. Suggests the known name that may be meant. Call
+    /// it only for errors that are shown, because it compares all names. Only the first unknown
+    /// names are compared, because peers can invent names.
     pub fn explain(&mut self, kind: TextKind, error: &DefinitionError) -> String {
         let DefinitionError::Unknown { name, needed_by } = error else {
             return error.to_string();
@@ -134,8 +136,8 @@ impl Definitions {
         }
     }
 
-    /// Explains an error of a type whose definition only files bring. `wanted` says which file is
-    /// needed; a file that is there and is of the other ROS is named instead.
+    /// Explains an error of a type that only files define. `wanted` names the file that is needed.
+    /// If a file of the other ROS exists, the text names it instead.
     pub fn explain_missing(
         &mut self,
         (kind, name): (TextKind, &TypeName),
@@ -154,19 +156,19 @@ impl Definitions {
         format!("{}; {wanted}", self.explain(kind, error))
     }
 
-    /// Notes that a peer brought the definition that counts, as `type description of /camera`.
+    /// Records the peer whose definition is used, such as `type description of /camera`.
     pub fn learned(&mut self, name: &TypeName, from: impl FnOnce() -> String) {
         if self.peers.len() < MOST_PEERS {
             self.peers.insert(name.clone(), from());
         }
     }
 
-    /// A definition that a peer brought is no longer kept.
+    /// Removes the record of a definition from a peer.
     pub fn forgotten(&mut self, name: &TypeName) {
         self.peers.remove(name);
     }
 
-    /// Where the definition of a type is from, for people.
+    /// Returns the source of the definition of a type, as text for the user.
     #[must_use]
     pub fn source(&self, name: &TypeName) -> &str {
         let file = || {
@@ -210,10 +212,9 @@ fn tell_differing(name: &TypeName, file: &str, only_file: &[String], only_built_
     );
 }
 
-/// Unknown names that are compared with the known ones, from one change of the definitions to the
-/// next.
+/// How many unknown names are compared with the known names until the definitions change.
 const MOST_SUGGESTIONS: u32 = 64;
-/// Types of peers whose origin is kept in mind.
+/// The maximal number of types from peers whose source is recorded.
 const MOST_PEERS: usize = 4096;
 
 #[cfg(test)]

@@ -1,10 +1,10 @@
-//! How many files and connections the program may have open.
+//! The limit of open files and connections of the program.
 
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use tracing::debug;
 
-/// Raises the limit as far as the system lets the program, within reason: a shell has 1024,
-/// for the sake of programs that use `select`, and a graph of 500 topics takes more.
+/// Raises the limit to at most [`MOST`], as far as the system permits. The usual limit of a shell
+/// is 1024, for programs that use `select`; a graph of 500 topics needs more.
 pub(crate) fn raise() {
     let limit = getrlimit(Resource::Nofile);
     let most = limit.maximum.map_or(MOST, |maximum| maximum.min(MOST));

@@ -1,8 +1,9 @@
-//! Services of the graph as calls of the space: others ask, a service here executes.
+//! Services of the graph as calls of the space: other spaces send requests, a service of the graph
+//! executes them.
 //!
-//! A service is a call where the mapping says so, or where it has the name of one of our own space
-//! (`/ua_1_2_61`). It is offered while it is there. Each execution is a task of its own, so that a
-//! slow service holds nothing up.
+//! A service is a call if the mapping sets it, or if it has the name of a call of the own space
+//! (`/ua_1_2_61`). It is offered while it is present. Each execution is a separate task, so that a
+//! slow service does not delay others.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
@@ -23,15 +24,15 @@ use crate::present::{self, Present};
 use crate::services::{CallFault, Ran, ServiceCall};
 use crate::{PortEvent, ServiceGraph};
 
-/// A ROS graph whose services can be executed for others.
+/// A ROS graph whose services can be executed for other spaces.
 pub trait ExecutorGraph: ServiceGraph {
-    /// Calls one service, several times at once.
+    /// The client of one service, for concurrent calls.
     type Executor: ServiceCall + Sync;
 
-    /// What calls a service, with the time that a call may take.
+    /// Creates a client of a service with a timeout for each call.
     ///
     /// # Errors
-    /// Why there can be none, for people.
+    /// The reason why the client cannot be created, as text for the user.
     fn executor(
         &mut self,
         service: &str,
@@ -40,13 +41,13 @@ pub trait ExecutorGraph: ServiceGraph {
     ) -> Result<Self::Executor, String>;
 }
 
-/// What of a graph is executed for the space.
+/// The services of a graph that are executed for the space.
 #[derive(Debug)]
 pub struct Executing<C> {
     served: HashMap<TopicId, Served<C>>,
-    /// Those that cannot be served as they are.
+    /// Services that cannot be served with their present settings.
     refused: HashMap<TopicId, Wanted>,
-    /// What is executed now, and of which call.
+    /// The running executions, each with its call.
     running: HashMap<ExecutionId, TopicId>,
     done: mpsc::Receiver<Done>,
     report: mpsc::Sender<Done>,
@@ -58,11 +59,11 @@ struct Served<C> {
     wanted: Wanted,
     service_type: Arc<ServiceType>,
     client: Arc<C>,
-    /// One for each execution there may be at a time.
+    /// Permits for the concurrent executions.
     places: Arc<Semaphore>,
 }
 
-/// A service, and what is said of it as a call.
+/// A service and its metadata as a call.
 #[derive(Debug, Clone, PartialEq, Eq)]
 struct Wanted {
     service: String,
@@ -73,7 +74,7 @@ struct Wanted {
     timeout: Duration,
 }
 
-/// What came of one execution.
+/// The result of one execution.
 #[derive(Debug)]
 struct Done {
     execution: ExecutionId,
@@ -95,20 +96,20 @@ impl<C> Default for Executing<C> {
 }
 
 impl<C: ServiceCall + Sync> Executing<C> {
-    /// Whether a service of that name is a call of our own space by its name, so that its type has
+    /// Returns whether the name of a service makes it a call of the own space, so that its type has
     /// to be found out.
     #[must_use]
     pub fn is_named(policy: &Policy, service: &str) -> bool {
         present::named(policy, service).is_some()
     }
 
-    /// The names of the services that the mapping has executed in our own space.
+    /// Returns the names of the services that the mapping has executed in the own space.
     pub fn mapped<'m>(mapping: &'m Mapping, policy: &Policy) -> BTreeSet<&'m str> {
         present::mapped(mapping, policy, CallKind::Service)
     }
 
-    /// Compares the services there are with those that are offered as calls, and begins to offer
-    /// `most` at most.
+    /// Compares the present services with the services that are offered as calls. Starts to offer
+    /// at most `most` further services.
     pub fn reconcile<G: ExecutorGraph<Executor = C>>(
         &mut self,
         graph: &mut G,
@@ -149,7 +150,7 @@ impl<C: ServiceCall + Sync> Executing<C> {
         events
     }
 
-    /// Has everything looked at again: definitions may be others.
+    /// Checks all services again, because definitions may have changed.
     pub fn look_again<G: ExecutorGraph<Executor = C>>(&mut self, graph: &mut G) -> Vec<PortEvent> {
         self.refused.clear();
         let other = self.served.extract_if(|_, served| {
@@ -191,17 +192,17 @@ impl<C: ServiceCall + Sync> Executing<C> {
         Ok(PortEvent::OfferTyped { topic, offered })
     }
 
-    /// Whether it executes that call.
+    /// Returns whether a call is executed here.
     #[must_use]
     pub fn serves(&self, topic: TopicId) -> bool {
         self.served.contains_key(&topic)
     }
 
-    /// Calls the service of a call that is executed here. What becomes of it comes from
+    /// Calls the service of a call that is executed here. The outcome is reported by
     /// [`recv`](Self::recv).
     ///
     /// # Errors
-    /// Why it is not called.
+    /// The reason why the request is refused.
     pub fn execute(&mut self, execution: Execution) -> Result<(), Refusal> {
         let served = self.served.get(&execution.topic);
         let served = served.ok_or(Refusal::NotExecutable)?;
@@ -219,16 +220,16 @@ impl<C: ServiceCall + Sync> Executing<C> {
         Ok(())
     }
 
-    /// What an execution came to. Cancel-safe.
+    /// Returns the outcome of the next execution. Cancel-safe.
     pub async fn recv(&mut self) -> Vec<PortEvent> {
         std::future::poll_fn(|cx| self.poll_recv(cx)).await
     }
 
-    /// As [`recv`](Self::recv), for ports that poll.
+    /// Polls for the events of [`recv`](Self::recv), for ports that poll.
     pub fn poll_recv(&mut self, cx: &mut Context<'_>) -> Poll<Vec<PortEvent>> {
         match self.done.poll_recv(cx) {
             Poll::Ready(Some(done)) => Poll::Ready(self.done(done)),
-            // Never `None` while we hold a sender ourselves.
+            // Never `None`, because `self` holds a sender.
             Poll::Ready(None) | Poll::Pending => Poll::Pending,
         }
     }
@@ -255,8 +256,8 @@ impl<C: ServiceCall + Sync> Executing<C> {
     }
 }
 
-/// One execution. It goes on when its call is withdrawn, and ends in the time that its client gives
-/// a call.
+/// Runs one execution. It goes on when its call is withdrawn, and ends within the timeout of its
+/// client.
 async fn run<C: ServiceCall + Sync>(
     client: Arc<C>,
     (execution, request): (ExecutionId, Bytes),
@@ -267,7 +268,7 @@ async fn run<C: ServiceCall + Sync>(
     drop(report.send(Done { execution, result }));
 }
 
-/// What is to be offered of the services there are.
+/// Returns the present services that are to be offered, by topic.
 fn wanted(policy: &Policy, present: &Present) -> BTreeMap<TopicId, Wanted> {
     let found = present::found(policy, present, CallKind::Service);
     let wanted = found.map(|found| {
@@ -285,13 +286,14 @@ fn wanted(policy: &Policy, present: &Present) -> BTreeMap<TopicId, Wanted> {
     wanted.collect()
 }
 
-/// Services that are offered to other spaces: anybody in a graph can invent names.
+/// The maximal number of services offered to other spaces: any node in a graph can invent names.
 const MOST_SERVED: usize = 1024;
-/// Executions of one service at a time; one more is refused as busy.
+/// The maximal number of concurrent executions of one service; a further request is refused as
+/// busy.
 const MOST_AT_A_TIME: usize = 256;
-/// Executions of all services at a time.
+/// The maximal number of concurrent executions of all services.
 const MOST_RUNNING: usize = 1024;
-/// How long a service may take of which the mapping says nothing.
+/// Time limit of a call, unless the mapping sets it.
 const TIMEOUT: Duration = Duration::from_secs(30);
-/// Bad_UnexpectedError (OPC 10000-6, A.2): the service ran, and says that it failed.
+/// Bad_UnexpectedError (OPC 10000-6, A.2): the service ran and reports a failure.
 const BAD_UNEXPECTED_ERROR: StatusCode = StatusCode(0x8001_0000);

@@ -1,9 +1,9 @@
-//! How a program ends.
+//! The end of a program: messages and exit codes.
 
 use std::process::ExitCode;
 
-/// Why a program cannot run or had to end: what to tell, and the exit code of `sysexits.h` that
-/// says whose it is to mend.
+/// The reason why a program cannot run or had to end: a message, and the kind of failure with its
+/// exit code of `sysexits.h`.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{message}")]
 pub struct Failure {
@@ -11,21 +11,21 @@ pub struct Failure {
     message: String,
 }
 
-/// Whose it is to mend.
+/// The kind of a failure. It shows who can correct it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum FailureKind {
-    /// What was typed. Exit code 64.
+    /// Wrong command line. Exit code 64.
     Usage,
     /// A needed peer, port or interface is not available. Exit code 69.
     Unavailable,
-    /// Reading or writing went wrong. Exit code 74.
+    /// An error of reading or writing. Exit code 74.
     Io,
     /// The mapping cannot run. Exit code 78.
     Configuration,
 }
 
 impl Failure {
-    /// A failure with a message that says what, where and what to do.
+    /// Creates a failure with a message that states the problem, its location and the remedy.
     pub fn new(kind: FailureKind, message: impl Into<String>) -> Self {
         Self {
             kind,
@@ -33,7 +33,7 @@ impl Failure {
         }
     }
 
-    /// Whose it is to mend.
+    /// Returns the kind of the failure.
     #[must_use]
     pub const fn kind(&self) -> FailureKind {
         self.kind

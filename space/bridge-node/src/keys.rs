@@ -1,4 +1,4 @@
-//! The keys of secured groups: read from files, looked at again from time to time, and fetched from
+//! The keys of secured groups: read from files that are checked periodically, and fetched from
 //! Security Key Services.
 
 mod fetch;
@@ -26,16 +26,16 @@ pub(crate) struct NewKeys {
     pub(crate) delivery: KeyDelivery,
 }
 
-/// Where a run loop has its keys from.
+/// The sources of the keys of a run loop.
 #[derive(Debug)]
 pub(crate) struct KeyRing {
-    /// The groups in place of those of the mapping, where the command line says so.
+    /// The groups that replace the groups of the mapping, if the command line sets them.
     groups: Option<Vec<SecurityGroup>>,
-    /// What the keepers bring.
+    /// New keys from the keepers.
     incoming: mpsc::Receiver<NewKeys>,
     outgoing: mpsc::Sender<NewKeys>,
     service: Option<Arc<dyn KeyService>>,
-    /// The keepers of the groups there are; each ends when its sender goes.
+    /// The keepers of the groups; each ends when its sender is dropped.
     keepers: BTreeMap<String, Keeper>,
 }
 
@@ -60,7 +60,7 @@ impl KeyRing {
         }
     }
 
-    /// The mapping with the groups of the command line, if that has any.
+    /// Returns the mapping with the groups of the command line, if there are any.
     pub(crate) fn applied(&self, mapping: Arc<Mapping>) -> Arc<Mapping> {
         match &self.groups {
             Some(groups) => {
@@ -71,10 +71,10 @@ impl KeyRing {
         }
     }
 
-    /// Reads the keys that stand in files, and begins to look after those of each group.
+    /// Reads the keys from files, and starts a keeper for each group.
     ///
     /// # Errors
-    /// When a file is not there or not to be used: the program would hear and say nothing.
+    /// A file is missing or unusable: the program could neither receive nor send.
     pub(crate) fn start(&mut self, mapping: &Mapping, router: &mut Router) -> Result<(), Failure> {
         for group in mapping.security() {
             if let Some(path) = path_of(group) {
@@ -86,8 +86,8 @@ impl KeyRing {
         Ok(())
     }
 
-    /// Looks after the keys of the groups of a mapping from now on. Those of files are read by
-    /// their keepers.
+    /// Starts and stops keepers for the groups of a mapping. The keepers read keys from files
+    /// themselves.
     pub(crate) fn follow(&mut self, mapping: &Mapping) {
         let groups = mapping.security();
         let stays = |keeper: &Keeper| groups.contains(&keeper.group);
@@ -122,12 +122,12 @@ impl KeyRing {
         }
     }
 
-    /// The next keys that are new. Whoever drops it before loses none.
+    /// Returns the next new keys. Cancel-safe.
     pub(crate) async fn next(&mut self) -> Option<NewKeys> {
         self.incoming.recv().await
     }
 
-    /// The keys of a group are out of date.
+    /// Requests new keys of a group because its keys are out of date.
     pub(crate) fn want(&self, group: &str) {
         if let Some(keeper) = self.keepers.get(group) {
             keeper.wanted.send_modify(|count| *count += 1);
@@ -135,7 +135,7 @@ impl KeyRing {
     }
 }
 
-/// Gives a group its keys.
+/// Passes keys of a group to the Router.
 pub(crate) fn give(router: &mut Router, group: &str, delivery: &KeyDelivery) {
     match router.set_keys(group, delivery, now()) {
         Ok(()) => info!(
@@ -148,7 +148,7 @@ pub(crate) fn give(router: &mut Router, group: &str, delivery: &KeyDelivery) {
     }
 }
 
-/// The file with the keys of a group, if they are in one.
+/// Returns the file with the keys of a group, if the group has one.
 fn path_of(group: &SecurityGroup) -> Option<Result<PathBuf, Failure>> {
     match group.keys.as_ref()? {
         KeySource::File(path) => Some(Ok(path.clone())),
@@ -157,7 +157,7 @@ fn path_of(group: &SecurityGroup) -> Option<Result<PathBuf, Failure>> {
     }
 }
 
-/// Where systemd puts the credentials of a service.
+/// Returns the path of a credential that systemd provides to a service.
 fn credential(name: &str) -> Result<PathBuf, Failure> {
     let folder = std::env::var_os("CREDENTIALS_DIRECTORY").ok_or_else(|| {
         let message = format!(
@@ -169,7 +169,7 @@ fn credential(name: &str) -> Result<PathBuf, Failure> {
     Ok(Path::new(&folder).join(name))
 }
 
-/// Looks at a file from time to time, and brings what it has when it is another.
+/// Checks a file periodically, and sends its keys when it has changed.
 async fn watch_file(
     group: SecurityGroup,
     (out, mut wants): (mpsc::Sender<NewKeys>, watch::Receiver<u64>),
@@ -196,7 +196,8 @@ async fn watch_file(
             },
         }
         let seen = seen(&path);
-        // At first too, also where there is no file: a reload may have brought the group.
+        // The first check counts as a change, even if the file is missing: a reload may have added
+        // the group.
         if before == Some(seen) {
             continue;
         }
@@ -220,7 +221,7 @@ fn read_again(path: &Path, group: &SecurityGroup) -> Option<KeyDelivery> {
     }
 }
 
-/// When a file was written, and how long it is.
+/// Modification time and length of a file.
 type Seen = (Option<SystemTime>, u64);
 
 fn seen(path: &Path) -> Option<Seen> {
@@ -228,7 +229,7 @@ fn seen(path: &Path) -> Option<Seen> {
     Some((about.modified().ok(), about.len()))
 }
 
-/// Keys that wait to be taken.
+/// The maximal number of queued keys.
 const WAITING: usize = 16;
-/// How often a file is looked at.
+/// Interval of the checks of a file.
 const LOOK: Duration = Duration::from_secs(1);

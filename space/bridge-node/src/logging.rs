@@ -1,5 +1,5 @@
-//! Log lines for people (text) or for machines (one JSON object a line), on stderr; and what a
-//! program warns of, for whoever in it publishes that elsewhere.
+//! Logging to stderr as text lines or JSON objects, and forwarding of warnings and errors to the
+//! sinks of the program.
 
 mod limit;
 
@@ -27,8 +27,8 @@ pub enum LogFormat {
     Json,
 }
 
-/// Starts logging. `UA_LOG` sets levels as `debug` or `info,bridge_core=trace`; `quiet` holds the
-/// directives that hush what a library says without need.
+/// Starts logging. `UA_LOG` sets levels, such as `debug` or `info,bridge_core=trace`. `quiet` holds
+/// directives that suppress noisy messages of a library.
 pub(crate) fn start(format: LogFormat, quiet: &str) {
     let levels = std::env::var("UA_LOG").unwrap_or_else(|_| "info".to_owned());
     let filter = EnvFilter::builder().parse_lossy(format!("{quiet},{levels}"));
@@ -40,12 +40,12 @@ pub(crate) fn start(format: LogFormat, quiet: &str) {
             colour,
         })
         .with_ansi(colour);
-    // Each line layer has its filter: what is hushed on stderr may still be of use elsewhere.
+    // Each layer has its own filter: a sink may need messages that are suppressed on stderr.
     let lines = match format {
         LogFormat::Text => lines.with_target(false).with_filter(filter).boxed(),
         LogFormat::Json => lines.json().flatten_event(true).with_filter(filter).boxed(),
     };
-    // A second start, as tests make it, keeps the first one's.
+    // A second start, as in tests, keeps the first subscriber.
     let started = tracing_subscriber::registry()
         .with(lines)
         .with(Warnings.with_filter(LevelFilter::WARN.and(PerCallsite::default())))
@@ -58,18 +58,18 @@ pub(crate) fn start(format: LogFormat, quiet: &str) {
     }
 }
 
-/// Writes each event as one line, whatever its texts hold: names, reasons and errors come from
-/// peers, and a line break in one of them would make a line of their own.
+/// Writes each event as one line, whatever its texts contain. Names, reasons and errors come from
+/// peers, and a line break in them could forge a log line.
 #[derive(Debug)]
 struct OneLine<W> {
     to: W,
-    /// Whether events are coloured, by the control character that begins a sequence. Those in texts
-    /// are escaped before.
+    /// Whether events are coloured by escape sequences. Control characters in texts are escaped
+    /// before.
     colour: bool,
 }
 
 impl<W: Write> Write for OneLine<W> {
-    /// Takes a whole event, as `tracing-subscriber` hands it over.
+    /// Writes a whole event, as `tracing-subscriber` passes it.
     fn write(&mut self, event: &[u8]) -> io::Result<usize> {
         let line = event.strip_suffix(b"\n").unwrap_or(event);
         let line = String::from_utf8_lossy(line);
@@ -84,8 +84,8 @@ impl<W: Write> Write for OneLine<W> {
     }
 }
 
-/// Adds the number of suppressed messages to a line: a further field of JSON, or of a line for
-/// people.
+/// Adds the number of suppressed messages to a line, as a field of the JSON object or of the text
+/// line.
 fn with_suppressed(line: &str, suppressed: u64) -> Cow<'_, str> {
     match (suppressed, line.strip_suffix('}')) {
         (0, _) => Cow::Borrowed(line),
@@ -96,8 +96,8 @@ fn with_suppressed(line: &str, suppressed: u64) -> Cow<'_, str> {
     }
 }
 
-/// The text with its control characters, line breaks, and marks that turn the direction of what is
-/// around them escaped, but for those that `stay`.
+/// Escapes control characters, line breaks and marks of text direction, except for characters that
+/// `stay` accepts.
 fn escaped(text: &str, stay: impl Fn(char) -> bool) -> Cow<'_, str> {
     let breaks = |c: char| match c {
         '\u{2028}' | '\u{2029}' | '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}' => true,
@@ -120,9 +120,9 @@ fn escaped(text: &str, stay: impl Fn(char) -> bool) -> Cow<'_, str> {
 /// A warning or an error of the program.
 #[derive(Debug, Clone)]
 pub struct LogRecord {
-    /// How bad it is.
+    /// The level: warning or error.
     pub level: Level,
-    /// What is to be said, the fields behind it.
+    /// The message, followed by the fields.
     pub message: String,
     /// The source file.
     pub file: Option<&'static str>,
@@ -132,15 +132,15 @@ pub struct LogRecord {
     pub line: Option<u32>,
 }
 
-/// Where a program's warnings and errors go beside stderr.
+/// A receiver of the program's warnings and errors beside stderr.
 pub trait LogSink: Send + Sync + 'static {
-    /// Takes one record. Called on whichever thread warns, so it neither waits nor logs.
+    /// Receives one record. Called on the thread that logs, so it must neither wait nor log.
     fn hear(&self, record: LogRecord);
 }
 
-/// Has `sink` hear every warning and error of our own crates from now on, for as long as it is
-/// there. Those of libraries are left out: a sink that uses the library would hear of its own
-/// doing.
+/// Registers `sink` for every warning and error of our own crates while it is alive. Messages of
+/// libraries are excluded, because a sink that uses a library would receive messages about its own
+/// work.
 pub fn hear_log(sink: &Arc<impl LogSink>) {
     let sink: Arc<dyn LogSink> = Arc::clone(sink) as _;
     let mut sinks = SINKS.write().unwrap_or_else(PoisonError::into_inner);
@@ -150,7 +150,7 @@ pub fn hear_log(sink: &Arc<impl LogSink>) {
 
 static SINKS: RwLock<Vec<Weak<dyn LogSink>>> = RwLock::new(Vec::new());
 
-/// The layer that hands warnings and errors to the sinks.
+/// The layer that forwards warnings and errors to the sinks.
 #[derive(Debug)]
 struct Warnings;
 
@@ -208,7 +208,7 @@ impl Visit for Text {
     }
 }
 
-/// The crates whose warnings are the program's.
+/// Prefixes of the crates whose warnings are forwarded.
 const OURS: [&str; 4] = ["bridge_", "tcpros", "transport", "uadp"];
 
 #[cfg(test)]
@@ -228,7 +228,7 @@ mod tests {
         }
     }
 
-    /// What a program writes that logs as `start` has it, without colours.
+    /// Returns the output of a program that logs as `start` sets it up, without colours.
     fn written(log: impl FnOnce()) -> String {
         #[derive(Clone, Default)]
         struct Written(Arc<Mutex<Vec<u8>>>);

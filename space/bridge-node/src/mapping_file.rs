@@ -1,4 +1,4 @@
-//! The mapping as a file that people edit while the program runs.
+//! The mapping file, which users edit while the program runs.
 
 mod look;
 
@@ -30,35 +30,35 @@ use crate::exit::{Failure, FailureKind};
 /// Reads NodeSet2 files for the check of a mapping.
 pub type NodeSetReader = fn(&[PathBuf]) -> Box<dyn NodeSets>;
 
-/// The mapping that runs, and what is to be told of it.
+/// The running mapping with its definitions and status.
 #[derive(Debug, Clone)]
 pub(crate) struct Running {
     pub(crate) mapping: Arc<Mapping>,
-    /// What its `type_paths` have.
+    /// The definitions of its `type_paths`.
     pub(crate) types: Arc<TypePaths>,
     pub(crate) about: Arc<About>,
 }
 
-/// What the status says of the mapping.
+/// The status of the mapping.
 #[derive(Debug, Clone, Default, Serialize)]
 pub(crate) struct About {
-    /// `None` for zero configuration.
+    /// The path of the file; `None` without a mapping (zero configuration).
     file: Option<String>,
-    /// The beginning of the SHA-256 of all its files.
+    /// The first 8 bytes of the SHA-256 of all its files, in hexadecimal.
     hash: String,
-    /// When it was taken, in seconds since 1970.
+    /// Time of adoption, in seconds since 1970.
     loaded: i64,
     variables: usize,
-    /// How often another one took its place.
+    /// Number of adopted reloads.
     reloads: u64,
-    /// How often one was refused.
+    /// Number of refused reloads.
     refused: u64,
-    /// Why the file is newer than what runs.
+    /// The reason why the file is newer than the running mapping.
     stale: Option<String>,
 }
 
 impl About {
-    /// What Prometheus asks for: name and value.
+    /// Returns the values for Prometheus, each with its name.
     pub(crate) fn figures(&self) -> [(&'static str, u64); 4] {
         [
             (
@@ -81,22 +81,22 @@ impl About {
 struct Reading {
     checked: Checked,
     hash: String,
-    /// Of what the `type_paths` have.
+    /// Fingerprint of the definitions in the `type_paths`.
     fingerprint: u64,
     types: Arc<TypePaths>,
-    /// Types the mapping names that are defined by files.
+    /// Types named in the mapping that files define.
     known: Known,
-    /// Definitions that are not what runs.
+    /// Number of definitions that differ from the running definitions.
     differing: usize,
     files: Seen,
 }
 
 type Known = BTreeSet<(Dialect, TextKind, TypeName)>;
 
-/// Reads the mapping, what it includes, and the definitions of its `type_paths`.
+/// Reads the mapping, its includes, and the definitions of its `type_paths`.
 ///
 /// # Errors
-/// Why the file cannot be read.
+/// The reason why the file cannot be read.
 fn read(
     (file, nodesets): (&Path, Option<NodeSetReader>),
     running: &TypePaths,
@@ -135,7 +135,7 @@ fn read(
         // Where one ends and the next begins.
         all.update([0]);
     }
-    // What the NodeSets are belongs to it as if it stood there.
+    // The content of the NodeSets counts as content of the mapping.
     all.update(disk.nodesets.1.get().to_le_bytes());
     let mut hash = String::new();
     for byte in all.finalize().iter().take(8) {
@@ -160,16 +160,16 @@ fn key(used: &TypeUse) -> (Dialect, TextKind, TypeName) {
     (used.dialect, used.kind, used.name.clone())
 }
 
-/// The files and the environment of this process. Remembers each file and folder it was asked for,
-/// and how that was before it was read.
+/// The files and the environment of this process. Records each requested file and folder with its
+/// stamp from before it was read.
 #[derive(Debug)]
 struct Disk<'r> {
-    /// What runs, for definitions that cannot be had.
+    /// The running definitions, for definitions that cannot be read.
     running: &'r TypePaths,
     seen: RefCell<Seen>,
-    /// What the `type_paths` have, once they were read.
+    /// The definitions of the `type_paths`, once they were read.
     types: RefCell<Option<Arc<TypePaths>>>,
-    /// How NodeSets are read, and the fingerprint of those that were.
+    /// The reader of NodeSets, and the fingerprint of the NodeSets read.
     nodesets: (Option<NodeSetReader>, Cell<u64>),
 }
 
@@ -225,31 +225,31 @@ impl Surroundings for Disk<'_> {
     }
 }
 
-/// The file and the mapping last taken from it.
+/// The mapping file and the mapping last adopted from it.
 #[derive(Debug)]
 pub(crate) struct MappingFile {
     file: Option<PathBuf>,
-    /// How the NodeSets that it names are read.
+    /// The reader of the NodeSets that the mapping names.
     nodesets: Option<NodeSetReader>,
     /// The files as they were when they were last read.
     files: Arc<Seen>,
-    /// Of the last reading, taken or refused.
+    /// Hash of the last reading, adopted or refused.
     hash: String,
-    /// Likewise.
+    /// Fingerprint of the last reading, adopted or refused.
     fingerprint: u64,
-    /// Of the types that what runs names, those that are defined by files.
+    /// Types named in the running mapping that files define.
     known: Arc<Known>,
-    /// What was told of definitions that are those of before.
+    /// The logged reasons why earlier definitions stay in use.
     told: BTreeSet<String>,
-    /// Whether it was told that the file is gone.
+    /// Whether the loss of the file was logged.
     gone: bool,
-    /// Those the program serves: what only others need stops it from nothing.
+    /// The spaces that the program serves. Errors that concern only other spaces do not stop it.
     spaces: Vec<SpaceId>,
     running: Running,
 }
 
 impl MappingFile {
-    /// A mapping without a file, which never changes.
+    /// Returns a mapping without a file, which never changes.
     pub(crate) fn none(mapping: Mapping) -> Self {
         let running = Running {
             mapping: Arc::new(mapping),
@@ -270,10 +270,10 @@ impl MappingFile {
         }
     }
 
-    /// Reads the mapping for the first time and prints its findings, as they are for a program of
-    /// the `spaces` it says of a mapping. Without a file: zero configuration. `None`: with
-    /// `only_check`, it was checked and can run; where it does not say which spaces the program
-    /// serves, for everybody.
+    /// Reads the mapping for the first time and prints its findings for a program that serves
+    /// `spaces`. Without a file the program runs with zero configuration. With `only_check`, the
+    /// mapping is only checked, and `None` means that it can run; if `spaces` fails, it is checked
+    /// for all spaces.
     ///
     /// # Errors
     /// A file that cannot be read, or a mapping that cannot run.
@@ -296,7 +296,7 @@ impl MappingFile {
         if !only_check && reading.checked.mapping.is_some() {
             let _rendered_no_more = reading.leave_to_the_run(file);
         }
-        // A closed stderr is no reason not to run.
+        // The program runs even if stderr is closed.
         let _printed = std::io::stderr().write_all(reading.checked.render_all().as_bytes());
         if !only_check {
             spaces?;
@@ -338,18 +338,18 @@ impl MappingFile {
         }
     }
 
-    /// What runs now.
+    /// Returns the running mapping.
     pub(crate) const fn running(&self) -> &Running {
         &self.running
     }
 
-    /// Reads the files again whenever one of them was saved, and at each SIGHUP, and tells `shells`
-    /// of what is to run. Never ends.
+    /// Reads the files again whenever a file was saved, and at each SIGHUP, and sends the adopted
+    /// mapping to `shells`. Never ends.
     ///
-    /// The files are looked at, not listened to: that sees what inotify does not, as a folder of a
-    /// container that is mounted anew and files on a network, costs a handful of system calls, and
-    /// is how a file that is being written is waited for in any case. Of the definitions, of which
-    /// there may be thousands, a bounded number has its turn with each look.
+    /// The files are polled instead of watched with inotify. Polling notices changes that inotify
+    /// does not, such as a remounted folder of a container and files on a network. It costs a
+    /// handful of system calls, and it is needed anyway to wait until a file is written completely.
+    /// There may be thousands of definitions, so each poll checks a bounded number of them in turn.
     pub(crate) async fn follow(mut self, mut hangup: Signal, shells: watch::Sender<Running>) {
         let mut looks = interval(LOOK);
         looks.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -380,8 +380,8 @@ impl MappingFile {
                 known: Arc::clone(&self.known),
             };
             turn = turn.wrapping_add(1);
-            // One at a time: what is saved meanwhile differs from what was seen before the reading,
-            // and a signal is kept.
+            // One poll at a time: a file saved meanwhile differs from the stamp taken before the
+            // reading, and a signal stays queued.
             let looked = look.take_elsewhere().await;
             if looked.gone && !self.gone {
                 self.lose();
@@ -391,7 +391,7 @@ impl MappingFile {
                 before = looked.before;
                 continue;
             };
-            // One that cannot be read is told of once.
+            // A file that cannot be read is reported once.
             let files = Arc::make_mut(&mut self.files);
             if let Some(mapping) = looked.before.mapping {
                 files.mapping = mapping;
@@ -410,7 +410,7 @@ impl MappingFile {
         }
     }
 
-    /// Takes what was read, or refuses it; says whether anything is to be told on.
+    /// Adopts or refuses a reading. Returns whether the shells have to be notified.
     fn take(&mut self, reading: Result<Reading, String>, asked: bool) -> bool {
         let Some(file) = self.file.clone() else {
             return false;
@@ -419,7 +419,8 @@ impl MappingFile {
             Ok(reading) => reading,
             Err(why) => {
                 self.refuse(why);
-                // The same text, once it can be read again, is no longer stale.
+                // Once the file is readable again, the same text counts as new, which clears the
+                // stale status.
                 self.hash.clear();
                 return true;
             }
@@ -449,11 +450,11 @@ impl MappingFile {
         true
     }
 
-    /// Adopts what was read if it can run.
+    /// Adopts a reading if it can run.
     fn judge(&mut self, file: &Path, mut reading: Reading) {
         reading.checked = reading.checked.for_spaces(&self.spaces);
         if reading.checked.mapping.is_some() {
-            // What is doubted was told at the start.
+            // Unknown types were reported at the start.
             let _rendered_no_more = reading.leave_to_the_run(file);
         }
         tell(&reading.checked.findings);
@@ -478,7 +479,7 @@ impl MappingFile {
         about.stale = Some(why);
     }
 
-    /// Tells that the file is gone. Once it is there it is taken as another one.
+    /// Logs that the file is missing. Once it exists again, it is read as a changed file.
     fn lose(&mut self) {
         let Some(file) = &self.file else {
             return;
@@ -509,15 +510,15 @@ impl MappingFile {
         about.variables = mapping.variables().len();
         about.reloads += 1;
         about.stale = reason(reading.types.kept());
-        // A copy, made by this thread: that of the thread that read lies among what it left, whose
-        // room would stay taken.
+        // A copy made by this thread: the original was allocated by the thread that read the files
+        // and would keep the memory around it in use.
         self.running.mapping = Arc::new(mapping.clone());
         self.running.types = reading.types;
         self.known = Arc::new(reading.known);
     }
 }
 
-/// Why what runs has definitions of before, if it has.
+/// Returns the reason why the running mapping uses earlier definitions, if it does.
 fn reason(kept: &[String]) -> Option<String> {
     let (first, more) = kept.split_first()?;
     let more = match more.len() {
@@ -527,7 +528,7 @@ fn reason(kept: &[String]) -> Option<String> {
     Some(format!("the definitions of before count: {first}{more}"))
 }
 
-/// Logs findings, each with what to do about it.
+/// Logs findings, each with its remedy.
 fn tell(findings: &[Diagnostic]) {
     for finding in findings {
         let help = finding.help.as_ref().map(tracing::field::display);
@@ -539,8 +540,9 @@ fn tell(findings: &[Diagnostic]) {
 }
 
 impl Reading {
-    /// Types that are not built in are the rule with robots of a make, and what comes of them is
-    /// told when they are met. Says whether there are such findings, which are taken out.
+    /// Removes the findings about types that are not built in, and returns whether there were any.
+    /// Such types are normal for robots of a vendor, and the run loop reports problems with them
+    /// when the types are used.
     fn leave_to_the_run(&mut self, file: &Path) -> bool {
         let findings = &mut self.checked.findings;
         let before = findings.len();
@@ -574,12 +576,13 @@ fn seconds() -> i64 {
     seconds.try_into().unwrap_or(i64::MAX)
 }
 
-/// How often the files are looked at. One that was the same twice is no longer being written.
+/// Interval of the polls. A file with the same stamp in two polls is written completely.
 const LOOK: Duration = Duration::from_millis(250);
-/// After so many looks, ten seconds, folders of definitions that could not be listed are looked
-/// into again, whatever can be seen of them.
+/// After this number of polls, ten seconds, folders of definitions that could not be listed are
+/// read again, whatever their stamps are.
 const AGAIN: usize = 40;
-/// Faulty definitions named in one go; more are of one cause.
+/// The maximal number of faulty definitions logged at a time; further faults usually have the same
+/// cause.
 const MOST_TOLD: usize = 10;
 
 #[cfg(test)]
@@ -642,7 +645,7 @@ mod tests {
         assert!(mapping.take(reading, false));
         let about = &mapping.running.about;
         assert_eq!((about.reloads, about.refused), (1, 0));
-        // Where nobody can say which space is served, the whole cell is checked.
+        // Without a known space, the whole cell is checked.
         let nobody = |_: &Mapping| Err(Failure::new(FailureKind::Usage, "which?"));
         let checked = MappingFile::open((Some(&file), None), true, nobody).unwrap_err();
         assert_eq!(checked.kind(), FailureKind::Configuration);

@@ -1,4 +1,4 @@
-//! The HTTP pages with counters, delays, and whether the program can do its work.
+//! The HTTP pages with counters, delays and readiness.
 
 use std::collections::VecDeque;
 use std::convert::Infallible;
@@ -20,15 +20,16 @@ use tracing::{debug, info};
 use crate::clock;
 use crate::exit::{Failure, FailureKind};
 
-/// What a program says of itself at one moment.
+/// The state of a program at one moment, as the pages show it.
 pub trait Told: Send + 'static {
-    /// One JSON object, for /status.
+    /// Returns one JSON object, for /status.
     fn json(&self) -> String;
 
-    /// The text exposition format of Prometheus, version 0.0.4, for /metrics.
+    /// Returns the text exposition format of Prometheus, version 0.0.4, for /metrics.
     fn prometheus(&self) -> String;
 
-    /// What keeps it from its work, a line each; nothing where it can do it. For /readyz.
+    /// Returns the reasons why the program is not ready, a line each; empty if it is ready. For
+    /// /readyz.
     fn not_ready(&self) -> Vec<String>;
 
     /// Returns the peers that the program waits for, a line each. The program is ready without
@@ -38,33 +39,33 @@ pub trait Told: Send + 'static {
     }
 }
 
-/// The run loops that answer, in the order of their spaces.
+/// The run loops that answer requests, in the order of their spaces.
 type Ask<T> = Arc<[mpsc::Sender<oneshot::Sender<T>>]>;
-/// A run loop's end: each request brings the place for its answer.
+/// The receiver of a run loop: each request carries the sender for its response.
 pub type Requests<T> = mpsc::Receiver<oneshot::Sender<T>>;
 
-/// The requests of nobody.
+/// Returns a receiver without requests.
 pub(crate) fn never<T>() -> Requests<T> {
     mpsc::channel(1).1
 }
 
-/// Listens at `address` for requests to [`Told`] pages. Without an address there are never any.
+/// Listens at `address` for requests to [`Told`] pages. Without an address there are no requests.
 ///
 /// # Errors
-/// Nothing can listen there.
+/// The address cannot be bound.
 pub async fn serve_pages<T: Told>(address: Option<SocketAddr>) -> Result<Requests<T>, Failure> {
     let requests = serve(address, 1).await?.pop();
     Ok(requests.unwrap_or_else(never))
 }
 
-/// Listens at `address` and gives each of so many run loops its requests to answer. Without an
-/// address there are never any.
+/// Listens at `address` and returns the receivers of requests for `loops` run loops. Without an
+/// address there are no requests.
 pub(crate) async fn serve<T: Told>(
     address: Option<SocketAddr>,
     loops: usize,
 ) -> Result<Vec<Requests<T>>, Failure> {
     let (ask, mut requests): (Vec<_>, Vec<_>) = (0..loops).map(|_| mpsc::channel(4)).unzip();
-    // The last is taken first; answers are to be in the order of the spaces.
+    // The caller pops from the end; responses have to be in the order of the spaces.
     requests.reverse();
     let Some(address) = address else {
         return Ok(requests);
@@ -89,7 +90,7 @@ async fn accept<T: Told>(listener: TcpListener, ask: Ask<T>) {
         let (stream, peer) = tokio::select! {
             accepted = listener.accept() => match accepted {
                 Ok(accepted) => accepted,
-                // Out of descriptors, most likely: others may be closed by then.
+                // The process is probably out of descriptors; others may be closed after the pause.
                 Err(error) => {
                     debug!(%error, "a connection for metrics was not accepted");
                     tokio::time::sleep(ACCEPT_AGAIN).await;
@@ -111,9 +112,9 @@ async fn accept<T: Told>(listener: TcpListener, ask: Ask<T>) {
     }
 }
 
-/// The open connections in the order in which they came. Who comes is always let in: where there
-/// are too many, the oldest gives way, of the same address if that has its share. A request takes
-/// milliseconds, so what is old is idle.
+/// The open connections, oldest first. A new connection is always admitted: at the limit the oldest
+/// connection is closed, from the same address if that address has reached its share. A request
+/// takes milliseconds, so an old connection is idle.
 #[derive(Debug, Default)]
 struct Crowd {
     open: VecDeque<(IpAddr, AbortHandle)>,
@@ -239,7 +240,8 @@ mod tests {
     use super::*;
     use crate::status::Status;
 
-    /// A page without run loops behind it, and what keeps it open.
+    /// Serves pages without run loops. Returns the address, and the receiver that keeps the server
+    /// running.
     async fn served() -> (SocketAddr, Requests<Status>) {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let address = listener.local_addr().unwrap();
@@ -290,7 +292,7 @@ mod tests {
         for _ in 0..3 * MAX_CONNECTIONS {
             idle.push(connect("127.0.0.1", address).await);
         }
-        // All of them have been taken in once the last is answered.
+        // The response to the last connection shows that all of them were accepted.
         assert_eq!(
             status(&mut idle.pop().unwrap()).await,
             "HTTP/1.0 404 Not Found"

@@ -1,4 +1,4 @@
-//! What a bridge program brings to the shell: its own side of the bridge.
+//! The local side that a bridge program provides to the run loop.
 
 use std::collections::BTreeMap;
 use std::net::{IpAddr, SocketAddr};
@@ -21,17 +21,19 @@ use crate::awaited::AwaitedPeers;
 
 /// The local side of a bridge: a ROS 1 graph, a DDS domain, or an OPC UA address space.
 ///
-/// The shell polls [`recv`](Self::recv) beside the socket, and hands over what the Router lets
-/// pass. Topic names are resolved once, when a port subscribes; the samples carry the [`TopicId`].
+/// The run loop polls [`recv`](Self::recv) beside the socket, and passes on the output of the
+/// Router. Topic names are resolved once, when a port subscribes; the samples carry the
+/// [`TopicId`].
 pub trait Port: Send + 'static {
-    /// The next thing that happened on this side. Cancel-safe: dropping the future loses nothing.
-    /// Pends while there is nothing.
+    /// Returns the next event of this side. Cancel-safe: dropping the future loses nothing. Pends
+    /// while there is no event.
     fn recv(&mut self) -> impl Future<Output = PortEvent> + Send;
 
     /// Publishes a sample of another space. Never waits.
     ///
-    /// `payload` is a ROS 1 message body without its length, a CDR with its 4 byte encapsulation
-    /// header, or a block of OPC UA fields, as the port's [`Local`](bridge_core::Local) says.
+    /// `payload` is a ROS 1 message body without its length, a CDR message with its 4 byte
+    /// encapsulation header, or a block of OPC UA fields, as the [`Local`](bridge_core::Local) of
+    /// the port sets it.
     ///
     /// # Errors
     /// A short reason under which the sample is counted as dropped.
@@ -49,10 +51,10 @@ pub trait Port: Send + 'static {
         let _nobody_waits = (topic, arrival);
     }
 
-    /// The Router heard a value of another space whose local type is not known yet, or what its
-    /// writer says it is. The port finds a type (mapping, then a local subscriber's, then what is
-    /// described, then the standard type of the value) and answers with [`PortEvent::Bound`], now
-    /// or when a subscriber comes; it is asked again while values arrive.
+    /// Requests the local type of a value of another space, after the Router has received the value
+    /// or its description by the writer. The port chooses a type (mapping, then a local subscriber,
+    /// then the description, then the standard type of the value) and reports [`PortEvent::Bound`],
+    /// at once or when a subscriber arrives. Called again while values arrive.
     fn wanted(
         &mut self,
         topic: TopicId,
@@ -60,77 +62,78 @@ pub trait Port: Send + 'static {
         described: Option<&Described>,
     );
 
-    /// A topic of another space has had no good value for its receive timeout, or has one again:
-    /// its writer is not heard, or all it sends is dropped, be it by [`publish`](Self::publish).
+    /// Notes that a topic of another space had no good value for its receive timeout, or has one
+    /// again. Either its writer is silent, or all its values are dropped, possibly by
+    /// [`publish`](Self::publish).
     fn silent(&mut self, topic: TopicId, silent: bool);
 
-    /// Of the values a topic has side by side, one is no longer there for who comes late: the one
-    /// delivered with that [`instance`](Delivery::instance). Nothing to do for a side that keeps
-    /// the last value only.
+    /// Notes that one of the concurrent values of a topic is not available to late joiners any
+    /// more: the value delivered with this [`instance`](Delivery::instance). No effect for a side
+    /// that keeps only the last value.
     fn retired(&mut self, topic: TopicId, instance: Timestamp) {
         let _one_value = (topic, instance);
     }
 
-    /// A call of another program can be asked for from now on, or is another than before.
+    /// Notes that a call of another program is available or has changed.
     fn call_known(&mut self, topic: TopicId, description: &Arc<CallDescription>) {
         let _not_served = (topic, description);
     }
 
-    /// Nobody executes a call any longer. What was asked is still answered.
+    /// Notes that a call has no executor any more. Open requests are still answered.
     fn call_gone(&mut self, topic: TopicId) {
         let _not_served = topic;
     }
 
-    /// What became of a request that was reported as [`PortEvent::Ask`].
+    /// Receives the outcome of a request that was reported as [`PortEvent::Ask`].
     fn answered(&mut self, ask: AskId, topic: TopicId, answer: Answered<Bytes>) {
         let _never_asked = (ask, topic, answer);
     }
 
-    /// Executes a request for a call that was reported as [`PortEvent::Offer`]: what it came to is
-    /// reported as [`PortEvent::Executed`]. Never waits. False where it is not executed, for which
-    /// nothing is to be reported.
+    /// Executes a request for a call that was reported as [`PortEvent::Offer`]. The outcome is
+    /// reported as [`PortEvent::Executed`]. Never waits. Returns false if the request is not
+    /// executed; then no outcome is reported.
     fn execute(&mut self, execution: Execution) -> bool {
         let _never_offered = execution;
         false
     }
 
-    /// Who asked for an execution does not want it any longer. It is to be reported as executed all
-    /// the same.
+    /// Notes that the caller has given up an execution. It is still to be reported as executed.
     fn abandoned(&mut self, execution: ExecutionId, topic: TopicId) {
         let _goes_on = (execution, topic);
     }
 
-    /// Somebody else writes a namespace of ours, and nothing of ours is sent in it; or, without
-    /// anybody, no longer. The program is not ready meanwhile, and that is told.
+    /// Notes that another participant writes a namespace of ours, so that we do not send in it; or,
+    /// with `None`, that the conflict has ended. The program is not ready during a conflict, and a
+    /// message is logged.
     fn taken(&mut self, namespace: u16, by: Option<SocketAddr>) {
         let _told_by_the_shell = (namespace, by);
     }
 
-    /// Another mapping takes the place of the one there is. What both say alike goes on
-    /// undisturbed; what only the old one says is given up ([`PortEvent::Unbound`]), and what only
-    /// the new one says taken up. Returns what is not changed while the program runs, by its keys
-    /// in the mapping and with the reason, for people. `types` are the definitions of its
-    /// `type_paths`, which may be others although the mapping is the same.
+    /// Replaces the mapping. Entries that are the same in both mappings stay undisturbed. Entries
+    /// of the old mapping only are given up ([`PortEvent::Unbound`]), and entries of the new
+    /// mapping only are added. Returns the keys of the mapping that cannot change while the program
+    /// runs, each with the reason, as text for the user. `types` are the definitions of its
+    /// `type_paths`, which may have changed although the mapping has not.
     fn reload(&mut self, mapping: &Arc<Mapping>, types: &Arc<TypePaths>) -> Vec<String>;
 
-    /// What the Router has counted by now, told every second: for sides that show it.
+    /// Receives the counters of the Router every second, for sides that show them.
     fn counted(&mut self, router: &Router) {
         let _shown_by_the_shell = router;
     }
 
-    /// What keeps this side from doing its work now, such as a ROS master that does not answer: for
-    /// people.
+    /// Returns the reason why this side cannot work at the moment, such as a ROS master that does
+    /// not answer, as text for the user.
     fn hindrance(&self) -> Option<String> {
         None
     }
 
     /// Adds the peers of this side that the mapping needs and that are missing, such as a topic
-    /// without a publisher. The run loop asks each second.
+    /// without a publisher. Called by the run loop each second.
     fn add_awaited(&self, missing: &mut AwaitedPeers) {
         let _needs_no_peers = missing;
     }
 
-    /// The other servers that this side is connected to, or tries to be.
+    /// Returns the servers that this side is connected to, or tries to connect to.
     fn links(&self) -> Vec<LinkState> {
         Vec::new()
     }
@@ -140,26 +143,25 @@ pub trait Port: Send + 'static {
         None
     }
 
-    /// The program is to end: what this side works on elsewhere is to be cancelled as far as it
-    /// ends with the program. The shell goes on until nothing is [pending](Self::pending), 5 s at
+    /// Prepares for the end of the program: executions elsewhere that have to end with the program
+    /// are cancelled. The run loop continues until nothing is [pending](Self::pending), 5 s at
     /// most. Never waits.
     fn closing(&mut self) {}
 
-    /// Lists goals and runs with a pending cancellation, a line each: they are being cancelled, and
-    /// their end is not known.
+    /// Lists goals and runs with a pending cancellation, a line each. Their outcome is not known
+    /// yet.
     fn pending(&self) -> Vec<String> {
         Vec::new()
     }
 
-    /// What the program tells whoever asks the group which applications there are. `None` of one
-    /// that is no server: what it is says the shell.
+    /// Returns the description of the program for discovery of the applications in the group.
+    /// `None` if the program is not a server; the run loop then describes it.
     fn application(&self) -> Option<Application> {
         None
     }
 
-    /// The addresses of this host that this side has taken for good when it started, all there were
-    /// where the list is empty: its library cannot go over to others. `None` where it goes by
-    /// itself.
+    /// Returns the addresses of this host that this side has used since its start and cannot
+    /// change; an empty list stands for all addresses. `None` if its library follows changes.
     fn addresses(&self) -> Option<&[IpAddr]> {
         None
     }
@@ -168,31 +170,30 @@ pub trait Port: Send + 'static {
     fn shutdown(self) -> impl Future<Output = ()> + Send;
 }
 
-/// A server that a side has a link to, by its name in the mapping, and what came and went over it
-/// since the start.
+/// A server that a side has a link to, by its name in the mapping, with counters since the start.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
 pub struct LinkState {
-    /// What the mapping calls it.
+    /// Its name in the mapping.
     pub name: String,
-    /// Where it is.
+    /// Its URL.
     pub url: String,
-    /// Whether there is a connection.
+    /// Whether it is connected.
     pub up: bool,
-    /// Whether it is signed and encrypted.
+    /// Whether the connection is signed and encrypted.
     pub secured: bool,
-    /// Why there is no connection, for people.
+    /// The reason why there is no connection, as text for the user.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub why: Option<String>,
-    /// How often there has been a connection.
+    /// Number of established connections.
     pub connects: u64,
-    /// How often the certificate of the server was refused, each attempt to connect counted.
+    /// Number of refused certificates of the server, counting each attempt to connect.
     pub certificates_refused: u64,
-    /// Values that came, of whatever quality.
+    /// Number of received values, of any quality.
     pub values: u64,
-    /// Values that were written there.
+    /// Number of written values.
     pub written: u64,
-    /// Values that were not: the server refused them, they waited too long, or they gave way to
-    /// newer ones.
+    /// Number of values not written: refused by the server, expired in the queue, or replaced by
+    /// newer values.
     pub not_written: u64,
     /// What cannot be had there, by its name in the mapping, and why.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
@@ -205,193 +206,196 @@ pub type Execution = bridge_core::Execution<Bytes>;
 /// One value of another space on its way to the local side.
 #[derive(Debug, Clone)]
 pub struct Delivery {
-    /// Which value.
+    /// The value's topic.
     pub topic: TopicId,
-    /// Its bytes in the port's encoding.
+    /// The payload in the port's encoding.
     pub payload: Bytes,
-    /// When its producer's bridge took it (the DataSetMessage Timestamp, or the SourceTimestamp of
-    /// a DataValue), where the writer says so.
+    /// Time at which the producer's bridge took the value (the DataSetMessage Timestamp, or the
+    /// SourceTimestamp of a DataValue), if the writer sends it.
     pub source: Option<Timestamp>,
     /// The status of the message or of its DataValue: the upper 16 bits of an OPC UA StatusCode, 0
     /// for Good.
     pub status: u16,
-    /// The DataSetMessage Timestamp, where it tells this value from all others of the topic.
+    /// The DataSetMessage Timestamp, if it identifies this value among the values of the topic.
     pub instance: Option<Timestamp>,
-    /// What the value is to the others of its topic.
+    /// The relation of the value to the other values of its topic.
     pub kept: Kept,
-    /// Whether subscribers that come late get it: it is a state, and no event.
+    /// Whether late subscribers receive it: it is a state, not an event.
     pub lasting: bool,
 }
 
-/// What a port reports.
+/// An event that a port reports.
 #[derive(Debug)]
 pub enum PortEvent {
-    /// The local type of a topic is known, for the first time or anew: values can be transcoded
-    /// from now on.
+    /// The local type of a topic is known or has changed: values can be transcoded from this event
+    /// on.
     Bound {
-        /// Which value.
+        /// The value's topic.
         topic: TopicId,
         /// Its message type in the port's dialect.
         message_type: Arc<MessageType>,
         /// The part of the message that is the value.
         selection: Selection,
     },
-    /// As `Bound`, for a value that no mapping names and that is bound by the names of its fields.
+    /// Binds a value, as `Bound` does, that no mapping names, by the names of its fields.
     BoundAs {
-        /// Which value.
+        /// The value's topic.
         topic: TopicId,
         /// Its message type in the port's dialect.
         message_type: Arc<MessageType>,
-        /// What is said of it, and how it queues.
+        /// Its metadata and queue settings.
         note: ValueNote,
     },
-    /// The local side no longer has a topic, or will bind it to something else: the mapping has
-    /// changed.
+    /// The local side has dropped a topic, or will bind it to something else, because the mapping
+    /// has changed.
     Unbound {
-        /// Which value.
+        /// The value's topic.
         topic: TopicId,
     },
     /// A message was received on a topic of our own space.
     Sample {
-        /// Which value; a message that several variables select from is reported once for each.
+        /// The value's topic; a message that several variables select from is reported once for
+        /// each.
         topic: TopicId,
-        /// The message as it came.
+        /// The message as received.
         payload: Bytes,
-        /// When it came.
+        /// Time of reception.
         received: Timestamp,
-        /// Who published it, if that publisher latches: the same for as long as it is there, and
-        /// for no other of the topic.
+        /// The key of the publisher, if that publisher latches: constant while the publisher
+        /// exists, and unique among the publishers of the topic.
         latched_by: Option<PublisherKey>,
     },
-    /// As `Sample`, of a side that knows the quality of its values.
+    /// A sample, as `Sample`, of a side that knows the quality of its values.
     Qualified {
-        /// Which value.
+        /// The value's topic.
         topic: TopicId,
-        /// It, in the port's encoding.
+        /// The payload in the port's encoding.
         payload: Bytes,
-        /// When it was taken.
+        /// Time at which the value was taken.
         taken: Timestamp,
         /// The upper 16 bits of its OPC UA StatusCode; 0 for Good.
         status: u16,
     },
-    /// A latched publisher has gone for good: its last message is not for late joiners any more.
+    /// A latched publisher has left for good: its last message is not available to late joiners any
+    /// more.
     Left {
-        /// Which value.
+        /// The value's topic.
         topic: TopicId,
-        /// What its samples were reported under.
+        /// The publisher key of its samples.
         publisher: PublisherKey,
     },
-    /// A topic of our own space has a producer now, or has none any more.
+    /// A topic of our own space has gained its first producer, or lost its last producer.
     Live {
-        /// Which value.
+        /// The value's topic.
         topic: TopicId,
-        /// Whether anybody publishes it.
+        /// Whether it has a publisher.
         live: bool,
     },
-    /// Something was dropped that is no sample of a value.
+    /// Something other than a sample of a value was dropped.
     Dropped {
         /// The counter.
         reason: Reason,
-        /// What it was, in two or three words.
+        /// The dropped item, in two or three words.
         why: &'static str,
-        /// How many.
+        /// The number of dropped items.
         count: u64,
     },
     /// Samples were lost before the Router saw them, such as in a bounded queue that was full.
     Lost {
-        /// Which value, if it is known.
+        /// The value's topic, if it is known.
         topic: Option<TopicId>,
         /// The counter.
         reason: Reason,
-        /// Why, in two or three words; the counter's label.
+        /// The reason, in two or three words; the counter's label.
         why: &'static str,
-        /// How many.
+        /// The number of lost samples.
         count: u64,
     },
-    /// A publisher or subscriber of the topic asks for or offers what excludes ours, so that
-    /// nothing passes between them. Counted; the port tells of it.
+    /// A publisher or subscriber of the topic has settings that are incompatible with ours, so that
+    /// no messages pass between them. Counted; the port logs it.
     Unmatched {
-        /// Which value.
+        /// The value's topic.
         topic: TopicId,
     },
-    /// A value could not be handed to the service it is for, or no service answered with it.
+    /// A value could not be passed to its service, or no service answered with it.
     CallFailed {
-        /// Which value.
+        /// The value's topic.
         topic: TopicId,
-        /// What went wrong, for the log.
+        /// The failure, for the log.
         detail: String,
     },
-    /// What a value of our own space is, where the port speaks in fields and no mapping says it.
+    /// The description of a value of our own space, if the port uses fields and no mapping
+    /// describes the value.
     Described {
-        /// Which value.
+        /// The value's topic.
         topic: TopicId,
-        /// What it is.
+        /// The description.
         description: ValueDescription,
     },
-    /// The local side asks for a call under that type from now on.
+    /// The local side starts to send requests to a call under this type.
     CallBound {
-        /// Which call.
+        /// The call's topic.
         topic: TopicId,
         /// Its type in the port's dialect.
         service_type: Arc<ServiceType>,
-        /// What is not made of the field of the same name.
+        /// The fields that are not mapped by name.
         map: Arc<CallMap>,
     },
-    /// The local side no longer asks for a call, or will under another type.
+    /// The local side has stopped to send requests to a call, or will use another type.
     CallUnbound {
-        /// Which call.
+        /// The call's topic.
         topic: TopicId,
     },
-    /// The local side has somebody who would ask for a call: what it is is asked of who executes
-    /// it.
+    /// The local side has a potential caller of a call: its description is requested from its
+    /// executor.
     CallWanted {
-        /// Which call.
+        /// The call's topic.
         topic: TopicId,
     },
     /// A request of the local side.
     Ask {
-        /// Tells it from all others.
+        /// The id of the request.
         ask: AskId,
-        /// For which call.
+        /// The call's topic.
         topic: TopicId,
-        /// It, in the port's encoding.
+        /// The payload in the port's encoding.
         request: Bytes,
-        /// How long the answer is waited for.
+        /// How long to wait for the response.
         timeout: Duration,
     },
-    /// Who asked is gone: the request is not answered any more, and whoever executes it is told so.
+    /// The caller has given up: the request is not answered any more, and its executor is notified.
     AskGivenUp {
-        /// Which request.
+        /// The id of the request.
         ask: AskId,
     },
-    /// The local side executes a call of its own from now on, or it is another than before.
+    /// The local side executes a call of its own from this event on, or its description has
+    /// changed.
     Offer {
-        /// Which call: of a namespace that the program owns.
+        /// The call's topic, in a namespace that the program owns.
         topic: TopicId,
-        /// What it is.
+        /// The description of the call.
         offered: Offered,
     },
-    /// As `Offer`, for a ROS service: requests are handed out, and responses taken, as its
-    /// messages.
+    /// Offers a call, as `Offer` does, for a ROS service: requests and responses are ROS messages.
     OfferTyped {
-        /// Which call: of a namespace that the program owns.
+        /// The call's topic, in a namespace that the program owns.
         topic: TopicId,
-        /// What it is.
+        /// The type and description of the call.
         offered: OfferedType,
     },
-    /// The local side no longer executes a call, or no longer has a value, of its own.
+    /// The local side has stopped to execute a call of its own, or has dropped a value of its own.
     Withdrawn {
-        /// Which.
+        /// The topic of the call or value.
         topic: TopicId,
     },
-    /// What an execution came to.
+    /// The outcome of an execution.
     Executed {
-        /// Which.
+        /// The id of the execution.
         execution: ExecutionId,
         /// Its outcome.
         outcome: Executed,
     },
-    /// The port cannot go on, such as a ROS 1 node that was told to shut down because another took
-    /// its name. The program ends with this message.
+    /// The port cannot continue, for example because a ROS 1 node was shut down by another node of
+    /// the same name. The program ends with this message.
     Ended(String),
 }

@@ -1,5 +1,5 @@
-//! Which services and actions of a graph are executed for the space: those that the mapping names,
-//! and those that have the name of a call of our own space (`/ua_1_2_61`).
+//! The services and actions of a graph that are executed for the space. They are named in the
+//! mapping, or have the name of a call of the own space (`/ua_1_2_61`).
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -9,35 +9,36 @@ use messages::TypeName;
 
 use crate::policy::Policy;
 
-/// The services or actions there are, each with its type as far as that is known.
+/// The present services or actions, each with its type if that is known.
 pub type Present = BTreeMap<String, Option<TypeName>>;
 
-/// One that is there and is to be executed for others.
+/// A present service or action that is to be executed for other spaces.
 #[derive(Debug)]
 pub(crate) struct Found<'p> {
     pub(crate) topic: TopicId,
     /// Its name in the graph.
     pub(crate) target: &'p str,
     pub(crate) type_name: &'p TypeName,
-    /// What the mapping says of it.
+    /// Its entry in the mapping.
     pub(crate) call: Option<&'p Call>,
 }
 
 impl Found<'_> {
-    /// Its name and what it is, for people, and whether it is open to other hosts.
+    /// Returns its display name, its description, and whether it is open to other hosts.
     pub(crate) fn said(&self) -> (String, String, bool) {
         let said = |call: &Call| (call.name.clone(), call.about.clone(), call.open);
         self.call.map(said).unwrap_or_default()
     }
 }
 
-/// The call that a service or action is by its name.
+/// Returns the call that the name of a service or action denotes.
 pub(crate) fn named(policy: &Policy, target: &str) -> Option<TopicId> {
     let topic: TopicId = target.strip_prefix('/')?.parse().ok()?;
     (topic.space == policy.own()).then_some(topic)
 }
 
-/// The names in the graph of those that the mapping has executed in our own space.
+/// Returns the names in the graph of the services or actions that the mapping has executed in the
+/// own space.
 pub(crate) fn mapped<'m>(
     mapping: &'m Mapping,
     policy: &Policy,
@@ -47,8 +48,8 @@ pub(crate) fn mapped<'m>(
     targets.map(|(_, target)| target.name.as_str()).collect()
 }
 
-/// Those of that kind that are there, by the mapping or by their names. One of another type than
-/// the mapping says is not.
+/// Returns the present services or actions, by the mapping or by their names. Excludes those whose
+/// type differs from the type in the mapping.
 pub(crate) fn found<'p>(
     policy: &'p Policy,
     present: &'p Present,
@@ -79,7 +80,7 @@ pub(crate) fn found<'p>(
     by_name.chain(by_mapping)
 }
 
-/// Tells of those that are of other types than the mapping says.
+/// Logs services or actions whose type differs from the type in the mapping.
 pub(crate) fn tell_other_types(policy: &mut Policy, present: &Present, kind: CallKind) {
     let mapping = Arc::clone(policy.mapping());
     let noun = match kind {

@@ -1,4 +1,4 @@
-//! From the command line to the run loop and back: what every program's `main` does.
+//! The main function of every program, from the command line to the exit code.
 
 use std::collections::BTreeMap;
 use std::ffi::OsString;
@@ -36,106 +36,109 @@ use crate::service;
 use crate::signals;
 use crate::status::Status;
 
-/// What one program is, for [`run`].
+/// The parts of one program, for [`run`].
 pub trait Program: Parser {
-    /// Its local side.
+    /// The local side of the program.
     type Port: Port;
 
-    /// Its name, as typed.
+    /// The name of the program on the command line.
     const NAME: &'static str;
-    /// What its local side's payloads are.
+    /// The payload encoding of the local side.
     const LOCAL: Local;
-    /// Log directives that hush what a library says without need, such as `rustdds=warn`.
+    /// Log directives that suppress noisy messages of a library, such as `rustdds=warn`.
     const QUIET: &'static str = "";
 
-    /// How it reads the NodeSet2 files that a mapping names, where it does.
+    /// The reader of the NodeSet2 files that a mapping names, if the program reads them.
     const NODESETS: Option<NodeSetReader> = None;
 
-    /// The library of its local side, with its version and patches, for the status.
+    /// Returns the library of the local side with its version and patches, for the status.
     #[must_use]
     fn library() -> Option<&'static str> {
         None
     }
 
-    /// The arguments all programs have.
+    /// Returns the arguments that all programs have.
     fn arguments(&self) -> &Arguments;
 
-    /// Whether it listens for a moment for somebody else in its namespaces before it sends anything
+    /// Whether the program listens for other writers in its namespaces for a moment before it sends
     /// in them.
     const CLAIMS: bool = false;
 
-    /// A mapping made in code, in place of a file: for programs with a configuration of their own.
+    /// Returns a mapping made in code instead of a file, for programs with a configuration of their
+    /// own.
     ///
     /// # Errors
-    /// When that configuration cannot run; what is wrong with it in detail is printed by then.
+    /// The configuration cannot run. Its faults have been printed.
     fn made(&self) -> Result<Option<Made>, Failure> {
         Ok(None)
     }
 
-    /// The namespaces of its space that it alone writes. Asked again when the mapping changes.
+    /// Returns the namespaces of its space that only this program writes. Called again when the
+    /// mapping changes.
     #[must_use]
     fn owned(mapping: &Mapping) -> Owned {
         let _whole_space = mapping;
         Owned::All
     }
 
-    /// How it fetches keys from a Security Key Service; `None` where it does not.
+    /// Returns the client of Security Key Services; `None` if the program has none.
     fn key_service(&self, mapping: &Mapping) -> Option<Arc<dyn KeyService>> {
         let _none = mapping;
         None
     }
 
-    /// Tells of a space that it carries elsewhere than in the group, as by mDNS, for as long as
-    /// what this gives is kept. `None` where it does not.
+    /// Announces a carried space outside the group, for example by mDNS, until the returned value
+    /// is dropped. Returns `None` if the program does not announce it.
     fn tell(&self, carried: &Carried<'_>) -> Option<Box<dyn Send + Sync>> {
         let _nobody = carried;
         None
     }
 
-    /// The spaces it serves, none of them twice: each with a local side, a Router and a place in
-    /// the group of its own.
+    /// Returns the spaces that the program serves, without duplicates. Each has a local side, a
+    /// Router and a socket in the group.
     ///
     /// # Errors
-    /// When neither the arguments nor the mapping say which, or they contradict each other.
+    /// Neither the arguments nor the mapping name the spaces, or they contradict each other.
     fn spaces(&self, mapping: &Mapping) -> Result<Vec<SpaceId>, Failure>;
 
     /// Starts the local side of one space.
     ///
     /// # Errors
-    /// What keeps it from running at all. A peer that is not there yet is waited for instead.
+    /// The reason why the local side cannot run at all. A missing peer is not an error; the local
+    /// side waits for it.
     fn start(&self, context: Context) -> impl Future<Output = Result<Self::Port, Failure>>;
 }
 
-/// What a program with a configuration of its own comes to.
+/// The result of a program with a configuration of its own.
 #[derive(Debug)]
 #[expect(
     clippy::large_enum_variant,
     reason = "there is one, and it is moved once"
 )]
 pub enum Made {
-    /// This is to run.
+    /// The mapping to run.
     Run(Mapping),
     /// The configuration was only to be checked, and can run.
     Checked,
 }
 
-/// A space that a program carries, and where.
+/// A space that a program carries, and its PubSub group.
 #[derive(Debug, Clone, Copy)]
 pub struct Carried<'a> {
-    /// What the program is.
+    /// The description of the program.
     pub application: &'a Application,
     /// The space.
     pub own: SpaceId,
     /// The PubSub group.
     pub group: SocketAddr,
-    /// The network interface of the group, by name or address, where one is named.
+    /// The network interface of the group, by name or address, if it is set.
     pub interface: Option<&'a str>,
 }
 
-/// What a port is started with.
+/// The parameters for the start of a port.
 #[derive(Debug, Clone)]
 pub struct Context {
-    /// The cell, as the mapping has it.
+    /// The mapping of the cell.
     pub mapping: Arc<Mapping>,
     /// The definitions of its `type_paths`.
     pub types: Arc<TypePaths>,
@@ -143,8 +146,8 @@ pub struct Context {
     pub own: SpaceId,
 }
 
-/// Runs a program from its command line to its end. `arguments` begin with the name of the program,
-/// as those of [`std::env::args_os`] do.
+/// Runs a program from its command line to its end. `arguments` start with the name of the program,
+/// as in [`std::env::args_os`].
 #[must_use]
 pub fn run<P: Program>(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
     let program: P = match service::parse(arguments) {
@@ -177,7 +180,8 @@ pub fn run<P: Program>(arguments: impl IntoIterator<Item = OsString>) -> ExitCod
 }
 
 fn serve<P: Program>(program: P, file: MappingFile) -> Result<(), Failure> {
-    // One thread: the way from the socket to ROS and back has no hand-over, and its state no lock.
+    // A single thread: samples pass from the socket to ROS and back without a change of threads,
+    // and the state needs no lock.
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()
@@ -194,7 +198,7 @@ fn serve<P: Program>(program: P, file: MappingFile) -> Result<(), Failure> {
         let (stopping, stop) = watch::channel(false);
         let mut shells = JoinSet::new();
         for own in spaces.iter().copied() {
-            // Which space a line of the log is about is only a question where there are several.
+            // The span names the space of a log line, which matters only with several spaces.
             let span = if several {
                 info_span!("bridge", space = %own)
             } else {
@@ -204,7 +208,7 @@ fn serve<P: Program>(program: P, file: MappingFile) -> Result<(), Failure> {
             let shell = prepare(&program, &changes, (own, several), requests);
             let shell = shell.instrument(span.clone());
             let ended = shell.await?.run(told(stop.clone()));
-            // As tasks of their own: waking the future given to `block_on` costs a system call each
+            // Run as separate tasks: waking the future given to `block_on` costs a system call each
             // time.
             shells.spawn(ended.instrument(span));
         }
@@ -220,12 +224,12 @@ fn serve<P: Program>(program: P, file: MappingFile) -> Result<(), Failure> {
         }
         ended
     });
-    // A look at files on a disk that does not answer is not waited for.
+    // A poll of files on a disk that does not answer is not awaited.
     runtime.shutdown_background();
     ended
 }
 
-/// What carries one space, ready to run.
+/// Prepares the run loop of one space.
 async fn prepare<P: Program>(
     program: &P,
     changes: &watch::Receiver<Running>,
@@ -305,13 +309,13 @@ async fn prepare<P: Program>(
     })
 }
 
-/// Ready when all are told to stop, or nobody is left to tell them.
+/// Completes when the program is to stop, or when the sender is dropped.
 async fn told(mut stop: watch::Receiver<bool>) {
     let _told_or_alone = stop.wait_for(|stop| *stop).await;
 }
 
-/// What a program is that is no server. Its ApplicationUri is that of the certificate it fetches
-/// keys with.
+/// Returns the description of a program that is not a server. Its ApplicationUri is the URI of the
+/// certificate with which it fetches keys.
 fn plain(program: &str, own: SpaceId) -> Application {
     let host = std::fs::read_to_string(HOST_NAME).unwrap_or_default();
     let host = match host.trim() {
@@ -329,7 +333,7 @@ fn plain(program: &str, own: SpaceId) -> Application {
 
 const HOST_NAME: &str = "/proc/sys/kernel/hostname";
 
-/// Random bytes, which tell the requests of this run from those of others.
+/// Returns random bytes that distinguish the requests of this run from requests of other runs.
 fn instance() -> Result<[u8; 16], Failure> {
     let mut bytes = [0; 16];
     File::open(RANDOM)
@@ -340,7 +344,7 @@ fn instance() -> Result<[u8; 16], Failure> {
 
 const RANDOM: &str = "/dev/urandom";
 
-/// The secured groups of the mapping that the command line names for them.
+/// Returns the secured groups of the mapping that the command line names for them.
 fn groups(arguments: &Arguments) -> Result<Option<Vec<SecurityGroup>>, Failure> {
     let Some(path) = &arguments.flags.security else {
         return Ok(None);
@@ -362,7 +366,7 @@ fn groups(arguments: &Arguments) -> Result<Option<Vec<SecurityGroup>>, Failure> 
     Ok(Some(mapping.security().to_vec()))
 }
 
-/// How a space's run loop ended.
+/// Returns how the run loop of a space ended.
 fn how(ended: Option<Result<Result<(), Failure>, JoinError>>) -> Result<(), Failure> {
     ended.unwrap_or(Ok(Ok(()))).unwrap_or_else(|error| {
         Err(Failure::new(
@@ -372,7 +376,7 @@ fn how(ended: Option<Result<Result<(), Failure>, JoinError>>) -> Result<(), Fail
     })
 }
 
-/// The place in the group.
+/// Returns the socket options for the group.
 fn options(arguments: &Arguments, mapping: &Mapping, several: bool) -> Result<Options, Failure> {
     let pubsub = mapping.pubsub();
     let address: SocketAddr = match &arguments.flags.address {

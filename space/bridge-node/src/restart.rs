@@ -1,8 +1,8 @@
-//! Restarts the program as the same process, with the same arguments: libraries read the
-//! certificate of a server once.
+//! Restarts the program in the same process with the same arguments, because libraries read the
+//! certificate of a server only once.
 //!
-//! The program ends as after SIGTERM, with goodbyes to the space and to clients, and executes its
-//! own file again. The process id stays.
+//! The program ends as after SIGTERM, with goodbyes to the space and to clients, and then executes
+//! its own file again. The process id stays the same.
 
 use std::env;
 use std::os::unix::process::CommandExt as _;
@@ -16,7 +16,7 @@ use crate::exit::FailureKind;
 
 static REQUESTED: AtomicBool = AtomicBool::new(false);
 
-/// Ends the program in order, and starts it again in the same process.
+/// Ends the program in order, and restarts it in the same process.
 pub fn restart() {
     if REQUESTED.swap(true, Ordering::Relaxed) {
         return;
@@ -27,7 +27,7 @@ pub fn restart() {
     }
 }
 
-/// Executes the program again after [`restart`]; otherwise returns the code of its end.
+/// Executes the program again after [`restart`]; otherwise returns its exit code.
 pub(crate) fn executed_again(ended: ExitCode) -> ExitCode {
     if !REQUESTED.load(Ordering::Relaxed) {
         return ended;

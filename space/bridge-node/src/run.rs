@@ -1,4 +1,4 @@
-//! The run loop: the only place where a bridge waits.
+//! The run loop: the only module in which a bridge waits.
 
 mod awaited;
 mod calls;
@@ -31,7 +31,7 @@ use crate::policy::NO_SUBSCRIBER;
 use crate::port::{Delivery, Port, PortEvent};
 use crate::status::{Interfaces, Readiness, Status};
 
-/// A bridge in the middle: router, port and socket, and who asks for the status.
+/// The run loop of one space, with its Router, port and socket, and the requests for the status.
 pub(crate) struct Shell<P> {
     pub(crate) program: &'static str,
     /// The library of the port, for the status.
@@ -40,50 +40,50 @@ pub(crate) struct Shell<P> {
     pub(crate) router: Router,
     pub(crate) port: P,
     pub(crate) udp: Udp,
-    /// The interfaces the port has taken for good.
+    /// The network interfaces that the port cannot change while it runs.
     pub(crate) held: Option<Held>,
-    /// The namespaces it alone writes, by the mapping.
+    /// Returns the namespaces that only this program writes, by the mapping.
     pub(crate) owned: fn(&Mapping) -> Owned,
-    /// Whether it listens for somebody else in them first.
+    /// Whether it listens for other writers in these namespaces before it sends.
     pub(crate) claims: bool,
     pub(crate) requests: Requests<Status>,
     pub(crate) changes: watch::Receiver<Running>,
     pub(crate) keys: KeyRing,
     pub(crate) fixed: Fixed,
-    /// What of the mapping waits for the next start.
+    /// The keys of the mapping that take effect at the next start.
     pub(crate) restart: Vec<String>,
-    /// The namespaces that somebody else writes, with what is told of each.
+    /// The namespaces that another participant writes, each with its message.
     pub(crate) taken: BTreeMap<u16, String>,
     /// The peers that are missing.
     pub(crate) awaited: PeerWatch,
     pub(crate) busy: BusyPoll,
     pub(crate) dry_run: bool,
-    /// Elsewhere than in the group, for as long as it is here.
+    /// Announces the space outside the group until it is dropped.
     pub(crate) _told: Option<Box<dyn Send + Sync>>,
 }
 
-/// Whether a program goes on or is about to end.
+/// Whether the program runs or is about to end.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Phase {
     Running,
-    /// Only pending cancellations are waited for.
+    /// Only pending cancellations are awaited.
     Closing,
 }
 
-/// What of the mapping was decided when the program started.
+/// Settings of the mapping that are fixed at the start of the program.
 #[derive(Debug)]
 pub(crate) struct Fixed {
     pub(crate) started: Arc<Mapping>,
-    /// The mapping that was taken last.
+    /// The mapping that was adopted last.
     pub(crate) taken: Arc<Mapping>,
-    /// Whether the mapping says the address; else the command line does.
+    /// Whether the mapping sets the address; else the command line does.
     pub(crate) address: bool,
-    /// Likewise the interface.
+    /// Whether the mapping sets the interface; else the command line does.
     pub(crate) interface: bool,
 }
 
 impl Fixed {
-    /// The keys of `mapping` that say something else than what runs.
+    /// Returns the keys of `mapping` that differ from the running settings.
     fn differing(&self, mapping: &Mapping) -> Vec<String> {
         let (was, is) = (self.started.pubsub(), mapping.pubsub());
         let keys = [
@@ -100,7 +100,7 @@ impl Fixed {
 }
 
 impl<P: Port> Shell<P> {
-    /// Carries samples until `stop` is ready or the port cannot go on, then shuts the port down.
+    /// Carries samples until `stop` is ready or the port cannot continue, then shuts the port down.
     pub(crate) async fn run(
         mut self,
         stop: impl Future<Output = ()> + Send,
@@ -109,7 +109,7 @@ impl<P: Port> Shell<P> {
             self.router.claim(now());
         }
         let mut ended = self.carry(stop, Phase::Running).await;
-        // Nobody is to wait for what is executed no longer.
+        // Callers are not to wait for calls that are not executed any more.
         self.router.withdraw_all(now());
         while self.drain() {}
         if ended.is_ok() {
@@ -136,8 +136,8 @@ impl<P: Port> Shell<P> {
         debug!(status = %status.json(), "the last status");
     }
 
-    /// All branches of the `select!` are cancel-safe: a socket and bounded channels that hold what
-    /// was not taken.
+    /// Runs the loop of one phase. All branches of the `select!` are cancel-safe: a socket, and
+    /// bounded channels that keep unread items.
     async fn carry(
         &mut self,
         stop: impl Future<Output = ()> + Send,
@@ -157,8 +157,8 @@ impl<P: Port> Shell<P> {
             self.arm(timer.as_mut());
             let yields = std::mem::take(&mut more) || self.busy.looks(|| now().monotonic);
             tokio::select! {
-                // One more look at everything else: something is left of a long drain, or the next
-                // sample is near.
+                // Poll all branches once more: a long drain has left work, or the next sample is
+                // near.
                 () = tokio::task::yield_now(), if yields => {}
                 () = &mut stop => return Ok(()),
                 heard = self.udp.recv(&mut buffer) => more = self.heard_all(heard, &mut buffer),
@@ -174,16 +174,16 @@ impl<P: Port> Shell<P> {
                 Some(NewKeys { group, delivery }) = self.keys.next() => {
                     keys::give(&mut self.router, &group, &delivery);
                 }
-                // Who asked may have gone; there is nobody else to tell.
+                // The client may have disconnected.
                 Some(reply) = self.requests.recv() => drop(reply.send(self.status())),
             }
             more |= self.drain();
         }
     }
 
-    /// A datagram and those that wait behind it, a bounded number, each carried on before the next
-    /// is looked at. Under a flood everybody else is then asked once for many of them. Says whether
-    /// more may wait.
+    /// Handles a datagram and the datagrams queued behind it, up to a limit, and carries out each
+    /// before the next is read. Under a flood, the other branches are then polled once for many
+    /// datagrams. Returns whether more datagrams may be queued.
     fn heard_all(
         &mut self,
         first: io::Result<(usize, std::net::SocketAddr)>,
@@ -200,13 +200,13 @@ impl<P: Port> Shell<P> {
                 next => heard = next,
             }
         }
-        // The last one was taken and is not to be lost.
+        // The last datagram was read and must not be lost.
         self.heard(heard, buffer);
         true
     }
 
-    /// As [`heard_all`](Self::heard_all), of what the port reports. Where samples may share a
-    /// datagram, those that wait here are taken before any is sent.
+    /// Handles the events of the port as [`heard_all`](Self::heard_all) handles datagrams. If
+    /// samples may share a datagram, all queued samples are collected before a datagram is sent.
     async fn port_events(&mut self, first: PortEvent) -> Result<bool, Failure> {
         let mut event = first;
         for _ in 0..TAKEN_AT_ONCE {
@@ -222,19 +222,19 @@ impl<P: Port> Shell<P> {
                 Poll::Pending => return Ok(false),
             }
         }
-        // Likewise.
+        // The last event was received and must not be lost.
         self.port_event_and_drain(event)?;
         Ok(true)
     }
 
-    /// Says whether more than was carried out may wait; samples that are to share a datagram are
-    /// left out of that.
+    /// Handles an event and drains the Router. Returns whether more outputs may be queued, not
+    /// counting samples that are to share a datagram.
     fn port_event_and_drain(&mut self, event: PortEvent) -> Result<bool, Failure> {
         if self.router.mapping().pubsub().messages_per_datagram == 1 {
             self.port_event(event)?;
             return Ok(self.drain());
         }
-        // None is lost for having waited, and nothing overtakes what waits.
+        // No event is lost by waiting, and no event overtakes queued samples.
         let joins =
             matches!(&event, PortEvent::Sample { topic, .. } if !self.router.is_full(*topic));
         let more = !joins && self.drain();
@@ -274,14 +274,14 @@ impl<P: Port> Shell<P> {
         .with_pending(self.port.pending())
     }
 
-    /// What is told of secured groups without keys.
+    /// Returns the messages about secured groups without keys.
     fn keyless(&self) -> impl Iterator<Item = String> {
         let groups = self.router.groups();
         let keyless = groups.filter(|state| state.token_id.is_none());
         keyless.map(|state| format!("there are no keys of the group `{}` yet", state.group))
     }
 
-    /// Goes with the network interface of the group, whatever becomes of it.
+    /// Follows the changes of the network interface of the group.
     fn follow_group(&mut self) {
         match self.udp.follow() {
             None => {}
@@ -296,7 +296,8 @@ impl<P: Port> Shell<P> {
         }
     }
 
-    /// Looks at the network interfaces of the local side; fails where it cannot go with them.
+    /// Checks the network interfaces of the local side; fails if the local side cannot follow a
+    /// change.
     fn look_at_held(&mut self) -> Result<(), Failure> {
         let findings = self.held.as_mut().map(Held::look);
         for finding in findings.into_iter().flatten() {
@@ -322,7 +323,7 @@ impl<P: Port> Shell<P> {
         Ok(())
     }
 
-    /// Goes over to another mapping, where it is another.
+    /// Adopts the mapping if it has changed.
     fn reload(&mut self) {
         let Running { mapping, types, .. } = self.changes.borrow_and_update().clone();
         if Arc::ptr_eq(&mapping, &self.fixed.taken) {
@@ -348,7 +349,8 @@ impl<P: Port> Shell<P> {
             .router
             .poll_timeout()
             .map_or_else(|| TokioInstant::now() + FAR, TokioInstant::from_std);
-        // Only an earlier deadline needs the timer wheel; a later one is found out when it rings.
+        // Only an earlier deadline needs the timer wheel; a later deadline is found when the timer
+        // fires.
         if timer.is_elapsed() || due < timer.deadline() {
             timer.as_mut().reset(due);
         }
@@ -362,12 +364,12 @@ impl<P: Port> Shell<P> {
                 self.busy.arrived(now.monotonic);
                 self.router.handle_datagram(datagram, from, now);
             }
-            // An ICMP answer to a unicast peer, at worst; the socket stays as it is.
+            // Probably an ICMP error for a unicast peer; the socket stays usable.
             Err(error) => debug!(%error, "receiving failed"),
         }
     }
 
-    /// Takes in what the port reports; fails when the port cannot go on.
+    /// Handles an event of the port; fails when the port cannot continue.
     fn port_event(&mut self, event: PortEvent) -> Result<(), Failure> {
         match event {
             PortEvent::Sample {
@@ -384,7 +386,7 @@ impl<P: Port> Shell<P> {
                 };
                 let now = now();
                 self.busy.arrived(now.monotonic);
-                // Counted by the router, whatever it is.
+                // The Router counts the verdict.
                 let _verdict = self.router.handle_local(heard, now);
             }
             PortEvent::Qualified {
@@ -399,7 +401,7 @@ impl<P: Port> Shell<P> {
                     received: taken,
                     latched_by: None,
                 };
-                // Counted by the router, whatever it is.
+                // The Router counts the verdict.
                 let _verdict = self.router.handle_local_as(heard, status, now());
             }
             PortEvent::Bound {
@@ -410,7 +412,7 @@ impl<P: Port> Shell<P> {
                 Ok(()) => info!(%topic, message_type = %message_type.name(), "bound"),
                 Err(error) => {
                     warn!(%topic, %error, "the topic cannot cross");
-                    // By what it was bound to before it would be misread.
+                    // Values would be misread with the previous binding.
                     self.router.unbind(topic, now());
                 }
             },
@@ -447,8 +449,7 @@ impl<P: Port> Shell<P> {
         self.router.unbind(topic, now());
     }
 
-    /// Carries out what the Router wants done, a bounded number of things; says whether more may
-    /// wait.
+    /// Carries out the outputs of the Router, up to a limit; returns whether more may be queued.
     #[expect(
         clippy::wildcard_enum_match_arm,
         reason = "those of calls, and those this program does not know"
@@ -593,10 +594,10 @@ fn tell(notice: &Notice) {
     warn!(topic, from, reason = %reason, total, "dropped: {detail}");
 }
 
-/// Outputs carried out before everybody else has a turn: where sending is slower than the Router's
-/// pace for large messages, there is always one more.
+/// The maximal number of outputs carried out before the other branches are polled. If sending is
+/// slower than the Router produces parts of large messages, there is always a further output.
 const DRAINED_AT_ONCE: usize = 64;
-/// Datagrams, or events of the port, that are carried on one behind the other.
+/// The maximal number of datagrams, or of events of the port, handled in a row.
 const TAKEN_AT_ONCE: usize = 32;
 /// How long the end of the program waits for pending cancellations.
 const PENDING_AT_END: Duration = Duration::from_secs(5);

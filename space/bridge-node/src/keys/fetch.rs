@@ -1,5 +1,5 @@
-//! Keys from a Security Key Service: fetched at the start, before they run out, and when somebody
-//! uses one that is not known.
+//! Keys from a Security Key Service: fetched at the start, before the keys expire, and when a peer
+//! uses an unknown key.
 
 use std::fmt;
 use std::pin::Pin;
@@ -15,29 +15,29 @@ use uadp::{Keys, SecurityPolicy};
 
 use super::NewKeys;
 
-/// What is asked of a Security Key Service.
+/// A request to a Security Key Service.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct KeyRequest {
-    /// Where it is, as opc.tcp://sks.local:4840.
+    /// The endpoint URL, such as opc.tcp://sks.local:4840.
     pub endpoint: String,
-    /// Whether that is the cell's own server.
+    /// Whether the endpoint is the own server of the cell.
     pub own: bool,
     /// The SecurityGroupId.
     pub group: String,
 }
 
-/// What GetSecurityKeys answers (OPC 10000-14, 8.3.2).
+/// The response to GetSecurityKeys (OPC 10000-14, 8.3.2).
 #[derive(Clone, PartialEq, Eq)]
 pub struct Fetched {
     /// The SecurityPolicyUri.
     pub policy_uri: String,
     /// The SecurityTokenId of the first key.
     pub first_token_id: u32,
-    /// The key data of the current key and the future ones.
+    /// The key data of the current key and the future keys.
     pub keys: Vec<Vec<u8>>,
-    /// Until the next key is used.
+    /// Time until the next key is used.
     pub time_to_next: Duration,
-    /// How long each is used.
+    /// How long each key is used.
     pub lifetime: Duration,
 }
 
@@ -50,17 +50,17 @@ impl fmt::Debug for Fetched {
     }
 }
 
-/// What a fetch comes to, later.
+/// The future of a fetch.
 pub type Fetching<'a> = Pin<Box<dyn Future<Output = Result<Fetched, String>> + Send + 'a>>;
 
-/// Fetches keys; what knows how to is the program, as this crate knows no OPC UA sessions.
+/// Fetches keys. The program implements it, because this crate does not know OPC UA sessions.
 pub trait KeyService: fmt::Debug + Send + Sync {
-    /// The keys of a group from now on, or why there are none, for people. Has an end within a
-    /// minute.
+    /// Fetches the keys of a group, or returns the reason of the failure as text for the user. Ends
+    /// within a minute.
     fn fetch<'a>(&'a self, request: &'a KeyRequest) -> Fetching<'a>;
 }
 
-/// Fetches the keys of a group again and again.
+/// Fetches the keys of a group periodically.
 pub(super) async fn keep(
     group: SecurityGroup,
     service: Arc<dyn KeyService>,
@@ -98,7 +98,7 @@ pub(super) async fn keep(
         };
         tokio::select! {
             () = sleep(rest) => {}
-            // Somebody uses a key that is not known here.
+            // A peer uses a key that is unknown here.
             changed = wants.changed() => if changed.is_err() {
                 return;
             },
@@ -139,13 +139,13 @@ fn tell_failure(request: &KeyRequest, failures: u32, why: &str) {
     );
 }
 
-/// When to ask again: after half the lifetime of a key (OPC 10000-14, 8.3.2), which is soon enough
-/// to hear of one that is withdrawn, and not all the time.
+/// Returns the time until the next fetch: half the lifetime of a key (OPC 10000-14, 8.3.2). It is
+/// short enough to notice a revoked key, and limits the load of the service.
 fn rest(delivery: &KeyDelivery) -> Duration {
     (delivery.lifetime / 2).clamp(LEAST_REST, MOST_REST)
 }
 
-/// Holds what was answered against what the mapping says.
+/// Checks the response against the mapping.
 fn delivery(fetched: Fetched, policy: SecurityPolicy) -> Result<KeyDelivery, String> {
     if fetched.policy_uri != policy.uri() {
         return Err(format!(
@@ -168,10 +168,10 @@ fn delivery(fetched: Fetched, policy: SecurityPolicy) -> Result<KeyDelivery, Str
     })
 }
 
-/// The first time to wait after a failure, doubled with each, and the longest.
+/// The first pause after a failure, doubled with each failure, and the longest pause.
 const RETRY: Duration = Duration::from_millis(250);
 const RETRY_MOST: Duration = Duration::from_secs(5);
-/// The same failure is told again after so many.
+/// An unchanged failure is logged again after this number of failures.
 const TOLD_AGAIN: u32 = 60;
 const LEAST_REST: Duration = Duration::from_millis(500);
 const MOST_REST: Duration = Duration::from_secs(300);

@@ -1,4 +1,4 @@
-//! A file with keys: a JSON list of them, the one that is used first.
+//! A file with keys: a JSON list in the order of use.
 
 use std::fs::File;
 use std::io::Read as _;
@@ -13,7 +13,7 @@ use uadp::{Keys, SecurityPolicy};
 
 use crate::exit::{Failure, FailureKind};
 
-/// One key of a SecurityGroup, in its parts; those of text are hexadecimal.
+/// One key of a SecurityGroup, in its parts; keys and nonce are hexadecimal text.
 #[derive(Deserialize)]
 #[serde(rename_all = "camelCase", deny_unknown_fields)]
 struct Written {
@@ -25,11 +25,11 @@ struct Written {
     key_nonce: String,
 }
 
-/// The keys of a group, in the order of the file.
+/// Reads the keys of a group, in the order of the file.
 ///
 /// # Errors
-/// When the file cannot be read, others can read it too, or what stands in it are no keys of the
-/// group. No key is told.
+/// The file cannot be read, other users can access it, or its content is not a list of keys of the
+/// group. The message contains no key.
 pub(super) fn read(path: &Path, group: &SecurityGroup) -> Result<KeyDelivery, Failure> {
     let name = path.display();
     let unreadable = |error: std::io::Error| {
@@ -49,7 +49,7 @@ pub(super) fn read(path: &Path, group: &SecurityGroup) -> Result<KeyDelivery, Fa
     };
     let mut file = File::open(path).map_err(unreadable)?;
     let about = file.metadata().map_err(unreadable)?;
-    // Of what is handed over by systemd that sees to it.
+    // systemd controls the access to credentials.
     let handed = matches!(group.keys, Some(KeySource::Credential(_)));
     let mode = about.permissions().mode() & 0o777;
     if !handed && mode & 0o077 != 0 {
@@ -69,7 +69,7 @@ fn parse(text: &str, policy: SecurityPolicy) -> Result<KeyDelivery, String> {
         false => serde_json::from_str(text).map(|one| vec![one]),
     };
     let written: Vec<Written> = written.map_err(|error| {
-        // What the file holds is not told.
+        // The content of the file is not shown.
         format!(
             "line {}: no list of keys as `ua-space keys` writes it",
             error.line()
@@ -141,7 +141,7 @@ fn bytes(hex: &str) -> Option<Vec<u8>> {
     pairs.collect()
 }
 
-/// Far more than keys take.
+/// Far above the size of any valid file.
 const MOST_BYTES: u64 = 64 * 1024;
 const MOST_KEYS: usize = 64;
 

@@ -1,6 +1,6 @@
 //! Limits the log lines that one callsite writes. Messages of peers cause most log lines, so a peer
-//! in a loop could fill a disk. A place that knows its cause limits by it with `LogLimit`; this is
-//! the bound for all.
+//! in a loop could fill a disk. A callsite that knows the cause limits by it with `LogLimit`; this
+//! is the general limit.
 
 use std::cell::Cell;
 use std::collections::HashMap;
@@ -14,8 +14,8 @@ use tracing_subscriber::layer::{Context, Filter};
 
 use crate::clock::now;
 
-/// Admits [`MOST`] messages per callsite and [`PERIOD`]. Debug and trace levels are not limited:
-/// the operator asked for them.
+/// Admits [`MOST`] messages per callsite and [`PERIOD`]. Debug and trace levels are not limited,
+/// because the operator has enabled them.
 #[derive(Debug, Default)]
 pub(super) struct PerCallsite {
     throttles: Mutex<HashMap<Identifier, Throttle>>,
@@ -24,7 +24,7 @@ pub(super) struct PerCallsite {
 }
 
 impl PerCallsite {
-    /// The limit of a layer that writes the count of suppressed messages, too.
+    /// Returns the limit for the layer that also writes the number of suppressed messages.
     pub(super) fn counted() -> Self {
         Self {
             is_counted: true,
@@ -59,16 +59,16 @@ impl<S: Subscriber> Filter<S> for PerCallsite {
     }
 }
 
-/// Returns the number of messages that were suppressed before the one that this thread writes.
+/// Returns the number of messages that were suppressed before the message that this thread writes.
 pub(super) fn take_suppressed() -> u64 {
     SUPPRESSED.take()
 }
 
 thread_local! {
-    /// An event is filtered and written on one thread.
+    /// An event is filtered and written on the same thread.
     static SUPPRESSED: Cell<u64> = const { Cell::new(0) };
 }
 
-/// Messages of one callsite in a [`PERIOD`].
+/// The maximal number of messages of one callsite in a [`PERIOD`].
 pub(super) const MOST: u32 = 300;
 const PERIOD: Duration = Duration::from_secs(60);

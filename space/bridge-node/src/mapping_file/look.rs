@@ -1,4 +1,4 @@
-//! Whether the files of a mapping are other ones than those that were read.
+//! Detects changes of the files of a mapping.
 
 use std::collections::BTreeMap;
 use std::os::unix::fs::MetadataExt as _;
@@ -12,17 +12,17 @@ use type_files::TypePaths;
 
 use super::{Known, NodeSetReader, Reading, read};
 
-/// What was read, or would have been, and how each file and folder was before that.
+/// The files and folders that were read or looked for, each with its stamp from before the reading.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(super) struct Seen {
-    /// The mapping and what it includes.
+    /// The mapping and its includes.
     pub(super) mapping: Stamps,
-    /// What is at and below the `type_paths`.
+    /// The files and folders at and below the `type_paths`.
     pub(super) types: Stamps,
 }
 
 impl Seen {
-    /// Whether one of the definition files and folders whose turn it is is another by now.
+    /// Returns whether any definition file or folder of this turn has changed.
     fn types_differ(&self, turn: usize) -> bool {
         let turns = self.types.len().div_ceil(LOOKED_AT_ONCE).max(1);
         let first = turn % turns * LOOKED_AT_ONCE;
@@ -31,10 +31,10 @@ impl Seen {
     }
 }
 
-/// How files were when they were looked at; `None` for one that is not there.
+/// The stamps of files; `None` for a missing file.
 pub(super) type Stamps = BTreeMap<PathBuf, Option<Stamp>>;
 
-/// What changes when a file is written, renamed over, or the link to it is turned to another.
+/// The properties that change when a file is written or replaced, or when the link to it changes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Stamp {
     device: u64,
@@ -55,58 +55,59 @@ fn stamp(file: &Path) -> Option<Stamp> {
     })
 }
 
-/// How it was at first counts, as something is read by then.
+/// Records the stamp of a path. The first stamp counts, because the file may be read afterwards.
 pub(super) fn see(seen: &mut Stamps, path: &Path) {
     if !seen.contains_key(path) {
         seen.insert(path.to_owned(), stamp(path));
     }
 }
 
-/// How the same files are by now.
+/// Returns the present stamps of the same files.
 fn again(stamps: &Stamps) -> Stamps {
     let files = stamps.keys();
     files.map(|file| (file.clone(), stamp(file))).collect()
 }
 
-/// What the last look found.
+/// The state from the last poll.
 #[derive(Debug, Default)]
 pub(super) struct Before {
     pub(super) mapping: Option<Stamps>,
-    /// Where they are not as they were read, with the turn at which that was seen.
+    /// The stamps of the definitions if they have changed since the reading, with the turn at which
+    /// the change was seen.
     pub(super) types: Option<(Stamps, usize)>,
 }
 
-/// What one look at the files found.
+/// The result of one poll of the files.
 #[derive(Debug, Default)]
 pub(super) struct Looked {
     pub(super) before: Before,
-    /// Whether the mapping is not there, or empty, and was so at the last look.
+    /// Whether the mapping is missing or empty, and was so at the last poll.
     pub(super) gone: bool,
     pub(super) reading: Option<Result<Reading, String>>,
 }
 
-/// What is looked for.
+/// The parameters of one poll.
 #[derive(Debug)]
 pub(super) struct Look {
     pub(super) file: PathBuf,
     pub(super) nodesets: Option<NodeSetReader>,
-    /// As they were read last.
+    /// The stamps from the last reading.
     pub(super) files: Arc<Seen>,
     pub(super) before: Before,
-    /// Counts the looks.
+    /// The number of the poll.
     pub(super) turn: usize,
-    /// Whether they are to be read whatever they are.
+    /// Whether the files are to be read even if they are unchanged.
     pub(super) asked: bool,
-    /// Whether the mapping was gone, and is to be read when it is there.
+    /// Whether the mapping was missing, and is to be read when it exists.
     pub(super) gone: bool,
-    /// Whether the definitions are to be read whatever they are.
+    /// Whether the definitions are to be read even if they are unchanged.
     pub(super) again: bool,
     pub(super) running: Arc<TypePaths>,
     pub(super) known: Arc<Known>,
 }
 
 impl Look {
-    /// [`take`](Self::take) in another thread, since no sample should wait for a disk.
+    /// Runs [`take`](Self::take) in another thread, so that no sample waits for a disk.
     pub(super) async fn take_elsewhere(self) -> Looked {
         let mut looking = tokio::task::spawn_blocking(|| self.take());
         let looked = match timeout(SLOW, &mut looking).await {
@@ -125,12 +126,12 @@ impl Look {
         })
     }
 
-    /// Looks at the files, and reads them if they are other ones that are no longer being written.
-    /// The definitions do not keep a mapping from being read, and are waited for so long only.
+    /// Polls the files, and reads them if they have changed and are written completely. The
+    /// definitions do not prevent the reading of a mapping, and the wait until they are stable is
+    /// bounded.
     fn take(self) -> Looked {
         let mapping = again(&self.files.mapping);
-        // Written to until just now, or about to be: a file that is saved is gone or empty for a
-        // moment.
+        // The file is being written: a file that is saved may be missing or empty for a moment.
         let at = mapping.get(&self.file).copied().flatten();
         let is_there = at.is_some_and(|at| at.len > 0);
         let settled = self.before.mapping.as_ref() == Some(&mapping);
@@ -162,8 +163,8 @@ impl Look {
         }
     }
 
-    /// How the definition files are, where that is not how they were read, and whether they have
-    /// been waited for.
+    /// Returns the stamps of the definition files if they have changed since the reading, and
+    /// whether they are stable or were waited for long enough.
     fn types(&self) -> (Option<(Stamps, usize)>, bool) {
         let before = self.before.types.as_ref();
         if before.is_none() && !self.files.types_differ(self.turn) {
@@ -180,20 +181,19 @@ impl Look {
     }
 }
 
-/// After that time a disk is said not to answer.
+/// Time after which a warning about a slow disk is logged.
 const SLOW: Duration = Duration::from_secs(5);
-/// After so many looks, five seconds, definitions that do not stay the same are read as they are.
+/// After this number of polls, five seconds, definitions that keep changing are read as they are.
 const PATIENCE: usize = 20;
-/// Definition files and folders looked at with each look: some 1000 a second, of which each costs a
-/// microsecond or two.
+/// The maximal number of definition files and folders checked in each poll: about 1000 a second, at
+/// a microsecond or two each.
 const LOOKED_AT_ONCE: usize = 256;
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    /// A mapping with definitions, in a folder of its own that goes away with it, that is looked at
-    /// again and again.
+    /// A mapping with definitions, in a temporary folder, for repeated polls.
     struct Looks {
         folder: PathBuf,
         files: Arc<Seen>,
@@ -242,7 +242,7 @@ mod tests {
             look.take()
         }
 
-        /// Whether a look reads, the definition being so long by then.
+        /// Returns whether a poll reads the files after a definition of this length was written.
         fn reads(&mut self, definition: usize) -> bool {
             self.write("types/my_msgs/msg/Arm.msg", &"#".repeat(definition));
             let looked = self.look(false);

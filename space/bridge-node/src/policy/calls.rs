@@ -1,16 +1,16 @@
-//! Under which type a call of another space can be asked for as a service.
+//! Chooses the type under which a call of another space is offered as a service or an action.
 
 use std::sync::Arc;
 
 use bridge_core::{CallDescription, CallMap};
 use messages::{ActionCalls, ServiceType, TypeName};
 
-/// The type of the service that a call is offered as: what the mapping says; else what the one who
-/// executes it says (at the beginning of what is said about it, as in `my_msgs/Weigh; Weighs the
-/// part`); else one of `std_srvs` that has its fields. `find` finds the type of a name.
+/// Returns the service type under which a call is offered. The order is: the type in the mapping;
+/// the type that the executor names at the beginning of the description, as in `my_msgs/Weigh;
+/// Weighs the part`; a type of `std_srvs` with the same fields. `find` returns the type of a name.
 ///
 /// # Errors
-/// Why there is none, for people.
+/// The reason why there is no type, as text for the user.
 pub fn call_type(
     call: &CallDescription,
     (mapped, map): (Option<&TypeName>, &CallMap),
@@ -28,7 +28,7 @@ pub fn call_type(
     }
     let standard = match call.response.is_empty() {
         true => &STANDARD[..],
-        // It would say nothing of what came out.
+        // `std_srvs/Empty` would hide the response.
         false => STANDARD.get(..2).unwrap_or_default(),
     };
     let found = standard.iter().find_map(|name| {
@@ -50,11 +50,12 @@ pub fn call_type(
     })
 }
 
-/// The type of the action that a family of calls is offered as: what the mapping says, else what
-/// the one who executes it says of its goals. `find` finds the type of a name.
+/// Returns the action type under which a family of calls is offered: the type in the mapping, else
+/// the type that the executor names in the description of the goals. `find` returns the type of a
+/// name.
 ///
 /// # Errors
-/// Why there is none, for people.
+/// The reason why there is no type, as text for the user.
 pub fn action_type(
     call: &CallDescription,
     (mapped, map): (Option<&TypeName>, &CallMap),
@@ -67,13 +68,13 @@ pub fn action_type(
     Ok(calls)
 }
 
-/// The service type that is named in what is said about a call.
+/// Returns the type named in the description of a call.
 fn named(call: &CallDescription) -> Option<TypeName> {
     let first = call.about.split(';').next()?.trim();
     first.parse().ok()
 }
 
-/// Types for calls that are said to be of none, the one first that tells most.
+/// Types for calls without a named type, most informative first.
 const STANDARD: [&str; 3] = ["std_srvs/Trigger", "std_srvs/SetBool", "std_srvs/Empty"];
 
 #[cfg(test)]

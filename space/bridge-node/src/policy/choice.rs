@@ -1,48 +1,49 @@
-//! In which type the values of a topic of another space are written.
+//! Chooses the type in which the values of a topic of another space are written.
 
 use bridge_core::Described;
 use messages::{MessageType, Selection, TypeName};
 
-/// What is known of the type of one topic of another space: what the mapping says, what the writer
-/// of the value says, and what the value is.
+/// The known facts about the type of one topic of another space: from the mapping, from the writer
+/// of the value, and from the value itself.
 #[derive(Debug, Clone, Default)]
 pub struct Choice {
-    /// What the mapping ties it to; it decides alone.
+    /// The type and selection that the mapping sets. It takes precedence over all others.
     mapped: Option<(TypeName, Selection)>,
-    // In Boxes, as a mapped value of which nothing was heard has none of these.
-    /// What the writer of the value says of it.
+    // Boxed, because a mapped value without a received description has neither.
+    /// The description by the writer of the value.
     described: Option<Box<Described>>,
-    /// The type it says, where it is known here and has those fields, and what of the message they
-    /// are.
+    /// The described type, if it is known here and has the described fields, and the selection that
+    /// the value is.
     learned: Option<Box<(TypeName, Selection)>>,
-    /// The std_msgs type of the value, if it is one value and there is such a type.
+    /// The std_msgs type of the value, if the value is a single field and such a type exists.
     standard: Option<TypeName>,
 }
 
-/// What the Router heard of a value.
+/// The facts that the Router has received about a value.
 #[derive(Debug, Clone, Default)]
 pub struct Word {
-    /// What its writer says it is.
+    /// The description by the writer.
     pub described: Option<Described>,
-    /// That type with what of it the value is, where both are known here.
+    /// The described type and the selection that the value is, if both are known here.
     pub learned: Option<(TypeName, Selection)>,
     /// The type that carries such a value and nothing else.
     pub standard: Option<TypeName>,
 }
 
-/// What a port does about it.
+/// The action of a port after new facts.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Step {
-    /// Nothing: what is open stays.
+    /// No action: an open topic stays open.
     Stay,
-    /// Opens the topic, in the first of the [`candidates`](Choice::candidates) that is known.
+    /// Opens the topic with the first known type of the [`candidates`](Choice::candidates).
     Open,
-    /// Binds the topic anew in the type it has, of which this is the value.
+    /// Binds the topic again with the same type and this selection.
     Select(Selection),
 }
 
 impl Choice {
-    /// For a value that the mapping ties to a ROS topic, or, with `None`, to no topic.
+    /// Creates the choice for a value that the mapping ties to a ROS topic, or, with `None`, to no
+    /// topic.
     #[must_use]
     pub fn new(mapped: Option<(TypeName, Selection)>) -> Self {
         Self {
@@ -51,14 +52,14 @@ impl Choice {
         }
     }
 
-    /// What the mapping ties it to.
+    /// Returns the type and selection that the mapping sets.
     #[must_use]
     pub const fn mapped(&self) -> Option<&(TypeName, Selection)> {
         self.mapped.as_ref()
     }
 
-    /// The types it could have, best first: the mapping's; what subscribers ask for; what its
-    /// writer says; the standard type of the value.
+    /// Returns the possible types, best first: the type in the mapping; types that subscribers
+    /// request; the type that the writer names; the standard type of the value.
     #[must_use]
     pub fn candidates(&self, asked_for: impl IntoIterator<Item = TypeName>) -> Vec<TypeName> {
         if let Some((message_type, _)) = &self.mapped {
@@ -78,7 +79,7 @@ impl Choice {
         candidates
     }
 
-    /// What of a message of that type the value is.
+    /// Returns the part of a message of a type that the value is.
     #[must_use]
     pub fn selection(&self, name: &TypeName) -> Selection {
         let learned = self.learned.as_deref();
@@ -89,13 +90,13 @@ impl Choice {
             .map_or(Selection::Whole, |(_, selection)| selection.clone())
     }
 
-    /// Whether the stamp at the beginning of such messages is no part of the value.
+    /// Returns whether the stamp at the beginning of such messages is not a part of the value.
     #[must_use]
     pub fn stamps(&self, message_type: &MessageType) -> bool {
         crate::wants_stamp(message_type, Some(&self.selection(message_type.name())))
     }
 
-    /// Looks at what the writer of the value says again, with the definition that is written.
+    /// Evaluates the description by the writer again, with the definition that is used for writing.
     pub fn learn_from(&mut self, message_type: &MessageType) {
         let name = message_type.name();
         let described = self.described.as_ref();
@@ -105,9 +106,9 @@ impl Choice {
         }
     }
 
-    /// Takes what was heard of the value. `open` is the type in which it is written by now, and
-    /// whether somebody here subscribes to it: the type that somebody subscribed to stays, whatever
-    /// of it the value is; without a word nothing changes.
+    /// Evaluates new facts about the value. `open` is the type in which the value is written, and
+    /// whether it has a local subscriber. A type with a subscriber stays, whatever part of it the
+    /// value is. Without facts nothing changes.
     #[must_use]
     pub fn hear(&mut self, word: Word, open: Option<(&TypeName, bool)>) -> Step {
         let Word {
@@ -201,13 +202,13 @@ mod tests {
         assert_eq!(step, Step::Open);
         assert_eq!(choice.hear(other(), Some((&open, true))), Step::Stay);
         assert_eq!(names(&choice.candidates([])), ["std_msgs/Float64"]);
-        // Without a word nothing changes.
+        // Without facts nothing changes.
         assert_eq!(
             choice.hear(Word::default(), Some((&open, false))),
             Step::Stay
         );
         assert_eq!(choice.hear(other(), Some((&open, false))), Step::Open);
-        // In the type it has, another part of it.
+        // The same type with another selection.
         let open = name("a_msgs/Turns");
         assert_eq!(choice.hear(other(), Some((&open, true))), Step::Stay);
         let whole = || word(Some(("a_msgs/Turns", Selection::Whole)), None);

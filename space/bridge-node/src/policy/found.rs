@@ -1,27 +1,27 @@
-//! What a topic of a graph is in the space that the mapping does not name.
+//! Classifies the topics of a graph that the mapping does not name.
 
 use mappings::{PatternFault, PatternVariable, TopicId};
 use messages::TypeName;
 
 use super::Policy;
 
-/// What a topic that the mapping does not name is in the space.
+/// The meaning in the space of a topic that the mapping does not name.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Found {
     /// By its own name a value of ours, whole, in whatever type it has.
     Named(TopicId),
     /// It has the name of a value of ours that the mapping ties to something else.
     Tied(TopicId),
-    /// A pattern makes a value of it.
+    /// A pattern makes a value of the topic.
     Made(PatternVariable),
-    /// A pattern is about it and makes nothing of it.
+    /// A pattern matches the topic, but cannot make a value of it.
     Fault(PatternFault),
-    /// Nothing.
+    /// Not a value.
     Nothing,
 }
 
 impl Policy {
-    /// What a topic is, by its full name (`/ua_1_5_3`, `/turtle1/pose`) and its type, where that is
+    /// Classifies a topic by its full name (`/ua_1_5_3`, `/turtle1/pose`) and its type, if that is
     /// known.
     #[must_use]
     pub fn found(&self, ros_topic: &str, typed: Option<&TypeName>) -> Found {
@@ -38,13 +38,13 @@ impl Policy {
         }
     }
 
-    /// Whether the mapping makes this value of another topic of our graph, or of a service.
+    /// Returns whether the mapping makes this value of another topic of the graph, or of a service.
     fn is_tied(&self, topic: TopicId) -> bool {
         let variable = self.mapping.variable(topic);
         variable.is_some_and(|v| v.binding(self.own).is_some() || v.service.is_some())
     }
 
-    /// Tells once of a topic that it would be a value which another topic is already.
+    /// Logs once that a topic would become a value that another topic already is.
     pub fn tell_same(&mut self, ros_topic: &str, topic: TopicId, other: &str) {
         self.told.once(ros_topic, "pattern", || {
             format!("it would be {topic}, which {other} is already: it does not cross")
@@ -80,7 +80,7 @@ patterns:
     fn a_topic_with_the_name_of_a_value_of_ours_is_that_value() {
         let topic = |text: &str| text.parse::<TopicId>().unwrap();
         assert_eq!(found("/ua_1_9_9", None), Found::Named(topic("ua_1_9_9")));
-        // The mapping says what it is, and not where it comes from.
+        // The mapping declares the value without a source.
         assert_eq!(found("/ua_1_5_12", None), Found::Named(topic("ua_1_5_12")));
         assert_eq!(found("/ua_1_5_11", None), Found::Tied(topic("ua_1_5_11")));
         assert_eq!(found("/ua_2_9_9", None), Found::Nothing);

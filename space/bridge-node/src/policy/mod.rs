@@ -1,9 +1,9 @@
-//! What the ports of both ROS decide alike: which topics of a graph are values of the space, in
-//! which type values of other spaces are written, what gives way, what another mapping changes, and
-//! what is told once.
+//! Decisions shared by the ports of both ROS: which topics of a graph are values of the space, in
+//! which type values of other spaces are written, which topics are dropped at the limit, which
+//! changes a new mapping causes, and which messages are logged once.
 //!
-//! No IO and no clock: a port says what there is in its graph, and carries out what comes of it
-//! with its library.
+//! No IO and no clock: a port reports the state of its graph, and carries out the decisions with
+//! its library.
 
 mod calls;
 mod choice;
@@ -26,28 +26,28 @@ pub use self::reload::{Destination, Read, still_made, taken_up};
 pub use self::told::Told;
 use crate::PortEvent;
 
-/// What a port knows of its own space, apart from what its graph has.
+/// The knowledge of a port about its own space, apart from the content of its graph.
 #[derive(Debug)]
 pub struct Policy {
     own: SpaceId,
     mapping: Arc<Mapping>,
-    /// What is peculiar is told once.
+    /// Messages that are logged once.
     pub told: Told,
-    /// For values nobody here knows.
+    /// The places for strays: values that neither the mapping nor a subscriber asks for.
     room: Room,
 }
 
-/// What is done about a value that neither the mapping names nor anybody here wants.
+/// The decision about a value that neither the mapping names nor a local subscriber requests.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Admission {
-    /// Whether it has a place.
+    /// Whether the value gets a place.
     pub admitted: bool,
-    /// Those that are to go for it and others to come.
+    /// The strays to be dropped, to make room for this value and later values.
     pub gone: Vec<TopicId>,
 }
 
 impl Policy {
-    /// Of a port whose graph is that space.
+    /// Creates the policy of a port whose graph is the space `own`.
     #[must_use]
     pub fn new(own: SpaceId, mapping: Arc<Mapping>) -> Self {
         Self {
@@ -58,34 +58,35 @@ impl Policy {
         }
     }
 
-    /// The space whose values are produced in the graph.
+    /// Returns the space whose values are produced in the graph.
     #[must_use]
     pub const fn own(&self) -> SpaceId {
         self.own
     }
 
-    /// The cell.
+    /// Returns the mapping of the cell.
     #[must_use]
     pub const fn mapping(&self) -> &Arc<Mapping> {
         &self.mapping
     }
 
-    /// Goes over to another mapping and returns the one before. What is peculiar is told anew.
+    /// Replaces the mapping and returns the previous mapping. Messages are logged again.
     pub fn replace(&mut self, mapping: &Arc<Mapping>) -> Arc<Mapping> {
         self.told.clear();
         std::mem::replace(&mut self.mapping, Arc::clone(mapping))
     }
 
-    /// Whether a value is one that can be made up by anybody on the network: the mapping does not
-    /// name it, and nobody here subscribes to it.
+    /// Returns whether a value is a stray: the mapping does not name it, and it has no local
+    /// subscriber. Any publisher on the network can invent such values.
     #[must_use]
     pub fn is_stray(&self, topic: TopicId, subscribed: bool) -> bool {
         !subscribed && self.mapping.variable(topic).is_none()
     }
 
-    /// Room for one more stray. `strays` are those there are, each with since when its writer is
-    /// silent; they are only looked at when no place is left, and then those give way first that
-    /// are silent longest, at most [`MOST_LET_GO`] of them. One whose writer is heard never does.
+    /// Requests a place for one more stray. `strays` returns the present strays, each with the time
+    /// since which its writer is silent; it is called only if no place is free. Then the longest
+    /// silent strays are dropped, at most [`MOST_LET_GO`] of them. A stray whose writer is active
+    /// is never dropped.
     pub fn admit_stray<I>(&mut self, now: Instant, strays: impl FnOnce(&Self) -> I) -> Admission
     where
         I: IntoIterator<Item = (Option<Instant>, TopicId)>,
@@ -102,8 +103,8 @@ impl Policy {
         }
     }
 
-    /// What of a message of the type that the writer of a value says it is the value is. `None`,
-    /// and told once, where the type has other fields here.
+    /// Returns the described type of a value and the part of its messages that the value is.
+    /// Returns `None`, and logs it once, if the type has other fields here.
     pub fn learned(
         &mut self,
         topic: TopicId,
@@ -121,8 +122,8 @@ impl Policy {
     }
 }
 
-/// Returns the strays that give way, longest silent first, at most [`MOST_LET_GO`]. A stray whose
-/// writer is heard does not.
+/// Returns the strays to be dropped, longest silent first, at most [`MOST_LET_GO`]. A stray whose
+/// writer is active is not dropped.
 #[must_use]
 pub fn longest_silent(
     strays: impl IntoIterator<Item = (Option<Instant>, TopicId)>,
@@ -135,8 +136,8 @@ pub fn longest_silent(
     silent.into_iter().map(|(_, topic)| topic).collect()
 }
 
-/// Whether the type of a topic is another than the Router knows by now: what it wrote is still in
-/// the old one.
+/// Returns whether queued events change the type of a topic: earlier samples are still in the old
+/// type.
 #[must_use]
 pub fn type_changes(waiting: &VecDeque<PortEvent>, topic: TopicId) -> bool {
     waiting.iter().any(|event| {
@@ -148,21 +149,21 @@ pub fn type_changes(waiting: &VecDeque<PortEvent>, topic: TopicId) -> bool {
     })
 }
 
-/// Whether a status, the upper 16 bits of a StatusCode (OPC 10000-4, 7.39.1), is Bad.
+/// Returns whether a status, the upper 16 bits of a StatusCode (OPC 10000-4, 7.39.1), is Bad.
 #[must_use]
 pub const fn is_bad(status: u16) -> bool {
     status & 0x8000 != 0
 }
 
-/// Why a value is not written while its topic goes over to another type.
+/// The reason why a value is not written while the type of its topic changes.
 pub const TYPE_CHANGES: &str = "type changes";
-/// Why an event is not written. It is counted, and is no fault.
+/// The reason why an event is not written. It is counted, and is not a fault.
 pub const NO_SUBSCRIBER: &str = "no subscriber is present";
-/// Topics of the space that the mapping does not name and that are read: anybody in a graph can
-/// invent names. Likewise those that are written, of values nobody here knows.
+/// The maximal number of topics that are read although the mapping does not name them: any node in
+/// a graph can invent names. The same limit holds for written topics of strays.
 pub const MAX_TOPICS: usize = 4096;
-/// How many strays are given up at a time: a master is told of each, and RustDDS takes commands
-/// from a bounded queue.
+/// The maximal number of strays dropped at a time: each is reported to the ROS master, and RustDDS
+/// has a bounded queue of commands.
 pub const MOST_LET_GO: usize = MAX_TOPICS / 32;
 
 #[cfg(test)]
@@ -209,7 +210,8 @@ variables:
             (Some(since), topic(id))
         });
         let now = start + Duration::from_secs(60);
-        // All there are, were they so many: none of them is free for a while.
+        // The strays in use and the silent strays fill all places, and no place becomes free for a
+        // while.
         let admission = policy.admit_stray(now, |_| heard.chain(silent));
         assert_eq!(
             (admission.admitted, admission.gone.len()),
@@ -222,7 +224,7 @@ variables:
                 .iter()
                 .all(|gone| gone.identifier.get().abs_diff(200) <= 64)
         );
-        // Not at every stranger that comes.
+        // The strays are not checked again for each new stray.
         let again = policy.admit_stray(now, |_| -> [_; 0] { panic!("it was looked a moment ago") });
         assert!(!again.admitted);
         let later = now + Duration::from_secs(2);

@@ -1,4 +1,4 @@
-//! Going over to another mapping: what both say alike is left as it is.
+//! Adoption of another mapping: entries that are the same in both mappings stay undisturbed.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -12,26 +12,26 @@ use uadp::Timestamp;
 use super::Policy;
 use crate::PortEvent;
 
-/// The topics the mapping reads, by the names the graph has for them: the type each is to have, and
+/// The topics that the mapping reads, by their names in the graph: the required type of each, and
 /// the values made of it.
 pub type Read = BTreeMap<String, (TypeName, Vec<(TopicId, Selection)>)>;
 
-/// Where the values of a topic of another space go.
+/// The destination of the values of a topic of another space.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Destination {
-    /// The ROS topic as the mapping has it, or the name of the value as a full one: `/ua_0_7_101`.
+    /// The ROS topic in the mapping, or the name of the value with a leading slash: `/ua_0_7_101`.
     pub ros_topic: String,
-    /// The type, and what of a message the value is, where the mapping says it.
+    /// The type and the selection of a message, if the mapping sets them.
     pub mapped: Option<(TypeName, Selection)>,
-    /// How many values wait.
+    /// The queue limit of the values.
     pub overflow: Overflow,
-    /// Whether subscribers that come late get the last value.
+    /// Whether late subscribers receive the last value.
     pub lasting: Lasting,
 }
 
 impl Policy {
-    /// What the mapping reads. `resolve` makes of a topic of the mapping the name the graph has for
-    /// it; a topic it fails at is told of and left out.
+    /// Returns the topics that the mapping reads. `resolve` converts a topic of the mapping to its
+    /// name in the graph; a topic that cannot be resolved is logged and omitted.
     pub fn read<E: std::fmt::Display>(&self, resolve: impl Fn(&str) -> Result<String, E>) -> Read {
         let mut read = Read::new();
         for (variable, binding) in self.mapping.bindings(self.own) {
@@ -53,8 +53,8 @@ impl Policy {
         read
     }
 
-    /// Where the values of another space go: to what the mapping ties them to, else to a topic of
-    /// their name.
+    /// Returns the destination of the values of another space: the topic in the mapping, else a
+    /// topic with the name of the value.
     #[must_use]
     pub fn destination(&self, topic: TopicId) -> Destination {
         let variable = self.mapping.variable(topic);
@@ -76,7 +76,7 @@ impl Policy {
         }
     }
 
-    /// The values of other spaces that the mapping ties to topics of our graph.
+    /// Returns the values of other spaces that the mapping ties to topics of the graph.
     pub fn written(&self) -> impl Iterator<Item = TopicId> + use<> {
         let bound = self.mapping.bindings(self.own);
         let written: Vec<TopicId> = bound
@@ -86,7 +86,8 @@ impl Policy {
         written.into_iter()
     }
 
-    /// Whether a value of another space is for a service of our graph, so that it has no topic.
+    /// Returns whether a value of another space is for a service of the graph, so that it has no
+    /// topic.
     #[must_use]
     pub fn is_for_service(&self, topic: TopicId) -> bool {
         let variable = self.mapping.variable(topic);
@@ -95,9 +96,9 @@ impl Policy {
     }
 }
 
-/// The values that are made of a topic by the mapping that is gone over to: what that says of it,
-/// if the type is the one the topic has; else, where it does not name the topic, what was `found`
-/// of it.
+/// Returns the values that the new mapping makes of a topic. These are the values it declares, if
+/// the type is the present type of the topic; if the mapping does not name the topic, the value
+/// that `found` returns.
 #[must_use]
 pub fn still_made(
     named: Option<&(TypeName, Vec<(TopicId, Selection)>)>,
@@ -105,15 +106,15 @@ pub fn still_made(
     found: impl FnOnce() -> Option<(TopicId, Selection)>,
 ) -> Vec<(TopicId, Selection)> {
     match named {
-        // Another type: everything of it is different.
+        // With another type, all values are different.
         Some((wanted, _)) if has_type != Some(wanted) => Vec::new(),
         Some((_, values)) => values.clone(),
         None => found().into_iter().collect(),
     }
 }
 
-/// What a port reports of a value that comes to be made of a topic that is read already: what is
-/// latched there was sent before and will not be again.
+/// Returns the events for a new value of a topic that is read already. Latched messages are
+/// included, because their publishers do not send them again.
 pub fn taken_up<'l>(
     (topic, selection): (TopicId, Selection),
     message_type: &Arc<MessageType>,

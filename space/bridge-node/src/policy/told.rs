@@ -1,16 +1,16 @@
-//! What is peculiar about a topic, told once.
+//! Messages about topics that are logged once.
 
 use std::collections::BTreeSet;
 
 use tracing::warn;
 
-/// What was told already. Bounded: anybody in a graph can make up what is peculiar.
+/// The messages already logged. Bounded, because any node in a graph can cause messages.
 #[derive(Debug, Default)]
 pub struct Told(BTreeSet<(String, &'static str)>);
 
 impl Told {
-    /// Logs something about a topic the first time it happens; says whether it was. `what` names
-    /// the kind of it.
+    /// Logs a message about a topic the first time it occurs; returns whether it was logged. `what`
+    /// is the kind of the message.
     pub fn once(
         &mut self,
         topic: &str,
@@ -29,18 +29,18 @@ impl Told {
         true
     }
 
-    /// Has everything told anew.
+    /// Allows all messages to be logged again.
     pub fn clear(&mut self) {
         self.0.clear();
     }
 
-    /// Has what is peculiar about these topics told anew.
+    /// Allows messages about these topics to be logged again.
     pub fn forget(&mut self, topics: &BTreeSet<String>) {
         self.0.retain(|(topic, _)| !topics.contains(topic));
     }
 }
 
-/// Peculiarities told; a graph with more of them is told about no further ones.
+/// The maximal number of logged messages; further messages are suppressed.
 const MAX_TOLD: usize = 4096;
 
 #[cfg(test)]
