@@ -1,24 +1,24 @@
-//! Which program a command line asks for.
+//! Finds the program that a command line starts.
 
 use std::ffi::{OsStr, OsString};
 use std::path::Path;
 
 use crate::{PROGRAMS, Program};
 
-/// What a command line asks for.
+/// The meaning of a command line.
 pub(crate) enum Called {
-    /// A program, with its arguments; the first of them is its name for usage messages.
+    /// A program with its arguments; the first argument is its name in usage messages.
     Program(&'static Program, Vec<OsString>),
     Help,
     Version,
-    /// `ua-bridge` alone.
+    /// `ua-bridge` without arguments.
     Nothing,
-    /// `ua-bridge` with a word that names no program.
+    /// `ua-bridge` with a first argument that names no program.
     Unknown(OsString),
 }
 
 impl Called {
-    /// Decides by the name the program is called by, and by its first argument where that name is not the name of a program.
+    /// Chooses by the name under which the program is called, else by its first argument.
     pub(crate) fn by(arguments: Vec<OsString>) -> Self {
         let path = arguments.first().map(Path::new);
         let name = path.and_then(Path::file_name);
@@ -35,7 +35,7 @@ impl Called {
         }
         match PROGRAMS.iter().find(|program| first == word(program)) {
             Some(program) => {
-                // clap takes the name for usage messages from here.
+                // clap takes the name for usage messages from the first argument.
                 let name = OsString::from(format!("ua-bridge {}", word(program)));
                 let rest = arguments.into_iter().skip(2);
                 Self::Program(program, std::iter::once(name).chain(rest).collect())

@@ -1,7 +1,7 @@
 //! `ua-bridge`: the programs of the plant in one file.
 //!
-//! The program acts as `ua-server`, `ua-component` and so on by the name it is called by, which a link gives it, or by its
-//! first argument: `ua-bridge server` is `ua-server`.
+//! The program acts as `ua-server`, `ua-component` and so on. It chooses by the name under which it
+//! is called, which a link sets, or by its first argument: `ua-bridge server` is `ua-server`.
 
 mod called;
 

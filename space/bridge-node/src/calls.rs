@@ -431,7 +431,7 @@ impl<S: Send> Calls<S> {
                 });
                 continue;
             }
-            // A name has only one service.
+            // A name has at most a single service.
             self.leaving.retain(|(_, left, _)| *left != topic);
             let asker = Asker {
                 topic,

@@ -26,7 +26,7 @@ use crate::{PortEvent, ServiceGraph};
 
 /// A ROS graph whose services can be executed for other spaces.
 pub trait ExecutorGraph: ServiceGraph {
-    /// The client of one service, for concurrent calls.
+    /// The client of a service, for concurrent calls.
     type Executor: ServiceCall + Sync;
 
     /// Creates a client of a service with a timeout for each call.
@@ -74,7 +74,7 @@ struct Wanted {
     timeout: Duration,
 }
 
-/// The result of one execution.
+/// The result of an execution.
 #[derive(Debug)]
 struct Done {
     execution: ExecutionId,

@@ -20,7 +20,7 @@ pub enum FailureKind {
     Unavailable,
     /// An error of reading or writing. Exit code 74.
     Io,
-    /// The mapping cannot run. Exit code 78.
+    /// The mapping or another configuration file cannot be used. Exit code 78.
     Configuration,
 }
 

@@ -58,8 +58,8 @@ pub(crate) fn start(format: LogFormat, quiet: &str) {
     }
 }
 
-/// Writes each event as one line, whatever its texts contain. Names, reasons and errors come from
-/// peers, and a line break in them could forge a log line.
+/// Writes each event as one line, even if its texts contain line breaks. Names, reasons and errors
+/// come from peers, and a line break in them could forge a log line.
 #[derive(Debug)]
 struct OneLine<W> {
     to: W,
@@ -208,7 +208,7 @@ impl Visit for Text {
     }
 }
 
-/// Prefixes of the crates whose warnings are forwarded.
+/// Prefixes of the crates with forwarded warnings.
 const OURS: [&str; 4] = ["bridge_", "tcpros", "transport", "uadp"];
 
 #[cfg(test)]

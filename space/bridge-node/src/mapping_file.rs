@@ -76,7 +76,7 @@ impl About {
     }
 }
 
-/// One reading of the mapping's files.
+/// A reading of the mapping's files.
 #[derive(Debug)]
 struct Reading {
     checked: Checked,
@@ -132,7 +132,7 @@ fn read(
     let mut all = Sha256::new();
     for source in &checked.sources {
         all.update(&source.text);
-        // Where one ends and the next begins.
+        // Separates a file from the next.
         all.update([0]);
     }
     // The content of the NodeSets counts as content of the mapping.
@@ -579,7 +579,7 @@ fn seconds() -> i64 {
 /// Interval of the polls. A file with the same stamp in two polls is written completely.
 const LOOK: Duration = Duration::from_millis(250);
 /// After this number of polls, ten seconds, folders of definitions that could not be listed are
-/// read again, whatever their stamps are.
+/// read again, even if their stamps are unchanged.
 const AGAIN: usize = 40;
 /// The maximal number of faulty definitions logged at a time; further faults usually have the same
 /// cause.

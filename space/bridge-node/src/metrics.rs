@@ -22,7 +22,7 @@ use crate::exit::{Failure, FailureKind};
 
 /// The state of a program at one moment, as the pages show it.
 pub trait Told: Send + 'static {
-    /// Returns one JSON object, for /status.
+    /// Returns a JSON object, for /status.
     fn json(&self) -> String;
 
     /// Returns the text exposition format of Prometheus, version 0.0.4, for /metrics.

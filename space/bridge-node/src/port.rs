@@ -195,7 +195,7 @@ pub struct LinkState {
     /// Number of values not written: refused by the server, expired in the queue, or replaced by
     /// newer values.
     pub not_written: u64,
-    /// What cannot be had there, by its name in the mapping, and why.
+    /// Unavailable items by their names in the mapping, with the reasons.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub faults: BTreeMap<String, String>,
 }
@@ -203,7 +203,7 @@ pub struct LinkState {
 /// A request for the local side to execute.
 pub type Execution = bridge_core::Execution<Bytes>;
 
-/// One value of another space on its way to the local side.
+/// A value of another space on its way to the local side.
 #[derive(Debug, Clone)]
 pub struct Delivery {
     /// The value's topic.
@@ -317,9 +317,10 @@ pub enum PortEvent {
         /// The value's topic.
         topic: TopicId,
     },
-    /// A value could not be passed to its service, or no service answered with it.
+    /// A call failed: a value could not be passed to its service, no service answered with it, or
+    /// an execution for another space failed.
     CallFailed {
-        /// The value's topic.
+        /// The topic of the value or call.
         topic: TopicId,
         /// The failure, for the log.
         detail: String,

@@ -36,7 +36,7 @@ use crate::service;
 use crate::signals;
 use crate::status::Status;
 
-/// The parts of one program, for [`run`].
+/// The parts of a program, for [`run`].
 pub trait Program: Parser {
     /// The local side of the program.
     type Port: Port;
@@ -101,7 +101,7 @@ pub trait Program: Parser {
     /// Neither the arguments nor the mapping name the spaces, or they contradict each other.
     fn spaces(&self, mapping: &Mapping) -> Result<Vec<SpaceId>, Failure>;
 
-    /// Starts the local side of one space.
+    /// Starts the local side of a space.
     ///
     /// # Errors
     /// The reason why the local side cannot run at all. A missing peer is not an error; the local
@@ -229,7 +229,7 @@ fn serve<P: Program>(program: P, file: MappingFile) -> Result<(), Failure> {
     ended
 }
 
-/// Prepares the run loop of one space.
+/// Prepares the run loop of a space.
 async fn prepare<P: Program>(
     program: &P,
     changes: &watch::Receiver<Running>,

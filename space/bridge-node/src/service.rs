@@ -1,5 +1,5 @@
-//! A program of the plant that carries no space: from its command line to its end, without a
-//! mapping and a run loop.
+//! A program of the plant that carries no space: its main function, without a mapping and a run
+//! loop.
 
 use std::ffi::OsString;
 use std::process::ExitCode;
@@ -12,26 +12,26 @@ use crate::exit::{Failure, FailureKind};
 use crate::logging::{self, LogFormat};
 use crate::{descriptors, restart, signals};
 
-/// What one program is, for [`run_service`].
+/// The parts of a program, for [`run_service`].
 pub trait Service: Parser {
-    /// Log directives that hush what a library says without need.
+    /// Log directives that suppress noisy messages of a library.
     const QUIET: &'static str = "";
 
-    /// How log lines look.
+    /// Returns the format of log lines.
     fn log(&self) -> LogFormat;
 
-    /// Does its work until it is told to stop.
+    /// Runs the program until `stop` completes.
     ///
     /// # Errors
-    /// What keeps it from its work.
+    /// The reason why the program cannot run.
     fn serve(
         self,
         stop: impl Future<Output = ()> + Send + 'static,
     ) -> impl Future<Output = Result<(), Failure>>;
 }
 
-/// Runs a program from its command line to its end, on one thread. `arguments` begin with the name
-/// of the program, as those of [`std::env::args_os`] do.
+/// Runs a program from its command line to its end, on one thread. `arguments` start with the name
+/// of the program, as in [`std::env::args_os`].
 #[must_use]
 pub fn run_service<S: Service>(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
     let service: S = match parse(arguments) {
@@ -59,12 +59,12 @@ fn serve<S: Service>(service: S) -> Result<(), Failure> {
     ended
 }
 
-/// The command line; or how to end where it asks for help or cannot be read.
+/// Parses the command line. Returns the exit code if it asks for help or is invalid.
 pub(crate) fn parse<P: Parser>(
     arguments: impl IntoIterator<Item = OsString>,
 ) -> Result<P, ExitCode> {
     P::try_parse_from(arguments).map_err(|usage| {
-        // Nobody is left to tell when stdout or stderr is closed.
+        // Printing fails if stdout or stderr is closed.
         let _printed = usage.print();
         let asked = [ErrorKind::DisplayHelp, ErrorKind::DisplayVersion];
         match asked.contains(&usage.kind()) {

@@ -1,8 +1,8 @@
-//! Services of the graph as values of the space: calls made for values that arrive, calls made by
-//! the clock, and what they bring.
+//! Services of the graph as values of the space: calls caused by received values, calls made
+//! periodically, and the values made of their responses.
 //!
-//! Each variable that calls and each service that is polled has a task of its own, so that no call
-//! holds up another or the port.
+//! Each variable that calls and each polled service has a separate task, so that no call delays
+//! another call or the port.
 
 mod caller;
 mod pending;
@@ -27,35 +27,35 @@ use self::caller::{Caller, Source};
 use self::pending::Pending;
 use crate::PortEvent;
 
-/// A ROS graph with services, as a port has it.
+/// A ROS graph with services, as implemented by a port.
 pub trait ServiceGraph {
-    /// Calls one service.
+    /// The client of a service.
     type Client: ServiceCall;
 
-    /// How its messages are on the wire.
+    /// The wire format of its messages.
     const WIRE: Wire;
 
-    /// The service type of that name.
+    /// Returns the service type of a name.
     ///
     /// # Errors
-    /// Why there is none, for people.
+    /// The reason why there is no such type, as text for the user.
     fn service_type(&mut self, name: &TypeName) -> Result<Arc<ServiceType>, String>;
 
-    /// The message type that carries one value of that type, and nothing else; `None` when there is
-    /// none.
+    /// Returns the message type that carries one value of a type and nothing else; `None` if there
+    /// is no such message type.
     ///
     /// # Errors
-    /// Why its definition is not known, for people.
+    /// The reason why the definition of the message type is not known, as text for the user.
     fn carrier(
         &mut self,
         builtin: BuiltinType,
         array: bool,
     ) -> Result<Option<Arc<MessageType>>, String>;
 
-    /// A client of a service, with the time that a call may take.
+    /// Creates a client of a service with a timeout for each call.
     ///
     /// # Errors
-    /// Why there can be none, for people.
+    /// The reason why the client cannot be created, as text for the user.
     fn client(
         &mut self,
         service: &str,
@@ -64,13 +64,13 @@ pub trait ServiceGraph {
     ) -> Result<Self::Client, String>;
 }
 
-/// The calls of one bridge.
+/// The service calls of a bridge.
 #[derive(Debug)]
 pub struct Services {
     callers: HashMap<TopicId, Callee>,
-    /// Which values are made of the answers.
+    /// The values that are made of the responses.
     takers: HashMap<Source, Vec<TopicId>>,
-    /// Polls whose last call was answered.
+    /// Sources whose service has answered: for a poll, the last call was answered.
     answering: HashSet<Source>,
     outcomes: mpsc::Receiver<Outcome>,
     report: mpsc::Sender<Outcome>,
@@ -78,38 +78,39 @@ pub struct Services {
     /// The number of the next poll.
     next_poll: usize,
     tasks: JoinSet<()>,
-    /// The types that are called: definitions may be others when a mapping is read again.
+    /// The types of the called services: definitions may have changed when a mapping is read again.
     types: HashMap<TypeName, Arc<ServiceType>>,
 }
 
-/// What the values of one variable call.
+/// The service that the values of one variable call.
 #[derive(Debug)]
 struct Callee {
     pending: Arc<Pending>,
-    /// Where the request is the same each time: that request, and the value that calls, if not any
-    /// does.
+    /// The request and its trigger, if the request does not depend on the value. The trigger is
+    /// the only value that calls; without a trigger, every value calls.
     constant: Option<(Bytes, Option<Vec<u8>>)>,
     task: AbortHandle,
 }
 
-/// A service as a binding has it.
+/// The service of a binding.
 struct Target<'m> {
     service: &'m str,
     service_type: Arc<ServiceType>,
     timeout: Duration,
 }
 
-/// A service that is asked regularly, for all values that are made of what it answers.
+/// A service that is called periodically, for all values that are made of its responses.
 #[derive(Debug)]
 struct Polled {
     of: usize,
-    /// The binding that it was begun for, apart from what of the response is the value.
+    /// The binding for which the poll was started. Its selection may differ from the selections of
+    /// other bindings of the same poll.
     role: ServiceRole,
     task: AbortHandle,
 }
 
 impl Polled {
-    /// Whether another binding is served by the same calls.
+    /// Returns whether another binding can use the same calls.
     fn serves(&self, other: &ServiceRole) -> bool {
         let calls = |role: &ServiceRole| match role {
             ServiceRole::Poll {
@@ -133,14 +134,14 @@ impl Polled {
 }
 
 impl Services {
-    /// Starts what the mapping ties to services. Reports the types of the values; a binding that
-    /// cannot be served is told of.
+    /// Starts the service calls of the mapping. Reports the types of the values. A binding that
+    /// cannot be served is logged.
     pub fn start(
         graph: &mut impl ServiceGraph,
         own: SpaceId,
         mapping: &Mapping,
     ) -> (Self, Vec<PortEvent>) {
-        // What the port has not taken yet delays the next calls: no more than these wait.
+        // A full queue of outcomes delays the next calls, so that no more outcomes are queued.
         let (report, outcomes) = mpsc::channel(64);
         let mut services = Self {
             callers: HashMap::new(),
@@ -157,8 +158,8 @@ impl Services {
         (services, events)
     }
 
-    /// The types of the services that the mapping calls, as far as they are known. One whose file
-    /// cannot be read for the moment is what it was.
+    /// Returns the known types of the services that the mapping calls. A type whose file is
+    /// temporarily unreadable stays as it was.
     fn called_types(
         &self,
         graph: &mut impl ServiceGraph,
@@ -181,16 +182,16 @@ impl Services {
         types
     }
 
-    /// Ends what only `before` ties to services and starts what only `after` does; what both have
-    /// alike goes on. Reports the values that are given up, then the types of those taken up; a
-    /// binding that cannot be served is told of.
+    /// Stops the service calls of `before` only and starts the service calls of `after` only; calls
+    /// that are the same in both mappings continue. Reports the values that are given up, then the
+    /// types of the new values. A binding that cannot be served is logged.
     pub fn reload(
         &mut self,
         graph: &mut impl ServiceGraph,
         own: SpaceId,
         (before, after): (&Mapping, &Mapping),
     ) -> Vec<PortEvent> {
-        // Those that were ended before.
+        // Reap the tasks that were aborted earlier.
         while self.tasks.try_join_next().is_some() {}
         let types = self.called_types(graph, own, after);
         let alike = |name: &TypeName| match (self.types.get(name), types.get(name)) {
@@ -252,7 +253,7 @@ impl Services {
         }
     }
 
-    /// Ends what a value has to do with its service. A call under way is broken off.
+    /// Ends the calls of a value, or the values made of responses. A running call is aborted.
     fn close(&mut self, topic: TopicId, role: &ServiceRole) {
         match role {
             ServiceRole::Call { .. } => {
@@ -417,7 +418,7 @@ impl Services {
         Ok(Caller::new(client, of, self.report.clone()))
     }
 
-    /// Whether the values of a topic are for a service.
+    /// Returns whether the values of a topic are for a service.
     #[must_use]
     pub fn takes(&self, topic: TopicId) -> bool {
         self.callers.contains_key(&topic)
@@ -431,39 +432,40 @@ impl Services {
         Some(callee.pending.handover())
     }
 
-    /// Hands a value to the service of its topic; `None` when it has none. Else says how many older
-    /// values gave way.
+    /// Queues a value for the service of its topic. Returns the number of older values that were
+    /// dropped, or `None` if the topic has no service.
     #[must_use]
     pub fn hand_over(&self, topic: TopicId, value: &Bytes) -> Option<u64> {
         let callee = self.callers.get(&topic)?;
         let request = match &callee.constant {
             None => Some(value.clone()),
-            // It calls nothing, and of a state it takes the place of one that still does.
+            // The value calls nothing. In a queue that keeps the latest value, it replaces a value
+            // that would still call.
             Some((_, Some(wanted))) if wanted != value => None,
             Some((request, _)) => Some(request.clone()),
         };
         Some(callee.pending.push(request))
     }
 
-    /// The end of the next call. Cancel-safe.
+    /// Returns the outcome of the next call. Cancel-safe.
     pub async fn recv(&mut self) -> Outcome {
         match self.outcomes.recv().await {
             Some(outcome) => outcome,
-            // Not while we hold a sender ourselves.
+            // Never `None`, because `self` holds a sender.
             None => std::future::pending().await,
         }
     }
 
-    /// As [`recv`](Self::recv), for ports that poll.
+    /// Polls for the outcome of [`recv`](Self::recv), for ports that poll.
     pub fn poll_recv(&mut self, cx: &mut Context<'_>) -> Poll<Outcome> {
         match self.outcomes.poll_recv(cx) {
             Poll::Ready(Some(outcome)) => Poll::Ready(outcome),
-            // Never `None` while we hold a sender ourselves.
+            // Never `None`, because `self` holds a sender.
             Poll::Ready(None) | Poll::Pending => Poll::Pending,
         }
     }
 
-    /// What the end of a call is for the values made of it.
+    /// Returns the events that the outcome of a call causes for the values made of it.
     #[must_use]
     pub fn ended(&mut self, outcome: Outcome, received: Timestamp) -> Vec<PortEvent> {
         let Outcome { of, result } = outcome;
@@ -493,7 +495,7 @@ impl Services {
                     detail: detail.clone(),
                 };
                 match of {
-                    // What the service answered before is still its last answer.
+                    // The last response of the service stays valid.
                     Source::Value(topic) => events.push(failed(&topic)),
                     Source::Poll(_) => {
                         if self.answering.remove(&of) {
@@ -508,7 +510,7 @@ impl Services {
     }
 }
 
-/// Whether a value has the same to do with the same service in both mappings.
+/// Returns whether a value has the same service binding in both mappings.
 fn is_same(topic: TopicId, (before, after): (&Mapping, &Mapping)) -> bool {
     let tie = |mapping: &Mapping| {
         let variable = mapping.variable(topic)?;
@@ -523,13 +525,14 @@ fn is_same(topic: TopicId, (before, after): (&Mapping, &Mapping)) -> bool {
     was.is_some() && was == is && of.is_none_or(|of| is_same(of, (before, after)))
 }
 
-/// The type of the service that a variable is tied to.
+/// Returns the type of the service that a variable is tied to.
 fn called_type(mapping: &Mapping, topic: TopicId) -> Option<&TypeName> {
     match &mapping.variable(topic)?.service.as_ref()?.role {
         ServiceRole::Call { service_type, .. } | ServiceRole::Poll { service_type, .. } => {
             Some(service_type)
         }
-        // That of a call, which has an answer of none.
+        // The type of the call that the response belongs to. A poll or another response has no
+        // responses of its own.
         ServiceRole::Answer { of, .. } => match &mapping.variable(*of)?.service.as_ref()?.role {
             ServiceRole::Call { service_type, .. } => Some(service_type),
             ServiceRole::Poll { .. } | ServiceRole::Answer { .. } => None,
@@ -545,7 +548,7 @@ fn bound(topic: TopicId, service_type: &ServiceType, selection: &Selection) -> P
     }
 }
 
-/// The type a value comes as that is only compared.
+/// Returns the message type of a value that is only compared, not sent.
 fn carrier(graph: &mut impl ServiceGraph, variable: &Variable) -> Result<Arc<MessageType>, String> {
     let (builtin, array) = variable
         .value_type
@@ -555,7 +558,7 @@ fn carrier(graph: &mut impl ServiceGraph, variable: &Variable) -> Result<Arc<Mes
         .ok_or_else(|| format!("a value of type {builtin:?} cannot be compared with `when`"))
 }
 
-/// The message of a template without a value in it.
+/// Encodes the message of a template without values.
 fn constant<G: ServiceGraph>(
     message_type: &Arc<MessageType>,
     template: &Selection,
@@ -567,7 +570,7 @@ fn constant<G: ServiceGraph>(
     Ok(bytes.into())
 }
 
-/// A std_msgs type with that text as its `data`.
+/// Returns a std_msgs template with `text` as its `data`.
 fn only(text: &str) -> Selection {
     Selection::Template {
         fields: Vec::new(),

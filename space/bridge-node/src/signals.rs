@@ -4,7 +4,7 @@ use tokio::signal::unix::{Signal, SignalKind, signal};
 
 use crate::exit::{Failure, FailureKind};
 
-/// Ready at the first SIGINT or SIGTERM.
+/// Completes at the first SIGINT or SIGTERM.
 pub(crate) fn stopped() -> Result<impl Future<Output = ()> + Send + 'static, Failure> {
     let (mut interrupt, mut terminate) = (
         listen(SignalKind::interrupt())?,
@@ -18,7 +18,7 @@ pub(crate) fn stopped() -> Result<impl Future<Output = ()> + Send + 'static, Fai
     })
 }
 
-/// That signal, each time it comes.
+/// Returns a stream of a signal.
 pub(crate) fn listen(kind: SignalKind) -> Result<Signal, Failure> {
     signal(kind).map_err(|error| {
         Failure::new(

@@ -1,10 +1,10 @@
-//! Which messages of ours want a stamp.
+//! Decides which messages get a stamp from the bridge.
 
 use messages::{Leaf, MessageType, Selection};
 
-/// Whether a message that is made of `selection` alone begins with a header whose stamp nobody
-/// gives, so that it is to be the time of the graph. A message that crosses as a whole keeps its
-/// own.
+/// Returns whether a message made of `selection` alone starts with a header whose stamp no value
+/// provides, so that the stamp has to be the time of the graph. A message that crosses as a whole
+/// keeps its own stamp.
 #[must_use]
 pub fn wants_stamp(message_type: &MessageType, selection: Option<&Selection>) -> bool {
     let is_stamp = |leaf: &Leaf| leaf.path == STAMP;
@@ -26,7 +26,7 @@ pub fn wants_stamp(message_type: &MessageType, selection: Option<&Selection>) ->
     }
 }
 
-/// The first field of a message that begins with a header.
+/// The first field of a message that starts with a header.
 const STAMP: &str = "header.stamp";
 
 #[cfg(test)]

@@ -1,5 +1,4 @@
-//! What a program says of itself: counters per topic and delays per hop, as JSON and for
-//! Prometheus.
+//! The status of a program: counters per topic and delays per hop, as JSON and for Prometheus.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -12,7 +11,7 @@ use crate::mapping_file::About;
 use crate::metrics::Told;
 use crate::port::LinkState;
 
-/// A program's counters and delays at one moment.
+/// A snapshot of a program's counters and delays.
 #[derive(Debug, Clone, Serialize)]
 pub(crate) struct Status {
     program: &'static str,
@@ -22,42 +21,42 @@ pub(crate) struct Status {
     #[serde(flatten)]
     readiness: Readiness,
     mapping: MappingStatus,
-    /// The secured groups, by their SecurityGroupId.
+    /// The secured groups by SecurityGroupId.
     groups: BTreeMap<String, GroupStatus>,
     topics: BTreeMap<String, TopicStatus>,
-    /// Calls that are known, asked for or executed here.
+    /// Calls that are known, requested or executed here.
     calls: BTreeMap<String, CallStatus>,
-    /// Other servers that the program is a client of.
+    /// Other servers to which the program is a client.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     servers: Vec<LinkState>,
     /// The application's own OPC UA certificate.
     #[serde(skip_serializing_if = "Option::is_none")]
     certificate: Option<serde_json::Value>,
-    /// Goals and runs that are being cancelled, as long as their end is not known.
+    /// Goals and runs that are being cancelled, until their end is known.
     cancellations_pending: Vec<String>,
-    /// Other applications of the group, as they say of themselves.
+    /// Other applications of the group, as they describe themselves.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     applications: Vec<ApplicationStatus>,
-    /// Datagrams and messages that belong to no topic.
+    /// Datagrams and messages without a topic.
     others: TopicStatus,
     hops: BTreeMap<&'static str, HopStatus>,
 }
 
-/// Whether it can do its work.
+/// The readiness of the program.
 #[derive(Debug, Clone, Serialize)]
 pub(crate) struct Readiness {
-    /// Why it cannot, for people; nothing where it can.
+    /// The reasons why the program is not ready, as text for the user; empty if it is ready.
     pub(crate) not_ready: Vec<String>,
     /// The peers that are missing, each with the reason. The program works without them.
     pub(crate) waiting_for: Vec<String>,
     pub(crate) interfaces: Interfaces,
 }
 
-/// For each side, 1 where the network interfaces are there that it is on, and 0 where not.
+/// For each side, 1 if its network interfaces are present, else 0.
 #[derive(Debug, Clone, Copy, Serialize)]
 pub(crate) struct Interfaces {
     pub(crate) pubsub: u8,
-    /// `None` where the side is on none in particular.
+    /// `None` if the side uses no particular interface.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) local: Option<u8>,
 }
@@ -76,18 +75,18 @@ struct ApplicationStatus {
 struct MappingStatus {
     #[serde(flatten)]
     about: About,
-    /// Its keys that count only after a restart.
+    /// Keys of the mapping that take effect only after a restart.
     restart_needed: Vec<String>,
 }
 
 #[derive(Debug, Clone, Serialize)]
 struct GroupStatus {
     mode: &'static str,
-    /// The key that is used, by its SecurityTokenId.
+    /// The SecurityTokenId of the key in use.
     token: Option<u32>,
-    /// The one that comes next.
+    /// The SecurityTokenId of the next key.
     next_token: Option<u32>,
-    /// Whether there should be a next one by now.
+    /// Whether the next key should be present already.
     overdue: bool,
 }
 
@@ -101,18 +100,18 @@ struct TopicStatus {
     keep_alives: u64,
     missing: u64,
     sender_changed: u64,
-    /// Our own datagrams that the group brought back, and values that the local side heard of
-    /// itself: no drops.
+    /// Own datagrams that the group looped back, and values that the local side received from
+    /// itself. They are not drops.
     looped: u64,
     dropped: BTreeMap<&'static str, u64>,
 }
 
 #[derive(Debug, Clone, Serialize)]
 struct CallStatus {
-    /// Its name for people, of one that somebody else executes.
+    /// Display name of a call that another program executes.
     #[serde(skip_serializing_if = "Option::is_none")]
     name: Option<String>,
-    /// Whether somebody else executes it now.
+    /// Whether another program executes it at the moment.
     known: bool,
     asked: u64,
     answered: u64,
@@ -204,7 +203,7 @@ impl Status {
         self
     }
 
-    /// How many topics there are, and how many samples were sent, delivered and dropped.
+    /// Returns the number of topics, and the numbers of samples sent, delivered and dropped.
     pub(crate) fn summary(&self) -> [u64; 4] {
         let all = || self.topics.values().chain([&self.others]);
         [
@@ -247,7 +246,7 @@ impl Told for Status {
     }
 
     fn json(&self) -> String {
-        // All keys are strings and no number is special, so there is nothing that could fail.
+        // All keys are strings and all numbers are finite, so serialization does not fail.
         serde_json::to_string(self).unwrap_or_default()
     }
 
@@ -347,7 +346,7 @@ impl HopStatus {
 }
 
 impl LinkState {
-    /// Gives each figure: its name, its labels, `own` among them, and its value.
+    /// Passes the name, the labels (including `own`) and the value of each figure to `line`.
     fn figures(&self, own: &str, line: &mut impl FnMut(&str, &str, &dyn std::fmt::Display)) {
         let labels = format!("{own},server=\"{}\"", self.name);
         line("server_up", &labels, &u8::from(self.up));
@@ -364,7 +363,7 @@ impl LinkState {
     }
 }
 
-/// As the value of a label has to be written.
+/// Escapes a text for the value of a label.
 fn escaped(text: &str) -> String {
     text.replace('\\', "\\\\").replace('"', "\\\"")
 }

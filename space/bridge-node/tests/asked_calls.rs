@@ -1,4 +1,4 @@
-//! Calls of other spaces as services of a graph that is made up.
+//! Calls of other spaces as services of a fake graph.
 
 #![expect(
     clippy::unwrap_used,
@@ -23,7 +23,7 @@ use uadp::{BuiltinType, StatusCode};
 
 type Offered = Arc<Mutex<BTreeMap<String, Asker>>>;
 
-/// A graph whose services the test calls.
+/// A graph with services that the test calls.
 struct Fake {
     registry: Registry,
     offered: Offered,
@@ -104,7 +104,7 @@ impl Bench {
         }
     }
 
-    /// The services that are there.
+    /// Returns the offered services.
     fn services(&self) -> Vec<String> {
         self.graph.offered.lock().unwrap().keys().cloned().collect()
     }
@@ -123,7 +123,7 @@ impl Bench {
         self.calls.recv::<Fake>().await
     }
 
-    /// The number and topic of what is asked next.
+    /// Returns the id and topic of the next request.
     async fn asked(&mut self) -> (AskId, TopicId) {
         let event = self.heard().await;
         let PortEvent::Ask { ask, topic, .. } = event else {
@@ -166,7 +166,7 @@ fn fault(text: &str) -> AskError {
     }
 }
 
-/// A trigger's `success` and `message`.
+/// Returns `success` and `message` of a Trigger response.
 fn read(answer: &[u8]) -> (bool, String) {
     let success = answer[4] == 1;
     let length = u32::from_le_bytes(answer[8..12].try_into().unwrap());
@@ -186,7 +186,7 @@ async fn a_call_is_a_service_from_when_it_is_known_until_it_is_gone() {
             if *of == topic(105) && service_type.name().to_string() == "std_srvs/Trigger"
     ));
     assert_eq!(bench.services(), ["/ua_0_7_105"]);
-    // Said again, it is left alone; said to be another, it is offered anew.
+    // An unchanged description has no effect; a changed description is offered again.
     bench.calls.known(topic(105), trigger());
     assert!(!bench.calls.is_waiting());
     bench.calls.known(topic(105), start(&[]));

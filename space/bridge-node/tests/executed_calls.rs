@@ -1,4 +1,4 @@
-//! Services of a graph that is made up, executed for other spaces.
+//! Services of a fake graph, executed for other spaces.
 
 #![expect(clippy::unwrap_used, clippy::panic, reason = "test code")]
 
@@ -17,10 +17,10 @@ use messages::{Dialect, MessageType, Registry, ServiceType, TypeName, Wire};
 use tokio::sync::Semaphore;
 use uadp::BuiltinType;
 
-/// What a service answers next.
+/// The next responses of a service.
 type Answers = Arc<Mutex<VecDeque<Result<Bytes, CallFault>>>>;
 
-/// A graph whose services answer once they may.
+/// A graph whose services respond once the test permits it.
 struct Fake {
     registry: Registry,
     may: Arc<Semaphore>,
@@ -96,7 +96,7 @@ impl Bench {
         }
     }
 
-    /// What comes of a look at a graph with these services.
+    /// Returns the events of a comparison with a graph that has these services.
     fn look(&mut self, services: &[(&str, Option<&str>)]) -> Vec<String> {
         let present = services.iter().map(|(service, type_name)| {
             let type_name = type_name.map(|name| name.parse().unwrap());
@@ -190,7 +190,7 @@ async fn what_the_mapping_executes_goes_by_its_name_there_and_by_no_other() {
     assert_eq!(bench.look(&[("/grip", SET_BOOL)]), none);
     let offered = ["+ua_1_2_70 std_srvs/Trigger open"];
     assert_eq!(bench.look(&[("/grip", TRIGGER)]), offered);
-    // No more is said of it by another mapping: it is given up.
+    // A mapping without the call withdraws it.
     bench.policy.replace(&Arc::default());
     assert_eq!(bench.look(&[("/grip", TRIGGER)]), ["-ua_1_2_70"]);
 }
@@ -236,7 +236,7 @@ async fn what_came_of_an_execution_says_whether_the_service_ran() {
         };
         bench.graph.answers.lock().unwrap().push_back(Err(fault));
         bench.execute(topic(61), id).unwrap();
-        // A call that is withdrawn is executed to its end.
+        // The execution of a withdrawn call continues to its end.
         bench.look(&[]);
         bench.graph.may.add_permits(1);
         let events = bench.executing.recv().await;

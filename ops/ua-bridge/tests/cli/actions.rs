@@ -86,7 +86,7 @@ fn the_one_shot_form_is_recognised() {
 fn what_is_shown_of_an_action_is_written_again_as_it_was() {
     let mut written = 0;
     for (name, digits) in vectors() {
-        // RawData of a peer that does not say the encoding reads as Variants that are wrong.
+        // RawData of a peer that does not announce the encoding is decoded as wrong Variants.
         if name == "netstandard_raw_response" {
             continue;
         }
@@ -143,7 +143,7 @@ fn an_action_that_is_not_opened_is_written_again_as_it_was() {
     encoder.finish_sealed(seal).unwrap();
     let digits: String = datagram.iter().map(|byte| format!("{byte:02x}")).collect();
 
-    // That it is not opened is told beside it.
+    // The output marks the message as sealed.
     let shown = run_on(&["decode", "-"], digits.as_bytes()).stdout;
     let shown: Value = serde_json::from_str(&shown).unwrap();
     assert_eq!(shown["sealed"]["action"], true);

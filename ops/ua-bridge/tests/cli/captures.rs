@@ -1,4 +1,4 @@
-//! Captures made of the vectors.
+//! Captures made from the vectors.
 
 use std::net::Ipv6Addr;
 
@@ -14,7 +14,7 @@ const RAW: u16 = 101;
 /// 2026-05-17T12:34:56Z.
 const SECONDS: u32 = 1_779_021_296;
 
-/// A pcap file of microseconds, a packet each of them.
+/// Returns a pcap file of packets, one microsecond apart.
 fn pcap(link_type: u16, packets: &[Vec<u8>]) -> Vec<u8> {
     let mut file = vec![0xD4, 0xC3, 0xB2, 0xA1, 2, 0, 4, 0];
     for number in [0, 0, 65_535, u32::from(link_type)] {
@@ -30,7 +30,7 @@ fn pcap(link_type: u16, packets: &[Vec<u8>]) -> Vec<u8> {
     file
 }
 
-/// A pcapng file by a big-endian machine, with an interface for each packet.
+/// Returns a pcapng file in big endian, with an interface for each packet.
 fn pcapng(packets: &[(u16, Vec<u8>)]) -> Vec<u8> {
     let block = |kind: u32, body: &[u8]| {
         let mut body = body.to_vec();
@@ -42,10 +42,10 @@ fn pcapng(packets: &[(u16, Vec<u8>)]) -> Vec<u8> {
     let mut file = block(0x0A0D_0D0A, &[&version[..], &[0xFF; 8]].concat());
     for ((link_type, packet), index) in packets.iter().zip(0_u32..) {
         let [a, b] = link_type.to_be_bytes();
-        // Nanoseconds.
+        // Time stamps in nanoseconds.
         let interface = [a, b, 0, 0, 0, 0, 0, 0, 0, 9, 0, 1, 9, 0, 0, 0, 0, 0, 0, 0];
         file.extend(block(1, &interface));
-        // A block of names, which says nothing here.
+        // A block of names, which has no effect.
         file.extend(block(4, &[0; 8]));
         let time = u64::from(SECONDS) * 1_000_000_000 + 7 + u64::from(index);
         let length = u32::try_from(packet.len()).unwrap().to_be_bytes();
@@ -107,18 +107,18 @@ fn ethernet(packet: &[u8]) -> Vec<u8> {
     [&[0; 12][..], &ether_type, packet].concat()
 }
 
-/// A vector as a frame to port 4840.
+/// Returns a vector as a frame to port 4840.
 fn frame(name: &str) -> Vec<u8> {
     ethernet(&ipv4(0, &udp(4840, &Vector::load(name).bytes())))
 }
 
-/// What is shown of a vector by itself.
+/// Returns the decoded output of a vector without a capture.
 fn shown(name: &str) -> Value {
     let shown = run_on(&["decode", "-"], Vector::load(name).hex.as_bytes()).quiet();
     serde_json::from_str(&shown).unwrap()
 }
 
-/// An object without what the capture adds.
+/// Removes the keys that a capture adds to an object.
 fn alone(mut object: Value) -> Value {
     for key in ["time", "source", "destination"] {
         assert!(
@@ -225,7 +225,7 @@ fn one_bad_datagram_does_not_stop_the_others_and_ends_with_65() {
 #[test]
 fn the_port_says_what_is_looked_at() {
     let to = |port, name| ethernet(&ipv4(0, &udp(port, &Vector::load(name).bytes())));
-    // A name query, and a datagram for an unusual port that is malformed.
+    // A name query, and a malformed datagram to an unusual port.
     let dns = [
         0x31, 0x01, 1, 0, 0, 1, 0, 0, 0, 0, 0, 0, 4, b'r', b'o', b's', b'1', 0, 0, 1, 0, 1,
     ];
@@ -317,7 +317,7 @@ fn chunks_are_shown_and_put_together() {
         message["fields"],
         json!([{ "value": { "UaType": 15, "Value": text } }])
     );
-    // It is a NetworkMessage that could be sent as it is.
+    // The output is a NetworkMessage that can be encoded unchanged.
     let hex = run_on(&["encode", "-"], whole.to_string().as_bytes()).quiet();
     assert!(
         hex.starts_with("f101ba080164000105 00094d00".replace(' ', "").as_str()),

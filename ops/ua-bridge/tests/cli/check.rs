@@ -1,4 +1,4 @@
-//! Mappings checked, codes explained, the schema.
+//! Checks of mappings, explanations of codes, and the schema.
 
 use std::fs;
 use std::path::Path;
@@ -74,7 +74,7 @@ fn a_program_gets_the_same_as_json() {
     assert_eq!(minimal["canRun"], true);
 }
 
-/// A ROS 2 robot of a make whose definitions are on its own host only.
+/// A ROS 2 robot of a vendor whose definitions are on its own host only.
 const FOREIGN: &str = "spaces: [{id: 1}, {id: 2}]\nnamespaces: {2: urn:x}\nvariables:\n\
     - {node: ns=2;i=1, name: Arm, origin: 1, ros: [{topic: /arm, type: std_msgs/Bool}, \
     {space: 2, topic: /arm, type: their_msgs/Arm}]}\n";
@@ -263,7 +263,7 @@ fn a_password_in_a_file_others_can_read_is_told_and_not_shown() {
     );
 }
 
-/// A NodeSet with one Double of its own.
+/// A NodeSet with a Double variable.
 const LINE: &str = r#"<UANodeSet xmlns="http://opcfoundation.org/UA/2011/03/UANodeSet.xsd">
   <NamespaceUris><Uri>urn:line</Uri></NamespaceUris>
   <UAVariable NodeId="ns=1;i=1" BrowseName="1:Speed" DataType="i=11">
@@ -336,7 +336,7 @@ fn each_nodeset_that_cannot_be_loaded_is_told_where_it_is_named_and_with_what_to
         if !sound {
             wrong.push(format!("{file}: {code} {findings:?}"));
         }
-        // On the host of a bridge the files need not be.
+        // The files may be missing on the host of a bridge.
         let (code, findings) = check(file, &["--for", "1"]);
         if code != 0
             || findings

@@ -1,4 +1,4 @@
-//! Mappings made of NodeSets, and put into files that are there.
+//! Mappings made from NodeSets, and merged into existing files.
 
 use std::fs;
 use std::path::Path;
@@ -8,7 +8,7 @@ use serde_json::Value;
 
 use crate::program::{file, run};
 
-/// A NodeSet of one namespace with variables of these node ids, each named as its text says.
+/// Returns a NodeSet of one namespace with variables of these node ids and names.
 fn node_set(variables: &[(&str, &str)]) -> String {
     let variables = variables.iter().map(|(node, name)| {
         format!("<UAVariable NodeId=\"{node}\" BrowseName=\"1:{name}\" DataType=\"i=1\"/>\n")
@@ -51,7 +51,8 @@ fn an_alias_once_given_stays_with_its_node() {
         found.map(|(_, topic)| topic)
     };
     assert_eq!(of("ns=2;s=B").unwrap(), "ua_0_2_8");
-    // One that comes before it in the alphabet takes the next number, also after a higher one was given.
+    // A variable that is earlier in the alphabet gets the next number, even after a higher number
+    // was assigned.
     let second = file(
         "second.xml",
         node_set(&[
@@ -68,7 +69,7 @@ fn an_alias_once_given_stays_with_its_node() {
     let before = fs::read_to_string(&out).unwrap();
     run(&["init", "--nodeset", &second, "-o", &out, "--merge"]).quiet();
     assert_eq!(fs::read_to_string(&out).unwrap(), before);
-    // A node whose own number is an alias by now cannot be there too, and is told of once.
+    // A node whose number is already an alias cannot be added, and is reported once.
     let third = file("third.xml", node_set(&[("ns=1;i=9", "Nine")]));
     let told = run(&["init", "--nodeset", &third, "-o", &out, "--merge", "--json"]).quiet();
     let told: Value = serde_json::from_str(&told).unwrap();

@@ -1,9 +1,9 @@
-//! What is said of datagrams that are malformed, cut off or secured with other keys.
+//! Messages about datagrams that are malformed, truncated or secured with other keys.
 
 use crate::program::{file, run, run_on};
 use crate::vectors::{Vector, vectors};
 
-/// The vectors that break the standard, and what is said of each.
+/// The vectors that violate the standard, and the message about each.
 #[test]
 fn malformed_vectors_are_refused_at_the_right_byte() {
     for (name, said) in [
@@ -15,7 +15,7 @@ fn malformed_vectors_are_refused_at_the_right_byte() {
             "asyncua_promoted",
             "offset 14, in the PromotedFields, field 0 (Int32): expected 4 bytes, found 0",
         ),
-        // ProbeType 2 asks for applications and nothing more.
+        // ProbeType 2 requests applications and nothing more.
         (
             "asyncua_discovery_request_metadata",
             "offset 6, in the discovery message, 9 bytes after the end of the message",
@@ -27,7 +27,7 @@ fn malformed_vectors_are_refused_at_the_right_byte() {
         let first = ended.stderr.lines().next().unwrap();
         assert_eq!(first, format!("{file}: {said}"));
     }
-    // Its extra byte makes another DataSetWriterId of the Count, and of what follows a chunk like any other.
+    // The extra byte turns the Count into another DataSetWriterId, and the rest into a chunk.
     let vector = Vector::load("asyncua_chunk");
     assert!(vector.is_malformed());
     let shown = run_on(&["decode", "-"], vector.hex.as_bytes()).quiet();
@@ -134,7 +134,7 @@ fn a_fault_in_a_field_is_named_with_writer_field_and_type() {
 
 #[test]
 fn one_malformed_message_among_several_does_not_hide_the_others() {
-    // Of the second message three bytes of its Double are left.
+    // Three bytes of the Double of the second message are left.
     let hex = Vector::load("wire_two_writers").hex;
     let cut = hex
         .replacen("1c001c00", "1c001200", 1)
@@ -156,7 +156,7 @@ fn one_malformed_message_among_several_does_not_hide_the_others() {
     assert_eq!(messages[1]["fields"][0]["value"]["Value"], "cell");
     assert_eq!(messages[1]["fields"].as_array().unwrap().len(), 1);
     assert_eq!(messages[1]["malformed"], said);
-    // What is malformed is not written as if it were not.
+    // A malformed message is not encoded as a valid message.
     let again = run_on(&["encode", "-"], ended.stdout.as_bytes());
     assert_eq!(again.code, 65);
     assert!(again.stderr.contains("malformed"), "{}", again.stderr);
@@ -184,12 +184,12 @@ fn sizes_that_reach_too_far_are_named() {
     }
 }
 
-/// Every prefix of every vector, a thousand runs in one.
+/// Every prefix of every vector, with all prefixes of a vector in one run.
 #[test]
 fn where_a_datagram_ends_too_early_the_offset_is_that_of_what_is_cut_off() {
     for vector in vectors() {
         let bytes = vector.hex.len() / 2;
-        // More than a few hundred prefixes of one kind tell nothing new.
+        // The first few hundred prefixes cover all cases.
         let prefixes = (1..bytes.min(300)).map(|end| &vector.hex[..end * 2]);
         let lines = prefixes.collect::<Vec<_>>().join("\n");
         let ended = run_on(&["decode", "--lines", "-"], lines.as_bytes());
@@ -204,7 +204,7 @@ fn where_a_datagram_ends_too_early_the_offset_is_that_of_what_is_cut_off() {
             let Some(at) = said.strip_prefix("stdin: line ") else {
                 continue;
             };
-            // Chunks that contradict each other are told of too.
+            // Chunks that contradict each other are reported too.
             let Some((line, said)) = at.split_once(": offset ") else {
                 continue;
             };

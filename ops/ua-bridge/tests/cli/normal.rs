@@ -1,10 +1,11 @@
-//! The JSON of a vector and ours in one style, what says nothing of the datagram left out.
+//! Converts the JSON of a vector and the JSON of `decode` to one style, without keys that do not
+//! describe the datagram.
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD as BASE64;
 use serde_json::{Value, json};
 
-/// Keys about a vector, not about what its datagram holds.
+/// Keys about a vector that do not describe the content of its datagram.
 const ASIDE: &[&str] = &[
     "name",
     "producer",
@@ -16,11 +17,11 @@ const ASIDE: &[&str] = &[
     "contested",
     "security",
     "trailingBytes",
-    // In prose; captures show it in full.
+    // In prose; captures show the whole message.
     "reassembled",
 ];
 
-/// One datagram.
+/// Normalizes the JSON of a datagram.
 pub(crate) fn normal(mut json: Value) -> Value {
     let object = json.as_object_mut().unwrap();
     object.retain(|key, value| !ASIDE.contains(&key.as_str()) && !value.is_null());
@@ -39,7 +40,7 @@ pub(crate) fn normal(mut json: Value) -> Value {
         .flatten()
     {
         let message = message.as_object_mut().unwrap();
-        // What the user gave, and what is shown of RawData without.
+        // Metadata from the user, and the bytes of RawData shown without metadata.
         message.remove("metaData");
         message.remove("rawDataHex");
     }
@@ -50,7 +51,7 @@ pub(crate) fn normal(mut json: Value) -> Value {
         for key in READABLE {
             announcement.remove(*key);
         }
-        // A connection has a status here; the vector knows and does not name it.
+        // `decode` shows the status of a connection, which the vector omits.
         if announcement["type"] == 4 {
             announcement.remove("statusCode");
         }
@@ -59,15 +60,16 @@ pub(crate) fn normal(mut json: Value) -> Value {
     json
 }
 
-/// What we show of an announcement besides its `bodyHex`, which the vectors do in part.
+/// Keys of an announcement that `decode` shows besides `bodyHex`; the vectors have only some of
+/// them.
 const READABLE: &[&str] = &["metaDataName", "metaData", "endpointUrls"];
 
-/// Each object in it.
+/// Normalizes each nested object.
 fn parts(json: &mut Value) {
     match json {
         Value::Array(elements) => elements.iter_mut().for_each(parts),
         Value::Object(object) => {
-            // A text for people; the ticks beside it count.
+            // Readable time; the ticks beside it are compared.
             if object.contains_key("ticks100ns") {
                 object.remove("iso");
             }
@@ -77,7 +79,7 @@ fn parts(json: &mut Value) {
             if let Some(status) = object.remove("StatusCode") {
                 object.insert("Status".to_owned(), status);
             }
-            // Which of the two an array without elements is, the vectors do not say.
+            // The vectors do not distinguish null arrays from empty arrays.
             object.remove("NullArray");
             object.values_mut().for_each(parts);
             if let Some(value) = value_in_one_style(json) {
@@ -94,7 +96,7 @@ fn parts(json: &mut Value) {
 }
 
 fn value_in_one_style(json: &Value) -> Option<Value> {
-    // asyncua names the encoding, not the type, and gives the bytes.
+    // asyncua names the encoding instead of the type, and shows the bytes.
     if let Some(body) = json.get("BodyBase64") {
         assert_eq!(
             (&json["TypeId"], body),
@@ -109,12 +111,12 @@ fn value_in_one_style(json: &Value) -> Option<Value> {
             name.as_str()?
         )));
     }
-    // open62541 writes the bytes of a body as the text they are.
+    // open62541 writes the bytes of a body as text.
     if json["UaBody"] == "\u{1}\u{2}\u{3}\u{4}\u{5}" {
         let body = BASE64.encode([1, 2, 3, 4, 5]);
         return Some(json!({ "UaTypeId": json["UaTypeId"], "UaEncoding": 1, "UaBody": body }));
     }
-    // One dimension is the length of the array.
+    // A single dimension equals the length of the array.
     let dimensions = json.get("Dimensions")?.as_array()?;
     if let [length] = dimensions.as_slice() {
         assert_eq!(length.as_u64()?, json["Value"].as_array()?.len() as u64);
@@ -123,7 +125,7 @@ fn value_in_one_style(json: &Value) -> Option<Value> {
     None
 }
 
-/// A time without the zeros at the end of its fraction.
+/// Returns a time without the zeros at the end of its fraction.
 fn without_zeros(text: &str) -> Option<String> {
     let (whole, fraction) = text.strip_suffix('Z')?.split_once('.')?;
     let digits = fraction.trim_end_matches('0');

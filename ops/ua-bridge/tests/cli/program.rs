@@ -1,4 +1,4 @@
-//! The built program, run as a user does.
+//! The built program, run as users run it.
 
 use std::fs;
 use std::io::Write as _;
@@ -8,7 +8,7 @@ use std::process::{Command, Stdio};
 
 use serde_json::Value;
 
-/// What the program left behind.
+/// The exit code and output of the program.
 #[derive(Debug)]
 pub(crate) struct Ended {
     pub(crate) code: i32,
@@ -23,7 +23,7 @@ pub(crate) fn named(name: &str) -> Command {
     command
 }
 
-/// Runs `ua-space` with nothing on stdin.
+/// Runs `ua-space` with empty stdin.
 pub(crate) fn run(words: &[&str]) -> Ended {
     run_on(words, b"")
 }
@@ -37,7 +37,7 @@ pub(crate) fn run_on(words: &[&str], stdin: &[u8]) -> Ended {
         .stderr(Stdio::piped())
         .spawn()
         .unwrap();
-    // The program may have enough before it has read all.
+    // The program may end before it has read all input.
     let _written = child.stdin.take().unwrap().write_all(stdin);
     let output = child.wait_with_output().unwrap();
     Ended {
@@ -48,7 +48,7 @@ pub(crate) fn run_on(words: &[&str], stdin: &[u8]) -> Ended {
 }
 
 impl Ended {
-    /// The output of a run that went well and had nothing to say.
+    /// Returns the output of a successful run with empty stderr.
     #[track_caller]
     pub(crate) fn quiet(self) -> String {
         assert_eq!(
@@ -60,7 +60,7 @@ impl Ended {
         self.stdout
     }
 
-    /// The objects of the output, one a line.
+    /// Returns the JSON objects of the output, one per line.
     #[track_caller]
     pub(crate) fn lines(&self) -> Vec<Value> {
         let lines = self.stdout.lines();
@@ -70,7 +70,7 @@ impl Ended {
     }
 }
 
-/// A file of this test run with that name, which only its owner may read.
+/// Writes a file of this test run that only its owner can read. Returns its path.
 pub(crate) fn file(name: &str, content: impl AsRef<[u8]>) -> String {
     let path = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(name);
     fs::write(&path, content).unwrap();

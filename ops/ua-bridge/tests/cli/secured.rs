@@ -5,7 +5,7 @@ use serde_json::{Value, json};
 use crate::program::{file, run};
 use crate::vectors::Vector;
 
-/// Files of one secured vector: its datagram and its keys.
+/// Writes the files of one secured vector, its datagram and its keys, and returns their paths.
 fn files(name: &str, keys: &Value) -> (String, String) {
     let vector = Vector::load("wire_encrypt_aes128_r0");
     (
@@ -193,7 +193,8 @@ fn a_secured_datagram_is_not_written_without_its_keys() {
 
 #[test]
 fn raw_data_is_read_in_the_way_that_is_asked_for() {
-    // One dimension of four Int32: a UInt32 in the one, an Int32 in the other, so both are the same.
+    // The length of an array of four Int32 is a UInt32 in the standard reading and an Int32 in the
+    // open62541 reading; the bytes are equal.
     let vector = Vector::load("raw_array_1d");
     let metadata = &vector.json["dataSetMessages"][0]["metaData"];
     let metadata = file("raw_array_1d.reading", metadata.to_string());
@@ -213,7 +214,7 @@ fn raw_data_is_read_in_the_way_that_is_asked_for() {
             json!([1000, 2000, 3000, 4000])
         );
     }
-    // Of a matrix the standard tells the number of dimensions as well.
+    // For a matrix the standard encodes the number of dimensions as well.
     let vector = Vector::load("raw_matrix_2d");
     let metadata = &vector.json["dataSetMessages"][0]["metaData"];
     let metadata = file("raw_matrix_2d.reading", metadata.to_string());
@@ -277,11 +278,11 @@ fn what_an_announcement_says_of_the_fields_is_metadata() {
     let fields = &shown["announcement"]["metaData"];
     assert_eq!(fields[1]["name"], "pose");
     let metadata = file("announced.json", fields.to_string());
-    // A Double, three Doubles, and a text of 32 bytes at most.
+    // A Double, three Doubles, and a String of at most 32 bytes.
     let pose = [1.0_f64, 2.0, 3.0].map(f64::to_le_bytes).concat();
     let text = [&[2, 0, 0, 0][..], b"ok", &[0; 30]].concat();
     let payload = [&0.5_f64.to_le_bytes()[..], &[3, 0, 0, 0], &pose, &text].concat();
-    // PublisherId 2234, one message of DataSetWriter 1, RawData.
+    // PublisherId 2234, a message of DataSetWriter 1, RawData.
     let head = [0xD1, 0x01, 0xBA, 0x08, 1, 1, 0, 0x03];
     let raw = file("announced.raw", [&head[..], &payload].concat());
     let shown = run(&["decode", &raw, "--metadata", &metadata]).quiet();

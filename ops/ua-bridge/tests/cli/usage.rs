@@ -1,4 +1,4 @@
-//! Arguments, the forms of input and output, and what JSON is refused.
+//! Arguments, the formats of input and output, and refused JSON.
 
 use serde_json::{Value, json};
 
@@ -206,7 +206,7 @@ fn json_that_is_no_datagram_is_refused_with_its_place() {
     }
 }
 
-/// Values the vectors do not have, and forms in which they may be given too.
+/// Values that the vectors do not contain, and their alternative forms.
 #[test]
 fn values_survive_the_way_there_and_back() {
     let fields = json!([
@@ -319,7 +319,7 @@ fn padding_to_a_configured_size_is_kept() {
 
 #[test]
 fn a_message_that_is_not_valid_is_kept_whatever_it_holds() {
-    // A cleared valid bit, then flags no message has; a good message behind it.
+    // A cleared valid bit, then flags that no message has, followed by a valid message.
     let hex = "f101020001050002 0a000b00 04000800 20ffeedd 010100062a000000".replace(' ', "");
     let shown = run_on(&["decode", "-"], hex.as_bytes()).quiet();
     let json: Value = serde_json::from_str(&shown).unwrap();

@@ -1,4 +1,4 @@
-//! Every datagram of `uadp/tests/vectors` as its JSON, and back.
+//! Decodes every datagram of `uadp/tests/vectors` to JSON, and encodes it again.
 
 use std::fs;
 use std::path::PathBuf;
@@ -8,7 +8,7 @@ use serde_json::{Map, Value};
 use crate::normal::normal;
 use crate::program::{Ended, file, run, run_on};
 
-/// Why writing the JSON of a vector does not give its datagram.
+/// Vectors whose JSON does not encode to their datagram, with the reason.
 const NOT_WRITTEN: &[(&str, &str)] = &[
     ("asyncua_raw", "the JSON does not say what the RawData is"),
     (
@@ -102,7 +102,7 @@ fn the_json_of_every_vector_makes_its_datagram() {
 fn what_was_shown_makes_the_datagram_again() {
     let mut wrong = Vec::new();
     for vector in vectors() {
-        // Written with the FieldCount it lacks.
+        // The encoder adds the missing FieldCount.
         if vector.is_malformed() || vector.name.contains("heartbeat") {
             continue;
         }
@@ -159,7 +159,7 @@ fn names_of_status_codes_are_those_of_the_vectors() {
     assert!(count >= 10, "{count}");
 }
 
-/// The names that stand beside codes, by code.
+/// Returns the symbols of status codes, by code.
 fn symbols(json: &Value) -> Map<String, Value> {
     match json {
         Value::Object(object) => {
@@ -174,10 +174,10 @@ fn symbols(json: &Value) -> Map<String, Value> {
     }
 }
 
-/// A datagram and what it contains.
+/// A datagram and its content.
 pub(crate) struct Vector {
     pub(crate) name: String,
-    /// One line of digits, without line end.
+    /// One line of hexadecimal digits without a line end.
     pub(crate) hex: String,
     pub(crate) json: Value,
 }
@@ -199,13 +199,13 @@ impl Vector {
             .collect()
     }
 
-    /// The datagram as `decode` shows it with all keys and metadata it needs.
+    /// Decodes the datagram with the keys and metadata of the vector.
     fn decode(&self) -> Ended {
         let hex = file(&format!("{}.hex", self.name), &self.hex);
         self.with_files("decode", &hex)
     }
 
-    /// The datagram of some JSON, with the keys and metadata of this vector.
+    /// Encodes JSON with the keys and metadata of this vector.
     fn encode(&self, json: &str) -> Ended {
         let json = file(&format!("{}.json", self.name), json);
         self.with_files("encode", &json)
@@ -229,12 +229,12 @@ impl Vector {
         run(&words)
     }
 
-    /// What its RawData is read with.
+    /// Returns the metadata for the decoding of the RawData.
     fn metadata(&self) -> Option<Value> {
         let messages = self.json.get("dataSetMessages")?.as_array()?;
         let mut metadata = messages.first()?.get("metaData")?.clone();
         if self.name == "raw_structure_range" {
-            // The vector says that it is a structure, and not which.
+            // The vector states that the type is a structure, but does not name it.
             metadata[0]["dataType"] = "i=884".into();
         }
         Some(metadata)

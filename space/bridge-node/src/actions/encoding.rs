@@ -9,7 +9,7 @@ use super::block;
 use super::graph::{CancelAnswer, GoalId};
 use super::wire::{self, CancelRequest, GoalAnswer};
 
-/// The encoding of one action.
+/// The encoding of an action.
 #[derive(Debug, Clone)]
 pub(super) enum Encoding {
     /// ROS 1 or ROS 2 messages of these types.

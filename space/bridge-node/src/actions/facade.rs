@@ -32,7 +32,7 @@ pub(super) struct Asks {
     pub(super) gone: watch::Receiver<Option<Instant>>,
 }
 
-/// The task of one served action.
+/// The task of a served action.
 #[derive(Debug)]
 pub(super) struct Facade<A> {
     pub(super) asks: Asks,
@@ -126,7 +126,7 @@ struct Told {
     ends: mpsc::Sender<oneshot::Sender<()>>,
 }
 
-/// Drives one goal to its end.
+/// Drives a goal to its end.
 async fn drive<N: NewGoal>(asks: Asks, new: N, told: Told) {
     let id = new.id();
     let Some(goal) = begin(&asks, id, new).await else {
@@ -333,7 +333,7 @@ const MOST_GOALS: usize = 1000;
 const MOST_CANCELS: usize = 64;
 /// The maximal number of queued feedback messages of a goal.
 const MOST_FEEDBACK: usize = 100;
-/// Timeout of one request for a result.
+/// Timeout of a single request for a result.
 const RESULT_WITHIN: Duration = Duration::from_secs(30);
 /// Time limit for cancelling a goal: an action server of ROS 2 answers its client within 5 s.
 const CANCEL_WITHIN: Duration = Duration::from_secs(4);

@@ -23,9 +23,9 @@ pub const NO_GOAL: GoalId = [0; 16];
 /// A ROS graph with actions, as implemented by a port. [`ServiceGraph::WIRE`] is the encoding of
 /// its messages.
 pub trait ActionGraph: ServiceGraph {
-    /// The client of one action.
+    /// The client of an action.
     type Sender: ActionClient;
-    /// The server of one action.
+    /// The server of an action.
     type Taker: ActionServer;
 
     /// Returns the calls and values of an action type.
@@ -101,7 +101,7 @@ pub enum GoalEvent {
 pub enum CancelWhat {
     /// All goals of the server.
     All,
-    /// One goal.
+    /// A single goal.
     Goal(GoalId),
 }
 

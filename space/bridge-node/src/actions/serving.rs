@@ -52,11 +52,11 @@ pub(super) struct Action {
     /// Whether the values are delivered: the server of the action is present.
     pub(super) offered: Arc<AtomicBool>,
     pub(super) report: mpsc::Sender<PortEvent>,
-    /// The goals whose cancellation is pending.
+    /// The goals with a pending cancellation.
     pub(super) pending: Pending,
 }
 
-/// The task of one executed action.
+/// The task of an executed action.
 pub(super) struct Serving<C> {
     action: Action,
     client: Arc<C>,
@@ -494,7 +494,7 @@ impl<C: ActionClient> Serving<C> {
 /// The port is closed.
 struct Over;
 
-/// Forwards the events of one goal.
+/// Forwards the events of a goal.
 async fn follow<G: SentGoal>(id: GoalId, mut goal: G, tell: mpsc::Sender<News>) {
     let mut is_open = true;
     while is_open {

@@ -494,7 +494,7 @@ impl Goal {
 /// The maximal number of known goals of one action; ended goals give way to new goals.
 const MOST_GOALS: usize = 1000;
 /// The maximal size in bytes of the kept results of one action. The oldest results give way; the
-/// newest is kept whatever its size.
+/// newest is kept at any size.
 const MOST_BYTES: usize = 64 << 20;
 /// How long a goal is known after its end.
 const KEPT: Duration = Duration::from_secs(15 * 60);

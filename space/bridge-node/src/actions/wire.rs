@@ -65,7 +65,7 @@ pub(super) fn result_request(wire: Wire, id: GoalId) -> Bytes {
     out.finish()
 }
 
-/// Returns the goal whose result is requested.
+/// Returns the goal of a request for a result.
 pub(super) fn read_result_request(wire: Wire, message: &[u8]) -> Option<GoalId> {
     Reader::new(wire, message)?.id()
 }

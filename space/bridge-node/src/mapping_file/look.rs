@@ -77,7 +77,7 @@ pub(super) struct Before {
     pub(super) types: Option<(Stamps, usize)>,
 }
 
-/// The result of one poll of the files.
+/// The result of a poll of the files.
 #[derive(Debug, Default)]
 pub(super) struct Looked {
     pub(super) before: Before,
@@ -86,7 +86,7 @@ pub(super) struct Looked {
     pub(super) reading: Option<Result<Reading, String>>,
 }
 
-/// The parameters of one poll.
+/// The parameters of a poll.
 #[derive(Debug)]
 pub(super) struct Look {
     pub(super) file: PathBuf,

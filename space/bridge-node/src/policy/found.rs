@@ -8,9 +8,10 @@ use super::Policy;
 /// The meaning in the space of a topic that the mapping does not name.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Found {
-    /// By its own name a value of ours, whole, in whatever type it has.
+    /// The name of the topic is a value of the own space. The value is the whole message, whatever
+    /// its type.
     Named(TopicId),
-    /// It has the name of a value of ours that the mapping ties to something else.
+    /// The name of the topic is a value of the own space that the mapping ties to something else.
     Tied(TopicId),
     /// A pattern makes a value of the topic.
     Made(PatternVariable),

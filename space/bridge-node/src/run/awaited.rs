@@ -1,4 +1,4 @@
-//! The peers that the mapping needs and that are missing: those of the port, and other spaces.
+//! The missing peers that the mapping needs: peers of the port, and other spaces.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
@@ -13,13 +13,14 @@ use crate::clock::now;
 use crate::port::Port;
 
 impl<P: Port> Shell<P> {
-    /// Compares the peers that the mapping needs with those that are there, and logs the
-    /// difference.
+    /// Compares the peers that the mapping needs with the peers that are present, and logs the
+    /// changes.
     pub(super) fn look_for_peers(&mut self) {
         let now = now().monotonic;
         let mut missing = AwaitedPeers::default();
         self.port.add_awaited(&mut missing);
-        // While the network is lost, that is the reason.
+        // While the network is lost, the other spaces cannot be received, and its loss is reported
+        // instead.
         if self.udp.lost().is_none() {
             let interface = self.udp.interface();
             add_spaces(&self.router, self.own, (&interface, now), &mut missing);
@@ -35,7 +36,7 @@ impl<P: Port> Shell<P> {
 }
 
 /// Adds the spaces that the program needs values or calls of and receives nothing from, and the
-/// calls that nobody offers.
+/// calls that no program offers.
 fn add_spaces(
     router: &Router,
     own: SpaceId,
@@ -91,7 +92,7 @@ fn add_spaces(
     }
 }
 
-/// Returns the spaces that the program receives values or calls from, as the mapping says.
+/// Returns the spaces from which the program needs values or calls, by the mapping.
 fn needed_spaces(mapping: &Mapping, own: SpaceId) -> BTreeSet<SpaceId> {
     let values = mapping.variables().iter().filter(|variable| {
         let is_shown = own == SpaceId::UA;
@@ -106,7 +107,7 @@ fn needed_spaces(mapping: &Mapping, own: SpaceId) -> BTreeSet<SpaceId> {
     values.chain(calls).filter(|space| *space != own).collect()
 }
 
-/// Whether anything of a space is received.
+/// Whether anything is received from a space.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Presence {
     Online,
@@ -114,7 +115,7 @@ enum Presence {
     Silent,
 }
 
-/// Returns the spaces that anything was received from. A program without values is known by the
+/// Returns the spaces from which anything was received. A program without values is known by the
 /// description of its application or by its calls.
 fn received_spaces(
     router: &Router,
@@ -170,7 +171,7 @@ calls:
         Router::new(settings, Arc::new(mapping))
     }
 
-    /// A value of `ua_2_5_10`.
+    /// Returns a message with a value of `ua_2_5_10`.
     fn value() -> Vec<u8> {
         let network = NetworkHeader {
             publisher_id: Some(PublisherId::UInt16(2)),

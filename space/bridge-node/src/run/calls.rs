@@ -1,5 +1,5 @@
-//! What passes between the port and the Router about calls, and about what a program without a
-//! mapping has.
+//! Events and outputs between the port and the Router that concern calls, and values that a program
+//! describes without a mapping.
 
 use std::sync::Arc;
 
@@ -14,7 +14,8 @@ use crate::clock::now;
 use crate::port::{Execution, Port, PortEvent};
 
 impl<P: Port> Shell<P> {
-    /// Takes in what the port reports of calls, and of values that it describes itself.
+    /// Handles the events of the port that concern calls, and values that the port describes
+    /// itself.
     #[expect(
         clippy::wildcard_enum_match_arm,
         reason = "all others are taken in by who hands these on"
@@ -79,7 +80,7 @@ impl<P: Port> Shell<P> {
         }
     }
 
-    /// Carries out what the Router wants done about calls and namespaces.
+    /// Carries out the outputs of the Router that concern calls and namespaces.
     #[expect(
         clippy::wildcard_enum_match_arm,
         reason = "all others are carried out by who hands these on"

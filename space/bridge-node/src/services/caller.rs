@@ -1,4 +1,4 @@
-//! The task that calls one service.
+//! The task that calls a service.
 
 use std::pin::pin;
 use std::sync::Arc;
@@ -12,72 +12,72 @@ use tracing::info;
 
 use super::pending::Pending;
 
-/// One service of a ROS graph, to be called.
+/// The client of one service of a ROS graph.
 pub trait ServiceCall: Send + 'static {
-    /// Its name there.
+    /// Returns the name of the service in the graph.
     fn service(&self) -> &str;
 
-    /// One call: a request as the messages of that ROS are on the wire, and the answer likewise.
+    /// Calls the service. Request and response are in the wire format of the ROS.
     ///
     /// # Errors
     /// [`CallFault`]; a call ends in bounded time.
     fn call(&self, request: Bytes) -> impl Future<Output = Result<Bytes, CallFault>> + Send;
 
-    /// Whether the service has the request of the call that is under way, as far as that is known
-    /// before its answer.
+    /// Returns whether the service has received the request of the running call, as far as that is
+    /// known before the response.
     fn has_request(&self) -> bool {
         false
     }
 }
 
-/// Why a call brought no answer.
+/// The reason why a call has no response.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct CallFault {
-    /// For people.
+    /// Text for the user.
     pub text: String,
-    /// Whether the same call may succeed later, with nobody changing anything but the service
-    /// coming back.
+    /// Whether the same call may succeed later without any change other than the return of the
+    /// service.
     pub may_pass: bool,
     /// Whether the service ran.
     pub ran: Ran,
 }
 
-/// Whether a service ran although there is no answer.
+/// Whether a service ran although there is no response.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Ran {
-    /// It never had the request.
+    /// The service never received the request.
     No,
-    /// It had the request, and no more is known.
+    /// The service received the request; its execution is unknown.
     Perhaps,
-    /// It did, and says that it failed.
+    /// The service ran and reports a failure.
     Yes,
 }
 
-/// What became of a call.
+/// The outcome of a call.
 #[derive(Debug)]
 pub struct Outcome {
-    /// What it was made for.
+    /// The source of the call.
     pub(super) of: Source,
-    /// The answer, or why there is none.
+    /// The response, or the reason why there is none.
     pub(super) result: Result<Bytes, String>,
 }
 
-/// What makes calls.
+/// The cause of calls.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(super) enum Source {
     /// The values of a topic.
     Value(TopicId),
-    /// The clock; the number of the poll.
+    /// A periodic poll, by its number.
     Poll(usize),
 }
 
-/// Calls one service and reports what came of it.
+/// Calls a service and reports the outcomes.
 #[derive(Debug)]
 pub(super) struct Caller<C> {
     client: C,
     of: Source,
     report: mpsc::Sender<Outcome>,
-    /// Whether the last call came to nothing.
+    /// Whether the last call failed.
     failing: bool,
 }
 
@@ -91,8 +91,8 @@ impl<C: ServiceCall> Caller<C> {
         }
     }
 
-    /// Calls with each request in turn. A state (`insist`) is tried until the service takes it or a
-    /// newer value has come, an event once.
+    /// Calls the service with each request in turn. An event is sent once. A state (`insist`) is
+    /// sent again after a temporary failure, until the service accepts it or a newer value arrives.
     pub(super) async fn serve(mut self, pending: Arc<Pending>, insist: bool) {
         loop {
             let mut request = pending.take().await;
@@ -108,10 +108,10 @@ impl<C: ServiceCall> Caller<C> {
         }
     }
 
-    /// Calls with one request every so often.
+    /// Calls the service periodically with the same request.
     pub(super) async fn poll(mut self, request: Bytes, every: Duration) {
         let mut ticks = interval(every);
-        // A slow service is asked again in its turn, not twice in a row.
+        // After a slow call the next call waits for a full interval.
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
             ticks.tick().await;
@@ -120,7 +120,7 @@ impl<C: ServiceCall> Caller<C> {
         }
     }
 
-    /// Calls with a request, and notes whether the service has it.
+    /// Calls the service with a request, and records whether the service has received it.
     async fn call_for(
         &mut self,
         (pending, number): (&Pending, u64),
@@ -165,7 +165,7 @@ impl<C: ServiceCall> Caller<C> {
             of: self.of,
             result,
         };
-        // Nobody is left to be told when the port is gone.
+        // The channel is closed when the port is dropped.
         drop(self.report.send(outcome).await);
         next
     }
@@ -177,8 +177,8 @@ enum Next {
     Again,
 }
 
-/// How often it is looked whether a service has the request.
+/// Interval of the checks whether a service has received the request.
 const LOOK: Duration = Duration::from_millis(20);
-/// The first wait before a state is handed to its service again, doubling to the last.
+/// The first pause before a state is sent to its service again, doubling up to the last pause.
 const FIRST_WAIT: Duration = Duration::from_millis(250);
 const LAST_WAIT: Duration = Duration::from_secs(5);

@@ -1,4 +1,4 @@
-//! Requests that wait for a service.
+//! Queued requests of a service.
 
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -10,27 +10,27 @@ use mappings::Overflow;
 use tokio::sync::Notify;
 
 /// The bounded queue between the port and the task that calls one service. When it is full, the
-/// oldest gives way.
+/// oldest request is dropped.
 ///
-/// `None` stands for a value that calls nothing: of a state it says that no earlier one is to be
-/// called for any more, of events nothing.
+/// `None` stands for a value that calls nothing. For a state it replaces earlier requests, so that
+/// they are not sent any more; for events it has no effect.
 #[derive(Debug)]
 pub(super) struct Pending {
     depth: usize,
     is_state: bool,
     waiting: Mutex<Waiting>,
     changed: Notify,
-    /// The number of the newest request that the service has.
+    /// The number of the newest request that the service has received.
     taken: AtomicU64,
-    /// The number of the newest request that no service has taken.
+    /// The number of the newest request that no service has received.
     refused: AtomicU64,
 }
 
-/// Requests with their numbers, which count from 1.
+/// Queued requests with their numbers, which count from 1.
 #[derive(Debug, Default)]
 struct Waiting {
     requests: VecDeque<(u64, Option<Bytes>)>,
-    /// The number of the newest one.
+    /// The number of the newest request.
     last: u64,
 }
 
@@ -50,7 +50,7 @@ impl Pending {
         }
     }
 
-    /// Queues a request and says how many requests had to go for it.
+    /// Queues a request and returns the number of requests that were dropped for it.
     pub(super) fn push(&self, request: Option<Bytes>) -> u64 {
         let mut waiting = self.lock();
         waiting.last += 1;
@@ -70,12 +70,12 @@ impl Pending {
         u64::from(oldest.is_some())
     }
 
-    /// The service has the request of that number.
+    /// Records that the service has received a request.
     pub(super) fn took(&self, number: u64) {
         self.taken.fetch_max(number, Ordering::AcqRel);
     }
 
-    /// No service has taken the request of that number.
+    /// Records that no service has received a request.
     pub(super) fn refused(&self, number: u64) {
         self.refused.fetch_max(number, Ordering::AcqRel);
     }
@@ -92,8 +92,8 @@ impl Pending {
         }
     }
 
-    /// The oldest with its number, when there is one. Cancel-safe: it is taken only when it is
-    /// returned.
+    /// Waits for the oldest request and returns it with its number. Cancel-safe: the request is
+    /// removed only when it is returned.
     pub(super) async fn take(&self) -> (u64, Option<Bytes>) {
         loop {
             let next = self.lock().requests.pop_front();
@@ -105,7 +105,7 @@ impl Pending {
     }
 
     fn lock(&self) -> MutexGuard<'_, Waiting> {
-        // The queue is whole between statements.
+        // The queue is consistent between statements.
         self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

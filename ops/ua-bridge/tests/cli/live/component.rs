@@ -1,4 +1,4 @@
-//! A component with one skill, gripper.Grasp of namespace 7, made of the codec alone.
+//! A component with one skill, gripper.Grasp of namespace 7, implemented with the codec alone.
 
 use std::net::{Ipv4Addr, SocketAddr, UdpSocket};
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
@@ -27,7 +27,7 @@ const RESULT: u16 = 104;
 const START: u16 = 105;
 const HALT: u16 = 106;
 
-/// It lives in a group of its own until it is dropped.
+/// A component that runs in a group of its own until it is dropped.
 pub(crate) struct Component {
     pub(crate) group: String,
     pub(crate) address: SocketAddr,
@@ -35,7 +35,7 @@ pub(crate) struct Component {
     thread: Option<JoinHandle<()>>,
 }
 
-/// What it saw.
+/// The events that the component has recorded.
 #[derive(Default)]
 struct Seen {
     stop: AtomicBool,
@@ -49,7 +49,8 @@ impl Component {
         Self::start_beside(false)
     }
 
-    /// With a stranger that answers every request before the component does, from a port of its own.
+    /// Starts the component beside a forger, which answers every request before the component does,
+    /// from another port.
     pub(crate) fn start_beside_a_forger() -> Self {
         Self::start_beside(true)
     }
@@ -92,7 +93,7 @@ impl Component {
         }
     }
 
-    /// A verb with where to find it.
+    /// Appends the options with the address of the component to a command.
     pub(crate) fn words<'a>(&'a self, words: &[&'a str]) -> Vec<&'a str> {
         let group = ["--address", &self.group, "--interface", "127.0.0.1"];
         words.iter().copied().chain(group).collect()
@@ -128,7 +129,7 @@ struct Gripper {
     responder: Responder<()>,
     forger: Option<(Udp, Responder<()>)>,
     run: u32,
-    /// Since when it runs, and when it will be done.
+    /// Start time and duration of the running skill.
     running: Option<(Instant, Duration)>,
     last_transition: &'static str,
     succeeded: bool,
@@ -208,7 +209,7 @@ impl Gripper {
         }
     }
 
-    /// Answers in the name of the component, with a run that there is none of.
+    /// Answers in the name of the component, with a run that does not exist.
     fn forge(&mut self, action: &ActionMessage<'_>) {
         let now = self.start.elapsed();
         let Some((udp, responder)) = &mut self.forger else {
@@ -226,7 +227,7 @@ impl Gripper {
         send_due(udp, responder, now);
     }
 
-    /// The response: success, message, run.
+    /// Returns the response: success, message, run.
     fn execute(&mut self, writer_id: u16, fields: ActionFields<'_>) -> Vec<u8> {
         let (success, message) = if writer_id == START {
             self.seen.started.fetch_add(1, Ordering::SeqCst);
@@ -240,7 +241,7 @@ impl Gripper {
                 (false, "BadInvalidArgument: Force 100 at most")
             } else {
                 self.run += 1;
-                // Of a force that is not felt it never ends.
+                // Without a force the run does not end during the test.
                 let ends = if force > 0.0 { 300 } else { 60_000 };
                 self.running = Some((Instant::now(), Duration::from_millis(ends)));
                 self.last_transition = "ReadyToRunning";
@@ -424,7 +425,7 @@ fn unix_nanos() -> i128 {
     i128::try_from(since.unwrap().as_nanos()).unwrap()
 }
 
-/// Name, type and ValueRank.
+/// Name, type and ValueRank of a field.
 type Told = (&'static str, BuiltinType, i32);
 
 fn field((name, builtin, value_rank): &Told) -> FieldMetaData<'static> {

@@ -1,4 +1,4 @@
-//! What is seen of a running space, and what is asked of it.
+//! Output of the commands that observe a running space and send requests to it.
 
 mod component;
 
@@ -30,7 +30,7 @@ fn topics_and_calls_are_listed_with_what_they_are_whatever_else_is_in_the_group(
             let mut made_up = vec![0x11 | 0x40, 0x01, 7, 0];
             made_up.extend(round.to_le_bytes());
             for datagram in [&b"garbage"[..], &[0xff; 40], &made_up, &[]] {
-                // Multicast from a socket bound to loopback stays there.
+                // Multicast from a socket bound to loopback stays on loopback.
                 let _sent = socket.send_to(datagram, group);
             }
             std::thread::park_timeout(Duration::from_millis(2));
@@ -347,7 +347,8 @@ fn of_who_falls_silent_in_a_call_it_is_said_that_nobody_knows() {
     assert!(since.elapsed() < Duration::from_secs(9));
 }
 
-/// Answers so many requests with what it is asked for, and gives what they were.
+/// Serves each of the `answers` to one request. Returns the URL, and a thread that returns the
+/// requests.
 fn server(
     answers: Vec<(&'static str, &'static str)>,
 ) -> (String, std::thread::JoinHandle<Vec<String>>) {
