@@ -96,8 +96,8 @@ fn with_suppressed(line: &str, suppressed: u64) -> Cow<'_, str> {
     }
 }
 
-/// Escapes control characters, line breaks and marks of text direction, except for characters that
-/// `stay` accepts.
+/// Escapes control characters, line breaks and marks of text direction, except for control
+/// characters that `stay` accepts.
 fn escaped(text: &str, stay: impl Fn(char) -> bool) -> Cow<'_, str> {
     let breaks = |c: char| match c {
         '\u{2028}' | '\u{2029}' | '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}' => true,

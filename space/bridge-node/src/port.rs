@@ -342,7 +342,7 @@ pub enum PortEvent {
         /// The fields that are not mapped by name.
         map: Arc<CallMap>,
     },
-    /// The local side has stopped to send requests to a call, or will use another type.
+    /// The local side has stopped sending requests to a call, or will use another type.
     CallUnbound {
         /// The call's topic.
         topic: TopicId,
@@ -384,7 +384,7 @@ pub enum PortEvent {
         /// The type and description of the call.
         offered: OfferedType,
     },
-    /// The local side has stopped to execute a call of its own, or has dropped a value of its own.
+    /// The local side has stopped executing a call of its own, or has dropped a value of its own.
     Withdrawn {
         /// The topic of the call or value.
         topic: TopicId,

@@ -48,8 +48,8 @@ pub(crate) fn mapped<'m>(
     targets.map(|(_, target)| target.name.as_str()).collect()
 }
 
-/// Returns the present services or actions, by the mapping or by their names. Excludes those whose
-/// type differs from the type in the mapping.
+/// Returns the present services or actions, by the mapping or by their names. Excludes
+/// targets with another type than the mapping sets.
 pub(crate) fn found<'p>(
     policy: &'p Policy,
     present: &'p Present,

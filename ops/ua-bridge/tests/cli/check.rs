@@ -74,7 +74,7 @@ fn a_program_gets_the_same_as_json() {
     assert_eq!(minimal["canRun"], true);
 }
 
-/// A ROS 2 robot of a vendor whose definitions are on its own host only.
+/// A ROS 2 robot of a vendor, with definitions that are on its own host only.
 const FOREIGN: &str = "spaces: [{id: 1}, {id: 2}]\nnamespaces: {2: urn:x}\nvariables:\n\
     - {node: ns=2;i=1, name: Arm, origin: 1, ros: [{topic: /arm, type: std_msgs/Bool}, \
     {space: 2, topic: /arm, type: their_msgs/Arm}]}\n";

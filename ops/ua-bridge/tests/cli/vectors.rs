@@ -8,7 +8,7 @@ use serde_json::{Map, Value};
 use crate::normal::normal;
 use crate::program::{Ended, file, run, run_on};
 
-/// Vectors whose JSON does not encode to their datagram, with the reason.
+/// Vectors with JSON that does not encode to their datagram, each with the reason.
 const NOT_WRITTEN: &[(&str, &str)] = &[
     ("asyncua_raw", "the JSON does not say what the RawData is"),
     (
