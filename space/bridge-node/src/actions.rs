@@ -109,7 +109,7 @@ impl Actions {
         self.executors.abandoned(execution);
     }
 
-    /// Returns the goals whose cancellation is pending, a line each.
+    /// Returns the goals with a pending cancellation, a line each.
     #[must_use]
     pub fn pending(&self) -> Vec<String> {
         self.executors.pending()

@@ -27,8 +27,8 @@ impl AwaitedPeers {
         self.reasons.entry(peer.into()).or_insert_with(reason);
     }
 
-    /// Adds a missing peer whose name may be misspelt: the reason names the nearest of the `known`
-    /// names.
+    /// Adds a missing peer with a name that may be misspelt: the reason names the nearest of the
+    /// `known` names.
     pub fn add_named<'k>(
         &mut self,
         (kind, name): (&str, &str),
@@ -74,9 +74,9 @@ struct MissingPeer {
 /// Log lines about peers.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub(crate) struct PeerChanges {
-    /// All peers that the program waits for, if a further one is missing.
+    /// All peers that the program waits for, if a further peer is missing.
     pub(crate) missing: Option<String>,
-    /// The peers that have arrived, of those that were reported.
+    /// The reported peers that have arrived.
     pub(crate) arrived: Option<String>,
 }
 
@@ -89,7 +89,7 @@ impl PeerWatch {
         }
     }
 
-    /// Compares the peers that are missing at `now` with those that were missing before.
+    /// Compares the peers that are missing at `now` with the peers that were missing before.
     pub(crate) fn update(&mut self, missing: AwaitedPeers, now: Instant) -> PeerChanges {
         let AwaitedPeers { reasons, omitted } = missing;
         self.omitted = omitted;

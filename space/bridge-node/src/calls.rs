@@ -89,7 +89,7 @@ struct Target {
 }
 
 impl Target {
-    /// Returns the target of the mapping; without one, the name of the topic.
+    /// Returns the target of the mapping; without it, the name of the topic.
     fn of(topic: TopicId, policy: &Policy) -> Self {
         let call = policy.mapping().call(topic);
         let timeout = call.map_or(ANSWERED_WITHIN, |call| call.timeout);
@@ -311,7 +311,7 @@ impl<S: Send> Calls<S> {
     }
 
     /// Checks calls again, because definitions or the mapping may have changed: calls that are not
-    /// offered, and calls whose type or target has changed.
+    /// offered, and calls with a changed type or target.
     pub fn look_again<G: CallGraph<Server = S>>(&mut self, graph: &mut G, policy: &Policy) {
         for (topic, known) in &mut self.known {
             let again = match &known.state {
@@ -521,8 +521,8 @@ impl<S: Send> Calls<S> {
         }
     }
 
-    /// Returns the timeout of a request, and the type of a response that reports failure, if there
-    /// is one.
+    /// Returns the timeout of a request, and the type of a response that reports failure, if
+    /// such a type exists.
     fn how_asked<G: CallGraph<Server = S>>(
         &self,
         topic: TopicId,

@@ -156,7 +156,7 @@ impl Definitions {
         format!("{}; {wanted}", self.explain(kind, error))
     }
 
-    /// Records the peer whose definition is used, such as `type description of /camera`.
+    /// Records the peer that provides the definition in use, such as `type description of /camera`.
     pub fn learned(&mut self, name: &TypeName, from: impl FnOnce() -> String) {
         if self.peers.len() < MOST_PEERS {
             self.peers.insert(name.clone(), from());
@@ -214,7 +214,7 @@ fn tell_differing(name: &TypeName, file: &str, only_file: &[String], only_built_
 
 /// How many unknown names are compared with the known names until the definitions change.
 const MOST_SUGGESTIONS: u32 = 64;
-/// The maximal number of types from peers whose source is recorded.
+/// The maximal number of types from peers with a recorded source.
 const MOST_PEERS: usize = 4096;
 
 #[cfg(test)]

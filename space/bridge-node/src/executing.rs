@@ -24,7 +24,7 @@ use crate::present::{self, Present};
 use crate::services::{CallFault, Ran, ServiceCall};
 use crate::{PortEvent, ServiceGraph};
 
-/// A ROS graph whose services can be executed for other spaces.
+/// A ROS graph with services that can be executed for other spaces.
 pub trait ExecutorGraph: ServiceGraph {
     /// The client of a service, for concurrent calls.
     type Executor: ServiceCall + Sync;

@@ -11,7 +11,7 @@ pub struct Failure {
     message: String,
 }
 
-/// The kind of a failure. It shows who can correct it.
+/// The kind of a failure: the cause that has to be corrected.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum FailureKind {
     /// Wrong command line. Exit code 64.

@@ -80,7 +80,7 @@ pub(crate) fn found<'p>(
     by_name.chain(by_mapping)
 }
 
-/// Logs services or actions whose type differs from the type in the mapping.
+/// Logs services or actions with another type than the mapping sets.
 pub(crate) fn tell_other_types(policy: &mut Policy, present: &Present, kind: CallKind) {
     let mapping = Arc::clone(policy.mapping());
     let noun = match kind {

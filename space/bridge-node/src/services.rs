@@ -70,7 +70,7 @@ pub struct Services {
     callers: HashMap<TopicId, Callee>,
     /// The values that are made of the responses.
     takers: HashMap<Source, Vec<TopicId>>,
-    /// Sources whose service has answered: for a poll, the last call was answered.
+    /// Sources with an answering service: for a poll, the last call was answered.
     answering: HashSet<Source>,
     outcomes: mpsc::Receiver<Outcome>,
     report: mpsc::Sender<Outcome>,
@@ -158,8 +158,8 @@ impl Services {
         (services, events)
     }
 
-    /// Returns the known types of the services that the mapping calls. A type whose file is
-    /// temporarily unreadable stays as it was.
+    /// Returns the known types of the services that the mapping calls. A type stays as it was
+    /// while its file is temporarily unreadable.
     fn called_types(
         &self,
         graph: &mut impl ServiceGraph,

@@ -2,9 +2,9 @@
 
 use messages::{Leaf, MessageType, Selection};
 
-/// Returns whether a message made of `selection` alone starts with a header whose stamp no value
-/// provides, so that the stamp has to be the time of the graph. A message that crosses as a whole
-/// keeps its own stamp.
+/// Returns whether a message made of `selection` alone starts with a header with a stamp that no
+/// value provides, so that the stamp has to be the time of the graph. A message that crosses as a
+/// whole keeps its own stamp.
 #[must_use]
 pub fn wants_stamp(message_type: &MessageType, selection: Option<&Selection>) -> bool {
     let is_stamp = |leaf: &Leaf| leaf.path == STAMP;

@@ -107,7 +107,7 @@ impl Executors {
         events
     }
 
-    /// Withdraws actions whose settings have changed, and actions whose servers are missing. The
+    /// Withdraws actions with changed settings, and actions with missing servers. The
     /// outcomes of the goals of a missing server can be requested again after its return, for up to
     /// [`KEPT`].
     fn withdraw_missing(&mut self, wanted: &BTreeMap<TopicId, Wanted>) -> Vec<PortEvent> {

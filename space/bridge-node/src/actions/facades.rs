@@ -74,7 +74,7 @@ struct Target {
 }
 
 impl Target {
-    /// Returns the target of the mapping; without one, the name of the topic.
+    /// Returns the target of the mapping; without it, the name of the topic.
     fn of(topic: TopicId, policy: &Policy) -> Self {
         let call = policy.mapping().call(topic);
         let call = call.filter(|call| call.kind == CallKind::Action);

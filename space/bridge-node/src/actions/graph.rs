@@ -209,9 +209,9 @@ pub trait ServedGoal: Send + Sync + 'static {
     /// The reason why the feedback cannot be published, as text for the user.
     fn feedback(&self, body: &[u8]) -> Result<(), String>;
 
-    /// Ends the goal: 4 succeeded, 5 canceled, any other value aborted. A canceled goal whose
-    /// clients have not requested to cancel it is aborted if the ROS has no such end. `result` is
-    /// as in [`GoalEvent::Ended`]; without a result the client receives the empty result.
+    /// Ends the goal: 4 succeeded, 5 canceled, any other value aborted. If no client has requested
+    /// to cancel the goal, 5 aborts it in a ROS without such an end. `result` is as in
+    /// [`GoalEvent::Ended`]; without a result the client receives the empty result.
     ///
     /// # Errors
     /// The reason why the goal cannot be ended, as text for the user; the goal is not ended then.

@@ -1,5 +1,5 @@
-//! Actions that a program executes itself, without a ROS graph, for ports whose payloads are
-//! fields.
+//! Actions that a program executes itself, without a ROS graph, for ports with
+//! fields as payloads.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -82,9 +82,9 @@ impl Default for OwnActions {
 }
 
 impl OwnActions {
-    /// Offers an action whose goals go to `client`, and replaces an earlier action of the same
-    /// topic. Returns the events of its calls and values, or `None` if there are no identifiers
-    /// behind the identifier of its goals. Needs a tokio runtime.
+    /// Offers an action that sends its goals to `client`, and replaces an earlier action of the
+    /// same topic. Returns the events of its calls and values, or `None` if there are no
+    /// identifiers behind the identifier of its goals. Needs a tokio runtime.
     pub fn add<C: ActionClient>(
         &mut self,
         action: &OwnAction,
@@ -157,8 +157,8 @@ impl OwnActions {
         Ok(())
     }
 
-    /// Handles a caller that gives up an execution. An accepted goal goes on. A goal whose run has
-    /// not started is cancelled.
+    /// Handles a caller that gives up an execution. An accepted goal goes on. A goal is cancelled
+    /// if its run has not started.
     pub fn abandoned(&mut self, execution: ExecutionId) {
         let running = self.running.get(&execution);
         if let Some(commands) = running.and_then(|(action, _)| self.commands.get(action)) {

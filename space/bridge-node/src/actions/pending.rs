@@ -1,4 +1,4 @@
-//! Goals whose cancellation is pending, as `/status` and the end of the program show them.
+//! Goals with a pending cancellation, as `/status` and the end of the program show them.
 
 use std::fmt;
 use std::sync::{Arc, Mutex, PoisonError, Weak};

@@ -107,8 +107,8 @@ impl Choice {
     }
 
     /// Evaluates new facts about the value. `open` is the type in which the value is written, and
-    /// whether it has a local subscriber. A type with a subscriber stays, whatever part of it the
-    /// value is. Without facts nothing changes.
+    /// whether it has a local subscriber. A type with a subscriber stays, even
+    /// if the value is another part of it. Without facts nothing changes.
     #[must_use]
     pub fn hear(&mut self, word: Word, open: Option<(&TypeName, bool)>) -> Step {
         let Word {

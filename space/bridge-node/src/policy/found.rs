@@ -8,8 +8,8 @@ use super::Policy;
 /// The meaning in the space of a topic that the mapping does not name.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Found {
-    /// The name of the topic is a value of the own space. The value is the whole message, whatever
-    /// its type.
+    /// The name of the topic is a value of the own space. The value is the
+    /// whole message, of any type.
     Named(TopicId),
     /// The name of the topic is a value of the own space that the mapping ties to something else.
     Tied(TopicId),

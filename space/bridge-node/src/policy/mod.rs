@@ -47,7 +47,7 @@ pub struct Admission {
 }
 
 impl Policy {
-    /// Creates the policy of a port whose graph is the space `own`.
+    /// Creates the policy of a port for the graph of the space `own`.
     #[must_use]
     pub fn new(own: SpaceId, mapping: Arc<Mapping>) -> Self {
         Self {
@@ -58,7 +58,7 @@ impl Policy {
         }
     }
 
-    /// Returns the space whose values are produced in the graph.
+    /// Returns the space with the values that are produced in the graph.
     #[must_use]
     pub const fn own(&self) -> SpaceId {
         self.own
@@ -85,8 +85,8 @@ impl Policy {
 
     /// Requests a place for one more stray. `strays` returns the present strays, each with the time
     /// since which its writer is silent; it is called only if no place is free. Then the longest
-    /// silent strays are dropped, at most [`MOST_LET_GO`] of them. A stray whose writer is active
-    /// is never dropped.
+    /// silent strays are dropped, at most [`MOST_LET_GO`] of them. A stray with an
+    /// active writer is never dropped.
     pub fn admit_stray<I>(&mut self, now: Instant, strays: impl FnOnce(&Self) -> I) -> Admission
     where
         I: IntoIterator<Item = (Option<Instant>, TopicId)>,
@@ -122,8 +122,8 @@ impl Policy {
     }
 }
 
-/// Returns the strays to be dropped, longest silent first, at most [`MOST_LET_GO`]. A stray whose
-/// writer is active is not dropped.
+/// Returns the strays to be dropped, longest silent first, at most [`MOST_LET_GO`]. A stray with an
+/// active writer is not dropped.
 #[must_use]
 pub fn longest_silent(
     strays: impl IntoIterator<Item = (Option<Instant>, TopicId)>,
