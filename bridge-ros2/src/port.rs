@@ -1,8 +1,8 @@
-//! The port: the topics of a DDS domain tied to the values of the space.
+//! The ROS 2 port: binds the topics of a DDS domain to the values of the space.
 //!
-//! One task owns everything; [`Ros2Port::recv`](Port::recv) is its only wait. Endpoints are made in
-//! [`reconcile`], which compares what the domain holds with what is open: every 200 ms, and soon
-//! after RustDDS reports a change.
+//! One task owns the state; [`Ros2Port::recv`](Port::recv) is its only wait. Endpoints are created
+//! in [`reconcile`], which compares the endpoints of the domain with the open endpoints: every 200
+//! ms, and shortly after RustDDS reports a change.
 
 mod action_graph;
 mod actions;
@@ -65,18 +65,19 @@ use schedule::Schedule;
 use services::{Client, Ros2Graph};
 use strangers::{KEPT_OUT, Stranger, Strangers};
 
-/// What a [`Ros2Port`] is started with.
+/// The options with which a [`Ros2Port`] starts.
 #[derive(Debug, Clone)]
 pub struct PortOptions {
-    /// The domain to join.
+    /// The DDS domain to join.
     pub domain: DomainOptions,
-    /// The space whose values are produced there.
+    /// The space whose values are produced in this domain.
     pub own: SpaceId,
-    /// The cell.
+    /// The mapping of the cell.
     pub mapping: Arc<Mapping>,
-    /// The definitions of its `type_paths`.
+    /// The definitions from the `type_paths` of the mapping.
     pub types: Arc<TypePaths>,
-    /// Where to look for message definitions that are not built in, as `AMENT_PREFIX_PATH` lists.
+    /// Search path for message definitions that are not built in, in the order of
+    /// `AMENT_PREFIX_PATH`.
     pub prefixes: Vec<PathBuf>,
 }
 
@@ -84,20 +85,20 @@ pub struct PortOptions {
 pub struct Ros2Port {
     domain: Domain,
     joined: Instant,
-    /// By it other bridges know this one.
+    /// Announces this bridge to the other bridges of the domain.
     presence: RawWriter,
     discovery: DomainParticipantStatusListener,
     strangers: Strangers,
     policy: Policy,
     domain_id: u16,
-    /// The addresses RustDDS has its sockets on; all when empty.
+    /// The addresses to which RustDDS binds its sockets; empty means all addresses.
     networks: Vec<IpAddr>,
     definitions: Definitions,
     descriptions: Descriptions,
-    /// Tells what the types are that are read and written here.
+    /// Serves the descriptions of the types that this bridge reads and writes.
     told_types: TypeServer,
     graph: Graph,
-    /// Topics we read; a source never goes away, so that its index names it.
+    /// Topics that this bridge reads. A source is never removed, so its index identifies it.
     #[expect(
         clippy::vec_box,
         reason = "a vector that grows has room for twice what is in it"
@@ -111,34 +112,36 @@ pub struct Ros2Port {
     calls: Calls<ServiceServer>,
     /// Services of the domain, executed for other spaces.
     executing: Executing<Client>,
-    /// Actions, either way.
+    /// Actions in both directions.
     actions: Actions,
-    /// Whose services they are, and who is there.
+    /// Matches service endpoints with their nodes and lists the service peers of the domain.
     peers: ServicePeers,
     parameters: ParameterServer,
-    /// Topics we write.
-    /// In Boxes, because the table has room for up to twice as many as there are.
+    /// Topics that this bridge writes.
+    /// The sinks are boxed because the table reserves room for up to twice the number of entries.
     sinks: HashMap<TopicId, Box<Sink>>,
-    /// Readers that were replaced; they hear on until their successor is matched.
+    /// Replaced readers, which receive until their successors are matched.
     retired: VecDeque<(Instant, Reader)>,
-    /// Writers that were given up, while their readers may lack something.
+    /// Writers that were given up while their readers may still miss samples.
     former: VecDeque<Former>,
-    /// What `recv` hands out next; filled only while it is empty, or by one pass over the topics.
+    /// Events that `recv` returns next; filled only while it is empty, or by one pass over the
+    /// topics.
     events: VecDeque<PortEvent>,
-    /// Endpoints that may still be made before the next [`reconcile`](Self::reconcile).
+    /// Endpoints that may be created before the next [`reconcile`](Self::reconcile).
     budget: usize,
     descriptors: Descriptors,
     clock: RosClock,
-    /// Endpoints of others that were told and counted as incompatible with ours.
+    /// Remote endpoints that were logged and counted as incompatible with ours.
     incompatible: BTreeSet<GUID>,
-    /// Readers of others that were told and counted as having another definition of a type than we write.
+    /// Remote readers that were logged and counted because their definition of a type differs from
+    /// ours.
     misreading: BTreeSet<GUID>,
     drops: Drops,
     schedule: Schedule,
 }
 
 impl Ros2Port {
-    /// Joins the domain and prepares the endpoints the mapping names.
+    /// Joins the domain and prepares the endpoints that the mapping names.
     ///
     /// # Errors
     /// [`DomainError`].
@@ -218,7 +221,7 @@ impl Ros2Port {
         for (dds_topic, (message_type, values)) in self.read() {
             let index = self.source(dds_topic, message_type);
             if let Some(source) = self.sources.get_mut(index) {
-                // Most topics have one.
+                // Most topics have one value.
                 source.values.reserve_exact(values.len());
                 source.values.extend(values);
             }
@@ -226,13 +229,13 @@ impl Ros2Port {
         self.take_up_sinks();
     }
 
-    /// What the mapping reads.
+    /// Returns the topics that the mapping reads.
     fn read(&self) -> Read {
         let name = |ros_topic: &str| Ok::<_, Infallible>(dds_topic(ros_topic));
         self.policy.read(name)
     }
 
-    /// Takes up the values of other spaces that the mapping ties to topics here.
+    /// Adds sinks for the values of other spaces that the mapping binds to topics of this domain.
     fn take_up_sinks(&mut self) {
         for topic in self.policy.written() {
             if !self.sinks.contains_key(&topic) {
@@ -242,7 +245,7 @@ impl Ros2Port {
         }
     }
 
-    /// What a mapping says otherwise that only a start can change.
+    /// Returns the changes of a mapping that require a restart.
     fn fixed(&self, mapping: &Mapping) -> Vec<String> {
         let declared = mapping
             .space(self.policy.own())
@@ -258,7 +261,7 @@ impl Ros2Port {
         fixed.into_iter().collect()
     }
 
-    /// The index of the source of that topic, made when there is none.
+    /// Returns the index of the source of the topic; creates the source if it is missing.
     fn source(&mut self, dds_topic: String, message_type: TypeName) -> usize {
         let next = self.sources.len();
         let index = *self.source_of.entry(dds_topic.clone()).or_insert(next);
@@ -274,7 +277,8 @@ impl Ros2Port {
             if let Some(event) = self.events.pop_front() {
                 return Poll::Ready(event);
             }
-            // Before the samples, so that a flood of them does not keep new topics out.
+            // The schedule comes before the samples, so that a flood of samples does not delay new
+            // topics.
             if self.schedule.is_due(cx) {
                 self.look_again();
                 continue;
@@ -303,7 +307,7 @@ impl Ros2Port {
         }
     }
 
-    /// Whether discovery reported a change that is not scheduled for a look yet.
+    /// Returns whether discovery reported a change for which no pass is scheduled yet.
     fn noticed_change(&mut self, cx: &mut Context<'_>) -> bool {
         let before = self.schedule.changed;
         let now = Instant::now();
@@ -342,7 +346,8 @@ impl Ros2Port {
                 let Some(source) = self.sources.get_mut(key) else {
                     return;
                 };
-                // Our own publication, which RustDDS hands to our own reader as well.
+                // The bridge's own publication, which RustDDS delivers to the bridge's own reader
+                // as well.
                 if same_participant(writer, self.domain.participant()) {
                     return;
                 }
@@ -391,7 +396,7 @@ impl Ros2Port {
         }
     }
 
-    /// The timer rang: send what waits, and compare the domain with what is open.
+    /// Handles the timer: sends waiting samples and compares the domain with the open endpoints.
     fn look_again(&mut self) {
         let now = Instant::now();
         if self.schedule.waiting {
@@ -421,11 +426,12 @@ impl Ros2Port {
         self.schedule.waiting = waiting;
     }
 
-    /// The local type a writer says its value is of, if it is known and has the fields that are said.
+    /// Returns the local type that a publisher of the space names, if the type is known and has the
+    /// named fields.
     fn learned(&mut self, topic: TopicId, described: &Described) -> Option<(TypeName, Selection)> {
         let name = &described.message_type;
         if ActionCalls::is_value(name) {
-            // Whoever serves the action here takes it.
+            // The action server takes this value.
             return None;
         }
         match self.definitions.get(name) {
@@ -434,7 +440,7 @@ impl Ros2Port {
                 let dds_topic = self.sinks.get(&topic).map(|sink| sink.dds_topic.as_str());
                 let readers = self.graph.readers(dds_topic.unwrap_or_default());
                 let dds_type = name.dds();
-                // Nodes that can tell are asked when it is opened.
+                // Nodes that serve type descriptions are asked when the sink is opened.
                 if !readers
                     .iter()
                     .any(|r| r.type_name == dds_type && r.type_hash.is_some())
@@ -447,7 +453,7 @@ impl Ros2Port {
         }
     }
 
-    /// Logs of a topic, once, that a type is not known; says whether it was.
+    /// Logs an unknown type once per topic; returns whether it was logged.
     fn tell_unknown_type(&mut self, topic: &str, what: &str, error: &DefinitionError) -> bool {
         let definitions = &mut self.definitions;
         self.policy.told.once(topic, "unknown type", || {
@@ -478,7 +484,8 @@ impl Port for Ros2Port {
             ..
         } = sample;
         if kept == Kept::Again {
-            // A service is no late subscriber, and a writer of depth 1 has no place for more than the newest value.
+            // A service is not a late subscriber, and a writer of depth 1 has room for the newest
+            // value only.
             let sink = self.sinks.get(&topic).and_then(|sink| sink.open.as_ref());
             let stores_newer =
                 sink.is_none_or(|open| open.outlet.stores_newer_than(source.map(dds_time)));
@@ -500,7 +507,7 @@ impl Port for Ros2Port {
             return Ok(());
         }
         if self.is_at_home(topic.space) {
-            // Whoever listens here hears the node that produces it.
+            // Subscribers of this domain receive from the node that produces the value.
             return Err("at home in this domain");
         }
         let Some(Sink {
@@ -524,7 +531,7 @@ impl Port for Ros2Port {
         };
         self.schedule.waiting |= open.outlet.is_waiting();
         let offered = match offered {
-            // An older sample was lost: the new one must not be handed over again.
+            // An older sample was lost: the new sample must not be offered again.
             Err(Refusal::Overflow) if confirmed.is_some() => {
                 let cause = Refusal::Overflow.cause();
                 self.events.push_back(lost(topic, cause, 1));
@@ -558,7 +565,7 @@ impl Port for Ros2Port {
         described: Option<&Described>,
     ) {
         if self.actions.takes(&self.policy, topic) {
-            // It is bound when its action is served.
+            // The value is bound when its action is served.
             return;
         }
         let at_home = topic.space == self.policy.own() || self.is_at_home(topic.space);
@@ -604,7 +611,8 @@ impl Port for Ros2Port {
     fn silent(&mut self, topic: TopicId, silent: bool) {
         debug!(%topic, silent, "the writer in the space");
         if let Some(sink) = self.sinks.get_mut(&topic) {
-            // The value stays with the subscribers that have it, and goes to no other.
+            // The value stays with the subscribers that have it and is sent to no further
+            // subscriber.
             if let Some(open) = sink.open.as_mut().filter(|_| silent) {
                 open.outlet.forget_stored(Instant::now());
                 self.schedule.waiting |= open.outlet.is_waiting();
@@ -659,7 +667,8 @@ impl Port for Ros2Port {
     }
 
     fn addresses(&self) -> Option<&[IpAddr]> {
-        // RustDDS joins its groups and names its addresses to others when the participant is made, and never again.
+        // RustDDS joins multicast groups and announces its addresses only when the participant is
+        // created.
         Some(&self.networks)
     }
 
@@ -726,12 +735,12 @@ fn lost(topic: TopicId, (reason, why): (Reason, &'static str), count: u64) -> Po
     }
 }
 
-/// Why samples are counted that another bridge published: they are values of the space.
+/// The reason for dropped samples that another bridge published: they are values of the space.
 const BY_BRIDGE: (Reason, &str) = (Reason::Looped, "published by another bridge");
-/// Why samples are counted that RustDDS says were lost.
+/// The reason for samples that RustDDS reports as lost.
 const UNREAD: (Reason, &str) = (Reason::Overflow, "lost before they were read");
 
-/// Whether a discovery event may mean another set of endpoints.
+/// Returns whether a discovery event may change the set of endpoints.
 fn is_change(event: &DomainParticipantStatusEvent) -> bool {
     matches!(
         event,
@@ -743,8 +752,8 @@ fn is_change(event: &DomainParticipantStatusEvent) -> bool {
     )
 }
 
-/// The time as RTPS has it: seconds since 1970 and 2^-32 fractions (RTPS 2.5, 9.3.2.1). Times it cannot express are
-/// cut to its ends.
+/// Converts a time to RTPS: seconds since 1970 and fractions of 2^-32 s (RTPS 2.5, 9.3.2.1). Times
+/// outside the range are clamped.
 fn dds_time(time: uadp::Timestamp) -> rustdds::Timestamp {
     let nanos = u64::try_from(time.unix_nanos().max(0)).unwrap_or(u64::MAX);
     let seconds = (nanos / NANOS).min(u64::from(u32::MAX) - 1);

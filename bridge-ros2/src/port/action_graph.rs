@@ -1,4 +1,4 @@
-//! Actions of the domain, as the policy of both bridges knows them.
+//! Implements [`ActionGraph`], the view that the policy of both bridges has of actions, for ROS 2.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -74,7 +74,7 @@ impl ActionGraph for Ros2Graph<'_> {
 }
 
 impl Ros2Graph<'_> {
-    /// The action, whose hashes the domain announces.
+    /// Returns the action; its type hashes are announced in the domain.
     fn action(&self, name: &str, type_name: &TypeName) -> Action {
         let action = Action::new(name, type_name);
         if let Some(hashes) = self.definitions.action_type_hashes(type_name) {
@@ -84,7 +84,7 @@ impl Ros2Graph<'_> {
     }
 }
 
-/// A message with nothing in it, CDR in little endian.
+/// Encodes a message without field values, as little-endian CDR.
 fn empty(message: &Arc<MessageType>) -> Result<Bytes, String> {
     let nothing = Selection::Template {
         fields: Vec::new(),
@@ -131,11 +131,11 @@ impl Sends for Client {
     }
 }
 
-/// A goal of ours at a server of the domain.
+/// A goal of this bridge at an action server of the domain.
 #[derive(Debug)]
 pub(super) enum Goal {
     Sent(GoalHandle),
-    /// With the reason, until it is told.
+    /// The goal was not sent. Holds the reason until it is reported.
     NotSent(Option<String>),
 }
 
@@ -189,13 +189,13 @@ fn lost(reason: &LostReason) -> GoalEvent {
     }
 }
 
-/// Times beyond those of OPC UA are cut to its ends.
+/// Converts a time; times outside the range of OPC UA are clamped.
 fn timestamp(time: RosTime) -> Timestamp {
     let nanos = i128::from(time.sec) * NANOS + i128::from(time.nanosec);
     Timestamp::from_unix_nanos(nanos)
 }
 
-/// Takes goals of the domain.
+/// Receives goals from the domain.
 #[derive(Debug)]
 pub(super) struct Server(action::ActionServer);
 
@@ -211,7 +211,7 @@ impl Takes for Server {
     }
 }
 
-/// A goal of a client of the domain.
+/// A goal of an action client of the domain.
 #[derive(Debug)]
 pub(super) struct New(action::NewGoal);
 
@@ -232,13 +232,13 @@ impl NewGoal for New {
     }
 
     fn reject(self, why: &str) {
-        // Clients are told that, and not why.
+        // Clients receive the rejection without its reason.
         debug!(goal = %self.0.id(), why, "a goal is rejected");
         self.0.reject();
     }
 }
 
-/// A request of a client of the domain.
+/// A cancel request of an action client of the domain.
 #[derive(Debug)]
 pub(super) struct Cancel(action::CancelRequest);
 
@@ -256,12 +256,13 @@ impl CancelRequest for Cancel {
     }
 }
 
-/// A goal of a client of the domain, worked on elsewhere.
+/// A goal of an action client of the domain that another space executes.
 #[derive(Debug)]
 pub(super) struct Served(action::ServerGoal);
 
 impl Served {
-    /// Ends are no steps from accepted, and the one as cancelled only from canceling.
+    /// Takes the transitions before a terminal state: a goal does not end from accepted, and
+    /// becomes canceled from canceling only.
     fn step(&self, status: i8) -> Result<(), GoalError> {
         if self.0.status() == Status::Accepted {
             self.0.execute()?;
@@ -288,7 +289,7 @@ impl ServedGoal for Served {
 
     fn end(&self, status: i8, message: &str, result: Option<&[u8]>) -> Result<(), String> {
         if !message.is_empty() {
-            // Results of ROS 2 have no words of their own.
+            // Results of ROS 2 carry no message.
             debug!(goal = %self.0.id(), status, message, "a goal ends");
         }
         let end = || {
@@ -308,9 +309,9 @@ impl ServedGoal for Served {
 
 const SUCCEEDED: i8 = Status::Succeeded.code();
 const CANCELED: i8 = Status::Canceled.code();
-/// How long results stay, as those of the space do.
+/// How long results are kept; the same time applies to results of the space.
 const KEPT: Duration = Duration::from_secs(15 * 60);
-/// How long a server elsewhere may take to say whether it cancels a goal.
+/// How long the executing server of another space may take to decide about a cancel request.
 const CANCEL_TIMEOUT: Duration = Duration::from_secs(10);
 const NANOS: i128 = 1_000_000_000;
 
@@ -328,7 +329,7 @@ mod tests {
         registry.add_action(&name, text).unwrap();
         let messages = registry.action_messages(&name).unwrap();
         let bytes = empty(messages.result_response()).unwrap();
-        // Status, the count of the sequence behind three bytes of padding, and the share.
+        // The status, the count of the sequence after three bytes of padding, and the share.
         assert_eq!(bytes.as_ref(), [&[0, 1, 0, 0][..], &[0; 16]].concat());
     }
 

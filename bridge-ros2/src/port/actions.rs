@@ -1,4 +1,5 @@
-//! Actions of other spaces, as action servers of the domain; and action servers of the domain, executed for other spaces.
+//! Offers actions of other spaces as action servers of the domain, and executes action servers of
+//! the domain for other spaces.
 
 use std::sync::Arc;
 
@@ -14,7 +15,7 @@ use crate::graph::Graph;
 use crate::service::{Snapshot, action_type};
 
 impl Ros2Port {
-    /// Serves the actions that are known, as [`offer_calls`](Self::offer_calls) does with services.
+    /// Serves the known actions, as [`offer_calls`](Self::offer_calls) does for services.
     pub(super) fn offer_actions(&mut self) {
         let snapshot = self.peers.look(Instant::now(), SEEN);
         let mut taken = Vec::new();
@@ -62,8 +63,8 @@ impl Ros2Port {
         self.events.extend(events);
     }
 
-    /// Offers the action servers of other nodes that are actions of our space, and withdraws those that are gone. Of two types
-    /// under one name neither can be asked.
+    /// Offers the action servers of other nodes that are actions of our space, and withdraws the
+    /// lost servers. If servers of one name have two types, neither can be called.
     pub(super) fn find_actions(&mut self) {
         let snapshot = self.peers.look(Instant::now(), SEEN);
         let mapping = Arc::clone(self.policy.mapping());
@@ -91,7 +92,8 @@ impl Ros2Port {
         self.events.extend(events);
     }
 
-    /// Has the node tell who asks what the type of an action is. The name of a call that sends goals is that of the type.
+    /// Serves the description of the type of an action. The name of a call that sends goals is the
+    /// name of the action type.
     fn tell_action(&mut self, name: &TypeName) {
         if let Some(hashes) = self.definitions.action_type_hashes(name)
             && let Ok(described) = self.definitions.described_action(name)
@@ -102,7 +104,8 @@ impl Ros2Port {
     }
 }
 
-/// Whether an action is executed from now on, by what is said of its call that takes goals.
+/// Returns whether the event starts the execution of an action, judged by its call that takes
+/// goals.
 fn is_goal(event: &PortEvent) -> bool {
     matches!(
         event,
@@ -110,7 +113,7 @@ fn is_goal(event: &PortEvent) -> bool {
     )
 }
 
-/// Whether another node than a bridge serves that action.
+/// Returns whether a node that is not a bridge serves the action.
 fn is_served(graph: &Graph, snapshot: &Snapshot, action: &str) -> bool {
     let action = action.trim_start_matches('/');
     let mut served = snapshot.served_actions();
@@ -119,5 +122,6 @@ fn is_served(graph: &Graph, snapshot: &Snapshot, action: &str) -> bool {
     servers.any(|one| !graph.is_bridge(one.guid))
 }
 
-/// Of an action, on either side: a reader and a writer of each of three services, and two of topics.
+/// The endpoints of an action on either side: a reader and a writer for each of three services, and
+/// two for topics.
 const ENDPOINTS: usize = 8;

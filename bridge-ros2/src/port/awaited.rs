@@ -1,4 +1,4 @@
-//! The peers in the DDS domain that the mapping needs and that are missing.
+//! Lists the peers in the DDS domain that the mapping needs and that are missing.
 
 use std::collections::BTreeSet;
 
@@ -74,8 +74,8 @@ impl Ros2Port {
         }
     }
 
-    /// Adds a topic that the mapping writes and no node reads, if another node publishes it or reads one with a similar
-    /// name.
+    /// Adds a topic that the mapping writes and no node reads, if another node publishes it or
+    /// reads a topic with a similar name.
     fn add_mistaken(&self, sink: &Sink, missing: &mut AwaitedPeers) {
         let Some(name) = ros_topic(&sink.dds_topic) else {
             return;
@@ -121,7 +121,7 @@ impl Ros2Port {
         add_unserved("action", actions, &served, missing);
     }
 
-    /// Returns the names of the servers that are no bridges.
+    /// Returns the names of the servers that are not bridges.
     fn of_nodes<'s>(
         &self,
         served: impl Iterator<Item = (&'s str, &'s [Endpoint])>,
@@ -146,7 +146,7 @@ fn add_unserved<'n>(
     }
 }
 
-/// Adds a name of ROS without its leading slash, as DDS has them.
+/// Adds a ROS name that has no leading slash, as in DDS topic names.
 fn add_topic<'k>(
     (kind, name): (&str, &str),
     reason: &str,

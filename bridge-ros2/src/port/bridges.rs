@@ -1,4 +1,4 @@
-//! Other bridges of the domain, whose word keeps the values of their spaces out.
+//! Tracks other bridges of the domain, whose announcements keep the values of their spaces out.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -11,17 +11,17 @@ use crate::graph::{Graph, bridge_topic};
 use crate::node::ParticipantPrefix;
 
 impl Ros2Port {
-    /// Whether another bridge serves that space in this domain. Anybody may say so; where the mapping has the space in
-    /// another domain it is not believed.
+    /// Returns whether another bridge serves the space in this domain. Any participant can announce
+    /// a space; the announcement is ignored if the mapping has the space in another domain.
     pub(super) fn is_at_home(&self, space: SpaceId) -> bool {
         is_at_home(&self.graph, self.policy.mapping(), space, self.domain_id)
     }
 
-    /// Tells of bridges of other spaces in the domain, whose word keeps values out.
+    /// Logs bridges of other spaces in the domain, whose announcements keep values out.
     pub(super) fn tell_of_bridges(&mut self) {
         let own = u16::from(self.policy.own());
         let others = self.graph.bridges().filter(|(_, space)| *space != own);
-        // By the space: a stranger may come under any number of names.
+        // Keyed by space, because a hostile participant may use any number of identities.
         let others: BTreeMap<_, _> = others.map(|(bridge, space)| (space, bridge)).collect();
         for (number, bridge) in others {
             let Some(space) = SpaceId::new(number) else {
@@ -50,23 +50,23 @@ impl Ros2Port {
     }
 }
 
-/// Whether another bridge serves that space in the domain of the graph.
+/// Returns whether another bridge serves the space in the domain of the graph.
 pub(super) fn is_at_home(graph: &Graph, mapping: &Mapping, space: SpaceId, domain: u16) -> bool {
     graph.is_at_home(space.into()) && is_possible(mapping, space, domain)
 }
 
-/// This bridge, beside others of its domain.
+/// The identity of this bridge among the bridges of its domain.
 #[derive(Clone, Copy)]
 pub(super) struct Bridge {
-    /// Which it serves.
+    /// The space that this bridge serves.
     pub(super) space: SpaceId,
-    /// Of its participant.
+    /// The participant of this bridge.
     pub(super) participant: GUID,
 }
 
 impl Bridge {
-    /// Whether another bridge that comes before this one offers a call of a third space under the same name: a client would
-    /// ask both, and it would be executed twice.
+    /// Returns whether another bridge that precedes this bridge offers a call of a third space
+    /// under the same name: a client would call both, and the call would be executed twice.
     pub(super) fn is_second(
         &self,
         graph: &Graph,
@@ -90,7 +90,7 @@ impl Bridge {
     }
 }
 
-/// Whether a bridge may serve that space in that domain, for all the mapping says.
+/// Returns whether the mapping allows a bridge of the space in the domain.
 fn is_possible(mapping: &Mapping, space: SpaceId, domain: u16) -> bool {
     mapping
         .space(space)
@@ -114,7 +114,7 @@ mod tests {
         GUID::from_bytes([first; 16])
     }
 
-    /// A domain with bridges of these spaces, whose participants begin with these bytes.
+    /// Returns a graph with bridges of these spaces, whose participants start with these bytes.
     fn domain_with(bridges: &[(u16, u8)]) -> Graph {
         let markers = bridges.iter().map(|(space, first)| {
             let endpoint = Endpoint {

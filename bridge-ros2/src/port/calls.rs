@@ -1,4 +1,5 @@
-//! Calls of other spaces, as services of the domain; and services of the domain, executed for other spaces.
+//! Offers calls of other spaces as services of the domain, and executes services of the domain for
+//! other spaces.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -18,9 +19,12 @@ use crate::graph::{Endpoint, Graph};
 use crate::service::{Snapshot, service_type};
 
 impl Ros2Port {
-    /// Offers the calls that are known as services, as far as there is room for endpoints; those of a space that another
-    /// bridge of the domain serves are left to it, as are those that such a bridge offers too and that under a chosen name
-    /// somebody else offers: a client asks all servers of a name.
+    /// Offers the known calls as services, within the budget of endpoints.
+    ///
+    /// Not offered, because a client calls all servers of a name:
+    /// - calls of a space that another bridge of the domain serves
+    /// - calls that such a bridge offers too
+    /// - calls under a chosen name that another node offers
     pub(super) fn offer_calls(&mut self) {
         let snapshot = self.peers.look(Instant::now(), SEEN);
         let mut taken = Vec::new();
@@ -50,10 +54,10 @@ impl Ros2Port {
             definitions: &mut self.definitions,
         };
         let (calls, policy) = (&mut self.calls, &mut self.policy);
-        // Other bridges that are there are known by then.
+        // Other bridges of the domain are discovered by this time.
         let settled = self.joined.elapsed() >= SETTLED;
         let may = |topic: TopicId, service: &str| settled && !left.is(topic, service);
-        // Each has a reader and a writer.
+        // Each service has a reader and a writer.
         let events = calls.offer_waiting(&mut services, policy, may, self.budget / 2);
         self.budget = self.budget.saturating_sub(2 * events.len());
         for event in &events {
@@ -64,8 +68,8 @@ impl Ros2Port {
         self.events.extend(events);
     }
 
-    /// Offers the services of other nodes that are calls of our space, and withdraws those that are gone. Of two types under
-    /// one name neither can be called.
+    /// Offers the services of other nodes that are calls of our space, and withdraws the lost
+    /// services. If servers of one name have two types, neither can be called.
     pub(super) fn find_services(&mut self) {
         let snapshot = self.peers.look(Instant::now(), SEEN);
         let mapping = Arc::clone(self.policy.mapping());
@@ -106,8 +110,9 @@ impl Ros2Port {
         self.events.extend(events);
     }
 
-    /// The servers of others that are wanted, each with its type. What another bridge serves is executed elsewhere. Of two types
-    /// under one name neither can be asked.
+    /// Returns the wanted servers of other nodes with their types. Servers of other bridges are
+    /// left out: they are executed elsewhere. If servers of one name have two types, neither can be
+    /// called.
     pub(super) fn present<'s>(
         &mut self,
         offered: impl Iterator<Item = (&'s str, &'s [Endpoint])>,
@@ -146,7 +151,7 @@ impl Ros2Port {
         present
     }
 
-    /// This bridge, beside others of the domain.
+    /// Returns the identity of this bridge.
     pub(super) fn bridge(&self) -> Bridge {
         Bridge {
             space: self.policy.own(),
@@ -154,7 +159,7 @@ impl Ros2Port {
         }
     }
 
-    /// Has the node tell who asks what the type of a service is.
+    /// Serves the description of the type of a service.
     fn tell_service(&self, name: &TypeName) {
         if let Some(hashes) = self.definitions.service_type_hashes(name)
             && let Ok(described) = self.definitions.described_service(name)
@@ -165,29 +170,29 @@ impl Ros2Port {
     }
 }
 
-/// What kind of servers there are.
+/// A kind of servers: services or actions.
 #[derive(Clone, Copy)]
 pub(super) struct Kind {
-    /// For people.
+    /// The noun in log messages.
     pub(super) noun: &'static str,
-    /// Under which it is told that a type is none.
+    /// The key under which an unusable type is logged once.
     pub(super) told: &'static str,
-    /// The ROS type by that of DDS of its requests.
+    /// Converts the DDS type of the requests to the ROS type.
     pub(super) type_of: fn(&str) -> String,
 }
 
-/// Which calls of other spaces are left to others of the domain.
+/// Selects the calls of other spaces that are left to other servers of the domain.
 pub(super) struct Left<'p> {
     pub(super) graph: &'p Graph,
     pub(super) mapping: &'p Mapping,
     pub(super) bridge: Bridge,
     pub(super) domain: u16,
-    /// The names that another node has.
+    /// The names that another node offers.
     pub(super) taken: Vec<String>,
 }
 
 impl Left<'_> {
-    /// Whether that call is not to be offered under that name here.
+    /// Returns whether this bridge must not offer the call under the name.
     pub(super) fn is(&self, topic: TopicId, name: &str) -> bool {
         let (graph, mapping) = (self.graph, self.mapping);
         is_at_home(graph, mapping, topic.space, self.domain)
@@ -198,14 +203,14 @@ impl Left<'_> {
     }
 }
 
-/// Whether another node than a bridge offers that service.
+/// Returns whether a node that is not a bridge offers the service.
 fn is_offered(graph: &Graph, snapshot: &Snapshot, service: &str) -> bool {
     let topic = format!("rq/{}Request", service.trim_start_matches('/'));
     let mut servers = snapshot.readers(&topic).iter();
     servers.any(|one| !graph.is_bridge(one.guid))
 }
 
-/// From when on after joining a domain services are offered in it.
+/// The delay after joining a domain before services are offered.
 pub(super) const SETTLED: Duration = Duration::from_secs(1);
-/// How old what is known of others may be.
+/// The maximum age of a snapshot of the service peers.
 pub(super) const SEEN: Duration = Duration::from_millis(100);

@@ -1,4 +1,5 @@
-//! Types that are known to the nodes that use them: from ROS 2 Iron on each node tells what its types are.
+//! Fetches type descriptions from the nodes that use the types: since ROS 2 Iron each node serves
+//! them.
 
 use std::collections::{BTreeMap, HashMap};
 use std::time::Duration;
@@ -15,24 +16,24 @@ use crate::graph::Endpoint;
 use crate::service::{ServiceClient, ServiceClientOptions, ServicePeers};
 use crate::type_description;
 
-/// What was asked for, and what came of it.
+/// The requested type descriptions and the state of each inquiry.
 pub(super) struct Descriptions {
     peers: ServicePeers,
     asked: BTreeMap<Wanted, Inquiry>,
     calls: Calls,
 }
 
-/// The calls that are out.
+/// The pending calls.
 #[derive(Default)]
 struct Calls {
     tasks: JoinSet<Answer>,
-    /// What each of them asks for, and whom.
+    /// The type and the service of each pending call.
     asking: HashMap<Id, (Wanted, String)>,
 }
 
 /// A type as an endpoint announces it.
 type Wanted = (TypeName, TypeHash);
-/// The type with what it needs, or why there is none.
+/// The type with the types that it references, or the reason for the failure.
 type Answer = Result<Vec<DescribedType>, String>;
 
 impl Descriptions {
@@ -44,7 +45,7 @@ impl Descriptions {
         }
     }
 
-    /// Whether an answer may be there, or somebody is to be asked.
+    /// Returns whether a response may have arrived or a request is due.
     pub(super) fn is_asking(&self, now: Instant) -> bool {
         self.calls.len() > 0 || self.asked.values().any(|inquiry| inquiry.is_open(now))
     }
@@ -65,8 +66,8 @@ impl Calls {
         self.tasks.len()
     }
 
-    /// One that has ended: what was asked for, who was asked, and the answer. One that was broken off has failed like any
-    /// other: whoever waits for it must not do so for ever.
+    /// Returns a finished call: the requested type, the called service, and the response. An
+    /// aborted call counts as failed, so that no endpoint waits for it forever.
     fn ended(&mut self) -> Option<(Wanted, String, Answer)> {
         loop {
             let (task, answer) = match self.tasks.try_join_next_with_id()? {
@@ -81,10 +82,16 @@ impl Calls {
 }
 
 impl Ros2Port {
-    /// Which of the definitions of a type counts on a topic with these endpoints, by its hash: the one that counts by now
-    /// while it is known and any of them announces it, else the first that is known, of which the nodes of the endpoints are
-    /// asked; else the first. Endpoints that announce none are of no release that does. `None` while a node is asked for the
-    /// first time.
+    /// Returns the hash of the type definition that applies to a topic with these endpoints.
+    ///
+    /// In order of preference:
+    /// 1. the current hash, while its definition is known and an endpoint announces it
+    /// 2. the first announced hash whose definition is known; the nodes of the endpoints are asked
+    ///    for it
+    /// 3. the first announced hash
+    ///
+    /// Endpoints without a hash belong to releases that announce none. Returns `None` while a node
+    /// is asked for the first time.
     pub(super) fn hash_that_counts(
         &mut self,
         name: &TypeName,
@@ -116,7 +123,8 @@ impl Ros2Port {
         settled.then(|| there.or_else(|| announced.first().copied()))
     }
 
-    /// Whether a type of that hash is known, or nobody tells it: `false` while a node is asked for the first time.
+    /// Returns whether the type of the hash is known or no node describes it; `false` while a node
+    /// is asked for the first time.
     fn is_settled(&mut self, wanted: Wanted, endpoints: &[Endpoint], now: Instant) -> bool {
         let full = self.descriptions.asked.len() >= MOST_ASKED;
         let mut inquiry = match self.descriptions.asked.remove(&wanted) {
@@ -138,12 +146,12 @@ impl Ros2Port {
         settled
     }
 
-    /// Asks one of the nodes of these endpoints, if it is due and any offers to tell.
+    /// Sends a request to a node of these endpoints, if it is due and a node offers the service.
     fn ask(&mut self, wanted: &Wanted, alike: &[GUID], inquiry: &mut Inquiry, now: Instant) {
         let Some(turn) = inquiry.due(now) else {
             return;
         };
-        // What nobody waits for leaves room for what somebody does.
+        // Background inquiries leave room for inquiries that endpoints wait for.
         let most = match inquiry.is_waited_for() {
             true => MOST_CALLS,
             false => MOST_CALLS / 2,
@@ -193,7 +201,7 @@ impl Ros2Port {
         inquiry.asked();
     }
 
-    /// Takes in what was answered since the last look.
+    /// Processes the responses that arrived after the last pass.
     pub(super) fn take_descriptions(&mut self, now: Instant) {
         while let Some((wanted, service, told)) = self.descriptions.calls.ended() {
             let Some(mut inquiry) = self.descriptions.asked.remove(&wanted) else {
@@ -202,7 +210,7 @@ impl Ros2Port {
             let (outcome, why) = match told {
                 Ok(types) => match self.described(&wanted, &service, &types) {
                     Ok(()) => (inquiry.told(), String::new()),
-                    // The same node would not tell anything else so soon.
+                    // A second request to the same node would return the same description.
                     Err(why) => (inquiry.untold(now), why),
                 },
                 Err(why) => (inquiry.failed(now), why),
@@ -213,7 +221,7 @@ impl Ros2Port {
         }
     }
 
-    /// Believes what is of the hash.
+    /// Adds the types if they match the hash.
     fn described(
         &mut self,
         (name, hash): &Wanted,
@@ -245,13 +253,14 @@ impl Ros2Port {
     }
 }
 
-/// How long a call may take.
+/// The timeout of a call.
 const ANSWERED_WITHIN: Duration = Duration::from_secs(3);
-/// Calls at a time: each has two endpoints.
+/// Maximum number of concurrent calls; each has two endpoints.
 const MOST_CALLS: usize = 4;
-/// Types asked for while the program runs: anybody in the domain can invent names.
+/// Maximum number of types requested in the lifetime of the process: any participant of the domain
+/// can invent names.
 const MOST_ASKED: usize = 1024;
-/// How old what is known of services may be.
+/// The maximum age of a snapshot of the service peers.
 const FRESH: Duration = Duration::from_millis(100);
 
 #[cfg(test)]
@@ -271,7 +280,7 @@ mod tests {
             panic!("as the test wants it")
         });
         calls.begin(hangs.clone(), "/hangs".to_owned(), std::future::pending());
-        // The runtime of a test has one thread: both have their turn.
+        // The runtime of a test has one thread, so both tasks get their turn.
         tokio::task::yield_now().await;
         calls.tasks.abort_all();
         tokio::task::yield_now().await;

@@ -1,4 +1,4 @@
-//! What was dropped beside the topics: by the node, its clock and its services.
+//! Reports drops that belong to no topic: those of the node, its clock and its services.
 
 use std::collections::BTreeMap;
 
@@ -8,12 +8,12 @@ use bridge_node::PortEvent;
 use super::Ros2Port;
 use crate::service::{ServiceCounters, ServiceServer};
 
-/// The counts that were reported, by the reason and by what it was.
+/// The reported counts, by reason and cause.
 #[derive(Debug, Default)]
 pub(super) struct Drops(BTreeMap<(&'static str, &'static str), u64>);
 
 impl Drops {
-    /// What came on top of what was reported.
+    /// Returns the increases above the reported counts.
     fn since(
         &mut self,
         totals: impl IntoIterator<Item = (Reason, &'static str, u64)>,
@@ -22,7 +22,7 @@ impl Drops {
         for (reason, why, total) in totals {
             let told = self.0.entry((reason.label(), why)).or_default();
             let count = total.saturating_sub(*told);
-            // It falls when a service goes.
+            // The total falls when a service is removed.
             *told = total;
             if count > 0 {
                 events.push(PortEvent::Dropped { reason, why, count });
@@ -33,7 +33,7 @@ impl Drops {
 }
 
 impl Ros2Port {
-    /// Reports what was dropped since the last time.
+    /// Reports the drops after the last report.
     pub(super) fn report_drops(&mut self) {
         let served = self.parameters.counters().plus(self.told_types.counters());
         let calls = self.calls.servers().map(ServiceServer::counters);
@@ -50,7 +50,7 @@ impl Ros2Port {
             ),
             (Reason::Malformed, "clock", self.clock.malformed()),
             (Reason::Malformed, "service request", served.malformed),
-            // Our services fail at nothing but a request that they cannot read.
+            // Services of the bridge fail only at a request that they cannot decode.
             (
                 Reason::Malformed,
                 "body of a service request",

@@ -1,4 +1,4 @@
-//! Asking what a type is: when, and when again.
+//! The schedule of requests for a type description.
 
 use std::collections::BTreeSet;
 use std::time::Duration;
@@ -6,25 +6,25 @@ use std::time::Duration;
 use rustdds::GUID;
 use tokio::time::Instant;
 
-/// How far the asking for one type is.
+/// The state of the requests for one type.
 #[derive(Debug)]
 pub(super) struct Inquiry {
     state: State,
-    /// Endpoints of that type that were there when it was asked for.
+    /// Endpoints of the type that were present at the request.
     seen: BTreeSet<GUID>,
-    /// When somebody last wanted to know.
+    /// The time of the last interest in the type.
     looked: Instant,
-    /// How many calls were made: whoever tells is asked in turn.
+    /// The number of calls; nodes that offer the service are called in turn.
     calls: usize,
-    /// How long to wait before it is asked for once more; none until nobody told it.
+    /// The delay before the next request; `None` before the first failure.
     pause: Option<Duration>,
-    /// How often in a row all who could have told it left before they had the time to.
+    /// How often in a row all candidate nodes left before they had time to respond.
     cut_short: u8,
 }
 
 #[derive(Debug)]
 enum State {
-    /// To be asked for, not before `next`.
+    /// A request is due, not before `next`.
     Waiting {
         since: Instant,
         next: Instant,
@@ -34,21 +34,21 @@ enum State {
         tries: u8,
     },
     Told,
-    /// Nobody told it. To be asked for again then, or when there is somebody new to ask.
+    /// No node described the type. It is requested at `again`, or when a new node appears.
     Untold {
         again: Instant,
     },
 }
 
-/// What comes of a call, or of nobody to call.
+/// The outcome of a call, or of a request without a node to call.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Outcome {
     Told,
-    /// It goes on.
+    /// The inquiry continues.
     GoesOn,
-    /// Nobody told it, for the first time.
+    /// No node described the type, for the first time.
     Untold,
-    /// Nobody told it this time either.
+    /// No node described the type, as before.
     UntoldAgain,
 }
 
@@ -64,7 +64,8 @@ impl Inquiry {
         }
     }
 
-    /// Whether endpoints wait for the answer. They do not once nobody told it: it is asked for again beside what goes on.
+    /// Returns whether endpoints wait for the response. After the first failure they do not wait:
+    /// later requests run in the background.
     pub(super) fn is_waited_for(&self) -> bool {
         match self.state {
             State::Waiting { .. } | State::Asking { .. } => self.pause.is_none(),
@@ -72,15 +73,18 @@ impl Inquiry {
         }
     }
 
-    /// Whether it goes on, and somebody wanted to know lately.
+    /// Returns whether the inquiry continues and the type is still of interest.
     pub(super) fn is_open(&self, now: Instant) -> bool {
         let goes_on = matches!(self.state, State::Waiting { .. } | State::Asking { .. });
         goes_on && now.saturating_duration_since(self.looked) <= OFFERED_WITHIN
     }
 
-    /// Takes note of the endpoints whose nodes could tell it. Somebody new is worth asking at once; where all others have
-    /// left, or nobody wanted to know for a while, it begins anew, with the time that a node has to tell of its services.
-    /// Where they leave and come before that time is over, again and again, nothing waits for it any longer.
+    /// Records the endpoints whose nodes could describe the type.
+    ///
+    /// A new endpoint is asked at once. The inquiry restarts, with the time that a node needs to
+    /// announce its services, when all former endpoints have left or the type was of no interest
+    /// for a while. If endpoints repeatedly leave before this time is over, no endpoint waits for
+    /// the response any longer.
     pub(super) fn meet(
         &mut self,
         endpoints: impl IntoIterator<Item = GUID>,
@@ -89,7 +93,8 @@ impl Inquiry {
     ) -> Outcome {
         let lapsed = now.duration_since(self.looked) > OFFERED_WITHIN;
         self.looked = now;
-        // While a call is out nobody is noted: who comes then is new at the next look.
+        // Endpoints are not recorded during a call: an endpoint that appears then is new at the
+        // next pass.
         if matches!(self.state, State::Asking { .. } | State::Told) {
             return Outcome::GoesOn;
         }
@@ -123,7 +128,8 @@ impl Inquiry {
         outcome
     }
 
-    /// Whether somebody is to be asked, and how many were before: of those who can tell, the next one's turn it is.
+    /// Returns the number of earlier calls if a request is due. The number selects the next node in
+    /// turn.
     pub(super) fn due(&mut self, now: Instant) -> Option<usize> {
         if matches!(self.state, State::Untold { again } if now >= again) {
             self.state = State::begin(now);
@@ -134,7 +140,7 @@ impl Inquiry {
         (now >= next).then_some(self.calls)
     }
 
-    /// A call is out.
+    /// Records that a call was sent.
     pub(super) fn asked(&mut self) {
         if let State::Waiting { tries, .. } = self.state {
             self.state = State::Asking { tries };
@@ -142,7 +148,7 @@ impl Inquiry {
         }
     }
 
-    /// Nobody offers to tell.
+    /// Records that no node offers the service.
     pub(super) fn nobody(&mut self, now: Instant) -> Outcome {
         let State::Waiting { since, .. } = self.state else {
             return Outcome::GoesOn;
@@ -153,7 +159,7 @@ impl Inquiry {
         self.untold(now)
     }
 
-    /// The call failed.
+    /// Records that the call failed.
     pub(super) fn failed(&mut self, now: Instant) -> Outcome {
         let State::Asking { tries } = self.state else {
             return Outcome::GoesOn;
@@ -176,7 +182,7 @@ impl Inquiry {
         Outcome::Told
     }
 
-    /// Nobody tells it for the time being.
+    /// Records that no node describes the type for the time being.
     pub(super) fn untold(&mut self, now: Instant) -> Outcome {
         let before = self.pause;
         let pause = before.map_or(AGAIN_FIRST, |before| (before * 2).min(AGAIN_MOST));
@@ -199,15 +205,15 @@ impl State {
     }
 }
 
-/// How long a node may take to tell its name and services.
+/// How long a node may take to announce its name and services.
 const OFFERED_WITHIN: Duration = Duration::from_secs(3);
-/// How often all may leave before that time is over: whoever comes next is asked beside what goes on.
+/// How often all nodes may leave early; after that, requests run in the background.
 const MOST_CUT_SHORT: u8 = 3;
-/// Calls for one type.
+/// Maximum number of calls for one type.
 const MOST_TRIES: u8 = 3;
-/// After the first call that failed; longer after the next.
+/// The delay after the first failed call; later delays are longer.
 const PAUSE: Duration = Duration::from_secs(1);
-/// After which a type that nobody told is asked for again; longer each time.
+/// The delay before a failed type is requested again; it doubles each time.
 const AGAIN_FIRST: Duration = Duration::from_secs(10);
 const AGAIN_MOST: Duration = Duration::from_secs(300);
 
@@ -222,7 +228,8 @@ mod tests {
     const OLD: [GUID; 1] = [GUID::GUID_UNKNOWN];
     const LOOK: Duration = Duration::from_millis(200);
 
-    /// One that nobody offers to tell while an endpoint of it is there, and when that was found.
+    /// Returns an inquiry that no node answers while an endpoint of the type is present, and the
+    /// time of that outcome.
     fn untold(began: Instant) -> (Inquiry, Instant) {
         let mut inquiry = Inquiry::new(began);
         inquiry.meet(OLD, |_| true, began);
@@ -235,7 +242,7 @@ mod tests {
         (inquiry, now)
     }
 
-    /// When it is due, looked at from then on, and that.
+    /// Returns the time at which the inquiry is due, if polled from `now` on.
     fn next_due(inquiry: &mut Inquiry, mut now: Instant) -> Instant {
         let end = now + 2 * AGAIN_MOST;
         loop {
@@ -272,7 +279,7 @@ mod tests {
         inquiry.meet([OLD[0], guid(2)], |_| true, now);
         assert_eq!(inquiry.due(now), Some(0));
         assert!(!inquiry.is_waited_for());
-        // Once.
+        // Asked only once.
         inquiry.asked();
         assert_eq!(inquiry.due(now), None);
     }
@@ -309,7 +316,7 @@ mod tests {
                 let first = inquiry.meet([one], |it| it == one, now);
                 let is_last = number == MOST_CUT_SHORT;
                 assert_eq!(first == Outcome::Untold, is_last, "{number}: {first:?}");
-                // Asked all the same.
+                // It is asked nevertheless.
                 assert_eq!(inquiry.due(now), Some(0));
                 assert_eq!(inquiry.is_waited_for(), number < MOST_CUT_SHORT, "{number}");
                 assert_eq!(inquiry.nobody(now), Outcome::GoesOn);
@@ -318,7 +325,8 @@ mod tests {
                 assert_eq!(inquiry.nobody(now), Outcome::GoesOn);
                 now += away;
             }
-            // One that stays and tells nothing has had its time: the next is waited for as the first was.
+            // A node that stays and does not respond has had its time; endpoints wait for the next
+            // node as for the first.
             let stays = guid(100);
             inquiry.meet([stays], |it| it == stays, now);
             now += OFFERED_WITHIN;

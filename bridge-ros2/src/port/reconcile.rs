@@ -1,4 +1,4 @@
-//! Making what is open fit what the domain holds.
+//! Reconciles the open endpoints with the endpoints of the domain.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -23,8 +23,9 @@ use crate::sink::Sink;
 use crate::source::{OTHER_DEFINITION, OTHER_TYPE, Reading};
 
 impl Ros2Port {
-    /// Makes what is open fit what the domain holds, where either may be another by now; at most [`MAX_BATCH`] endpoints at a time: RustDDS' discovery
-    /// takes commands from a bounded queue and drops what does not fit.
+    /// Reconciles the open endpoints with the domain, if either may have changed. Creates at most
+    /// [`MAX_BATCH`] endpoints at a time: the discovery of RustDDS takes commands from a bounded
+    /// queue and drops commands that do not fit.
     pub(super) fn reconcile(&mut self, now: Instant) {
         let domain = self.domain.changes();
         let is_due = self.schedule.is_look_due(domain, now) || self.descriptions.is_asking(now);
@@ -69,7 +70,7 @@ impl Ros2Port {
         }
     }
 
-    /// Makes anew what RustDDS left out of its announcements.
+    /// Recreates the endpoints that RustDDS left out of its announcements.
     fn announce_anew(&mut self, now: Instant) {
         let lost = self.domain.unannounced(&self.graph);
         if lost.is_empty() {
@@ -100,7 +101,8 @@ impl Ros2Port {
         for topic in sinks {
             made += usize::from(self.advertise_anew(topic, now).is_some());
         }
-        // What is left are endpoints of services and of the node itself, and readers that were replaced and hear on.
+        // The remaining endpoints are service endpoints, endpoints of the node itself, and replaced
+        // readers that still receive.
         if made == 0 {
             let count = lost.len();
             self.policy.told.once("", "unannounced", || {
@@ -114,8 +116,8 @@ impl Ros2Port {
         }
     }
 
-    /// Zero configuration, and patterns: a topic named in our part of the space, or that a pattern is about, crosses as
-    /// soon as somebody writes it.
+    /// Finds topics without a binding (zero configuration and patterns): a topic named in our part
+    /// of the space, or matched by a pattern, crosses once it has a publisher.
     fn find_topics(&mut self, now: Instant) {
         let pending = self.sources.iter();
         let pending = pending.filter(|source| source.reading == Reading::Pending);
@@ -132,7 +134,7 @@ impl Ros2Port {
             .filter_map(|topic| self.value_of(topic))
             .collect();
         for (dds_topic, topic, selection) in found {
-            // Those that were given up leave their place behind.
+            // Sources that were given up keep their slots.
             let read = self.sources.iter().filter(|s| !s.values.is_empty());
             if read.count() >= MAX_TOPICS {
                 self.policy.told.once("", "too many topics", || {
@@ -167,7 +169,7 @@ impl Ros2Port {
         }
     }
 
-    /// Reports once that further topics that the mapping does not name are left alone.
+    /// Logs once that further topics that the mapping does not name are ignored.
     pub(super) fn tell_scarce(&mut self) {
         let limit = self.descriptors.limit();
         self.policy.told.once("", "descriptors", || {
@@ -179,12 +181,13 @@ impl Ros2Port {
         });
     }
 
-    /// The first type of a topic's writers that is known; `None` as long as none is, or a node is asked what it is.
+    /// Returns the first known type of a topic's writers; `None` while no type is known or a node
+    /// is asked for its description.
     fn found_type(&mut self, topic: TopicId, dds_topic: &str, now: Instant) -> Option<TypeName> {
         let writers = self.graph.writers(dds_topic).to_vec();
         let mut known = None;
         for writer in &writers {
-            // A pattern may be about one type.
+            // A pattern may apply to one type only.
             if known.is_some() || self.found(dds_topic, &writer.type_name) == Found::Nothing {
                 continue;
             }
@@ -206,7 +209,8 @@ impl Ros2Port {
         known
     }
 
-    /// The value a topic is that the mapping does not name: by its own name, or by a pattern.
+    /// Returns the value of a topic that the mapping does not name: by the topic's own name or by a
+    /// pattern.
     fn value_of(&mut self, dds_topic: String) -> Option<(String, TopicId, Selection)> {
         let writers = self.graph.writers(&dds_topic).iter();
         let mut found = writers.map(|writer| self.found(&dds_topic, &writer.type_name));
@@ -218,7 +222,8 @@ impl Ros2Port {
                 });
                 None
             }
-            // Others who write where values of other spaces go are not a value of ours.
+            // Other publishers on a topic to which the bridge writes values of other spaces are no
+            // value of ours.
             Found::Made(_) | Found::Fault(_) if self.is_written(&dds_topic) => None,
             Found::Made(made) => Some((dds_topic, made.topic, made.selection)),
             Found::Fault(fault) => {
@@ -231,8 +236,8 @@ impl Ros2Port {
         }
     }
 
-    /// What a topic that the mapping does not name is in the space, written in that type. A type that is none of ROS is
-    /// one that no pattern is about.
+    /// Classifies a topic that the mapping does not name, written with the DDS type. No pattern
+    /// applies to a type that is not a ROS type.
     pub(super) fn found(&self, dds_topic: &str, dds_type: &str) -> Found {
         let Some(name) = ros_topic(dds_topic) else {
             return Found::Nothing;
@@ -248,12 +253,12 @@ impl Ros2Port {
         }
     }
 
-    /// Whether values of other spaces are written there.
+    /// Returns whether values of other spaces are written to the topic.
     pub(super) fn is_written(&self, dds_topic: &str) -> bool {
         self.sinks.values().any(|sink| sink.dds_topic == dds_topic)
     }
 
-    /// Says once why a topic cannot be used.
+    /// Logs once why a topic cannot be used.
     fn tell_unknown(&mut self, topic: TopicId, dds_topic: &str, error: &str) {
         let first = self.policy.told.once(dds_topic, "unknown type", || {
             format!(
@@ -268,7 +273,7 @@ impl Ros2Port {
     }
 
     fn reconcile_source(&mut self, index: usize, now: Instant) {
-        // Without a value it is one that the mapping no longer names.
+        // A source without a value is no longer named by the mapping.
         let source = self.sources.get(index);
         if source.is_none_or(|source| source.values.is_empty()) {
             return;
@@ -299,13 +304,14 @@ impl Ros2Port {
             Reading::Pending => {
                 let name = source.message_type.clone();
                 let known = self.definitions.get(&name).is_ok();
-                // A reader that asks for more than a writer offers has the writer's node warn: the writers that are there
-                // are known by then.
+                // A reader that requests more than a writer offers makes the writer's node log a
+                // warning. After the wait, the present writers are known.
                 let is_early = ours.is_empty() && self.joined.elapsed() < SETTLED;
                 if is_early {
                     self.schedule.look_next();
                 }
-                // What nobody knows and nobody publishes is asked for when somebody does.
+                // The unknown type of a topic without a publisher is requested when a publisher
+                // appears.
                 if (known || !ours.is_empty()) && settled && !is_early {
                     self.open_source(index, requested);
                 }
@@ -331,8 +337,8 @@ impl Ros2Port {
         }
     }
 
-    /// Finds which definition of a source's type counts by now; `false` as long as a node is asked. A reader of another
-    /// definition is closed, for one of this to be made.
+    /// Selects the definition of a source's type; returns `false` while a node is asked. Closes a
+    /// reader that uses another definition, so that a new reader can be created.
     fn settle_source(&mut self, index: usize, now: Instant) -> bool {
         let Some(source) = self.sources.get(index) else {
             return false;
@@ -341,7 +347,8 @@ impl Ros2Port {
         let dds_type = name.dds();
         let writers = self.graph.writers(&source.dds_topic);
         let read_so = |writer: &Endpoint| writer.is_of(&dds_type, current);
-        // Only while it is read by the definition of that hash: one that comes with ours goes before one nobody tells.
+        // Only while the source is read with the definition of the hash: a built-in definition
+        // precedes a hash that no node describes.
         let known = source.definition.as_ref().map(|it| it.hash) == Some(current);
         if current.is_some() && known && writers.iter().any(read_so) {
             return true;
@@ -359,7 +366,8 @@ impl Ros2Port {
         if let Reading::Open { slot, .. } = source.reading
             && !read.is_none_or(same)
         {
-            // What it holds was sent by the definition that counted so far; of the new one it is misread.
+            // The reader holds samples of the former definition; the new definition would misread
+            // them.
             source.meet(&writers);
             for taken in self.inbox.drain(slot) {
                 self.taken(taken);
@@ -372,7 +380,7 @@ impl Ros2Port {
         true
     }
 
-    /// Closes the reader of a source whose publishers have another definition of its type now.
+    /// Closes the reader of a source whose publishers use another definition of its type.
     fn close_source(&mut self, index: usize, slot: SlotId) {
         drop(self.inbox.remove(slot));
         let Some(source) = self.sources.get_mut(index) else {
@@ -380,7 +388,7 @@ impl Ros2Port {
         };
         source.reading = Reading::Pending;
         source.live = false;
-        // What was sent by the other definition is not to be repeated by this.
+        // Samples of the former definition must not be repeated with the new definition.
         let unbound = source.values.iter();
         self.events
             .extend(unbound.map(|(topic, _)| PortEvent::Unbound { topic: *topic }));
@@ -430,9 +438,10 @@ impl Ros2Port {
         }
     }
 
-    /// Another QoS needs another reader, and so do transient-local writers that were gone for a while and are to tell again
-    /// what they keep: to the reader there is, that is nothing new. It stays for a while: it fills the cache both share,
-    /// until the writers have matched the new one.
+    /// Reopens a reader. A change of QoS requires a new reader. So do transient-local writers that
+    /// return after an absence and have to resend their samples: for the existing reader these are
+    /// not new. The former reader stays for a while: it fills the cache that both share until the
+    /// writers have matched the new reader.
     fn reopen_source(&mut self, index: usize, requested: Requested, now: Instant) {
         let Some(source) = self.sources.get(index) else {
             return;
@@ -508,7 +517,7 @@ impl Ros2Port {
         });
     }
 
-    /// Tells and counts, once each, the endpoints of others that DDS does not match with ours.
+    /// Logs and counts, once each, the remote endpoints that DDS does not match with ours.
     pub(super) fn note_incompatible(
         &mut self,
         side: &Side,
@@ -552,7 +561,8 @@ impl Ros2Port {
         }
     }
 
-    /// Has the domain announce the hash of a definition with the endpoints of its type that are made next.
+    /// Sets the type hash that the domain announces with the next endpoints of the definition's
+    /// type.
     pub(super) fn announce_type(&self, definition: &Definition) {
         let (name, Some(hash)) = (definition.name(), definition.hash) else {
             return;
@@ -566,7 +576,8 @@ impl Ros2Port {
         }
     }
 
-    /// Makes an endpoint if the budget allows; `None` when it does not, or when RustDDS fails, which is told once.
+    /// Creates an endpoint if the budget allows; returns `None` if it does not, or if RustDDS
+    /// fails, which is logged once.
     pub(super) fn make<E>(
         &mut self,
         make: impl FnOnce(&Domain) -> Result<E, DomainError>,
@@ -587,17 +598,18 @@ impl Ros2Port {
     }
 }
 
-/// Which of our endpoints others are not matched with.
+/// Our endpoints with which remote endpoints are not matched.
 pub(super) enum Side {
-    /// The reader of that source.
+    /// The reader of the source.
     Source(usize),
-    /// The writer of that sink.
+    /// The writer of the sink.
     Sink(TopicId),
 }
 
-/// Why a topic is counted whose type nobody knows.
+/// The reason for drops on a topic whose type is unknown.
 const UNKNOWN_TYPE: &str = "type without a definition";
-/// How long a replaced reader hears on.
+/// How long a replaced reader keeps receiving.
 const RETIRE_AFTER: Duration = Duration::from_secs(2);
-/// Endpoints made in one go. RustDDS queues two commands for each, and has room for 1024.
+/// Maximum number of endpoints created in one pass. RustDDS queues two commands for each and has
+/// room for 1024.
 pub(super) const MAX_BATCH: usize = 200;

@@ -1,4 +1,4 @@
-//! Going over to another mapping: what both say alike is left as it is.
+//! Applies another mapping; bindings that are the same in both mappings stay untouched.
 
 use std::sync::Arc;
 
@@ -15,8 +15,8 @@ use crate::sink::Sink;
 use crate::source::{Reading, Source};
 
 impl Ros2Port {
-    /// Everything is given up before anything is taken up, as a value or a topic may only have changed hands. Endpoints
-    /// are made with the next look at the domain.
+    /// Gives up all outdated bindings before it adds new bindings, because a value or a topic may
+    /// only have moved. Endpoints are created in the next pass over the domain.
     pub(super) fn go_over_to(&mut self, mapping: &Arc<Mapping>, types: &Arc<TypePaths>) {
         let before = self.policy.replace(mapping);
         self.definitions.replace(types);
@@ -49,12 +49,13 @@ impl Ros2Port {
         self.schedule.changed = true;
     }
 
-    /// Lets go of the values of a topic that are no longer made of it; and of the topic, where it is read as another type.
+    /// Gives up the values that are no longer made of a topic, and the topic itself if it is read
+    /// as another type.
     fn give_up_values(&mut self, index: usize, read: &Read) {
         let Some(source) = self.sources.get(index) else {
             return;
         };
-        // Its definition may be another since the files were read again.
+        // The definition may have changed because the files were read again.
         let outdated = source
             .definition
             .as_ref()
@@ -85,10 +86,11 @@ impl Ros2Port {
     fn give_up_source(&mut self, index: usize) {
         if let Some(source) = self.sources.get_mut(index) {
             if let Reading::Open { slot, .. } = source.reading {
-                // Whoever published to it sees the reader disposed.
+                // The publishers of the topic see that the reader is disposed.
                 drop(self.inbox.remove(slot));
             }
-            // Its index stays, by which the inbox names it; its name is free for another.
+            // The slot stays, because the inbox uses its index; the name is free for another
+            // source.
             let (topic, message_type) = (source.dds_topic.clone(), source.message_type.clone());
             **source = Source::new(topic.clone(), message_type);
             if self.source_of.get(&topic) == Some(&index) {
@@ -97,7 +99,7 @@ impl Ros2Port {
         }
     }
 
-    /// The value that a topic is which was found, in that type.
+    /// Returns the value of a found topic of that type.
     fn found_value(
         &self,
         dds_topic: &str,
@@ -110,8 +112,8 @@ impl Ros2Port {
         }
     }
 
-    /// Makes the value of a topic that the mapping does not name, where all it had were given up: while it is read alike its
-    /// reader goes on. Lets go of the topic where there is no such value.
+    /// Creates the value of a topic that the mapping does not name, if all its values were given
+    /// up; the reader stays while the type is the same. Gives up the topic if it has no such value.
     fn take_up_found(&mut self, index: usize) {
         let Some(source) = self.sources.get(index) else {
             return;
@@ -120,7 +122,8 @@ impl Ros2Port {
             return;
         }
         let (dds_topic, message_type) = (source.dds_topic.clone(), source.message_type.clone());
-        // Others who write where values of other spaces go are not a value of ours.
+        // Other publishers on a topic to which the bridge writes values of other spaces are no
+        // value of ours.
         let is_written = self.is_written(&dds_topic);
         let found = self.found_value(&dds_topic, &message_type);
         let found = found.filter(|(topic, _)| {
@@ -143,7 +146,7 @@ impl Ros2Port {
                 || outdated
                 || !sink.is_like(&Sink::new(policy.destination(*topic)))
         });
-        // Their writers are disposed here, or when their readers have what was written.
+        // Their writers are disposed here, or once their readers have received all samples.
         let now = Instant::now();
         for (topic, sink) in gone {
             if let Some(open) = sink.open {
@@ -156,7 +159,7 @@ impl Ros2Port {
         drop(self.former.drain(..too_many));
     }
 
-    /// Makes values of a topic that the mapping reads, of which some may be made already.
+    /// Adds values of a topic that the mapping reads; some may exist already.
     fn take_up_values(
         &mut self,
         dds_topic: String,
@@ -173,7 +176,7 @@ impl Ros2Port {
             .filter(|(topic, _)| !known.contains(topic))
             .collect();
         source.values.extend(new.iter().cloned());
-        // One that is not read yet tells of all its values when it is.
+        // A source that is not read yet reports all its values when it is opened.
         let Reading::Open { .. } = source.reading else {
             return;
         };
@@ -193,5 +196,5 @@ impl Ros2Port {
     }
 }
 
-/// Writers that were given up and stay for a while.
+/// Maximum number of former writers that are kept for a while.
 const MOST_FORMER: usize = 256;

@@ -1,4 +1,4 @@
-//! When the port does what nobody asked for.
+//! The schedule of the periodic work of the port.
 
 use std::pin::Pin;
 use std::task::Context;
@@ -6,17 +6,18 @@ use std::time::Duration;
 
 use tokio::time::{Instant, Sleep};
 
-/// When to look again.
+/// The times of the next pass and of the next flush.
 pub(super) struct Schedule {
     timer: Pin<Box<Sleep>>,
     pub(super) reconciled: Instant,
     /// Something changed: reconcile soon.
     pub(super) changed: bool,
-    /// Endpoints are left to be made.
+    /// Endpoints remain to be created.
     pub(super) unfinished: bool,
     /// Samples wait in an outlet.
     pub(super) waiting: bool,
-    /// What the domain was like when all topics were looked at, and when that was; none where they are to be looked at again.
+    /// The change count of the domain and the time of the last pass over all topics; `None` forces
+    /// the next pass.
     looked: Option<(u64, Instant)>,
 }
 
@@ -32,7 +33,8 @@ impl Schedule {
         }
     }
 
-    /// Whether all topics are to be looked at, in a domain like that; always where nobody says whether it is another.
+    /// Returns whether a pass over all topics is due for this change count; always true without a
+    /// count.
     pub(super) fn is_look_due(&self, domain: Option<u64>, now: Instant) -> bool {
         let alike = self.looked.is_some_and(|(before, at)| {
             domain == Some(before) && now.saturating_duration_since(at) < LOOK
@@ -40,19 +42,19 @@ impl Schedule {
         self.changed || self.unfinished || self.waiting || !alike
     }
 
-    /// They are being looked at.
+    /// Records the start of a pass over all topics.
     pub(super) fn looks(&mut self, domain: Option<u64>, now: Instant) {
         self.changed = false;
         self.unfinished = false;
         self.looked = domain.map(|domain| (domain, now));
     }
 
-    /// Has them looked at the next time, although the domain may be what it was.
+    /// Forces the next pass, even if the domain has not changed.
     pub(super) fn look_next(&mut self) {
         self.looked = None;
     }
 
-    /// When the domain is to be looked at.
+    /// Returns the time of the next reconciliation.
     pub(super) fn next_reconcile(&self) -> Instant {
         self.reconciled
             + match (self.unfinished, self.changed) {
@@ -71,15 +73,15 @@ impl Schedule {
         }
     }
 
-    /// Sets the timer anew, after what was due is done.
+    /// Resets the timer after the due work is done.
     pub(super) fn arm(&mut self, now: Instant) {
         let next = self.next(now);
         self.timer.as_mut().reset(next);
     }
 
-    /// Whether there is something to do; otherwise the task is woken when there is.
+    /// Returns whether work is due; otherwise the task is woken when it is.
     pub(super) fn is_due(&mut self, cx: &mut Context<'_>) -> bool {
-        // `publish` and discovery make it earlier than it was set for.
+        // `publish` and discovery move the time forward.
         if self.changed || self.unfinished || self.waiting {
             let now = Instant::now();
             if self.next(now) < self.timer.deadline() {
@@ -90,16 +92,16 @@ impl Schedule {
     }
 }
 
-/// How often the domain is looked at when nothing is reported.
+/// The interval of passes while no change is reported.
 const POLL: Duration = Duration::from_millis(200);
-/// How often all topics are looked at when the domain is what it was: for what only time changes, and that may come late.
-/// More often than a type is taken to be of no interest any more (3 s).
+/// The interval of passes over all topics in an unchanged domain, for changes that depend on time
+/// only and may be noticed late. Shorter than the time after which a type is of no interest (3 s).
 const LOOK: Duration = Duration::from_secs(2);
-/// After a change: how long to let further ones come.
+/// The delay after a change, to collect further changes.
 const SETTLE: Duration = Duration::from_millis(20);
-/// Between two batches of endpoints.
+/// The pause between two batches of endpoints.
 const BATCH_PAUSE: Duration = Duration::from_millis(100);
-/// How often a full send window is tried again.
+/// The retry interval for a full send window.
 const FLUSH: Duration = Duration::from_millis(2);
 
 #[cfg(test)]
@@ -127,7 +129,7 @@ mod tests {
         }
         schedule.waiting = true;
         assert!(schedule.is_look_due(Some(1), later));
-        // RustDDS as published does not say it.
+        // The published RustDDS provides no change count.
         schedule.waiting = false;
         schedule.looks(None, now);
         assert!(schedule.is_look_due(None, later));

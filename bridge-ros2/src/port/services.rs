@@ -1,4 +1,5 @@
-//! Services of the domain, as values of the space call them, and calls of the space as services.
+//! Implements services of the domain, which values of the space call, and calls of the space
+//! offered as services.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -17,7 +18,7 @@ use crate::service::{
     ServicePeers, ServiceRequest, ServiceServer,
 };
 
-/// A domain and what is known of types.
+/// A DDS domain and the known type definitions.
 pub(super) struct Ros2Graph<'p> {
     pub(super) domain: &'p Domain,
     pub(super) peers: &'p ServicePeers,
@@ -90,7 +91,7 @@ impl ExecutorGraph for Ros2Graph<'_> {
 impl CallGraph for Ros2Graph<'_> {
     type Server = ServiceServer;
 
-    // A request without a reply is all there is.
+    // A ROS 2 service reports a fault only by the missing reply.
     const TELLS_FAULTS: bool = false;
 
     fn offer(
@@ -105,7 +106,7 @@ impl CallGraph for Ros2Graph<'_> {
         }
         let options = ServiceOptions {
             max_handled: HANDLED,
-            // Each request ends with the time that its call may take.
+            // Each request ends with the timeout of its call.
             handler_timeout: None,
             ..ServiceOptions::default()
         };
@@ -115,7 +116,7 @@ impl CallGraph for Ros2Graph<'_> {
     }
 }
 
-/// What `ros2 param` shows of the bridge.
+/// Returns the parameters of the bridge, as `ros2 param` lists them.
 pub(super) fn parameters(own: SpaceId, domain: u16, sim_time: bool) -> Vec<Parameter> {
     let parameter = |name: &str, value, description: &str, read_only| Parameter {
         name: name.to_owned(),
@@ -150,7 +151,7 @@ pub(super) fn parameters(own: SpaceId, domain: u16, sim_time: bool) -> Vec<Param
 #[derive(Debug)]
 pub(super) struct Client {
     client: ServiceClient,
-    /// The call that began last.
+    /// The most recent call.
     under_way: Mutex<Recall>,
 }
 
@@ -165,7 +166,7 @@ impl From<ServiceClient> for Client {
 
 impl Client {
     fn under_way(&self) -> MutexGuard<'_, Recall> {
-        // The handle is whole between statements.
+        // The handle is consistent between statements.
         let lock = self.under_way.lock();
         lock.unwrap_or_else(PoisonError::into_inner)
     }
@@ -187,7 +188,8 @@ impl ServiceCall for Client {
         let replied = call.await.map(|replied| replied.reply);
         replied.map_err(|error| CallFault {
             text: error.to_string(),
-            // A server of another type may give way to the right one as well as none.
+            // A server of another type may be replaced by a server of the right type, as may a
+            // missing server.
             may_pass: matches!(
                 error,
                 ServiceError::Timeout { .. }
@@ -202,5 +204,5 @@ impl ServiceCall for Client {
     }
 }
 
-/// Requests of one service at a time, as many as there may be for one call.
+/// Maximum number of concurrent requests of one service, equal to the limit of one call.
 const HANDLED: usize = 256;

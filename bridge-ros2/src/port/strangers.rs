@@ -1,4 +1,5 @@
-//! Participants DDS Security keeps out, so that somebody hears why a robot is not there.
+//! Reports participants that DDS Security rejects, so that an operator learns why a robot is
+//! missing.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::time::Duration;
@@ -12,13 +13,13 @@ use crate::node::ParticipantPrefix;
 
 #[derive(Debug, Default)]
 pub(super) struct Strangers {
-    /// Who is being authenticated, and since when.
+    /// Participants under authentication, with the start time.
     waiting: BTreeMap<ParticipantPrefix, Instant>,
-    /// Those the log names already, the oldest first.
+    /// Participants that were logged, oldest first.
     told: VecDeque<ParticipantPrefix>,
 }
 
-/// One that is not let in.
+/// A participant that is not admitted.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) struct Stranger {
     participant: ParticipantPrefix,
@@ -26,7 +27,7 @@ pub(super) struct Stranger {
 }
 
 impl Strangers {
-    /// Takes note of what discovery reports; the return value is to be told and counted.
+    /// Records a discovery event; the caller logs and counts the returned participant.
     #[cfg(feature = "security")]
     pub(super) fn note(
         &mut self,
@@ -47,7 +48,7 @@ impl Strangers {
         self.turn(participant.as_ref().try_into().ok()?, *status, now)
     }
 
-    /// Nobody is kept out.
+    /// Returns `None`: without DDS Security no participant is rejected.
     #[cfg(not(feature = "security"))]
     pub(super) const fn note(
         &mut self,
@@ -83,8 +84,8 @@ impl Strangers {
         }
     }
 
-    /// Whether the log does not name it yet, which it is taken to do from now on. Everybody who tries is another one, so
-    /// the oldest are forgotten.
+    /// Returns whether the participant was not logged yet, and records it as logged. Each attempt
+    /// may use another identity, so the oldest entries are dropped.
     pub(super) fn is_new(&mut self, stranger: &Stranger) -> bool {
         let is_new = !self.told.contains(&stranger.participant);
         if is_new {
@@ -96,7 +97,7 @@ impl Strangers {
         is_new
     }
 
-    /// Those that should have proved who they are by now. Each is returned once.
+    /// Returns the participants that failed to authenticate in time, once each.
     pub(super) fn overdue(&mut self, now: Instant) -> Vec<Stranger> {
         let late = |since: &Instant| now.saturating_duration_since(*since) > PATIENCE;
         let overdue = self.waiting.iter().filter(|(_, since)| late(since));
@@ -123,13 +124,13 @@ impl std::fmt::Display for Stranger {
     }
 }
 
-/// The reason under which they are counted.
+/// The reason under which rejected participants are counted.
 pub(super) const KEPT_OUT: &str = "participant not authenticated";
-/// A handshake is three messages, each repeated every second.
+/// The time limit of a handshake of three messages, each repeated every second.
 const PATIENCE: Duration = Duration::from_secs(8);
-/// How many the log is known to name.
+/// Maximum number of logged participants that are remembered.
 const MAX_TOLD: usize = 256;
-/// Anybody can claim to be somebody.
+/// Maximum number of participants under authentication: any host can claim an identity.
 #[cfg(feature = "security")]
 const MAX_WAITING: usize = 1024;
 

@@ -1,4 +1,5 @@
-//! Values of other spaces that neither the mapping names nor a subscriber wants: they are written while there is room.
+//! Handles values of other spaces that neither the mapping names nor a subscriber requests: they
+//! are written while there is room.
 
 use std::collections::{BTreeSet, HashMap};
 use std::time::Instant;
@@ -13,7 +14,8 @@ use crate::graph::Graph;
 use crate::sink::Sink;
 
 impl Ros2Port {
-    /// Has a topic for the value; false where there is no room for one that nobody here knows.
+    /// Creates a sink for the value; returns false if there is no room for a value without a
+    /// mapping and subscriber.
     pub(super) fn take_in(&mut self, topic: TopicId) -> bool {
         if self.sinks.contains_key(&topic) {
             return true;
@@ -47,7 +49,8 @@ impl Ros2Port {
         true
     }
 
-    /// Returns whether the process has descriptors for another writer of a value that the mapping does not name.
+    /// Returns whether the process has file descriptors for another writer of a value that the
+    /// mapping does not name.
     fn has_descriptors(&self) -> bool {
         let sinks = self.sinks.values();
         let pending = sinks.filter(|sink| sink.open.is_none()).count();
@@ -63,24 +66,25 @@ impl Ros2Port {
         admitted
     }
 
-    /// Ends the writers of strays that give way to others.
+    /// Closes the writers of strays that are replaced.
     fn let_go(&mut self, gone: Vec<TopicId>) {
         let mut names = BTreeSet::new();
         for topic in gone {
             if let Some(sink) = self.sinks.remove(&topic) {
-                // Nobody reads what it wrote.
+                // No reader receives their values.
                 let unwritten = sink.open.as_ref().and_then(|open| unwritten(topic, open));
                 self.events.extend(unwritten);
                 names.extend([topic.to_string(), sink.dds_topic]);
             }
             self.events.push_back(PortEvent::Unbound { topic });
         }
-        // Should they return, what is peculiar is told anew.
+        // If the values return, their anomalies are logged again.
         self.policy.told.forget(&names);
     }
 }
 
-/// Returns the values that neither the mapping names nor a reader subscribes to, each with since when its writer is silent.
+/// Returns the values that neither the mapping names nor a reader subscribes to, each with the time
+/// at which its publisher in the space fell silent.
 fn strays(
     policy: &Policy,
     sinks: &HashMap<TopicId, Box<Sink>>,

@@ -1,4 +1,4 @@
-//! The topics we write: in which type and definition, and for whom.
+//! Manages the topics that the bridge writes: their type, their definition and their readers.
 
 use std::sync::Arc;
 
@@ -22,7 +22,8 @@ impl Ros2Port {
             return;
         };
         if at_home {
-            // Another bridge serves its space in this domain. What was written would stand beside it, and grow old.
+            // Another bridge serves the space in this domain. A value written here would compete
+            // with its values and become stale.
             let given_up = sink.open.take();
             let dds_topic = sink.dds_topic.clone();
             if let Some(open) = given_up {
@@ -76,8 +77,8 @@ impl Ros2Port {
         }
     }
 
-    /// Tells of the readers that what is written does not serve: those of another type, and, counted once each, those that
-    /// take it for another definition of its type.
+    /// Logs the readers that the written type does not serve: readers of another type and, counted
+    /// once each, readers with another definition of the type.
     fn note_others(&mut self, topic: TopicId) {
         let Some(sink) = self.sinks.get(&topic) else {
             return;
@@ -119,7 +120,8 @@ impl Ros2Port {
         }
     }
 
-    /// A reader that acknowledges nothing must not keep a value from the others.
+    /// Replaces the writer, so that a reader that acknowledges nothing does not block the value for
+    /// other readers.
     fn replace_writer(&mut self, topic: TopicId, now: Instant) {
         if let Some(dds_topic) = self.advertise_anew(topic, now) {
             warn!(
@@ -129,7 +131,7 @@ impl Ros2Port {
         }
     }
 
-    /// A reader that asks for a deadline is matched by a writer that offers it.
+    /// Replaces the writer: a reader that requests a deadline matches only a writer that offers it.
     fn offer_deadline(&mut self, topic: TopicId, before: Option<rustdds::Duration>, now: Instant) {
         if let Some(dds_topic) = self.advertise_anew(topic, now) {
             info!(
@@ -141,12 +143,12 @@ impl Ros2Port {
             .get_mut(&topic)
             .and_then(|sink| sink.open.as_mut())
         {
-            // The writer there is goes on with what it offers; the next look tries again.
+            // The existing writer keeps its offered deadline; the next pass tries again.
             open.deadline = before;
         }
     }
 
-    /// Puts another writer in the place of a sink's; returns the topic.
+    /// Replaces the writer of a sink; returns the topic.
     pub(super) fn advertise_anew(&mut self, topic: TopicId, now: Instant) -> Option<String> {
         let sink = self.sinks.get(&topic)?;
         let open = sink.open.as_ref()?;
@@ -166,9 +168,11 @@ impl Ros2Port {
         Some(dds_topic)
     }
 
-    /// Opens a sink in the best type that is known; one that is open in a lesser type is opened anew. Where a node is asked
-    /// what the type of a subscriber is, another subscriber's is not kept waiting: it stays with that one, which is served.
-    /// A type nobody asks for is not worth opening before the answer.
+    /// Opens a sink in the best known type, or reopens a sink that is open in a lesser type.
+    ///
+    /// While a node is asked for the type of one subscriber, the subscriber of another type does
+    /// not wait: the sink stays with the type that is served. A type without a subscriber is not
+    /// opened before the response.
     pub(super) fn open_sink(&mut self, topic: TopicId, now: Instant) {
         let Some(sink) = self.sinks.get(&topic) else {
             return;
@@ -250,7 +254,7 @@ impl Ros2Port {
     }
 }
 
-/// What goes with a writer that is given up: values that still wait to be written.
+/// Returns the loss of the values that still wait in a writer that is given up.
 pub(super) fn unwritten(topic: TopicId, open: &Open) -> Option<PortEvent> {
     let waiting = open.outlet.waiting();
     (waiting > 0).then(|| {
@@ -262,5 +266,5 @@ pub(super) fn unwritten(topic: TopicId, open: &Open) -> Option<PortEvent> {
     })
 }
 
-/// Why a reader is counted that announces another hash than the one that is written.
+/// The reason for counting a reader whose type hash differs from the written type.
 const OTHER_DEFINITION_READ: &str = "subscriber of another definition";

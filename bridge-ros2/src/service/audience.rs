@@ -1,4 +1,4 @@
-//! Which readers can be written to.
+//! Tracks the readers that a writer can reach.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
@@ -8,8 +8,8 @@ use tokio::time::Instant;
 
 use crate::raw::Writer;
 
-/// The readers of a writer, as two sources tell of them: RustDDS says of each that it has matched it, in a queue that drops
-/// what it has no room for; discovery knows all, a moment before the writer does.
+/// The readers of a writer, from two sources. RustDDS reports each match in a queue that drops
+/// reports when it is full. Discovery knows all readers, shortly before the writer does.
 #[derive(Debug, Default)]
 pub(crate) struct Audience {
     known: BTreeMap<GUID, Known>,
@@ -22,7 +22,7 @@ struct Known {
 }
 
 impl Audience {
-    /// Takes note of the matches that the writer has told of since.
+    /// Records the matches that the writer reported after the last call.
     pub(crate) fn listen(&mut self, writer: &Writer, now: Instant) {
         while let Some(status) = writer.try_recv_status() {
             if let DataWriterStatus::PublicationMatched {
@@ -50,7 +50,7 @@ impl Audience {
         self.known.remove(&reader);
     }
 
-    /// Takes note of the readers that discovery knows, or knew a moment ago.
+    /// Records the readers that discovery knows, or knew shortly before.
     pub(crate) fn meet(&mut self, readers: impl Iterator<Item = GUID>, now: Instant) {
         let readers: BTreeSet<GUID> = readers.collect();
         self.known.retain(|guid, known| {
@@ -65,28 +65,28 @@ impl Audience {
         }
     }
 
-    /// Whether what is written now reaches that reader.
+    /// Returns whether a sample written at `now` reaches the reader.
     pub(crate) fn hears(&self, reader: GUID, now: Instant) -> bool {
         self.known.get(&reader).is_some_and(|known| {
             known.matched || now.saturating_duration_since(known.since) >= MATCHED
         })
     }
 
-    /// Whether what is written now reaches a reader of the participant of `client`.
+    /// Returns whether a sample written at `now` reaches a reader of the participant of `client`.
     pub(crate) fn hears_one_of(&self, client: GUID, now: Instant) -> bool {
         self.readers()
             .any(|reader| reader.prefix == client.prefix && self.hears(reader, now))
     }
 
-    /// All of them.
+    /// Returns all known readers.
     pub(crate) fn readers(&self) -> impl Iterator<Item = GUID> {
         self.known.keys().copied()
     }
 }
 
-/// How long RustDDS takes at most from discovering a reader to writing to it.
+/// The maximum delay of RustDDS between the discovery of a reader and the first sample to it.
 const MATCHED: Duration = Duration::from_millis(20);
-/// How old what was looked at may be: a reader matched since then is not in it.
+/// The maximum age of a snapshot: a reader matched after the snapshot is missing from it.
 const FRESH: Duration = Duration::from_secs(1);
 
 #[cfg(test)]
@@ -117,7 +117,7 @@ mod tests {
             audience.matched(reader(number), start);
         }
         audience.lost(reader(1));
-        // What was looked at may be older than the match.
+        // The snapshot may be older than the match.
         audience.meet([reader(2)].into_iter(), start + FRESH / 2);
         assert_eq!(audience.readers().collect::<Vec<_>>(), [2, 3].map(reader));
         audience.meet([reader(2)].into_iter(), start + FRESH);

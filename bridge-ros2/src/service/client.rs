@@ -1,4 +1,5 @@
-//! Calling a service: finding its servers, asking each in its own way, and telling what went wrong.
+//! The service client: finds the servers, sends each a request in its vendor's mapping, and reports
+//! failures.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 use std::sync::Arc;
@@ -23,17 +24,18 @@ use super::{Service, ServiceMapping, next, policies};
 use crate::domain::{Domain, DomainError};
 use crate::raw::{Payload, Reader, Writer};
 
-/// How long a client waits, and how much.
+/// The limits of a service client.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ServiceClientOptions {
-    /// For a whole call: waiting for a server, request and reply. `None` waits until the server is gone.
+    /// The timeout of a whole call: waiting for a server, request and reply. `None` waits until the
+    /// server is lost.
     pub timeout: Option<Duration>,
-    /// Calls in progress at once; one more is refused.
+    /// Maximum number of concurrent calls; a further call is refused.
     pub max_calls: usize,
 }
 
 impl Default for ServiceClientOptions {
-    /// 10 seconds, 1024 calls.
+    /// Returns a timeout of 10 seconds and a limit of 1024 calls.
     fn default() -> Self {
         Self {
             timeout: Some(Duration::from_secs(10)),
@@ -42,7 +44,7 @@ impl Default for ServiceClientOptions {
     }
 }
 
-/// Calls one service. Clones share its endpoints, which go with the last of them.
+/// Calls one service. Clones share its endpoints, which are removed with the last clone.
 #[derive(Clone, Debug)]
 pub struct ServiceClient {
     shared: Arc<Shared>,
@@ -66,7 +68,7 @@ impl Drop for Shared {
 }
 
 impl ServiceClient {
-    /// Makes the endpoints and starts to look for servers. To be called on a tokio runtime.
+    /// Creates the endpoints and starts to look for servers. Call this on a tokio runtime.
     ///
     /// # Errors
     /// [`DomainError::Endpoint`].
@@ -76,7 +78,8 @@ impl ServiceClient {
         service: &Service,
         options: ServiceClientOptions,
     ) -> Result<Self, DomainError> {
-        // The reader first: who knows our writer then most likely knows it too.
+        // The reader comes first: a server that has discovered the writer most likely knows the
+        // reader too.
         let reader =
             domain.open_reader(&service.reply_topic(), &service.types.response, &policies())?;
         let writer = domain.open_writer(
@@ -124,37 +127,41 @@ impl ServiceClient {
         })
     }
 
-    /// The service's ROS name.
+    /// Returns the ROS name of the service.
     #[must_use]
     pub fn service(&self) -> &str {
         &self.shared.service.name
     }
 
-    /// Servers that would be asked now: those of other participants whose reader and writer are both matched.
+    /// Returns the number of servers that receive the next request: servers of other participants
+    /// whose reader and writer are both matched.
     #[must_use]
     pub fn servers(&self) -> u64 {
         self.shared.servers.load(Ordering::Relaxed)
     }
 
-    /// Those of them whose HEARTBEATs name our reader (RTPS 2.5, 8.3.8.6): their replies will reach it. They are asked at
-    /// once; others get a while to find us, since what a server sends to readers it does not know yet is lost. None with
-    /// `RustDDS` as published, which does not tell.
+    /// Returns the number of these servers whose HEARTBEATs name our reader (RTPS 2.5, 8.3.8.6), so
+    /// that their replies reach it. They receive requests at once; other servers get time to
+    /// discover the client, because a reply to a reader unknown to the server is lost. The
+    /// published `RustDDS` does not report this, so the number is 0.
     #[must_use]
     pub fn acquainted(&self) -> u64 {
         self.shared.acquainted.load(Ordering::Relaxed)
     }
 
-    /// Replies so far that were for nobody here: to calls of other clients, to calls given up, or malformed.
+    /// Returns the number of ignored replies: replies to other clients, to abandoned calls, or
+    /// malformed replies.
     #[must_use]
     pub fn ignored(&self) -> u64 {
         self.shared.ignored.load(Ordering::Relaxed)
     }
 
-    /// Sends a request, CDR with its encapsulation header, and returns the reply likewise. With several servers all
-    /// are asked, as everywhere in ROS 2, and the first reply counts.
+    /// Sends a request, which is CDR with its encapsulation header, and returns the reply in the
+    /// same form. Like any ROS 2 client, it sends the request to all servers, and the first reply
+    /// counts.
     ///
-    /// It is never sent twice: when it fails, [`ServiceError::may_have_run`] tells whether a server may have acted.
-    /// Dropping the future gives the call up; a server may still act.
+    /// A request is never sent twice. On failure, [`ServiceError::may_have_run`] returns whether a
+    /// server may have acted on it. Dropping the future abandons the call; a server may still act.
     ///
     /// # Errors
     /// [`ServiceError`].
@@ -163,8 +170,9 @@ impl ServiceClient {
         Ok(answer.reply)
     }
 
-    /// The same, but waits for a server of the participant that has `endpoint`, up to [`COMPANION`], before any is asked.
-    /// For what one service of a participant was told that another is to be asked of: that other may be found later.
+    /// Calls as [`call`](Self::call) does, but first waits up to [`COMPANION`] for a server of the
+    /// participant that has `endpoint`. Used when a service of a participant refers to another
+    /// service of the same participant, which may be discovered later.
     pub(crate) async fn call_after(
         &self,
         request: Bytes,
@@ -174,7 +182,8 @@ impl ServiceClient {
         self.call_recallable(request, endpoint, &recall).await
     }
 
-    /// The same, for a request that can be [recalled](Recall::recall) until it is sent.
+    /// Calls as [`call_after`](Self::call_after) does, with a request that can be
+    /// [recalled](Recall::recall) until it is sent.
     pub(crate) async fn call_recallable(
         &self,
         request: Bytes,
@@ -227,7 +236,7 @@ impl ServiceClient {
     }
 }
 
-/// Takes a request back that is not sent yet.
+/// Recalls a request that was not sent yet.
 #[derive(Debug, Clone)]
 pub(crate) struct Recall(Arc<AtomicU8>);
 
@@ -238,12 +247,12 @@ impl Default for Recall {
 }
 
 impl Recall {
-    /// Whether the request was sent.
+    /// Returns whether the request was sent.
     pub(crate) fn is_sent(&self) -> bool {
         self.0.load(Ordering::Acquire) == u8::from(CallPhase::Answer)
     }
 
-    /// Keeps the request from being sent. Returns false if it was sent, or is being sent.
+    /// Prevents the request from being sent. Returns false if it was sent or is being sent.
     pub(crate) fn recall(&self) -> bool {
         let before = |phase: u8| (phase < CallPhase::Request.into()).then_some(RECALLED);
         let moved = self
@@ -253,7 +262,7 @@ impl Recall {
     }
 }
 
-/// What a server replied, and the writer it came from.
+/// The reply of a server and the writer that sent it.
 #[derive(Debug)]
 pub(crate) struct Replied {
     pub(crate) reply: Bytes,
@@ -263,14 +272,15 @@ pub(crate) struct Replied {
 #[derive(Debug)]
 struct Call {
     request: Bytes,
-    /// An endpoint of the participant that is to be among the servers, and until when that is waited for.
+    /// An endpoint of the participant that has to be among the servers, and the time limit for
+    /// this.
     companion: Option<(GUID, Instant)>,
     phase: Arc<AtomicU8>,
     done: oneshot::Sender<Result<Replied, Failure>>,
 }
 
 impl Call {
-    /// Returns false if the request was recalled: it is not to be sent.
+    /// Enters a phase. Returns false if the request was recalled and must not be sent.
     fn enter(&self, phase: CallPhase) -> bool {
         let moved = |now: u8| (now != RECALLED).then_some(phase.into());
         let entered = self
@@ -279,7 +289,7 @@ impl Call {
         entered.is_ok()
     }
 
-    /// Whether to ask those servers now.
+    /// Returns whether to send the request to these servers at `now`.
     fn is_for(&self, servers: &BTreeMap<GUID, Met>, now: Instant) -> bool {
         self.companion.is_none_or(|(endpoint, until)| {
             now >= until
@@ -290,12 +300,12 @@ impl Call {
     }
 
     fn end(self, result: Result<Replied, Failure>) {
-        // Who gave the call up does not listen.
+        // The receiver is closed if the caller abandoned the call.
         drop(self.done.send(result));
     }
 }
 
-/// What ended a call, but for time.
+/// The reason for which a call failed, except for a timeout.
 #[derive(Debug)]
 enum Failure {
     Busy,
@@ -313,11 +323,11 @@ struct Driver {
     writer: Writer,
     reader: Reader,
     max_calls: usize,
-    /// By the reader of the requests.
+    /// The servers, keyed by the reader of the requests.
     servers: BTreeMap<GUID, Met>,
-    /// A type that a server has instead of ours.
+    /// The type of a server whose type differs from ours.
     other_type: Option<String>,
-    /// Calls that wait for a server, for it to take what it was sent, or for the send window, oldest first.
+    /// Calls that wait for a server, for its capacity, or for the send window; oldest first.
     waiting: VecDeque<Call>,
     /// Calls that wait for a reply.
     asked: BTreeMap<u64, Asked>,
@@ -325,7 +335,7 @@ struct Driver {
     count: u64,
     looked: Option<Instant>,
     pace: Pace,
-    /// All that read the requests.
+    /// All readers of the request topic.
     readers: Vec<GUID>,
     opening: Opening,
     ignored: Arc<AtomicU64>,
@@ -343,7 +353,7 @@ struct Asked {
 impl Driver {
     async fn run(mut self, mut calls: mpsc::Receiver<Call>) {
         loop {
-            // Each branch is cancel-safe: nothing is taken but by the branch that completes.
+            // Each branch is cancel-safe: only the branch that completes takes an item.
             let tick = self.next_look().unwrap_or_else(Instant::now);
             tokio::select! {
                 reply = next(&self.reader) => self.replied(reply),
@@ -389,7 +399,7 @@ impl Driver {
         }
     }
 
-    /// Takes note of the servers there are, and asks them what waits.
+    /// Updates the servers and sends the waiting requests to them.
     fn look(&mut self, now: Instant) {
         self.looked = Some(now);
         self.forget_given_up();
@@ -410,7 +420,8 @@ impl Driver {
         }
     }
 
-    /// How many servers are to be asked now, and how many of them tell that they know us.
+    /// Returns how many servers are ready for a request, and how many of them report that they know
+    /// the client.
     fn ready(&self, now: Instant) -> (u64, u64) {
         let in_step = all_in_step(&self.writer, self.servers.len());
         let of = |(ready, acquainted): (u64, u64), met: &Met| {
@@ -427,14 +438,14 @@ impl Driver {
         if self.ready(now).0 == 0 {
             return;
         }
-        // Those too that are new: the others may be dead, with their leases still running.
+        // New servers are included: the others may be dead while their leases still run.
         let servers: Vec<GUID> = self.servers.keys().copied().collect();
         while self.opening.is_over(&self.writer, now)
             && may_ask(self.asked.values().rev().map(|asked| asked.since), now)
             && let Some(call) = self.next_call(now)
         {
             if call.done.is_closed() || !call.enter(CallPhase::Request) {
-                // Whoever called has given it up.
+                // The caller abandoned the call.
                 continue;
             }
             if let Some(unsent) = self.ask(call, &servers, now) {
@@ -446,7 +457,7 @@ impl Driver {
         }
     }
 
-    /// The call that has waited longest for the servers there are.
+    /// Returns the call that has waited longest for the present servers.
     fn next_call(&mut self, now: Instant) -> Option<Call> {
         let mut waiting = self.waiting.iter();
         let at = waiting.position(|call| call.is_for(&self.servers, now))?;
@@ -482,7 +493,7 @@ impl Driver {
         self.readers = readers.iter().map(|reader| reader.guid).collect();
     }
 
-    /// Writes a request to the servers; returns it when the send window is full.
+    /// Writes a request to the servers; returns it if the send window is full.
     fn ask(&mut self, call: Call, servers: &[GUID], now: Instant) -> Option<Call> {
         self.count += 1;
         let (mut keys, mut asked) = (Vec::new(), Vec::new());
@@ -493,7 +504,7 @@ impl Driver {
                     asked.push(*server);
                 }
                 Err(Unsent::Full) => {}
-                // The request itself is at fault, so the first server tells it.
+                // The request itself is invalid, so the first server fails already.
                 Err(Unsent::Request(why)) => {
                     call.end(Err(Failure::Request(why)));
                     return None;
@@ -525,9 +536,9 @@ impl Driver {
             .seal_request(mapping, count, request.clone())
             .map_err(|fault| Unsent::Request(fault.label()))?;
         let payload = Payload::to_write(payload).map_err(|error| Unsent::Request(error.label()))?;
-        // To each server alone: a request in one vendor's way is garbage to the servers of another. Besides, what goes to
-        // all readers RustDDS puts together into larger datagrams, and of 100 requests so sent at once some never
-        // reached Cyclone DDS.
+        // Addressed to each server separately: servers of one vendor cannot read the mapping of
+        // another. In addition, RustDDS combines samples for all readers into larger datagrams, and
+        // of 100 requests sent at once in this way some never reached Cyclone DDS.
         let options = WriteOptionsBuilder::new()
             .related_sample_identity_opt(related)
             .to_single_reader(server)
@@ -550,7 +561,7 @@ impl Driver {
     }
 
     fn replied(&mut self, reply: Option<Received>) {
-        // Ourselves as server, which no client here is for.
+        // Replies of this process as a server are for no client here.
         let foreign = reply.filter(|reply| !self.peers.is_own(reply.writer));
         let opened = foreign.map(|reply| {
             let writer = reply.writer;
@@ -584,7 +595,7 @@ impl Driver {
         }
     }
 
-    /// Ends the calls whose servers have all gone.
+    /// Ends the calls whose servers are all lost.
     fn give_up_lost(&mut self) {
         let servers: BTreeSet<GUID> = self.servers.keys().copied().collect();
         let lost = |asked: &Asked| !asked.servers.iter().any(|guid| servers.contains(guid));
@@ -609,9 +620,9 @@ enum Unsent {
     Request(&'static str),
 }
 
-/// How long a call waits for a certain server. What the others know it asks them then.
+/// How long a call waits for a certain server; after that, it is sent to the other servers.
 const COMPANION: Duration = Duration::from_secs(5);
-/// Of a request that was taken back before it was sent; no [`CallPhase`].
+/// The phase of a request that was recalled before it was sent; not a [`CallPhase`].
 const RECALLED: u8 = u8::MAX;
-/// Calls that may wait to be taken; more wait in [`ServiceClient::call`].
+/// Capacity of the call queue; further calls wait in [`ServiceClient::call`].
 const QUEUE: usize = 64;

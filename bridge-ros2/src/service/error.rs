@@ -1,21 +1,21 @@
-//! What went wrong with a call.
+//! Errors of service calls.
 
 use std::fmt;
 use std::time::Duration;
 
 use thiserror::Error;
 
-/// What a call was at when it ended.
+/// The phase in which a call ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum CallPhase {
-    /// Waiting to be taken by the client's task.
+    /// Waiting in the queue of the client task.
     Queue,
     /// Waiting for a server.
     Discovery,
     /// Sending the request.
     Request,
-    /// The request is sent, the reply awaited.
+    /// Waiting for the reply; the request is sent.
     Answer,
 }
 
@@ -54,37 +54,37 @@ impl fmt::Display for CallPhase {
     }
 }
 
-/// Why a call brought no answer.
+/// The reason for which a call returned no reply.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
 #[non_exhaustive]
 pub enum ServiceError {
-    /// The time for the call is over.
+    /// The timeout of the call has expired.
     #[error("{service}: the call was given up after {limit:?} while {phase}")]
     Timeout {
         /// The service.
         service: String,
-        /// What took too long.
+        /// The phase that was not completed in time.
         phase: CallPhase,
-        /// The time given to the whole call.
+        /// The timeout of the whole call.
         limit: Duration,
     },
-    /// Every server that was asked has left, in order or by the end of its lease.
+    /// Every server that received the request has left or its lease has expired.
     #[error("the servers of {service} left before they answered")]
     Lost {
         /// The service.
         service: String,
     },
-    /// There is a server, of another type.
+    /// A server exists, but with another type.
     #[error("{service} has the type {theirs}, and {ours} is wanted")]
     OtherType {
         /// The service.
         service: String,
-        /// DDS type of the server's requests.
+        /// The DDS type of the server's requests.
         theirs: String,
-        /// DDS type of ours.
+        /// The DDS type of the client's requests.
         ours: String,
     },
-    /// The client has as many calls in progress as its options allow.
+    /// The client has reached its limit of concurrent calls.
     #[error("{limit} calls of {service} are in progress already")]
     Busy {
         /// The service.
@@ -97,10 +97,10 @@ pub enum ServiceError {
     Request {
         /// The service.
         service: String,
-        /// What is wrong with it.
+        /// The fault of the request.
         why: &'static str,
     },
-    /// The reply is none of the service's type.
+    /// The reply does not have the service's type.
     #[error("the reply of {service} does not read")]
     Reply {
         /// The service.
@@ -111,14 +111,14 @@ pub enum ServiceError {
     Closed {
         /// The service.
         service: String,
-        /// What the call was at.
+        /// The phase of the call.
         phase: CallPhase,
     },
 }
 
 impl ServiceError {
-    /// Whether a server may have acted on the request though no answer tells so: it was sent, and no reply came. When
-    /// this is false, no server has had it.
+    /// Returns whether a server may have acted on the request without a reply: the request was
+    /// sent, and no reply was received. If false, no server has received the request.
     #[must_use]
     pub const fn may_have_run(&self) -> bool {
         match self {

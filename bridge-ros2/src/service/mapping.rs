@@ -1,27 +1,31 @@
-//! How requests and replies are tied together on the wire, which each vendor's ROS 2 middleware does in its own way.
+//! Maps requests and replies to samples and correlates them, which each vendor's ROS 2 middleware
+//! does differently.
 //!
-//! The mapping is chosen per peer, from its vendor: a server answers each client in the client's way, and
-//! a client asks each server in the server's. Pure: bytes and identities in, bytes and identities out.
+//! The mapping is chosen per peer by its vendor: a server replies to each client in the client's
+//! mapping, and a client sends each server a request in the server's mapping. The module is pure:
+//! bytes and identities in, bytes and identities out.
 
 use bytes::{Bytes, BytesMut};
 use rustdds::rpc::SampleIdentity;
 use rustdds::{GUID, SequenceNumber};
 
-/// One vendor's way.
+/// The mapping of one vendor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum ServiceMapping {
-    /// rmw_cyclonedds: 16 bytes in front of the body, request and reply alike, which are 8 bytes that identify the
-    /// client and an Int64 that counts its requests (`cdds_request_header_t`).
+    /// The mapping of rmw_cyclonedds: 16 bytes in front of the body of requests and replies, which
+    /// are 8 bytes that identify the client and an Int64 that counts its requests
+    /// (`cdds_request_header_t`).
     Cyclone,
-    /// rmw_fastrtps, ros2-client and ourselves: nothing in the payload. The reply names the request in its related
-    /// sample identity (DDS-RPC 1.0, 7.8.2, "enhanced"), as client and sequence number. The client is the GUID that the
-    /// request has in its own related sample identity, which is that of the reader for the replies, else the GUID of
-    /// the request's writer.
+    /// The mapping of rmw_fastrtps, ros2-client and this bridge: the payload has no header. The
+    /// reply names the request in its related sample identity (DDS-RPC 1.0, 7.8.2, "enhanced"), as
+    /// client and sequence number. The client is the GUID in the request's own related sample
+    /// identity, which is the GUID of the reader for the replies; without it, the GUID of the
+    /// request's writer.
     Enhanced,
 }
 
 impl ServiceMapping {
-    /// The way of a vendor, by its number in the OMG's list.
+    /// Returns the mapping of a vendor, by its number in the OMG's list.
     #[must_use]
     pub fn of(vendor: [u8; 2]) -> Self {
         if vendor == CYCLONE {
@@ -32,10 +36,10 @@ impl ServiceMapping {
     }
 }
 
-/// A sample as it was read.
+/// A received sample.
 #[derive(Debug, Clone)]
 pub(crate) struct Received {
-    /// Encapsulation header first.
+    /// The payload, which starts with the encapsulation header.
     pub(crate) payload: Bytes,
     pub(crate) writer: GUID,
     pub(crate) sequence: i64,
@@ -45,12 +49,12 @@ pub(crate) struct Received {
 /// A sample to be written.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Outgoing {
-    /// Encapsulation header first, unpadded.
+    /// The payload, which starts with the encapsulation header and is not padded.
     pub(super) payload: Bytes,
     pub(super) related: Option<SampleIdentity>,
 }
 
-/// What a server must remember of a request to answer it.
+/// The data of a request that a server needs for the reply.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum ReplyTo {
     Cyclone {
@@ -64,14 +68,14 @@ pub(super) enum ReplyTo {
 }
 
 impl ReplyTo {
-    /// The writer of the request.
+    /// Returns the writer of the request.
     pub(super) const fn client(&self) -> GUID {
         match self {
             Self::Cyclone { client, .. } | Self::Enhanced { client, .. } => *client,
         }
     }
 
-    /// The reader for the reply, where the request names it.
+    /// Returns the reader for the reply, if the request names it.
     pub(super) fn reader(&self) -> Option<GUID> {
         match self {
             Self::Cyclone { .. } => None,
@@ -82,12 +86,12 @@ impl ReplyTo {
     }
 }
 
-/// Why a sample is no request or reply.
+/// The reason for which a sample is not a valid request or reply.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Fault {
-    /// Not plain CDR.
+    /// The encoding is not plain CDR.
     Encoding,
-    /// Ends within its header.
+    /// The payload ends within its header.
     Short,
 }
 
@@ -100,7 +104,7 @@ impl Fault {
     }
 }
 
-/// Takes a request apart: how to answer it, and its body behind an encapsulation header.
+/// Splits a request into the data for its reply and the body after an encapsulation header.
 pub(super) fn open_request(
     mapping: ServiceMapping,
     received: Received,
@@ -126,7 +130,7 @@ pub(super) fn open_request(
     }
 }
 
-/// The reply with that body, which is little endian CDR with its encapsulation header.
+/// Returns the reply with the body, which is little-endian CDR with its encapsulation header.
 pub(super) fn seal_reply(to: &ReplyTo, body: Bytes) -> Result<Outgoing, Fault> {
     match to {
         ReplyTo::Cyclone { header, .. } => Ok(Outgoing {
@@ -140,24 +144,25 @@ pub(super) fn seal_reply(to: &ReplyTo, body: Bytes) -> Result<Outgoing, Fault> {
     }
 }
 
-/// Who a client is in either mapping.
+/// The identity of a client in either mapping.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct ClientId {
     pub(super) writer: GUID,
     pub(super) reader: GUID,
 }
 
-/// Which request a reply is for.
+/// Identifies the request to which a reply belongs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(super) enum RequestKey {
-    /// The number the client gave it.
+    /// The number that the client assigned.
     Counted(i64),
-    /// The sequence number its writer gave it.
+    /// The sequence number that the client's writer assigned.
     Written(i64),
 }
 
 impl ClientId {
-    /// The request with that body. `count` tells it from others of this client where the header says so.
+    /// Returns the request with the body. `count` distinguishes it from other requests of this
+    /// client if the mapping has a header for it.
     pub(super) fn seal_request(
         self,
         mapping: ServiceMapping,
@@ -177,7 +182,7 @@ impl ClientId {
             }
             ServiceMapping::Enhanced => Ok(Outgoing {
                 payload: little_endian(body)?,
-                // As rmw_fastrtps does; its servers wait for that reader before they answer.
+                // As in rmw_fastrtps, whose servers wait for this reader before they reply.
                 related: Some(SampleIdentity {
                     writer_guid: self.reader,
                     sequence_number: SequenceNumber::from_high_low(-1, 0),
@@ -186,7 +191,8 @@ impl ClientId {
         }
     }
 
-    /// Takes a reply apart. `None` when it is for another client.
+    /// Splits a reply into its request key and its body. Returns `None` for a reply to another
+    /// client.
     pub(super) fn open_reply(
         self,
         mapping: ServiceMapping,
@@ -215,14 +221,15 @@ impl ClientId {
         }
     }
 
-    /// 8 bytes no other client has: the end of its participant's prefix and its writer's entity id.
+    /// Returns 8 bytes that are unique to the client: the end of its participant's prefix and its
+    /// writer's entity id.
     fn cyclone_id(self) -> [u8; 8] {
         let [.., a, b, c, d, e, f, g, h] = self.writer.to_bytes();
         [a, b, c, d, e, f, g, h]
     }
 }
 
-/// Of a CDR body.
+/// The byte order of a CDR body.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum ByteOrder {
     Little,
@@ -241,8 +248,8 @@ impl ByteOrder {
     }
 }
 
-/// Parts a payload into Cyclone's header, as a little endian writer would have it, and the rest. The header has a
-/// multiple of 8 bytes, so nothing behind it is aligned otherwise without it.
+/// Splits a payload into Cyclone's header, converted to little endian, and the rest. The header
+/// length is a multiple of 8 bytes, so its removal keeps the alignment of the rest.
 fn split(payload: &Bytes, order: ByteOrder) -> Result<([u8; CYCLONE_HEADER], Bytes), Fault> {
     let (encapsulation, rest) = payload
         .split_first_chunk::<ENCAPSULATION>()
@@ -283,7 +290,7 @@ fn little_endian(payload: Bytes) -> Result<Bytes, Fault> {
     }
 }
 
-/// Eclipse Cyclone DDS in the OMG's list of vendors.
+/// The vendor number of Eclipse Cyclone DDS in the OMG's list.
 const CYCLONE: [u8; 2] = [0x01, 0x10];
 const CYCLONE_HEADER: usize = 16;
 const ENCAPSULATION: usize = 4;
@@ -397,7 +404,7 @@ mod tests {
             let request = ours()
                 .seal_request(mapping, 3, Bytes::from_static(TRUE))
                 .unwrap();
-            // As a server of that vendor answers it.
+            // As a server of the vendor replies.
             let reply = match mapping {
                 ServiceMapping::Cyclone => request,
                 ServiceMapping::Enhanced => Outgoing {

@@ -1,4 +1,4 @@
-//! The servers a client has found, and whether they know it by now.
+//! The servers that a client has discovered, and whether they have discovered the client.
 
 use std::time::Duration;
 
@@ -8,23 +8,24 @@ use tokio::time::Instant;
 use super::SETTLE;
 use crate::raw::{Reader, Writer};
 
-/// A server as its client sees it.
+/// A server from the view of its client.
 #[derive(Debug)]
 pub(super) struct Met {
-    /// Since when both halves are known.
+    /// The time at which both endpoints of the server were known.
     since: Instant,
-    /// The writers its replies may come from: those of its participant.
+    /// The writers from which its replies may come: the reply writers of its participant.
     repliers: Vec<GUID>,
 }
 
-/// What tells whether a server that is asked now gets the request and its reply gets back.
+/// The evidence that a server would receive a request and its reply would reach the client.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum Acquaintance {
     /// Its HEARTBEATs name our reader, and all servers have acknowledged our writer.
     Told,
-    /// It has sent HEARTBEATs, which may have been for others, or nothing tells.
+    /// It has sent HEARTBEATs, which may have been for other readers, or RustDDS does not report
+    /// this.
     Likely,
-    /// It has sent no HEARTBEAT, for which our reader asks as soon as it knows the writer.
+    /// It has sent no HEARTBEAT. The reader requests a HEARTBEAT as soon as it knows the writer.
     #[cfg_attr(
         not(any(feature = "patched-dds", test)),
         expect(dead_code, reason = "nothing tells")
@@ -44,7 +45,7 @@ impl Met {
         self.repliers = repliers;
     }
 
-    /// What our reader of its replies knows of it.
+    /// Returns the acquaintance that our reply reader observed.
     #[cfg(feature = "patched-dds")]
     pub(super) fn acquaintance(&self, reader: &Reader, all_in_step: bool) -> Acquaintance {
         use rustdds::WriterContact;
@@ -60,21 +61,21 @@ impl Met {
         each.max().unwrap_or(Acquaintance::Silent)
     }
 
-    /// Nothing, with RustDDS as published.
+    /// Returns `Likely`, because the published RustDDS does not report contacts.
     #[cfg(not(feature = "patched-dds"))]
     #[expect(clippy::unused_self, reason = "the patched RustDDS tells of each")]
     pub(super) fn acquaintance(&self, _reader: &Reader, _all_in_step: bool) -> Acquaintance {
         Acquaintance::Likely
     }
 
-    /// Whether to ask it now.
+    /// Returns whether the server is ready for a request.
     pub(super) fn is_ready(&self, acquaintance: Acquaintance, now: Instant) -> bool {
         now.saturating_duration_since(self.since) >= acquaintance.patience()
     }
 }
 
 impl Acquaintance {
-    /// How long to wait after a server was found.
+    /// Returns the delay after the discovery of a server.
     fn patience(self) -> Duration {
         match self {
             Self::Told => Duration::ZERO,
@@ -84,20 +85,21 @@ impl Acquaintance {
     }
 }
 
-/// Whether as many readers as there are servers have acknowledged what the writer told them.
+/// Returns whether as many readers as there are servers have acknowledged the writer's
+/// announcements.
 #[cfg(feature = "patched-dds")]
 pub(super) fn all_in_step(writer: &Writer, servers: usize) -> bool {
     writer.matched_readers().in_step >= servers
 }
 
-/// Nothing tells, with RustDDS as published.
+/// Returns false, because the published RustDDS does not report acknowledgements.
 #[cfg(not(feature = "patched-dds"))]
 pub(super) fn all_in_step(_writer: &Writer, _servers: usize) -> bool {
     false
 }
 
-/// How long to wait for a server that says nothing. What tells it of us may have been lost, and said again; or it is one
-/// that never says anything.
+/// The maximum delay for a silent server. The announcement to it may have been lost and repeated,
+/// or the server never sends a HEARTBEAT.
 const PATIENCE: Duration = Duration::from_secs(1);
 
 #[cfg(test)]

@@ -1,8 +1,9 @@
-//! Services: one request, one reply, as bytes of any type, with servers and clients of any vendor.
+//! Services: one request and one reply, as bytes of any type, with servers and clients of any
+//! vendor.
 //!
-//! A service `/name` is two topics, `rq/nameRequest` and `rr/nameReply` (design.ros2.org, "Topic and Service name
-//! mapping to DDS"). Requests and replies are CDR with their encapsulation header; how they are tied together is
-//! [`ServiceMapping`].
+//! A service `/name` consists of two topics, `rq/nameRequest` and `rr/nameReply` (design.ros2.org,
+//! "Topic and Service name mapping to DDS"). Requests and replies are CDR with their encapsulation
+//! header; [`ServiceMapping`] defines how they are correlated.
 
 mod audience;
 mod client;
@@ -40,14 +41,14 @@ use crate::raw::Reader;
 /// The DDS types of a service's two topics.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ServiceTypes {
-    /// Such as `std_srvs::srv::dds_::SetBool_Request_`.
+    /// The request type, such as `std_srvs::srv::dds_::SetBool_Request_`.
     pub request: String,
-    /// Such as `std_srvs::srv::dds_::SetBool_Response_`.
+    /// The response type, such as `std_srvs::srv::dds_::SetBool_Response_`.
     pub response: String,
 }
 
 impl ServiceTypes {
-    /// Of a `.srv` file.
+    /// Returns the types of a `.srv` file.
     #[must_use]
     pub fn of(service: &TypeName) -> Self {
         let of = |half| {
@@ -67,14 +68,14 @@ impl ServiceTypes {
 /// A service by name and type.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Service {
-    /// The ROS name, `/arm/grip`.
+    /// The ROS name, such as `/arm/grip`.
     pub name: String,
-    /// Its types.
+    /// The DDS types of the service.
     pub types: ServiceTypes,
 }
 
 impl Service {
-    /// The service of that name, of the type of a `.srv` file.
+    /// Returns the service with the name and the type of a `.srv` file.
     #[must_use]
     pub fn new(name: &str, service_type: &TypeName) -> Self {
         Self {
@@ -83,27 +84,27 @@ impl Service {
         }
     }
 
-    /// Has the domain announce the hashes of the types, for endpoints that are made from now on.
+    /// Sets the type hashes that the domain announces with the next endpoints of the service.
     pub(crate) fn announce(&self, domain: &Domain, hashes: &ServiceTypeHashes) {
         domain.learn_type_hash(&self.types.request, hashes.request.to_string());
         domain.learn_type_hash(&self.types.response, hashes.response.to_string());
     }
 
-    /// The DDS topic with the requests.
+    /// Returns the DDS topic of the requests.
     #[must_use]
     pub fn request_topic(&self) -> String {
         format!("rq/{}Request", self.name.trim_start_matches('/'))
     }
 
-    /// The DDS topic with the replies.
+    /// Returns the DDS topic of the replies.
     #[must_use]
     pub fn reply_topic(&self) -> String {
         format!("rr/{}Reply", self.name.trim_start_matches('/'))
     }
 }
 
-/// Reliable and volatile, as rmw's default for services. Depths are no part of discovery; ours is longer than the 10
-/// of rmw, so that a burst of calls is kept.
+/// Returns reliable and volatile policies, the default of rmw for services. Discovery does not
+/// compare depths; this depth exceeds the 10 of rmw, so that a burst of calls is kept.
 pub(crate) fn policies() -> QosPolicies {
     QosPolicyBuilder::new()
         .reliable(rustdds::Duration::ZERO)
@@ -117,7 +118,8 @@ pub(crate) fn policies() -> QosPolicies {
         .build()
 }
 
-/// The next sample, or `None` for one that cannot be read. Cancel-safe: a sample is taken only when it is returned.
+/// Receives the next sample, or `None` for an unreadable sample. Cancel-safe: a sample is taken
+/// only when it is returned.
 pub(crate) async fn next(reader: &Reader) -> Option<Received> {
     poll_fn(|cx| {
         let mut armed = false;
@@ -132,7 +134,8 @@ pub(crate) async fn next(reader: &Reader) -> Option<Received> {
                     }));
                 }
                 Ok(None) if armed => return Poll::Pending,
-                // What arrives between a take and the arming would wake nobody, hence another look.
+                // A sample that arrives between the take and the arming would wake no task, hence
+                // another take.
                 Ok(None) => {
                     reader.set_waker(Some(cx.waker().clone()));
                     armed = true;
@@ -144,12 +147,13 @@ pub(crate) async fn next(reader: &Reader) -> Option<Received> {
     .await
 }
 
-/// How often endpoints of peers are looked at when nothing waits for them, and when something does.
+/// Intervals at which the endpoints of peers are polled: while no call waits for them, and while
+/// one waits.
 pub(crate) const IDLE: Duration = Duration::from_millis(200);
 pub(crate) const BUSY: Duration = Duration::from_millis(10);
-/// How long peers take to learn of our endpoints after we learned of theirs: 30 to 190 ms measured.
+/// How long peers take to discover our endpoints after we discovered theirs: 30 to 190 ms measured.
 const SETTLE: Duration = Duration::from_millis(250);
-/// Samples a writer keeps for repairs, and a reader for us.
+/// Samples that a writer keeps for repairs, and a reader for the bridge.
 const DEPTH: i32 = 256;
 /// Samples that a reader may leave unacknowledged before the writer stops.
 const WINDOW: i32 = 1024;

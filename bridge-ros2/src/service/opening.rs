@@ -1,11 +1,11 @@
-//! The first sample to a new reader.
+//! Delays the first samples to a new reader.
 
 use std::time::Duration;
 
 #[cfg(not(feature = "patched-dds"))]
 pub(crate) use self::published::Opening;
 
-/// How long a reader may take; one that was killed never acknowledges.
+/// The maximum delay for a reader; a killed reader never acknowledges.
 const PATIENCE: Duration = Duration::from_millis(250);
 
 #[cfg(feature = "patched-dds")]
@@ -16,15 +16,15 @@ mod patched {
     use super::PATIENCE;
     use crate::raw::Writer;
 
-    /// Holds a writer up until its readers have heard a HEARTBEAT of it.
+    /// Holds a writer until its readers have received a HEARTBEAT of it.
     ///
-    /// A reader of Cyclone DDS takes what the first HEARTBEAT it hears of a volatile writer announces for older than
-    /// itself, so it would miss what is written before that.
+    /// A reader of Cyclone DDS regards the samples that the first HEARTBEAT of a volatile writer
+    /// announces as older than itself, so it would miss samples written before that HEARTBEAT.
     #[derive(Debug)]
     pub(crate) struct Opening {
-        /// Readers that may not have heard one, when last asked.
+        /// Readers that may not have received a HEARTBEAT at the last check.
         new: usize,
-        /// Since when that is waited for.
+        /// The start of the current wait.
         since: Option<Instant>,
     }
 
@@ -36,7 +36,7 @@ mod patched {
             }
         }
 
-        /// Whether a sample may be written now.
+        /// Returns whether a sample may be written at `now`.
         pub(crate) fn is_over(&mut self, writer: &Writer, now: Instant) -> bool {
             let readers = writer.matched_readers();
             self.passes(readers.silent + readers.greeting, now)
@@ -49,7 +49,7 @@ mod patched {
                 return true;
             }
             match self.since {
-                // Others that come do not prolong it: some may never say anything.
+                // Further new readers do not prolong the wait: some may never respond.
                 Some(since) if now.saturating_duration_since(since) < PATIENCE => false,
                 Some(_) => {
                     self.since = None;
@@ -63,7 +63,7 @@ mod patched {
             }
         }
 
-        /// The readers say themselves how far they are.
+        /// Does nothing: RustDDS reports the state of the readers.
         #[expect(
             clippy::unused_self,
             reason = "RustDDS as published has to be told, and is called in the same places"
@@ -117,15 +117,17 @@ mod published {
     use super::PATIENCE;
     use crate::raw::Writer;
 
-    /// Holds a writer up until new readers have had one sample.
+    /// Holds a writer until new readers have received one sample.
     ///
-    /// A reader of Cyclone DDS takes what the first HEARTBEAT it hears of a volatile writer announces for older than
-    /// itself. RustDDS sends that HEARTBEAT ahead of samples that wait to be sent, so of a burst some would be lost in
-    /// its middle. With a single sample the HEARTBEAT comes behind it.
+    /// A reader of Cyclone DDS regards the samples that the first HEARTBEAT of a volatile writer
+    /// announces as older than itself. RustDDS sends this HEARTBEAT ahead of samples that wait to
+    /// be sent, so samples in the middle of a burst would be lost. With a single sample, the
+    /// HEARTBEAT follows the sample.
     #[derive(Debug)]
     pub(crate) struct Opening {
         known: BTreeSet<GUID>,
-        /// When a sample was written that some reader is yet to acknowledge as its first.
+        /// The time at which a sample was written whose first acknowledgement by some reader is
+        /// pending.
         since: Option<Instant>,
     }
 
@@ -137,11 +139,11 @@ mod published {
             }
         }
 
-        /// Whether a sample may be written now.
+        /// Returns whether a sample may be written at `now`.
         pub(crate) fn is_over(&mut self, writer: &Writer, now: Instant) -> bool {
             if let Some(since) = self.since
                 && now.saturating_duration_since(since) < PATIENCE
-                // The answer is immediate with a wait of zero.
+                // A wait of zero returns immediately.
                 && !matches!(writer.wait_for_acknowledgments(Duration::ZERO), Ok(true))
             {
                 return false;
@@ -150,7 +152,7 @@ mod published {
             true
         }
 
-        /// To be called when a sample was written that all of `readers` get.
+        /// Records that a sample was written to all of `readers`.
         pub(crate) fn written(&mut self, readers: impl Iterator<Item = GUID>, now: Instant) {
             let readers: BTreeSet<GUID> = readers.collect();
             if !readers.is_subset(&self.known) {

@@ -1,4 +1,4 @@
-//! How often a client looks for its servers.
+//! The intervals at which a client looks for its servers.
 
 use std::time::Duration;
 
@@ -6,19 +6,20 @@ use tokio::time::Instant;
 
 use super::{BUSY, IDLE};
 
-/// What the calls of a client wait for.
+/// The condition that the calls of a client wait for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Awaited {
-    /// No call waits, or only for replies.
+    /// No call waits, or all calls wait for replies only.
     Nothing,
     /// No server is known.
     Server,
-    /// A server is known, and is to learn of us or to take what it was sent.
+    /// A server is known, and has to discover the client or to process earlier requests.
     Turn,
 }
 
-/// When to look again. Each look at the peers copies what RustDDS has discovered, so one for a server that is not there
-/// comes later each time; a server that starts with its client is found at once nevertheless.
+/// The interval of the next poll. Each poll of the peers copies the discovery data of RustDDS, so
+/// the polls for an absent server become less frequent. A server that starts together with its
+/// client is still found at once.
 #[derive(Debug)]
 pub(super) struct Pace {
     next: Duration,
@@ -33,7 +34,7 @@ impl Pace {
         }
     }
 
-    /// To be told at each look.
+    /// Records a poll.
     pub(super) fn looked(&mut self, awaited: Awaited) {
         self.next = match (self.awaited, awaited) {
             (Awaited::Server, Awaited::Server) => IDLE.min(self.next * 2),
@@ -42,7 +43,7 @@ impl Pace {
         self.awaited = awaited;
     }
 
-    /// The time to the next look.
+    /// Returns the time until the next poll.
     pub(super) fn pause(&self, awaited: Awaited) -> Duration {
         match awaited {
             Awaited::Nothing => IDLE,
@@ -51,7 +52,7 @@ impl Pace {
         }
     }
 
-    /// How old what is known of the peers may be at that look.
+    /// Returns the maximum age of the peers' snapshot at that poll.
     pub(super) fn age(&self, awaited: Awaited) -> Duration {
         match awaited {
             Awaited::Nothing => IDLE,
@@ -61,23 +62,25 @@ impl Pace {
     }
 }
 
-/// How old what is known of the peers may be when a server is asked: the one that is known may be dead, with its lease
-/// still running, and its successor there.
+/// The maximum age of the peers' snapshot when a request is sent: the known server may be dead
+/// while its lease still runs, and its successor present.
 pub(super) const FRESH: Duration = Duration::from_millis(20);
 
-/// Whether one more request may be sent now, given when those that are unanswered were sent, newest first.
+/// Returns whether another request may be sent at `now`, given the send times of the unanswered
+/// requests, newest first.
 ///
-/// A server of rmw keeps the last ten requests that it has not taken yet (`rmw_qos_profile_services_default`), also where
-/// delivery is reliable: of twenty at once the first ten are gone, and nobody is told. Those that are answered it has taken.
-/// One that it answers late, such as for the result of a goal, it has taken by then most likely.
+/// A server of rmw keeps the last ten requests that it has not taken yet
+/// (`rmw_qos_profile_services_default`), even with reliable delivery: of twenty simultaneous
+/// requests the first ten are lost without a report. The server has taken all answered requests. A
+/// request with a late reply, such as for the result of a goal, has most likely been taken as well.
 pub(super) fn may_ask(unanswered: impl Iterator<Item = Instant>, now: Instant) -> bool {
     let recent = unanswered.take_while(|sent| now.saturating_duration_since(*sent) < TAKEN);
     recent.take(AT_ONCE).count() < AT_ONCE
 }
 
-/// Requests that a server has to keep, at most.
+/// Maximum number of requests that a server has to keep.
 const AT_ONCE: usize = 8;
-/// After that time a server has taken a request, answered or not.
+/// The time after which a server has taken a request, answered or not.
 const TAKEN: Duration = Duration::from_millis(100);
 
 #[cfg(test)]
@@ -91,12 +94,12 @@ mod tests {
         assert!(may_ask(std::iter::empty(), now));
         assert!(may_ask((0..7).map(ago), now));
         assert!(!may_ask((0..8).map(ago), now));
-        // One of eight is from long ago, and so is what came before.
+        // Requests sent 100 ms ago or earlier do not count.
         assert!(may_ask((93..900).map(ago), now));
         assert!(!may_ask((92..900).map(ago), now));
     }
 
-    /// The times of the looks within so long, while that is awaited.
+    /// Returns the times of the polls within a period, for a constant condition.
     fn looks(pace: &mut Pace, awaited: Awaited, within: Duration) -> Vec<Duration> {
         let mut at = Duration::ZERO;
         let mut all = Vec::new();
@@ -129,7 +132,7 @@ mod tests {
         pace.looked(Awaited::Turn);
         assert_eq!(pace.pause(Awaited::Turn), BUSY);
         assert_eq!(pace.age(Awaited::Turn), FRESH);
-        // The next server that is absent is looked for as the first was.
+        // The search for the next absent server starts at the same interval as the first search.
         pace.looked(Awaited::Server);
         assert_eq!(pace.pause(Awaited::Server), BUSY);
     }

@@ -1,4 +1,4 @@
-//! Who else offers and calls services in a domain.
+//! The other participants that offer and call services in a domain.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -12,10 +12,11 @@ use crate::graph::{Endpoint, Graph};
 
 use super::ServiceMapping;
 
-/// The endpoints of other participants on the topics of services and actions, shared by all of a process: RustDDS'
-/// discovery is copied once for all that look at the same time.
+/// The endpoints of other participants on the topics of services and actions. All users in a
+/// process share one copy of RustDDS's discovery data.
 ///
-/// Our own endpoints are left out: that we call a service does not make it available.
+/// The bridge's own endpoints are left out: a client of the bridge does not make a service
+/// available.
 #[derive(Clone)]
 pub struct ServicePeers(Arc<Shared>);
 
@@ -26,7 +27,7 @@ struct Shared {
 
 struct Seen {
     at: Instant,
-    /// What discovery had counted by then; see [`changes_of`].
+    /// The change count of discovery at the copy; see [`changes_of`].
     changes: Option<u64>,
     snapshot: Arc<Snapshot>,
 }
@@ -39,7 +40,8 @@ pub(crate) struct Snapshot {
 }
 
 impl ServicePeers {
-    /// Of that domain. It keeps the participant: drop it before [`Domain::leave`].
+    /// Returns the service peers of the domain. The value holds the participant: drop it before
+    /// [`Domain::leave`].
     #[must_use]
     pub fn new(domain: &Domain) -> Self {
         Self(Arc::new(Shared {
@@ -48,8 +50,9 @@ impl ServicePeers {
         }))
     }
 
-    /// What is known, no older than `age`. Discovery is not copied again while it says that nothing changed: with
-    /// thousands of endpoints a copy costs more than all else a bridge does when nothing happens.
+    /// Returns a snapshot no older than `age`. Discovery data is not copied again while its change
+    /// count stays the same: with thousands of endpoints, a copy costs more than all other work of
+    /// an idle bridge.
     pub(crate) fn look(&self, now: Instant, age: Duration) -> Arc<Snapshot> {
         let mut seen = self.0.seen.lock().unwrap_or_else(PoisonError::into_inner);
         let fresh = seen
@@ -58,7 +61,7 @@ impl ServicePeers {
         if let Some(fresh) = fresh {
             return Arc::clone(&fresh.snapshot);
         }
-        // Counted before the copy: a change in between is copied again.
+        // The count is read before the copy, so that a change in between causes another copy.
         let changes = changes_of(&self.0.participant);
         if let Some(seen) = seen.as_mut()
             && changes.is_some()
@@ -76,12 +79,12 @@ impl ServicePeers {
         snapshot
     }
 
-    /// The way of whoever has that endpoint.
+    /// Returns the mapping of the vendor of the endpoint's participant.
     pub(crate) fn mapping_of(&self, endpoint: GUID) -> ServiceMapping {
         ServiceMapping::of(vendor_of(&self.0.participant, endpoint))
     }
 
-    /// Whether an endpoint is one of ours.
+    /// Returns whether the endpoint belongs to this participant.
     pub(crate) fn is_own(&self, endpoint: GUID) -> bool {
         endpoint.prefix == self.0.participant.guid().prefix
     }
@@ -93,7 +96,8 @@ impl std::fmt::Debug for ServicePeers {
     }
 }
 
-/// Another number than before means that what is discovered may be another. RustDDS as published does not say it.
+/// Returns the change count of discovery; a new count means that discovery data may have changed.
+/// The published RustDDS does not provide it.
 #[cfg(feature = "patched-dds")]
 pub(crate) fn changes_of(participant: &DomainParticipant) -> Option<u64> {
     Some(participant.discovered_changes())
@@ -104,8 +108,9 @@ pub(crate) fn changes_of(_participant: &DomainParticipant) -> Option<u64> {
     None
 }
 
-/// The vendor of a participant with that endpoint, as it says itself. GUIDs start with the same number (RTPS 2.5, 8.2.4.1)
-/// unless DDS Security makes them (DDS Security 1.1, 9.3.3).
+/// Returns the vendor of the endpoint's participant, as announced by the participant. GUIDs start
+/// with the vendor number (RTPS 2.5, 8.2.4.1) unless DDS Security generates them (DDS Security 1.1,
+/// 9.3.3).
 #[cfg(feature = "patched-dds")]
 fn vendor_of(participant: &DomainParticipant, endpoint: GUID) -> [u8; 2] {
     let told = participant.vendor_of(endpoint.prefix);
@@ -153,28 +158,28 @@ impl Snapshot {
         self.writers.get(topic).map_or(&[], Vec::as_slice)
     }
 
-    /// The services that somebody offers, each with the readers of its requests.
+    /// Returns the offered services, each with the readers of its requests.
     pub(crate) fn offered(&self) -> impl Iterator<Item = (&str, &[Endpoint])> {
         named(&self.readers, service_name)
     }
 
-    /// The services that somebody asks for, each with the writers of its requests.
+    /// Returns the called services, each with the writers of its requests.
     pub(crate) fn called(&self) -> impl Iterator<Item = (&str, &[Endpoint])> {
         named(&self.writers, service_name)
     }
 
-    /// The actions that somebody serves, each with the readers of its goals.
+    /// Returns the served actions, each with the readers of its goals.
     pub(crate) fn served_actions(&self) -> impl Iterator<Item = (&str, &[Endpoint])> {
         named(&self.readers, action_name)
     }
 
-    /// The actions that somebody sends goals to, each with the writers of its goals.
+    /// Returns the actions that receive goals from clients, each with the writers of its goals.
     pub(crate) fn called_actions(&self) -> impl Iterator<Item = (&str, &[Endpoint])> {
         named(&self.writers, action_name)
     }
 }
 
-/// The names without the slash in front that `name` finds in topics with requests.
+/// Returns the names without leading slash that `name` extracts from request topics.
 fn named(
     topics: &BTreeMap<String, Vec<Endpoint>>,
     name: impl Fn(&str) -> Option<&str>,
@@ -193,7 +198,8 @@ fn action_name(name: &str) -> Option<&str> {
     name.strip_suffix("/_action/send_goal")
 }
 
-/// The services that others than `participant` and the bridges in `graph` offer, with their types.
+/// Returns the services, with their types, that are offered by participants other than
+/// `participant` and the bridges in `graph`.
 pub(crate) fn offered(
     participant: &DomainParticipant,
     graph: &Graph,
@@ -209,7 +215,7 @@ pub(crate) fn offered(
     services
 }
 
-/// `std_srvs/SetBool` of `std_srvs::srv::dds_::SetBool_Request_`.
+/// Converts `std_srvs::srv::dds_::SetBool_Request_` to `std_srvs/SetBool`.
 pub(crate) fn service_type(request: &str) -> String {
     let parts = request.split_once("::srv::dds_::");
     let named = parts.and_then(|(package, rest)| Some((package, rest.strip_suffix("_Request_")?)));
@@ -219,7 +225,8 @@ pub(crate) fn service_type(request: &str) -> String {
     )
 }
 
-/// `nav2_msgs/NavigateToPose` of `nav2_msgs::action::dds_::NavigateToPose_SendGoal_Request_`.
+/// Converts `nav2_msgs::action::dds_::NavigateToPose_SendGoal_Request_` to
+/// `nav2_msgs/NavigateToPose`.
 pub(crate) fn action_type(request: &str) -> String {
     let parts = request.split_once("::action::dds_::");
     let named =

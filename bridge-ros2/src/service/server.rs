@@ -1,4 +1,5 @@
-//! Offering a service: reading requests, running the handler, answering each client in its own way.
+//! The service server: reads requests, runs the handler, and replies to each client in its vendor's
+//! mapping.
 
 use std::collections::VecDeque;
 use std::pin::Pin;
@@ -22,21 +23,21 @@ use super::{BUSY, IDLE, Service, next, policies};
 use crate::domain::{Domain, DomainError};
 use crate::raw::{Payload, Reader, Writer};
 
-/// What a service does for its clients, at most.
+/// The limits of a service server.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ServiceOptions {
-    /// Requests handled at once.
+    /// Maximum number of requests handled concurrently.
     pub max_handled: usize,
-    /// Requests that wait for that. When they are more, the oldest is dropped: its client has waited longest, and may
-    /// have given up.
+    /// Maximum number of waiting requests. Beyond it, the oldest request is dropped: its client has
+    /// waited longest and may have given up.
     pub max_waiting: usize,
-    /// How long the handler may take for one request. Past that it is dropped, and the client gets no answer: services
-    /// of ROS 2 have no word for failure.
+    /// The timeout of the handler for one request. When it expires, the handler is dropped and the
+    /// client gets no reply: ROS 2 services cannot report a failure.
     pub handler_timeout: Option<Duration>,
 }
 
 impl Default for ServiceOptions {
-    /// 64 requests, 1024 waiting, one minute.
+    /// Returns limits of 64 handled and 1024 waiting requests, and a timeout of one minute.
     fn default() -> Self {
         Self {
             max_handled: 64,
@@ -46,10 +47,11 @@ impl Default for ServiceOptions {
     }
 }
 
-/// One request, as the handler of a service gets it.
+/// One request, as passed to the handler of a service.
 #[derive(Clone, Debug)]
 pub struct ServiceRequest {
-    /// CDR with its encapsulation header, in the client's byte order. Any bytes may stand behind the header.
+    /// CDR with its encapsulation header, in the client's byte order. The bytes after the header
+    /// are not validated.
     pub bytes: Bytes,
     /// The writer of the request.
     pub client: GUID,
@@ -63,23 +65,23 @@ pub struct ServiceServer {
     task: AbortHandle,
 }
 
-/// What a service has done so far.
+/// The counters of a service.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct ServiceCounters {
-    /// Requests given to the handler.
+    /// Requests passed to the handler.
     pub calls: u64,
-    /// Requests the handler failed at, or took too long for.
+    /// Requests for which the handler failed or timed out.
     pub failures: u64,
-    /// Samples that were no requests.
+    /// Samples that were not valid requests.
     pub malformed: u64,
     /// Requests dropped because too many waited.
     pub overflowed: u64,
-    /// Replies dropped because the client's reader did not appear, or takes nothing.
+    /// Replies dropped because the client's reader did not appear or did not accept them.
     pub undelivered: u64,
 }
 
 impl ServiceCounters {
-    /// Of two services together.
+    /// Returns the sums of the counters of two services.
     #[must_use]
     pub fn plus(self, other: Self) -> Self {
         Self {
@@ -102,8 +104,9 @@ struct Counters {
 }
 
 impl ServiceServer {
-    /// Makes the endpoints and serves. To be called on a tokio runtime. The handler returns CDR in little endian with
-    /// its encapsulation header; with an error, which is logged, the client gets no answer.
+    /// Creates the endpoints and starts to serve. Call this on a tokio runtime. The handler returns
+    /// little-endian CDR with its encapsulation header; its errors are logged, and the client gets
+    /// no reply.
     ///
     /// # Errors
     /// [`DomainError::Endpoint`].
@@ -125,7 +128,8 @@ impl ServiceServer {
         Self::open_told(domain, peers, service, options, handler)
     }
 
-    /// As [`open`](Self::open), for a handler that has to know when its reply is out.
+    /// Opens a server as [`open`](Self::open) does, for a handler that has to know when its reply
+    /// was written.
     pub(crate) fn open_told<H, F>(
         domain: &Domain,
         peers: &ServicePeers,
@@ -138,7 +142,8 @@ impl ServiceServer {
         F: Future<Output = Result<Answer, String>> + Send + 'static,
     {
         let types = &service.types;
-        // The writer first: who finds our reader then most likely finds it too.
+        // The writer comes first: a client that has discovered the reader most likely knows the
+        // writer too.
         let writer = domain.open_writer(&service.reply_topic(), &types.response, &policies())?;
         let reader = domain.open_reader(&service.request_topic(), &types.request, &policies())?;
         let counters: Arc<Counters> = Arc::default();
@@ -163,13 +168,13 @@ impl ServiceServer {
         })
     }
 
-    /// The service's ROS name.
+    /// Returns the ROS name of the service.
     #[must_use]
     pub fn service(&self) -> &str {
         &self.service
     }
 
-    /// What it has done.
+    /// Returns the counters.
     #[must_use]
     pub fn counters(&self) -> ServiceCounters {
         let Counters {
@@ -196,16 +201,16 @@ impl Drop for ServiceServer {
     }
 }
 
-/// What a handler answers.
+/// The result of a handler.
 #[derive(Debug)]
 pub(crate) struct Answer {
-    /// CDR in little endian with its encapsulation header.
+    /// Little-endian CDR with its encapsulation header.
     pub(crate) bytes: Bytes,
-    /// Dropped once the reply is given to the client's reader, or given up.
+    /// Dropped once the reply is written for the client's reader, or given up.
     pub(crate) written: Option<oneshot::Sender<Never>>,
 }
 
-/// What is never sent: that the sender is gone tells all.
+/// A type without values: only the drop of the sender is signalled.
 #[derive(Debug)]
 pub(crate) enum Never {}
 
@@ -230,7 +235,7 @@ struct Driver {
     counters: Arc<Counters>,
     waiting: VecDeque<(ReplyTo, Bytes)>,
     handled: JoinSet<(ReplyTo, Result<Answer, String>)>,
-    /// Replies whose client is not matched yet, or that find the send window full, oldest first.
+    /// Replies whose client is not matched yet, or that wait for the send window; oldest first.
     replies: VecDeque<Reply>,
     audience: Audience,
     opening: Opening,
@@ -247,7 +252,7 @@ struct Reply {
 impl Driver {
     async fn run(mut self, reader: Reader) {
         loop {
-            // Each branch is cancel-safe: nothing is taken but by the branch that completes.
+            // Each branch is cancel-safe: only the branch that completes takes an item.
             let tick = Instant::now() + BUSY;
             tokio::select! {
                 request = next(&reader) => self.received(request),
@@ -268,7 +273,8 @@ impl Driver {
 
     fn received(&mut self, request: Option<Received>) {
         let opened = match request {
-            // Of a client of ours: nobody here is to be asked what others are.
+            // A request of a client of this bridge: the server is for requests of other
+            // participants only.
             Some(request) if self.peers.is_own(request.writer) => return,
             Some(request) => {
                 let mapping = self.peers.mapping_of(request.writer);
@@ -294,7 +300,7 @@ impl Driver {
         }
     }
 
-    /// Runs the handler, in a task of its own: a panic ends that alone.
+    /// Runs the handler in its own task, so that a panic ends only that task.
     fn handle(&mut self, to: ReplyTo, bytes: Bytes) {
         count(&self.counters.calls);
         let answer = (self.handler)(ServiceRequest {
@@ -349,7 +355,7 @@ impl Driver {
         }
     }
 
-    /// Writes the replies whose clients can take them by now.
+    /// Writes the replies that their clients can receive by `now`.
     fn send(&mut self, now: Instant) {
         self.audience.listen(&self.writer, now);
         for reply in std::mem::take(&mut self.replies) {
@@ -371,8 +377,9 @@ impl Driver {
         }
     }
 
-    /// The readers of a client: the one its request names, else all of its participant, as Cyclone's requests do not say
-    /// which. `None` while the client has none that could hear us.
+    /// Returns the readers of a client: the reader that its request names, else all readers of its
+    /// participant, because requests of Cyclone do not name the reader. Returns `None` while the
+    /// client has no reachable reader.
     fn targets(&mut self, to: &ReplyTo, now: Instant) -> Option<Vec<GUID>> {
         let topic = self.service.reply_topic();
         let mut age = IDLE;
@@ -396,10 +403,11 @@ impl Driver {
         }
     }
 
-    /// Returns the reply when the send window is full.
+    /// Writes the reply to the readers; returns it if the send window is full.
     fn write(&mut self, reply: Reply, targets: &[GUID], now: Instant) -> Option<Reply> {
         for reader in targets {
-            // To them alone: a reply in one vendor's way is garbage to the clients of another.
+            // Addressed to these readers only: clients of one vendor cannot read the mapping of
+            // another.
             let options = WriteOptionsBuilder::new()
                 .related_sample_identity_opt(reply.related)
                 .to_single_reader(*reader)
