@@ -1,4 +1,4 @@
-//! What a client of an action asks its server, and what its goals share.
+//! The requests of an action client to its server, and the state that its goals share.
 
 use std::collections::BTreeMap;
 use std::convert::Infallible;
@@ -25,28 +25,31 @@ use crate::service::{
     BUSY, CallPhase, IDLE, Recall, Received, Replied, ServiceClient, ServiceError, ServicePeers,
 };
 
-/// How long a client waits, in steady time, and how much it holds.
+/// The timeouts of an action client, in steady time, and its limits.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ActionClientOptions {
-    /// How long a goal waits for a server before it is sent, and, once it is accepted, for one to come back when there
-    /// is none.
+    /// How long a goal waits for a server before it is sent. An accepted goal waits as long for a
+    /// lost server to return.
     pub server_timeout: Duration,
-    /// How long the server may take to accept or reject a goal; `None` waits until the server is gone. A goal that was
-    /// not answered in time is withdrawn: it is cancelled as soon as it is accepted.
+    /// How long the server may take to accept or reject a goal; `None` waits until the server is
+    /// lost. A goal without a decision in time is withdrawn: it is cancelled as soon as it is
+    /// accepted.
     pub answer_timeout: Option<Duration>,
-    /// How long a request to cancel may take.
+    /// The timeout of a cancel request.
     pub cancel_timeout: Duration,
-    /// Goals that have not ended, at most; one more is lost at once.
+    /// Maximum number of goals that have not ended; a further goal is lost at once.
     pub max_goals: usize,
-    /// How many reports of progress may wait per goal; then the oldest are dropped.
+    /// Maximum number of waiting feedback messages per goal; beyond it, the oldest are dropped.
     pub feedback_messages: usize,
-    /// How many bytes of them may wait per goal; then the oldest are dropped. The newest is always kept.
+    /// Maximum size of the waiting feedback per goal in bytes; beyond it, the oldest messages are
+    /// dropped. The newest is always kept.
     pub feedback_bytes: usize,
 }
 
 impl Default for ActionClientOptions {
-    /// 10 seconds for a server, a minute for its decision, 10 seconds for one about cancelling; 1000 goals; 100 reports
-    /// of progress and 16 MiB.
+    /// Returns 10 seconds for a server, one minute for its decision about a goal, 10 seconds for
+    /// its decision about a cancel request, 1000 goals, 100 feedback messages and 16 MiB of
+    /// feedback.
     fn default() -> Self {
         Self {
             server_timeout: Duration::from_secs(10),
@@ -59,7 +62,7 @@ impl Default for ActionClientOptions {
     }
 }
 
-/// The three services of an action, as its client asks them.
+/// The service clients of the three services of an action.
 #[derive(Debug)]
 pub(super) struct Asked {
     pub(super) send: ServiceClient,
@@ -67,7 +70,7 @@ pub(super) struct Asked {
     pub(super) result: ServiceClient,
 }
 
-/// What the client, its tasks and its goals share.
+/// The state that the client, its tasks and its goals share.
 #[derive(Debug)]
 pub(super) struct Shared {
     pub(super) action: Action,
@@ -75,12 +78,12 @@ pub(super) struct Shared {
     participant: GUID,
     peers: ServicePeers,
     asked: Asked,
-    /// Goals that end once feedback is taken that was received before their results.
+    /// Goals that end once all feedback received before their results is delivered.
     ends: mpsc::Sender<GoalEnd>,
     state: Mutex<State>,
 }
 
-/// How a goal has ended.
+/// The end of a goal.
 #[derive(Debug)]
 pub(super) struct GoalEnd {
     id: GoalId,
@@ -92,9 +95,9 @@ pub(super) struct GoalEnd {
 #[derive(Debug)]
 pub(super) struct State {
     pub(super) goals: ClientGoals,
-    /// Of goals that somebody holds.
+    /// The tasks of goals that have a handle.
     pub(super) tasks: BTreeMap<GoalId, AbortHandle>,
-    /// An endpoint of the server that has accepted a goal, while it runs.
+    /// An endpoint of the server that has accepted a goal, while the goal runs.
     servers: BTreeMap<GoalId, GUID>,
 }
 
@@ -128,7 +131,7 @@ impl Shared {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Asks to cancel goals. What the server has not decided about is withdrawn.
+    /// Requests to cancel goals. Withdraws the goals that the server has not decided about.
     pub(super) async fn cancel(&self, what: CancelWhat) -> Result<CancelAnswer, ServiceError> {
         let withdrawn = self.withdraw(what);
         if let (CancelWhat::Goal(_), [_, ..]) = (what, &withdrawn[..]) {
@@ -171,7 +174,7 @@ impl Shared {
         }
     }
 
-    /// Nobody holds the goal any more.
+    /// Records that the handle of the goal was dropped.
     pub(super) fn forget(&self, id: GoalId) {
         let mut state = self.lock();
         if !state.goals.forget(id) {
@@ -183,7 +186,7 @@ impl Shared {
         }
     }
 
-    /// The participant and a count: no other client in the domain has it.
+    /// Returns an id made of the participant and a count, which is unique in the domain.
     pub(super) fn new_id(&self) -> GoalId {
         static COUNT: AtomicU32 = AtomicU32::new(1);
         let mut bytes = self.participant.to_bytes();
@@ -234,7 +237,7 @@ impl Shared {
         }
     }
 
-    /// Returns when there has been no server for the time a goal waits for one.
+    /// Returns when no server has been present for the time that a goal waits for a server.
     async fn wait_for_no_server(&self) {
         let mut since = Instant::now();
         while since.elapsed() < self.options.server_timeout {
@@ -245,16 +248,17 @@ impl Shared {
         }
     }
 
-    /// Sees a goal through to its end.
+    /// Drives a goal to its end.
     pub(super) async fn drive(self: Arc<Self>, id: GoalId, request: Bytes) {
         let changed = self.lock().goals.changed(id);
-        // Both are cancel-safe: a request to cancel is noted as sent before it is.
+        // Both branches are cancel-safe: a cancel request is recorded as sent before it is sent.
         let outcome = tokio::select! {
             outcome = self.outcome(id, request) => outcome,
             never = self.cancel_withdrawn(id) => match never {},
         };
         if let Outcome::Done { .. } = &outcome {
-            // Feedback that was sent before may be on another socket, which is read later.
+            // Feedback that was sent before the result may wait on another socket, which is read
+            // later.
             sleep(FEEDBACK_GRACE).await;
         }
         let end = GoalEnd {
@@ -262,11 +266,11 @@ impl Shared {
             outcome,
             changed,
         };
-        // It is closed with the client, whose goals have ended then.
+        // The channel is closed with the client, whose goals have ended then.
         let _is_open = self.ends.send(end).await;
     }
 
-    /// Ends a goal, unless nobody holds it any more.
+    /// Ends a goal, unless its handle was dropped.
     pub(super) fn end(&self, end: GoalEnd) {
         let GoalEnd {
             id,
@@ -304,7 +308,8 @@ impl Shared {
             Ok(server) => server,
             Err(outcome) => return outcome,
         };
-        // After a restart the old server may still be known, while of the new one not all is: it is the one to ask.
+        // After a restart, the former server may still be known while the new server is only partly
+        // known: the request goes to the new server.
         let asked = self
             .asked
             .result
@@ -326,8 +331,9 @@ impl Shared {
         }
     }
 
-    /// Sends the goal and waits until it is accepted: by the answer, which names an endpoint of the server, or by the
-    /// status of the server, since the answer can be lost. Otherwise returns how the goal ended.
+    /// Sends the goal and waits until it is accepted: by the reply, which names an endpoint of the
+    /// server, or by the status of the server, because the reply can be lost. Otherwise returns the
+    /// outcome of the goal.
     async fn decision(&self, id: GoalId, request: Bytes) -> Result<Option<GUID>, Outcome> {
         let recall = Recall::default();
         let send = &self.asked.send;
@@ -378,7 +384,7 @@ impl Shared {
             Ok(None) => Err(Outcome::Rejected),
             Ok(Some(stamp)) => {
                 let mut state = self.lock();
-                // Unless nobody holds it any more.
+                // Unless the handle of the goal was dropped.
                 if state.tasks.contains_key(&id) {
                     state.servers.insert(id, answer.writer);
                 }
@@ -389,12 +395,12 @@ impl Shared {
         }
     }
 
-    /// Returns when that holds for the goal.
+    /// Returns when the condition holds for the goal.
     async fn until(&self, id: GoalId, holds: impl Fn(&ClientGoals, GoalId) -> bool) {
         let changed = self.lock().goals.changed(id);
         loop {
             let mut rung = pin!(changed.notified());
-            // From here on none is missed.
+            // From here on, no notification is missed.
             let _rung = rung.as_mut().enable();
             if holds(&self.lock().goals, id) {
                 return;
@@ -460,7 +466,7 @@ impl Shared {
     }
 }
 
-/// Returns the limit once it is over; never without one.
+/// Returns the limit once it has elapsed; never returns for `None`.
 async fn after(limit: Option<Duration>) -> Duration {
     match limit {
         Some(limit) => {
@@ -471,7 +477,7 @@ async fn after(limit: Option<Duration>) -> Duration {
     }
 }
 
-/// How long feedback may come behind a result that was sent after it.
+/// How long feedback may arrive after a result that was sent after it.
 const FEEDBACK_GRACE: Duration = Duration::from_millis(10);
-/// How long the answer to a goal may come behind the status that says that the goal is accepted.
+/// How long the reply to a goal may arrive after the status that reports the goal as accepted.
 const ANSWER_AFTER_STATUS: Duration = Duration::from_secs(1);

@@ -1,4 +1,4 @@
-//! The client: sends goals, and hands each what its server says of it.
+//! The action client: sends goals and reports the events of each goal.
 
 use std::sync::{Arc, MutexGuard};
 use std::time::Duration;
@@ -20,10 +20,11 @@ use crate::service::{
     ServiceClient, ServiceClientOptions, ServiceError, ServicePeers, next, policies,
 };
 
-/// Sends goals to the server of an action. Dropping it ends its goals as lost; it does not cancel them. Of withdrawn
-/// goals it logs then that their end is unknown.
+/// Sends goals to the server of an action. Dropping the client ends its goals as lost; it does not
+/// cancel them, and logs for each withdrawn goal that its end is unknown.
 ///
-/// With several servers of one name, all get each goal, as everywhere in ROS 2, and the first answer counts.
+/// If several servers have the same name, each server receives each goal, as with any ROS 2 client,
+/// and the first reply counts.
 #[derive(Debug)]
 pub struct ActionClient {
     shared: Arc<Shared>,
@@ -31,8 +32,8 @@ pub struct ActionClient {
 }
 
 impl ActionClient {
-    /// Makes the action's endpoints; the server need not be there yet, and may come and go. To be called on a tokio
-    /// runtime.
+    /// Creates the endpoints of the action. The server may be absent, and may come and go. Call
+    /// this on a tokio runtime.
     ///
     /// # Errors
     /// [`ActionError::Domain`].
@@ -43,7 +44,8 @@ impl ActionClient {
         options: ActionClientOptions,
     ) -> Result<Self, ActionError> {
         action.announce_shared(domain);
-        // Before what asks for goals: a server that knows the latter knows these too.
+        // These readers come before the clients that send goals: a server that knows the clients
+        // then knows the readers too.
         let feedback_type = action.feedback_type();
         let feedback = domain.open_reader(&action.feedback_topic(), &feedback_type, &policies())?;
         let status = domain.open_reader(&action.status_topic(), STATUS_TYPE, &status_policies())?;
@@ -52,10 +54,11 @@ impl ActionClient {
             let options = ServiceClientOptions { timeout, max_calls };
             ServiceClient::open(domain, peers, &service, options)
         };
-        // A goal takes as long as it takes.
+        // The execution of a goal has no time limit.
         let result = open(action.get_result(), None)?;
         let cancel = open(action.cancel_goal(), Some(options.cancel_timeout))?;
-        // The decision about a goal is awaited until the server has left, since a withdrawn goal is cancelled then.
+        // The client waits for the decision about a goal until the server is lost, because a
+        // withdrawn goal is cancelled after the decision.
         let send = open(action.send_goal(), None)?;
         let (ends, ended) = mpsc::channel(MOST_ENDS);
         let asked = Asked {
@@ -70,18 +73,19 @@ impl ActionClient {
         Ok(Self { shared, task })
     }
 
-    /// Sends a goal, the `X_Goal` as CDR in little endian with its encapsulation header. Never waits: what becomes of it
-    /// is told by the handle. To be called on a tokio runtime.
+    /// Sends a goal, which is the `X_Goal` as little-endian CDR with its encapsulation header.
+    /// Never waits: the handle reports the outcome. Call this on a tokio runtime.
     #[must_use]
     pub fn send_goal(&self, body: &[u8]) -> GoalHandle {
         let id = self.shared.new_id();
         self.send_new(self.shared.lock(), id, body)
     }
 
-    /// As [`send_goal`](Self::send_goal), under an id that was chosen elsewhere. A server rejects one that it knows already.
+    /// Sends a goal as [`send_goal`](Self::send_goal) does, with an id chosen by the caller. A
+    /// server rejects an id that it knows already.
     ///
     /// # Errors
-    /// [`IdInUse`] while somebody holds a goal of that id: nothing is sent.
+    /// [`IdInUse`] while a handle for a goal with this id exists: nothing is sent.
     pub fn send_goal_as(&self, id: GoalId, body: &[u8]) -> Result<GoalHandle, IdInUse> {
         let state = self.shared.lock();
         if state.goals.is_held(id) {
@@ -105,25 +109,27 @@ impl ActionClient {
         GoalHandle::new(Arc::clone(&self.shared), id, wake)
     }
 
-    /// Asks the server to cancel goals, those of other clients too where `what` includes them. The goals tell what
-    /// comes of it. A goal of this client that the server has not decided about is withdrawn, and named in the answer:
-    /// it is not sent, or is cancelled as soon as it is accepted.
+    /// Requests the server to cancel goals, including goals of other clients if `what` selects
+    /// them. The goals report the outcome. A goal of this client that the server has not decided
+    /// about is withdrawn and named in the answer: it is not sent, or it is cancelled as soon as it
+    /// is accepted.
     ///
     /// # Errors
-    /// [`ServiceError`]; a server may have heard the request where [`ServiceError::may_have_run`] says so.
+    /// [`ServiceError`]; a server may have received the request if [`ServiceError::may_have_run`]
+    /// returns true.
     pub async fn cancel(&self, what: CancelWhat) -> Result<CancelAnswer, ServiceError> {
         self.shared.cancel(what).await
     }
 
-    /// Whether there is a server whose every service and topic is known here.
+    /// Checks for a server whose services and topics are all known to this client.
     ///
     /// # Errors
-    /// [`NoServer`] tells what is missing.
+    /// [`NoServer`] names the missing endpoint.
     pub fn server(&self) -> Result<(), NoServer> {
         self.shared.server()
     }
 
-    /// Waits until there is a [`Self::server`]. Cancel-safe.
+    /// Waits until [`Self::server`] succeeds. Cancel-safe.
     ///
     /// # Errors
     /// [`NoServer`] after `limit`.
@@ -131,13 +137,13 @@ impl ActionClient {
         self.shared.wait_for_server(limit).await
     }
 
-    /// The action's ROS name.
+    /// Returns the ROS name of the action.
     #[must_use]
     pub fn name(&self) -> &str {
         self.shared.action.name()
     }
 
-    /// What was received so far and could not be used.
+    /// Returns the counters of unusable samples.
     #[must_use]
     pub fn counters(&self) -> ClientCounters {
         self.shared.lock().goals.counters
@@ -162,15 +168,15 @@ impl Drop for ActionClient {
     }
 }
 
-/// Receives statuses and feedback until aborted. A goal ends here, once what was received before
-/// its result is taken.
+/// Receives statuses and feedback until aborted. Ends each goal after all samples received before
+/// its result are processed.
 async fn listen(
     shared: Arc<Shared>,
     (status, feedback): (Reader, Reader),
     mut ended: mpsc::Receiver<GoalEnd>,
 ) {
     loop {
-        // All are cancel-safe.
+        // All branches are cancel-safe.
         tokio::select! {
             sample = next(&status) => shared.hear_status(sample),
             sample = next(&feedback) => shared.hear_feedback(sample),
@@ -189,7 +195,8 @@ async fn listen(
     }
 }
 
-/// Goals that may wait for their end here; others wait in their tasks.
+/// Capacity of the queue of ended goals; further goals wait in their tasks.
 const MOST_ENDS: usize = 64;
-/// Samples that are taken before a goal ends. A server that keeps sending does not hold up the end.
+/// Maximum number of samples that are processed before a goal ends, so that a server that keeps
+/// sending does not delay the end.
 const MOST_OVERTAKEN: usize = 10_000;

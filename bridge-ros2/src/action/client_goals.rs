@@ -1,6 +1,7 @@
-//! The client's side of goals: what became of each, and what of it waits to be told.
+//! The client's state of its goals: the status of each goal and its waiting events.
 //!
-//! No clock and no network: answers, statuses, feedback and results come in, events come out.
+//! The module uses no clock and no network: replies, statuses, feedback and results come in, events
+//! come out.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
@@ -15,54 +16,58 @@ use super::types::{CancelCode, GoalId, Status};
 use super::withdrawal::Withdrawal;
 use crate::clock::RosTime;
 
-/// What happens to a goal that was sent, in the order in which it is told.
+/// An event of a sent goal, in the order of delivery.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum GoalEvent {
-    /// A server has taken it, then, by the clock of the server. The first event, unless the goal ends before.
+    /// A server accepted the goal at this time of the server's clock. The first event, unless the
+    /// goal ends before.
     Accepted(RosTime),
-    /// It is [`Status::Executing`] or [`Status::Canceling`] now. A state that did not last may not be told of.
+    /// The goal changed to [`Status::Executing`] or [`Status::Canceling`]. A short state may be
+    /// skipped.
     Status(Status),
-    /// The server reports progress: the `X_Feedback`, CDR with its encapsulation header, in the server's byte order.
+    /// Feedback of the server: the `X_Feedback`, CDR with its encapsulation header, in the server's
+    /// byte order.
     Feedback(Bytes),
-    /// So many reports of progress gave way to newer ones since the last event.
+    /// The number of feedback messages dropped for newer feedback after the last event.
     FeedbackDropped(u64),
-    /// The server has not decided within that time. The goal is withdrawn: it is cancelled as soon as it is accepted.
-    /// May come before [`Accepted`](Self::Accepted).
+    /// The server did not decide within this time. The goal is withdrawn: it is cancelled as soon
+    /// as it is accepted. May come before [`Accepted`](Self::Accepted).
     Overdue(Duration),
-    /// The goal was withdrawn, the server has accepted it, and refuses to cancel it.
+    /// The goal was withdrawn, and the server accepted it and refuses to cancel it.
     CancelRefused,
-    /// The last event.
+    /// The goal ended. The last event.
     Ended(Outcome),
 }
 
-/// How a goal ended.
+/// The outcome of a goal.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Outcome {
-    /// The server did not take it.
+    /// The server rejected the goal.
     Rejected,
-    /// The server has ended it.
+    /// The server ended the goal.
     Done {
         /// Succeeded, canceled or aborted.
         status: Status,
-        /// The `X_GetResult_Response`: CDR with its encapsulation header, in the server's byte order, status first.
+        /// The `X_GetResult_Response`: CDR with its encapsulation header, in the server's byte
+        /// order, status first.
         result: Bytes,
     },
-    /// Nothing more will be heard of it.
+    /// The client receives nothing more about the goal.
     Lost(LostReason),
 }
 
-/// What a client has received and could not use.
+/// Counters of samples that a client could not use.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ClientCounters {
-    /// Feedback and statuses that do not read.
+    /// Feedback and statuses that could not be decoded.
     pub malformed: u64,
-    /// Feedback for goals that are not of this client, or have ended.
+    /// Feedback for goals of other clients, or for ended goals.
     pub others_feedback: u64,
-    /// Reports of progress that gave way to newer ones because nobody asked for them.
+    /// Feedback messages dropped for newer feedback because they were not received in time.
     pub feedback_dropped: u64,
 }
 
-/// How much of each goal may wait.
+/// The limits of the client: open goals, and waiting feedback per goal.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Limits {
     pub(super) goals: usize,
@@ -70,7 +75,7 @@ pub(super) struct Limits {
     pub(super) feedback_bytes: usize,
 }
 
-/// The goals somebody holds.
+/// The goals that have a handle or are withdrawn.
 #[derive(Debug)]
 pub(super) struct ClientGoals {
     goals: BTreeMap<GoalId, Goal>,
@@ -83,22 +88,22 @@ struct Goal {
     answer: Answer,
     status: Status,
     events: VecDeque<GoalEvent>,
-    /// Of the feedback in `events`.
+    /// The number of feedback messages in `events`.
     messages: usize,
     bytes: usize,
     dropped: u64,
     outcome: Option<Outcome>,
     wake: Arc<Notify>,
-    /// Tells the task of the goal that it is accepted or withdrawn.
+    /// Notifies the goal's task that the goal is accepted or withdrawn.
     changed: Arc<Notify>,
     withdrawal: Option<Withdrawal>,
-    /// The time the server had, until that is told.
+    /// The time limit that the server exceeded, until it is reported.
     overdue: Option<Duration>,
-    /// Nobody holds the goal: it is kept for its withdrawal.
+    /// The handle was dropped: the goal is kept for its withdrawal.
     is_left: bool,
 }
 
-/// Whether the server has answered. What it says before is kept, and told after the answer.
+/// Whether the server has replied. Earlier events are kept and delivered after the reply.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Answer {
     Awaited,
@@ -114,7 +119,7 @@ impl ClientGoals {
         }
     }
 
-    /// A goal is about to be sent. `wake` is rung for each event.
+    /// Adds a goal that is about to be sent. `wake` is notified for each event.
     pub(super) fn sent(&mut self, id: GoalId, wake: Arc<Notify>) {
         let open = self.goals.values().filter(|goal| goal.outcome.is_none());
         let full = open.count() >= self.limits.goals;
@@ -139,12 +144,12 @@ impl ClientGoals {
         }
     }
 
-    /// Whether somebody holds a goal of that id, be it ended.
+    /// Returns whether a goal with this id has a handle, even if the goal has ended.
     pub(super) fn is_held(&self, id: GoalId) -> bool {
         self.goals.contains_key(&id)
     }
 
-    /// A server has accepted the goal.
+    /// Records that a server accepted the goal.
     pub(super) fn accepted(&mut self, id: GoalId, stamp: RosTime, now: Instant) {
         if let Some(goal) = self.open(id)
             && goal.answer == Answer::Awaited
@@ -162,8 +167,9 @@ impl ClientGoals {
         }
     }
 
-    /// The server's list says so. It may be older than what is known, as other topics overtake it. A goal in the list
-    /// is accepted, even if the answer that says so is lost.
+    /// Records a status from the server's list. The list may be older than the known status,
+    /// because samples of other topics can overtake it. A goal in the list is accepted, even if the
+    /// reply to it is lost.
     pub(super) fn status(&mut self, id: GoalId, (status, stamp): (Status, RosTime), now: Instant) {
         if status != Status::Unknown {
             self.accepted(id, stamp, now);
@@ -180,7 +186,7 @@ impl ClientGoals {
         }
     }
 
-    /// The server reports progress.
+    /// Records feedback of the server.
     pub(super) fn feedback(&mut self, id: GoalId, body: Bytes) {
         let Limits {
             feedback_messages,
@@ -205,8 +211,8 @@ impl ClientGoals {
         self.counters.feedback_dropped += dropped;
     }
 
-    /// Has the goal cancelled as soon as it is accepted, or not sent. Returns false if the server has decided about the
-    /// goal, or nobody holds such a goal here.
+    /// Withdraws the goal, so that it is not sent, or is cancelled as soon as it is accepted.
+    /// Returns false if the server has decided about the goal, or the goal is unknown.
     pub(super) fn withdraw(&mut self, id: GoalId, now: Instant) -> bool {
         let goal = self.open(id);
         let Some(goal) = goal.filter(|goal| goal.answer == Answer::Awaited) else {
@@ -217,7 +223,7 @@ impl ClientGoals {
         true
     }
 
-    /// The goals that no server has decided about.
+    /// Returns the goals that no server has decided about.
     pub(super) fn undecided(&self) -> Vec<GoalId> {
         let open = self
             .goals
@@ -226,7 +232,7 @@ impl ClientGoals {
         open.map(|(id, _)| *id).collect()
     }
 
-    /// The server has not decided within `limit`: the goal is withdrawn.
+    /// Withdraws a goal for which the server did not decide within `limit`.
     pub(super) fn overdue(&mut self, id: GoalId, limit: Duration, now: Instant) {
         if self.withdraw(id, now)
             && let Some(goal) = self.open(id)
@@ -236,37 +242,37 @@ impl ClientGoals {
         }
     }
 
-    /// Whether the goal is to be cancelled once it is accepted.
+    /// Returns whether the goal is to be cancelled once it is accepted.
     pub(super) fn is_withdrawn(&self, id: GoalId) -> bool {
         self.goals
             .get(&id)
             .is_some_and(|goal| goal.withdrawal.is_some())
     }
 
-    /// Whether a server has accepted the goal.
+    /// Returns whether a server has accepted the goal.
     pub(super) fn is_accepted(&self, id: GoalId) -> bool {
         let goal = self.goals.get(&id);
         goal.is_some_and(|goal| goal.answer == Answer::Had)
     }
 
-    /// What rings when a goal is accepted or withdrawn.
+    /// Returns the notification for the acceptance or withdrawal of the goal.
     pub(super) fn changed(&self, id: GoalId) -> Arc<Notify> {
         let goal = self.goals.get(&id);
         goal.map(|goal| Arc::clone(&goal.changed))
             .unwrap_or_default()
     }
 
-    /// The withdrawal of a goal that has not ended.
+    /// Returns the withdrawal of a goal that has not ended.
     pub(super) fn withdrawal(&mut self, id: GoalId) -> Option<&mut Withdrawal> {
         self.open(id)?.withdrawal.as_mut()
     }
 
-    /// When the next request to cancel a withdrawn goal is due.
+    /// Returns the time of the next cancel request for a withdrawn goal.
     pub(super) fn cancel_due(&self, id: GoalId) -> Option<Instant> {
         self.goals.get(&id)?.withdrawal.as_ref()?.due()
     }
 
-    /// What the server has answered to a request to cancel a withdrawn goal.
+    /// Records the server's response to a cancel request for a withdrawn goal.
     pub(super) fn cancel_answered(&mut self, id: GoalId, answer: Option<CancelCode>, now: Instant) {
         let Some(goal) = self.open(id) else {
             return;
@@ -277,7 +283,7 @@ impl ClientGoals {
         }
     }
 
-    /// The withdrawn goals that have not ended, and for how long.
+    /// Returns the withdrawn goals that have not ended, and the age of each withdrawal.
     pub(super) fn pending(&self, now: Instant) -> Vec<(GoalId, Duration)> {
         let open = self.goals.iter().filter(|(_, goal)| goal.outcome.is_none());
         let withdrawn =
@@ -285,7 +291,7 @@ impl ClientGoals {
         withdrawn.collect()
     }
 
-    /// The goal has ended. Returns true if nobody holds it, and it is forgotten.
+    /// Ends a goal. Returns true if its handle was dropped, so that the goal is removed.
     pub(super) fn end(&mut self, id: GoalId, outcome: Outcome) -> bool {
         let Some(goal) = self.open(id) else {
             return false;
@@ -313,7 +319,7 @@ impl ClientGoals {
         }
     }
 
-    /// The next event of a goal.
+    /// Returns the next event of a goal.
     pub(super) fn next_event(&mut self, id: GoalId) -> Option<GoalEvent> {
         let goal = self.goals.get_mut(&id)?;
         if let Some(limit) = goal.overdue.take() {
@@ -322,7 +328,7 @@ impl ClientGoals {
         if goal.answer == Answer::Awaited {
             return None;
         }
-        // What was dropped was older than what waits, but for the acceptance.
+        // Dropped feedback is older than the waiting events, except for the acceptance.
         if goal.dropped > 0 && !matches!(goal.events.front(), Some(GoalEvent::Accepted(_))) {
             return Some(GoalEvent::FeedbackDropped(std::mem::take(
                 &mut goal.dropped,
@@ -336,19 +342,20 @@ impl ClientGoals {
         Some(event)
     }
 
-    /// What is known of a goal: unknown until it was answered.
+    /// Returns the known status of a goal: unknown before the server's reply.
     pub(super) fn known_status(&self, id: GoalId) -> Status {
         let goal = self.goals.get(&id);
         let goal = goal.filter(|goal| goal.answer == Answer::Had);
         goal.map_or(Status::Unknown, |goal| goal.status)
     }
 
-    /// How a goal ended.
+    /// Returns the outcome of an ended goal.
     pub(super) fn outcome(&self, id: GoalId) -> Option<&Outcome> {
         self.goals.get(&id)?.outcome.as_ref()
     }
 
-    /// Nobody holds the goal any more. Returns false if it is withdrawn and has not ended: it is kept until then.
+    /// Records that the handle was dropped. Returns false if the goal is withdrawn and has not
+    /// ended: it is kept until its end.
     pub(super) fn forget(&mut self, id: GoalId) -> bool {
         if let Some(goal) = self.open(id)
             && goal.withdrawal.is_some()
@@ -391,7 +398,7 @@ impl Goal {
     }
 }
 
-/// Which status is the later one; the ends are each other's equal.
+/// Returns the order of a status; all terminal states are equal.
 const fn rank(status: Status) -> u8 {
     match status {
         Status::Unknown => 0,

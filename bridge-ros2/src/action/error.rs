@@ -1,4 +1,4 @@
-//! What can go wrong with an action, on either side.
+//! Errors of action clients and action servers.
 
 use thiserror::Error;
 
@@ -6,65 +6,67 @@ use super::types::GoalId;
 use crate::domain::DomainError;
 use crate::service::ServiceError;
 
-/// Why a server or client cannot be opened.
+/// The reason for which a server or client cannot be opened.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ActionError {
-    /// An endpoint could not be made.
+    /// An endpoint could not be created.
     #[error(transparent)]
     Domain(#[from] DomainError),
-    /// The empty result of a server's options cannot be one.
+    /// The empty result in a server's options is invalid.
     #[error("the empty result of the action {0} is not CDR in little endian with a status in it")]
     EmptyResult(String),
 }
 
-/// A goal was not sent, because its client holds one of the same id.
+/// A goal was not sent, because its client has a goal with the same id.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Error)]
 #[error("the client has a goal {0} already")]
 pub struct IdInUse(pub GoalId);
 
-/// No server is ready to take goals.
+/// No server is ready to receive goals.
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
 #[error("no server of the action {action}: {missing}")]
 pub struct NoServer {
-    /// The action's ROS name.
+    /// The ROS name of the action.
     pub action: String,
-    /// What is not there, or not yet.
+    /// The missing endpoint.
     pub missing: String,
 }
 
-/// Why nothing more will be heard of a goal. A goal that was accepted may still run.
+/// The reason for which the client receives nothing more about a goal. An accepted goal may still
+/// run.
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
 #[non_exhaustive]
 pub enum LostReason {
-    /// There was no server to send it to. It was not sent.
+    /// No server was present. The goal was not sent.
     #[error(transparent)]
     NoServer(#[from] NoServer),
-    /// The client has as many goals as its options allow. It was not sent.
+    /// The client has reached its limit of goals. The goal was not sent.
     #[error("{0} goals of the action are open already")]
     Busy(usize),
-    /// It was withdrawn before it was sent.
+    /// The goal was withdrawn before it was sent.
     #[error("the goal was withdrawn before it was sent")]
     Withdrawn,
-    /// The message is not CDR in little endian with its encapsulation header. It was not sent.
+    /// The message is not little-endian CDR with its encapsulation header. The goal was not sent.
     #[error("the goal is not CDR in little endian")]
     Message,
-    /// No answer to the goal came; [`ServiceError::may_have_run`] tells whether a server may have accepted it.
+    /// The server did not reply to the goal; [`ServiceError::may_have_run`] returns whether a
+    /// server may have accepted it.
     #[error("the goal was not answered: {0}")]
     Unanswered(ServiceError),
-    /// It was accepted, and its server has left since: it died, was restarted, or is out of reach.
+    /// The goal was accepted, and its server was lost: it died, restarted, or is unreachable.
     #[error("the server has left: {0}")]
     ServerLost(ServiceError),
-    /// It was accepted, and all of that action's servers have been away for too long.
+    /// The goal was accepted, and all servers of the action have been absent for too long.
     #[error("the server of {action} has left")]
     ServerGone {
-        /// The action's ROS name.
+        /// The ROS name of the action.
         action: String,
     },
-    /// The server does not know the goal any more: it was restarted, or did not keep the result for long enough.
+    /// The server no longer knows the goal: it restarted, or the time limit of the result expired.
     #[error("the server does not know the goal")]
     Unknown,
-    /// The server's answer does not read.
+    /// The server's reply could not be decoded.
     #[error("the server's {0} does not read")]
     Malformed(&'static str),
     /// The client was dropped.
@@ -73,7 +75,8 @@ pub enum LostReason {
 }
 
 impl LostReason {
-    /// Whether a server may have accepted the goal, or has. When this is false, none has had it.
+    /// Returns whether a server has accepted the goal or may have. If false, no server has received
+    /// it.
     #[must_use]
     pub const fn may_run(&self) -> bool {
         match self {

@@ -1,4 +1,4 @@
-//! The writer of an action's feedback, which never waits and goes to whoever listens.
+//! The writer of an action's feedback, which never waits and sends to all matched readers.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::time::Duration;
@@ -11,16 +11,16 @@ use crate::graph::Endpoint;
 use crate::raw::{Payload, Writer};
 use crate::service::{Audience, Opening};
 
-/// Feedback waits here while the send window is full, a client of a goal is yet to be matched, or a new reader could
-/// miss it ([`Opening`]).
+/// Writes feedback. Feedback waits here while the send window is full, a client of a goal is not
+/// matched yet, or a new reader could miss it ([`Opening`]).
 pub(super) struct FeedbackWriter {
     writer: Writer,
     audience: Audience,
     expected: Expected,
     opening: Opening,
-    /// Oldest first.
+    /// The waiting feedback, oldest first.
     waiting: VecDeque<Payload>,
-    /// Bytes of what waits.
+    /// The size of the waiting feedback in bytes.
     bytes: usize,
 }
 
@@ -40,18 +40,20 @@ impl FeedbackWriter {
         !self.waiting.is_empty()
     }
 
-    /// Takes note of the readers there are by now.
+    /// Updates the known readers.
     pub(super) fn meet(&mut self, readers: &[Endpoint], now: Instant) {
         self.audience
             .meet(readers.iter().map(|reader| reader.guid), now);
     }
 
-    /// A client whose goal is accepted hears its feedback from the first on, if its participant has a reader for it.
+    /// Expects a reader of the client whose goal is accepted, so that the client receives all
+    /// feedback if its participant has such a reader.
     pub(super) fn expect(&mut self, client: GUID, now: Instant) {
         self.expected.add(client, now);
     }
 
-    /// Writes a sample, or queues it. Returns how many older ones were dropped to make room.
+    /// Writes a sample, or queues it. Returns the number of older samples that were dropped to make
+    /// room.
     pub(super) fn offer(&mut self, sample: Payload, now: Instant) -> u64 {
         self.bytes += sample.len();
         self.waiting.push_back(sample);
@@ -64,7 +66,8 @@ impl FeedbackWriter {
         lost + dropped
     }
 
-    /// Sends what waits, as far as there is room. Returns how many were lost because RustDDS failed.
+    /// Sends the waiting samples as the send window allows. Returns the number of samples lost
+    /// because RustDDS failed.
     pub(super) fn flush(&mut self, now: Instant) -> u64 {
         let mut lost = 0;
         while !self.waiting.is_empty() && self.is_heard(now) {
@@ -87,7 +90,7 @@ impl FeedbackWriter {
         lost
     }
 
-    /// Whether those who are to hear what is written now do.
+    /// Returns whether the expected readers receive samples written at `now`.
     fn is_heard(&mut self, now: Instant) -> bool {
         self.audience.listen(&self.writer, now);
         let hears = |client| self.audience.hears_one_of(client, now);
@@ -101,12 +104,12 @@ impl FeedbackWriter {
     }
 }
 
-/// Clients whose participant is yet to have a reader that hears.
+/// Clients whose participant has no reachable reader yet.
 #[derive(Debug, Default)]
 struct Expected {
-    /// And until when that is waited for.
+    /// The clients with the end of their wait.
     clients: BTreeMap<GUID, Instant>,
-    /// Since when feedback waits for any of them.
+    /// The time at which feedback began to wait for a client.
     held: Option<Instant>,
 }
 
@@ -116,7 +119,8 @@ impl Expected {
         self.clients.entry(client).or_insert(now + PATIENCE);
     }
 
-    /// Whether none is waited for. Others that come do not prolong it: clients need not have a reader.
+    /// Returns whether no client is waited for. Further clients do not prolong the wait: a client
+    /// need not have a reader.
     fn are_there(&mut self, hears: impl Fn(GUID) -> bool, now: Instant) -> bool {
         self.clients
             .retain(|client, until| now < *until && !hears(*client));
@@ -141,9 +145,9 @@ impl std::fmt::Debug for FeedbackWriter {
     }
 }
 
-/// How long a client of a goal may be without a reader of feedback; nobody has to have one.
+/// How long feedback waits for the reader of a goal's client; the reader is optional.
 const PATIENCE: Duration = Duration::from_millis(250);
-/// What may wait, beside the send window of RustDDS.
+/// Capacity of the queue in front of the send window of RustDDS, in samples and bytes.
 const ROOM: usize = 512;
 const ROOM_BYTES: usize = 16 * 1024 * 1024;
 

@@ -1,4 +1,4 @@
-//! A goal as its client holds it.
+//! The client's handle of a goal.
 
 use std::sync::Arc;
 
@@ -10,8 +10,8 @@ use super::error::LostReason;
 use super::types::{CancelAnswer, CancelWhat, GoalId, Status};
 use crate::service::ServiceError;
 
-/// A goal that was sent. Dropping it ends the interest in the goal; it does not cancel it. A goal that was cancelled
-/// before the server decided about it is cancelled on acceptance all the same.
+/// The handle of a sent goal. Dropping it does not cancel the goal. A goal that was cancelled
+/// before the server decided about it is still cancelled on acceptance.
 #[derive(Debug)]
 pub struct GoalHandle {
     shared: Arc<Shared>,
@@ -24,19 +24,19 @@ impl GoalHandle {
         Self { shared, id, wake }
     }
 
-    /// The goal's id.
+    /// Returns the id of the goal.
     #[must_use]
     pub const fn id(&self) -> GoalId {
         self.id
     }
 
-    /// What the server has said last of how far the goal is; unknown until it was answered.
+    /// Returns the last status that the server reported; unknown before its reply.
     #[must_use]
     pub fn status(&self) -> Status {
         self.shared.lock().goals.known_status(self.id)
     }
 
-    /// The next event, in order; `None` after the one that ends the goal. Cancel-safe.
+    /// Returns the next event, in order; `None` after the goal's last event. Cancel-safe.
     pub async fn recv(&mut self) -> Option<GoalEvent> {
         loop {
             let rung = self.wake.notified();
@@ -54,21 +54,24 @@ impl GoalHandle {
         }
     }
 
-    /// Waits for the end of the goal, passing over what else happens to it. May be asked again. Cancel-safe.
+    /// Waits for the end of the goal and discards its other events. May be called again.
+    /// Cancel-safe.
     pub async fn outcome(&mut self) -> Outcome {
         while self.recv().await.is_some() {}
         let state = self.shared.lock();
         let outcome = state.goals.outcome(self.id).cloned();
-        // It is known as long as this handle is.
+        // The outcome is kept as long as this handle.
         outcome.unwrap_or(Outcome::Lost(LostReason::ClientClosed))
     }
 
-    /// Asks the server to cancel the goal, and returns what it says to that. The goal goes on until the server ends it,
-    /// be it as succeeded. While the server has not decided about the goal, the answer is that it is being cancelled:
-    /// the request goes to the server as soon as it accepts the goal.
+    /// Requests the server to cancel the goal, and returns its response. The goal continues until
+    /// the server ends it, possibly as succeeded. If the server has not decided about the goal yet,
+    /// the answer reports it as being cancelled: the request is sent as soon as the server accepts
+    /// the goal.
     ///
     /// # Errors
-    /// [`ServiceError`]; the server may have heard the request where [`ServiceError::may_have_run`] says so.
+    /// [`ServiceError`]; the server may have received the request if [`ServiceError::may_have_run`]
+    /// returns true.
     pub async fn cancel(&self) -> Result<CancelAnswer, ServiceError> {
         self.shared.cancel(CancelWhat::Goal(self.id)).await
     }

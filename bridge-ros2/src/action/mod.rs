@@ -1,13 +1,14 @@
-//! Actions: goals that take their time, with feedback and cancelling, of any type, with peers of any vendor.
+//! Actions: long-running goals with feedback and cancellation, of any type, with peers of any
+//! vendor.
 //!
-//! An action `/name` is three services and two topics below `/name/_action` (design.ros2.org, "Actions"): `send_goal`,
-//! `cancel_goal`, `get_result`, `feedback` and `status`. The states of a goal, and what an answer says in which case,
-//! are those of rcl_action.
+//! An action `/name` consists of three services and two topics below `/name/_action`
+//! (design.ros2.org, "Actions"): `send_goal`, `cancel_goal`, `get_result`, `feedback` and `status`.
+//! The states of a goal and the response codes follow rcl_action.
 //!
-//! All messages are CDR with their encapsulation header. Goals and feedback are those of the `.action` file, `X_Goal`
-//! and `X_Feedback`. Results travel as `X_GetResult_Response`, which is an Int8 status in front of the fields of
-//! `X_Result`: what comes behind one byte is aligned otherwise than by itself, so that only who knows the type can take
-//! it apart.
+//! All messages are CDR with their encapsulation header. Goals and feedback are the messages of the
+//! `.action` file, `X_Goal` and `X_Feedback`. Results are sent as `X_GetResult_Response`, which is
+//! an Int8 status in front of the fields of `X_Result`. The status byte changes the alignment of
+//! the fields, so only a reader that knows the type can split the message.
 
 mod asking;
 mod client;
@@ -49,7 +50,8 @@ pub struct Action {
 }
 
 impl Action {
-    /// The action of that ROS name, `/arm/move`, of the type of an `.action` file.
+    /// Returns the action with the ROS name, such as `/arm/move`, and the type of an `.action`
+    /// file.
     #[must_use]
     pub fn new(name: &str, action_type: &TypeName) -> Self {
         Self {
@@ -58,20 +60,20 @@ impl Action {
         }
     }
 
-    /// The ROS name.
+    /// Returns the ROS name.
     #[must_use]
     pub fn name(&self) -> &str {
         &self.name
     }
 
-    /// Has the domain announce the hashes of the types, for servers and clients that are opened from now on.
+    /// Sets the type hashes that the domain announces with servers and clients opened later.
     pub fn announce(&self, domain: &Domain, hashes: &ActionTypeHashes) {
         self.send_goal().announce(domain, &hashes.send_goal);
         self.get_result().announce(domain, &hashes.get_result);
         domain.learn_type_hash(&self.feedback_type(), hashes.feedback_message.to_string());
     }
 
-    /// The same for the types that all actions share, which are known here.
+    /// Sets the type hashes of the types that all actions share, which are built in.
     fn announce_shared(&self, domain: &Domain) {
         let bundle = Registry::bundle(Dialect::Ros2);
         let action_msgs = |name| TypeName::new("action_msgs", name);
@@ -144,7 +146,8 @@ impl Action {
     }
 }
 
-/// What a reader of the status asks for (`rcl_action_qos_profile_status_default`): the last one, whenever it comes.
+/// Returns the policies of a status reader (`rcl_action_qos_profile_status_default`): it receives
+/// the last status, however late it is created.
 fn status_policies() -> QosPolicies {
     QosPolicyBuilder::new()
         .reliable(rustdds::Duration::ZERO)
@@ -161,7 +164,7 @@ fn status_policies() -> QosPolicies {
 }
 
 const STATUS_TYPE: &str = "action_msgs::msg::dds_::GoalStatusArray_";
-/// A status says all of all goals, but what comes between two may be worth an event.
+/// A status covers all goals, but the statuses in between may cause events.
 const STATUS_DEPTH: i32 = 16;
 
 #[cfg(test)]

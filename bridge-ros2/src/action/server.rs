@@ -1,4 +1,5 @@
-//! The server: takes goals and requests to cancel, and tells clients what becomes of them.
+//! The action server: receives goals and cancel requests, and reports the progress of goals to
+//! clients.
 
 use std::sync::Arc;
 
@@ -13,17 +14,17 @@ use super::{Action, wire};
 use crate::domain::Domain;
 use crate::service::{ServicePeers, ServiceServer};
 
-/// What clients want of a server.
+/// A request of a client to an action server.
 #[derive(Debug)]
 pub enum ServerEvent {
     /// A new goal, to be accepted or rejected.
     Goal(NewGoal),
-    /// A goal should be cancelled, which is to be agreed to or not.
+    /// A request to cancel a goal, to be accepted or rejected.
     Cancel(CancelRequest),
 }
 
-/// Takes the goals of an action. Dropping it withdraws the action: its goals are forgotten, and clients that wait for
-/// results find that their server has left.
+/// Receives the goals of an action. Dropping the server withdraws the action: its goals are
+/// dropped, and clients that wait for results detect the loss of their server.
 #[derive(Debug)]
 pub struct ActionServer {
     shared: Arc<Shared>,
@@ -32,7 +33,7 @@ pub struct ActionServer {
 }
 
 impl ActionServer {
-    /// Makes the action's endpoints and serves. To be called on a tokio runtime.
+    /// Creates the endpoints of the action and serves it. Call this on a tokio runtime.
     ///
     /// # Errors
     /// [`ActionError`].
@@ -56,7 +57,8 @@ impl ActionServer {
         })
     }
 
-    /// The next event. Cancel-safe. As many wait as there may be goals, and as many requests to cancel.
+    /// Returns the next event. Cancel-safe. The queue holds up to the maximum number of goals, and
+    /// as many cancel requests.
     pub async fn recv(&mut self) -> ServerEvent {
         loop {
             if let Some(event) = self.try_recv() {
@@ -66,7 +68,7 @@ impl ActionServer {
         }
     }
 
-    /// The next event if there is one.
+    /// Returns the next event if one is waiting.
     pub fn try_recv(&mut self) -> Option<ServerEvent> {
         let arrived = self.shared.lock().arrived.pop_front()?;
         let shared = Arc::clone(&self.shared);
@@ -82,13 +84,13 @@ impl ActionServer {
         })
     }
 
-    /// The action's ROS name.
+    /// Returns the ROS name of the action.
     #[must_use]
     pub fn name(&self) -> &str {
         self.shared.action_name()
     }
 
-    /// What could not be used so far, or was lost.
+    /// Returns the counters of unusable requests and lost messages.
     #[must_use]
     pub fn counters(&self) -> ServerCounters {
         self.shared.lock().goals.counters

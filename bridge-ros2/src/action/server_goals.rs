@@ -1,7 +1,8 @@
-//! The server's side of goals: which it knows, what may follow on what, and whom a result is owed.
+//! The server's state of its goals: the known goals, their transitions, and the clients that wait
+//! for results.
 //!
-//! No clock and no network: decisions and time come in, what is to be sent comes out. The states are those of
-//! `rcl_action_transition_goal_state`, and what a request to cancel means those of
+//! The module uses no clock and no network: decisions and times come in, messages to send come out.
+//! The states follow `rcl_action_transition_goal_state`, and the meaning of cancel requests follows
 //! `rcl_action_process_cancel_request`.
 
 use std::collections::{BTreeMap, VecDeque};
@@ -14,7 +15,7 @@ use tokio::time::Instant;
 use super::types::{CancelCode, CancelWhat, GoalId, GoalInfo, Status};
 use crate::clock::RosTime;
 
-/// How a goal ends.
+/// The end of a goal.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum End {
     Succeed,
@@ -22,25 +23,25 @@ pub(super) enum End {
     Cancel,
 }
 
-/// Why a goal did not take a decision.
+/// The reason for which a decision about a goal was refused.
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
 #[non_exhaustive]
 pub enum GoalError {
-    /// It cannot follow on the goal's status.
+    /// The goal's status does not allow the transition.
     #[error("the goal {goal} is {from:?}: it cannot be {wanted}")]
     NotFrom {
-        /// The goal.
+        /// The id of the goal.
         goal: GoalId,
-        /// Its status, which stays.
+        /// The status of the goal, which stays.
         from: Status,
-        /// What was asked for.
+        /// The requested state.
         wanted: &'static str,
     },
-    /// It is not known any more: it has ended and its time is over, or the client that asked to cancel it waits no
-    /// longer.
+    /// The goal is no longer known: it has ended and its result has expired, or the client of the
+    /// cancel request no longer waits.
     #[error("the goal {0} is forgotten")]
     Forgotten(GoalId),
-    /// The message is not CDR in little endian with its encapsulation header.
+    /// The message is not little-endian CDR with its encapsulation header.
     #[error("the message for the goal {0} is not CDR in little endian")]
     Message(GoalId),
     /// The server was dropped.
@@ -48,58 +49,59 @@ pub enum GoalError {
     Closed,
 }
 
-/// What a server has received and could not use, or lost.
+/// Counters of requests that a server could not use, and of lost messages.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ServerCounters {
-    /// Requests that do not read. Their clients get no answer, as there is none that says so.
+    /// Requests that could not be decoded. Their clients get no reply, because no reply expresses
+    /// this fault.
     pub malformed: u64,
-    /// Goals rejected, and requests to cancel a goal, because too many are open.
+    /// Goals and cancel requests rejected because too many are open.
     pub refused: u64,
-    /// Goals rejected because there is one of the same id.
+    /// Goals rejected because a goal with the same id exists.
     pub repeated: u64,
-    /// Ended goals that were forgotten early to make room.
+    /// Ended goals that were removed early to make room.
     pub forgotten: u64,
-    /// Requests for a result that get no answer because too many wait for that of the same goal.
+    /// Requests for a result that get no reply because too many requests wait for the same goal.
     pub displaced: u64,
-    /// Reports of progress that were dropped because readers did not keep up.
+    /// Feedback messages dropped because readers did not keep up.
     pub feedback_dropped: u64,
 }
 
-/// Names a goal, and tells it from a later one of the same id.
+/// Identifies a goal and distinguishes it from a later goal with the same id.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Ticket {
     pub(super) id: GoalId,
     key: u64,
 }
 
-/// What becomes of a goal that arrives.
+/// The decision about a new goal.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Arrival {
-    /// It is the user's to decide.
+    /// The user has to accept or reject the goal.
     New(Ticket),
-    /// There is one of that id.
+    /// A goal with this id exists.
     Known,
-    /// There is no room for it.
+    /// The server has no room for the goal.
     Full,
 }
 
-/// What becomes of a request for a result.
+/// The result of a request for a goal's result.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) enum Asked<W> {
     /// The goal is unknown.
     Unknown,
-    /// It has ended with this.
+    /// The goal has ended with this result.
     Ended(Bytes),
-    /// It waits for the end; this one gave way to it.
+    /// The request waits for the end of the goal; it displaced the request in this field.
     Waits(Option<W>),
 }
 
-/// All goals, with those who wait for their results, each a `W`.
+/// All goals, with the requests that wait for their results, each a `W`.
 #[derive(Debug)]
 pub(super) struct ServerGoals<W> {
     goals: BTreeMap<GoalId, Goal<W>>,
     most: usize,
-    /// `None` keeps results until there is no room.
+    /// `None` keeps results until room is needed.
     result_timeout: Option<Duration>,
     next_key: u64,
     pub(super) counters: ServerCounters,
@@ -107,7 +109,7 @@ pub(super) struct ServerGoals<W> {
 
 #[derive(Debug)]
 struct Goal<W> {
-    /// In the order of arrival.
+    /// Increases in the order of arrival.
     key: u64,
     stamp: RosTime,
     phase: Phase<W>,
@@ -115,7 +117,7 @@ struct Goal<W> {
 
 #[derive(Debug)]
 enum Phase<W> {
-    /// Neither accepted nor rejected. To clients it is unknown.
+    /// Neither accepted nor rejected. Clients see the goal as unknown.
     Offered,
     Open {
         status: Status,
@@ -129,7 +131,7 @@ enum Phase<W> {
 }
 
 impl<W> ServerGoals<W> {
-    /// Knows at most `most` goals, ended ones for as long as `result_timeout`.
+    /// Returns a registry for at most `most` goals, which keeps ended goals for `result_timeout`.
     pub(super) fn new(most: usize, result_timeout: Option<Duration>) -> Self {
         Self {
             goals: BTreeMap::new(),
@@ -140,7 +142,7 @@ impl<W> ServerGoals<W> {
         }
     }
 
-    /// A goal arrives.
+    /// Registers a new goal.
     pub(super) fn arrive(&mut self, id: GoalId) -> Arrival {
         if self.goals.contains_key(&id) {
             self.counters.repeated += 1;
@@ -161,7 +163,7 @@ impl<W> ServerGoals<W> {
         Arrival::New(Ticket { id, key })
     }
 
-    /// Accepts a goal that was offered.
+    /// Accepts an offered goal.
     pub(super) fn accept(&mut self, ticket: Ticket, stamp: RosTime) -> Result<(), GoalError> {
         let goal = self.goal(ticket)?;
         if !matches!(goal.phase, Phase::Offered) {
@@ -175,7 +177,7 @@ impl<W> ServerGoals<W> {
         Ok(())
     }
 
-    /// Forgets a goal that was offered; one that was accepted stays.
+    /// Removes an offered goal; an accepted goal stays.
     pub(super) fn reject(&mut self, ticket: Ticket) {
         let offered = |goal: &mut Goal<W>| matches!(goal.phase, Phase::Offered);
         if self.goal(ticket).is_ok_and(offered) {
@@ -183,14 +185,14 @@ impl<W> ServerGoals<W> {
         }
     }
 
-    /// Begins work on an accepted goal.
+    /// Starts work on an accepted goal.
     pub(super) fn execute(&mut self, ticket: Ticket) -> Result<(), GoalError> {
         self.step(ticket, Status::Executing, "executed", |from| {
             matches!(from, Status::Accepted)
         })
     }
 
-    /// Agrees to cancel a goal. It may be on its way there by an earlier request.
+    /// Agrees to cancel a goal. An earlier request may have started the cancellation.
     pub(super) fn cancel(&mut self, ticket: Ticket) -> Result<(), GoalError> {
         self.step(ticket, Status::Canceling, "cancelled", |from| {
             matches!(
@@ -219,7 +221,7 @@ impl<W> ServerGoals<W> {
         }
     }
 
-    /// The status with which a goal would end so, unless it may not.
+    /// Returns the terminal status for this end, or an error if the goal cannot end in this way.
     pub(super) fn may_end(&mut self, ticket: Ticket, end: End) -> Result<Status, GoalError> {
         let goal = self.goal(ticket)?;
         match (end, goal.status()) {
@@ -232,7 +234,7 @@ impl<W> ServerGoals<W> {
         }
     }
 
-    /// Ends a goal with its result, which is kept, and returns those who wait for it.
+    /// Ends a goal with its result, which is kept. Returns the requests that wait for the result.
     pub(super) fn end(
         &mut self,
         ticket: Ticket,
@@ -252,14 +254,16 @@ impl<W> ServerGoals<W> {
         }
     }
 
-    /// Whether nobody decides about a goal that has not ended: then it has to be ended as aborted.
+    /// Returns whether a goal that is no longer worked on has not ended, so that it has to be
+    /// aborted.
     pub(super) fn abandon(&mut self, ticket: Ticket) -> bool {
-        // What was not begun cannot be aborted. Whether it was begun before does not matter.
+        // Only an executing goal can be aborted. The goal may be executing already.
         drop(self.execute(ticket));
         self.may_end(ticket, End::Abort).is_ok()
     }
 
-    /// The goals that a request to cancel is about, each to be agreed to, or why it is about none.
+    /// Returns the goals that a cancel request selects, each to be agreed to, or the reason for
+    /// which it selects no goal.
     pub(super) fn to_cancel(
         &self,
         what: CancelWhat,
@@ -288,7 +292,7 @@ impl<W> ServerGoals<W> {
         Ok(found)
     }
 
-    /// A client asks for a result.
+    /// Handles a client's request for a result.
     pub(super) fn ask(&mut self, id: GoalId, who: impl FnOnce() -> W) -> Asked<W> {
         match self.goals.get_mut(&id).map(|goal| &mut goal.phase) {
             None | Some(Phase::Offered) => Asked::Unknown,
@@ -304,13 +308,13 @@ impl<W> ServerGoals<W> {
         }
     }
 
-    /// A goal's status while it is known.
+    /// Returns the status of a known goal.
     pub(super) fn status(&self, ticket: Ticket) -> Option<Status> {
         let goal = self.goals.get(&ticket.id)?;
         (goal.key == ticket.key).then(|| goal.status())
     }
 
-    /// What to publish: the accepted goals in the order they came.
+    /// Returns the status list to publish: the accepted goals in the order of arrival.
     pub(super) fn list(&self) -> Vec<(GoalInfo, Status)> {
         let accepted = self.goals.iter().filter(|(_, goal)| goal.is_accepted());
         let mut found: Vec<_> = accepted.collect();
@@ -319,7 +323,7 @@ impl<W> ServerGoals<W> {
         found.into_iter().map(said).collect()
     }
 
-    /// Forgets what has ended long enough ago. Returns whether there was any.
+    /// Removes the ended goals whose time limit has expired. Returns whether any was removed.
     pub(super) fn expire(&mut self, now: Instant) -> bool {
         let Some(timeout) = self.result_timeout else {
             return false;
@@ -338,7 +342,7 @@ impl<W> ServerGoals<W> {
             .ok_or(GoalError::Forgotten(ticket.id))
     }
 
-    /// Makes room by forgetting what has ended first. False when all are open.
+    /// Makes room by removing the goal that ended first. Returns false if all goals are open.
     fn has_room(&mut self) -> bool {
         if self.goals.len() < self.most {
             return true;
@@ -399,8 +403,8 @@ impl End {
     }
 }
 
-/// Requests that may wait for the result of one goal. When they are more, the oldest gets no answer: its client has
-/// waited longest, and may have gone.
+/// Maximum number of requests that wait for the result of one goal. Beyond it, the oldest gets no
+/// reply: its client has waited longest and may have left.
 pub(super) const MOST_WAITING: usize = 8;
 
 #[cfg(test)]

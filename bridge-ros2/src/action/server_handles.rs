@@ -1,4 +1,4 @@
-//! What the user of a server holds: goals to decide about, requests to cancel them, goals to work on.
+//! The handles of a server's user: new goals, cancel requests and accepted goals.
 
 use std::sync::Arc;
 
@@ -13,7 +13,7 @@ use super::types::{GoalId, Status};
 use super::wire;
 use crate::raw::Payload;
 
-/// A goal to decide about. One that is dropped is rejected.
+/// A new goal to accept or reject. A dropped goal is rejected.
 #[derive(Debug)]
 pub struct NewGoal {
     shared: Arc<Shared>,
@@ -37,23 +37,25 @@ impl NewGoal {
         }
     }
 
-    /// The goal's id.
+    /// Returns the id of the goal.
     #[must_use]
     pub const fn id(&self) -> GoalId {
         self.ticket.id
     }
 
-    /// The `X_Goal`: CDR with its encapsulation header, in the client's byte order. Any bytes may stand behind it.
+    /// Returns the `X_Goal`: CDR with its encapsulation header, in the client's byte order. The
+    /// bytes after the header are not validated.
     #[must_use]
     pub const fn body(&self) -> &Bytes {
         &self.body
     }
 
-    /// Accepts the goal, and returns when its client has been told, or cannot be within a second: clients take no notice
-    /// of feedback for goals that they do not know as accepted. Dropping the future then aborts the goal.
+    /// Accepts the goal. Returns after the client was notified, or after one second without
+    /// success: clients ignore feedback for goals that they do not know as accepted. Dropping the
+    /// future during the wait aborts the goal.
     ///
     /// # Errors
-    /// [`GoalError::Closed`] when the server was dropped.
+    /// [`GoalError::Closed`] if the server was dropped.
     pub async fn accept(mut self) -> Result<ServerGoal, GoalError> {
         let answer = self.answer.take().ok_or(GoalError::Closed)?;
         let stamp = self.shared.accept(self.ticket)?;
@@ -63,25 +65,25 @@ impl NewGoal {
             body: self.body.clone(),
         };
         let (written, told) = oneshot::channel();
-        // A client that cannot be answered any more does not stop the goal.
+        // A client that cannot receive the reply any more does not stop the goal.
         drop(answer.send(Acceptance { stamp, written }));
         drop(told.await);
         self.shared.accepted();
         Ok(goal)
     }
 
-    /// Rejects the goal, which its client is told.
+    /// Rejects the goal and notifies its client.
     pub fn reject(self) {}
 }
 
 impl Drop for NewGoal {
     fn drop(&mut self) {
-        // One that was accepted stays.
+        // An accepted goal stays.
         self.shared.lock().goals.reject(self.ticket);
     }
 }
 
-/// A request to cancel a goal. One that is dropped is rejected: the goal goes on.
+/// A request to cancel a goal. A dropped request is rejected: the goal continues.
 #[derive(Debug)]
 pub struct CancelRequest {
     shared: Arc<Shared>,
@@ -102,16 +104,17 @@ impl CancelRequest {
         }
     }
 
-    /// The goal.
+    /// Returns the id of the goal.
     #[must_use]
     pub const fn id(&self) -> GoalId {
         self.ticket.id
     }
 
-    /// Agrees: the goal is now [`Status::Canceling`]. It still has to be ended, as cancelled or otherwise.
+    /// Agrees to cancel: the goal changes to [`Status::Canceling`]. The goal still has to be ended,
+    /// as canceled or otherwise.
     ///
     /// # Errors
-    /// [`GoalError`] when the goal has ended since, or the client waits no longer.
+    /// [`GoalError`] if the goal has ended in the meantime, or the client no longer waits.
     pub fn accept(self) -> Result<(), GoalError> {
         if self.answer.is_closed() {
             return Err(GoalError::Forgotten(self.ticket.id));
@@ -122,11 +125,11 @@ impl CancelRequest {
         Ok(())
     }
 
-    /// Does not agree: the goal goes on, which the client is told.
+    /// Refuses to cancel: the goal continues, and the client is notified.
     pub fn reject(self) {}
 }
 
-/// A goal to work on. One that is dropped before its end is aborted with the empty result.
+/// An accepted goal. A goal that is dropped before its end is aborted with the empty result.
 #[derive(Debug)]
 pub struct ServerGoal {
     shared: Arc<Shared>,
@@ -135,26 +138,26 @@ pub struct ServerGoal {
 }
 
 impl ServerGoal {
-    /// The goal's id.
+    /// Returns the id of the goal.
     #[must_use]
     pub const fn id(&self) -> GoalId {
         self.ticket.id
     }
 
-    /// The `X_Goal`, as [`NewGoal::body`].
+    /// Returns the `X_Goal`, as [`NewGoal::body`] does.
     #[must_use]
     pub const fn body(&self) -> &Bytes {
         &self.body
     }
 
-    /// How far the goal is; unknown once it has ended and is forgotten.
+    /// Returns the status of the goal; unknown after the ended goal was removed.
     #[must_use]
     pub fn status(&self) -> Status {
         let state = self.shared.lock();
         state.goals.status(self.ticket).unwrap_or(Status::Unknown)
     }
 
-    /// Begins work: from accepted to executing.
+    /// Starts work: changes the goal from accepted to executing.
     ///
     /// # Errors
     /// [`GoalError`].
@@ -163,8 +166,8 @@ impl ServerGoal {
             .decide(|goals| goals.execute(self.ticket).map(|()| Vec::new()))
     }
 
-    /// Goes over to cancelling without a client here having asked, as when the goal is worked on elsewhere and is cancelled
-    /// there.
+    /// Changes the goal to canceling without a request from a client of this domain, such as for a
+    /// goal that is executed and cancelled elsewhere.
     ///
     /// # Errors
     /// [`GoalError`].
@@ -173,13 +176,14 @@ impl ServerGoal {
             .decide(|goals| goals.cancel(self.ticket).map(|()| Vec::new()))
     }
 
-    /// The empty result of the server's options.
+    /// Returns the empty result of the server's options.
     #[must_use]
     pub fn empty_result(&self) -> Bytes {
         self.shared.empty_result()
     }
 
-    /// Reports progress: an `X_Feedback`, CDR in little endian with its encapsulation header. Never waits.
+    /// Publishes feedback: an `X_Feedback`, little-endian CDR with its encapsulation header. Never
+    /// waits.
     ///
     /// # Errors
     /// [`GoalError`], once the goal has ended.
@@ -190,8 +194,8 @@ impl ServerGoal {
         self.shared.feedback(self.ticket, message, Instant::now())
     }
 
-    /// Ends the goal as reached, with an `X_GetResult_Response` in CDR in little endian with its encapsulation header,
-    /// whose status is filled in here.
+    /// Ends the goal as succeeded, with an `X_GetResult_Response` in little-endian CDR with its
+    /// encapsulation header. This method fills in the status of the result.
     ///
     /// # Errors
     /// [`GoalError`]; the goal stays as it is.
@@ -199,24 +203,25 @@ impl ServerGoal {
         self.end(End::Succeed, result)
     }
 
-    /// Ends the goal as failed, with a result as for [`succeed`](Self::succeed).
+    /// Ends the goal as aborted, with a result as for [`succeed`](Self::succeed).
     ///
     /// # Errors
-    /// As there.
+    /// As for [`succeed`](Self::succeed).
     pub fn abort(&self, result: &[u8]) -> Result<(), GoalError> {
         self.end(End::Abort, result)
     }
 
-    /// Ends the goal as cancelled, which was agreed to, with a result as for [`succeed`](Self::succeed).
+    /// Ends the goal as canceled after a cancel request was accepted, with a result as for
+    /// [`succeed`](Self::succeed).
     ///
     /// # Errors
-    /// As there.
+    /// As for [`succeed`](Self::succeed).
     pub fn canceled(&self, result: &[u8]) -> Result<(), GoalError> {
         self.end(End::Cancel, result)
     }
 
-    /// Waits until a request to cancel the goal was agreed to, or the goal has ended, or the server was dropped.
-    /// Cancel-safe.
+    /// Waits until a cancel request for the goal was accepted, the goal has ended, or the server
+    /// was dropped. Cancel-safe.
     pub async fn cancel_agreed(&self) {
         let mut changed = self.shared.changed.subscribe();
         while self.shared.is_open() && matches!(self.status(), Status::Accepted | Status::Executing)

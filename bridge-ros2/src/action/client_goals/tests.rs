@@ -21,7 +21,7 @@ fn done(status: Status) -> Outcome {
     }
 }
 
-/// Goals 1 and 2, just sent.
+/// Returns goals 1 and 2, which were just sent.
 fn sent() -> ClientGoals {
     let mut goals = ClientGoals::new(Limits {
         goals: 2,
@@ -69,7 +69,7 @@ fn what_comes_before_the_acceptance_is_told_after_it() {
     goals.feedback(id(1), body(1));
     assert_eq!(events(&mut goals, 1), []);
     assert_eq!(goals.known_status(id(1)), Status::Unknown);
-    // The status says it too, and its answer may be lost.
+    // The status implies the acceptance too, whose reply may be lost.
     goals.status(id(1), (Status::Executing, STAMP), now());
     goals.accepted(id(1), STAMP, now());
     assert_eq!(
@@ -218,7 +218,7 @@ fn a_goal_that_is_not_decided_about_in_time_is_withdrawn_and_told_so() {
     assert!(goals.is_withdrawn(id(1)));
     let _is_left = goals.end(id(1), Outcome::Rejected);
     assert_eq!(events(&mut goals, 1), [GoalEvent::Ended(Outcome::Rejected)]);
-    // One that was decided about is not late.
+    // A goal with a decision is not overdue.
     goals.accepted(id(2), STAMP, now());
     goals.overdue(id(2), limit, now());
     assert_eq!(events(&mut goals, 2), [GoalEvent::Accepted(STAMP)]);

@@ -24,7 +24,7 @@ fn goals(most: usize) -> ServerGoals<u8> {
     ServerGoals::new(most, Some(KEPT))
 }
 
-/// A goal of that number, accepted at that second.
+/// Adds a goal with this number, accepted at the second of the same number.
 fn accepted(goals: &mut ServerGoals<u8>, number: u8) -> Ticket {
     let Arrival::New(ticket) = goals.arrive(id(number)) else {
         panic!("goal {number} is not new");
@@ -33,7 +33,7 @@ fn accepted(goals: &mut ServerGoals<u8>, number: u8) -> Ticket {
     ticket
 }
 
-/// A goal in that state.
+/// Adds a goal in this state.
 fn with_status(goals: &mut ServerGoals<u8>, number: u8, status: Status) -> Ticket {
     let ticket = accepted(goals, number);
     match status {
