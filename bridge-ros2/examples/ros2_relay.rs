@@ -1,8 +1,8 @@
-//! Repeats one topic of a DDS domain as another, by what the bridge reads and writes with: what the benchmarks hold
-//! against relays of Cyclone DDS and Fast DDS.
+//! Relays one topic of a DDS domain to another with the reader and writer of the bridge. The
+//! benchmarks compare it with relays of Cyclone DDS and Fast DDS.
 //!
-//! `ros2_relay FROM TO [DOMAIN]`: topics of `std_msgs/msg/String`, on loopback, until SIGTERM. `UA_BUSY_POLL` is what
-//! it is for a bridge.
+//! `ros2_relay FROM TO [DOMAIN]`: topics of `std_msgs/msg/String`, on loopback, until SIGTERM.
+//! `UA_BUSY_POLL` has the same meaning as for a bridge.
 
 #![expect(
     clippy::print_stdout,
@@ -34,7 +34,7 @@ async fn main() -> ExitCode {
         }
     };
     let result = match domain {
-        // A task of its own, as the bridge is: waking the main one costs a system call each time.
+        // A separate task, as in the bridge: waking the main task costs a system call each time.
         Ok(domain) => tokio::spawn(relay(from.clone(), to.clone(), domain))
             .await
             .unwrap_or_else(|panic| Err(panic.into())),

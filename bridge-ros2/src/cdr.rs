@@ -1,11 +1,12 @@
-//! CDR of the few interfaces that are part of what a ROS node is; all others are read and written by `messages`.
+//! CDR of the few interfaces that every ROS node has; `messages` encodes and decodes all others.
 //!
-//! Plain CDR (OMG CORBA 3.3 part 2, 9.3) behind the encapsulation header of RTPS: both byte orders are read, little
-//! endian is written. A reader never looks beyond the bytes and takes no length on trust.
+//! Plain CDR (OMG CORBA 3.3 part 2, 9.3) after the encapsulation header of RTPS: both byte orders
+//! are decoded, little endian is encoded. The reader stays within the bytes and validates every
+//! length.
 
 use bytes::Bytes;
 
-/// Reads one message after the other field.
+/// Reads the fields of a message in order.
 #[derive(Debug, Clone)]
 pub(crate) struct CdrReader<'b> {
     body: &'b [u8],
@@ -13,12 +14,12 @@ pub(crate) struct CdrReader<'b> {
     big: bool,
 }
 
-/// The bytes end before the message, or are none.
+/// The bytes end before the message does, or are invalid.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Malformed;
 
 impl<'b> CdrReader<'b> {
-    /// Of a payload with its encapsulation header.
+    /// Creates a reader of a payload with its encapsulation header.
     pub(crate) fn new(payload: &'b [u8]) -> Result<Self, Malformed> {
         let (header, body) = payload.split_first_chunk::<4>().ok_or(Malformed)?;
         let big = match header {
@@ -68,18 +69,18 @@ impl<'b> CdrReader<'b> {
         self.take().map(f64::from_le_bytes)
     }
 
-    /// Text; U+FFFD stands for what is not UTF-8.
+    /// Reads a string; U+FFFD replaces bytes that are not UTF-8.
     pub(crate) fn string(&mut self) -> Result<String, Malformed> {
         let length = usize::try_from(self.u32()?).map_err(|_| Malformed)?;
         let end = self.at.checked_add(length).ok_or(Malformed)?;
         let bytes = self.body.get(self.at..end).ok_or(Malformed)?;
         self.at = end;
-        // The length counts the zero behind the text; some writers send an empty text without one.
+        // The length includes the terminating zero; some writers send an empty string without it.
         let text = bytes.strip_suffix(&[0]).unwrap_or(bytes);
         Ok(String::from_utf8_lossy(text).into_owned())
     }
 
-    /// A sequence, whose elements have at least one byte each.
+    /// Reads a sequence whose elements have at least one byte each.
     pub(crate) fn sequence<T>(
         &mut self,
         mut element: impl FnMut(&mut Self) -> Result<T, Malformed>,
@@ -92,7 +93,7 @@ impl<'b> CdrReader<'b> {
     }
 }
 
-/// Writes a message field after field.
+/// Writes the fields of a message in order.
 #[derive(Debug, Clone)]
 pub(crate) struct CdrWriter {
     bytes: Vec<u8>,
@@ -105,13 +106,13 @@ impl CdrWriter {
         }
     }
 
-    /// The payload with its encapsulation header.
+    /// Returns the payload with its encapsulation header.
     pub(crate) fn finish(self) -> Bytes {
         self.bytes.into()
     }
 
     fn put<const N: usize>(&mut self, bytes: [u8; N]) {
-        // The header has 4 bytes, which no alignment counts.
+        // The header of 4 bytes does not count for the alignment.
         let body = self.bytes.len() - 4;
         self.bytes.resize(4 + body.next_multiple_of(N), 0);
         self.bytes.extend_from_slice(&bytes);
@@ -146,7 +147,7 @@ impl CdrWriter {
     }
 
     fn length(&mut self, length: usize) {
-        // What does not fit 32 bits does not fit a sample either.
+        // A length above 32 bits does not fit a sample either.
         self.u32(u32::try_from(length).unwrap_or(u32::MAX));
     }
 

@@ -1,29 +1,29 @@
-//! The clock of the node: the wall clock, or the simulated one of `/clock`.
+//! The clock of the node: the wall clock, or the simulated time of `/clock`.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
-/// The clock of a node: the wall clock, or with `use_sim_time` the time of `/clock`, which is zero until the first
-/// message (design.ros2.org, "Clock and Time").
+/// The clock of a node: the wall clock, or with `use_sim_time` the time of `/clock`, which is zero
+/// until the first message (design.ros2.org, "Clock and Time").
 ///
-/// It is for what messages say. Simulated time stands still and jumps as its publisher likes, so time limits never
-/// look at it.
+/// The clock provides stamps of messages. Simulated time can stop and jump, so timeouts never use
+/// it.
 #[derive(Debug, Clone, Default)]
 pub struct RosClock(Arc<Simulation>);
 
-/// A time as `builtin_interfaces/Time` has it.
+/// A time in the format of `builtin_interfaces/Time`.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub struct RosTime {
     /// Whole seconds since 1970, or since the start of the simulation.
     pub sec: i32,
-    /// The rest in nanoseconds, below 1 000 000 000.
+    /// The remainder in nanoseconds, below 1 000 000 000.
     pub nanosec: u32,
 }
 
 #[derive(Debug, Default)]
 struct Simulation {
     runs: AtomicBool,
-    /// Seconds in the upper half, nanoseconds in the lower: both change at once.
+    /// Seconds in the upper half and nanoseconds in the lower half, so that both change at once.
     time: AtomicU64,
     malformed: AtomicU64,
 }
@@ -35,7 +35,7 @@ impl RosClock {
         clock
     }
 
-    /// The time now.
+    /// Returns the current time.
     #[must_use]
     pub fn now(&self) -> RosTime {
         if !self.is_simulated() {
@@ -48,19 +48,19 @@ impl RosClock {
         }
     }
 
-    /// Whether the time is that of `/clock`.
+    /// Returns whether the time comes from `/clock`.
     #[must_use]
     pub fn is_simulated(&self) -> bool {
         self.0.runs.load(Ordering::Acquire)
     }
 
-    /// Messages of `/clock` that said no time, since the start.
+    /// Returns the number of invalid `/clock` messages.
     #[must_use]
     pub fn malformed(&self) -> u64 {
         self.0.malformed.load(Ordering::Relaxed)
     }
 
-    /// Takes a `rosgraph_msgs/msg/Clock`, encapsulation header first: seconds and nanoseconds.
+    /// Reads a `rosgraph_msgs/msg/Clock` after its encapsulation header: seconds and nanoseconds.
     pub(crate) fn hear(&self, payload: &[u8]) {
         let words = match payload {
             [0, 1, _, _, a, b, c, d, e, f, g, h, ..] => Some(([*d, *c, *b, *a], [*h, *g, *f, *e])),
@@ -81,7 +81,7 @@ impl RosClock {
 }
 
 impl RosTime {
-    /// The nearest time there is to that many nanoseconds since 1970.
+    /// Converts nanoseconds since 1970 to a time, clamped to its range.
     #[must_use]
     pub fn from_unix_nanos(nanos: i128) -> Self {
         let per_sec = i128::from(NANOS_PER_SEC);
@@ -100,7 +100,7 @@ impl RosTime {
 
 /// The topic of the simulated time.
 pub(crate) const TOPIC: &str = "rt/clock";
-/// Its DDS type.
+/// The DDS type of the topic.
 pub(crate) const TYPE: &str = "rosgraph_msgs::msg::dds_::Clock_";
 const NANOS_PER_SEC: u32 = 1_000_000_000;
 

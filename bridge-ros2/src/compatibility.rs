@@ -1,7 +1,8 @@
-//! Which qualities of service keep a writer and a reader apart.
+//! Finds the QoS policies that prevent a match of a writer and a reader.
 //!
-//! DDS matches a reader with a writer only when the writer offers at least what the reader requests (DDS 1.4, 2.2.3), and
-//! tells neither of a match that did not come about but by a status that nobody looks at. So it is looked for here.
+//! DDS matches a reader with a writer only if the writer offers at least the QoS that the reader
+//! requests (DDS 1.4, 2.2.3). It reports a failed match only by a status that ROS nodes rarely
+//! read, so the bridge checks the policies itself.
 
 use rustdds::policy::{
     DataRepresentation, DataRepresentationId, XCDR_DATA_REPRESENTATION, XCDR2_DATA_REPRESENTATION,
@@ -13,16 +14,16 @@ use rustdds::{Duration, QosPolicies};
 /// A policy in which a writer offers less than a reader requests.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Incompatibility {
-    /// The policy, in lower case.
+    /// The name of the policy, in lower case.
     pub policy: &'static str,
-    /// What the writer offers.
+    /// The offered value.
     pub offered: String,
-    /// What the reader requests.
+    /// The requested value.
     pub requested: String,
 }
 
 impl Incompatibility {
-    /// The first policy that keeps these two apart, if any does.
+    /// Returns the first incompatible policy, if any.
     #[must_use]
     pub fn between(offered: &QosPolicies, requested: &QosPolicies) -> Option<Self> {
         let id = offered.compliance_failure_wrt(requested)?;
@@ -40,7 +41,8 @@ impl Incompatibility {
     }
 }
 
-/// The data representation that the writer uses, and those that the reader accepts (DDS-XTypes 1.3, 7.6.3.1.1).
+/// Returns the data representation that the writer uses, and the representations that the reader
+/// accepts (DDS-XTypes 1.3, 7.6.3.1.1).
 fn representations(offered: &QosPolicies, requested: &QosPolicies) -> (String, String) {
     let writes = offered.data_representation();
     let accepts = requested.data_representation();
@@ -59,7 +61,7 @@ fn encoding(id: DataRepresentationId) -> String {
     }
 }
 
-/// Data representations that are named: a peer may list thousands.
+/// Maximum number of listed data representations: a peer may announce thousands.
 const SHOWN: usize = 4;
 
 fn name(id: &QosPolicyId) -> &'static str {
@@ -81,7 +83,7 @@ fn name(id: &QosPolicyId) -> &'static str {
     }
 }
 
-/// What the policies say of one, as people read it; `default` where nothing is said.
+/// Formats the value of a policy for log messages; `default` if the policy is not set.
 fn described(id: &QosPolicyId, qos: &QosPolicies) -> String {
     fn show(value: Option<impl std::fmt::Debug>) -> String {
         value.map_or_else(
@@ -97,7 +99,7 @@ fn described(id: &QosPolicyId, qos: &QosPolicies) -> String {
         }
         QosPolicyId::Deadline => qos.deadline().map(|deadline| deadline.0).map_or_else(
             || "none".to_owned(),
-            // RTPS counts fractions of a second in powers of two: to the nearest millisecond.
+            // RTPS expresses fractions of a second in powers of two: rounded to milliseconds.
             |deadline| format!("{} ms", (deadline.to_nanoseconds() + 500_000) / 1_000_000),
         ),
         QosPolicyId::Liveliness => show(qos.liveliness()),
@@ -114,7 +116,7 @@ fn described(id: &QosPolicyId, qos: &QosPolicies) -> String {
     }
 }
 
-/// The deadline of the policies, unless it is endless.
+/// Returns the deadline of the policies, unless it is infinite.
 #[must_use]
 pub fn finite_deadline(qos: &QosPolicies) -> Option<Duration> {
     qos.deadline()

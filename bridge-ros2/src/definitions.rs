@@ -1,4 +1,5 @@
-//! Message definitions: those built in, and those of the ROS installation the program was started in.
+//! Message definitions: built in, or from the ROS installation in whose environment the process was
+//! started.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -12,13 +13,14 @@ use messages::{
 };
 use uadp::BuiltinType;
 
-/// Finds message types by name; a type once found stays.
+/// Finds message types by name and caches them.
 ///
-/// A name may have several definitions: the one known here, and those that nodes told. Their hashes keep them apart.
+/// A name may have several definitions: the local definition, and definitions that nodes described.
+/// Their hashes distinguish them.
 #[derive(Debug)]
 pub(crate) struct Definitions {
     known: bridge_node::Definitions,
-    /// Those of `known` that were asked for.
+    /// The requested definitions of `known`.
     found: BTreeMap<TypeName, Definition>,
     told: BTreeMap<(TypeName, TypeHash), Told>,
 }
@@ -27,9 +29,9 @@ pub(crate) struct Definitions {
 #[derive(Debug, Clone)]
 pub(crate) struct Definition {
     pub(crate) message_type: Arc<MessageType>,
-    /// `None` where it has none, as with a type that ROS 2 cannot express.
+    /// `None` for a type that ROS 2 cannot express and that has no hash.
     pub(crate) hash: Option<TypeHash>,
-    /// Where it is from, for people.
+    /// The origin of the definition, for log messages.
     pub(crate) from: Arc<str>,
 }
 
@@ -38,7 +40,8 @@ impl Definition {
         self.message_type.name()
     }
 
-    /// Whether both are one definition: by their hashes, or, where there are none, by what they are made of.
+    /// Returns whether both are the same definition: by their hashes or, without hashes, by their
+    /// fields.
     pub(crate) fn is_same(&self, other: &Self) -> bool {
         match (self.hash, other.hash) {
             (None, None) => {
@@ -50,8 +53,8 @@ impl Definition {
 }
 
 impl Definitions {
-    /// With the built-in definitions, those of the mapping's `type_paths`, and the prefixes of ROS 2 installations, as
-    /// `AMENT_PREFIX_PATH` lists them.
+    /// Creates the definitions from the built-in types, the mapping's `type_paths`, and the
+    /// prefixes of ROS 2 installations in the order of `AMENT_PREFIX_PATH`.
     pub(crate) fn new(types: Arc<TypePaths>, prefixes: Vec<PathBuf>) -> Self {
         let environment = Environment {
             ros1: Vec::new(),
@@ -64,14 +67,15 @@ impl Definitions {
         }
     }
 
-    /// Takes what the mapping's `type_paths` have by now. What nodes told stays.
+    /// Replaces the definitions from the mapping's `type_paths`. Definitions described by nodes
+    /// stay.
     pub(crate) fn replace(&mut self, types: &Arc<TypePaths>) {
         self.known.replace(types);
         self.found.clear();
     }
 
-    /// Whether it is still what endpoints mean that announce this hash. A file that cannot be read for the moment changes
-    /// nothing.
+    /// Returns whether the definition still applies to endpoints that announce the hash. A file
+    /// that is temporarily unreadable changes nothing.
     pub(crate) fn is_current(
         &mut self,
         definition: &Definition,
@@ -81,8 +85,8 @@ impl Definitions {
         !now.is_ok_and(|now| !now.is_same(definition))
     }
 
-    /// The type of that name with all it needs, as endpoints mean it that announce no hash: built in, or read from files;
-    /// else what a node told, if nodes told the same.
+    /// Returns the type with its referenced types for endpoints that announce no hash: the built-in
+    /// type or the type from files, else the definition that nodes described, if it is unique.
     ///
     /// # Errors
     /// [`DefinitionError`].
@@ -98,8 +102,8 @@ impl Definitions {
         }
     }
 
-    /// The type as endpoints mean it that announce this hash, or none. Of a hash that is not known it is what is known
-    /// here under the name.
+    /// Returns the type for endpoints that announce the hash, or none. For an unknown hash, returns
+    /// the local definition of the name.
     ///
     /// # Errors
     /// [`DefinitionError`].
@@ -117,7 +121,7 @@ impl Definitions {
         }
     }
 
-    /// The definition of that hash.
+    /// Returns the definition with the hash.
     pub(crate) fn of_hash(&mut self, name: &TypeName, hash: TypeHash) -> Option<Definition> {
         let here = self.here(name).ok();
         here.filter(|found| found.hash == Some(hash)).or_else(|| {
@@ -126,7 +130,7 @@ impl Definitions {
         })
     }
 
-    /// What is known here, whatever nodes tell.
+    /// Returns the local definition, regardless of the descriptions of nodes.
     ///
     /// # Errors
     /// [`DefinitionError`].
@@ -143,7 +147,7 @@ impl Definitions {
         Ok(found)
     }
 
-    /// Takes what a node told of a type, if it is the type of that hash.
+    /// Adds a node's description of a type if it matches the hash.
     ///
     /// # Errors
     /// [`DefinitionError`].
@@ -154,7 +158,8 @@ impl Definitions {
         hash: TypeHash,
         from: &str,
     ) -> Result<(), DefinitionError> {
-        // Of its own: the types in it may be others than those of that name here.
+        // In a separate registry: the referenced types may differ from the local types of the same
+        // name.
         let message_type = Registry::empty(Dialect::Ros2).add_described(name, types, hash)?;
         let told = Told {
             definition: Definition {
@@ -171,7 +176,7 @@ impl Definitions {
         Ok(())
     }
 
-    /// The description of a type and what it needs.
+    /// Returns the descriptions of a type and of its referenced types.
     ///
     /// # Errors
     /// [`DefinitionError`].
@@ -186,8 +191,9 @@ impl Definitions {
         }
     }
 
-    /// The source of each of these types: the text of a message whose file is known here. A part of a service or action has no
-    /// file of its own, and neither has a type that a node described.
+    /// Returns the source of each of these types: the text of a message whose file is known
+    /// locally. A part of a service or action has no own file, nor has a type that a node
+    /// described.
     pub(crate) fn sources(&self, types: &[DescribedType]) -> Vec<TypeSource> {
         let registry = self.known.registry();
         let source = |described: &DescribedType| {
@@ -213,7 +219,7 @@ impl Definitions {
         types.iter().map(source).collect()
     }
 
-    /// The description of a service that was found, and what it needs.
+    /// Returns the descriptions of a known service and of its referenced types.
     ///
     /// # Errors
     /// [`DefinitionError`].
@@ -224,12 +230,12 @@ impl Definitions {
         self.known.registry().describe_service(name)
     }
 
-    /// What people are to be told of such an error, or of one of [`service`](Self::service).
+    /// Explains an error of this type, or of [`service`](Self::service), for log messages.
     pub(crate) fn explain(&mut self, kind: TextKind, error: &DefinitionError) -> String {
         self.known.explain(kind, error)
     }
 
-    /// Explains an error of a type whose definition only files bring.
+    /// Explains an error of a type whose definition can only come from files.
     pub(crate) fn explain_missing(
         &mut self,
         of: (TextKind, &TypeName),
@@ -239,7 +245,7 @@ impl Definitions {
         self.known.explain_missing(of, error, wanted)
     }
 
-    /// The service of that name, found likewise.
+    /// Returns the service with this name; the same sources apply as for messages.
     ///
     /// # Errors
     /// [`DefinitionError`].
@@ -247,12 +253,13 @@ impl Definitions {
         self.known.find_service(name)
     }
 
-    /// The type hashes of a service that was found.
+    /// Returns the type hashes of a known service.
     pub(crate) fn service_type_hashes(&self, name: &TypeName) -> Option<ServiceTypeHashes> {
         self.known.registry().service_type_hashes(name).ok()
     }
 
-    /// The calls and values that the action of that name is, found likewise.
+    /// Returns the calls and values of the action with this name; the same sources apply as for
+    /// messages.
     ///
     /// # Errors
     /// [`DefinitionError`].
@@ -263,7 +270,7 @@ impl Definitions {
         self.known.find_action_calls(name)
     }
 
-    /// The messages of the action of that name, found likewise.
+    /// Returns the messages of the action with this name; the same sources apply as for messages.
     ///
     /// # Errors
     /// [`DefinitionError`].
@@ -274,12 +281,12 @@ impl Definitions {
         self.known.find_action_messages(name)
     }
 
-    /// The type hashes of an action that was found.
+    /// Returns the type hashes of a known action.
     pub(crate) fn action_type_hashes(&self, name: &TypeName) -> Option<ActionTypeHashes> {
         self.known.registry().added_action_type_hashes(name).ok()
     }
 
-    /// The description of an action that was found, and what it needs.
+    /// Returns the descriptions of a known action and of its referenced types.
     ///
     /// # Errors
     /// [`DefinitionError`].
@@ -290,13 +297,13 @@ impl Definitions {
         self.known.registry().describe_action(name)
     }
 
-    /// The ROS type that carries one value of that type, and nothing else.
+    /// Returns the ROS type that carries exactly one value of this built-in type.
     pub(crate) fn standard_type(&self, builtin: BuiltinType, array: bool) -> Option<TypeName> {
         self.known.registry().standard_type(builtin, array)
     }
 }
 
-/// What a node told of a type.
+/// A node's description of a type.
 #[derive(Debug)]
 struct Told {
     definition: Definition,
@@ -350,7 +357,7 @@ mod tests {
         assert!(!definitions.is_current(&old, None));
     }
 
-    /// Description and hash of a type, as a node would tell it.
+    /// Returns the description and the hash of a type, as a node would send it.
     fn told(name: &TypeName, text: &str) -> (Vec<DescribedType>, TypeHash) {
         let mut registry = Registry::empty(Dialect::Ros2);
         registry.add(name, text).unwrap();
@@ -376,7 +383,7 @@ mod tests {
             assert_eq!(found.message_type.leaves()[0].path, first);
             assert_eq!(definitions.described(&name, hash).unwrap(), *types);
         }
-        // Nobody says which.
+        // Ambiguous without a hash.
         definitions.get(&name).unwrap_err();
         definitions.announced(&name, None).unwrap_err();
     }

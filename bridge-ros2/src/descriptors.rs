@@ -1,27 +1,29 @@
-//! File descriptors of the process: each endpoint of RustDDS takes some, and what other nodes make up must leave some free.
+//! File descriptors of the process: each endpoint of RustDDS takes some, and topics invented by
+//! other nodes must leave some free.
 
 use std::fs::File;
 use std::os::fd::AsRawFd;
 
 use rustix::process::{Resource, getrlimit};
 
-/// The descriptors of this process.
+/// The file descriptors of this process.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Descriptors {
     limit: usize,
 }
 
-/// Endpoints that there are descriptors for.
+/// The number of endpoints for which file descriptors are free.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Free {
     /// For topics of the mapping, services and actions.
     pub(crate) mapped: usize,
-    /// For topics that the mapping does not name. They leave a quarter of all descriptors to the others.
+    /// For topics that the mapping does not name. A quarter of all descriptors is reserved for
+    /// other endpoints.
     pub(crate) found: usize,
 }
 
 impl Descriptors {
-    /// Those that the limit of this process (`RLIMIT_NOFILE`) permits by now.
+    /// Returns the current limit of this process (`RLIMIT_NOFILE`).
     pub(crate) fn of_process() -> Self {
         let limit = getrlimit(Resource::Nofile).current;
         Self {
@@ -33,10 +35,11 @@ impl Descriptors {
         self.limit
     }
 
-    /// Returns how many endpoints there are descriptors for. The lowest free descriptor tells how many are open.
+    /// Returns the number of endpoints for which descriptors are free. The lowest free descriptor
+    /// shows how many are open.
     pub(crate) fn free(self) -> Free {
         let open = File::open("/dev/null").map(|file| file.as_raw_fd());
-        // Without a free descriptor it cannot be opened.
+        // Without a free descriptor, the file cannot be opened.
         let open = open.ok().and_then(|open| usize::try_from(open).ok());
         self.free_beside(open.unwrap_or(self.limit))
     }
@@ -50,9 +53,10 @@ impl Descriptors {
     }
 }
 
-/// Descriptors that RustDDS opens for an endpoint: two pairs of sockets, and one more at times. Measured: 217 readers in 1000.
+/// Descriptors that RustDDS opens for an endpoint: two pairs of sockets, and sometimes another
+/// descriptor. Measured: 217 readers in 1000.
 const OF_ENDPOINT: usize = 5;
-/// Descriptors that are left to status pages, files and the sockets of the space.
+/// Descriptors reserved for status pages, files and the sockets of the space.
 const RESERVE: usize = 64;
 
 #[cfg(test)]

@@ -1,22 +1,24 @@
-//! `ros_discovery_info`: which readers and writers of a participant are of which ROS node.
+//! `ros_discovery_info`: assigns the readers and writers of a participant to its ROS nodes.
 //!
-//! DDS knows participants and endpoints; nodes are ROS'. Each participant tells the others of its nodes by messages of
-//! this one type (`rmw_dds_common/msg/ParticipantEntitiesInfo`), always the whole list. An entity is named by its RTPS
-//! GUID in a `Gid`, which has 24 bytes up to ROS 2 Humble, the last 8 of them zero, and 16 from Iron on. Both have the
-//! same DDS type name, so a reader finds out by the length that comes out even.
+//! DDS knows participants and endpoints; nodes are a ROS concept. Each participant publishes its
+//! complete list of nodes as messages of one type (`rmw_dds_common/msg/ParticipantEntitiesInfo`).
+//! An entity is identified by its RTPS GUID in a `Gid`, which has 24 bytes up to ROS 2 Humble, the
+//! last 8 of them zero, and 16 bytes since Iron. Both have the same DDS type name, so a reader
+//! detects the length: only the right length consumes the whole payload.
 
 use bytes::{BufMut, Bytes, BytesMut};
 use thiserror::Error;
 
-/// A GUID as RTPS has it on the wire: 12 bytes of participant prefix, 4 of entity id (RTPS 2.5, 9.3.1).
+/// A GUID in the wire format of RTPS: 12 bytes of participant prefix, 4 of entity id (RTPS 2.5,
+/// 9.3.1).
 pub type GuidBytes = [u8; 16];
 
 /// The nodes of one participant: `rmw_dds_common/msg/ParticipantEntitiesInfo`.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct ParticipantEntitiesInfo {
-    /// The participant.
+    /// The GUID of the participant.
     pub participant: GuidBytes,
-    /// Its nodes.
+    /// The nodes of the participant.
     pub nodes: Vec<NodeEntities>,
 }
 
@@ -34,20 +36,20 @@ pub struct NodeEntities {
 }
 
 impl NodeEntities {
-    /// The name with its namespace, `/cell/camera`.
+    /// Returns the name with its namespace, such as `/cell/camera`.
     #[must_use]
     pub fn full_name(&self) -> String {
         format!("{}/{}", self.namespace.trim_end_matches('/'), self.name)
     }
 }
 
-/// How many bytes a `Gid` has.
+/// The length of a `Gid`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
 pub enum GidLength {
-    /// From ROS 2 Iron on.
+    /// The length since ROS 2 Iron.
     #[default]
     Bytes16,
-    /// Up to ROS 2 Humble.
+    /// The length up to ROS 2 Humble.
     Bytes24,
 }
 
@@ -60,17 +62,17 @@ impl GidLength {
     }
 }
 
-/// Why a sample is no `ParticipantEntitiesInfo` of either length.
+/// The sample is not a `ParticipantEntitiesInfo` of either length.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
 #[error("no list of nodes, neither with 16 nor with 24 bytes in a Gid")]
 pub struct NoDiscoveryInfo;
 
 impl ParticipantEntitiesInfo {
-    /// Reads a serialized payload, encapsulation header first, of either byte order. A length of `Gid` fits only when
-    /// nothing but padding is left over.
+    /// Decodes a serialized payload after its encapsulation header, in either byte order. A length
+    /// of `Gid` fits only if nothing but padding remains.
     ///
     /// # Errors
-    /// [`NoDiscoveryInfo`] when neither length fits.
+    /// [`NoDiscoveryInfo`] if neither length fits.
     pub fn decode(payload: &[u8]) -> Result<(Self, GidLength), NoDiscoveryInfo> {
         [GidLength::Bytes16, GidLength::Bytes24]
             .into_iter()
@@ -78,7 +80,7 @@ impl ParticipantEntitiesInfo {
             .ok_or(NoDiscoveryInfo)
     }
 
-    /// The serialized payload, little endian.
+    /// Returns the serialized payload, little endian.
     #[must_use]
     pub fn encode(&self, length: GidLength) -> Bytes {
         let mut out = Cdr::new();
@@ -102,7 +104,7 @@ impl ParticipantEntitiesInfo {
     }
 }
 
-/// Little endian CDR in the making, encapsulation header first.
+/// A buffer of little-endian CDR, which starts with the encapsulation header.
 #[derive(Debug)]
 pub(crate) struct Cdr(pub(crate) BytesMut);
 
@@ -111,7 +113,8 @@ impl Cdr {
         Self(BytesMut::from(&[0, 1, 0, 0][..]))
     }
 
-    /// The header is as long as the widest alignment here, so that positions count from either end of it.
+    /// Aligns to 4 bytes. The header is as long as the widest alignment in the message, so
+    /// positions may include the header.
     fn align(&mut self) {
         let padding = self.0.len().next_multiple_of(4) - self.0.len();
         self.0.put_bytes(0, padding);
@@ -122,9 +125,9 @@ impl Cdr {
         self.0.put_u32_le(value);
     }
 
-    /// The length of a sequence.
+    /// Writes the length of a sequence.
     fn count(&mut self, len: usize) {
-        // What is in memory has fewer elements than that.
+        // No sequence in memory reaches this length.
         self.u32(u32::try_from(len).unwrap_or(u32::MAX));
     }
 
@@ -135,7 +138,7 @@ impl Cdr {
     }
 }
 
-/// Reads CDR left to right; `None` when it ends too soon.
+/// Reads CDR in order; returns `None` if it ends too soon.
 struct Cursor<'a> {
     body: &'a [u8],
     at: usize,
@@ -163,7 +166,7 @@ impl<'a> Cursor<'a> {
         let participant = self.gid()?;
         let count = self.u32()?;
         let mut nodes = Vec::new();
-        // Nothing is reserved for a count, and each node takes some of what is left.
+        // Nothing is reserved for a count, and each node consumes some of the remaining bytes.
         for _ in 0..count {
             nodes.push(NodeEntities {
                 namespace: self.string()?,
@@ -219,9 +222,9 @@ impl<'a> Cursor<'a> {
     }
 }
 
-/// The topic.
+/// The topic of the node lists.
 pub(crate) const TOPIC: &str = "ros_discovery_info";
-/// Its DDS type.
+/// The DDS type of the topic.
 pub(crate) const TYPE: &str = "rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_";
 /// The bound of both names in the message.
 const MAX_NAME: usize = 256;

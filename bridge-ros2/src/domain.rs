@@ -1,4 +1,4 @@
-//! Being in a DDS domain: the participant, the ROS node it stands for, and the making of endpoints.
+//! The membership in a DDS domain: the participant, its ROS node, and the creation of endpoints.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::net::{IpAddr, Ipv4Addr};
@@ -33,44 +33,45 @@ use crate::rosout;
 use crate::security::{Enclave, SecurityError};
 use crate::service::peers::{changes_of, offered};
 
-/// Which domain to join and how.
+/// The domain to join and its network settings.
 #[derive(Debug, Clone)]
 pub struct DomainOptions {
     /// The DDS domain, 0..=232.
     pub domain: u16,
-    /// Addresses of the interfaces to use; all when empty.
+    /// Addresses of the interfaces to use; empty means all interfaces.
     pub networks: Vec<IpAddr>,
-    /// Hosts to announce ourselves to by unicast, beside multicast.
+    /// Hosts to which the participant is announced by unicast, in addition to multicast.
     pub peers: Vec<IpAddr>,
-    /// The ROS node it is there; a name alone is one in the root namespace.
+    /// The ROS node of the participant; a name without a namespace belongs to the root namespace.
     pub node: NodeOptions,
-    /// The enclave by whose files it is secured, if it is.
+    /// The enclave whose files secure the participant, if any.
     pub enclave: Option<Enclave>,
 }
 
 impl DomainOptions {
-    /// Whether discovery is confined to this machine.
+    /// Returns whether discovery is confined to this machine.
     #[must_use]
     pub fn is_local(&self) -> bool {
         !self.networks.is_empty() && self.networks.iter().all(IpAddr::is_loopback)
     }
 }
 
-/// Where discovery may go, as the environment of ROS says.
+/// The discovery range, as set in the ROS environment.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum DiscoveryRange {
-    /// As far as multicast carries.
+    /// The reach of multicast.
     Subnet,
-    /// This machine.
+    /// This machine only.
     Localhost,
 }
 
 impl DiscoveryRange {
-    /// Reads the values of `ROS_AUTOMATIC_DISCOVERY_RANGE` and of its predecessor `ROS_LOCALHOST_ONLY`, which wins
-    /// when it is set, as in rcl.
+    /// Reads the values of `ROS_AUTOMATIC_DISCOVERY_RANGE` and of its predecessor
+    /// `ROS_LOCALHOST_ONLY`, which takes precedence when it is set, as in rcl.
     ///
     /// # Errors
-    /// [`DomainError::DiscoveryRange`] for a range in which no bridge can work, or that ROS does not know.
+    /// [`DomainError::DiscoveryRange`] for a range that no bridge can use, or that ROS does not
+    /// define.
     pub fn from_env(
         range: Option<&str>,
         localhost_only: Option<&str>,
@@ -85,7 +86,7 @@ impl DiscoveryRange {
         }
     }
 
-    /// The addresses to use when no interface was asked for.
+    /// Returns the addresses to use if no interface was chosen.
     #[must_use]
     pub fn networks(self) -> Vec<IpAddr> {
         match self {
@@ -95,27 +96,27 @@ impl DiscoveryRange {
     }
 }
 
-/// Why the domain cannot be joined, or an endpoint not be made.
+/// The reason for which a domain cannot be joined or an endpoint not be created.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum DomainError {
-    /// Not a domain id (RTPS 2.5, 9.6.2.3: the ports of the next one would not fit).
+    /// Not a domain id (RTPS 2.5, 9.6.2.3: the ports of a higher domain would not fit).
     #[error("there is no DDS domain {0}: domains are 0 to 232")]
     Domain(u16),
-    /// A node name that ROS would not take.
+    /// A node name that is invalid in ROS.
     #[error("`{name}` is not a ROS node name: {why}")]
     NodeName {
-        /// The name.
+        /// The invalid name.
         name: String,
-        /// What is wrong with it.
+        /// The fault of the name.
         why: &'static str,
     },
-    /// A discovery range in which nobody is found.
+    /// A discovery range without discovery of other nodes.
     #[error(
         "ROS_AUTOMATIC_DISCOVERY_RANGE is `{0}`: a bridge needs SUBNET (the default) or LOCALHOST"
     )]
     DiscoveryRange(String),
-    /// Peers were given to a RustDDS that knows only multicast.
+    /// Peers were given, but the published RustDDS supports only multicast.
     #[error(
         "a list of peers needs RustDDS with this project's patches, as `cargo xtask dist` builds it"
     )]
@@ -123,22 +124,22 @@ pub enum DomainError {
     /// RustDDS could not open its sockets or start its threads.
     #[error("cannot join DDS domain {domain}: {source}")]
     Join {
-        /// The domain.
+        /// The DDS domain.
         domain: u16,
-        /// What RustDDS says.
+        /// The error of RustDDS.
         source: CreateError,
     },
-    /// The files of the enclave are wrong.
+    /// The files of the enclave are invalid.
     #[error("the bridge cannot be secured: {0}")]
     Security(#[from] SecurityError),
-    /// RustDDS does not join with these files.
+    /// RustDDS cannot join with these files.
     #[error("the enclave in {} does not let the bridge into domain {domain}: {why}", .folder.display())]
     Enclave {
-        /// Where the files are.
+        /// The folder of the files.
         folder: PathBuf,
-        /// The domain.
+        /// The DDS domain.
         domain: u16,
-        /// What RustDDS says.
+        /// The error of RustDDS.
         why: CreateError,
     },
     /// The ROS node could not be created.
@@ -149,17 +150,18 @@ pub enum DomainError {
     Endpoint {
         /// The DDS topic.
         topic: String,
-        /// What RustDDS says.
+        /// The error of RustDDS.
         source: CreateError,
     },
 }
 
 /// A participant of a domain that is a ROS node there.
 ///
-/// The node shows up in `ros2 node list` with the readers and writers made here, publishes the program's warnings on
-/// `/rosout`, and with `use_sim_time` follows `/clock`.
+/// `ros2 node list` shows the node with the readers and writers created here. The node publishes
+/// the process's warnings on `/rosout`, and with `use_sim_time` follows `/clock`.
 pub struct Domain {
-    // Dropped in this order: first the node withdraws its name, while the participant can still say so.
+    // Fields are dropped in this order: the node withdraws its name first, while the participant
+    // can still announce it.
     node: Node,
     domain: u16,
     joined: Instant,
@@ -168,16 +170,17 @@ pub struct Domain {
     publisher: Publisher,
     subscriber: Subscriber,
     participant: DomainParticipant,
-    /// The task that is the participant's traffic, until its end was told.
+    /// The task of the participant's traffic, until its end was reported.
     traffic: Option<JoinHandle<&'static str>>,
 }
 
 impl Domain {
-    /// Joins; returns when the discovery thread runs. Blocks for some milliseconds.
+    /// Joins the domain; returns when the discovery thread runs. Blocks for some milliseconds.
     ///
-    /// Called in a tokio runtime, and with the patched RustDDS, the domain's traffic is a task of that runtime: nothing
-    /// is sent or heard while the runtime does not run, and the domain is to be left by [`leave`](Self::leave), which lets
-    /// it run on until the goodbye is sent. Outside of one it has a thread of its own.
+    /// In a tokio runtime, and with the patched RustDDS, the domain's traffic is a task of this
+    /// runtime: nothing is sent or received while the runtime does not run. The domain has to be
+    /// left with [`leave`](Self::leave), which keeps the traffic running until the departure is
+    /// announced. Outside of a runtime, the traffic has its own thread.
     ///
     /// # Panics
     /// In a runtime without IO or time.
@@ -228,7 +231,7 @@ impl Domain {
         Ok(domain)
     }
 
-    /// What every ROS node has beside its name.
+    /// Creates the endpoints that every ROS node has in addition to its name.
     fn serve(&self) -> Result<(), DomainError> {
         for (dds_type, hash) in [(rosout::TYPE, LOG_HASH), (clock::TYPE, CLOCK_HASH)] {
             self.learn_type_hash(dds_type, hash);
@@ -247,8 +250,9 @@ impl Domain {
         Ok(())
     }
 
-    /// Announces this type hash (`RIHS01_` and 64 hex digits) for endpoints of that DDS type that are made from now
-    /// on. RustDDS as published has no place for it; see [`can_announce_type_hashes`].
+    /// Sets the type hash (`RIHS01_` and 64 hex digits) that is announced with endpoints of this
+    /// DDS type created later. The published RustDDS cannot announce it; see
+    /// [`can_announce_type_hashes`].
     pub fn learn_type_hash(&self, dds_type: &str, hash: impl Into<String>) {
         self.type_hashes
             .lock()
@@ -256,14 +260,15 @@ impl Domain {
             .insert(dds_type.to_owned(), hash.into());
     }
 
-    /// When it was joined. Participants that were there before become known in the 250 ms from then on.
+    /// Returns the time of joining. Participants that were present before are discovered within 250
+    /// ms after it.
     #[must_use]
     pub fn joined(&self) -> Instant {
         self.joined
     }
 
-    /// Ready, once, when nothing is sent or heard any more, though the domain was not left: with the reason. It never is
-    /// where the domain's traffic has a thread of its own.
+    /// Returns ready, once and with the reason, when the traffic has ended although the domain was
+    /// not left. Never returns ready if the traffic has its own thread.
     pub fn poll_end(&mut self, cx: &mut Context<'_>) -> Poll<String> {
         let Some(traffic) = &mut self.traffic else {
             return Poll::Pending;
@@ -277,7 +282,7 @@ impl Domain {
         ))
     }
 
-    /// What others have in the domain by now. Nodes of participants that are gone are forgotten with it.
+    /// Returns the endpoints of other participants. Removes the nodes of lost participants.
     pub fn graph(&self) -> Graph {
         let graph = Graph::snapshot(&self.participant);
         self.node
@@ -285,85 +290,89 @@ impl Domain {
         graph
     }
 
-    /// Another number than before means that [`graph`](Self::graph) may be another. RustDDS as published does not say it.
+    /// Returns the change count of discovery; a new count means that [`graph`](Self::graph) may
+    /// have changed. The published RustDDS does not provide it.
     #[must_use]
     pub fn changes(&self) -> Option<u64> {
         changes_of(&self.participant)
     }
 
-    /// The services others offer, by their names, with the types they have, as `std_srvs/SetBool`; a name that is none of
-    /// ROS as it is. Those that actions are made of are left out, and those of the other bridges in `graph`.
+    /// Returns the services of other participants by name, with their types, such as
+    /// `std_srvs/SetBool`; a type name outside of ROS is returned unchanged. Services of actions
+    /// are left out, as are services of the other bridges in `graph`.
     #[must_use]
     pub fn services(&self, graph: &Graph) -> BTreeMap<String, BTreeSet<String>> {
         offered(&self.participant, graph)
     }
 
-    /// The readers and writers made here that were not announced to the domain: RustDDS' discovery drops what does not
-    /// fit into its queue. They are to be made anew.
+    /// Returns the local readers and writers that were not announced to the domain: the discovery
+    /// of RustDDS drops commands that do not fit its queue. These endpoints have to be recreated.
     #[must_use]
     pub fn unannounced(&self, graph: &Graph) -> BTreeSet<GUID> {
         self.node.unannounced(graph.own())
     }
 
-    /// The nodes of others, as they told.
+    /// Returns the announced nodes of other participants.
     #[must_use]
     pub fn nodes(&self) -> Vec<NodeEntities> {
         self.node.others()
     }
 
-    /// The full name of the node an endpoint of others belongs to, if it told.
+    /// Returns the full name of the node that owns a remote endpoint, if it was announced.
     #[must_use]
     pub fn owner(&self, endpoint: GUID) -> Option<String> {
         self.node.owner(endpoint)
     }
 
-    /// The full names of the nodes a participant is, as it told.
+    /// Returns the full names of the nodes of a participant, as announced.
     pub(crate) fn nodes_of(&self, participant: &ParticipantPrefix) -> Vec<String> {
         self.node.nodes_of(participant)
     }
 
-    /// Whether the node's own thread has ended, by a panic: nobody is told of our nodes any more.
+    /// Returns whether the node's thread has ended by a panic, so that nodes are no longer
+    /// announced.
     pub(crate) fn is_mute(&self) -> bool {
         self.node.is_mute()
     }
 
-    /// How many lists of nodes, of those that others publish, could not be read.
+    /// Returns how many node lists of other participants could not be decoded.
     #[must_use]
     pub fn malformed_lists(&self) -> u64 {
         self.node.malformed_lists()
     }
 
-    /// The node's clock.
+    /// Returns the clock of the node.
     #[must_use]
     pub fn clock(&self) -> RosClock {
         self.node.clock()
     }
 
-    /// The participant, for its discovery snapshot.
+    /// Returns the participant, for its discovery data.
     #[must_use]
     pub fn participant(&self) -> &DomainParticipant {
         &self.participant
     }
 
-    /// The participant's own GUID.
+    /// Returns the GUID of the participant.
     #[must_use]
     pub fn guid(&self) -> GUID {
         self.participant.guid()
     }
 
-    /// The node's full ROS name.
+    /// Returns the full ROS name of the node.
     #[must_use]
     pub fn node_name(&self) -> String {
         self.node.options().full_name()
     }
 
-    /// Discovery events of the participant.
+    /// Returns the listener for discovery events of the participant.
     #[must_use]
     pub fn status_listener(&self) -> DomainParticipantStatusListener {
         self.participant.status_listener()
     }
 
-    /// Makes the reader of a ROS topic that asks for `requested`. `topic` and `type_name` are DDS names.
+    /// Creates the reader of a ROS topic with the `requested` QoS. `topic` and `type_name` are DDS
+    /// names.
     ///
     /// # Errors
     /// [`DomainError::Endpoint`].
@@ -376,7 +385,8 @@ impl Domain {
         self.open_reader(topic, type_name, &requested.policies())
     }
 
-    /// Makes the writer of a ROS topic that offers `offered`. `topic` and `type_name` are DDS names.
+    /// Creates the writer of a ROS topic with the `offered` QoS. `topic` and `type_name` are DDS
+    /// names.
     ///
     /// # Errors
     /// [`DomainError::Endpoint`].
@@ -389,7 +399,8 @@ impl Domain {
         self.open_writer(topic, type_name, &offered.policies())
     }
 
-    /// Makes a reader of any DDS topic, which is the node's until dropped. Samples arrive as bytes.
+    /// Creates a reader of any DDS topic, which belongs to the node until dropped. Samples are
+    /// received as bytes.
     ///
     /// # Errors
     /// [`DomainError::Endpoint`].
@@ -409,7 +420,8 @@ impl Domain {
             .map_err(|source| endpoint_error(topic, source))
     }
 
-    /// Makes a writer of any DDS topic, which is the node's until dropped. Samples are given as bytes.
+    /// Creates a writer of any DDS topic, which belongs to the node until dropped. Samples are
+    /// passed as bytes.
     ///
     /// # Errors
     /// [`DomainError::Endpoint`].
@@ -429,8 +441,8 @@ impl Domain {
             .map_err(|source| endpoint_error(topic, source))
     }
 
-    /// Tells other bridges that this participant is one too, for as long as the writer returned is there. It is on no
-    /// node's list.
+    /// Announces to other bridges that this participant is a bridge, for as long as the returned
+    /// writer exists. The writer belongs to no node.
     ///
     /// # Errors
     /// [`DomainError::Endpoint`].
@@ -438,7 +450,8 @@ impl Domain {
         let qos = QosPolicyBuilder::new()
             .reliable(rustdds::Duration::ZERO)
             .build();
-        // It is no topic of ROS; rmw_cyclonedds looks for a hash nevertheless, and each node of it would warn.
+        // The topic is not a ROS topic; rmw_cyclonedds reads a hash nevertheless, and each of its
+        // nodes would log a warning.
         let qos = with_hash(&qos, PRESENCE_HASH);
         let name = bridge_topic(space);
         create_topic(&self.participant, (&name, BRIDGE_TYPE), &qos)
@@ -448,7 +461,7 @@ impl Domain {
             .map_err(|source| endpoint_error(&name, source))
     }
 
-    /// The policies with the type hash, if it is known.
+    /// Returns the policies with the type hash, if it is known.
     fn with_type_hash(&self, type_name: &str, qos: &QosPolicies) -> QosPolicies {
         let hashes = self
             .type_hashes
@@ -459,10 +472,11 @@ impl Domain {
             .map_or_else(|| qos.clone(), |hash| with_hash(qos, hash))
     }
 
-    /// Leaves the domain, after `endpoints` (readers and writers) were disposed. Returns after [`LEAVE_WITHIN`] at the
-    /// latest: RustDDS joins its threads when a participant goes, and has no bound for that.
+    /// Leaves the domain after `endpoints` (readers and writers) were disposed. Returns after
+    /// [`LEAVE_WITHIN`] at the latest: RustDDS joins its threads without a time limit when a
+    /// participant is dropped.
     ///
-    /// The return value says whether everything was disposed in time.
+    /// Returns whether everything was disposed in time.
     pub async fn leave(self, endpoints: impl Send + 'static) -> bool {
         let (done, left) = tokio::sync::oneshot::channel();
         let thread = std::thread::Builder::new()
@@ -470,7 +484,7 @@ impl Domain {
             .spawn(move || {
                 drop(endpoints);
                 drop(self);
-                // Nobody waits any more when the time is over.
+                // The receiver is dropped after the time limit.
                 done.send(()).ok();
             });
         match thread {
@@ -491,7 +505,7 @@ impl std::fmt::Debug for Domain {
     }
 }
 
-/// A participant, and its traffic where that is a task.
+/// A participant, and its traffic if it is a task.
 type Joined = (DomainParticipant, Option<JoinHandle<&'static str>>);
 
 fn join(options: &DomainOptions) -> Result<Joined, DomainError> {
@@ -527,7 +541,8 @@ fn secured(
     builder
 }
 
-/// In a runtime, which needs its IO driver, the participant's traffic is a task of it; else a thread.
+/// Builds the participant. In a runtime, which needs its IO driver, the traffic is a task of the
+/// runtime; otherwise it has a thread.
 #[cfg(feature = "patched-dds")]
 fn build(builder: DomainParticipantBuilder) -> Result<Joined, CreateError> {
     if tokio::runtime::Handle::try_current().is_err() {
@@ -546,8 +561,8 @@ fn build(builder: DomainParticipantBuilder) -> Result<Joined, CreateError> {
 }
 
 fn participant(options: &DomainOptions) -> Result<DomainParticipantBuilder, DomainError> {
-    // Announcements to 127.0.0.1 find peers on this machine without multicast; they would contradict a choice of
-    // other interfaces.
+    // Announcements to 127.0.0.1 find peers on this machine without multicast; they would
+    // contradict a choice of other interfaces.
     let mut builder = DomainParticipantBuilder::new(options.domain)
         .same_host_loopback(options.networks.is_empty() || options.is_local());
     if !options.networks.is_empty() {
@@ -562,7 +577,8 @@ fn participant(options: &DomainOptions) -> Result<DomainParticipantBuilder, Doma
     with_peers(builder, &options.peers)
 }
 
-/// The policies with a type hash in the endpoint's user data, as every rmw of DDS puts it there (REP-2016).
+/// Returns the policies with a type hash in the endpoint's user data, where every DDS-based rmw
+/// places it (REP-2016).
 #[cfg(feature = "patched-dds")]
 fn with_hash(qos: &QosPolicies, hash: &str) -> QosPolicies {
     let user_data = QosPolicyBuilder::new().user_data(format!("typehash={hash};").into_bytes());
@@ -582,7 +598,7 @@ fn create_topic(
     participant.create_topic(name.to_owned(), type_name.to_owned(), qos, TopicKind::NoKey)
 }
 
-/// The policies of `ros_discovery_info`, as rmw_dds_common has them.
+/// Returns the policies of `ros_discovery_info`, as in rmw_dds_common.
 fn info_qos(depth: i32) -> QosPolicies {
     QosPolicyBuilder::new()
         .reliable(rustdds::Duration::ZERO)
@@ -596,14 +612,15 @@ fn info_qos(depth: i32) -> QosPolicies {
         .build()
 }
 
-/// Whether peers can be told of type hashes: RustDDS as published has no user data of its own.
+/// Returns whether endpoints can announce type hashes: the published RustDDS cannot set user data.
 #[must_use]
 pub const fn can_announce_type_hashes() -> bool {
     cfg!(feature = "patched-dds")
 }
 
-// When this does not compile: the feature `patched-dds` is on, but RustDDS is as published. `cargo xtask` builds with
-// both, and `cargo xtask patches` prints the flags to do so by hand.
+// A compile error here means that the feature `patched-dds` is on, but RustDDS is the published
+// version. `cargo xtask` builds with both, and `cargo xtask patches` prints the flags for a manual
+// build.
 #[cfg(feature = "patched-dds")]
 fn with_peers(
     builder: DomainParticipantBuilder,
@@ -631,19 +648,20 @@ fn endpoint_error(topic: &str, source: CreateError) -> DomainError {
     }
 }
 
-/// Lists of nodes a reader keeps until they are read, which is at once; and those RustDDS may keep unacknowledged.
+/// Node lists that a reader keeps until they are read, which happens at once, and that RustDDS may
+/// keep unacknowledged.
 const INFO_DEPTH: i32 = 256;
 /// The type hashes of `rcl_interfaces/msg/Log`, `rosgraph_msgs/msg/Clock` and
 /// `rmw_dds_common/msg/ParticipantEntitiesInfo`.
 const LOG_HASH: &str = "RIHS01_e28ce254ca8abc06abf92773b74602cdbf116ed34fbaf294fb9f81da9f318eac";
 const CLOCK_HASH: &str = "RIHS01_692f7a66e93a3c83e71765d033b60349ba68023a8c689a79e48078bcb5c58564";
 const INFO_HASH: &str = "RIHS01_91a0593bacdcc50ea9bdcf849a938b128412cc1ea821245c663bcd26f83c295e";
-/// The hash of `ua_bridge/msg/Presence`, of which there is never a message: one without fields.
+/// The hash of `ua_bridge/msg/Presence`, a type without fields of which no message is ever sent.
 const PRESENCE_HASH: &str =
     "RIHS01_d26c7c581663814e80adf6b78455270594107240f359b8e34121972bd039d589";
 /// The highest domain whose ports fit into 16 bits.
 pub const MAX_DOMAIN: u16 = 232;
-/// How long [`Domain::leave`] takes at most.
+/// The time limit of [`Domain::leave`].
 pub const LEAVE_WITHIN: Duration = Duration::from_secs(2);
 
 #[cfg(test)]

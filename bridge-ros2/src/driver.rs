@@ -1,7 +1,8 @@
-//! Turns RustDDS' event loop in the runtime of the bridge, instead of in a thread of its own.
+//! Runs the event loop of RustDDS in the runtime of the bridge instead of in its own thread.
 //!
-//! A sample on its way through the bridge then wakes no other thread: the datagram it came in, the reader, the router and
-//! the writer are handled one after the other. Waking a thread costs 30 us and more, several times what all the rest does.
+//! A sample then passes through the bridge without waking another thread: its datagram, the reader,
+//! the router and the writer are handled in sequence. Waking a thread costs 30 us and more, several
+//! times the cost of all other work.
 
 use std::future::poll_fn;
 use std::os::fd::OwnedFd;
@@ -18,11 +19,11 @@ use tokio::io::unix::AsyncFd;
 use tokio::task::JoinHandle;
 use tokio::time::{Instant, Sleep};
 
-/// Gives the loop its turns, in a task of the current runtime, until its participant is gone. The task ends with the
-/// reason.
+/// Runs the event loop in a task of the current runtime until its participant is dropped. The task
+/// returns the reason for its end.
 ///
 /// # Errors
-/// When the runtime cannot watch the sockets.
+/// If the runtime cannot watch the sockets.
 pub(crate) fn spawn(event_loop: EventLoop) -> std::io::Result<JoinHandle<&'static str>> {
     let task = Arc::new(AtomicWaker::new());
     let sockets: Result<Vec<_>, std::io::Error> = event_loop
@@ -51,14 +52,15 @@ fn watched(socket: OwnedFd) -> std::io::Result<AsyncFd<OwnedFd>> {
 
 struct Driver {
     event_loop: EventLoop,
-    /// Its descriptors, each watched by the runtime itself: what is behind a second poll wakes a thread late.
+    /// The descriptors of the event loop, each watched by the runtime directly: a nested poll wakes
+    /// a thread late.
     sockets: Vec<Watched>,
-    /// What their bells wake.
+    /// The waker that the bells of the sockets call.
     task: Arc<AtomicWaker>,
 }
 
-/// A descriptor that says whether it is worth a look: asking the runtime for each of them at each wake was a tenth of
-/// what a sample costs.
+/// A descriptor with a flag that shows whether a poll is worthwhile: polling the runtime for each
+/// descriptor at each wake took a tenth of the cost of a sample.
 struct Watched {
     socket: AsyncFd<OwnedFd>,
     bell: Arc<Bell>,
@@ -68,7 +70,7 @@ struct Watched {
 impl Watched {
     fn new(socket: AsyncFd<OwnedFd>, task: Arc<AtomicWaker>) -> Self {
         let bell = Arc::new(Bell {
-            // The first look has the runtime watch it.
+            // The first poll registers the descriptor with the runtime.
             rung: AtomicBool::new(true),
             task,
         });
@@ -101,7 +103,8 @@ impl Driver {
         let mut timer = Box::pin(tokio::time::sleep(Duration::ZERO));
         loop {
             let due = Instant::now() + self.event_loop.timeout();
-            // Only an earlier deadline needs the timer wheel; a later one is found out when it rings.
+            // Only an earlier deadline needs the timer wheel; a later deadline is detected when the
+            // timer fires.
             if timer.is_elapsed() || due < timer.deadline() {
                 timer.as_mut().reset(due);
             }
@@ -122,15 +125,15 @@ impl Driver {
                 } else {
                     tokio::task::yield_now().await;
                 }
-                // A socket that is never empty must not keep the others from being read.
+                // A socket that is never empty must not delay the other sockets.
                 poll_fn(|cx| Poll::Ready(self.poll_sockets(cx))).await;
             }
-            // Commands and datagrams may come for ever; everybody else has a turn.
+            // Commands and datagrams may arrive without end; other tasks get their turn here.
             tokio::task::consume_budget().await;
         }
     }
 
-    /// Ready when the loop is to have a turn; false when the runtime ends.
+    /// Returns ready when the event loop has work; false if the runtime ends.
     fn poll_wake(&mut self, timer: Pin<&mut Sleep>, cx: &mut Context<'_>) -> Poll<bool> {
         let rung = self.event_loop.poll_commands(cx).is_ready();
         match self.poll_sockets(cx) {
@@ -141,9 +144,10 @@ impl Driver {
         }
     }
 
-    /// Tells the loop which sockets have become readable; the task is woken when one of the others does.
+    /// Passes the readable sockets to the event loop; the task is woken when another socket becomes
+    /// readable.
     fn poll_sockets(&mut self, cx: &mut Context<'_>) -> Sockets {
-        // Before the bells are looked at, so that none rings unheard.
+        // Registered before the bells are read, so that no wake is missed.
         self.task.register(cx.waker());
         let mut found = Sockets::Quiet;
         for (index, watched) in self.sockets.iter().enumerate() {
@@ -153,10 +157,10 @@ impl Driver {
             let mut cx = Context::from_waker(&watched.waker);
             match watched.socket.poll_read_ready(&mut cx) {
                 Poll::Ready(Ok(mut ready)) => {
-                    // Before the turn, so that what comes during it is noticed.
+                    // Cleared before the turn, so that data that arrives during it is noticed.
                     ready.clear_ready();
                     self.event_loop.readable(index);
-                    // For the next look, which has it watched again.
+                    // For the next poll, which registers the descriptor again.
                     watched.bell.rung.store(true, Ordering::Release);
                     found = Sockets::Readable;
                 }
@@ -168,8 +172,8 @@ impl Driver {
     }
 }
 
-/// Lets the tasks run that are ready, without the look at the sockets that
-/// [`yield_now`](tokio::task::yield_now) takes: a system call for each sample.
+/// Runs the ready tasks without the poll of the sockets that [`yield_now`](tokio::task::yield_now)
+/// performs: a system call for each sample.
 async fn let_others_run() {
     let mut ran = false;
     poll_fn(|cx| {
@@ -185,6 +189,6 @@ async fn let_others_run() {
 enum Sockets {
     Readable,
     Quiet,
-    /// With the runtime.
+    /// The runtime has ended.
     Gone,
 }

@@ -1,6 +1,8 @@
-//! Variables of the ROS 2 environment that this bridge does not honour, since it joins the domain through RustDDS.
+//! Variables of the ROS 2 environment that this bridge ignores because it joins the domain through
+//! RustDDS.
 
-/// Returns one warning for each variable that is set and has no effect on the bridge. `variable` looks a variable up.
+/// Returns one warning for each variable that is set and has no effect on the bridge. `variable`
+/// looks a variable up.
 pub fn ignored(variable: impl Fn(&str) -> Option<String>) -> Vec<String> {
     let set = |name: &str| {
         let value = variable(name)?;

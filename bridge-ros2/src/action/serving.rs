@@ -1,4 +1,5 @@
-//! What serves an action behind its handles: the three services, the two topics, and the task that keeps time.
+//! The parts of an action server behind its handles: the three services, the two topics, and the
+//! periodic task.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -24,24 +25,27 @@ use crate::service::{
     policies,
 };
 
-/// What a server holds, and for how long.
+/// The limits of an action server.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ActionServerOptions {
-    /// An `X_GetResult_Response` with nothing in it, little endian CDR with its encapsulation header: for goals that are
-    /// unknown, and those that end without a result of yours. Clients of the type have to be able to read it.
+    /// An `X_GetResult_Response` with default field values, little-endian CDR with its
+    /// encapsulation header. It is sent for unknown goals and for goals that end without a result
+    /// from the user. Clients of the type have to be able to decode it.
     pub empty_result: Bytes,
-    /// How long the result of a goal is kept after its end, by the steady clock; `None` keeps it until there is no
-    /// room. `rcl_action_server_get_default_options` says 10 seconds, up to ROS 2 Humble 15 minutes.
+    /// How long the result of a goal is kept after its end, in steady time; `None` keeps it until
+    /// room is needed. The default of `rcl_action_server_get_default_options` is 10 seconds, up to
+    /// ROS 2 Humble 15 minutes.
     pub result_timeout: Option<Duration>,
-    /// How many goals are known at once, ended ones included. When there are more, ended ones are forgotten early; when
-    /// none has ended, goals are rejected.
+    /// Maximum number of known goals, including ended goals. Beyond it, ended goals are removed
+    /// early; if no goal has ended, new goals are rejected.
     pub max_goals: usize,
-    /// How long a request to cancel waits for your decision. Past that it counts as rejected.
+    /// How long a cancel request waits for the user's decision. After that, it counts as rejected.
     pub cancel_timeout: Duration,
 }
 
 impl ActionServerOptions {
-    /// Results are kept for 10 seconds; 1000 goals; 5 seconds to decide about cancelling.
+    /// Returns options that keep results for 10 seconds, allow 1000 goals, and allow 5 seconds for
+    /// the decision about a cancel request.
     #[must_use]
     pub const fn new(empty_result: Bytes) -> Self {
         Self {
@@ -53,18 +57,18 @@ impl ActionServerOptions {
     }
 }
 
-/// What the server, its services, its task and its goals share.
+/// The state that the server, its services, its task and its goals share.
 #[derive(Debug)]
 pub(super) struct Shared {
     action: Action,
     options: ActionServerOptions,
     clock: RosClock,
     state: Mutex<State>,
-    /// Rings for [`ActionServer::recv`](super::ActionServer::recv).
+    /// Notifies [`ActionServer::recv`](super::ActionServer::recv).
     pub(super) arrival: Notify,
-    /// Tells all goals that one has changed.
+    /// Notifies all goals that a goal has changed.
     pub(super) changed: watch::Sender<()>,
-    /// Rings for the task when something waits to be sent.
+    /// Notifies the task that a message waits to be sent.
     unsent: Notify,
 }
 
@@ -85,7 +89,7 @@ struct Outputs {
     status: Outlet,
 }
 
-/// What waits for the user.
+/// A request that waits for the user.
 #[derive(Debug)]
 pub(super) enum Arrived {
     Goal {
@@ -99,19 +103,19 @@ pub(super) enum Arrived {
     },
 }
 
-/// That a goal was accepted, and what to drop when its client knows.
+/// The acceptance of a goal, and the sender to drop when its client was notified.
 #[derive(Debug)]
 pub(super) struct Acceptance {
     pub(super) stamp: RosTime,
     pub(super) written: oneshot::Sender<Never>,
 }
 
-/// That a goal is being cancelled.
+/// The agreement to cancel a goal.
 #[derive(Debug)]
 pub(super) struct CancelAgreed;
 
 impl Shared {
-    /// Makes the topics' writers.
+    /// Creates the writers of the topics.
     pub(super) fn new(
         domain: &Domain,
         peers: &ServicePeers,
@@ -145,8 +149,8 @@ impl Shared {
         })
     }
 
-    /// Opens the services. Each may handle as many requests as can wait for their answers here, and some more that are
-    /// answered at once: none waits for another.
+    /// Opens the services. Each service may handle as many requests as can wait for their replies,
+    /// and some more that are answered at once, so no request waits for another.
     pub(super) fn serve(
         self: &Arc<Self>,
         domain: &Domain,
@@ -200,17 +204,17 @@ impl Shared {
         self.lock().outputs.is_some()
     }
 
-    /// Lets go of the topics, and of what nobody has taken.
+    /// Closes the topics and drops the requests that the user has not received.
     pub(super) fn close(&self) {
         let mut state = self.lock();
         let left = (state.outputs.take(), std::mem::take(&mut state.arrived));
         drop(state);
-        // Without the lock: RustDDS may have something to say about it.
+        // Without the lock: the drop may take RustDDS some time.
         drop(left);
         self.changed.send_replace(());
     }
 
-    /// Accepts a goal; returns when.
+    /// Accepts a goal; returns the time of acceptance.
     pub(super) fn accept(&self, ticket: Ticket) -> Result<RosTime, GoalError> {
         let stamp = self.clock.now();
         let mut state = self.lock();
@@ -219,18 +223,19 @@ impl Shared {
         Ok(stamp)
     }
 
-    /// A goal's client knows that it was accepted.
+    /// Records that the client of a goal was notified of its acceptance.
     pub(super) fn accepted(&self) {
         let mut guard = self.lock();
         let state = &mut *guard;
         if let Some(outputs) = &mut state.outputs {
-            // Its reader of feedback may be new.
+            // The client's feedback reader may be new.
             self.note(outputs.meet(&self.action, Instant::now(), BUSY));
         }
         self.publish_status(state);
     }
 
-    /// Applies a decision, tells the status, and gives those who waited for it their result.
+    /// Applies a decision, publishes the status, and sends the result to the requests that waited
+    /// for it.
     pub(super) fn decide(
         &self,
         decision: impl FnOnce(&mut Goals) -> Result<Vec<(oneshot::Sender<Bytes>, Bytes)>, GoalError>,
@@ -241,7 +246,7 @@ impl Shared {
         self.publish_status(&mut state);
         drop(state);
         for (who, result) in results {
-            // A client that went away asks no more.
+            // The receiver is closed if the client has left.
             drop(who.send(result));
         }
         self.changed.send_replace(());
@@ -296,7 +301,8 @@ impl Shared {
         })
     }
 
-    /// Hands a goal to the user, whose decision is to come; `None` where it is rejected without.
+    /// Passes a goal to the user and returns the receiver of the decision; `None` if the goal is
+    /// rejected at once.
     fn arrive(&self, id: GoalId, body: Bytes) -> Option<oneshot::Receiver<Acceptance>> {
         let mut state = self.lock();
         let ticket = match state.goals.arrive(id) {
@@ -345,7 +351,7 @@ impl Shared {
         Ok(wire::cancel_answer(&CancelAnswer { code, goals }))
     }
 
-    /// Hands a request to cancel to the user, once for each goal that it is about.
+    /// Passes a cancel request to the user, once for each selected goal.
     fn ask_to_cancel(
         &self,
         what: CancelWhat,
@@ -359,7 +365,7 @@ impl Shared {
                 let arrived = Arrived::Cancel { ticket, answer };
                 state.arrived.push_back(arrived);
             } else {
-                // Without an answer it counts as rejected.
+                // Without a decision, the request counts as rejected.
                 state.goals.counters.refused += 1;
             }
             asked.push((info, decision));
@@ -387,8 +393,8 @@ impl Shared {
         result
     }
 
-    /// Waits until queued feedback is sent: a client reports none after the result. A reader that
-    /// takes nothing holds up a result for half a second.
+    /// Waits until queued feedback is sent: a client ignores feedback after the result. A reader
+    /// that accepts no sample delays a result by half a second.
     async fn feedback_first(&self) {
         let is_waiting = || {
             let state = self.lock();
@@ -421,7 +427,7 @@ impl Shared {
         }
     }
 
-    /// Does what is due, and returns when it is to be done again.
+    /// Does the due work; returns the time of the next call.
     fn tick(&self, now: Instant) -> Instant {
         let mut guard = self.lock();
         let state = &mut *guard;
@@ -442,10 +448,10 @@ impl Shared {
         }
     }
 
-    /// The next status says all again.
+    /// Logs a failure to publish the status. The next status repeats the complete list.
     fn note(&self, sent: Result<(), Refusal>) {
         match sent {
-            // One status waits, which is the newest.
+            // At most one status waits, which is the newest.
             Ok(()) | Err(Refusal::Overflow | Refusal::NoReader) => {}
             Err(refusal @ (Refusal::TooLarge(_) | Refusal::Late | Refusal::Failed)) => {
                 let (action, why) = (self.action.name(), refusal.label());
@@ -465,7 +471,7 @@ impl State {
 }
 
 impl Outputs {
-    /// Takes note of who listens, looked at no longer than `age` ago, and sends the status that waits.
+    /// Updates the known readers from a snapshot no older than `age`, and sends the waiting status.
     fn meet(&mut self, action: &Action, now: Instant, age: Duration) -> Result<(), Refusal> {
         let seen = self.peers.look(now, age);
         self.feedback
@@ -476,7 +482,8 @@ impl Outputs {
     }
 }
 
-/// Keeps time until aborted: forgets results, takes note of readers, sends what waits.
+/// Runs the periodic work until aborted: expires results, updates the readers, and sends waiting
+/// messages.
 pub(super) async fn run(shared: Arc<Shared>) {
     let mut due = Instant::now();
     loop {
@@ -487,9 +494,9 @@ pub(super) async fn run(shared: Arc<Shared>) {
     }
 }
 
-/// Requests that are answered at once, beside those that wait.
+/// Requests that are answered at once, in addition to waiting requests.
 const AT_ONCE: usize = 64;
-/// How long a result waits for feedback that is yet to be sent.
+/// How long a result waits for feedback that is not sent yet.
 const FEEDBACK_FIRST: Duration = Duration::from_millis(500);
-/// Stands for a time limit too long for the clock.
+/// Replaces a timeout too long for the clock.
 const LONGEST: Duration = Duration::from_secs(86_400 * 365);

@@ -1,28 +1,28 @@
-//! What the messages of every action say: ids, statuses, and requests to cancel.
+//! The types that the messages of every action share: goal ids, statuses, and cancel requests.
 
 use std::fmt;
 
 use crate::clock::RosTime;
 
-/// Tells a goal from all others, as its client has chosen it (`unique_identifier_msgs/UUID`).
+/// The id of a goal, chosen by its client (`unique_identifier_msgs/UUID`).
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct GoalId([u8; 16]);
 
 impl GoalId {
-    /// Of its 16 bytes.
+    /// Creates an id from its 16 bytes.
     #[must_use]
     pub const fn from_bytes(bytes: [u8; 16]) -> Self {
         Self(bytes)
     }
 
-    /// Its 16 bytes.
+    /// Returns the 16 bytes of the id.
     #[must_use]
     pub const fn to_bytes(self) -> [u8; 16] {
         self.0
     }
 }
 
-/// As `ros2 action` prints it: 32 hexadecimal digits.
+/// Formats the id as `ros2 action` does: 32 hexadecimal digits.
 impl fmt::Display for GoalId {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         self.0.iter().try_for_each(|byte| write!(f, "{byte:02x}"))
@@ -35,27 +35,27 @@ impl fmt::Debug for GoalId {
     }
 }
 
-/// How far a goal is (`action_msgs/GoalStatus`).
+/// The status of a goal (`action_msgs/GoalStatus`).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Status {
-    /// Nobody knows the goal.
+    /// The goal is unknown.
     Unknown,
-    /// Accepted, and work has not begun.
+    /// The goal is accepted, and its execution has not started.
     Accepted,
-    /// At work.
+    /// The goal is executing.
     Executing,
-    /// At work to end it as cancelled, which a client asked for and the server agreed to.
+    /// The goal is being canceled: a client requested it and the server agreed.
     Canceling,
-    /// Ended: reached.
+    /// The goal has ended successfully.
     Succeeded,
-    /// Ended: cancelled.
+    /// The goal has ended as canceled.
     Canceled,
-    /// Ended: failed.
+    /// The goal has ended with a failure.
     Aborted,
 }
 
 impl Status {
-    /// The code in messages.
+    /// Returns the code used in messages.
     #[must_use]
     pub const fn code(self) -> i8 {
         match self {
@@ -69,7 +69,7 @@ impl Status {
         }
     }
 
-    /// Of the code in a message; `None` for one that is none.
+    /// Returns the status with this code; `None` for an unknown code.
     #[must_use]
     pub const fn from_code(code: i8) -> Option<Self> {
         Some(match code {
@@ -84,50 +84,51 @@ impl Status {
         })
     }
 
-    /// Whether nothing follows.
+    /// Returns whether the status is terminal.
     #[must_use]
     pub const fn is_terminal(self) -> bool {
         matches!(self, Self::Succeeded | Self::Canceled | Self::Aborted)
     }
 }
 
-/// A goal, and when it was accepted by the clock of its server (`action_msgs/GoalInfo`).
+/// A goal and the time of its acceptance by the clock of its server (`action_msgs/GoalInfo`).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct GoalInfo {
-    /// The goal.
+    /// The id of the goal.
     pub id: GoalId,
-    /// When it was accepted.
+    /// The time of acceptance.
     pub stamp: RosTime,
 }
 
-/// Which goals to cancel (`action_msgs/CancelGoal`, request).
+/// Selects goals to cancel (`action_msgs/CancelGoal`, request).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum CancelWhat {
-    /// All.
+    /// All goals.
     All,
-    /// This one.
+    /// The goal with this id.
     Goal(GoalId),
-    /// All that were accepted then or before, by the clock of the server.
+    /// All goals accepted at or before this time of the server's clock.
     Until(RosTime),
-    /// Both this one and all that were accepted then or before.
+    /// The goal with this id and all goals accepted at or before this time.
     GoalAndUntil(GoalId, RosTime),
 }
 
-/// What a server says to a request to cancel (`action_msgs/CancelGoal`, `return_code`).
+/// The server's response code to a cancel request (`action_msgs/CancelGoal`, `return_code`).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum CancelCode {
-    /// The goals named are being cancelled; there may be none where no one goal was asked for.
+    /// The named goals are being canceled; the list may be empty if the request selected goals
+    /// other than by a single id.
     None,
-    /// The server goes on with all of them.
+    /// The server cancels no goal.
     Rejected,
-    /// There is no such goal.
+    /// The goal is unknown.
     UnknownGoal,
-    /// The goal has ended, or is being cancelled already.
+    /// The goal has ended, or is being canceled already.
     Terminated,
 }
 
 impl CancelCode {
-    /// The code in messages.
+    /// Returns the code used in messages.
     #[must_use]
     pub const fn code(self) -> i8 {
         match self {
@@ -138,7 +139,7 @@ impl CancelCode {
         }
     }
 
-    /// Of the code in a message; `None` for one that is none.
+    /// Returns the response code with this number; `None` for an unknown number.
     #[must_use]
     pub const fn from_code(code: i8) -> Option<Self> {
         Some(match code {
@@ -151,18 +152,18 @@ impl CancelCode {
     }
 }
 
-/// The answer to a request to cancel (`action_msgs/CancelGoal`, response).
+/// The response to a cancel request (`action_msgs/CancelGoal`, response).
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct CancelAnswer {
-    /// What the server says.
+    /// The response code.
     pub code: CancelCode,
-    /// The goals that are being cancelled now. How they end is told with their results.
+    /// The goals that are being canceled. Their results report their ends.
     pub goals: Vec<GoalInfo>,
 }
 
 impl CancelAnswer {
-    /// The answer to that request. A server of rclpy that goes on with a goal says no more than which goals it cancels,
-    /// and that is not among them.
+    /// Adjusts the response to the request. A server of rclpy that refuses to cancel a goal only
+    /// leaves the goal out of the list of canceled goals.
     pub(super) fn to(self, what: CancelWhat) -> Self {
         match what {
             CancelWhat::Goal(id)
@@ -198,7 +199,7 @@ mod tests {
             code(none.clone(), CancelWhat::Goal(one)),
             CancelCode::Rejected
         );
-        // Where more than one may be meant, none may be there.
+        // A request that may select several goals may select none.
         assert_eq!(code(none.clone(), CancelWhat::All), CancelCode::None);
         assert_eq!(
             code(none, CancelWhat::Until(RosTime::default())),

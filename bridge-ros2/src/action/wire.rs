@@ -1,4 +1,5 @@
-//! The bytes of the messages every action has. Pure; bytes from outside are looked at with care.
+//! Encodes and decodes the messages that every action has. The module is pure, and validates all
+//! received bytes.
 
 use bytes::{Bytes, BytesMut};
 
@@ -6,8 +7,8 @@ use super::types::{CancelAnswer, CancelCode, CancelWhat, GoalId, GoalInfo, Statu
 use crate::cdr::{CdrReader, CdrWriter, Malformed};
 use crate::clock::RosTime;
 
-/// Parts `X_SendGoal_Request` or `X_FeedbackMessage` into the id and what follows, behind an encapsulation header.
-/// The id has 16 bytes, so nothing behind it is aligned otherwise without it.
+/// Splits `X_SendGoal_Request` or `X_FeedbackMessage` into the id and the rest, which keeps an
+/// encapsulation header. The id has 16 bytes, so its removal keeps the alignment of the rest.
 pub(super) fn split(message: &Bytes) -> Result<(GoalId, Bytes), Malformed> {
     let mut reader = CdrReader::new(message)?;
     let id = read_id(&mut reader)?;
@@ -21,7 +22,7 @@ pub(super) fn split(message: &Bytes) -> Result<(GoalId, Bytes), Malformed> {
     Ok((id, bytes.freeze()))
 }
 
-/// The inverse of [`split`]. `None` when the body is not CDR in little endian.
+/// The inverse of [`split`]. Returns `None` if the body is not little-endian CDR.
 pub(super) fn join(id: GoalId, body: &[u8]) -> Option<Bytes> {
     let body = little_endian(body)?;
     let mut bytes = BytesMut::with_capacity(ENCAPSULATION + ID + body.len());
@@ -31,7 +32,7 @@ pub(super) fn join(id: GoalId, body: &[u8]) -> Option<Bytes> {
     Some(bytes.freeze())
 }
 
-/// `X_SendGoal_Response`.
+/// Encodes `X_SendGoal_Response`.
 pub(super) fn goal_answer(accepted: bool, stamp: RosTime) -> Bytes {
     let mut writer = CdrWriter::new();
     writer.bool(accepted);
@@ -39,7 +40,7 @@ pub(super) fn goal_answer(accepted: bool, stamp: RosTime) -> Bytes {
     writer.finish()
 }
 
-/// `X_SendGoal_Response`: when the goal was accepted, `None` when it was rejected.
+/// Decodes `X_SendGoal_Response`: the time of acceptance, or `None` if the goal was rejected.
 pub(super) fn read_goal_answer(message: &[u8]) -> Result<Option<RosTime>, Malformed> {
     let mut reader = CdrReader::new(message)?;
     let accepted = reader.bool()?;
@@ -47,19 +48,20 @@ pub(super) fn read_goal_answer(message: &[u8]) -> Result<Option<RosTime>, Malfor
     Ok(accepted.then_some(stamp))
 }
 
-/// `X_GetResult_Request`.
+/// Encodes `X_GetResult_Request`.
 pub(super) fn result_request(id: GoalId) -> Bytes {
     let mut writer = CdrWriter::new();
     write_id(&mut writer, id);
     writer.finish()
 }
 
-/// `X_GetResult_Request`.
+/// Decodes `X_GetResult_Request`.
 pub(super) fn read_result_request(message: &[u8]) -> Result<GoalId, Malformed> {
     read_id(&mut CdrReader::new(message)?)
 }
 
-/// `X_GetResult_Response` with another status. `None` when it is not CDR in little endian.
+/// Replaces the status in `X_GetResult_Response`. Returns `None` if the message is not
+/// little-endian CDR.
 pub(super) fn with_status(result: &[u8], status: Status) -> Option<Bytes> {
     let (_, fields) = little_endian(result)?.split_first()?;
     let mut bytes = BytesMut::with_capacity(result.len());
@@ -69,7 +71,7 @@ pub(super) fn with_status(result: &[u8], status: Status) -> Option<Bytes> {
     Some(bytes.freeze())
 }
 
-/// The status in `X_GetResult_Response`, where it is one with which a goal ends or that says that there is none.
+/// Decodes the status in `X_GetResult_Response`, which has to be terminal or unknown.
 pub(super) fn result_status(message: &[u8]) -> Result<Status, Malformed> {
     let status = read_code(&mut CdrReader::new(message)?)?;
     Status::from_code(status)
@@ -77,7 +79,7 @@ pub(super) fn result_status(message: &[u8]) -> Result<Status, Malformed> {
         .ok_or(Malformed)
 }
 
-/// `action_msgs/CancelGoal`, request.
+/// Encodes the request of `action_msgs/CancelGoal`.
 pub(super) fn cancel_request(what: CancelWhat) -> Bytes {
     let (id, stamp) = match what {
         CancelWhat::All => (NO_ID, RosTime::default()),
@@ -90,7 +92,7 @@ pub(super) fn cancel_request(what: CancelWhat) -> Bytes {
     writer.finish()
 }
 
-/// `action_msgs/CancelGoal`, request.
+/// Decodes the request of `action_msgs/CancelGoal`.
 pub(super) fn read_cancel_request(message: &[u8]) -> Result<CancelWhat, Malformed> {
     let GoalInfo { id, stamp } = read_info(&mut CdrReader::new(message)?)?;
     Ok(match (id == NO_ID, stamp == RosTime::default()) {
@@ -101,7 +103,7 @@ pub(super) fn read_cancel_request(message: &[u8]) -> Result<CancelWhat, Malforme
     })
 }
 
-/// `action_msgs/CancelGoal`, response.
+/// Encodes the response of `action_msgs/CancelGoal`.
 pub(super) fn cancel_answer(answer: &CancelAnswer) -> Bytes {
     let mut writer = CdrWriter::new();
     write_code(&mut writer, answer.code.code());
@@ -109,7 +111,7 @@ pub(super) fn cancel_answer(answer: &CancelAnswer) -> Bytes {
     writer.finish()
 }
 
-/// `action_msgs/CancelGoal`, response.
+/// Decodes the response of `action_msgs/CancelGoal`.
 pub(super) fn read_cancel_answer(message: &[u8]) -> Result<CancelAnswer, Malformed> {
     let mut reader = CdrReader::new(message)?;
     Ok(CancelAnswer {
@@ -118,7 +120,7 @@ pub(super) fn read_cancel_answer(message: &[u8]) -> Result<CancelAnswer, Malform
     })
 }
 
-/// `action_msgs/GoalStatusArray`.
+/// Encodes `action_msgs/GoalStatusArray`.
 pub(super) fn status_array(goals: &[(GoalInfo, Status)]) -> Bytes {
     let mut writer = CdrWriter::new();
     writer.sequence(goals, |writer, (info, status)| {
@@ -128,7 +130,7 @@ pub(super) fn status_array(goals: &[(GoalInfo, Status)]) -> Bytes {
     writer.finish()
 }
 
-/// `action_msgs/GoalStatusArray`, without goals whose status is none.
+/// Decodes `action_msgs/GoalStatusArray` and drops goals with an unknown status code.
 pub(super) fn read_status_array(message: &[u8]) -> Result<Vec<(GoalInfo, Status)>, Malformed> {
     let goals = CdrReader::new(message)?.sequence(|reader| {
         let info = read_info(reader)?;
@@ -195,7 +197,7 @@ fn write_code(writer: &mut CdrWriter, code: i8) {
 const ENCAPSULATION: usize = 4;
 const LITTLE_ENDIAN: [u8; ENCAPSULATION] = [0, 1, 0, 0];
 const ID: usize = 16;
-/// Stands for any goal.
+/// The id that selects any goal.
 const NO_ID: GoalId = GoalId::from_bytes([0; ID]);
 
 #[cfg(test)]
@@ -217,7 +219,7 @@ mod tests {
         );
         let (id, body) = split(&message).unwrap();
         assert_eq!((id, body.as_ref()), (SEVEN, &[0, 1, 0, 0, 3, 0, 0, 0][..]));
-        // Of a client that writes big endian, who says so in the header.
+        // From a client that writes big endian, as the header states.
         let big = Bytes::from([&[0, 0, 0, 0][..], &[7; 16], &[0, 0, 0, 3]].concat());
         let (id, body) = split(&big).unwrap();
         assert_eq!((id, body.as_ref()), (SEVEN, &[0, 0, 0, 0, 0, 0, 0, 3][..]));
@@ -288,7 +290,8 @@ mod tests {
             stamp: stamp(1),
         };
         let bytes = status_array(&[(info, Status::Executing), (info, Status::Aborted)]);
-        // Header, count, the first goal, and the second with three bytes of padding before its stamp.
+        // Header, count, the first goal, and the second goal with three bytes of padding before its
+        // stamp.
         assert_eq!(bytes.len(), 4 + 4 + 25 + 28);
         assert_eq!(
             read_status_array(&bytes),
@@ -315,7 +318,7 @@ mod tests {
                     read_cancel_answer(cut).is_ok(),
                     read_status_array(cut).is_ok(),
                 ];
-                // None is as short as its header.
+                // No message is as short as its header.
                 proptest::prop_assert!(cut.len() > 4 || !read.contains(&true));
             }
         }

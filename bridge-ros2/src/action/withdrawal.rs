@@ -1,7 +1,7 @@
-//! Withdrawn goals: a goal that its client gives up before the server has decided about it is cancelled as soon as it
-//! is accepted.
+//! Withdrawn goals: a goal that its client cancels before the server has decided about it is
+//! cancelled as soon as it is accepted.
 //!
-//! No clock and no network: times and answers come in, requests to cancel come out.
+//! The module uses no clock and no network: times and responses come in, cancel requests come out.
 
 use std::time::Duration;
 
@@ -9,7 +9,7 @@ use tokio::time::Instant;
 
 use super::types::CancelCode;
 
-/// The way of one withdrawn goal to its end.
+/// The state of one withdrawn goal until its end.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Withdrawal {
     since: Instant,
@@ -20,9 +20,9 @@ pub(super) struct Withdrawal {
 enum Stage {
     /// The server has not decided about the goal.
     Undecided,
-    /// The server has accepted the goal. The next request to cancel is due at that time.
+    /// The server has accepted the goal. The next cancel request is due at this time.
     Due(Instant),
-    /// A request to cancel is on its way.
+    /// A cancel request is pending.
     Asked,
     /// The server cancels the goal, or has ended it.
     Agreed,
@@ -38,14 +38,14 @@ impl Withdrawal {
         }
     }
 
-    /// Notes that the server has accepted the goal.
+    /// Records that the server has accepted the goal.
     pub(super) const fn accepted(&mut self, now: Instant) {
         if matches!(self.stage, Stage::Undecided) {
             self.stage = Stage::Due(now);
         }
     }
 
-    /// Returns when the next request to cancel is due.
+    /// Returns the time at which the next cancel request is due.
     pub(super) const fn due(&self) -> Option<Instant> {
         match self.stage {
             Stage::Due(at) => Some(at),
@@ -53,7 +53,7 @@ impl Withdrawal {
         }
     }
 
-    /// Returns true once for each request to cancel that is to be sent at that time.
+    /// Returns true once for each cancel request that is due at `now`.
     pub(super) fn take_due(&mut self, now: Instant) -> bool {
         let is_due = self.due().is_some_and(|at| at <= now);
         if is_due {
@@ -62,26 +62,27 @@ impl Withdrawal {
         is_due
     }
 
-    /// Notes the answer to a request to cancel, or that there was none, in which case it is sent again. Returns true if
-    /// the server refuses for the first time.
+    /// Records the response to a cancel request. Without a response, the request is sent again.
+    /// Returns true if the server refuses for the first time.
     pub(super) fn answered(&mut self, answer: Option<CancelCode>, now: Instant) -> bool {
         let before = self.stage;
         self.stage = match answer {
             Some(CancelCode::None | CancelCode::Terminated) => Stage::Agreed,
             Some(CancelCode::Rejected) => Stage::Refused,
-            // A server with several threads may take the request before it has noted the goal.
+            // A server with several threads may process the request before it has registered the
+            // goal.
             Some(CancelCode::UnknownGoal) | None => Stage::Due(now + AGAIN),
         };
         self.stage == Stage::Refused && before != Stage::Refused
     }
 
-    /// How long ago the goal was withdrawn.
+    /// Returns the time since the withdrawal of the goal.
     pub(super) fn age(&self, now: Instant) -> Duration {
         now.saturating_duration_since(self.since)
     }
 }
 
-/// The pause before a request to cancel is sent again.
+/// The pause before a cancel request is sent again.
 const AGAIN: Duration = Duration::from_millis(200);
 
 #[cfg(test)]
