@@ -1,7 +1,7 @@
-//! Who else is in the domain: the endpoints of other participants, by topic.
+//! The other participants of the domain: their endpoints, by topic.
 //!
-//! RustDDS reports discovery as events too, but on a channel that drops when it is full, and its graph events name
-//! built-in entities. A snapshot of its database is the whole truth at that moment.
+//! RustDDS reports discovery as events too, but on a channel that drops events when it is full, and
+//! its graph events name built-in entities. A snapshot of its database is complete at that moment.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -14,10 +14,10 @@ use rustdds::{DomainParticipant, GUID, QosPolicies, RTPSEntity};
 
 use crate::node::ParticipantPrefix;
 
-/// One writer or reader of another participant.
+/// A writer or reader of another participant.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Endpoint {
-    /// Who it is.
+    /// The GUID of the endpoint.
     pub guid: GUID,
     /// The DDS name of its type, such as `std_msgs::msg::dds_::String_`.
     pub type_name: String,
@@ -25,21 +25,22 @@ pub struct Endpoint {
     pub reliable: bool,
     /// Offered or requested durability is transient-local or stronger.
     pub transient_local: bool,
-    /// The hash of its type, which nodes from ROS 2 Iron on announce.
+    /// The hash of its type, which nodes announce since ROS 2 Iron.
     pub type_hash: Option<TypeHash>,
-    /// All it offers or requests.
+    /// All offered or requested policies.
     pub qos: Arc<QosPolicies>,
 }
 
 impl Endpoint {
-    /// A writer as discovered, and its DDS topic.
+    /// Returns a discovered writer and its DDS topic.
     pub(crate) fn of_writer(writer: DiscoveredWriterData) -> (String, Self) {
         let data = writer.publication_topic_data;
         let qos = Arc::new(data.qos());
         let endpoint = Self {
             guid: writer.writer_proxy.remote_writer_guid,
             type_name: data.type_name,
-            // The default of a writer is reliable, that of a reader is best effort (DDS 1.4, 2.2.3.14).
+            // The default of a writer is reliable, the default of a reader is best effort (DDS 1.4,
+            // 2.2.3.14).
             reliable: data.reliability != Some(Reliability::BestEffort),
             transient_local: is_durable(data.durability),
             type_hash: type_hash(&writer.user_data),
@@ -48,7 +49,7 @@ impl Endpoint {
         (data.topic_name, endpoint)
     }
 
-    /// A reader as discovered, and its DDS topic.
+    /// Returns a discovered reader and its DDS topic.
     pub(crate) fn of_reader(reader: DiscoveredReaderData) -> (String, Self) {
         let data = reader.subscription_topic_data;
         let qos = data.qos();
@@ -63,34 +64,37 @@ impl Endpoint {
         (data.topic_name().clone(), endpoint)
     }
 
-    /// Whether it is of that type, and of the definition with that hash as far as either is known to have one.
+    /// Returns whether the endpoint has the type, and the definition with the hash. An unknown hash
+    /// on either side matches.
     pub(crate) fn is_of(&self, dds_type: &str, hash: Option<TypeHash>) -> bool {
         let differ = self.type_hash.zip(hash).is_some_and(|(a, b)| a != b);
         self.type_name == dds_type && !differ
     }
 
-    /// Whether the endpoint is of Fast DDS, by the vendor in its GUID (eProsima is 01.0f in the OMG's list).
+    /// Returns whether the endpoint belongs to Fast DDS, by the vendor in its GUID (eProsima is
+    /// 01.0f in the OMG's list).
     #[must_use]
     pub fn is_fast_dds(&self) -> bool {
         self.guid.prefix.as_ref().starts_with(&[0x01, 0x0f])
     }
 }
 
-/// The endpoints of others on the topics of ROS (`rt/...`), by DDS topic name.
+/// The endpoints of other participants on ROS topics (`rt/...`), by DDS topic name.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Graph {
     writers: BTreeMap<String, Vec<Endpoint>>,
     readers: BTreeMap<String, Vec<Endpoint>>,
     /// Participants with any endpoint.
     participants: BTreeSet<ParticipantPrefix>,
-    /// Endpoints of our own that came back to us as announced: RustDDS hears itself.
+    /// The bridge's own endpoints that were received as announcements: RustDDS receives its own
+    /// multicast.
     own: BTreeSet<GUID>,
-    /// Participants of other bridges, and the number of the space each serves.
+    /// Participants of other bridges, with the number of the space that each serves.
     bridges: BTreeMap<ParticipantPrefix, u16>,
 }
 
 impl Graph {
-    /// What `participant` has discovered by now; its own endpoints are left out.
+    /// Returns the endpoints that `participant` has discovered; its own endpoints are left out.
     #[must_use]
     pub fn snapshot(participant: &DomainParticipant) -> Self {
         let prefix = participant.guid().prefix;
@@ -114,8 +118,8 @@ impl Graph {
         }
     }
 
-    /// Sorts endpoints by topic, leaving out what is not a ROS topic, and what bridges write: values of the space, which
-    /// would come back to it under another name or go round for ever.
+    /// Sorts endpoints by topic. Leaves out topics outside of ROS, and writers of bridges: their
+    /// values of the space would return to the space under another name, or loop forever.
     pub fn from_endpoints(
         writers: impl IntoIterator<Item = (String, Endpoint)>,
         readers: impl IntoIterator<Item = (String, Endpoint)>,
@@ -143,42 +147,44 @@ impl Graph {
         }
     }
 
-    /// Whether this is an endpoint of another bridge.
+    /// Returns whether the endpoint belongs to another bridge.
     #[must_use]
     pub fn is_bridge(&self, guid: GUID) -> bool {
         !self.bridges.is_empty() && prefix(guid).is_some_and(|of| self.bridges.contains_key(&of))
     }
 
-    /// Whether another bridge serves this space in the same domain: its values are at home there.
+    /// Returns whether another bridge serves the space in the same domain, so that its values
+    /// belong to that bridge.
     #[must_use]
     pub fn is_at_home(&self, space: u16) -> bool {
         self.bridges.values().any(|other| *other == space)
     }
 
-    /// The other bridges, each with the space it says it serves.
+    /// Returns the other bridges, each with its announced space.
     pub fn bridges(&self) -> impl Iterator<Item = (ParticipantPrefix, u16)> {
         self.bridges.iter().map(|(bridge, space)| (*bridge, *space))
     }
 
-    /// The writers of a topic, in the order of their GUIDs.
+    /// Returns the writers of a topic, in the order of their GUIDs.
     #[must_use]
     pub fn writers(&self, topic: &str) -> &[Endpoint] {
         self.writers.get(topic).map_or(&[], Vec::as_slice)
     }
 
-    /// The readers of a topic, in the order of their GUIDs.
+    /// Returns the readers of a topic, in the order of their GUIDs.
     #[must_use]
     pub fn readers(&self, topic: &str) -> &[Endpoint] {
         self.readers.get(topic).map_or(&[], Vec::as_slice)
     }
 
-    /// Endpoints of our own that were announced. Empty, too, where RustDDS cannot hear itself, as without multicast.
+    /// Returns the bridge's own endpoints that were announced. Also empty if RustDDS cannot receive
+    /// its own announcements, such as without multicast.
     #[must_use]
     pub fn own(&self) -> &BTreeSet<GUID> {
         &self.own
     }
 
-    /// Whether there is a reader or writer of a ROS topic with this GUID.
+    /// Returns whether a reader or writer of a ROS topic has this GUID.
     #[must_use]
     pub fn holds(&self, guid: GUID) -> bool {
         self.writers
@@ -188,43 +194,46 @@ impl Graph {
             .any(|endpoint| endpoint.guid == guid)
     }
 
-    /// What the GUIDs of the participants begin with that have any reader or writer, be it of ROS or not.
+    /// Returns the GUID prefixes of the participants with any reader or writer, inside or outside
+    /// of ROS.
     #[must_use]
     pub fn participants(&self) -> &BTreeSet<ParticipantPrefix> {
         &self.participants
     }
 
-    /// The topics somebody reads.
+    /// Returns the topics that have a reader.
     pub fn read_topics(&self) -> impl Iterator<Item = &str> {
         self.readers.keys().map(String::as_str)
     }
 
-    /// The topics somebody writes.
+    /// Returns the topics that have a writer.
     pub fn written_topics(&self) -> impl Iterator<Item = &str> {
         self.writers.keys().map(String::as_str)
     }
 }
 
-/// The DDS name of a ROS topic given with its leading slash.
+/// Returns the DDS name of a ROS topic with a leading slash.
 #[must_use]
 pub fn dds_topic(ros_topic: &str) -> String {
     format!("{TOPIC_PREFIX}{}", ros_topic.trim_start_matches('/'))
 }
 
-/// The ROS name of a DDS topic without the leading slash, or `None` when it is not a topic of ROS.
+/// Returns the ROS name of a DDS topic without the leading slash, or `None` for a topic outside of
+/// ROS.
 #[must_use]
 pub fn ros_topic(dds_topic: &str) -> Option<&str> {
     dds_topic.strip_prefix(TOPIC_PREFIX)
 }
 
-/// The DDS topic by whose writer others know that a participant is a bridge, and of which space. It is no topic of ROS, so
-/// no tool of ROS shows it.
+/// Returns the DDS topic whose writer announces a bridge and its space. The topic is outside of
+/// ROS, so ROS tools do not show it.
 #[must_use]
 pub fn bridge_topic(space: u16) -> String {
     format!("{BRIDGE_PREFIX}{space}")
 }
 
-/// The space whose bridge says by such a writer that it is one. Values of OPC UA and of ROS 1 are at home in no domain.
+/// Returns the space of the bridge that such a writer announces. Spaces of OPC UA and of ROS 1
+/// belong to no domain.
 fn bridge_of(dds_topic: &str, dds_type: &str) -> Option<u16> {
     let space = dds_topic.strip_prefix(BRIDGE_PREFIX)?.parse().ok()?;
     let is_ros2 = SpaceId::new(space).is_some_and(SpaceId::is_ros2);
@@ -251,7 +260,7 @@ fn by_topic(
     topics
 }
 
-/// What `typehash=RIHS01_..;` in an endpoint's user data says (REP-2016).
+/// Returns the hash of `typehash=RIHS01_..;` in an endpoint's user data (REP-2016).
 fn type_hash(user_data: &[u8]) -> Option<TypeHash> {
     let text = String::from_utf8_lossy(user_data);
     let (_, behind) = text.split_once("typehash=")?;
@@ -262,10 +271,10 @@ fn is_durable(durability: Option<Durability>) -> bool {
     durability.is_some_and(|durability| durability != Durability::Volatile)
 }
 
-/// What ROS 2 puts before the name of a topic (design.ros2.org, topic and service names).
+/// The prefix of ROS 2 topic names (design.ros2.org, topic and service names).
 const TOPIC_PREFIX: &str = "rt/";
 const BRIDGE_PREFIX: &str = "ua_bridge_";
-/// The type of that topic, of which there is never a sample.
+/// The type of the bridge topic, on which no sample is ever sent.
 pub const BRIDGE_TYPE: &str = "ua_bridge::Presence_";
 
 #[cfg(test)]
@@ -307,11 +316,11 @@ mod tests {
     #[test]
     fn a_writer_that_no_bridge_would_have_keeps_no_value_of_a_space_out() {
         let markers = [
-            // No ROS 2 space.
+            // The number of no ROS 2 space.
             marker("ua_bridge_0", 1),
             marker("ua_bridge_1", 2),
             marker("ua_bridge_233", 3),
-            // Not how bridges spell it.
+            // A spelling that bridges do not use.
             marker("ua_bridge_+3", 4),
             marker("ua_bridge_03", 5),
             marker("rt/ua_bridge_3", 6),

@@ -1,8 +1,10 @@
-//! All readers behind one wait: whoever has a sample queues up, and is served one sample a turn.
+//! Combines all readers into one wait: a reader with samples queues up and delivers one sample per
+//! turn.
 //!
-//! What is bounded: a reader's history (the queue proper, [`crate::qos::READER_DEPTH`] samples per topic, oldest
-//! lost), and the queue of who is ready (one place per reader). Samples that were overwritten unread show as a gap in
-//! their writer's sequence numbers, and are reported with the sample after the gap.
+//! Two queues are bounded: the history of each reader ([`crate::qos::READER_DEPTH`] samples per
+//! topic, oldest lost), and the queue of ready readers (one entry per reader). Samples that were
+//! overwritten unread show as a gap in their writer's sequence numbers, and are reported with the
+//! sample after the gap.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::future::poll_fn;
@@ -15,44 +17,45 @@ use rustdds::GUID;
 
 use crate::raw::{Payload, Reader};
 
-/// Readers by a key of the owner's choice.
+/// Readers with a key chosen by the owner.
 #[derive(Debug)]
 pub struct Inbox<K> {
-    /// In Boxes, because the nodes of a map that grows at its end stay half empty.
+    /// Boxed, because the nodes of a map that grows at its end stay half empty.
     slots: BTreeMap<u64, Box<Slot<K>>>,
     next_slot: u64,
     ready: Arc<Ready>,
 }
 
-/// Where a reader sits in an [`Inbox`].
+/// The slot of a reader in an [`Inbox`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct SlotId(u64);
 
-/// What a turn brought.
+/// The result of a turn.
 #[derive(Debug)]
 pub enum Taken<K> {
     /// A sample that was not delivered before.
     Sample {
-        /// The reader's key.
+        /// The key of the reader.
         key: K,
-        /// Its bytes.
+        /// The payload of the sample.
         payload: Payload,
-        /// Who wrote it.
+        /// The writer of the sample.
         writer: GUID,
-        /// How many samples of this writer are missing between the last one delivered and this.
+        /// The number of samples of this writer that are missing between the last delivered sample
+        /// and this sample.
         missing: u64,
     },
-    /// A sample RustDDS received and could not hand out.
+    /// A sample that RustDDS received and could not deliver.
     Unreadable {
-        /// The reader's key.
+        /// The key of the reader.
         key: K,
-        /// Why, from RustDDS.
+        /// The error of RustDDS.
         why: String,
     },
 }
 
 impl<K: Clone> Inbox<K> {
-    /// An inbox without readers; its [`recv`](Self::recv) pends.
+    /// Creates an inbox without readers; its [`recv`](Self::recv) pends.
     #[must_use]
     pub fn new() -> Self {
         Self {
@@ -62,7 +65,7 @@ impl<K: Clone> Inbox<K> {
         }
     }
 
-    /// Adds a reader; what it already holds is delivered.
+    /// Adds a reader; its existing samples are delivered.
     pub fn insert(&mut self, key: K, reader: Reader) -> SlotId {
         let id = self.next_slot;
         self.next_slot += 1;
@@ -85,8 +88,8 @@ impl<K: Clone> Inbox<K> {
         SlotId(id)
     }
 
-    /// Puts another reader of the same topic in a slot and returns the one before; samples both received are
-    /// delivered once.
+    /// Replaces the reader in a slot by another reader of the same topic and returns the former
+    /// reader; samples that both received are delivered once.
     pub fn replace(&mut self, id: SlotId, reader: Reader) -> Option<Reader> {
         let slot = self.slots.get_mut(&id.0)?;
         slot.reader.set_waker(None);
@@ -95,18 +98,18 @@ impl<K: Clone> Inbox<K> {
         Some(before)
     }
 
-    /// Who the reader in a slot is to others.
+    /// Returns the GUID of the reader in a slot.
     #[must_use]
     pub fn guid(&self, id: SlotId) -> Option<GUID> {
         self.slots.get(&id.0).map(|slot| slot.reader.guid())
     }
 
-    /// Takes a reader out.
+    /// Removes a reader.
     pub fn remove(&mut self, id: SlotId) -> Option<Reader> {
         self.slots.remove(&id.0).map(|slot| slot.reader)
     }
 
-    /// What the reader in a slot holds and was not delivered: its history at most.
+    /// Returns the undelivered samples of the reader in a slot, at most its history.
     pub fn drain(&mut self, id: SlotId) -> Vec<Taken<K>> {
         let Some(slot) = self.slots.get_mut(&id.0) else {
             return Vec::new();
@@ -114,8 +117,8 @@ impl<K: Clone> Inbox<K> {
         std::iter::from_fn(|| slot.take()).collect()
     }
 
-    /// Forgets writers of a slot that are not in `alive`, once there are many of them: what they wrote stays in the
-    /// cache of the topic, and another reader of it would hand it out again.
+    /// Removes the writers of a slot that are not in `alive`, if the slot has many: their samples
+    /// stay in the cache of the topic, and another reader of the topic would deliver them again.
     pub fn retain_writers(&mut self, id: SlotId, mut alive: impl FnMut(&GUID) -> bool) {
         if let Some(slot) = self.slots.get_mut(&id.0)
             && slot.delivered.len() > MAX_WRITERS
@@ -124,7 +127,8 @@ impl<K: Clone> Inbox<K> {
         }
     }
 
-    /// Has the last sample of a writer delivered once more, should the reader in that slot get it again.
+    /// Allows the last sample of a writer to be delivered again if the reader in the slot receives
+    /// it again.
     pub fn repeat_last(&mut self, id: SlotId, writer: GUID) {
         let slot = self.slots.get_mut(&id.0);
         if let Some(last) = slot.and_then(|slot| slot.delivered.get_mut(&writer)) {
@@ -132,12 +136,13 @@ impl<K: Clone> Inbox<K> {
         }
     }
 
-    /// The next sample of any reader. Cancel-safe: a sample is only taken in the poll that returns it.
+    /// Returns the next sample of any reader. Cancel-safe: a sample is only taken in the poll that
+    /// returns it.
     pub async fn recv(&mut self) -> Taken<K> {
         poll_fn(|cx| self.poll_recv(cx)).await
     }
 
-    /// As [`recv`](Self::recv), for a hand-written future.
+    /// Polls for the next sample as [`recv`](Self::recv) does, for a hand-written future.
     pub fn poll_recv(&mut self, cx: &mut Context<'_>) -> Poll<Taken<K>> {
         self.ready.consumer.register(cx.waker());
         while let Some(id) = self.ready.pop() {
@@ -163,7 +168,7 @@ impl<K: Clone> Default for Inbox<K> {
 struct Slot<K> {
     key: K,
     reader: Reader,
-    /// The last sequence number delivered, by writer.
+    /// The last delivered sequence number, by writer.
     delivered: BTreeMap<GUID, i64>,
     wakeup: Arc<Wakeup>,
     waker: Waker,
@@ -179,7 +184,7 @@ impl<K: std::fmt::Debug> std::fmt::Debug for Slot<K> {
 }
 
 impl<K: Clone> Slot<K> {
-    /// The next sample, or `None` with the waker armed.
+    /// Takes the next sample, or returns `None` with the waker armed.
     fn take(&mut self) -> Option<Taken<K>> {
         let mut armed = false;
         loop {
@@ -197,7 +202,8 @@ impl<K: Clone> Slot<K> {
                     }
                 }
                 Ok(None) if armed => return None,
-                // What arrives between a take and the arming would wake nobody, hence another look.
+                // A sample that arrives between the take and the arming would wake no task, hence
+                // another take.
                 Ok(None) => {
                     self.reader.set_waker(Some(self.waker.clone()));
                     armed = true;
@@ -212,8 +218,9 @@ impl<K: Clone> Slot<K> {
         }
     }
 
-    /// How many samples of `writer` were skipped before this one; `None` when it was delivered already, which happens
-    /// after a reader was replaced, as all readers of a topic share one cache in RustDDS.
+    /// Returns the number of samples of `writer` that were skipped before this sample. Returns
+    /// `None` if the sample was delivered already, which happens after a reader was replaced,
+    /// because all readers of a topic share one cache in RustDDS.
     fn advance(&mut self, writer: GUID, sequence: i64) -> Option<u64> {
         let last = self
             .delivered
@@ -225,12 +232,12 @@ impl<K: Clone> Slot<K> {
     }
 }
 
-/// Writers whose last sample is remembered, the dead ones included.
+/// Writers whose last sequence number is remembered, including lost writers.
 const MAX_WRITERS: usize = 1024;
-/// The most one gap counts: a peer says by itself how many it has written.
+/// The maximum count of one gap: a peer chooses its sequence numbers freely.
 const MAX_MISSING: u64 = 1 << 16;
 
-/// Who has something to read, in the order they said so.
+/// The slots of ready readers, in the order of their wakes.
 #[derive(Debug, Default)]
 struct Ready {
     queue: Mutex<VecDeque<u64>>,
@@ -246,7 +253,7 @@ impl Ready {
     }
 }
 
-/// One reader's waker: puts the reader into the queue, once.
+/// The waker of one reader: queues the reader once.
 #[derive(Debug)]
 struct Wakeup {
     slot: u64,

@@ -1,7 +1,8 @@
-//! The ROS 2 side of the bridge: topics of a DDS domain as bytes, and the port that ties them to the space.
+//! The ROS 2 side of the bridge: topics of a DDS domain as bytes, and the port that binds them to
+//! the space.
 //!
-//! Discovery, reliability and fragments are RustDDS'; what makes a participant a ROS node is here. The samples go past
-//! RustDDS as bytes, because their types are known at run time only.
+//! RustDDS provides discovery, reliability and fragmentation; this crate makes a participant a ROS
+//! node. Samples pass through RustDDS as bytes, because their types are known only at run time.
 
 pub mod action;
 mod cdr;

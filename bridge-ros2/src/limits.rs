@@ -1,7 +1,8 @@
-//! Which RustDDS carries the samples, and the largest sample it delivers.
+//! The version of RustDDS that carries the samples, and the largest sample that it delivers.
 //!
-//! RustDDS as published repairs lost fragments so slowly that a large sample, whose burst overflows the receiver's socket
-//! buffer, never becomes complete. The patches in `patches/` change that; `cargo xtask` builds with them.
+//! The published RustDDS repairs lost fragments so slowly that a large sample, whose burst
+//! overflows the receiver's socket buffer, never becomes complete. The patches in `patches/` change
+//! that; `cargo xtask` builds with them.
 
 use crate::graph::Endpoint;
 
@@ -34,13 +35,13 @@ macro_rules! rustdds {
     };
 }
 
-/// Whether RustDDS is the patched one.
+/// True with the patched RustDDS.
 pub const PATCHED: bool = cfg!(feature = "patched-dds");
 
-/// Which RustDDS this is and what its limits are, for people.
+/// The version and the limits of RustDDS, for log messages.
 pub const RUSTDDS: &str = rustdds!();
 
-/// The version of this program, and of RustDDS in it.
+/// The version of this program and of its RustDDS.
 pub const VERSION: &str = concat!(
     env!("CARGO_PKG_VERSION"),
     " (",
@@ -50,8 +51,9 @@ pub const VERSION: &str = concat!(
     ")"
 );
 
-/// The largest serialized sample, in bytes, that all readers with the system's default socket buffers receive. A larger
-/// one is not written, but refused ([`Refusal::TooLarge`](crate::outlet::Refusal::TooLarge)).
+/// Returns the size in bytes of the largest serialized sample that all readers with the system's
+/// default socket buffers receive. A larger sample is not written, but refused
+/// ([`Refusal::TooLarge`](crate::outlet::Refusal::TooLarge)).
 #[must_use]
 pub fn sample_size(readers: &[Endpoint]) -> usize {
     if readers.iter().any(Endpoint::is_fast_dds) {
@@ -61,7 +63,7 @@ pub fn sample_size(readers: &[Endpoint]) -> usize {
     }
 }
 
-/// The largest sample for readers of which nothing is known yet.
+/// The largest sample for unknown readers.
 pub const TO_ANY: usize = if TO_FAST_DDS < TO_OTHERS {
     TO_FAST_DDS
 } else {
@@ -72,7 +74,7 @@ pub const TO_ANY: usize = if TO_FAST_DDS < TO_OTHERS {
 mod sizes {
     /// Measured: 30 of 30 samples of this size, reliable.
     pub(super) const TO_FAST_DDS: usize = 10 * 1024 * 1024;
-    /// The same.
+    /// Measured with the same result.
     pub(super) const TO_OTHERS: usize = 10 * 1024 * 1024;
 }
 

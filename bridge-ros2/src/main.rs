@@ -80,7 +80,7 @@ impl BridgeRos2 {
         RosArgs::parse(&self.ros_args).map_err(|error| Failure::new(FailureKind::Usage, error))
     }
 
-    /// Whether and with what the ROS 2 side is secured.
+    /// Returns the security settings of the ROS 2 side.
     fn security(&self) -> Result<Security, Failure> {
         let enclave = self.ros_args()?.enclave;
         let variable = |name: &str| std::env::var(name).ok();
@@ -95,7 +95,7 @@ impl BridgeRos2 {
         Ok(security)
     }
 
-    /// The node to be; ROS arguments win.
+    /// Returns the options of the node; ROS arguments take precedence.
     fn node(&self) -> Result<NodeOptions, Failure> {
         let RosArgs {
             name,
@@ -111,7 +111,7 @@ impl BridgeRos2 {
         })
     }
 
-    /// The domain to join for the space `own`.
+    /// Returns the domain to join for the space `own`.
     fn domain(&self, own: SpaceId, mapping: &Mapping) -> u16 {
         let spaces = self.chosen(mapping).unwrap_or_default();
         let asked = spaces.iter().position(|space| *space == own);
@@ -147,7 +147,7 @@ impl BridgeRos2 {
     }
 }
 
-/// What was given; a variable of the environment that is set to nothing gives nothing, as in rcl.
+/// Returns the given numbers; an empty environment variable gives no number, as in rcl.
 fn given(numbers: &[Option<u16>]) -> Vec<u16> {
     numbers.iter().copied().flatten().collect()
 }
@@ -174,7 +174,7 @@ fn number(text: &str, range: RangeInclusive<u16>) -> Result<Option<u16>, String>
     }
 }
 
-/// The addresses of hosts given as the command line and the environment have them.
+/// Returns the addresses of the hosts from the command line, or else from the environment.
 fn peers(given: &[String], variable: Option<&str>) -> Result<Vec<IpAddr>, Failure> {
     let listed = variable.unwrap_or_default().split(';');
     let hosts: Vec<&str> = if given.is_empty() {
@@ -188,7 +188,7 @@ fn peers(given: &[String], variable: Option<&str>) -> Result<Vec<IpAddr>, Failur
     hosts.into_iter().map(address).collect()
 }
 
-/// The address of one host; RustDDS speaks IPv4.
+/// Returns the address of a host; RustDDS supports IPv4 only.
 fn address(host: &str) -> Result<IpAddr, Failure> {
     if let Ok(IpAddr::V6(_)) = host.parse() {
         let message = format!("peer {host}: only IPv4 addresses can be reached");
@@ -209,7 +209,7 @@ impl Program for BridgeRos2 {
     type Port = Ros2Port;
 
     const NAME: &'static str = "bridge-ros2";
-    // Keys are fetched over OPC UA, and what becomes of that is told here.
+    // Keys are fetched over OPC UA, and this program logs the outcome.
     const QUIET: &'static str = plant_keys::QUIET;
     const LOCAL: Local = Local::Cdr;
 
@@ -276,7 +276,8 @@ impl Program for BridgeRos2 {
     }
 }
 
-/// Whose it is to mend.
+/// Returns the kind of failure, which shows whether the usage, the configuration or the system is
+/// at fault.
 const fn kind(error: &DomainError) -> FailureKind {
     if matches!(
         error,
@@ -293,7 +294,7 @@ const fn kind(error: &DomainError) -> FailureKind {
     }
 }
 
-/// The spaces a bridge serves, one for each domain asked for.
+/// Returns the spaces that a bridge serves, one for each requested domain.
 fn choose_spaces(
     spaces: &[u16],
     domains: &[u16],
@@ -335,7 +336,8 @@ fn repeated<T: Copy + PartialEq>(all: &[T]) -> Option<T> {
         .map(|(_, one)| *one)
 }
 
-/// The space of one domain: what was asked for, else the space of the domain asked for, else the mapping's only one.
+/// Returns the space of one domain: the requested space, else the space of the requested domain,
+/// else the only ROS 2 space of the mapping.
 fn choose_space(
     space: Option<u16>,
     domain: Option<u16>,
@@ -384,7 +386,7 @@ fn choose_space(
     }
 }
 
-/// A fixed length, or that which most others write.
+/// A fixed length, or the length that most other participants write.
 #[derive(Debug, Clone, Copy)]
 struct GidChoice(Option<GidLength>);
 
@@ -397,9 +399,10 @@ fn gid_length(text: &str) -> Result<GidChoice, &'static str> {
     }
 }
 
-/// The first number that is proposed for the space of another domain. Lower numbers are kept for domains of the same number.
+/// The first number that is proposed for the space of another domain. Lower numbers are kept for
+/// domains of the same number.
 const FIRST_FREE: u16 = 40;
-/// How the bridge appears in `ros2 node list`.
+/// The name of the bridge in `ros2 node list`.
 const NODE_NAME: &str = "ua_bridge_ros2";
 
 #[cfg(test)]

@@ -1,7 +1,9 @@
-//! The ROS node a participant stands for: its name, what it tells the others of itself, and what they tell.
+//! The ROS node of a participant: its name, its announcements, and the announcements of other
+//! nodes.
 //!
-//! One thread does it, so that the node is whole whoever polls what. It sleeps until there is something to do: an
-//! endpoint that came or went, a message of another node's list, of `/clock`, or a warning for `/rosout`.
+//! One thread serves the node, so that it works independently of other polls. The thread sleeps
+//! until there is work: a new or removed endpoint, a node list of another participant, a message of
+//! `/clock`, or a warning for `/rosout`.
 
 mod teller;
 
@@ -22,32 +24,34 @@ use crate::rosout::Rosout;
 
 use teller::Teller;
 
-/// A node's name, and how it is to behave.
+/// The name and the options of a node.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct NodeOptions {
-    /// `/`, or `/cell/left`.
+    /// The namespace, `/` or for example `/cell/left`.
     pub namespace: String,
     /// The name without namespace.
     pub name: String,
-    /// The length of the Gids it writes; without one that which most other participants write.
+    /// The length of the Gids that the node writes; `None` selects the length that most other
+    /// participants write.
     pub gid: Option<GidLength>,
-    /// Whether its clock is that of `/clock`.
+    /// Whether the node's clock follows `/clock`.
     pub use_sim_time: bool,
 }
 
 impl NodeOptions {
-    /// The name with its namespace.
+    /// Returns the name with its namespace.
     #[must_use]
     pub fn full_name(&self) -> String {
         format!("{}/{}", self.namespace.trim_end_matches('/'), self.name)
     }
 
-    /// What its messages on `/rosout` are headed by, as rcl has it: the full name with dots.
+    /// Returns the logger name of its messages on `/rosout`, as in rcl: the full name with dots.
     fn logger(&self) -> String {
         self.full_name().trim_start_matches('/').replace('/', ".")
     }
 
-    /// Why ROS would not take such a node (`rmw_validate_node_name`, `rmw_validate_namespace`).
+    /// Returns the reason for which the names are invalid in ROS (`rmw_validate_node_name`,
+    /// `rmw_validate_namespace`).
     pub(crate) fn fault(&self) -> Option<&'static str> {
         let is_token = |text: &str| {
             text.starts_with(|c: char| c.is_ascii_alphabetic() || c == '_')
@@ -66,7 +70,7 @@ impl NodeOptions {
     }
 }
 
-/// A node in the root namespace.
+/// Creates the options of a node in the root namespace.
 impl From<&str> for NodeOptions {
     fn from(name: &str) -> Self {
         Self {
@@ -78,14 +82,14 @@ impl From<&str> for NodeOptions {
     }
 }
 
-/// A reader or writer that is on its node's list for as long as it is there.
+/// A reader or writer that is on its node's list as long as it exists.
 pub struct Listed<E> {
     endpoint: E,
     entry: Entry,
 }
 
 impl<E> Listed<E> {
-    /// Who it is to others.
+    /// Returns the GUID of the endpoint.
     pub fn guid(&self) -> GUID {
         self.entry.guid
     }
@@ -99,7 +103,7 @@ impl<E> Deref for Listed<E> {
     }
 }
 
-/// A place on the node's list, given up when dropped.
+/// An entry in the node's list, removed when dropped.
 struct Entry {
     node: Arc<Shared>,
     guid: GUID,
@@ -121,13 +125,13 @@ impl Drop for Entry {
     }
 }
 
-/// The node, told of by a thread of its own until dropped; then its name is withdrawn.
+/// The node. Its own thread announces it until it is dropped; then its name is withdrawn.
 pub(crate) struct Node {
     shared: Arc<Shared>,
     thread: Option<JoinHandle<()>>,
 }
 
-/// The endpoints a node lives by, none of which is on its list.
+/// The endpoints that announce nodes, which are not on the node's list.
 pub(crate) struct Channels {
     pub(crate) participant: GuidBytes,
     pub(crate) info_reader: RawReader,
@@ -150,35 +154,36 @@ struct Shared {
     thread: Mutex<Option<Thread>>,
 }
 
-/// What we tell.
+/// The announcements of this node.
 #[derive(Debug, Default)]
 struct Own {
     readers: BTreeSet<GuidBytes>,
     writers: BTreeSet<GuidBytes>,
     changed: bool,
-    /// Those that were not seen to be announced, and since when they are there.
+    /// The endpoints that were not seen as announced, with the time of their creation.
     unseen: BTreeMap<GUID, Instant>,
 }
 
-/// What others told.
+/// The announcements of other participants.
 #[derive(Debug, Default)]
 struct Others {
     participants: BTreeMap<ParticipantPrefix, (GidLength, Vec<NodeEntities>)>,
     malformed: u64,
-    /// Those whose lease ran out. They may come back, and do not tell again then.
+    /// Participants whose lease expired. They may return, and do not repeat their announcements
+    /// then.
     absent: BTreeSet<ParticipantPrefix>,
-    /// Names that were warned of.
+    /// Participants whose duplicate node name was logged.
     doubles: BTreeSet<ParticipantPrefix>,
 }
 
-/// What the GUIDs of all entities of a participant begin with.
+/// The GUID prefix of all entities of a participant.
 pub type ParticipantPrefix = [u8; 12];
 
 impl Node {
-    /// Begins to tell of the node.
+    /// Starts the thread that announces the node.
     ///
     /// # Errors
-    /// When the thread cannot be started.
+    /// If the thread cannot be started.
     pub(crate) fn start(options: NodeOptions, channels: Channels) -> std::io::Result<Self> {
         let shared = Arc::new(Shared {
             clock: RosClock::new(options.use_sim_time),
@@ -203,7 +208,7 @@ impl Node {
         })
     }
 
-    /// Publishes the program's warnings and hears `/clock` from now on.
+    /// Starts to publish the process's warnings and to read `/clock`.
     pub(crate) fn serve(&self, services: Services) {
         let Some(thread) = lock(&self.shared.thread).clone() else {
             return;
@@ -246,7 +251,7 @@ impl Node {
         }
     }
 
-    /// The nodes of others.
+    /// Returns the nodes of other participants.
     pub(crate) fn others(&self) -> Vec<NodeEntities> {
         let others = lock(&self.shared.others);
         others
@@ -255,12 +260,12 @@ impl Node {
             .collect()
     }
 
-    /// How many lists of nodes could not be read.
+    /// Returns the number of node lists that could not be decoded.
     pub(crate) fn malformed_lists(&self) -> u64 {
         lock(&self.shared.others).malformed
     }
 
-    /// The full name of the node of others that has this endpoint.
+    /// Returns the full name of the remote node that owns this endpoint.
     pub(crate) fn owner(&self, endpoint: GUID) -> Option<String> {
         let guid = endpoint.to_bytes();
         let others = lock(&self.shared.others);
@@ -271,7 +276,7 @@ impl Node {
             .map(NodeEntities::full_name)
     }
 
-    /// The full names of the nodes of a participant of others.
+    /// Returns the full names of the nodes of a remote participant.
     pub(crate) fn nodes_of(&self, participant: &ParticipantPrefix) -> Vec<String> {
         let others = lock(&self.shared.others);
         let told = others.participants.get(participant);
@@ -279,17 +284,19 @@ impl Node {
         nodes.map(NodeEntities::full_name).collect()
     }
 
-    /// Whether its thread has ended, which it does not before it is dropped.
+    /// Returns whether the thread has ended, which does not happen before the drop unless it
+    /// panics.
     pub(crate) fn is_mute(&self) -> bool {
         self.thread.as_ref().is_none_or(JoinHandle::is_finished)
     }
 
-    /// Takes note of endpoints of ours that were announced, and returns those that should have been by now.
+    /// Records the announced endpoints of this node, and returns the endpoints whose announcement
+    /// is overdue.
     pub(crate) fn unannounced(&self, announced: &BTreeSet<GUID>) -> BTreeSet<GUID> {
         let mut own = lock(&self.shared.own);
         own.unseen.retain(|guid, _| !announced.contains(guid));
         if announced.is_empty() {
-            // RustDDS does not hear itself here, so nothing follows.
+            // RustDDS does not receive its own announcements here, so nothing can be concluded.
             return BTreeSet::new();
         }
         let now = Instant::now();
@@ -301,7 +308,8 @@ impl Node {
             .collect()
     }
 
-    /// Takes note of which participants are there. The nodes of the others are kept for when they come back.
+    /// Updates the present participants. The nodes of absent participants are kept for their
+    /// return.
     pub(crate) fn retain(&self, alive: impl Fn(&ParticipantPrefix) -> bool) {
         let mut others = lock(&self.shared.others);
         let absent: BTreeSet<_> = others
@@ -325,7 +333,8 @@ impl Drop for Node {
         self.shared.stop.store(true, Ordering::Release);
         self.shared.wake();
         if let Some(thread) = self.thread.take() {
-            // It does not panic; if it did, its name goes with the participant.
+            // The thread does not panic; if it did, its name would be withdrawn with the
+            // participant.
             thread.join().unwrap_or_default();
         }
     }
@@ -356,7 +365,7 @@ impl Own {
 }
 
 impl Others {
-    /// Says whether there was room.
+    /// Returns whether there was room.
     fn insert(
         &mut self,
         prefix: ParticipantPrefix,
@@ -375,13 +384,13 @@ impl Others {
         true
     }
 
-    /// What those told that are there.
+    /// Returns the announcements of the present participants.
     fn present(&self) -> impl Iterator<Item = &(GidLength, Vec<NodeEntities>)> {
         let there = |(prefix, told)| (!self.absent.contains(prefix)).then_some(told);
         self.participants.iter().filter_map(there)
     }
 
-    /// The length most participants write; the newer one when as many write either.
+    /// Returns the length that most participants write; the newer length in a tie.
     fn majority(&self) -> GidLength {
         let older = self
             .present()
@@ -407,9 +416,9 @@ where
     }
 }
 
-/// How long an announcement may take: a full queue of RustDDS' discovery is worked off in less.
+/// The time limit of an announcement: RustDDS's discovery empties a full queue in less.
 const ANNOUNCED_WITHIN: Duration = Duration::from_secs(3);
-/// Participants whose nodes are known; of further ones they are not.
+/// Maximum number of participants whose nodes are recorded.
 const MAX_PARTICIPANTS: usize = 4096;
 
 #[cfg(test)]

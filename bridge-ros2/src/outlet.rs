@@ -1,10 +1,12 @@
 //! A writer that never waits.
 //!
-//! RustDDS stops a reliable writer while its send window is full ([`Offered::policies`]): samples it does not take
-//! then wait here, in a queue as long as the topic's overflow policy says, and go out when the window opens.
+//! RustDDS stops a reliable writer while its send window is full ([`Offered::policies`]). Refused
+//! samples then wait in a queue, whose length is set by the topic's overflow policy, until the
+//! window opens.
 //!
-//! Samples wait, too, from the time the first reader was seen until it has answered: it is known here before our writer
-//! is known there, and what is written in between is history, which a volatile reader does not get.
+//! Samples also wait from the discovery of the first reader until it has responded: the reader is
+//! known here before our writer is known there. Samples written in between are history, which a
+//! volatile reader does not receive.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -28,21 +30,22 @@ pub struct Outlet {
     audience: Audience,
     /// Samples for which the send window had no room, oldest first.
     waiting: VecDeque<Sample>,
-    /// Whether a sample was dropped that would have come late, and that was not told.
+    /// Whether an expired sample was dropped and not reported yet.
     has_late: bool,
-    /// Since when the send window has no room.
+    /// The time since when the send window has no room.
     full_since: Option<Instant>,
-    /// Bytes written since every reader had acknowledged everything.
+    /// Bytes written after the last time that every reader had acknowledged everything.
     in_flight: usize,
-    /// Of a state topic, the value its readers have: another writer has to begin with it.
+    /// For a state topic, the value that its readers have: another writer has to start with it.
     last: Option<Sample>,
-    /// Since when the writer's history holds a sample that no reader is to find there, once those that are present have it.
+    /// Set while the writer's history holds a sample that no late reader may receive; it is cleared
+    /// once the present readers have it.
     to_forget: Option<Instant>,
-    /// Writers that were replaced, oldest first, while their readers may lack something of what they wrote.
+    /// Replaced writers, oldest first, while their readers may miss some of their samples.
     former: VecDeque<Former>,
 }
 
-/// A writer that writes nothing any more, and repairs what it has written.
+/// A former writer that only repairs the samples it has written.
 pub struct Former {
     writer: Writer,
     until: Instant,
@@ -52,55 +55,58 @@ pub struct Former {
 struct Sample {
     payload: Payload,
     source: Option<Timestamp>,
-    /// Whether readers that come late get it.
+    /// Whether late readers receive the sample.
     lasting: bool,
-    /// When it would come late.
+    /// The time at which the sample expires.
     until: Option<Instant>,
 }
 
-/// Who listens.
+/// The readers of the topic.
 #[derive(Debug)]
 enum Audience {
-    /// No reader. The history holds the last state alone, for transient-local readers that come; volatile readers get nothing
-    /// that was written before. The history of RustDDS as published would keep all values without acknowledgement: there the
-    /// state is held back until transient-local readers, and no others, have come.
+    /// No reader. The history holds only the last state, for transient-local readers that appear
+    /// later; volatile readers receive nothing that was written before. The history of the
+    /// published RustDDS would keep all values without acknowledgement, so with it the state is
+    /// held back until only transient-local readers have appeared.
     Nobody { held: Option<Sample> },
-    /// Somebody, whom a sample of at most that size reaches.
+    /// At least one reader, which receives samples of up to this size.
     Present {
-        /// Until what is written reaches them; none when it does.
+        /// Set until written samples reach the readers.
         settling: Option<Settling>,
-        /// How many there are, as far as they were seen.
+        /// The number of discovered readers.
         seen: usize,
         sample_size: usize,
     },
 }
 
-/// Waiting for readers to learn of the writer.
+/// The wait for readers to discover the writer.
 #[derive(Debug, Clone, Copy)]
 struct Settling {
     since: Instant,
-    /// How long to wait for one that says nothing.
+    /// How long to wait for a silent reader.
     patience: Duration,
 }
 
-/// Why a sample was not delivered.
+/// The reason for which a sample was not delivered.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Refusal {
-    /// The send window is full, and the waiting room too: the oldest waiting sample made room for this one.
+    /// The send window and the queue are full: the oldest waiting sample was dropped for this
+    /// sample.
     Overflow,
-    /// Larger than this many bytes, which is what readers of this topic receive for certain ([`limits`]). Not written.
+    /// Larger than this number of bytes, which readers of this topic certainly receive
+    /// ([`limits`]). Not written.
     TooLarge(usize),
-    /// An event, and no reader is present.
+    /// An event without a present reader.
     NoReader,
-    /// It waited for its readers until it would have come late.
+    /// The sample expired while it waited for its readers.
     Late,
-    /// RustDDS failed; it does so only when one of its threads has died.
+    /// RustDDS failed, which happens only when one of its threads has died.
     Failed,
 }
 
 impl Refusal {
-    /// Returns the counter and the label under which it is counted.
+    /// Returns the counter and the label under which the refusal is counted.
     #[must_use]
     pub fn cause(self) -> (Reason, &'static str) {
         let reason = match self {
@@ -111,7 +117,7 @@ impl Refusal {
         (reason, self.label())
     }
 
-    /// The label under which it is counted.
+    /// Returns the label under which the refusal is counted.
     #[must_use]
     pub fn label(self) -> &'static str {
         match self {
@@ -144,9 +150,10 @@ impl Outlet {
         }
     }
 
-    /// Whether another writer should take over ([`replace_writer`](Self::replace_writer)): a reader of a state topic
-    /// has acknowledged nothing for so long that the others see an old value. Events are worth waiting for instead. The patched
-    /// RustDDS goes on without a reader that is silent, and one that is not is being served.
+    /// Returns whether another writer should take over ([`replace_writer`](Self::replace_writer)):
+    /// a reader of a state topic has not acknowledged for so long that the other readers see an old
+    /// value. Event topics wait instead. The patched RustDDS continues without a silent reader, and
+    /// serves a slow reader.
     #[must_use]
     pub fn is_stuck(&self, now: Instant) -> bool {
         !limits::PATCHED
@@ -156,9 +163,10 @@ impl Outlet {
                 .is_some_and(|since| now.duration_since(since) >= STUCK_AFTER)
     }
 
-    /// Puts a new writer of the same topic and policies in place. What waits is written once its readers know it.
+    /// Installs a new writer of the same topic and policies. Waiting samples are written once its
+    /// readers know it.
     pub fn replace_writer(&mut self, writer: Writer, now: Instant) {
-        // Not for the reader because of which it is replaced.
+        // Without the full wait for the reader that caused the replacement.
         let patience = if self.is_stuck(now) { SETTLE } else { PATIENCE };
         let before = std::mem::replace(&mut self.writer, writer);
         self.full_since = None;
@@ -168,7 +176,7 @@ impl Outlet {
         if self.former.len() > MOST_FORMER {
             self.former.pop_front();
         }
-        // What is held back is newer than the last that was written.
+        // A held value is newer than the last written value.
         if self.waiting.is_empty() && !matches!(self.audience, Audience::Nobody { held: Some(_) }) {
             self.waiting.extend(self.last.clone());
         }
@@ -180,24 +188,25 @@ impl Outlet {
         }
     }
 
-    /// Gives the topic up, but for what its readers may lack of what was written; what waits is dropped.
+    /// Gives the topic up and drops waiting samples; returns the writer if its readers may miss
+    /// written samples.
     pub fn give_up(self, now: Instant) -> Option<Former> {
         Former::of(self.writer, self.offered, self.in_flight, now)
     }
 
-    /// The writer's GUID.
+    /// Returns the GUID of the writer.
     #[must_use]
     pub fn guid(&self) -> GUID {
         self.writer.guid()
     }
 
-    /// Whether samples wait for room, or to be forgotten; [`flush`](Self::flush) sees to both.
+    /// Returns whether samples wait for room or for removal; [`flush`](Self::flush) handles both.
     #[must_use]
     pub fn is_waiting(&self) -> bool {
         !self.waiting.is_empty() || self.to_forget.is_some()
     }
 
-    /// Whether readers that come late get a value that is not older than `source`.
+    /// Returns whether late readers receive a value that is not older than `source`.
     #[must_use]
     pub fn stores_newer_than(&self, source: Option<Timestamp>) -> bool {
         let held = match &self.audience {
@@ -208,7 +217,8 @@ impl Outlet {
             .is_some_and(|stored| stored.source >= source)
     }
 
-    /// Removes the values written so far from the history. Present readers still get them, late readers do not.
+    /// Removes the written values from the history. Present readers still receive them, late
+    /// readers do not.
     pub fn forget_stored(&mut self, now: Instant) {
         if let Audience::Nobody { held } = &mut self.audience {
             *held = None;
@@ -222,8 +232,8 @@ impl Outlet {
         self.look_back(now);
     }
 
-    /// Clears the history of samples that no reader is to find there, once the readers that are present have acknowledged them
-    /// or had the time to.
+    /// Clears the history of samples that late readers must not receive, once the present readers
+    /// have acknowledged them or had the time to do so.
     fn look_back(&mut self, now: Instant) {
         let Some(since) = self.to_forget else {
             return;
@@ -234,16 +244,17 @@ impl Outlet {
         }
     }
 
-    /// Whether a writer that was replaced is still there; [`set_readers`](Self::set_readers) lets go of it.
+    /// Returns whether a replaced writer is still kept; [`set_readers`](Self::set_readers) drops
+    /// it.
     #[must_use]
     pub fn is_repairing(&self) -> bool {
         !self.former.is_empty()
     }
 
-    /// Writes a sample, or queues it. Never waits. Of a state topic readers that come late get it, too.
+    /// Writes a sample, or queues it. Never waits. On a state topic, late readers receive it too.
     ///
     /// # Errors
-    /// [`Refusal`]: one sample was lost, this or an older one.
+    /// [`Refusal`]: one sample was lost, this sample or an older sample.
     pub fn offer(
         &mut self,
         payload: Payload,
@@ -262,11 +273,11 @@ impl Outlet {
         )
     }
 
-    /// As [`offer`](Self::offer), of an event: for the readers that are present.
+    /// Offers an event as [`offer`](Self::offer) does: only the present readers receive it.
     ///
     /// # Errors
-    /// [`Refusal`]: one sample was lost, this or an older one; [`Refusal::NoReader`] without a
-    /// present reader.
+    /// [`Refusal`]: one sample was lost, this sample or an older sample; [`Refusal::NoReader`]
+    /// without a present reader.
     pub fn offer_once(
         &mut self,
         payload: Payload,
@@ -288,10 +299,11 @@ impl Outlet {
         }
     }
 
-    /// As [`offer_once`](Self::offer_once), of a command: without readers it is not written, and after `within` it is dropped.
+    /// Offers a command as [`offer_once`](Self::offer_once) does: it is not written without
+    /// readers, and is dropped after `within`.
     ///
     /// # Errors
-    /// [`Refusal`]: one sample was lost, this or an older one.
+    /// [`Refusal`]: one sample was lost, this sample or an older sample.
     pub fn offer_in_time(
         &mut self,
         payload: Payload,
@@ -315,7 +327,7 @@ impl Outlet {
         )
     }
 
-    /// Returns the handover of the sample that was offered last.
+    /// Returns the handover of the last offered sample.
     #[must_use]
     pub fn handover(&self) -> Handover {
         match self.audience {
@@ -345,7 +357,7 @@ impl Outlet {
                 self.waiting.push_back(sample);
                 return Ok(());
             }
-            // Readers that have answered must not lose samples for one that says nothing.
+            // Readers that have responded must not lose samples because of a silent reader.
             self.settle();
         }
         self.flush_waiting(now)?;
@@ -358,10 +370,11 @@ impl Outlet {
         }
     }
 
-    /// Sends what waits, as far as there is room.
+    /// Sends the waiting samples as the send window allows.
     ///
     /// # Errors
-    /// [`Refusal::Failed`], with the sample lost.
+    /// [`Refusal::Failed`], with the sample lost, or [`Refusal::Late`] if a waiting sample has
+    /// expired.
     pub fn flush(&mut self, now: Instant) -> Result<(), Refusal> {
         self.flush_waiting(now)?;
         match std::mem::take(&mut self.has_late) {
@@ -388,13 +401,12 @@ impl Outlet {
         Ok(())
     }
 
-    /// Takes note of the readers the domain has for this topic by now, and gives the first of them the value that was
-    /// held back.
+    /// Updates the readers of the topic, and sends the held value to the first readers.
     ///
     /// # Errors
-    /// [`Refusal`] of the value held back.
+    /// [`Refusal`] of the held value.
     pub fn set_readers(&mut self, readers: &[Endpoint], now: Instant) -> Result<(), Refusal> {
-        // Statuses are read so that their channel never fills up; the snapshot is the newer knowledge.
+        // Statuses are read so that their channel never fills up; the snapshot is newer.
         while self.writer.try_recv_status().is_some() {}
         self.former.retain(|former| !former.is_done(now));
         if readers.is_empty() {
@@ -405,7 +417,7 @@ impl Outlet {
             return Ok(());
         }
         match self.greet(now, readers.len(), limits::sample_size(readers)) {
-            // A volatile reader is not given what was written before it came.
+            // A volatile reader does not receive values written before it appeared.
             Some(held) if readers.iter().all(|reader| reader.transient_local) => {
                 self.offer_sample(held, now)
             }
@@ -413,7 +425,8 @@ impl Outlet {
         }
     }
 
-    /// Stores a state for readers that come, in place of the state before. An event is dropped, because no reader is present.
+    /// Stores a state for later readers, in place of the former state. An event is dropped, because
+    /// no reader is present.
     fn store(&mut self, sample: Sample, now: Instant) -> Result<(), Refusal> {
         self.forget_written();
         self.to_forget = None;
@@ -431,11 +444,11 @@ impl Outlet {
         Ok(())
     }
 
-    /// Whether what is written now reaches the readers there are. Asked for the first time when there is something to
-    /// write; readers that come later join a stream that waits for nobody.
+    /// Returns whether written samples reach the present readers. The wait is checked only when
+    /// there is a sample to write; later readers join a stream that does not wait.
     fn is_settled(&mut self, now: Instant) -> bool {
         self.former.retain(|former| !former.is_done(now));
-        // What is repaired is older than what is written now.
+        // Repaired samples are older than new samples.
         let repaired = self.former.is_empty();
         let Audience::Present { settling, seen, .. } = &mut self.audience else {
             return true;
@@ -446,8 +459,9 @@ impl Outlet {
         settling.is_none()
     }
 
-    /// How many samples may wait for readers to learn of the writer. Of a state topic as many as go out at once then: an old
-    /// value must not stand before a newer one.
+    /// Returns how many samples may wait for readers to discover the writer. A state topic is
+    /// limited to the samples that are then sent at once: an old value must not precede a newer
+    /// value visibly.
     fn settling_room(&self) -> usize {
         match self.offered {
             Offered::KeepLatest => SETTLING_STATES,
@@ -461,13 +475,13 @@ impl Outlet {
         }
     }
 
-    /// How many samples wait, which go with it.
+    /// Returns the number of waiting samples, which are lost with the outlet.
     #[must_use]
     pub fn waiting(&self) -> u64 {
         u64::try_from(self.waiting.len()).unwrap_or(u64::MAX)
     }
 
-    /// Nobody listens any more.
+    /// Handles the loss of the last reader.
     fn leave_alone(&mut self, now: Instant) {
         let mut held = None;
         if self.offered == Offered::KeepLatest {
@@ -475,12 +489,12 @@ impl Outlet {
         }
         self.audience = Audience::Nobody { held: None };
         if let Some(held) = held {
-            // A writer that fails says so at the next value.
+            // A writer that fails reports it at the next value.
             let _stored = self.store(held, now);
         }
     }
 
-    /// Whether the readers that are present have all that was written.
+    /// Returns whether the present readers have received all written samples.
     fn is_acknowledged(&self) -> bool {
         #[cfg(feature = "patched-dds")]
         let acknowledged = self.writer.unacknowledged().samples == 0;
@@ -489,25 +503,26 @@ impl Outlet {
         acknowledged
     }
 
-    /// Takes back what was written, for a newer value that is not.
+    /// Removes the written samples from the history, for a newer value that is not written yet.
     fn forget_written(&self) {
         #[cfg(feature = "patched-dds")]
         self.writer.keep_last(0);
     }
 
-    /// A reader may match between two snapshots; what comes after the match is for it.
+    /// Handles matches between two snapshots: samples written after a match are for the matched
+    /// reader.
     fn notice_matches(&mut self, now: Instant) {
         while let Some(status) = self.writer.try_recv_status() {
             if let DataWriterStatus::PublicationMatched { current, .. } = status
                 && current.count() > 0
             {
-                // The value held back is older than the one about to be written, which replaces it.
+                // The new value replaces the older held value.
                 drop(self.greet(now, 1, limits::TO_ANY));
             }
         }
     }
 
-    /// Takes note of readers; returns the value that was held back from nobody.
+    /// Records the readers; returns the value that was held while there was no reader.
     fn greet(&mut self, now: Instant, number: usize, size: usize) -> Option<Sample> {
         match &mut self.audience {
             Audience::Present {
@@ -544,7 +559,7 @@ impl Outlet {
         }
     }
 
-    /// Gives a sample to RustDDS; returns it when the send window is full.
+    /// Passes a sample to RustDDS; returns it if the send window is full.
     fn write(&mut self, sample: Sample, now: Instant) -> Result<Option<Sample>, Refusal> {
         let Sample {
             payload,
@@ -581,7 +596,7 @@ impl Outlet {
             Ok(()) => {
                 self.full_since = None;
                 self.in_flight += size;
-                // The newest sample pushes the one before out of the history.
+                // The newest sample removes the former sample from the history.
                 self.to_forget = (is_state && !lasting).then_some(now);
                 self.last = kept;
                 Ok(None)
@@ -604,7 +619,8 @@ impl Outlet {
         }
     }
 
-    /// Whether there is memory for another sample of that size, or some is made.
+    /// Returns whether there is memory for another sample of the size, if necessary after making
+    /// room.
     #[cfg(feature = "patched-dds")]
     fn has_room(&mut self, size: usize) -> bool {
         while self.in_flight + size > MAX_IN_FLIGHT {
@@ -620,25 +636,26 @@ impl Outlet {
         true
     }
 
-    /// Whether there is memory for another sample of that size.
+    /// Returns whether there is memory for another sample of the size.
     #[cfg(not(feature = "patched-dds"))]
     fn has_room(&mut self, size: usize) -> bool {
-        // Long before there is none: readers acknowledge one sample in several, so that now all may be acknowledged and at
-        // the next sample not.
+        // Checked long before the limit: readers acknowledge several samples at once, so all
+        // samples may be acknowledged at this moment and not at the next sample.
         if self.in_flight > MAX_IN_FLIGHT / 2 {
-            // The answer is immediate with a wait of zero.
+            // A wait of zero returns immediately.
             match self.writer.wait_for_acknowledgments(Duration::ZERO) {
                 Ok(true) => self.in_flight = 0,
                 Ok(false) => return self.in_flight + size <= MAX_IN_FLIGHT,
-                // Writing fails, too.
+                // The write fails, too.
                 Err(_) => {}
             }
         }
         true
     }
 
-    /// Gives up the oldest value that a silent reader lacks, if it is a state's: the others must not see an old one because
-    /// of it. One that is only slow says so again and again, and gets what it has begun to receive.
+    /// Gives up the oldest state value that a silent reader misses, so that the other readers do
+    /// not see an old value. A slow reader acknowledges repeatedly, and receives the sample it has
+    /// begun to receive.
     fn makes_room(&self) -> bool {
         #[cfg(feature = "patched-dds")]
         if self.offered == Offered::KeepLatest {
@@ -654,8 +671,9 @@ impl Outlet {
 }
 
 impl Former {
-    /// Where every value counts and there may be somebody who lacks one. Of a state only the last value does, with which the
-    /// next writer begins: an old one must not reach anybody beside it.
+    /// Returns the writer if every value counts and a reader may miss some. Of a state only the
+    /// last value counts, with which the next writer starts: an old value must not reach a reader
+    /// in addition.
     fn of(writer: Writer, offered: Offered, in_flight: usize, now: Instant) -> Option<Self> {
         (matches!(offered, Offered::DropOldest(_)) && in_flight > 0).then(|| Self {
             writer,
@@ -663,10 +681,10 @@ impl Former {
         })
     }
 
-    /// Whether its readers have all of what it wrote, or have had the time to ask for it.
+    /// Returns whether the readers have received all its samples, or had time to request repairs.
     #[must_use]
     pub fn is_done(&self, now: Instant) -> bool {
-        // The answer is immediate with a wait of zero.
+        // A wait of zero returns immediately.
         let acknowledged = self.writer.wait_for_acknowledgments(Duration::ZERO);
         now >= self.until || !matches!(acknowledged, Ok(false))
     }
@@ -692,14 +710,14 @@ impl std::fmt::Debug for Outlet {
 }
 
 impl Settling {
-    /// Whether the readers get what is written now: those that acknowledge say so.
+    /// Returns whether the readers receive written samples, according to their acknowledgements.
     #[cfg(feature = "patched-dds")]
     fn is_over(&self, writer: &Writer, seen: usize, joined: Instant, now: Instant) -> bool {
         let readers = writer.matched_readers();
         let age = now.saturating_duration_since(self.since);
         let told = readers.silent + readers.greeting == 0 && readers.in_step > 0;
-        // Readers that were there before us are not all known yet when the first of them has answered, and those that were
-        // seen may not have matched yet.
+        // Readers that were present before us are not all known when the first of them has
+        // responded, and discovered readers may not have matched yet.
         let all = readers.in_step >= seen && now.saturating_duration_since(joined) >= SETTLE;
         let some = readers.in_step + readers.greeting + readers.best_effort > 0;
         told && readers.best_effort == 0 && all
@@ -707,30 +725,34 @@ impl Settling {
             || age >= self.patience
     }
 
-    /// Whether the readers most likely get what is written now.
+    /// Returns whether the readers most likely receive written samples.
     #[cfg(not(feature = "patched-dds"))]
     fn is_over(&self, _writer: &Writer, _seen: usize, _joined: Instant, now: Instant) -> bool {
         now.saturating_duration_since(self.since) >= SETTLE.min(self.patience)
     }
 }
 
-/// How long peers take to learn of our writer after we learned of their reader: 30 to 190 ms measured.
+/// How long peers take to discover our writer after we discovered their reader: 30 to 190 ms
+/// measured.
 const SETTLE: Duration = Duration::from_millis(250);
-/// How long to wait for a first reader that has not said anything: what tells it of us may have been lost, and said again.
+/// How long to wait for a first reader that is silent: the announcement of our writer may have been
+/// lost and repeated.
 const PATIENCE: Duration = Duration::from_secs(3);
-/// Samples that may wait for that, by what the topic carries.
+/// Samples that may wait during that time, for state topics and event topics.
 const SETTLING_STATES: usize = 128;
 const SETTLING_EVENTS: usize = 512;
-/// How long a state topic may lag behind for the sake of one reader that says nothing. A reader that was killed, or lost its
-/// radio link, holds up RustDDS' writer until its lease ends, 10 to 20 s later.
+/// How long a state topic may lag because of one silent reader. A reader that was killed or lost
+/// its radio link blocks RustDDS's writer until its lease expires, 10 to 20 s later.
 const STUCK_AFTER: Duration = Duration::from_millis(500);
-/// How long it may lag behind for the sake of one that is heard, and takes nothing: its program may have no room for more.
+/// How long a state topic may lag because of a reader that responds but accepts no sample: its
+/// process may have no room.
 #[cfg(feature = "patched-dds")]
 const SLOWEST: Duration = Duration::from_secs(10);
-/// How long a writer that was replaced stays for those that lack something. What it waits for is a repair or two; a reader
-/// that was killed acknowledges nothing.
+/// How long a replaced writer stays for readers that miss samples. This covers one or two repairs;
+/// a killed reader acknowledges nothing.
 const REPAIRED_WITHIN: Duration = Duration::from_secs(1);
-/// Writers of a topic that are kept so.
+/// Maximum number of replaced writers of a topic.
 const MOST_FORMER: usize = 2;
-/// Memory a topic may take for readers that do not acknowledge; the send window counts samples, whatever their size.
+/// Memory limit of a topic for readers that do not acknowledge; the send window counts samples of
+/// any size.
 const MAX_IN_FLIGHT: usize = 64 * 1024 * 1024;

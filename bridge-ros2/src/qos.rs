@@ -1,4 +1,4 @@
-//! Which quality of service our endpoints ask for and offer.
+//! The QoS that the bridge's endpoints request and offer.
 
 use std::num::NonZeroU16;
 
@@ -8,12 +8,13 @@ use rustdds::{Duration, QosPolicies, QosPolicyBuilder};
 
 use crate::graph::Endpoint;
 
-/// What a reader asks for, derived from what the writers of its topic offer.
+/// The QoS that a reader requests, derived from the offers of its topic's writers.
 ///
-/// A reader that asks for more than a writer offers is not matched with it (DDS 1.4, 2.2.3), so it asks for the most
-/// that all of them offer. Without any writer it asks for the defaults of a ROS publisher of its type:
-/// sensor data best effort, all else reliable, so that the first message after a match is repaired when it was sent before we
-/// noticed the match; and volatile.
+/// A reader that requests more than a writer offers is not matched with it (DDS 1.4, 2.2.3), so it
+/// requests the most that all writers offer. Without a writer it requests the defaults of a ROS
+/// publisher of its type: best effort for sensor data, otherwise reliable, so that the first
+/// message after a match is repaired if it was sent before the bridge noticed the match; and
+/// volatile.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Requested {
     reliable: bool,
@@ -21,12 +22,12 @@ pub struct Requested {
 }
 
 impl Requested {
-    /// Whether what was written before counts as well.
+    /// Returns whether earlier samples are requested as well.
     pub(crate) const fn is_transient_local(self) -> bool {
         self.transient_local
     }
 
-    /// The most that every one of `writers` offers.
+    /// Returns the most that all `writers` offer.
     #[must_use]
     pub fn from_writers(writers: &[Endpoint]) -> Self {
         Self {
@@ -36,8 +37,9 @@ impl Requested {
         }
     }
 
-    /// The request while no writer is known: the defaults of ROS publishers of that type. Drivers publish sensor data best
-    /// effort, and their nodes warn of a reader that requests more.
+    /// Returns the request without a known writer: the defaults of ROS publishers of the type.
+    /// Drivers publish sensor data as best effort, and their nodes log a warning about a reader
+    /// that requests more.
     #[must_use]
     pub fn without_writers(message_type: &TypeName) -> Self {
         Self {
@@ -46,7 +48,7 @@ impl Requested {
         }
     }
 
-    /// The policies of such a reader, with a history of [`READER_DEPTH`].
+    /// Returns the policies of such a reader, with a history of [`READER_DEPTH`].
     #[must_use]
     pub fn policies(self) -> QosPolicies {
         let qos = QosPolicyBuilder::new()
@@ -67,21 +69,25 @@ impl Requested {
     }
 }
 
-/// What a writer offers, and what its bounded queue does when it is full.
+/// The QoS that a writer offers, and the overflow policy of its bounded queue.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Offered {
-    /// The last value counts: transient-local, so that who comes late gets it, and the newest value wins.
+    /// Only the last value counts: transient-local, so that late readers receive it, and the newest
+    /// value replaces older values.
     KeepLatest,
-    /// Every value counts, up to this many waiting: volatile, and the oldest is dropped.
+    /// Every value counts, up to this number of waiting values: volatile, and the oldest value is
+    /// dropped.
     DropOldest(NonZeroU16),
 }
 
 impl Offered {
-    /// The policies of such a writer.
+    /// Returns the policies of such a writer.
     ///
-    /// Always reliable, which best-effort readers match too, and never blocking: with a blocking time of zero a full
-    /// send window is an immediate [`WouldBlock`](rustdds::dds::WriteError::WouldBlock). `max_samples` is that window
-    /// in RustDDS: how many samples a reader may leave unacknowledged before the writer stops.
+    /// The writer is always reliable, which best-effort readers match too, and never blocks: with a
+    /// blocking time of zero a full send window is an immediate
+    /// [`WouldBlock`](rustdds::dds::WriteError::WouldBlock). `max_samples` is this window in
+    /// RustDDS: the number of samples that a reader may leave unacknowledged before the writer
+    /// stops.
     #[must_use]
     pub fn policies(self) -> QosPolicies {
         let qos = QosPolicyBuilder::new().reliable(Duration::ZERO);
@@ -101,8 +107,8 @@ impl Offered {
         }
     }
 
-    /// The same with a deadline, in case readers ask for one: a reader that does is not matched by a writer that offers
-    /// none.
+    /// Returns the policies with a deadline, if readers request one: a reader with a deadline does
+    /// not match a writer that offers none.
     #[must_use]
     pub fn with_deadline(self, deadline: Option<Duration>) -> QosPolicies {
         match deadline {
@@ -113,7 +119,7 @@ impl Offered {
         }
     }
 
-    /// How many samples may wait on our side of a full send window.
+    /// Returns how many samples may wait in front of a full send window.
     #[must_use]
     pub fn waiting_room(self) -> usize {
         match self {
@@ -123,21 +129,24 @@ impl Offered {
     }
 }
 
-/// Samples a reader keeps for us: while we are busy, or while they wait for one before them that was lost and is repaired,
-/// which takes seconds on an overloaded machine. What was read is released, and what is not is bounded by its bytes, too.
+/// Samples that a reader keeps while the bridge is busy, or while they wait for the repair of an
+/// earlier lost sample, which takes seconds on an overloaded machine. Read samples are released,
+/// and unread samples are limited by their bytes, too.
 #[cfg(feature = "patched-dds")]
 pub const READER_DEPTH: i32 = 4096;
-/// Samples a reader keeps for us while we are busy. RustDDS as published keeps them until newer ones push them out, so this
-/// is also the memory of a topic that carries large messages.
+/// Samples that a reader keeps while the bridge is busy. The published RustDDS keeps them until
+/// newer samples replace them, so this also determines the memory of a topic with large messages.
 #[cfg(not(feature = "patched-dds"))]
 pub const READER_DEPTH: i32 = 256;
 
-/// How many values a reader may leave unacknowledged. RustDDS as published prunes a history by a timer only, and to this
-/// window when there is a best-effort reader: so many old values, at most, reach a late joiner before the last one. The
-/// patched one keeps the depth and what is not acknowledged, and gives a late joiner the depth.
+/// Maximum number of values that a reader may leave unacknowledged. The published RustDDS prunes a
+/// history only by a timer, and to this window if there is a best-effort reader: up to this number
+/// of old values reach a late joiner before the last value. The patched RustDDS keeps the depth and
+/// unacknowledged samples, and sends a late joiner the depth.
 const KEEP_LATEST_WINDOW: i32 = 256;
 const DROP_OLDEST_DEPTH: i32 = 100;
-/// Ten seconds of lease at 1 kHz, and some: what a reader that vanished without a word leaves unacknowledged.
+/// Somewhat more than ten seconds of lease at 1 kHz: the samples that a lost reader leaves
+/// unacknowledged.
 const DROP_OLDEST_WINDOW: i32 = 16_384;
 
 fn limits(max_samples: i32) -> ResourceLimits {

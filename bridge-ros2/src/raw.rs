@@ -1,7 +1,8 @@
-//! Samples as bytes: the adapter that keeps RustDDS from looking into a message.
+//! Samples as bytes: the adapter that keeps RustDDS from interpreting a message.
 //!
-//! A payload is a serialized message as RTPS carries it (RTPS 2.5, 10.2): 4 bytes of encapsulation header, which name
-//! the byte order, then the CDR body. RustDDS takes the header off and puts it on, so the adapter does the reverse.
+//! A payload is a serialized message in the format of RTPS (RTPS 2.5, 10.2): an encapsulation
+//! header of 4 bytes, which names the byte order, then the CDR body. RustDDS removes the header of
+//! received samples and adds it to sent samples, so the adapter does the reverse.
 
 use bytes::Bytes;
 use rustdds::no_key::{Decode, DefaultDecoder, DeserializerAdapter, SerializerAdapter};
@@ -10,18 +11,19 @@ use rustdds::{RepresentationIdentifier, no_key};
 use crate::limits;
 use crate::node::Listed;
 
-/// The serialized payload of one sample, encapsulation header first.
+/// The serialized payload of one sample, which starts with the encapsulation header.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Payload(Bytes);
 
 impl Payload {
-    /// Takes a payload to be written. With RustDDS as published it is copied when its length is no multiple of 4, to be
-    /// padded: that RustDDS sends the last fragment of a large sample in its own length, and Cyclone DDS refuses a
-    /// DATA_FRAG submessage that does not end on a 4 byte boundary.
+    /// Wraps a payload to be written. With the published RustDDS, a payload whose length is not a
+    /// multiple of 4 is copied and padded: that version sends the last fragment of a large sample
+    /// in its own length, and Cyclone DDS refuses a DATA_FRAG submessage that does not end on a 4
+    /// byte boundary.
     ///
     /// # Errors
-    /// [`PayloadError`] when there is no header, or it announces anything but little endian CDR, the one encoding
-    /// that is announced for our writers.
+    /// [`PayloadError`] if there is no header, or it announces an encoding other than little-endian
+    /// CDR, the only encoding that our writers announce.
     pub fn to_write(payload: Bytes) -> Result<Self, PayloadError> {
         match payload.get(..HEADER_LEN) {
             None => return Err(PayloadError::NoHeader(payload.len())),
@@ -42,26 +44,26 @@ impl Payload {
         Ok(Self(padded.into()))
     }
 
-    /// The bytes, encapsulation header first.
+    /// Returns the bytes, which start with the encapsulation header.
     #[must_use]
     pub fn into_bytes(self) -> Bytes {
         self.0
     }
 
-    /// Bytes with the header.
+    /// Returns the length in bytes, including the header.
     #[must_use]
     pub fn len(&self) -> usize {
         self.0.len()
     }
 
-    /// Whether there is not even a header; no constructor makes such a payload.
+    /// Returns whether even the header is missing; no constructor creates such a payload.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.0.is_empty()
     }
 }
 
-/// Why a payload cannot be written.
+/// The reason for which a payload cannot be written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum PayloadError {
@@ -72,7 +74,7 @@ pub enum PayloadError {
 }
 
 impl PayloadError {
-    /// The label under which such a sample is counted.
+    /// Returns the label under which such a sample is counted.
     #[must_use]
     pub fn label(self) -> &'static str {
         match self {
@@ -86,11 +88,11 @@ impl PayloadError {
 #[derive(Debug, Clone, Copy)]
 pub struct Opaque;
 
-/// A reader that hands out [`Payload`]s, on the list of its node.
+/// A reader that returns [`Payload`]s, on the list of its node.
 pub type Reader = Listed<RawReader>;
 /// A writer of [`Payload`]s, on the list of its node.
 pub type Writer = Listed<RawWriter>;
-/// A reader that hands out [`Payload`]s.
+/// A reader that returns [`Payload`]s.
 pub(crate) type RawReader = no_key::SimpleDataReader<Payload, Opaque>;
 /// A writer of [`Payload`]s.
 pub(crate) type RawWriter = no_key::DataWriter<Payload, Opaque>;
@@ -100,8 +102,8 @@ impl DeserializerAdapter<Payload> for Opaque {
     type Decoded = Payload;
 
     fn supported_encodings() -> &'static [RepresentationIdentifier] {
-        // Plain CDR is what every ROS 2 middleware writes. The others are handed up with their header too, so that
-        // the reader of the message, who knows the topic, refuses them by name.
+        // Every ROS 2 middleware writes plain CDR. Other encodings are passed on with their header
+        // too, so that the decoder of the message, which knows the topic, refuses them by name.
         &[
             RepresentationIdentifier::CDR_LE,
             RepresentationIdentifier::CDR_BE,

@@ -1,7 +1,8 @@
-//! What follows `--ros-args` on a command line, as `ros2 run` and launch files put it there (design.ros2.org, "ROS
-//! Command Line Arguments"): the node's name and namespace, and the one parameter a bridge has.
+//! The arguments after `--ros-args` on a command line, as `ros2 run` and launch files pass them
+//! (design.ros2.org, "ROS Command Line Arguments"): the node's name and namespace, and the only
+//! parameter of a bridge.
 
-/// What ROS arguments say of a node.
+/// The settings of a node in ROS arguments.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct RosArgs {
     /// `-r __node:=NAME`.
@@ -15,10 +16,11 @@ pub struct RosArgs {
 }
 
 impl RosArgs {
-    /// Reads the words after `--ros-args`. Later ones win.
+    /// Parses the words after `--ros-args`. Later words take precedence.
     ///
     /// # Errors
-    /// What a bridge cannot obey, such as another name for a topic: that would be left out without a word.
+    /// An argument that a bridge does not support, such as another name for a topic: it would be
+    /// ignored silently otherwise.
     pub fn parse<S: AsRef<str>>(words: &[S]) -> Result<Self, String> {
         let mut found = Self::default();
         let mut words = words.iter().map(AsRef::as_ref);
@@ -50,7 +52,7 @@ impl RosArgs {
                 (false, "__node" | "__name") => found.name = Some(value.to_owned()),
                 (false, "__ns") => found.namespace = Some(value.to_owned()),
                 (true, "use_sim_time") => {
-                    // As YAML has it.
+                    // Spelled as in YAML.
                     found.use_sim_time = Some(match value.to_ascii_lowercase().as_str() {
                         "true" => true,
                         "false" => false,

@@ -1,4 +1,4 @@
-//! `/rosout`: what the program warns of, as messages of the graph.
+//! `/rosout`: publishes the process's warnings as messages of the graph.
 
 use std::collections::VecDeque;
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -13,7 +13,7 @@ use tracing::Level;
 use crate::clock::{RosClock, RosTime};
 use crate::discovery_info::Cdr;
 
-/// Takes warnings and errors from wherever they occur, for the thread of the node to publish.
+/// Collects warnings and errors of all threads, for the node's thread to publish.
 #[derive(Debug)]
 pub(crate) struct Rosout {
     waiting: Mutex<Waiting>,
@@ -28,7 +28,7 @@ struct Waiting {
 }
 
 impl Rosout {
-    /// `publisher` is woken when there is something to publish.
+    /// Creates the queue. `publisher` is woken when a record is added.
     pub(crate) fn new(clock: RosClock, publisher: Thread) -> Self {
         Self {
             waiting: Mutex::default(),
@@ -37,11 +37,11 @@ impl Rosout {
         }
     }
 
-    /// Hands what waits to `write` as serialized `rcl_interfaces/msg/Log`s of the logger `name`, oldest first, until
-    /// `write` says no. Returns whether something still waits.
+    /// Passes waiting records to `write` as serialized `rcl_interfaces/msg/Log`s of the logger
+    /// `name`, oldest first, until `write` returns false. Returns whether records still wait.
     pub(crate) fn flush(&self, name: &str, mut write: impl FnMut(Bytes) -> bool) -> bool {
         while let Some((stamp, record)) = self.next() {
-            // Not while the lock is held: RustDDS may have something to say about it.
+            // Without the lock: RustDDS may log during the write.
             if !write(encode(stamp, &record, name)) {
                 let mut waiting = self.lock();
                 if waiting.records.len() < MAX_WAITING {
@@ -100,7 +100,7 @@ fn encode(stamp: RosTime, record: &LogRecord, name: &str) -> Bytes {
     out.0.freeze()
 }
 
-/// The constants of `rcl_interfaces/msg/Log`.
+/// Returns the constant of `rcl_interfaces/msg/Log`.
 fn level(level: Level) -> u8 {
     match level {
         Level::ERROR => 40,
@@ -116,18 +116,19 @@ fn cut(text: &str) -> &str {
     text.get(..end.unwrap_or_default()).unwrap_or_default()
 }
 
-/// The topic.
+/// The topic of log messages.
 pub(crate) const TOPIC: &str = "rt/rosout";
-/// Its DDS type.
+/// The DDS type of the topic.
 pub(crate) const TYPE: &str = "rcl_interfaces::msg::dds_::Log_";
-/// Records that wait to be published; the oldest gives way.
+/// Maximum number of waiting records; beyond it, the oldest is dropped.
 const MAX_WAITING: usize = 256;
-/// Bytes of one message.
+/// Maximum size of one message in bytes.
 const MAX_TEXT: usize = 8192;
-/// As `rcl_qos_profile_rosout_default` has it.
+/// As in `rcl_qos_profile_rosout_default`.
 const DEPTH: i32 = 1000;
 
-/// What rclcpp offers on `/rosout`: reliable, transient-local, 1000 messages of up to 10 s.
+/// Returns the policies that rclcpp offers on `/rosout`: reliable, transient-local, 1000 messages
+/// of up to 10 s.
 pub(crate) fn qos() -> QosPolicies {
     QosPolicyBuilder::new()
         .reliable(Duration::ZERO)
@@ -183,7 +184,7 @@ mod tests {
         let note = "number 3 (3 messages before it were dropped)";
         assert!(published[0].contains(note), "{}", published[0]);
         assert!(!published[1].contains("dropped"));
-        // The third was refused, so it comes again.
+        // The third record was refused, so it is passed again.
         let mut again = Vec::new();
         assert!(!rosout.flush("bridge", |log| {
             again.push(String::from_utf8_lossy(&log).into_owned());

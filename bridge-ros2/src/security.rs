@@ -1,8 +1,10 @@
-//! Whether a bridge takes part in DDS Security, and by which files: what SROS2 lays down in a keystore and rcl reads of
-//! the environment (design.ros2.org, "ROS 2 DDS-Security integration" and "ROS 2 Security Enclaves"; rcl `security.c`).
+//! The DDS Security settings of a bridge and its files: the keystore format of SROS2 and the
+//! environment variables of rcl (design.ros2.org, "ROS 2 DDS-Security integration" and "ROS 2
+//! Security Enclaves"; rcl `security.c`).
 //!
-//! Two things are stricter than in rcl. A value rcl does not know, such as `ROS_SECURITY_ENABLE=1`, is refused: rcl takes
-//! it for "no". And files that are there but wrong are refused with `Permissive`, too.
+//! Two rules are stricter than in rcl. A value that rcl does not know, such as
+//! `ROS_SECURITY_ENABLE=1`, is refused: rcl takes it for "no". Invalid files are refused with
+//! `Permissive`, too.
 
 #[cfg(feature = "security")]
 mod files;
@@ -11,38 +13,39 @@ use std::path::{Path, PathBuf};
 
 use thiserror::Error;
 
-/// What the environment asks for.
+/// The security that the environment requests.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub enum Security {
-    /// Nothing: everybody in the domain reads and writes.
+    /// No security: every participant in the domain can read and write.
     #[default]
     Off,
-    /// To be secured, but rather not than not at all (`ROS_SECURITY_STRATEGY` is not `Enforce`), and it cannot be: why.
+    /// Security is requested and unavailable, and not enforced (`ROS_SECURITY_STRATEGY` is not
+    /// `Enforce`). Holds the reason.
     Refrained(String),
-    /// To be secured with this enclave.
+    /// Secured with this enclave.
     On(Enclave),
 }
 
-/// A folder of a keystore, and the name by which others know it.
+/// A folder of a keystore, and the enclave name that other participants see.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Enclave {
-    /// `/` or `/cell/bridge`.
+    /// The name, `/` or for example `/cell/bridge`.
     pub name: String,
-    /// Where its files are.
+    /// The folder of the files.
     pub folder: PathBuf,
 }
 
-/// Why the bridge cannot be secured as it is told to.
+/// The reason for which the bridge cannot be secured as requested.
 #[derive(Debug, Error, PartialEq, Eq)]
 pub enum SecurityError {
-    /// A value ROS does not know.
+    /// A value that ROS does not define.
     #[error("{name} is `{value}`: it is {allowed}")]
     Value {
-        /// The variable.
+        /// The name of the variable.
         name: &'static str,
-        /// What it is set to.
+        /// The value of the variable.
         value: String,
-        /// What it can be set to.
+        /// The allowed values.
         allowed: &'static str,
     },
     /// Not a name of an enclave.
@@ -51,27 +54,28 @@ pub enum SecurityError {
          ROS_SECURITY_ENCLAVE_OVERRIDE)"
     )]
     Name(String),
-    /// With `Enforce`.
+    /// Security is unavailable, with `Enforce`.
     #[error(
         "ROS_SECURITY_ENABLE is true and ROS_SECURITY_STRATEGY is Enforce, but the bridge cannot be secured: {0}"
     )]
     Enforced(String),
-    /// A file is there, and wrong.
+    /// A file exists and is invalid.
     #[error("{}: {why}", .path.display())]
     File {
-        /// Which.
+        /// The path of the file.
         path: PathBuf,
-        /// What is wrong, and what to do.
+        /// The fault and its remedy.
         why: String,
     },
 }
 
 impl Security {
     /// Reads `ROS_SECURITY_ENABLE`, `ROS_SECURITY_STRATEGY`, `ROS_SECURITY_KEYSTORE` and
-    /// `ROS_SECURITY_ENCLAVE_OVERRIDE`, which wins over `enclave`, the argument `--enclave` of ROS.
+    /// `ROS_SECURITY_ENCLAVE_OVERRIDE`, which takes precedence over `enclave`, the argument
+    /// `--enclave` of ROS.
     ///
     /// # Errors
-    /// [`SecurityError`], and with `Enforce` also what `Permissive` goes without.
+    /// [`SecurityError`]; with `Enforce`, also for a fault that `Permissive` ignores.
     pub fn from_env(
         variable: impl Fn(&str) -> Option<String>,
         enclave: Option<&str>,
@@ -93,7 +97,7 @@ impl Security {
         }
     }
 
-    /// For people.
+    /// Returns the text for log messages.
     #[must_use]
     pub fn label(&self) -> String {
         match self {
@@ -103,7 +107,7 @@ impl Security {
         }
     }
 
-    /// The enclave, when it is on.
+    /// Returns the enclave if security is on.
     #[must_use]
     pub const fn enclave(&self) -> Option<&Enclave> {
         match self {
@@ -113,7 +117,7 @@ impl Security {
     }
 }
 
-/// Whether a variable is the first of two values; when it is not set it is the second.
+/// Returns whether a variable has the first of two values; an unset variable has the second.
 fn one_of(
     set: impl Fn(&'static str) -> Option<String>,
     name: &'static str,
@@ -134,7 +138,8 @@ fn one_of(
     }
 }
 
-/// An absolute ROS name. It becomes a path, so nothing else is in it.
+/// Returns whether the name is an absolute ROS name. It becomes a path, so no other characters are
+/// allowed.
 fn is_enclave(name: &str) -> bool {
     let is_part = |part: &str| {
         part.starts_with(|first: char| first.is_ascii_alphabetic() || first == '_')
@@ -147,7 +152,7 @@ fn is_enclave(name: &str) -> bool {
 }
 
 impl Enclave {
-    /// The enclave of that name, with all its files there.
+    /// Returns the enclave with the name if all its files exist.
     fn find(keystore: Option<&str>, name: &str) -> Result<Self, String> {
         if !cfg!(feature = "security") {
             return Err(
@@ -185,27 +190,27 @@ impl Enclave {
         })
     }
 
-    /// Looks at the files as far as RustDDS does not say clearly what is wrong with them.
+    /// Checks the files for faults that RustDDS does not report clearly.
     ///
-    /// The return value is what should be mended, though it works.
+    /// Returns advice about faults that do not prevent operation.
     ///
     /// # Errors
-    /// [`SecurityError::File`] for the first file that is wrong.
+    /// [`SecurityError::File`] for the first invalid file.
     #[cfg(feature = "security")]
     pub fn check(&self) -> Result<Vec<String>, SecurityError> {
         files::check(&self.folder)
     }
 
-    /// Nothing was found that could be looked at: there is no enclave without the feature.
+    /// Returns no advice: without the feature there is no enclave to check.
     ///
     /// # Errors
-    /// None.
+    /// Never fails.
     #[cfg(not(feature = "security"))]
     pub const fn check(&self) -> Result<Vec<String>, SecurityError> {
         Ok(Vec::new())
     }
 
-    /// An error about one of its files.
+    /// Returns an error about a file of the enclave.
     #[cfg(feature = "security")]
     fn fault(folder: &Path, file: &str, why: impl std::fmt::Display) -> SecurityError {
         SecurityError::File {
@@ -215,7 +220,7 @@ impl Enclave {
     }
 }
 
-/// What an enclave consists of (rmw_dds_common `security.cpp`).
+/// The files of an enclave (rmw_dds_common `security.cpp`).
 const FILES: [&str; 6] = [
     "identity_ca.cert.pem",
     "permissions_ca.cert.pem",
@@ -224,7 +229,7 @@ const FILES: [&str; 6] = [
     "governance.p7s",
     "permissions.p7s",
 ];
-/// The one that may be there beside them.
+/// An optional file of an enclave.
 #[cfg(feature = "security")]
 const REVOKED: &str = "crl.pem";
 

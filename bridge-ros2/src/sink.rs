@@ -1,4 +1,4 @@
-//! A topic of the domain that we write values of other spaces to.
+//! A topic of the domain to which the bridge writes values of other spaces.
 
 use std::num::NonZeroU16;
 use std::time::Instant;
@@ -16,16 +16,16 @@ use crate::graph::{Endpoint, dds_topic};
 use crate::outlet::Outlet;
 use crate::qos::Offered;
 
-/// Where the values of one topic of another space go.
+/// The destination of the values of one topic of another space.
 #[derive(Debug)]
 pub(crate) struct Sink {
     pub(crate) dds_topic: String,
     pub(crate) offered: Offered,
-    /// In which type.
+    /// The choice of the type.
     pub(crate) choice: Choice,
-    /// The topic as it is written.
+    /// The open writer of the topic.
     pub(crate) open: Option<Open>,
-    /// Since when its writer in the space is silent.
+    /// The time at which its publisher in the space fell silent.
     pub(crate) silent: Option<Instant>,
 }
 
@@ -34,16 +34,17 @@ pub(crate) struct Sink {
 pub(crate) struct Open {
     pub(crate) definition: Definition,
     pub(crate) outlet: Outlet,
-    /// The shortest deadline readers asked for, which the writer offers.
+    /// The shortest deadline that readers requested, which the writer offers.
     pub(crate) deadline: Option<Duration>,
-    /// How often it was made shorter.
+    /// How often the deadline was shortened.
     pub(crate) tightened: u32,
-    /// Whether its header's stamp is ours to set: only one field of the message is the value, and not the stamp.
+    /// Whether the bridge sets the stamp of the header: only one field of the message is the value,
+    /// and it is not the stamp.
     pub(crate) stamps: bool,
 }
 
 impl Open {
-    /// The message with the time in its header, if that is not part of the value.
+    /// Returns the message with the time in its header, if the stamp is not part of the value.
     pub(crate) fn stamped(&self, message: Bytes, now: impl Fn() -> RosTime) -> Bytes {
         if !self.stamps {
             return message;
@@ -51,7 +52,8 @@ impl Open {
         let mut message = message
             .try_into_mut()
             .unwrap_or_else(|shared| BytesMut::from(shared.as_ref()));
-        // Behind the encapsulation header, std_msgs/Header: stamp, then frame_id. What we write is little endian.
+        // After the encapsulation header, std_msgs/Header: stamp, then frame_id. Written messages
+        // are little endian.
         if let Some(stamp) = message.get_mut(4..12) {
             let RosTime { sec, nanosec } = now();
             let (secs, nanos) = stamp.split_at_mut(4);
@@ -61,7 +63,7 @@ impl Open {
         message.freeze()
     }
 
-    /// A deadline that a reader asks for and the writer does not offer yet.
+    /// Returns a deadline that a reader requests and the writer does not offer yet.
     pub(crate) fn shorter_deadline(&self, readers: &[Endpoint]) -> Option<Duration> {
         shortest_deadline(readers)
             .filter(|wanted| self.deadline.is_none_or(|offered| *wanted < offered))
@@ -69,7 +71,7 @@ impl Open {
     }
 }
 
-/// The shortest deadline among those readers ask for.
+/// Returns the shortest deadline that the readers request.
 pub(crate) fn shortest_deadline(readers: &[Endpoint]) -> Option<Duration> {
     let deadlines = readers.iter().map(|reader| finite_deadline(&reader.qos));
     deadlines.flatten().min()
@@ -92,14 +94,15 @@ impl Sink {
         }
     }
 
-    /// Whether the mapping says the same of both.
+    /// Returns whether the mapping defines both alike.
     pub(crate) fn is_like(&self, other: &Self) -> bool {
         self.dds_topic == other.dds_topic
             && self.choice.mapped() == other.choice.mapped()
             && self.offered == other.offered
     }
 
-    /// The types it could have, best first; of those that subscribers ask for, that in which it is written.
+    /// Returns the candidate types, best first; among the types that subscribers request, the
+    /// written type comes first.
     pub(crate) fn candidates(&self, readers: &[Endpoint]) -> Vec<TypeName> {
         let asked_for = readers
             .iter()
@@ -113,8 +116,9 @@ impl Sink {
         self.choice.candidates(written.into_iter().chain(asked_for))
     }
 
-    /// Whether what is open serves somebody, so that it is not to be given up for another type. A subscriber whose definition
-    /// nobody tells is not served by ours: it may misread it.
+    /// Returns whether the open writer serves a subscriber, so that it is not given up for another
+    /// type. A subscriber whose definition no node describes is not served by ours: it may misread
+    /// the values.
     pub(crate) fn serves(&self, readers: &[Endpoint]) -> bool {
         self.open.as_ref().is_some_and(|open| {
             let dds_type = open.definition.name().dds();
@@ -124,11 +128,12 @@ impl Sink {
     }
 }
 
-/// Each other deadline needs another writer, so readers get that many.
+/// Each change of the deadline needs another writer, so their number is limited.
 const MOST_TIGHTENED: u32 = 8;
 
-/// The policies of a topic. Where its source decides whether it is a state, it is offered as one and its events are forgotten
-/// once they are delivered, which RustDDS as published cannot do.
+/// Returns the policies of a topic. A topic whose source decides whether it is a state is offered
+/// as a state, and its events are removed once they are delivered, which the published RustDDS
+/// cannot do.
 fn offered(overflow: Overflow, lasting: Lasting) -> Offered {
     let is_offered = match lasting {
         Lasting::State => true,

@@ -1,4 +1,4 @@
-//! A topic of the domain whose values are ours to send out.
+//! A topic of the domain whose values this bridge publishes in the space.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -13,45 +13,47 @@ use crate::graph::Endpoint;
 use crate::inbox::SlotId;
 use crate::qos::Requested;
 
-/// A topic somebody in the domain writes, and which of our values it holds.
+/// A topic that other nodes write, and the values of our space that it holds.
 #[derive(Debug)]
 pub(crate) struct Source {
     pub(crate) dds_topic: String,
     pub(crate) message_type: TypeName,
-    /// The hash of the type that counts among those its writers announce; others of it are strangers.
+    /// The hash of the type that applies among the announced hashes; writers with another hash are
+    /// strangers.
     pub(crate) announced: Option<TypeHash>,
-    /// What it is read as.
+    /// The definition with which the topic is read.
     pub(crate) definition: Option<Definition>,
-    /// Which values are made of a message; one unless a mapping ties several variables to one topic.
+    /// The values made of a message; a single value unless the mapping binds several variables to
+    /// one topic.
     pub(crate) values: Vec<(TopicId, Selection)>,
     pub(crate) reading: Reading,
-    /// Whether somebody writes it, in our type.
+    /// Whether the topic has a publisher of our type.
     pub(crate) live: bool,
-    /// Writers of this topic with another type, or another definition of it. RustDDS matches by topic name alone, so their
-    /// samples come too. With what they are dropped for.
+    /// Writers of this topic with another type or another definition of it, with the reason for
+    /// their drops. RustDDS matches by topic name alone, so their samples are received too.
     pub(crate) strangers: BTreeMap<GUID, &'static str>,
-    /// Transient-local writers that have sent something, with what they sent last.
+    /// Transient-local writers that have sent a sample, with the last sample.
     latched: BTreeMap<GUID, Latched>,
-    /// The key for the next of them.
+    /// The key for the next transient-local writer.
     next_key: u32,
-    /// The writers there are that are transient-local.
+    /// The present transient-local writers.
     durable: BTreeSet<GUID>,
-    /// Transient-local writers that have sent something and gone. One that comes back, as after the network was out for
-    /// longer than its lease, is to be read again.
+    /// Lost transient-local writers that have sent a sample. A writer that returns, such as after a
+    /// network outage longer than its lease, has to be read again.
     lapsed: BTreeSet<GUID>,
 }
 
-/// A transient-local writer that has sent something.
+/// A transient-local writer that has sent a sample.
 #[derive(Debug)]
 struct Latched {
     key: PublisherKey,
     last: Bytes,
 }
 
-/// What there is of a reader.
+/// The state of the reader.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Reading {
-    /// To be made when there is room for another endpoint.
+    /// Created when there is room for another endpoint.
     Pending,
     /// In the inbox.
     Open { slot: SlotId, requested: Requested },
@@ -75,12 +77,13 @@ impl Source {
         }
     }
 
-    /// What the writer of a sample is called to the Router, if it is transient-local.
+    /// Returns the Router's key of the sample's writer, if the writer is transient-local.
     pub(crate) fn latched_by(&mut self, writer: GUID, sample: &Bytes) -> Option<PublisherKey> {
         let Reading::Open { requested, .. } = self.reading else {
             return None;
         };
-        // A transient-local reader is matched with no other writers, be they met or not.
+        // A transient-local reader is matched only with transient-local writers, whether recorded
+        // or not.
         if !requested.is_transient_local() && !self.durable.contains(&writer) {
             return None;
         }
@@ -97,12 +100,12 @@ impl Source {
         Some(latched.key)
     }
 
-    /// The last sample of each transient-local writer, for values that come to be made of it.
+    /// Returns the last sample of each transient-local writer, for values that are added later.
     pub(crate) fn latched(&self) -> impl Iterator<Item = (PublisherKey, &Bytes)> {
         self.latched.values().map(|known| (known.key, &known.last))
     }
 
-    /// The transient-local writers that have gone; `writers` are there.
+    /// Returns the transient-local writers that were lost; `writers` are present.
     pub(crate) fn gone(&mut self, writers: &[Endpoint]) -> Vec<PublisherKey> {
         let mut gone = Vec::new();
         let lapsed = &mut self.lapsed;
@@ -120,18 +123,19 @@ impl Source {
         gone
     }
 
-    /// The transient-local writers among `writers` that had gone and were not read since.
+    /// Returns the transient-local writers among `writers` that were lost and not read after their
+    /// return.
     pub(crate) fn returned(&self, writers: &[Endpoint]) -> Vec<GUID> {
         let returned = writers.iter().map(|writer| writer.guid);
         returned.filter(|guid| self.lapsed.contains(guid)).collect()
     }
 
-    /// A writer that had returned is being read again.
+    /// Records that a returned writer is read again.
     pub(crate) fn reread(&mut self, writer: GUID) {
         self.lapsed.remove(&writer);
     }
 
-    /// Sorts the writers the topic has by now into ours and strangers; returns ours.
+    /// Sorts the present writers of the topic into ours and strangers; returns ours.
     pub(crate) fn meet(&mut self, writers: &[Endpoint]) -> Vec<Endpoint> {
         let dds_type = self.message_type.dds();
         let (ours, strangers): (Vec<_>, Vec<_>) = writers
@@ -150,14 +154,15 @@ impl Source {
     }
 }
 
-/// Why samples of a writer are dropped whose type has another name.
+/// The reason for drops of samples of a writer whose type has another name.
 pub(crate) const OTHER_TYPE: &str = "publisher of another type";
-/// Why those of one are that announces another hash than the one that counts.
+/// The reason for drops of samples of a writer that announces another hash than the applicable
+/// hash.
 pub(crate) const OTHER_DEFINITION: &str = "publisher of another definition";
-/// How many writers are remembered that have gone: more do not come back at once.
+/// Maximum number of remembered lost writers: more do not return at once.
 const MAX_LAPSED: usize = 1024;
 
-/// The prefix all endpoints of a participant share.
+/// Returns whether the endpoint belongs to the participant, by their common prefix.
 pub(crate) fn same_participant(endpoint: GUID, participant: &impl RTPSEntity) -> bool {
     endpoint.prefix == participant.guid().prefix
 }

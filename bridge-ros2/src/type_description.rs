@@ -1,4 +1,5 @@
-//! The service `get_type_description` of a node (`type_description_interfaces/srv/GetTypeDescription`, REP-2016).
+//! The service `get_type_description` of a node
+//! (`type_description_interfaces/srv/GetTypeDescription`, REP-2016).
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -13,28 +14,29 @@ use crate::service::{
     ServiceTypes,
 };
 
-/// The types of the node by their full names, as `std_msgs/msg/Bool`.
+/// The types of the node by their full names, such as `std_msgs/msg/Bool`.
 type Known = BTreeMap<(String, TypeHash), Description>;
 
-/// A type with the types that it needs, itself first.
+/// A type with its referenced types, itself first.
 #[derive(Debug)]
 struct Description {
     types: Vec<DescribedType>,
     sources: Vec<TypeSource>,
 }
 
-/// The source of a type, as `type_description_interfaces/msg/TypeSource` has it.
+/// The source of a type, in the format of `type_description_interfaces/msg/TypeSource`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct TypeSource {
     /// The full name of the type.
     pub(crate) name: String,
-    /// The ending of its file, or `implicit` for a type without a file of its own.
+    /// The extension of its file, or `implicit` for a type without its own file.
     pub(crate) encoding: &'static str,
     /// The contents of its file.
     pub(crate) text: String,
 }
 
-/// Tells others what the types are that this node reads and writes. Dropping it withdraws the service.
+/// Serves the descriptions of the types that this node reads and writes. Dropping it withdraws the
+/// service.
 #[derive(Debug)]
 pub(crate) struct TypeServer {
     known: Arc<Mutex<Known>>,
@@ -42,7 +44,7 @@ pub(crate) struct TypeServer {
 }
 
 impl TypeServer {
-    /// Of the domain's node. To be called on a tokio runtime.
+    /// Opens the service of the domain's node. Call this on a tokio runtime.
     pub(crate) fn open(domain: &Domain, peers: &ServicePeers) -> Result<Self, DomainError> {
         let service = service(&domain.node_name());
         let hashes = TypeName::new(PACKAGE, SERVICE)
@@ -65,7 +67,7 @@ impl TypeServer {
         Ok(Self { known, server })
     }
 
-    /// A type that is read, written or served from now on, with what it needs.
+    /// Adds a type that is read, written or served, with its referenced types.
     pub(crate) fn learn(
         &self,
         types: Vec<DescribedType>,
@@ -80,19 +82,19 @@ impl TypeServer {
         known.insert((name, hash), Description { types, sources });
     }
 
-    /// Whether that is told already.
+    /// Returns whether the type is served already.
     pub(crate) fn tells(&self, full: &str, hash: TypeHash) -> bool {
         let known = self.known.lock().unwrap_or_else(PoisonError::into_inner);
         known.contains_key(&(full.to_owned(), hash))
     }
 
-    /// What it has counted so far.
+    /// Returns the counters of the service.
     pub(crate) fn counters(&self) -> ServiceCounters {
         self.server.counters()
     }
 }
 
-/// The service of a node.
+/// Returns the service of a node.
 pub(crate) fn service(node: &str) -> Service {
     let of = |half| format!("type_description_interfaces::srv::dds_::GetTypeDescription_{half}_");
     Service {
@@ -104,7 +106,7 @@ pub(crate) fn service(node: &str) -> Service {
     }
 }
 
-/// Asks for a type without its sources.
+/// Encodes a request for a type without its sources.
 pub(crate) fn request(name: &TypeName, hash: TypeHash) -> Bytes {
     let mut writer = CdrWriter::new();
     writer.string(&name.ros2());
@@ -113,7 +115,7 @@ pub(crate) fn request(name: &TypeName, hash: TypeHash) -> Bytes {
     writer.finish()
 }
 
-/// The type and those it needs, or why there is none.
+/// Decodes the type and its referenced types, or the reason for the failure.
 pub(crate) fn read_answer(bytes: &[u8]) -> Result<Vec<DescribedType>, String> {
     let read = || -> Result<Result<Vec<DescribedType>, String>, Malformed> {
         let mut reader = CdrReader::new(bytes)?;
@@ -140,7 +142,7 @@ fn read_type(reader: &mut CdrReader<'_>) -> Result<DescribedType, Malformed> {
                 string_capacity: reader.u64()?,
                 nested: reader.string()?,
             };
-            // Its default.
+            // The default value.
             reader.string()?;
             Ok(field)
         })?,
@@ -152,7 +154,7 @@ fn read_type(reader: &mut CdrReader<'_>) -> Result<DescribedType, Malformed> {
 struct TypeRequest {
     name: String,
     hash: String,
-    /// Whether the sources are wanted.
+    /// Whether the sources are requested.
     sources: bool,
 }
 
@@ -165,7 +167,7 @@ fn read_request(bytes: &[u8]) -> Result<TypeRequest, Malformed> {
     })
 }
 
-/// The answer to a request for a type that is known, or not.
+/// Encodes the response to a request, for a known or an unknown type.
 fn answer(known: &Known, request: &TypeRequest) -> Bytes {
     let found = describe(known, &request.name, &request.hash);
     let mut writer = CdrWriter::new();
@@ -197,11 +199,11 @@ fn answer(known: &Known, request: &TypeRequest) -> Bytes {
 
 fn describe<'k>(known: &'k Known, name: &str, hash: &str) -> Result<&'k Description, String> {
     let unknown = || format!("type {name} is none of this node");
-    // Of messages the short name will do.
+    // For messages the short name suffices.
     let full = name.parse::<TypeName>();
     let full = full.map_or_else(|_| name.to_owned(), |name| name.ros2());
     let of_name = || known.iter().filter(|((of, _), _)| *of == full);
-    // As in rcl, any hash will do where none is named.
+    // As in rcl, any hash matches if the request names none.
     let asked = of_name().find(|((_, ours), _)| hash.is_empty() || hash == ours.to_string());
     if let Some((_, described)) = asked {
         return Ok(described);
@@ -228,12 +230,13 @@ fn write_type(writer: &mut CdrWriter, described: &DescribedType) {
     });
 }
 
-/// What the service is in `.srv` and `.msg` files, for the hashes its endpoints announce.
+/// Returns the definitions of the service in `.srv` and `.msg` files, for the hashes that its
+/// endpoints announce.
 pub(crate) fn definitions() -> Registry {
     let mut registry = Registry::empty(Dialect::Ros2);
     for (name, text) in MESSAGES {
         if let Ok(name) = TypeName::new(PACKAGE, name) {
-            // A test has the hash of the whole.
+            // A test compares the hash of the complete definitions.
             let added = registry.add(&name, text);
             debug_assert!(added.is_ok(), "{name}");
         }
@@ -281,7 +284,7 @@ mod tests {
         text.parse().unwrap()
     }
 
-    /// A node that has that one type of the bundle.
+    /// Returns a node that has this one type of the bundle.
     fn known(name: &TypeName) -> (Known, TypeHash) {
         let registry = Registry::bundle(Dialect::Ros2);
         let hash = registry.type_hash(name).unwrap();
@@ -325,7 +328,7 @@ mod tests {
     fn an_answer_that_is_cut_anywhere_is_malformed() {
         let (known, _) = known(&name("geometry_msgs/Twist"));
         let whole = answer(&known, &asked("geometry_msgs/msg/Twist", "", false));
-        // Behind the types come two counts that are not read, and what aligns them.
+        // The types are followed by two counts that are not read, and their padding.
         for length in 0..whole.len() - 11 {
             assert!(read_answer(&whole[..length]).is_err(), "{length}");
         }
@@ -347,7 +350,7 @@ mod tests {
         assert!(!String::from_utf8_lossy(&without).contains("text of"));
     }
 
-    /// `type_description_interfaces/msg/TypeDescription` as ROS 2 publishes it.
+    /// The hash of `type_description_interfaces/msg/TypeDescription` as published by ROS 2.
     #[test]
     fn the_messages_have_the_hash_of_ros() {
         let hash = definitions().type_hash(&name("type_description_interfaces/TypeDescription"));

@@ -1,4 +1,5 @@
-//! The thread of a node: it tells of the node, hears of others, and serves `/rosout` and `/clock`.
+//! The thread of a node: announces the node, receives other node lists, and serves `/rosout` and
+//! `/clock`.
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -14,13 +15,13 @@ use super::{Channels, ParticipantPrefix, Shared, lock};
 use crate::discovery_info::{GidLength, NodeEntities, ParticipantEntitiesInfo};
 use crate::raw::{Payload, RawWriter};
 
-/// The thread's side.
+/// The state of the thread.
 pub(super) struct Teller {
     shared: Arc<Shared>,
     channels: Channels,
-    /// When the list is to be published.
+    /// The time at which the list is due for publication.
     due: Option<Instant>,
-    /// The length it was published in.
+    /// The length with which the list was published.
     written: Option<GidLength>,
 }
 
@@ -37,7 +38,8 @@ impl Teller {
     pub(super) fn run(mut self) {
         let waker = Waker::from(Arc::new(Unpark(std::thread::current())));
         while !self.shared.stop.load(Ordering::Acquire) {
-            // Armed before each look: what arrives between the look and the sleep ends the sleep.
+            // Armed before each read: a sample that arrives between the read and the sleep ends the
+            // sleep.
             self.channels.info_reader.set_waker(Some(waker.clone()));
             self.hear_others();
             let waits = self.serve(&waker);
@@ -81,13 +83,13 @@ impl Teller {
         let own = self.shared.options.full_name();
         let double = info.nodes.iter().any(|node| node.full_name() == own);
         if others.insert(prefix, length, info.nodes) && double && others.doubles.insert(prefix) {
-            // Not while the lock is held: a warning goes to all who hear the log.
+            // After the lock is released: a warning goes to all log sinks.
             drop(others);
             warn_of_double(&own);
         }
     }
 
-    /// Serves `/rosout` and `/clock`; says whether records wait for room.
+    /// Serves `/rosout` and `/clock`; returns whether records wait for room.
     fn serve(&self, waker: &Waker) -> bool {
         let services = lock(&self.shared.services);
         let Some((services, rosout)) = &*services else {
@@ -104,7 +106,7 @@ impl Teller {
         })
     }
 
-    /// Publishes the list if it is due, and makes up the next time.
+    /// Publishes the list if it is due, and schedules the next publication.
     fn tell(&mut self) {
         let length = self
             .shared
@@ -146,7 +148,7 @@ impl Teller {
         }
     }
 
-    /// Tells the others that the node has gone before the participant does.
+    /// Announces that the node has left before the participant is dropped.
     fn withdraw(self) {
         drop(lock(&self.shared.services).take());
         let info = ParticipantEntitiesInfo {
@@ -155,7 +157,7 @@ impl Teller {
         };
         let writer = &self.channels.info_writer;
         if write(writer, info.encode(self.written.unwrap_or_default())) {
-            // Whoever has not heard by then notices that the participant goes.
+            // A participant that has not received it by then detects the loss of this participant.
             writer.wait_for_acknowledgments(WITHDRAW_WITHIN).ok();
         }
     }
@@ -168,9 +170,9 @@ fn warn_of_double(name: &str) {
     );
 }
 
-/// Whether RustDDS took it.
+/// Returns whether RustDDS accepted the sample.
 fn write(writer: &RawWriter, bytes: Bytes) -> bool {
-    // What is made here is little endian CDR.
+    // The thread only creates little-endian CDR.
     Payload::to_write(bytes).is_ok_and(|payload| writer.write(payload, None).is_ok())
 }
 
@@ -182,9 +184,9 @@ impl Wake for Unpark {
     }
 }
 
-/// Changes of the list within this time are told at once.
+/// Changes of the list within this time are published together.
 const BATCH: Duration = Duration::from_millis(50);
-/// When to try again what RustDDS had no room for.
+/// The delay before RustDDS is offered a refused sample again.
 const RETRY: Duration = Duration::from_millis(100);
-/// How long leaving waits for others to hear of it.
+/// How long leaving waits for the acknowledgements of other participants.
 const WITHDRAW_WITHIN: Duration = Duration::from_millis(200);

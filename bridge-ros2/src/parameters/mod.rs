@@ -1,7 +1,8 @@
-//! The parameters of our own node, so that `ros2 param` of either vendor lists, gets, sets and describes them.
+//! The parameters of the bridge's node, so that `ros2 param` of either vendor lists, gets, sets and
+//! describes them.
 //!
-//! Six services below the node's name and the topic `/parameter_events` (rcl_interfaces). Parameters are declared at
-//! the start and keep their types.
+//! Six services below the node's name and the topic `/parameter_events` (rcl_interfaces).
+//! Parameters are declared at the start and keep their types.
 
 mod store;
 mod value;
@@ -38,7 +39,7 @@ struct Shared {
 }
 
 impl ParameterServer {
-    /// Declares `parameters` for the domain's node and serves them. To be called on a tokio runtime.
+    /// Declares `parameters` for the domain's node and serves them. Call this on a tokio runtime.
     ///
     /// # Errors
     /// [`DomainError::Endpoint`].
@@ -84,14 +85,14 @@ impl ParameterServer {
         Ok(Self { shared, services })
     }
 
-    /// What its services have counted so far, all together.
+    /// Returns the sums of the counters of its services.
     #[must_use]
     pub fn counters(&self) -> ServiceCounters {
         let each = self.services.iter().map(ServiceServer::counters);
         each.fold(ServiceCounters::default(), ServiceCounters::plus)
     }
 
-    /// The value of a parameter now; `None` when it is not declared.
+    /// Returns the current value of a parameter; `None` if it is not declared.
     #[must_use]
     pub fn value(&self, name: &str) -> Option<ParameterValue> {
         let store = self.shared.store.lock();
@@ -133,7 +134,7 @@ impl std::fmt::Debug for Shared {
     }
 }
 
-/// As rmw's default for parameter events, which are reliable and volatile.
+/// Returns rmw's default policies for parameter events, which are reliable and volatile.
 fn policies() -> QosPolicies {
     QosPolicyBuilder::new()
         .reliable(rustdds::Duration::ZERO)

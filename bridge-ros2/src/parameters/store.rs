@@ -1,4 +1,5 @@
-//! The parameters of a node and the answers to the six services about them. Pure: bytes in, bytes out.
+//! The parameters of a node and the responses of their six services. The module is pure: bytes in,
+//! bytes out.
 
 use std::collections::BTreeSet;
 
@@ -10,13 +11,13 @@ use crate::cdr::{CdrReader, CdrWriter, Malformed};
 /// A declared parameter.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Parameter {
-    /// Parts joined by dots.
+    /// The name, whose parts are joined by dots.
     pub name: String,
-    /// Its value; of this type for ever.
+    /// The value; its type never changes.
     pub value: ParameterValue,
-    /// For people.
+    /// The description for operators.
     pub description: String,
-    /// Whether nobody may set it.
+    /// Whether clients cannot set the parameter.
     pub read_only: bool,
 }
 
@@ -45,7 +46,7 @@ impl Question {
         Self::SetAtomically,
     ];
 
-    /// The service's name below the node's, and its type in `rcl_interfaces`.
+    /// Returns the service's name below the node's name, and its type in `rcl_interfaces`.
     pub(super) const fn names(self) -> (&'static str, &'static str) {
         match self {
             Self::Describe => ("describe_parameters", "DescribeParameters"),
@@ -68,7 +69,7 @@ impl Store {
         self.0.iter().find(|parameter| parameter.name == name)
     }
 
-    /// The answer to a request, and the parameters it changed.
+    /// Returns the response to a request, and the parameters that the request changed.
     pub(super) fn answer(
         &mut self,
         question: Question,
@@ -113,14 +114,15 @@ impl Store {
         Ok((writer.finish(), changed))
     }
 
-    /// The parameters of these names. As rclcpp and rclpy: none where any of the names is not declared, which tools take for
-    /// "not set".
+    /// Returns the parameters with these names. As in rclcpp and rclpy, the result is empty if any
+    /// name is not declared; tools show this as "not set".
     fn declared(&self, names: &[String]) -> Vec<&Parameter> {
         let found: Option<Vec<&Parameter>> = names.iter().map(|name| self.get(name)).collect();
         found.unwrap_or_default()
     }
 
-    /// As rclcpp: the names at or below one of the prefixes, at most `depth` parts below it; 0 is any number.
+    /// Lists names as rclcpp does: the names at or below one of the prefixes, at most `depth` parts
+    /// below it; 0 means any number.
     fn list(&self, writer: &mut CdrWriter, prefixes: &[String], depth: u64) {
         let near = |rest: &str| {
             let parts = rest.split('.').count();
@@ -146,7 +148,7 @@ impl Store {
         writer.sequence(&parents, |writer, name| writer.string(name));
     }
 
-    /// Sets all or none; those that have another value now.
+    /// Sets all parameters or none; returns the parameters whose values changed.
     fn set(&mut self, wanted: &[(String, ParameterValue)]) -> Result<Vec<Parameter>, String> {
         for (name, value) in wanted {
             let Some(found) = self.get(name) else {
@@ -179,12 +181,12 @@ impl Store {
     }
 }
 
-/// A `rcl_interfaces/msg/Parameter`.
+/// Decodes a `rcl_interfaces/msg/Parameter`.
 fn assignment(reader: &mut CdrReader<'_>) -> Result<(String, ParameterValue), Malformed> {
     Ok((reader.string()?, ParameterValue::read(reader)?))
 }
 
-/// A `rcl_interfaces/msg/ParameterDescriptor`.
+/// Encodes a `rcl_interfaces/msg/ParameterDescriptor`.
 fn describe(writer: &mut CdrWriter, parameter: &Parameter) {
     writer.string(&parameter.name);
     writer.u8(parameter.value.kind());
@@ -192,18 +194,18 @@ fn describe(writer: &mut CdrWriter, parameter: &Parameter) {
     writer.string("");
     writer.bool(parameter.read_only);
     writer.bool(false);
-    // No range, neither of numbers nor of whole ones.
+    // No range, neither for floating-point numbers nor for integers.
     writer.u32(0);
     writer.u32(0);
 }
 
-/// A `rcl_interfaces/msg/SetParametersResult`.
+/// Encodes a `rcl_interfaces/msg/SetParametersResult`.
 fn write_result(writer: &mut CdrWriter, result: &Result<Vec<Parameter>, String>) {
     writer.bool(result.is_ok());
     writer.string(result.as_ref().err().map_or("", String::as_str));
 }
 
-/// A `rcl_interfaces/msg/ParameterEvent` about parameters that changed.
+/// Encodes a `rcl_interfaces/msg/ParameterEvent` about changed parameters.
 pub(super) fn event(node: &str, unix_nanos: i128, changed: &[Parameter]) -> Bytes {
     let (seconds, nanos) = (
         unix_nanos.div_euclid(1_000_000_000),
@@ -213,13 +215,13 @@ pub(super) fn event(node: &str, unix_nanos: i128, changed: &[Parameter]) -> Byte
     writer.i32(i32::try_from(seconds).unwrap_or(i32::MAX));
     writer.u32(u32::try_from(nanos).unwrap_or_default());
     writer.string(node);
-    // New ones.
+    // New parameters.
     writer.u32(0);
     writer.sequence(changed, |writer, parameter| {
         writer.string(&parameter.name);
         parameter.value.write(writer);
     });
-    // Deleted ones.
+    // Deleted parameters.
     writer.u32(0);
     writer.finish()
 }
@@ -266,7 +268,7 @@ mod tests {
         assert_eq!(listed(&["ar"], 0), [""; 0]);
     }
 
-    /// How many elements the answer has to a request for those names.
+    /// Returns the number of elements in the response to a request for these names.
     fn counted(question: Question, names: &[&str]) -> u32 {
         let mut writer = CdrWriter::new();
         writer.sequence(names, |writer, name| writer.string(name));
@@ -307,7 +309,7 @@ mod tests {
             set("use_sim_time", ParameterValue::Bool(true)),
             set("arm.speed", ParameterValue::Double(1.0)),
         ]);
-        // The other has the value already.
+        // The other parameter has the value already.
         assert_eq!(changed.unwrap().len(), 1);
     }
 

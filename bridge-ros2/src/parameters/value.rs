@@ -1,36 +1,36 @@
-//! Values of parameters, as `rcl_interfaces/msg/ParameterValue` has them.
+//! Parameter values, in the format of `rcl_interfaces/msg/ParameterValue`.
 
 use crate::cdr::{CdrReader, CdrWriter, Malformed};
 
-/// A parameter's value.
+/// The value of a parameter.
 #[derive(Debug, Clone, PartialEq, Default)]
 #[non_exhaustive]
 pub enum ParameterValue {
-    /// None.
+    /// No value.
     #[default]
     NotSet,
-    /// A truth value.
+    /// A boolean.
     Bool(bool),
-    /// A whole number.
+    /// An integer.
     Integer(i64),
-    /// A number.
+    /// A floating-point number.
     Double(f64),
-    /// A text.
+    /// A string.
     String(String),
     /// Bytes.
     ByteArray(Vec<u8>),
-    /// Truth values.
+    /// Booleans.
     BoolArray(Vec<bool>),
-    /// Whole numbers.
+    /// Integers.
     IntegerArray(Vec<i64>),
-    /// Numbers.
+    /// Floating-point numbers.
     DoubleArray(Vec<f64>),
-    /// Texts.
+    /// Strings.
     StringArray(Vec<String>),
 }
 
 impl ParameterValue {
-    /// The constant of `rcl_interfaces/msg/ParameterType`.
+    /// Returns the constant of `rcl_interfaces/msg/ParameterType`.
     #[must_use]
     pub const fn kind(&self) -> u8 {
         match self {
@@ -47,7 +47,7 @@ impl ParameterValue {
         }
     }
 
-    /// All fields are on the wire, whichever counts.
+    /// Decodes a value. The message contains all fields, of which the kind selects one.
     pub(super) fn read(reader: &mut CdrReader<'_>) -> Result<Self, Malformed> {
         let kind = reader.u8()?;
         let all = [

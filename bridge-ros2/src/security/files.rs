@@ -1,5 +1,6 @@
-//! The files of an enclave, looked at before RustDDS does: it says that something does not verify, not which file to
-//! mend; and it looks neither at the dates of certificates nor at who may read a key.
+//! Checks the files of an enclave before RustDDS reads them: RustDDS reports a failed verification
+//! without the file to fix, and checks neither the dates of certificates nor the file mode of a
+//! key.
 
 use std::fs;
 use std::os::unix::fs::PermissionsExt as _;
@@ -15,7 +16,7 @@ use openssl::x509::store::X509StoreBuilder;
 
 use super::{Enclave, REVOKED, SecurityError};
 
-/// Looks at all files in `folder`; what works but should be mended is returned.
+/// Checks all files in `folder`; returns advice about faults that do not prevent operation.
 pub(super) fn check(folder: &Path) -> Result<Vec<String>, SecurityError> {
     if folder.join(REVOKED).is_file() {
         return Err(Enclave::fault(
@@ -59,10 +60,10 @@ fn read(folder: &Path, file: &str) -> Result<Vec<u8>, SecurityError> {
         .map_err(|error| Enclave::fault(folder, file, format!("cannot be read: {error}")))
 }
 
-/// Bytes of the largest file of an enclave.
+/// Maximum size of a file of an enclave in bytes.
 const LARGEST: u64 = 4 << 20;
 
-/// A certificate that is valid now.
+/// Reads a certificate that is currently valid.
 fn certificate(folder: &Path, file: &str) -> Result<X509, SecurityError> {
     let pem = read(folder, file)?;
     let fault = |why: String| Enclave::fault(folder, file, why);
@@ -101,7 +102,7 @@ fn private_key(folder: &Path) -> Result<PKey<Private>, SecurityError> {
     PKey::private_key_from_pem(&pem).map_err(|error| fault(&format!("not a private key: {error}")))
 }
 
-/// What a document in S/MIME says, if its signature is by that authority.
+/// Returns the content of an S/MIME document if the authority signed it.
 fn signed_document(folder: &Path, file: &str, authority: &X509) -> Result<String, SecurityError> {
     let text = read(folder, file)?;
     let verify = || -> Result<String, ErrorStack> {
@@ -109,7 +110,8 @@ fn signed_document(folder: &Path, file: &str, authority: &X509) -> Result<String
         let mut signers = Stack::new()?;
         signers.push(authority.clone())?;
         let nobody = X509StoreBuilder::new()?.build();
-        // By this certificate and no other that came along; its own chain is of no matter (DDS Security 1.1, 9.4.1.1).
+        // Verified with this certificate and no other included certificate; its own chain does not
+        // matter (DDS Security 1.1, 9.4.1.1).
         let flags = Pkcs7Flags::NOINTERN | Pkcs7Flags::NOVERIFY;
         let mut said = Vec::new();
         let content = content.as_deref();
@@ -129,11 +131,12 @@ fn signed_document(folder: &Path, file: &str, authority: &X509) -> Result<String
     })
 }
 
-/// Why nodes of Cyclone DDS are not found, if that is so.
+/// Returns the reason for which nodes of Cyclone DDS are not discovered, if the governance causes
+/// this.
 ///
-/// Where datagrams are protected as a whole, those that tell of topics have to be, too (DDS Security 1.1, 8.4.2.4, table
-/// 27). Cyclone DDS 0.10 protects none of them but where discovery is protected, and RustDDS lets none in, since
-/// anybody could have sent them.
+/// If whole datagrams are protected, the datagrams that announce topics have to be protected, too
+/// (DDS Security 1.1, 8.4.2.4, table 27). Cyclone DDS 0.10 protects them only if discovery is
+/// protected. RustDDS rejects unprotected datagrams, because any host could have sent them.
 fn not_found(governance: &str) -> Option<String> {
     governance.split("</domain_rule>").find_map(|rule| {
         let rtps = values(rule, "rtps_protection_kind").find(|kind| *kind != "NONE")?;
@@ -152,7 +155,7 @@ fn not_found(governance: &str) -> Option<String> {
     })
 }
 
-/// What stands in the elements of that name.
+/// Returns the contents of the elements with this name.
 fn values<'a>(xml: &'a str, element: &str) -> impl Iterator<Item = &'a str> {
     let (start, end) = (format!("<{element}>"), format!("</{element}>"));
     let parts: Vec<&str> = xml.split(&start).skip(1).collect();
@@ -160,7 +163,7 @@ fn values<'a>(xml: &'a str, element: &str) -> impl Iterator<Item = &'a str> {
     values.filter_map(move |part| Some(part.split_once(&end)?.0.trim()))
 }
 
-/// Tells of a key that not only its owner can read.
+/// Returns advice about a key that other users than its owner can read.
 fn readable_by_others(folder: &Path) -> Option<String> {
     let path = folder.join("key.pem");
     let mode = fs::metadata(&path).ok()?.permissions().mode() & 0o777;
