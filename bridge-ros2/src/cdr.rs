@@ -80,7 +80,7 @@ impl<'b> CdrReader<'b> {
         Ok(String::from_utf8_lossy(text).into_owned())
     }
 
-    /// Reads a sequence whose elements have at least one byte each.
+    /// Reads a sequence; each element has at least one byte.
     pub(crate) fn sequence<T>(
         &mut self,
         mut element: impl FnMut(&mut Self) -> Result<T, Malformed>,

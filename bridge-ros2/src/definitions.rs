@@ -1,5 +1,5 @@
-//! Message definitions: built in, or from the ROS installation in whose environment the process was
-//! started.
+//! Message definitions: built in, or from the ROS installation that was sourced when the process
+//! was started.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -25,7 +25,7 @@ pub(crate) struct Definitions {
     told: BTreeMap<(TypeName, TypeHash), Told>,
 }
 
-/// One definition of a type.
+/// A definition of a type.
 #[derive(Debug, Clone)]
 pub(crate) struct Definition {
     pub(crate) message_type: Arc<MessageType>,
@@ -191,7 +191,7 @@ impl Definitions {
         }
     }
 
-    /// Returns the source of each of these types: the text of a message whose file is known
+    /// Returns the source of each of these types: the text of a message if its file is known
     /// locally. A part of a service or action has no own file, nor has a type that a node
     /// described.
     pub(crate) fn sources(&self, types: &[DescribedType]) -> Vec<TypeSource> {
@@ -235,7 +235,7 @@ impl Definitions {
         self.known.explain(kind, error)
     }
 
-    /// Explains an error of a type whose definition can only come from files.
+    /// Explains an error of a type that only files can define.
     pub(crate) fn explain_missing(
         &mut self,
         of: (TextKind, &TypeName),

@@ -1,10 +1,11 @@
 //! `ros_discovery_info`: assigns the readers and writers of a participant to its ROS nodes.
 //!
 //! DDS knows participants and endpoints; nodes are a ROS concept. Each participant publishes its
-//! complete list of nodes as messages of one type (`rmw_dds_common/msg/ParticipantEntitiesInfo`).
-//! An entity is identified by its RTPS GUID in a `Gid`, which has 24 bytes up to ROS 2 Humble, the
-//! last 8 of them zero, and 16 bytes since Iron. Both have the same DDS type name, so a reader
-//! detects the length: only the right length consumes the whole payload.
+//! complete list of nodes as messages of a single type
+//! (`rmw_dds_common/msg/ParticipantEntitiesInfo`). An entity is identified by its RTPS GUID in a
+//! `Gid`, which has 24 bytes up to ROS 2 Humble, the last 8 of them zero, and 16 bytes since Iron.
+//! Both have the same DDS type name, so a reader detects the length: only the right length consumes
+//! the whole payload.
 
 use bytes::{BufMut, Bytes, BytesMut};
 use thiserror::Error;
@@ -13,7 +14,7 @@ use thiserror::Error;
 /// 9.3.1).
 pub type GuidBytes = [u8; 16];
 
-/// The nodes of one participant: `rmw_dds_common/msg/ParticipantEntitiesInfo`.
+/// The nodes of a participant: `rmw_dds_common/msg/ParticipantEntitiesInfo`.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct ParticipantEntitiesInfo {
     /// The GUID of the participant.
@@ -22,7 +23,7 @@ pub struct ParticipantEntitiesInfo {
     pub nodes: Vec<NodeEntities>,
 }
 
-/// One node: `rmw_dds_common/msg/NodeEntitiesInfo`.
+/// A ROS node: `rmw_dds_common/msg/NodeEntitiesInfo`.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct NodeEntities {
     /// The namespace, `/` or `/name/...`.

@@ -44,7 +44,7 @@ pub struct DomainOptions {
     pub peers: Vec<IpAddr>,
     /// The ROS node of the participant; a name without a namespace belongs to the root namespace.
     pub node: NodeOptions,
-    /// The enclave whose files secure the participant, if any.
+    /// The enclave that secures the participant, if any.
     pub enclave: Option<Enclave>,
 }
 
@@ -659,7 +659,7 @@ const INFO_HASH: &str = "RIHS01_91a0593bacdcc50ea9bdcf849a938b128412cc1ea821245c
 /// The hash of `ua_bridge/msg/Presence`, a type without fields of which no message is ever sent.
 const PRESENCE_HASH: &str =
     "RIHS01_d26c7c581663814e80adf6b78455270594107240f359b8e34121972bd039d589";
-/// The highest domain whose ports fit into 16 bits.
+/// The highest DDS domain: its ports still fit into 16 bits.
 pub const MAX_DOMAIN: u16 = 232;
 /// The time limit of [`Domain::leave`].
 pub const LEAVE_WITHIN: Duration = Duration::from_secs(2);

@@ -1,7 +1,7 @@
 //! Variables of the ROS 2 environment that this bridge ignores because it joins the domain through
 //! RustDDS.
 
-/// Returns one warning for each variable that is set and has no effect on the bridge. `variable`
+/// Returns a warning for each variable that is set and has no effect on the bridge. `variable`
 /// looks a variable up.
 pub fn ignored(variable: impl Fn(&str) -> Option<String>) -> Vec<String> {
     let set = |name: &str| {
@@ -38,7 +38,7 @@ pub fn ignored(variable: impl Fn(&str) -> Option<String>) -> Vec<String> {
     warnings
 }
 
-/// The RMW implementations whose DDS the bridge is tested with.
+/// The RMW implementations with which the bridge is tested.
 const KNOWN_RMW: [&str; 3] = [
     "rmw_fastrtps_cpp",
     "rmw_fastrtps_dynamic_cpp",

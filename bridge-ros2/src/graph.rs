@@ -225,8 +225,8 @@ pub fn ros_topic(dds_topic: &str) -> Option<&str> {
     dds_topic.strip_prefix(TOPIC_PREFIX)
 }
 
-/// Returns the DDS topic whose writer announces a bridge and its space. The topic is outside of
-/// ROS, so ROS tools do not show it.
+/// Returns the DDS topic on which a writer announces a bridge and its space. The topic is outside
+/// of ROS, so ROS tools do not show it.
 #[must_use]
 pub fn bridge_topic(space: u16) -> String {
     format!("{BRIDGE_PREFIX}{space}")

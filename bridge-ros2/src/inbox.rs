@@ -1,5 +1,5 @@
-//! Combines all readers into one wait: a reader with samples queues up and delivers one sample per
-//! turn.
+//! Combines all readers into one wait: a reader with samples queues up and delivers a single sample
+//! per turn.
 //!
 //! Two queues are bounded: the history of each reader ([`crate::qos::READER_DEPTH`] samples per
 //! topic, oldest lost), and the queue of ready readers (one entry per reader). Samples that were
@@ -232,7 +232,7 @@ impl<K: Clone> Slot<K> {
     }
 }
 
-/// Writers whose last sequence number is remembered, including lost writers.
+/// Maximum number of writers with a remembered sequence number, including lost writers.
 const MAX_WRITERS: usize = 1024;
 /// The maximum count of one gap: a peer chooses its sequence numbers freely.
 const MAX_MISSING: u64 = 1 << 16;
@@ -253,7 +253,7 @@ impl Ready {
     }
 }
 
-/// The waker of one reader: queues the reader once.
+/// The waker of a reader: queues the reader once.
 #[derive(Debug)]
 struct Wakeup {
     slot: u64,

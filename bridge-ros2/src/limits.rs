@@ -1,7 +1,7 @@
 //! The version of RustDDS that carries the samples, and the largest sample that it delivers.
 //!
-//! The published RustDDS repairs lost fragments so slowly that a large sample, whose burst
-//! overflows the receiver's socket buffer, never becomes complete. The patches in `patches/` change
+//! The published RustDDS repairs lost fragments so slowly that a large sample never becomes
+//! complete if its burst overflows the receiver's socket buffer. The patches in `patches/` change
 //! that; `cargo xtask` builds with them.
 
 use crate::graph::Endpoint;

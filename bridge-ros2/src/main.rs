@@ -294,7 +294,7 @@ const fn kind(error: &DomainError) -> FailureKind {
     }
 }
 
-/// Returns the spaces that a bridge serves, one for each requested domain.
+/// Returns the spaces that a bridge serves, a space for each requested domain.
 fn choose_spaces(
     spaces: &[u16],
     domains: &[u16],
@@ -336,8 +336,8 @@ fn repeated<T: Copy + PartialEq>(all: &[T]) -> Option<T> {
         .map(|(_, one)| *one)
 }
 
-/// Returns the space of one domain: the requested space, else the space of the requested domain,
-/// else the only ROS 2 space of the mapping.
+/// Returns the space of a domain: the requested space, else the space of the requested domain, else
+/// the only ROS 2 space of the mapping.
 fn choose_space(
     space: Option<u16>,
     domain: Option<u16>,

@@ -169,10 +169,10 @@ struct Own {
 struct Others {
     participants: BTreeMap<ParticipantPrefix, (GidLength, Vec<NodeEntities>)>,
     malformed: u64,
-    /// Participants whose lease expired. They may return, and do not repeat their announcements
+    /// Participants with an expired lease. They may return, and do not repeat their announcements
     /// then.
     absent: BTreeSet<ParticipantPrefix>,
-    /// Participants whose duplicate node name was logged.
+    /// Participants with a duplicate node name that was logged.
     doubles: BTreeSet<ParticipantPrefix>,
 }
 
@@ -290,8 +290,8 @@ impl Node {
         self.thread.as_ref().is_none_or(JoinHandle::is_finished)
     }
 
-    /// Records the announced endpoints of this node, and returns the endpoints whose announcement
-    /// is overdue.
+    /// Records the announced endpoints of this node, and returns the endpoints with an overdue
+    /// announcement.
     pub(crate) fn unannounced(&self, announced: &BTreeSet<GUID>) -> BTreeSet<GUID> {
         let mut own = lock(&self.shared.own);
         own.unseen.retain(|guid, _| !announced.contains(guid));
@@ -418,7 +418,7 @@ where
 
 /// The time limit of an announcement: RustDDS's discovery empties a full queue in less.
 const ANNOUNCED_WITHIN: Duration = Duration::from_secs(3);
-/// Maximum number of participants whose nodes are recorded.
+/// Maximum number of participants with recorded nodes.
 const MAX_PARTICIPANTS: usize = 4096;
 
 #[cfg(test)]

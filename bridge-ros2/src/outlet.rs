@@ -1,8 +1,8 @@
 //! A writer that never waits.
 //!
 //! RustDDS stops a reliable writer while its send window is full ([`Offered::policies`]). Refused
-//! samples then wait in a queue, whose length is set by the topic's overflow policy, until the
-//! window opens.
+//! samples then wait in a queue until the window opens; the topic's overflow policy sets the length
+//! of the queue.
 //!
 //! Samples also wait from the discovery of the first reader until it has responded: the reader is
 //! known here before our writer is known there. Samples written in between are history, which a
@@ -22,7 +22,7 @@ use crate::limits;
 use crate::qos::Offered;
 use crate::raw::{Payload, Writer};
 
-/// The writing end of one topic.
+/// The writing end of a topic.
 pub struct Outlet {
     writer: Writer,
     offered: Offered,
@@ -459,9 +459,9 @@ impl Outlet {
         settling.is_none()
     }
 
-    /// Returns how many samples may wait for readers to discover the writer. A state topic is
-    /// limited to the samples that are then sent at once: an old value must not precede a newer
-    /// value visibly.
+    /// Returns how many samples may wait for readers to discover the writer. The number for a state
+    /// topic fits the send window, so that all samples are sent at once and no old value stays
+    /// visible before a newer value.
     fn settling_room(&self) -> usize {
         match self.offered {
             Offered::KeepLatest => SETTLING_STATES,
@@ -494,7 +494,8 @@ impl Outlet {
         }
     }
 
-    /// Returns whether the present readers have received all written samples.
+    /// Returns whether the present readers have acknowledged all written samples; always false with
+    /// the published RustDDS.
     fn is_acknowledged(&self) -> bool {
         #[cfg(feature = "patched-dds")]
         let acknowledged = self.writer.unacknowledged().samples == 0;
@@ -503,7 +504,7 @@ impl Outlet {
         acknowledged
     }
 
-    /// Removes the written samples from the history, for a newer value that is not written yet.
+    /// Removes the written samples from the history. Does nothing with the published RustDDS.
     fn forget_written(&self) {
         #[cfg(feature = "patched-dds")]
         self.writer.keep_last(0);
@@ -639,8 +640,8 @@ impl Outlet {
     /// Returns whether there is memory for another sample of the size.
     #[cfg(not(feature = "patched-dds"))]
     fn has_room(&mut self, size: usize) -> bool {
-        // Checked long before the limit: readers acknowledge several samples at once, so all
-        // samples may be acknowledged at this moment and not at the next sample.
+        // Checked long before the limit: readers acknowledge several samples at once, so the writer
+        // may find all samples acknowledged now and not at the next sample.
         if self.in_flight > MAX_IN_FLIGHT / 2 {
             // A wait of zero returns immediately.
             match self.writer.wait_for_acknowledgments(Duration::ZERO) {

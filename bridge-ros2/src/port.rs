@@ -70,7 +70,7 @@ use strangers::{KEPT_OUT, Stranger, Strangers};
 pub struct PortOptions {
     /// The DDS domain to join.
     pub domain: DomainOptions,
-    /// The space whose values are produced in this domain.
+    /// The space of the values that are produced in this domain.
     pub own: SpaceId,
     /// The mapping of the cell.
     pub mapping: Arc<Mapping>,
@@ -221,7 +221,7 @@ impl Ros2Port {
         for (dds_topic, (message_type, values)) in self.read() {
             let index = self.source(dds_topic, message_type);
             if let Some(source) = self.sources.get_mut(index) {
-                // Most topics have one value.
+                // Most topics have a single value.
                 source.values.reserve_exact(values.len());
                 source.values.extend(values);
             }

@@ -108,7 +108,7 @@ impl Offered {
     }
 
     /// Returns the policies with a deadline, if readers request one: a reader with a deadline does
-    /// not match a writer that offers none.
+    /// not match a writer without a deadline.
     #[must_use]
     pub fn with_deadline(self, deadline: Option<Duration>) -> QosPolicies {
         match deadline {

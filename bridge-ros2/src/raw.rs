@@ -11,15 +11,15 @@ use rustdds::{RepresentationIdentifier, no_key};
 use crate::limits;
 use crate::node::Listed;
 
-/// The serialized payload of one sample, which starts with the encapsulation header.
+/// The serialized payload of a sample, which starts with the encapsulation header.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Payload(Bytes);
 
 impl Payload {
-    /// Wraps a payload to be written. With the published RustDDS, a payload whose length is not a
-    /// multiple of 4 is copied and padded: that version sends the last fragment of a large sample
-    /// in its own length, and Cyclone DDS refuses a DATA_FRAG submessage that does not end on a 4
-    /// byte boundary.
+    /// Wraps a payload to be written. With the published RustDDS, a payload is copied and padded if
+    /// its length is not a multiple of 4: that version sends the last fragment of a large sample in
+    /// its own length, and Cyclone DDS refuses a DATA_FRAG submessage that does not end on a 4 byte
+    /// boundary.
     ///
     /// # Errors
     /// [`PayloadError`] if there is no header, or it announces an encoding other than little-endian

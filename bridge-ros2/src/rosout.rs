@@ -122,7 +122,7 @@ pub(crate) const TOPIC: &str = "rt/rosout";
 pub(crate) const TYPE: &str = "rcl_interfaces::msg::dds_::Log_";
 /// Maximum number of waiting records; beyond it, the oldest is dropped.
 const MAX_WAITING: usize = 256;
-/// Maximum size of one message in bytes.
+/// Maximum size of a message in bytes.
 const MAX_TEXT: usize = 8192;
 /// As in `rcl_qos_profile_rosout_default`.
 const DEPTH: i32 = 1000;

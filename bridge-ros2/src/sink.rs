@@ -16,7 +16,7 @@ use crate::graph::{Endpoint, dds_topic};
 use crate::outlet::Outlet;
 use crate::qos::Offered;
 
-/// The destination of the values of one topic of another space.
+/// The destination of the values of a topic of another space.
 #[derive(Debug)]
 pub(crate) struct Sink {
     pub(crate) dds_topic: String,
@@ -117,8 +117,8 @@ impl Sink {
     }
 
     /// Returns whether the open writer serves a subscriber, so that it is not given up for another
-    /// type. A subscriber whose definition no node describes is not served by ours: it may misread
-    /// the values.
+    /// type. A subscriber with an unknown definition, which no node describes, is not served by
+    /// ours: it may misread the values.
     pub(crate) fn serves(&self, readers: &[Endpoint]) -> bool {
         self.open.as_ref().is_some_and(|open| {
             let dds_type = open.definition.name().dds();
@@ -131,9 +131,9 @@ impl Sink {
 /// Each change of the deadline needs another writer, so their number is limited.
 const MOST_TIGHTENED: u32 = 8;
 
-/// Returns the policies of a topic. A topic whose source decides whether it is a state is offered
-/// as a state, and its events are removed once they are delivered, which the published RustDDS
-/// cannot do.
+/// Returns the policies of a topic. If the source decides whether the topic is a state, it is
+/// offered as a state, and its events are removed once they are delivered, which the published
+/// RustDDS cannot do.
 fn offered(overflow: Overflow, lasting: Lasting) -> Offered {
     let is_offered = match lasting {
         Lasting::State => true,

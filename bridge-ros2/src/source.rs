@@ -1,4 +1,4 @@
-//! A topic of the domain whose values this bridge publishes in the space.
+//! A topic of the domain that this bridge reads and publishes in the space.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -24,7 +24,7 @@ pub(crate) struct Source {
     /// The definition with which the topic is read.
     pub(crate) definition: Option<Definition>,
     /// The values made of a message; a single value unless the mapping binds several variables to
-    /// one topic.
+    /// the topic.
     pub(crate) values: Vec<(TopicId, Selection)>,
     pub(crate) reading: Reading,
     /// Whether the topic has a publisher of our type.
@@ -154,9 +154,9 @@ impl Source {
     }
 }
 
-/// The reason for drops of samples of a writer whose type has another name.
+/// The reason for dropping the samples of a writer of another type name.
 pub(crate) const OTHER_TYPE: &str = "publisher of another type";
-/// The reason for drops of samples of a writer that announces another hash than the applicable
+/// The reason for dropping the samples of a writer that announces another hash than the applicable
 /// hash.
 pub(crate) const OTHER_DEFINITION: &str = "publisher of another definition";
 /// Maximum number of remembered lost writers: more do not return at once.

@@ -203,7 +203,7 @@ fn describe<'k>(known: &'k Known, name: &str, hash: &str) -> Result<&'k Descript
     let full = name.parse::<TypeName>();
     let full = full.map_or_else(|_| name.to_owned(), |name| name.ros2());
     let of_name = || known.iter().filter(|((of, _), _)| *of == full);
-    // As in rcl, any hash matches if the request names none.
+    // As in rcl, any hash matches if the request has an empty hash.
     let asked = of_name().find(|((_, ours), _)| hash.is_empty() || hash == ours.to_string());
     if let Some((_, described)) = asked {
         return Ok(described);
@@ -284,7 +284,7 @@ mod tests {
         text.parse().unwrap()
     }
 
-    /// Returns a node that has this one type of the bundle.
+    /// Returns a node that has only this type of the bundle.
     fn known(name: &TypeName) -> (Known, TypeHash) {
         let registry = Registry::bundle(Dialect::Ros2);
         let hash = registry.type_hash(name).unwrap();

@@ -266,7 +266,7 @@ impl Shared {
             outcome,
             changed,
         };
-        // The channel is closed with the client, whose goals have ended then.
+        // The channel is closed together with the client; its goals have ended then.
         let _is_open = self.ends.send(end).await;
     }
 

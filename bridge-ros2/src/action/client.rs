@@ -121,7 +121,7 @@ impl ActionClient {
         self.shared.cancel(what).await
     }
 
-    /// Checks for a server whose services and topics are all known to this client.
+    /// Checks for a server with all services and topics known to this client.
     ///
     /// # Errors
     /// [`NoServer`] names the missing endpoint.

@@ -46,8 +46,8 @@ impl FeedbackWriter {
             .meet(readers.iter().map(|reader| reader.guid), now);
     }
 
-    /// Expects a reader of the client whose goal is accepted, so that the client receives all
-    /// feedback if its participant has such a reader.
+    /// Expects a reader of the client of an accepted goal, so that the client receives all feedback
+    /// if its participant has such a reader.
     pub(super) fn expect(&mut self, client: GUID, now: Instant) {
         self.expected.add(client, now);
     }
@@ -104,7 +104,7 @@ impl FeedbackWriter {
     }
 }
 
-/// Clients whose participant has no reachable reader yet.
+/// Clients of participants without a reachable reader so far.
 #[derive(Debug, Default)]
 struct Expected {
     /// The clients with the end of their wait.

@@ -68,7 +68,7 @@ impl ActionServer {
         }
     }
 
-    /// Returns the next event if one is waiting.
+    /// Returns the next event if an event is waiting.
     pub fn try_recv(&mut self) -> Option<ServerEvent> {
         let arrived = self.shared.lock().arrived.pop_front()?;
         let shared = Arc::clone(&self.shared);

@@ -323,7 +323,7 @@ impl<W> ServerGoals<W> {
         found.into_iter().map(said).collect()
     }
 
-    /// Removes the ended goals whose time limit has expired. Returns whether any was removed.
+    /// Removes the ended goals after their time limit. Returns whether any was removed.
     pub(super) fn expire(&mut self, now: Instant) -> bool {
         let Some(timeout) = self.result_timeout else {
             return false;

@@ -451,7 +451,7 @@ impl Shared {
     /// Logs a failure to publish the status. The next status repeats the complete list.
     fn note(&self, sent: Result<(), Refusal>) {
         match sent {
-            // At most one status waits, which is the newest.
+            // At most the newest status waits.
             Ok(()) | Err(Refusal::Overflow | Refusal::NoReader) => {}
             Err(refusal @ (Refusal::TooLarge(_) | Refusal::Late | Refusal::Failed)) => {
                 let (action, why) = (self.action.name(), refusal.label());

@@ -9,7 +9,7 @@ use tokio::time::Instant;
 
 use super::types::CancelCode;
 
-/// The state of one withdrawn goal until its end.
+/// The state of a withdrawn goal until its end.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Withdrawal {
     since: Instant,

@@ -11,7 +11,7 @@ use crate::cdr::{CdrReader, CdrWriter, Malformed};
 /// A declared parameter.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Parameter {
-    /// The name, whose parts are joined by dots.
+    /// The name: parts joined by dots.
     pub name: String,
     /// The value; its type never changes.
     pub value: ParameterValue,
@@ -148,7 +148,7 @@ impl Store {
         writer.sequence(&parents, |writer, name| writer.string(name));
     }
 
-    /// Sets all parameters or none; returns the parameters whose values changed.
+    /// Sets all parameters or none; returns the changed parameters.
     fn set(&mut self, wanted: &[(String, ParameterValue)]) -> Result<Vec<Parameter>, String> {
         for (name, value) in wanted {
             let Some(found) = self.get(name) else {

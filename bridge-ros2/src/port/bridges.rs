@@ -1,4 +1,4 @@
-//! Tracks other bridges of the domain, whose announcements keep the values of their spaces out.
+//! Tracks other bridges of the domain. The values of their spaces are not exchanged here.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -17,7 +17,8 @@ impl Ros2Port {
         is_at_home(&self.graph, self.policy.mapping(), space, self.domain_id)
     }
 
-    /// Logs bridges of other spaces in the domain, whose announcements keep values out.
+    /// Logs other bridges of the domain, because their announcements exclude the values of their
+    /// spaces.
     pub(super) fn tell_of_bridges(&mut self) {
         let own = u16::from(self.policy.own());
         let others = self.graph.bridges().filter(|(_, space)| *space != own);
@@ -114,7 +115,8 @@ mod tests {
         GUID::from_bytes([first; 16])
     }
 
-    /// Returns a graph with bridges of these spaces, whose participants start with these bytes.
+    /// Returns a graph with bridges of these spaces; the GUIDs of their participants start with
+    /// these bytes.
     fn domain_with(bridges: &[(u16, u8)]) -> Graph {
         let markers = bridges.iter().map(|(space, first)| {
             let endpoint = Endpoint {

@@ -86,12 +86,12 @@ impl Ros2Port {
     ///
     /// In order of preference:
     /// 1. the current hash, while its definition is known and an endpoint announces it
-    /// 2. the first announced hash whose definition is known; the nodes of the endpoints are asked
+    /// 2. the first announced hash with a known definition; the nodes of the endpoints are asked
     ///    for it
     /// 3. the first announced hash
     ///
-    /// Endpoints without a hash belong to releases that announce none. Returns `None` while a node
-    /// is asked for the first time.
+    /// Endpoints without a hash belong to releases that announce no hash. Returns `None` while a
+    /// node is asked for the first time.
     pub(super) fn hash_that_counts(
         &mut self,
         name: &TypeName,

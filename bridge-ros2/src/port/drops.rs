@@ -1,4 +1,4 @@
-//! Reports drops that belong to no topic: those of the node, its clock and its services.
+//! Reports drops that belong to no topic: drops of the node, its clock and its services.
 
 use std::collections::BTreeMap;
 

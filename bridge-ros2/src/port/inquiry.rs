@@ -6,7 +6,7 @@ use std::time::Duration;
 use rustdds::GUID;
 use tokio::time::Instant;
 
-/// The state of the requests for one type.
+/// The state of the requests for a type.
 #[derive(Debug)]
 pub(super) struct Inquiry {
     state: State,
@@ -79,7 +79,7 @@ impl Inquiry {
         goes_on && now.saturating_duration_since(self.looked) <= OFFERED_WITHIN
     }
 
-    /// Records the endpoints whose nodes could describe the type.
+    /// Records the endpoints of nodes that could describe the type.
     ///
     /// A new endpoint is asked at once. The inquiry restarts, with the time that a node needs to
     /// announce its services, when all former endpoints have left or the type was of no interest
@@ -209,7 +209,7 @@ impl State {
 const OFFERED_WITHIN: Duration = Duration::from_secs(3);
 /// How often all nodes may leave early; after that, requests run in the background.
 const MOST_CUT_SHORT: u8 = 3;
-/// Maximum number of calls for one type.
+/// Maximum number of calls for a type.
 const MOST_TRIES: u8 = 3;
 /// The delay after the first failed call; later delays are longer.
 const PAUSE: Duration = Duration::from_secs(1);

@@ -187,7 +187,7 @@ impl Ros2Port {
         let writers = self.graph.writers(dds_topic).to_vec();
         let mut known = None;
         for writer in &writers {
-            // A pattern may apply to one type only.
+            // A pattern may apply to a single type.
             if known.is_some() || self.found(dds_topic, &writer.type_name) == Found::Nothing {
                 continue;
             }
@@ -380,7 +380,7 @@ impl Ros2Port {
         true
     }
 
-    /// Closes the reader of a source whose publishers use another definition of its type.
+    /// Closes the reader of a source because its publishers use another definition of its type.
     fn close_source(&mut self, index: usize, slot: SlotId) {
         drop(self.inbox.remove(slot));
         let Some(source) = self.sources.get_mut(index) else {
@@ -606,7 +606,7 @@ pub(super) enum Side {
     Sink(TopicId),
 }
 
-/// The reason for drops on a topic whose type is unknown.
+/// The reason for drops on a topic of unknown type.
 const UNKNOWN_TYPE: &str = "type without a definition";
 /// How long a replaced reader keeps receiving.
 const RETIRE_AFTER: Duration = Duration::from_secs(2);

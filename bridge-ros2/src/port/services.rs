@@ -147,7 +147,7 @@ pub(super) fn parameters(own: SpaceId, domain: u16, sim_time: bool) -> Vec<Param
     ]
 }
 
-/// Calls one service.
+/// Calls a service.
 #[derive(Debug)]
 pub(super) struct Client {
     client: ServiceClient,
@@ -204,5 +204,5 @@ impl ServiceCall for Client {
     }
 }
 
-/// Maximum number of concurrent requests of one service, equal to the limit of one call.
+/// Maximum number of concurrent requests of a service, equal to the limit of a call.
 const HANDLED: usize = 256;

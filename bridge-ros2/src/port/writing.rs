@@ -266,5 +266,5 @@ pub(super) fn unwritten(topic: TopicId, open: &Open) -> Option<PortEvent> {
     })
 }
 
-/// The reason for counting a reader whose type hash differs from the written type.
+/// The reason for counting a reader with another type hash than the written type.
 const OTHER_DEFINITION_READ: &str = "subscriber of another definition";

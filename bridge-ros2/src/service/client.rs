@@ -44,7 +44,7 @@ impl Default for ServiceClientOptions {
     }
 }
 
-/// Calls one service. Clones share its endpoints, which are removed with the last clone.
+/// Calls a service. Clones share its endpoints, which are removed with the last clone.
 #[derive(Clone, Debug)]
 pub struct ServiceClient {
     shared: Arc<Shared>,
@@ -134,14 +134,14 @@ impl ServiceClient {
     }
 
     /// Returns the number of servers that receive the next request: servers of other participants
-    /// whose reader and writer are both matched.
+    /// with a matched reader and a matched writer.
     #[must_use]
     pub fn servers(&self) -> u64 {
         self.shared.servers.load(Ordering::Relaxed)
     }
 
-    /// Returns the number of these servers whose HEARTBEATs name our reader (RTPS 2.5, 8.3.8.6), so
-    /// that their replies reach it. They receive requests at once; other servers get time to
+    /// Returns how many of these servers name our reader in their HEARTBEATs (RTPS 2.5, 8.3.8.6),
+    /// so that their replies reach it. They receive requests at once; other servers get time to
     /// discover the client, because a reply to a reader unknown to the server is lost. The
     /// published `RustDDS` does not report this, so the number is 0.
     #[must_use]
@@ -325,7 +325,7 @@ struct Driver {
     max_calls: usize,
     /// The servers, keyed by the reader of the requests.
     servers: BTreeMap<GUID, Met>,
-    /// The type of a server whose type differs from ours.
+    /// The type of a server that differs from our type.
     other_type: Option<String>,
     /// Calls that wait for a server, for its capacity, or for the send window; oldest first.
     waiting: VecDeque<Call>,
@@ -595,7 +595,7 @@ impl Driver {
         }
     }
 
-    /// Ends the calls whose servers are all lost.
+    /// Ends the calls that have lost all their servers.
     fn give_up_lost(&mut self) {
         let servers: BTreeSet<GUID> = self.servers.keys().copied().collect();
         let lost = |asked: &Asked| !asked.servers.iter().any(|guid| servers.contains(guid));

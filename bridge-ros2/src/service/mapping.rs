@@ -9,7 +9,7 @@ use bytes::{Bytes, BytesMut};
 use rustdds::rpc::SampleIdentity;
 use rustdds::{GUID, SequenceNumber};
 
-/// The mapping of one vendor.
+/// The mapping of a vendor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum ServiceMapping {
     /// The mapping of rmw_cyclonedds: 16 bytes in front of the body of requests and replies, which
@@ -182,7 +182,7 @@ impl ClientId {
             }
             ServiceMapping::Enhanced => Ok(Outgoing {
                 payload: little_endian(body)?,
-                // As in rmw_fastrtps, whose servers wait for this reader before they reply.
+                // As in rmw_fastrtps: its servers wait for this reader before they reply.
                 related: Some(SampleIdentity {
                     writer_guid: self.reader,
                     sequence_number: SequenceNumber::from_high_low(-1, 0),

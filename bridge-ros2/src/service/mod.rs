@@ -1,5 +1,4 @@
-//! Services: one request and one reply, as bytes of any type, with servers and clients of any
-//! vendor.
+//! Services: a request and a reply, as bytes of any type, with servers and clients of any vendor.
 //!
 //! A service `/name` consists of two topics, `rq/nameRequest` and `rr/nameReply` (design.ros2.org,
 //! "Topic and Service name mapping to DDS"). Requests and replies are CDR with their encapsulation
@@ -147,8 +146,8 @@ pub(crate) async fn next(reader: &Reader) -> Option<Received> {
     .await
 }
 
-/// Intervals at which the endpoints of peers are polled: while no call waits for them, and while
-/// one waits.
+/// Intervals at which the endpoints of peers are polled: while no call waits for them, and while a
+/// call waits.
 pub(crate) const IDLE: Duration = Duration::from_millis(200);
 pub(crate) const BUSY: Duration = Duration::from_millis(10);
 /// How long peers take to discover our endpoints after we discovered theirs: 30 to 190 ms measured.

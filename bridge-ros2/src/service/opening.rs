@@ -126,8 +126,7 @@ mod published {
     #[derive(Debug)]
     pub(crate) struct Opening {
         known: BTreeSet<GUID>,
-        /// The time at which a sample was written whose first acknowledgement by some reader is
-        /// pending.
+        /// The time of a written sample that some reader has to acknowledge as its first.
         since: Option<Instant>,
     }
 

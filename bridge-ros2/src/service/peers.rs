@@ -13,7 +13,7 @@ use crate::graph::{Endpoint, Graph};
 use super::ServiceMapping;
 
 /// The endpoints of other participants on the topics of services and actions. All users in a
-/// process share one copy of RustDDS's discovery data.
+/// process share a single copy of RustDDS's discovery data.
 ///
 /// The bridge's own endpoints are left out: a client of the bridge does not make a service
 /// available.
@@ -32,7 +32,7 @@ struct Seen {
     snapshot: Arc<Snapshot>,
 }
 
-/// The endpoints at one moment, by DDS topic.
+/// A snapshot of the endpoints, by DDS topic.
 #[derive(Debug, Default)]
 pub(crate) struct Snapshot {
     readers: BTreeMap<String, Vec<Endpoint>>,

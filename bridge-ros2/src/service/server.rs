@@ -47,7 +47,7 @@ impl Default for ServiceOptions {
     }
 }
 
-/// One request, as passed to the handler of a service.
+/// A request, as passed to the handler of a service.
 #[derive(Clone, Debug)]
 pub struct ServiceRequest {
     /// CDR with its encapsulation header, in the client's byte order. The bytes after the header
@@ -57,7 +57,7 @@ pub struct ServiceRequest {
     pub client: GUID,
 }
 
-/// Offers one service. Dropping it withdraws the service; requests in progress stay unanswered.
+/// Offers a service. Dropping it withdraws the service; requests in progress stay unanswered.
 #[derive(Debug)]
 pub struct ServiceServer {
     service: String,
@@ -235,7 +235,7 @@ struct Driver {
     counters: Arc<Counters>,
     waiting: VecDeque<(ReplyTo, Bytes)>,
     handled: JoinSet<(ReplyTo, Result<Answer, String>)>,
-    /// Replies whose client is not matched yet, or that wait for the send window; oldest first.
+    /// Replies that wait for the match of their client or for the send window; oldest first.
     replies: VecDeque<Reply>,
     audience: Audience,
     opening: Opening,

@@ -69,7 +69,7 @@ fn what_comes_before_the_acceptance_is_told_after_it() {
     goals.feedback(id(1), body(1));
     assert_eq!(events(&mut goals, 1), []);
     assert_eq!(goals.known_status(id(1)), Status::Unknown);
-    // The status implies the acceptance too, whose reply may be lost.
+    // The status implies the acceptance too; the reply to the goal may be lost.
     goals.status(id(1), (Status::Executing, STAMP), now());
     goals.accepted(id(1), STAMP, now());
     assert_eq!(
