@@ -1,8 +1,8 @@
 //! Finds the QoS policies that prevent a match of a writer and a reader.
 //!
 //! DDS matches a reader with a writer only if the writer offers at least the QoS that the reader
-//! requests (DDS 1.4, 2.2.3). It reports a failed match only by a status that ROS nodes rarely
-//! read, so the bridge checks the policies itself.
+//! requests (DDS 1.4, 2.2.3). It reports a failed match only by a status, which usually goes
+//! unnoticed, so the bridge compares the policies itself.
 
 use rustdds::policy::{
     DataRepresentation, DataRepresentationId, XCDR_DATA_REPRESENTATION, XCDR2_DATA_REPRESENTATION,

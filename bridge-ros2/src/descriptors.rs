@@ -23,7 +23,7 @@ pub(crate) struct Free {
 }
 
 impl Descriptors {
-    /// Returns the current limit of this process (`RLIMIT_NOFILE`).
+    /// Reads the current limit of this process (`RLIMIT_NOFILE`).
     pub(crate) fn of_process() -> Self {
         let limit = getrlimit(Resource::Nofile).current;
         Self {

@@ -38,8 +38,8 @@ pub struct Outlet {
     in_flight: usize,
     /// For a state topic, the value that its readers have: another writer has to start with it.
     last: Option<Sample>,
-    /// Set while the writer's history holds a sample that no late reader may receive; it is cleared
-    /// once the present readers have it.
+    /// The time since when the writer's history holds a sample that no late reader may receive.
+    /// Cleared once the present readers have the sample.
     to_forget: Option<Instant>,
     /// Replaced writers, oldest first, while their readers may miss some of their samples.
     former: VecDeque<Former>,

@@ -114,7 +114,7 @@ pub struct Ros2Port {
     executing: Executing<Client>,
     /// Actions in both directions.
     actions: Actions,
-    /// Matches service endpoints with their nodes and lists the service peers of the domain.
+    /// The endpoints of other participants on the topics of services and actions.
     peers: ServicePeers,
     parameters: ParameterServer,
     /// Topics that this bridge writes.

@@ -116,9 +116,9 @@ impl Sink {
         self.choice.candidates(written.into_iter().chain(asked_for))
     }
 
-    /// Returns whether the open writer serves a subscriber, so that it is not given up for another
-    /// type. A subscriber with an unknown definition, which no node describes, is not served by
-    /// ours: it may misread the values.
+    /// Returns whether the open writer serves a subscriber or there is no subscriber, so that it is
+    /// not given up for another type. A subscriber with an unknown definition, which no node
+    /// describes, is not served by ours: it may misread the values.
     pub(crate) fn serves(&self, readers: &[Endpoint]) -> bool {
         self.open.as_ref().is_some_and(|open| {
             let dds_type = open.definition.name().dds();

@@ -350,7 +350,8 @@ mod tests {
         assert!(!String::from_utf8_lossy(&without).contains("text of"));
     }
 
-    /// The hash of `type_description_interfaces/msg/TypeDescription` as published by ROS 2.
+    /// Compares the hash of `type_description_interfaces/msg/TypeDescription` with the hash that
+    /// ROS 2 publishes.
     #[test]
     fn the_messages_have_the_hash_of_ros() {
         let hash = definitions().type_hash(&name("type_description_interfaces/TypeDescription"));

@@ -254,10 +254,11 @@ impl<W> ServerGoals<W> {
         }
     }
 
-    /// Returns whether a goal that is no longer worked on has not ended, so that it has to be
-    /// aborted.
+    /// Prepares a dropped goal for its abort: starts an accepted goal. Returns whether the goal has
+    /// not ended, so that it has to be aborted.
     pub(super) fn abandon(&mut self, ticket: Ticket) -> bool {
-        // Only an executing goal can be aborted. The goal may be executing already.
+        // Only an executing or canceling goal can be aborted; for other states than accepted the
+        // error of `execute` does not matter.
         drop(self.execute(ticket));
         self.may_end(ticket, End::Abort).is_ok()
     }

@@ -209,7 +209,7 @@ impl Shared {
         let mut state = self.lock();
         let left = (state.outputs.take(), std::mem::take(&mut state.arrived));
         drop(state);
-        // Without the lock: the drop may take RustDDS some time.
+        // Without the lock: RustDDS may log during the drop.
         drop(left);
         self.changed.send_replace(());
     }

@@ -22,7 +22,8 @@ pub(super) fn split(message: &Bytes) -> Result<(GoalId, Bytes), Malformed> {
     Ok((id, bytes.freeze()))
 }
 
-/// The inverse of [`split`]. Returns `None` if the body is not little-endian CDR.
+/// Joins an id and a body; the inverse of [`split`]. Returns `None` if the body is not
+/// little-endian CDR.
 pub(super) fn join(id: GoalId, body: &[u8]) -> Option<Bytes> {
     let body = little_endian(body)?;
     let mut bytes = BytesMut::with_capacity(ENCAPSULATION + ID + body.len());

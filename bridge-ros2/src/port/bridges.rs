@@ -1,4 +1,4 @@
-//! Tracks other bridges of the domain. The values of their spaces are not exchanged here.
+//! Tracks other bridges of the domain: the values of the spaces that they serve are left to them.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;

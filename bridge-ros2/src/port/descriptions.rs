@@ -85,10 +85,11 @@ impl Ros2Port {
     /// Returns the hash of the type definition that applies to a topic with these endpoints.
     ///
     /// In order of preference:
-    /// 1. the current hash, while its definition is known and an endpoint announces it
-    /// 2. the first announced hash with a known definition; the nodes of the endpoints are asked
-    ///    for it
-    /// 3. the first announced hash
+    /// 1. the current hash, if its definition is known and an endpoint announces it, or no endpoint
+    ///    announces a hash
+    /// 2. the first announced hash with a known definition
+    /// 3. after the nodes of the endpoints were asked for the definitions: the current hash if it
+    ///    is announced or no endpoint announces a hash, else the first announced hash
     ///
     /// Endpoints without a hash belong to releases that announce no hash. Returns `None` while a
     /// node is asked for the first time.

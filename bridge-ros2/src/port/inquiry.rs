@@ -213,7 +213,7 @@ const MOST_CUT_SHORT: u8 = 3;
 const MOST_TRIES: u8 = 3;
 /// The delay after the first failed call; later delays are longer.
 const PAUSE: Duration = Duration::from_secs(1);
-/// The delay before a failed type is requested again; it doubles each time.
+/// The delay before a failed type is requested again; it doubles each time, up to `AGAIN_MOST`.
 const AGAIN_FIRST: Duration = Duration::from_secs(10);
 const AGAIN_MOST: Duration = Duration::from_secs(300);
 

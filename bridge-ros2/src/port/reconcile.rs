@@ -562,7 +562,7 @@ impl Ros2Port {
     }
 
     /// Sets the type hash that the domain announces with the next endpoints of the definition's
-    /// type.
+    /// type, and serves the description of the type.
     pub(super) fn announce_type(&self, definition: &Definition) {
         let (name, Some(hash)) = (definition.name(), definition.hash) else {
             return;
