@@ -3,9 +3,9 @@
 //! DDS knows participants and endpoints; nodes are a ROS concept. Each participant publishes its
 //! complete list of nodes as messages of a single type
 //! (`rmw_dds_common/msg/ParticipantEntitiesInfo`). An entity is identified by its RTPS GUID in a
-//! `Gid`, which has 24 bytes up to ROS 2 Humble, the last 8 of them zero, and 16 bytes since Iron.
-//! Both have the same DDS type name, so a reader detects the length: only the right length consumes
-//! the whole payload.
+//! `Gid`. A `Gid` has 24 bytes up to ROS 2 Humble, the last 8 of them zero, and 16 bytes since
+//! Iron. Both have the same DDS type name, so a reader detects the length: only the right length
+//! consumes the whole payload.
 
 use bytes::{BufMut, Bytes, BytesMut};
 use thiserror::Error;

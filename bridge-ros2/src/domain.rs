@@ -67,7 +67,7 @@ pub enum DiscoveryRange {
 
 impl DiscoveryRange {
     /// Reads the values of `ROS_AUTOMATIC_DISCOVERY_RANGE` and of its predecessor
-    /// `ROS_LOCALHOST_ONLY`, which takes precedence when it is set, as in rcl.
+    /// `ROS_LOCALHOST_ONLY`, which takes precedence when it is `1`, as in rcl.
     ///
     /// # Errors
     /// [`DomainError::DiscoveryRange`] for a range that no bridge can use, or that ROS does not
@@ -282,7 +282,8 @@ impl Domain {
         ))
     }
 
-    /// Returns the endpoints of other participants. Removes the nodes of lost participants.
+    /// Returns the endpoints of other participants. Hides the nodes of lost participants until the
+    /// participants return.
     pub fn graph(&self) -> Graph {
         let graph = Graph::snapshot(&self.participant);
         self.node

@@ -132,8 +132,8 @@ impl Sink {
 const MOST_TIGHTENED: u32 = 8;
 
 /// Returns the policies of a topic. If the source decides whether the topic is a state, it is
-/// offered as a state, and its events are removed once they are delivered, which the published
-/// RustDDS cannot do.
+/// offered as a state, and its events are removed once they are delivered. The published RustDDS
+/// cannot remove them, so the topic is then offered as an event topic.
 fn offered(overflow: Overflow, lasting: Lasting) -> Offered {
     let is_offered = match lasting {
         Lasting::State => true,

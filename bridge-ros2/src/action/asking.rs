@@ -47,9 +47,9 @@ pub struct ActionClientOptions {
 }
 
 impl Default for ActionClientOptions {
-    /// Returns 10 seconds for a server, one minute for its decision about a goal, 10 seconds for
-    /// its decision about a cancel request, 1000 goals, 100 feedback messages and 16 MiB of
-    /// feedback.
+    /// Returns timeouts of 10 seconds for a server, one minute for its decision about a goal, and
+    /// 10 seconds for a cancel request. The limits are 1000 goals, 100 feedback messages and 16 MiB
+    /// of feedback.
     fn default() -> Self {
         Self {
             server_timeout: Duration::from_secs(10),
