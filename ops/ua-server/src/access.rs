@@ -1,4 +1,4 @@
-//! Who may do what with the nodes of the space, as the mapping says.
+//! Permissions of clients on the nodes of the space, as the mapping defines them.
 
 use std::collections::HashMap;
 
@@ -15,16 +15,17 @@ use tracing::warn;
 use crate::address;
 use crate::layout::{Layout, node_id};
 
-/// Which sessions come from the application that their certificate is of.
+/// Records, for each session, if its ApplicationUri matches its certificate.
 ///
-/// The library does not compare the two when a session is made (OPC 10000-4, 5.6.2), so a session that pretends to be of another
-/// application is refused here whatever it asks of the space.
+/// The library does not compare the two when a session is created (OPC 10000-4, 5.6.2). The space
+/// refuses every request of a session with the ApplicationUri of another application.
 #[derive(Default)]
 pub(crate) struct Genuine(Mutex<HashMap<u32, bool>>);
 
 impl Genuine {
     /// # Errors
-    /// `BadCertificateUriInvalid` for a session whose certificate is of another ApplicationUri than it says.
+    /// Returns `BadCertificateUriInvalid` if the ApplicationUri of the session differs from the
+    /// ApplicationUri of its certificate.
     pub(crate) fn check(&self, context: &RequestContext) -> Result<(), StatusCode> {
         let known = self.0.lock().get(&context.session_id).copied();
         let genuine = known.unwrap_or_else(|| {
@@ -60,10 +61,11 @@ fn is_genuine(context: &RequestContext) -> bool {
     genuine
 }
 
-/// Sessions that are remembered; they are looked at again when that many were.
+/// Largest number of cached sessions. At this number the cache is cleared, and sessions are checked
+/// again.
 const MOST_REMEMBERED: usize = 10_000;
 
-/// The rules of a mapping for the nodes of its layout.
+/// Returns the access rules of a mapping for the nodes of its layout.
 pub(crate) fn rules(mapping: &Mapping, layout: &Layout) -> Rules {
     let mut nodes = HashMap::new();
     for topic in &layout.topics {
@@ -87,13 +89,14 @@ pub(crate) fn rules(mapping: &Mapping, layout: &Layout) -> Rules {
             call: roles(callers),
             ..Permissions::default()
         };
-        // The parts of an action are Methods too, and the first has the node of the mapping or one of its own.
+        // The parts of an action are Methods too. The first part has the node of the mapping or a
+        // node of its own.
         nodes.insert(node_id(&call.node), permissions);
         for topic in call.topics() {
             nodes.insert(address::unmapped_call(topic), permissions);
         }
     }
-    // Those of the core namespace are for everybody otherwise.
+    // Methods of the core namespace are open to every client by default.
     let switches = SWITCHES.map(|method| (method.into(), Permissions::default()));
     nodes.extend(switches);
     let certificates = Permissions {
@@ -107,14 +110,14 @@ pub(crate) fn rules(mapping: &Mapping, layout: &Layout) -> Rules {
     }
 }
 
-/// Methods that change what is sent and heard.
+/// Methods that change which messages are sent and received.
 const SWITCHES: [MethodId; 3] = [
     MethodId::PublishSubscribe_Status_Enable,
     MethodId::PublishSubscribe_Status_Disable,
     MethodId::PublishSubscribe_Diagnostics_Reset,
 ];
 
-/// Whether who asks may write the value of a node.
+/// Returns true if the client of a request may write the value of a node.
 pub(crate) fn may_write(context: &RequestContext, node: &NodeId) -> bool {
     let level = AccessLevel::CURRENT_WRITE;
     let left = context

@@ -1,4 +1,5 @@
-//! The nodes as they stand in the address space: folders, variables, and what says what they are. Values are elsewhere.
+//! The nodes of the address space: folders, variables and their attributes. Values are kept
+//! elsewhere.
 
 use std::collections::{HashMap, HashSet};
 
@@ -10,7 +11,7 @@ use opcua::types::{LocalizedText, NodeId, ObjectId, QualifiedName, VariableTypeI
 use crate::layout::{Layout, Shape, TopicNode};
 use crate::properties;
 
-/// Adds a variable for each of a topic's nodes under `folder`, without a value.
+/// Adds a variable without a value under `folder` for each node of a topic.
 pub(crate) fn add_topic(address_space: &mut AddressSpace, topic: &TopicNode, folder: &NodeId) {
     let access = access(topic);
     let (own_name, _) = topic.parts();
@@ -59,7 +60,7 @@ pub(crate) fn add_topic(address_space: &mut AddressSpace, topic: &TopicNode, fol
     }
 }
 
-/// Changes what a variable is said to hold.
+/// Changes the DataType and the ValueRank of a variable.
 pub(crate) fn retype(address_space: &mut AddressSpace, node: &NodeId, shape: Shape) {
     if let Some(NodeType::Variable(variable)) = address_space.find_mut(node) {
         variable.set_data_type(shape.data_type());
@@ -93,8 +94,8 @@ pub(crate) fn add_folders(layout: &Layout, address_space: &mut AddressSpace) {
     }
 }
 
-/// Where each node is among those with its parent: the spaces by their numbers, variables as in the mapping, and fields
-/// as in the message.
+/// Returns the rank of each node among the children of its parent: spaces by their numbers,
+/// variables as in the mapping, and fields as in the message.
 pub(crate) fn order(layout: &Layout) -> HashMap<NodeId, usize> {
     let mut order = HashMap::from([
         (root(), 1),
@@ -147,43 +148,45 @@ pub(crate) fn unmapped_folder() -> NodeId {
     NodeId::new(APPLICATION, "UaSpace.Unmapped")
 }
 
-/// Of the servers that are there.
+/// Returns the folder of the servers found in the network.
 pub(crate) fn components_folder() -> NodeId {
     NodeId::new(APPLICATION, "UaSpace.Components")
 }
 
-/// Of the calls of other spaces.
+/// Returns the folder of the calls of other spaces.
 pub(crate) fn calls_folder() -> NodeId {
     NodeId::new(APPLICATION, "UaSpace.Calls")
 }
 
-/// An object with calls in it, or in others in it, by the names of those around it and its own.
+/// Returns the node of an object that contains calls or further such objects. `names` are the names
+/// of its parents and its own name.
 pub(crate) fn call_object(names: &[&str]) -> NodeId {
     NodeId::new(APPLICATION, format!("UaSpace.Calls/{}", names.join("/")))
 }
 
-/// Of the actions of other spaces.
+/// Returns the folder of the actions of other spaces.
 pub(crate) fn programs_folder() -> NodeId {
     NodeId::new(APPLICATION, "UaSpace.Programs")
 }
 
-/// An object with Programs in it, or in others in it, by the names of those around it and its own.
+/// Returns the node of an object that contains Programs or further such objects. `names` are the
+/// names of its parents and its own name.
 pub(crate) fn program_folder(names: &[&str]) -> NodeId {
     NodeId::new(APPLICATION, format!("UaSpace.Programs/{}", names.join("/")))
 }
 
-/// A node of the Program of an action; that of the Program itself has no path.
+/// Returns a node of the Program of an action. The Program itself has an empty path.
 pub(crate) fn program(action: TopicId, path: &str) -> NodeId {
     let dot = if path.is_empty() { "" } else { "." };
     NodeId::new(APPLICATION, format!("{action}.program{dot}{path}"))
 }
 
-/// The node of a topic that the mapping does not name.
+/// Returns the node of a topic that the mapping does not name.
 pub(crate) fn unmapped_node(topic: TopicId) -> NodeId {
     NodeId::new(APPLICATION, topic.to_string())
 }
 
-/// The node of a call that the mapping does not name. A value may have the same name.
+/// Returns the node of a call that the mapping does not name. A value may have the same name.
 pub(crate) fn unmapped_call(topic: TopicId) -> NodeId {
     NodeId::new(APPLICATION, format!("{topic}.call"))
 }

@@ -1,4 +1,5 @@
-//! The DataTypes of messages in the arguments of Methods, which are there as long as a Method has them.
+//! The DataTypes of messages in the arguments of Methods. A DataType exists as long as a Method
+//! uses it.
 
 use bridge_node::{CallDescription, CallField};
 use mappings::TopicId;
@@ -10,12 +11,12 @@ use tracing::warn;
 use crate::layout::Shape;
 use crate::structures::Structure;
 
-/// Those that are there beside the DataTypes of variables.
+/// The DataTypes of arguments, beside the DataTypes of variables.
 #[derive(Debug, Default)]
 pub(crate) struct ArgumentTypes {
-    /// Of variables. They stay whatever calls there are.
+    /// DataTypes of variables. They stay when calls are removed.
     of_variables: Vec<Structure>,
-    /// Of calls, with those that have them.
+    /// DataTypes of calls, with the calls that use each of them.
     of_calls: Vec<(Structure, Vec<TopicId>)>,
 }
 
@@ -24,8 +25,9 @@ impl ArgumentTypes {
         self.of_variables = structures.to_vec();
     }
 
-    /// Puts the DataTypes of a call in that are not there. Where another definition has the name of one, or where there are too
-    /// many, the arguments with it are Structures without a definition.
+    /// Adds the DataTypes of a call that do not exist yet. If another definition has the name of a
+    /// DataType, or if there are too many, the arguments of this type are Structures without a
+    /// definition.
     pub(crate) fn add(
         &mut self,
         address_space: &mut AddressSpace,
@@ -49,7 +51,7 @@ impl ArgumentTypes {
         }
     }
 
-    /// Takes those out that no other call and no variable has.
+    /// Removes the DataTypes that no other call and no variable uses.
     pub(crate) fn remove(&mut self, address_space: &mut AddressSpace, topic: TopicId) {
         for (_, of) in &mut self.of_calls {
             of.retain(|one| *one != topic);
@@ -64,7 +66,7 @@ impl ArgumentTypes {
         });
     }
 
-    /// The DataType of an argument.
+    /// Returns the DataType of an argument.
     pub(crate) fn data_type(&self, topic: TopicId, field: &CallField) -> NodeId {
         let all = structures(topic, field);
         match all.first() {
@@ -73,7 +75,7 @@ impl ArgumentTypes {
         }
     }
 
-    /// Fields as the arguments of a Method.
+    /// Converts fields into the arguments of a Method.
     pub(crate) fn arguments(&self, topic: TopicId, fields: &[CallField]) -> Vec<Argument> {
         let argument = |field: &CallField| Argument {
             name: field.name.as_str().into(),
@@ -102,11 +104,12 @@ impl ArgumentTypes {
     }
 }
 
-/// The structure in a field, and those in it.
+/// Returns the structure of a field and the structures nested in it.
 fn structures(topic: TopicId, field: &CallField) -> Vec<Structure> {
     let structure = field.structure.as_deref();
     structure.map_or_else(Vec::new, |of| Structure::of_call(of, topic.namespace.get()))
 }
 
-/// DataTypes of calls: anybody in the space can announce some.
+/// Largest number of DataTypes of calls. The limit exists because every participant of the space
+/// can announce DataTypes.
 const MOST_TYPES: usize = 1_024;

@@ -1,6 +1,7 @@
 //! Writes that are answered when the bridges confirm them (`confirm: bridge` in the mapping).
 //!
-//! Each write goes out at once. It ends those of its topic that wait, because nobody sends their values again.
+//! Each write is sent at once. A write supersedes the pending writes of its topic, because their
+//! values are not sent again.
 
 use std::collections::HashMap;
 use std::time::Duration;
@@ -12,22 +13,22 @@ use opcua::types::StatusCode;
 use tokio::sync::oneshot;
 use tracing::warn;
 
-/// The topics of the mapping that bridges confirm, and the writes that wait.
+/// The topics of the mapping that bridges confirm, and the pending writes.
 #[derive(Default)]
 pub(crate) struct Arrivals {
     within: RwLock<HashMap<TopicId, Duration>>,
     waiting: Mutex<HashMap<TopicId, Vec<Awaited>>>,
 }
 
-/// A write that waits.
+/// A pending write.
 #[derive(Debug)]
 pub(crate) struct Awaited {
-    /// The field of the topic that it writes; `None` for all of them.
+    /// The written field of the topic, or `None` for all fields.
     field: Option<usize>,
     answer: oneshot::Sender<StatusCode>,
 }
 
-/// The answer to a write.
+/// The future answer to a write.
 #[derive(Debug)]
 pub(crate) struct Awaiting {
     answer: oneshot::Receiver<StatusCode>,
@@ -38,20 +39,20 @@ impl Awaiting {
     /// Waits for the answer.
     ///
     /// # Errors
-    /// `BadTimeout` if it is unknown whether the value has arrived, and `BadRequestCancelledByRequest` if a newer one took its
-    /// place before.
+    /// Returns `BadTimeout` if it is unknown whether the value has arrived, and
+    /// `BadRequestCancelledByRequest` if a newer value superseded it.
     pub(crate) async fn arrived(self) -> Result<(), StatusCode> {
         match tokio::time::timeout(self.within + GRACE, self.answer).await {
             Ok(Ok(StatusCode::Good)) => Ok(()),
             Ok(Ok(status)) => Err(status),
-            // A reload of the mapping, or the end of the server.
+            // The mapping was reloaded, or the server stopped.
             Ok(Err(_)) | Err(_) => Err(StatusCode::BadTimeout),
         }
     }
 }
 
 impl Arrivals {
-    /// Takes over the topics of a mapping.
+    /// Sets the topics of a mapping.
     pub(crate) fn follow(&self, mapping: &Mapping) {
         let variables = mapping.variables().iter();
         let wanted = variables.filter_map(|variable| {
@@ -62,7 +63,8 @@ impl Arrivals {
         *self.within.write() = wanted.collect();
     }
 
-    /// A write of a field, or of all of them, that is to be answered when it is confirmed; `None` where bridges confirm nothing.
+    /// Registers a write of a field, or of all fields, that is answered when it is confirmed.
+    /// Returns `None` for topics that bridges do not confirm.
     pub(crate) fn await_write(
         &self,
         topic: TopicId,
@@ -77,7 +79,8 @@ impl Arrivals {
         Some((awaited, Awaiting { answer, within }))
     }
 
-    /// A write is sent. Earlier writes are answered as superseded, except writes of other fields, whose values it contains.
+    /// Records that a write is sent. Earlier writes are answered as superseded, except writes of
+    /// other fields, whose values it contains.
     pub(crate) fn sent(&self, topic: TopicId, write: Option<Awaited>) {
         let mut waiting = self.waiting.lock();
         let field = write.as_ref().and_then(|write| write.field);
@@ -115,15 +118,16 @@ impl Arrivals {
             }
         };
         for write in writes {
-            // Likewise.
+            // The client may be lost.
             let _gone = write.answer.send(status);
         }
     }
 }
 
-/// The answer to a write after which a newer one of the same value came.
+/// The answer to a write that was superseded by a newer write of the same value.
 const SUPERSEDED: StatusCode = StatusCode::BadRequestCancelledByRequest;
-/// How much longer than the mapping says an answer is waited for: the value waits for its turn to leave, too.
+/// Extra time beyond the limit of the mapping, because the value also waits in the queue before it
+/// is sent.
 const GRACE: Duration = Duration::from_secs(5);
 
 #[cfg(test)]

@@ -1,4 +1,5 @@
-//! How clients ask for calls of other spaces: what each call takes, and the way of a request to whoever sends it on.
+//! The path of client calls to other spaces: the request of each call, and the queue to
+//! [`Methods`](crate::methods::Methods).
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -16,28 +17,28 @@ use uadp::Fields;
 use crate::layout::Shape;
 use crate::value;
 
-/// The Methods there are, by their nodes.
+/// The Methods by their nodes.
 pub(crate) type Table = Mutex<HashMap<NodeId, Callable>>;
 
-/// A call as a client finds it.
+/// A call as it is offered to clients.
 #[derive(Debug, Clone)]
 pub(crate) struct Callable {
     topic: TopicId,
     description: Arc<CallDescription>,
 }
 
-/// The way of clients to [`Methods`](crate::methods::Methods).
+/// The sender of client requests to [`Methods`](crate::methods::Methods).
 #[derive(Debug, Clone)]
 pub(crate) struct Questions {
     sender: mpsc::Sender<Question>,
     given_up: Arc<Notify>,
 }
 
-/// The other end of [`Questions`].
+/// The receiver of [`Questions`].
 #[derive(Debug)]
 pub(crate) struct Heard {
     pub(crate) questions: mpsc::Receiver<Question>,
-    /// Of one or more that were handed on nobody waits for the answer any longer.
+    /// Notified when clients have abandoned one or more requests that were handed on.
     pub(crate) given_up: Arc<Notify>,
 }
 
@@ -49,7 +50,8 @@ pub(crate) struct Question {
     pub(crate) answer: oneshot::Sender<Answered<Bytes>>,
 }
 
-/// What a client waits for; [`Methods`](crate::methods::Methods) is told when it does no longer.
+/// A pending answer for a client. [`Methods`](crate::methods::Methods) is notified when the client
+/// abandons it.
 struct Waiting {
     answered: oneshot::Receiver<Answered<Bytes>>,
     given_up: Arc<Notify>,
@@ -71,28 +73,29 @@ pub(crate) type Drives = Mutex<HashMap<NodeId, Drive>>;
 /// A method of a Program.
 #[derive(Clone)]
 pub(crate) struct Drive {
-    /// The node of the Method that sends goals of its action: whoever may call that may call this.
+    /// The node of the Method that sends goals of the action. Clients with permission to call that
+    /// Method may call this one.
     pub(crate) goal: NodeId,
-    /// Calls it with these arguments.
+    /// Calls the method with the given arguments.
     pub(crate) carry_out: CarryOut,
 }
 
-/// What a method of a Program does.
+/// The implementation of a method of a Program.
 pub(crate) type CarryOut =
     Arc<dyn Fn(Vec<Variant>) -> BoxFuture<'static, Result<Vec<Variant>, Refused>> + Send + Sync>;
 
-/// What the arguments of a client come to.
+/// The reason why a call of a client failed.
 pub(crate) enum Refused {
-    /// Some are not of their types: a status for each.
+    /// Some arguments have the wrong type; contains a status for each argument.
     Arguments(Vec<StatusCode>),
-    /// Nothing can be asked.
+    /// The request was not sent.
     Status(StatusCode),
-    /// It was asked, and there is no response.
+    /// The request was sent, but there is no response.
     Asked(AskError),
 }
 
 impl Questions {
-    /// Both ends.
+    /// Creates both ends of the queue.
     pub(crate) fn channel() -> (Self, Heard) {
         let (sender, questions) = mpsc::channel(MOST_QUESTIONS);
         let given_up = Arc::<Notify>::default();
@@ -105,8 +108,8 @@ impl Questions {
 }
 
 impl Waiting {
-    /// The answer. It is given up when the client is gone, for which is looked from time to time: the library goes on with the
-    /// requests of a connection that is lost.
+    /// Waits for the answer. The request is abandoned when the session of the client is closed. The
+    /// session is polled, because the library continues the requests of a lost connection.
     async fn answer(mut self, gone: impl Fn() -> bool) -> Result<Answered<Bytes>, StatusCode> {
         let answer = loop {
             match tokio::time::timeout(LOOK_AT_CLIENT, &mut self.answered).await {
@@ -136,7 +139,8 @@ impl Callable {
         &self.description
     }
 
-    /// Asks with those arguments, and gives what comes back. Given up when it is dropped, or when the client is gone.
+    /// Sends a request with these arguments and returns the response. The request is abandoned when
+    /// the future is dropped or the client is lost.
     pub(crate) async fn call(
         &self,
         arguments: &[Variant],
@@ -169,7 +173,7 @@ impl Callable {
             .map_err(|_| Refused::Status(StatusCode::BadDecodingError))
     }
 
-    /// The request. Arguments that all have values of their own may be left out all together.
+    /// Encodes the request. All arguments may be omitted together if each of them has a default.
     fn block(&self, arguments: &[Variant]) -> Result<Bytes, Refused> {
         let request = &self.description.request;
         let left_out = arguments.is_empty() && self.description.may_be_empty();
@@ -192,7 +196,7 @@ impl Callable {
     }
 }
 
-/// Requests of clients that wait for the run loop; one more is refused.
+/// Largest number of client requests that wait for the run loop. Further requests are refused.
 const MOST_QUESTIONS: usize = 256;
-/// How often it is looked whether a client that waits is still there.
+/// Interval between two checks if the waiting client is still connected.
 const LOOK_AT_CLIENT: Duration = Duration::from_secs(1);

@@ -1,4 +1,4 @@
-//! Which writes and calls of clients the audit is told, and with what.
+//! Audit events of writes and calls of clients.
 
 use opcua::server::node_manager::{MethodCall, RequestContext, WriteNode};
 use opcua::types::{AttributeId, NodeId, NumericRange, StatusCode, Variant};
@@ -7,15 +7,16 @@ use plant_opcua::users::Login;
 
 use crate::nodes::SpaceManager;
 
-/// What of a write is known before it is done.
+/// The state of a node before a write.
 pub(crate) struct Before {
     node: NodeId,
-    /// Whether everybody may read it: who watches the audit is anybody.
+    /// True if every client may read the node. Audit events are visible to all clients.
     is_public: bool,
     old: Variant,
 }
 
-/// What the nodes show before they are written. What not everybody may read is not told, nor what is large.
+/// Returns the values of the nodes before they are written. The values of nodes with restricted
+/// read access, and large values, are omitted.
 pub(crate) fn before(space: &SpaceManager, writes: &[&mut WriteNode]) -> Vec<Before> {
     let before = writes.iter().map(|write| {
         let node = write.value().node_id.clone();
@@ -31,7 +32,7 @@ pub(crate) fn before(space: &SpaceManager, writes: &[&mut WriteNode]) -> Vec<Bef
     before.collect()
 }
 
-/// Tells of writes, and how they ended.
+/// Reports writes and their results to the audit.
 pub(crate) fn wrote(
     context: &RequestContext,
     before: Vec<Before>,
@@ -66,7 +67,7 @@ pub(crate) fn wrote(
     }
 }
 
-/// Tells of calls, and how they ended.
+/// Reports calls and their results to the audit.
 pub(crate) fn called(
     context: &RequestContext,
     (calls, done): (&[&mut MethodCall], Result<(), StatusCode>),
@@ -80,7 +81,7 @@ pub(crate) fn called(
     }
 }
 
-/// Who came in, or wanted to.
+/// Returns the audit event of a login, successful or refused.
 pub(crate) fn came_in(login: &Login, server: &str) -> Audit {
     let action = Action::CameIn {
         by: login.by,
@@ -96,7 +97,7 @@ pub(crate) fn came_in(login: &Login, server: &str) -> Audit {
     }
 }
 
-/// Whether a value is told: one that is large is not.
+/// Returns true if a value is small enough for an audit event.
 fn is_small(value: &Variant) -> bool {
     if let Variant::Array(array) = value {
         return array.values.len() <= MOST_ELEMENTS && array.values.iter().all(is_small);
@@ -121,6 +122,6 @@ fn tell(context: &RequestContext, action: Action, status: StatusCode) {
     Audit::of(context, action, status).tell(&context.subscriptions);
 }
 
-/// Elements and bytes of a value that is told.
+/// Largest number of elements and bytes of a value in an audit event.
 const MOST_ELEMENTS: usize = 64;
 const MOST_BYTES: usize = 1_024;

@@ -1,4 +1,5 @@
-//! Browsing in the order of the mapping: the server's address space keeps references in none.
+//! Browsing in the order of the mapping. The address space of the server keeps references
+//! unordered.
 
 use std::sync::Arc;
 
@@ -24,16 +25,17 @@ use opcua::types::{
 use crate::auditing;
 use crate::nodes::{SpaceManager, SpaceNodes};
 
-/// The node manager of the space, with what is below a folder or a variable in the order of the mapping.
+/// The node manager of the space. It returns the children of folders and variables in the order of
+/// the mapping.
 pub(crate) struct Ordered {
     inner: Arc<DynNodeManager>,
 }
 
-/// What is left of a browse, the next one last.
+/// The remaining references of a browse, in reverse order.
 struct Rest(Vec<ReferenceDescription>);
 
 impl Ordered {
-    /// Builds the node manager that `nodes` builds, and this around it.
+    /// Builds the node manager of `nodes` and wraps it.
     pub(crate) fn around(
         nodes: impl InMemoryNodeManagerImplBuilder<Impl = SpaceNodes> + 'static,
     ) -> impl FnOnce(ServerContext) -> Self {
@@ -42,13 +44,13 @@ impl Ordered {
         }
     }
 
-    /// The node manager in it.
+    /// Returns the wrapped node manager.
     pub(crate) fn space(&self) -> Option<Arc<SpaceManager>> {
         Arc::clone(&self.inner).into_any_arc().downcast().ok()
     }
 }
 
-/// Browses a node whose children have an order.
+/// Browses a node whose children are ordered.
 fn browse(
     space: &SpaceManager,
     address_space: &AddressSpace,
@@ -75,8 +77,8 @@ fn browse(
     }
 }
 
-/// The references of a node with the rank of their targets. Those that lead out of this address space are left to the
-/// server.
+/// Returns the references of a node with the ranks of their targets. References to nodes outside
+/// this address space are left to the server.
 fn references(
     space: &SpaceManager,
     address_space: &AddressSpace,
@@ -234,8 +236,9 @@ impl NodeManager for Ordered {
             .await
     }
 
-    /// There is an aggregate for each node, and the node manager is told neither which of the nodes it has nor which are left
-    /// out on the way to it: so it gets the nodes one by one, or all of them for one aggregate.
+    /// Reads processed history. `details` has one aggregate for each node, but the inner node
+    /// manager does not know which nodes of the request it receives. It therefore receives the
+    /// nodes one at a time, or all nodes at once if there is only one aggregate.
     async fn history_read_processed(
         &self,
         context: &RequestContext,

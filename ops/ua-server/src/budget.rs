@@ -1,14 +1,15 @@
-//! How much memory the decoded values for clients may take up: those that are being answered with, and those that
-//! wait in subscriptions.
+//! Limits of the memory of decoded values for clients: values in responses, and values queued in
+//! subscriptions.
 //!
-//! The server copies what it is given, and does not say when it is done; so what is counted here is what it may hold.
+//! The server copies the values it receives and does not report when it releases them. The
+//! accounting is therefore an upper bound.
 
 use std::collections::{HashMap, VecDeque};
 use std::time::{Duration, Instant};
 
 use opcua::server::MonitoredItemHandle;
 
-/// What clients were answered with a short while ago.
+/// The responses of the last [`ANSWERED`].
 #[derive(Debug, Default)]
 pub(crate) struct Answers {
     given: VecDeque<(Instant, usize)>,
@@ -16,7 +17,7 @@ pub(crate) struct Answers {
 }
 
 impl Answers {
-    /// Whether there is room for an answer of so many bytes, which is then taken.
+    /// Reserves memory for a response of `bytes`. Returns false if there is not enough left.
     pub(crate) fn take(&mut self, bytes: usize, now: Instant) -> bool {
         while let Some((at, given)) = self.given.front().copied()
             && now.saturating_duration_since(at) >= ANSWERED
@@ -34,7 +35,7 @@ impl Answers {
     }
 }
 
-/// The monitored items, and what their large values may take up.
+/// The monitored items and the memory of their large values.
 #[derive(Debug, Default)]
 pub(crate) struct Watched {
     items: HashMap<MonitoredItemHandle, Item>,
@@ -44,11 +45,11 @@ pub(crate) struct Watched {
 #[derive(Debug)]
 struct Item {
     unfiltered: bool,
-    /// How many values its queue holds.
+    /// Size of the queue of the item, in values.
     queue: usize,
-    /// What is counted for it.
+    /// Bytes that are reserved for the item.
     bytes: usize,
-    /// How many smaller values it got since.
+    /// Number of smaller values after the last large value.
     smaller: usize,
 }
 
@@ -59,7 +60,8 @@ impl Item {
 }
 
 impl Watched {
-    /// A monitored item is there. Further ones than so many are not told of a status alone, and get no large value.
+    /// Adds a monitored item. Beyond the largest number of items, an item receives no status
+    /// changes without a value and no large values.
     pub(crate) fn insert(&mut self, handle: MonitoredItemHandle, unfiltered: bool, queue: usize) {
         if self.items.len() < MOST_ITEMS {
             let item = Item {
@@ -72,7 +74,7 @@ impl Watched {
         }
     }
 
-    /// Its queue holds another number of values.
+    /// Changes the queue size of an item.
     pub(crate) fn resize(&mut self, handle: MonitoredItemHandle, queue: usize) {
         if let Some(item) = self.items.get_mut(&handle) {
             item.queue = queue;
@@ -89,7 +91,8 @@ impl Watched {
         self.items.get(&handle).is_some_and(|item| item.unfiltered)
     }
 
-    /// Whether there is room to give an item a value of so many bytes as often as it keeps values.
+    /// Reserves memory for a value of `bytes` in all copies that the item keeps. Returns false if
+    /// there is not enough left.
     pub(crate) fn take(&mut self, handle: MonitoredItemHandle, bytes: usize) -> bool {
         let Some(item) = self.items.get_mut(&handle) else {
             return bytes <= SMALL;
@@ -99,7 +102,7 @@ impl Watched {
             _ => bytes.saturating_mul(item.copies()),
         };
         if wanted < item.bytes {
-            // Until they have all given way, the larger ones are there.
+            // The larger values occupy memory until smaller values have replaced all their copies.
             item.smaller += 1;
             if item.smaller < item.copies() {
                 return true;
@@ -115,15 +118,18 @@ impl Watched {
     }
 }
 
-/// A value up to this size is not counted: the numbers of sessions, items and places in queues are limits enough.
+/// Values up to this size are not counted. The limits of sessions, items and queue sizes suffice
+/// for them.
 pub(crate) const SMALL: usize = 64 << 10;
-/// The largest decoded value that is given at once. It has room for the largest ByteString.
+/// The largest decoded value in one response. It is large enough for the largest ByteString.
 pub(crate) const LARGEST: usize = 128 << 20;
 const MOST_ANSWERED: usize = 512 << 20;
-/// Answers are encoded as soon as their session has a thread.
+/// Time within which a response is expected to be encoded. Responses are encoded as soon as their
+/// session has a thread.
 const ANSWERED: Duration = Duration::from_millis(500);
 const MOST_WATCHED: usize = 512 << 20;
-/// The value that the next is compared with, the one being sent, and those that were not acknowledged yet.
+/// Copies beside the queue: the value to compare with, the value being sent, and values that were
+/// not acknowledged yet.
 const BESIDE_THE_QUEUE: usize = 4;
 const MOST_ITEMS: usize = 100_000;
 

@@ -1,4 +1,4 @@
-//! Which nodes a reload brought, took away or changed, for clients.
+//! Reports to clients which nodes a reload added, removed or changed.
 
 use std::collections::HashSet;
 
@@ -8,12 +8,12 @@ use plant_opcua::changes::{self, Became, ModelChange};
 
 use crate::layout::TopicNode;
 
-/// Tells who watches the Server object which nodes are gone, new or of another type.
+/// Notifies clients that monitor the Server object of removed, added and retyped nodes.
 pub(crate) fn tell(subscriptions: &SubscriptionCache, gone: &[TopicNode], new: &[TopicNode]) {
     changes::tell(subscriptions, &changed(gone, new));
 }
 
-/// Each node once: what is gone or another one, and then what is new.
+/// Returns one change for each node: removed and retyped nodes first, then added nodes.
 fn changed(gone: &[TopicNode], new: &[TopicNode]) -> Vec<ModelChange> {
     let nodes = |topics: &[TopicNode]| -> Vec<NodeId> {
         let nodes = topics.iter().flat_map(TopicNode::nodes);

@@ -1,4 +1,4 @@
-//! Sessions with other servers: one for each way in, whoever uses it.
+//! Sessions with other servers. Users of the same access data share a session.
 
 use std::collections::{HashMap, HashSet};
 use std::path::Path;
@@ -14,7 +14,7 @@ pub(crate) struct Clients {
 }
 
 impl Clients {
-    /// As a client with the ApplicationUri of the server and the certificates in `pki`.
+    /// Creates clients with the ApplicationUri of the server and the certificates in `pki`.
     pub(crate) fn new(server: &Server, pki: &Path) -> Self {
         Self {
             config: ClientConfig {
@@ -31,7 +31,8 @@ impl Clients {
         }
     }
 
-    /// The client of a server: it connects from now on, for ever.
+    /// Returns the client of a server. The client connects at once, and reconnects until it is
+    /// dropped.
     pub(crate) fn of(&mut self, access: &Access) -> Client {
         if let Some(open) = self.open.get(access) {
             return open.clone();
@@ -55,19 +56,19 @@ impl Clients {
         client
     }
 
-    /// How the connection to a server is, where there is a client for it.
+    /// Returns the state of the connection to a server, if there is a client for it.
     pub(crate) fn link(&self, access: &Access) -> Option<Link> {
         let open = self.open.get(access);
         open.map(|client| client.link().borrow().clone())
     }
 
-    /// How often the certificate of a server was refused.
+    /// Returns how often the certificate of a server was refused.
     pub(crate) fn refused(&self, access: &Access) -> u64 {
         let open = self.open.get(access);
         open.map_or(0, Client::certificates_refused)
     }
 
-    /// Lets go of the sessions that nobody has a use for: neither the mapping nor these.
+    /// Closes the sessions that neither the mapping nor `found` uses.
     pub(crate) fn keep<'s>(
         &mut self,
         mapping: &'s Mapping,
@@ -86,6 +87,7 @@ impl Clients {
     }
 }
 
-/// How long a server may take for what is asked beside Methods. One that does its Methods and nothing beside them takes long.
+/// Time limit of requests other than Method calls. A server that executes Methods and nothing else
+/// meanwhile may take long.
 const ANSWERS_WITHIN: Duration = Duration::from_secs(5);
 const KEEP_ALIVE: Duration = Duration::from_secs(2);

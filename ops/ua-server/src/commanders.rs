@@ -1,4 +1,5 @@
-//! The sessions that wrote commands last, so that a robot is stopped whose commander is gone.
+//! The sessions that wrote commands last. A robot is stopped when the session of its commander is
+//! lost.
 
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
@@ -8,11 +9,11 @@ use mappings::{Mapping, TopicId};
 use opcua::server::node_manager::RequestContext;
 use tokio::time::{Interval, MissedTickBehavior, interval};
 
-/// Tells whether the session of a write is still there.
+/// Reports if the session of a write still exists.
 pub(crate) struct Commander(Box<dyn Fn() -> bool + Send + Sync>);
 
 impl Commander {
-    /// The session of a request.
+    /// Returns the session of a request.
     pub(crate) fn of(context: &RequestContext) -> Self {
         // The type of the library's sessions has no public name.
         let session = Arc::downgrade(&context.session);
@@ -56,7 +57,7 @@ impl Commanders {
         commanders
     }
 
-    /// Goes over to another mapping.
+    /// Switches to another mapping.
     pub(crate) fn follow(&mut self, mapping: &Mapping) {
         let variables = mapping.variables().iter();
         let stopped = variables.filter(|variable| variable.loss.is_some());
@@ -64,14 +65,15 @@ impl Commanders {
         self.last.retain(|topic, _| self.stopped.contains(topic));
     }
 
-    /// Takes note of the session that wrote a topic.
+    /// Records the session that wrote a topic.
     pub(crate) fn wrote(&mut self, topic: TopicId, commander: Commander) {
         if self.stopped.contains(&topic) {
             self.last.insert(topic, commander);
         }
     }
 
-    /// Returns the topics whose commander is gone, each once. Cancel-safe; waits until there is such a topic.
+    /// Returns the topics whose commander is lost, each once. Cancel-safe; waits until there is
+    /// such a topic.
     pub(crate) async fn lost(&mut self) -> Vec<TopicId> {
         loop {
             if self.last.is_empty() {
@@ -87,5 +89,5 @@ impl Commanders {
     }
 }
 
-/// How often it is looked whether the sessions are there.
+/// Interval between two checks of the sessions.
 const LOOK: Duration = Duration::from_millis(100);

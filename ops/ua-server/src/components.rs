@@ -1,5 +1,5 @@
-//! The servers that are there, as objects and as values of the space: what each is called, where it is, and whether it
-//! still is.
+//! The servers found in the network, as objects and as values of the space: their names, locations
+//! and states.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -21,22 +21,22 @@ use crate::address;
 use crate::nodes::SpaceManager;
 use crate::presence::Presence;
 
-/// What comes next.
+/// The next event of [`Components`].
 pub(crate) enum Happened {
-    /// What is to be reported of a server.
+    /// An event of a server that is to be reported.
     Told(PortEvent),
-    /// What was heard of one, and is shown by now.
+    /// A discovered server, which is already shown.
     Heard(Found),
 }
 
-/// Shows each server that a watcher tells of, and those that have gone for some time after.
+/// Shows the servers that a watcher reports. Lost servers stay visible for some time.
 pub(crate) struct Components {
     watcher: Watcher,
     manager: Arc<SpaceManager>,
     subscriptions: Arc<SubscriptionCache>,
-    /// This server itself is none of them.
+    /// ApplicationUri of this server, which is not shown.
     own_uri: String,
-    /// Those that are gone, the one that has been so longest first.
+    /// Names of the lost servers, longest lost first.
     gone: VecDeque<String>,
     presence: Presence,
 }
@@ -63,7 +63,7 @@ impl Components {
         }
     }
 
-    /// Waits for the next thing to happen, and shows it. Whoever drops it before loses nothing.
+    /// Waits for the next event and shows it. Cancel-safe.
     pub(crate) async fn next(&mut self) -> Happened {
         if let Some(event) = self.presence.event() {
             return Happened::Told(event);
@@ -164,7 +164,7 @@ fn values(
     ]
 }
 
-/// Puts the object of a server in the place of what it was.
+/// Adds the object of a server, or replaces it.
 fn add(address_space: &mut AddressSpace, name: &str, values: &[Property]) {
     let object = node(name, "");
     drop(address_space.delete(&object, true));
@@ -187,7 +187,7 @@ fn add(address_space: &mut AddressSpace, name: &str, values: &[Property]) {
     }
 }
 
-/// The object of a server, or one of its properties.
+/// Returns the node of a server's object, or of one of its properties.
 fn node(name: &str, property: &str) -> NodeId {
     let folder = address::components_folder();
     let dot = if property.is_empty() { "" } else { "." };
@@ -197,7 +197,7 @@ fn node(name: &str, property: &str) -> NodeId {
     )
 }
 
-/// Now.
+/// Returns the current time.
 fn wall() -> SystemTime {
     let nanos = u64::try_from(now().utc.unix_nanos()).unwrap_or_default();
     SystemTime::UNIX_EPOCH + Duration::from_nanos(nanos)
@@ -211,7 +211,7 @@ fn time(at: SystemTime) -> DateTime {
     DateTime::from(i64::try_from(since.as_nanos() / 100).unwrap_or(i64::MAX))
 }
 
-/// How many that are gone are still shown.
+/// Largest number of lost servers that are still shown.
 const MOST_GONE: usize = 64;
-/// From 1601 to 1970.
+/// Time from 1601 to 1970.
 const TO_1970: Duration = Duration::from_secs(11_644_473_600);

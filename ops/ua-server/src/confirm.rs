@@ -1,7 +1,8 @@
-//! Writes that have succeeded when the robot answers (`confirm:` in the mapping).
+//! Writes that succeed when the robot answers (`confirm:` in the mapping).
 //!
-//! Of one topic one write waits at a time. It is registered before the value leaves, so that no answer is missed. Without an
-//! answer the value counts as not written: it is not shown, and no longer repeated to who comes later.
+//! Each topic has at most one pending write. The write is registered before the value is sent, so
+//! that no answer is missed. Without an answer the value counts as not written: it is not shown,
+//! and it is not repeated to late joiners.
 
 use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
@@ -16,31 +17,31 @@ use crate::arrivals::Arrivals;
 use crate::value;
 use crate::values::Shown;
 
-/// The rules of the mapping, and the writes that wait.
+/// The rules of the mapping, and the pending writes.
 #[derive(Default)]
 pub(crate) struct Confirms {
     rules: RwLock<HashMap<TopicId, Arc<Rule>>>,
     waiting: Mutex<Waiting>,
-    /// Topics whose last value was not confirmed, until the run loop has seen to it.
+    /// Topics whose last value was not confirmed, until the run loop has handled them.
     taken_back: Mutex<BTreeSet<TopicId>>,
     called: Notify,
     /// The writes that bridges confirm.
     pub(crate) arrivals: Arrivals,
 }
 
-/// What confirms the writes of one topic.
+/// The confirmation rule for the writes of a topic.
 pub(crate) struct Rule {
     by: TopicId,
     within: Duration,
     answer: Answer,
-    /// Whose turn it is to write.
+    /// Serializes the writes of the topic.
     turn: tokio::sync::Mutex<()>,
 }
 
 #[derive(Default)]
 struct Waiting {
     next: u64,
-    /// By the topic that answers.
+    /// The pending writes by the topic that answers.
     writes: HashMap<TopicId, Vec<Write>>,
 }
 
@@ -51,7 +52,7 @@ struct Write {
     confirmed: oneshot::Sender<()>,
 }
 
-/// A write that waits; no longer when it is dropped.
+/// A pending write. Dropping it unregisters the write.
 struct Pending<'c> {
     confirms: &'c Confirms,
     topic: TopicId,
@@ -61,7 +62,7 @@ struct Pending<'c> {
 }
 
 impl Confirms {
-    /// Takes over the rules of a mapping. Those that are the same keep their turns.
+    /// Sets the rules of a mapping. Unchanged rules keep their pending writes.
     pub(crate) fn follow(&self, mapping: &Mapping) {
         self.arrivals.follow(mapping);
         let mut rules = self.rules.write();
@@ -76,16 +77,16 @@ impl Confirms {
         *rules = wanted.collect();
     }
 
-    /// What confirms the writes of a topic, if anything does.
+    /// Returns the confirmation rule of a topic, if there is one.
     pub(crate) fn of(&self, topic: TopicId) -> Option<Arc<Rule>> {
         self.rules.read().get(&topic).cloned()
     }
 
-    /// Has a value written and waits for its answer. `send` works out the fields and has them sent; it gives them and what is
-    /// to be done when they have arrived.
+    /// Writes a value and waits for its answer. `send` computes the fields, passes them to its
+    /// argument and sends them. The result of `send` is returned when the answer has arrived.
     ///
     /// # Errors
-    /// What `send` says, and `BadTimeout` without an answer in time.
+    /// Returns the errors of `send`, and `BadTimeout` without an answer in time.
     pub(crate) async fn write<T: Send>(
         &self,
         topic: TopicId,
@@ -137,7 +138,7 @@ impl Confirms {
             topic,
             by: rule.by,
             number,
-            // Nothing has left.
+            // Nothing was sent yet.
             is_confirmed: true,
         };
         let sent = send(&register)?;
@@ -145,7 +146,7 @@ impl Confirms {
         Ok((pending, sent, answered))
     }
 
-    /// A value came, which may be an answer.
+    /// Checks if a received value answers a pending write.
     pub(crate) fn heard(&self, topic: TopicId, shown: &Shown) {
         let mut waiting = self.waiting.lock();
         let Some(writes) = waiting.writes.get_mut(&topic) else {
@@ -160,7 +161,7 @@ impl Confirms {
             .collect();
         let answered = writes.extract_if(.., |write| write.rule.is_answer(&write.fields, &fields));
         for write in answered {
-            // Who waited may have gone.
+            // The waiting client may be lost.
             let _gone = write.confirmed.send(());
         }
         if writes.is_empty() {
@@ -168,17 +169,17 @@ impl Confirms {
         }
     }
 
-    /// Ready when a value was not confirmed.
+    /// Waits until a value was not confirmed.
     pub(crate) async fn called(&self) {
         self.called.notified().await;
     }
 
-    /// The topics whose last value was not confirmed, since this was asked.
+    /// Takes the topics whose last value was not confirmed.
     pub(crate) fn take_back(&self) -> BTreeSet<TopicId> {
         std::mem::take(&mut *self.taken_back.lock())
     }
 
-    /// A newer value takes the place of one that was not confirmed.
+    /// Records that a newer value replaces an unconfirmed value.
     pub(crate) fn supersede(&self, topic: TopicId) {
         self.taken_back.lock().remove(&topic);
     }
@@ -214,7 +215,7 @@ impl Rule {
     }
 }
 
-/// Whether two values are the same, as far as their types tell them apart.
+/// Returns true if two values are equal within the precision of their types.
 fn are_equal(one: &Variant, other: &Variant) -> bool {
     if let (Variant::Array(ones), Variant::Array(others)) = (one, other) {
         let pairs = ones.values.iter().zip(&others.values);
@@ -235,7 +236,7 @@ fn are_equal(one: &Variant, other: &Variant) -> bool {
     (first - second).abs() <= least
 }
 
-/// Whether a value is the one that the text says.
+/// Returns true if a value equals the value that the text denotes.
 fn is_text(value: &Variant, text: &str) -> bool {
     if let Variant::Boolean(value) = value {
         return text.parse() == Ok(*value);
@@ -296,7 +297,7 @@ mod tests {
         shown
     }
 
-    /// What becomes of a write of 2.5 that is answered so.
+    /// Writes 2.5 with these answers and returns the result.
     async fn written(answer: Answer, answers: &[Shown]) -> (Result<u8, StatusCode>, Confirms) {
         let confirms = Confirms::default();
         let rule = rule(answer);

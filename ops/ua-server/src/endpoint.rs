@@ -1,4 +1,4 @@
-//! What clients may choose of the server: its endpoints and their security.
+//! The endpoints of the server and their security.
 
 use std::net::{SocketAddr, TcpListener};
 use std::sync::Arc;
@@ -18,7 +18,7 @@ use tracing::warn;
 
 use crate::identity;
 
-/// What the server offers of what the mapping says, listening at `address`.
+/// Returns the security policies that the server offers at `address`, as the mapping defines them.
 pub(crate) fn security(described: &Server, address: SocketAddr) -> Vec<Security> {
     let policies = described.policies(address.ip().is_loopback());
     let security = policies.into_iter().map(|policy| match policy {
@@ -30,8 +30,8 @@ pub(crate) fn security(described: &Server, address: SocketAddr) -> Vec<Security>
     security.collect()
 }
 
-/// The server the mapping describes, reached at `url`. `port` is the one that is listened on, which differs from the URL's
-/// when that is 0.
+/// Builds the server that the mapping describes, reached at `url`. `port` is the port of the
+/// listener; it differs from the port of the URL if that is 0.
 pub(crate) fn server(
     described: &Server,
     (url, port): (&EndpointUrl, u16),
@@ -51,8 +51,8 @@ pub(crate) fn server(
         .certificate_path(OWN_CERTIFICATE)
         .private_key_path(OWN_KEY)
         .subscription_poll_interval_ms(limits::POLL_MS)
-        // The library lets a request take the longer one of this and of what its client says, and what a client says is to
-        // hold. Each call has an end of its own.
+        // The library lets a request take the longer of this timeout and the timeout of its client,
+        // and the client's timeout has to hold. Each call has its own deadline.
         .max_timeout_ms(0)
         .limits(within(described.limits));
     for security in security {
@@ -63,7 +63,7 @@ pub(crate) fn server(
     builder
 }
 
-/// How much clients may take up.
+/// Returns the limits of resources of clients.
 pub(crate) fn within(told: ServerLimits) -> Limits {
     let mut limits = limits::server(clients(told));
     limits.max_history_continuation_points = MOST_HISTORY_GOES_ON;
@@ -91,7 +91,7 @@ pub(crate) fn clients(told: ServerLimits) -> ClientLimits {
     ])
 }
 
-/// The server's own threads, and the listener as they take it.
+/// Creates the threads of the server and registers the listener with them.
 pub(crate) fn threads(
     listener: TcpListener,
 ) -> Result<(Runtime, tokio::net::TcpListener), Failure> {
@@ -105,7 +105,7 @@ pub(crate) fn threads(
     Ok((runtime, listener))
 }
 
-/// A listener as the threads of the server take it.
+/// Registers a listener with the threads of the server.
 fn taken_by(runtime: &Runtime, listener: TcpListener) -> std::io::Result<tokio::net::TcpListener> {
     let _inside = runtime.enter();
     tokio::net::TcpListener::from_std(listener)
@@ -113,8 +113,8 @@ fn taken_by(runtime: &Runtime, listener: TcpListener) -> std::io::Result<tokio::
 
 pub(crate) type Standing = Option<(Door, TcpListener)>;
 
-/// The door in front of the server with the listener that clients reach, where the store wants one; the server's own listener; and the
-/// server with the store that it is to look into.
+/// Returns the door in front of the server with the public listener, if the certificate store needs
+/// a door; the server's own listener; and the builder with the certificate store to use.
 pub(crate) fn door(
     pki: &Pki,
     trust_any: bool,
@@ -137,7 +137,7 @@ pub(crate) fn door(
     })
 }
 
-/// Lets clients in through the door.
+/// Starts to accept clients through the door.
 pub(crate) fn stand(runtime: &Runtime, door: Standing) -> Result<(), Failure> {
     if let Some((door, listener)) = door {
         let listener = taken_by(runtime, listener).map_err(io_fault)?;
@@ -146,7 +146,7 @@ pub(crate) fn stand(runtime: &Runtime, door: Standing) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Keeps the certificate of the server current at the Global Discovery Server, for as long as the server runs.
+/// Renews the certificate of the server at the Global Discovery Server, as long as the server runs.
 pub(crate) fn enrol(
     runtime: &Runtime,
     (applicant, gds): (Applicant, Option<Invitation>),
@@ -165,6 +165,6 @@ fn io_fault(error: std::io::Error) -> Failure {
 
 pub(crate) const APPLICATION_NAME: &str = "UA bridge server";
 pub(crate) const PRODUCT_URI: &str = "urn:ua-bridge:server";
-/// Answers of a session from the history that are not at their end.
+/// Largest number of history continuation points of a session.
 const MOST_HISTORY_GOES_ON: usize = 100;
 const SERVER_THREADS: usize = 2;

@@ -1,7 +1,8 @@
-//! Methods of other OPC UA servers, executed for whoever asks for them in the space.
+//! Executes Methods of other OPC UA servers for callers in the space.
 //!
-//! Each server has one client, whatever number of its Methods are mapped. A Method is offered while the server is there and
-//! its arguments can be carried, and nothing is called twice: what was sent when the connection fell may have run.
+//! Each server has one client, however many of its Methods are mapped. A Method is offered while
+//! the server is connected and the types of its arguments are supported. No call is repeated: a
+//! request that was sent when the connection was lost may have been executed.
 
 mod signature;
 mod watch;
@@ -29,21 +30,21 @@ use crate::value;
 
 /// The Methods of other servers that the mapping names.
 pub(crate) struct Executing {
-    /// By how they are reached.
+    /// The servers by their access data.
     servers: HashMap<Access, Server>,
     wanted: HashMap<TopicId, Arc<Wanted>>,
     timeouts: HashMap<TopicId, Duration>,
-    /// Those that are offered.
+    /// The Methods that are offered.
     found: HashMap<TopicId, Arc<Found>>,
     heard: mpsc::Receiver<News>,
     tell: mpsc::Sender<News>,
-    /// What was not executed, and what is no longer offered.
+    /// Events that are not reported yet: refused executions and withdrawn calls.
     events: VecDeque<PortEvent>,
     running: JoinSet<Executed>,
     executions: HashMap<tokio::task::Id, (ExecutionId, TopicId)>,
 }
 
-/// A Method as the mapping has it.
+/// A Method as the mapping defines it.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) struct Wanted {
     topic: TopicId,
@@ -66,7 +67,7 @@ impl Drop for Server {
 }
 
 impl Executing {
-    /// Looks for the Methods of `mapping` from now on.
+    /// Starts to look for the Methods of `mapping`.
     pub(crate) fn new(mapping: &Mapping, clients: &mut Clients) -> Self {
         let (tell, heard) = mpsc::channel(MOST_NEWS);
         let mut executing = Self {
@@ -84,7 +85,7 @@ impl Executing {
         executing
     }
 
-    /// Goes over to the Methods of another mapping. What both say alike goes on undisturbed.
+    /// Switches to the Methods of another mapping. Methods that are unchanged stay undisturbed.
     pub(crate) fn reload(&mut self, mapping: &Mapping, clients: &mut Clients) {
         let mut before = std::mem::take(&mut self.wanted);
         self.timeouts.clear();
@@ -141,7 +142,7 @@ impl Executing {
         }
     }
 
-    /// What happens next. Cancel-safe.
+    /// Waits for the next event. Cancel-safe.
     pub(crate) async fn next(&mut self) -> PortEvent {
         loop {
             if let Some(event) = self.events.pop_front() {
@@ -185,7 +186,8 @@ impl Executing {
         }
     }
 
-    /// Calls the Method. False where there is no room to say what became of it.
+    /// Calls the Method. Returns false if the event queue is full, so that the outcome could not be
+    /// reported.
     pub(crate) fn execute(&mut self, execution: &Execution) -> bool {
         if self.events.len() >= MOST_EXECUTIONS {
             return false;
@@ -226,7 +228,7 @@ impl Executing {
     }
 }
 
-/// The arguments that the fields of a request are.
+/// Decodes the arguments from the fields of a request.
 fn arguments(request: &[u8], signature: &Signature) -> Result<Vec<Variant>, Refusal> {
     let wrong = |_| Refusal::InvalidArgument;
     let fields = Fields::parse(request).map_err(wrong)?;
@@ -275,7 +277,7 @@ fn answered(outputs: &[Variant], signature: &Signature) -> Executed {
     let block = value::fields_block(outputs);
     match block {
         Ok(block) if fits => Executed::Answered(block),
-        // It was executed, and nobody can read what it gave.
+        // The Method was executed, but its outputs cannot be decoded.
         Ok(_) | Err(_) => Executed::Failed(status(StatusCode::BadDecodingError)),
     }
 }
@@ -286,7 +288,8 @@ fn not_answered(error: &CallError) -> Executed {
             status: said,
             arguments,
         } => {
-            // The Method may say so too of what it has begun with, but then of no argument.
+            // A Method that was executed may return this status too, but then without a bad
+            // argument status.
             let of_arguments = arguments.iter().any(|status| status.is_bad());
             match refusal(*said) {
                 Some(refusal) => Executed::Refused(refusal),
@@ -301,14 +304,16 @@ fn not_answered(error: &CallError) -> Executed {
         }
         CallError::Client(ClientError::Status(said)) => match refusal(*said) {
             Some(refusal) => Executed::Refused(refusal),
-            // Of the whole request, such as an answer that is too large: it may have run.
+            // The status of the whole request, such as a response that is too large. The Method may
+            // have been executed.
             None => Executed::Lost,
         },
         CallError::Client(ClientError::Lost(_) | ClientError::Answer(_)) => Executed::Lost,
     }
 }
 
-/// What a server says that has not called the Method (OPC 10000-4, 5.12.2, and of the session 7.39.2).
+/// Returns the refusal for a status that proves that the Method was not called (OPC 10000-4,
+/// 5.12.2; for sessions 7.39.2).
 const fn refusal(status: StatusCode) -> Option<Refusal> {
     Some(match status {
         StatusCode::BadMethodInvalid
@@ -334,9 +339,9 @@ fn status(status: StatusCode) -> uadp::StatusCode {
     uadp::StatusCode(status.bits())
 }
 
-/// Executions of all Methods at a time.
+/// Largest number of simultaneous executions of all Methods.
 const MOST_EXECUTIONS: usize = 1_024;
-/// Executions of one Method at a time.
+/// Largest number of simultaneous executions of one Method.
 const MOST_OF_ONE: usize = 256;
-/// What the clients found out, waiting for the run loop.
+/// Largest number of news of the watchers that wait for the run loop.
 const MOST_NEWS: usize = 64;

@@ -1,7 +1,8 @@
-//! Servers with skills that are found by discovery: who is heard of, by mDNS and in the lists of discovery servers, and which
-//! of them have a place in the space.
+//! Servers with skills that are found by discovery. Servers are discovered by mDNS and in the lists
+//! of discovery servers; some of them have a slot in the space.
 //!
-//! What is heard is a claim of whoever is on the network: each server is asked itself who it is before it has a place.
+//! Discovery data is unauthenticated, so each server is queried for its identity before it gets a
+//! slot.
 
 mod places;
 
@@ -17,7 +18,7 @@ use tracing::{info, warn};
 use self::places::{Places, Room};
 use crate::endpoint::PRODUCT_URI;
 
-/// A server that has a place.
+/// A server with a slot in the space.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Placed {
     pub(crate) name: String,
@@ -26,64 +27,64 @@ pub(crate) struct Placed {
     pub(crate) access: Access,
 }
 
-/// Who is heard of.
+/// The discovered servers.
 pub(crate) struct Finding {
     wanted: Option<FindSkills>,
     room: Room,
-    /// Those of `servers` in the mapping, which have no place twice.
+    /// Endpoints of `servers` in the mapping, which get no second slot.
     named: Vec<Endpoint>,
     own_uri: String,
     heard: BTreeMap<String, Heard>,
-    /// Components with a number of their own in the space, by the names they are announced under.
+    /// Components with their own number in the space, by their announced names.
     speaking: BTreeMap<String, String>,
-    /// Discovery servers whose lists are read, by who told of them.
+    /// Discovery servers whose lists are read, by their sources.
     lists: BTreeMap<Source, String>,
-    /// Where servers may be that a discovery server lists which was only announced.
+    /// Allowed locations of servers that an announced discovery server lists.
     near: Option<Interface>,
     asking: JoinSet<Answer>,
     look: Interval,
-    /// Whether those that do not answer any more are to be asked again.
+    /// True if servers that no longer answer are to be queried again.
     is_time: bool,
     places: Places,
     placed: Vec<Placed>,
-    /// Those that there was no room for, which is told once.
+    /// Servers without a slot, each logged once.
     crowded: BTreeSet<String>,
-    /// Whether it was told that more are heard of than are looked at.
+    /// True if the limit of discovered servers was logged.
     is_full: bool,
 }
 
-/// A server that is heard of, by its URL.
+/// A discovered server, by its URL.
 #[derive(Debug, Default)]
 struct Heard {
     by: BTreeSet<Source>,
-    /// What others say its ApplicationUri is.
+    /// The ApplicationUri according to announcements and lists.
     hint: Option<String>,
-    /// What it says itself.
+    /// The identity that the server itself reports.
     says: Option<Says>,
-    /// Whether it is to be asked, again where something has happened to it.
+    /// True if the server is to be queried, for the first time or again after a change.
     due: bool,
-    /// Rounds in which it is not asked again, and how many times in a row it did not answer.
+    /// Number of rounds before the next query, and number of consecutive queries without an answer.
     pause: u32,
     failures: u32,
     is_asked: bool,
-    /// Whether there is no connection where there should be one.
+    /// True if the server should be connected but is not.
     is_missed: bool,
-    /// Whether it was seen to be in the space by itself.
+    /// True if the server was found to be a participant of the space itself.
     is_left_alone: bool,
 }
 
-/// Who tells of a server.
+/// The source of information about a server.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 enum Source {
-    /// It is announced, under this name.
+    /// The server is announced under this name.
     Network(String),
-    /// The discovery server at this URL lists it.
+    /// The discovery server at this URL lists the server.
     List(String),
-    /// The command line names it.
+    /// The command line names the server.
     Named,
 }
 
-/// What a server says of itself.
+/// The identity that a server reports.
 #[derive(Debug, Clone, PartialEq, Eq)]
 struct Says {
     application_uri: String,
@@ -91,14 +92,15 @@ struct Says {
 }
 
 enum Answer {
-    /// Of a server, by its URL; `None` where there is none in time.
+    /// The identity of the server at a URL, or `None` without an answer in time.
     Is(String, Option<Says>),
     /// The servers that a discovery server lists, each with its ApplicationUri.
     Lists(String, Vec<(String, String)>),
 }
 
 impl Finding {
-    /// As the mapping says; with the discovery server that the command line names, if it does.
+    /// Creates the state from the mapping, with the discovery server of the command line, if there
+    /// is one.
     pub(crate) fn new(mapping: &Mapping, lds: Option<&str>, near: Option<Interface>) -> Self {
         let mut look = interval(LOOK_AGAIN);
         look.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -127,7 +129,7 @@ impl Finding {
         finding
     }
 
-    /// Goes over to another mapping.
+    /// Switches to another mapping.
     pub(crate) fn reload(&mut self, mapping: &Mapping) {
         let server = mapping.server();
         self.wanted.clone_from(&server.find_skills);
@@ -154,7 +156,7 @@ impl Finding {
         self.is_full = false;
     }
 
-    /// Something has happened to a server on the network.
+    /// Handles a change of a server in the network.
     pub(crate) fn heard(&mut self, found: &Found) {
         let known = found.known();
         let source = Source::Network(known.name.clone());
@@ -211,14 +213,16 @@ impl Finding {
         }
     }
 
-    /// A server is in the space by itself: it has no place here until it is another run of its program.
+    /// Excludes a server that is a participant of the space itself. The server gets no slot until
+    /// its program restarts.
     pub(crate) fn leave_alone(&mut self, access: &Access) {
         if let Some(heard) = self.heard.get_mut(&access.endpoint.to_string()) {
             heard.is_left_alone = true;
         }
     }
 
-    /// Waits until who has a place may be another. Cancel-safe; pends where nobody is looked for.
+    /// Waits until the slots may have changed. Cancel-safe; pends if discovery of skills is
+    /// disabled.
     pub(crate) async fn changed(&mut self) {
         if self.wanted.is_none() {
             return std::future::pending().await;
@@ -226,7 +230,7 @@ impl Finding {
         self.ask();
         tokio::select! {
             Some(answer) = self.asking.join_next(), if !self.asking.is_empty() => {
-                // One that was broken off has said nothing, and is asked again.
+                // A query that was aborted has no result and is repeated.
                 if let Ok(answer) = answer {
                     self.take(answer);
                 }
@@ -247,7 +251,7 @@ impl Finding {
         }
     }
 
-    /// Asks who is to be asked, some at a time.
+    /// Queries the due servers, a limited number at a time.
     fn ask(&mut self) {
         let Some(wanted) = &self.wanted else {
             return;
@@ -273,7 +277,7 @@ impl Finding {
                         None => (heard.failures + 1).min(MOST_DOUBLED),
                     };
                     heard.pause = (1 << heard.failures) - 1;
-                    // A busy one that is connected has not gone.
+                    // A connected server may be too busy to answer; it is not lost.
                     if says.is_some() || heard.is_missed {
                         heard.says = says;
                     }
@@ -297,7 +301,8 @@ impl Finding {
         }
     }
 
-    /// Those that have a place now. A server that nobody tells of any more keeps it as long as `is_up`.
+    /// Returns the servers that have a slot. A server without any source keeps its slot as long as
+    /// `is_up` returns true.
     pub(crate) fn look(&mut self, is_up: impl Fn(&Access) -> bool) -> &[Placed] {
         let lists: BTreeSet<&String> = self.lists.values().collect();
         for heard in self.heard.values_mut() {
@@ -353,7 +358,7 @@ impl Finding {
             {
                 continue;
             }
-            // Of several ways to one the one that is used stays.
+            // Of several endpoints of one server, the endpoint in use is kept.
             let mut placed = self.placed.iter();
             let is_used = placed.any(|placed| placed.access == access);
             if is_used || !at.contains_key(&says.application_uri) {
@@ -385,7 +390,8 @@ impl Finding {
         all
     }
 
-    /// Not a server of a cell, whose Programs are what is in the space already; nor one that speaks for itself there.
+    /// Returns true if a server may have a slot. Servers of cells, whose Programs are in the space
+    /// already, and participants of the space are excluded.
     fn may(&self, says: &Says, wanted: &FindSkills) -> bool {
         let Says {
             application_uri: uri,
@@ -399,7 +405,7 @@ impl Finding {
     }
 }
 
-/// As it is told apart: without a path that says nothing.
+/// Normalizes a URL: a path of `/` is removed.
 fn url(text: &str) -> Option<String> {
     let mut endpoint = Endpoint::parse(text)?;
     if endpoint.path == "/" {
@@ -424,8 +430,8 @@ async fn described(url: String) -> Answer {
     Answer::Is(url, says)
 }
 
-/// Of a discovery server that does not answer the list is empty. Anyone can announce one, so that its list has servers that are
-/// `near` only.
+/// Reads the list of a discovery server; without an answer the list is empty. Every host can
+/// announce a discovery server, so only listed servers that `near` accepts are used.
 async fn listed(lds: String, near: Option<Interface>) -> Answer {
     let listed = client::find_servers(&lds, ANSWERS_WITHIN).await;
     let listed = listed.unwrap_or_default().into_iter().take(MOST_HEARD);
@@ -449,17 +455,18 @@ async fn listed(lds: String, near: Option<Interface>) -> Answer {
     Answer::Lists(lds, accepted)
 }
 
-/// How often lists are read, and those asked again that have not said who they are.
+/// Interval of reading lists and of repeating unanswered queries.
 const LOOK_AGAIN: Duration = Duration::from_secs(3);
-/// The pause of a server that does not answer doubles so often: to 32 rounds.
+/// Largest number of times that the pause of a server without answer doubles, which gives 32
+/// rounds.
 const MOST_DOUBLED: u32 = 5;
-/// How long who is asked may take. A busy one takes seconds.
+/// Time limit of a query. A busy server takes seconds.
 const ANSWERS_WITHIN: Duration = Duration::from_secs(3);
-/// So many are looked at.
+/// Largest number of discovered servers.
 const MOST_HEARD: usize = 256;
-/// So many are asked at once.
+/// Largest number of simultaneous queries.
 const MOST_ASKED: usize = 8;
-/// The lists of so many discovery servers are read.
+/// Largest number of discovery servers whose lists are read.
 const MOST_LISTS: usize = 8;
 
 #[cfg(test)]
@@ -541,7 +548,7 @@ servers: [{name: press, endpoint: 'opc.tcp://127.0.0.1:5000'}]
             finding.heard(&seen(name, port, number));
             says(&mut finding, port, uri, product);
         }
-        // A discovery server does not know that one of them has a number.
+        // A discovery server does not know that one of its servers has a number.
         finding
             .lists
             .insert(Source::Named, "opc.tcp://lds:4840".to_owned());

@@ -1,4 +1,5 @@
-//! The folders that the dots of variables' names say: `Line.Conveyor.Speed` is `Speed` in `Conveyor` in `Line`.
+//! The folders that follow from dotted names of variables: `Line.Conveyor.Speed` is the variable
+//! `Speed` in `Conveyor` in `Line`.
 
 use std::collections::HashMap;
 
@@ -10,7 +11,7 @@ use opcua::types::{BrowseDirection, NodeId, ReferenceTypeId};
 use crate::address;
 use crate::layout::{Layout, TopicNode};
 
-/// The folders of a topic with their names, the outermost first.
+/// Returns the folders of a topic with their names, outermost first.
 fn around(topic: &TopicNode) -> impl Iterator<Item = (NodeId, &str)> {
     let (_, names) = topic.parts();
     let space = topic.topic.space;
@@ -26,7 +27,7 @@ fn folder(space: SpaceId, names: &[&str]) -> NodeId {
     NodeId::new(root.namespace, path)
 }
 
-/// Puts the folders of a topic in that are not there, and gives the innermost.
+/// Adds the missing folders of a topic and returns the innermost folder.
 pub(crate) fn stand(address_space: &mut AddressSpace, topic: &TopicNode) -> NodeId {
     let mut parent = address::origin_folder(topic.topic.space);
     if !address_space.node_exists(&parent) {
@@ -42,7 +43,7 @@ pub(crate) fn stand(address_space: &mut AddressSpace, topic: &TopicNode) -> Node
     parent
 }
 
-/// Takes the folders of topics that are gone out where nothing is in them any longer.
+/// Removes the folders of removed topics that are empty.
 pub(crate) fn tidy(address_space: &mut AddressSpace, gone: &[TopicNode]) {
     let types = DefaultTypeTree::new();
     for topic in gone {
@@ -61,7 +62,8 @@ pub(crate) fn tidy(address_space: &mut AddressSpace, gone: &[TopicNode]) {
     }
 }
 
-/// Where each node is among those with its parent: a folder stands where the first variable in it does.
+/// Returns the rank of each node among the children of its parent. A folder has the rank of its
+/// first variable.
 pub(crate) fn order(layout: &Layout) -> HashMap<NodeId, usize> {
     let mut order = address::order(layout);
     for (at, topic) in (1..).zip(&layout.topics) {

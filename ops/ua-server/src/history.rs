@@ -1,4 +1,5 @@
-//! History of the values (OPC 10000-11): the last ones of each variable, in memory, raw and as aggregates (OPC 10000-13).
+//! History of the values (OPC 10000-11): the last values of each variable, in memory, raw and as
+//! aggregates (OPC 10000-13).
 
 mod aggregate;
 mod past;
@@ -32,42 +33,43 @@ pub(crate) struct Series {
 /// A past value.
 struct One {
     time: i64,
-    /// What no other has.
+    /// Unique number of the value.
     number: u64,
     shown: Shown,
 }
 
-/// One value of an answer.
+/// One value of a response.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Step {
     Value(usize),
-    /// There is none before or behind that time.
+    /// There is no value before or after that time.
     NoBound(i64),
 }
 
-/// What is left of an answer. The values are not held: what has gone meanwhile is not in the rest of it.
+/// The rest of a response. Values are referenced by number, so values dropped in the meantime are
+/// missing in the rest.
 struct Rest(Vec<Left>);
 
 #[derive(Clone, Copy)]
 enum Left {
-    /// The value of that number.
+    /// The value with that number.
     Value(u64),
     NoBound(i64),
 }
 
-/// How many bytes the values of one answer may take up.
+/// Accounts for the bytes of the values of one response.
 pub(crate) struct Room<'a> {
     used: usize,
-    /// Whether there is room for a large value beside all other answers.
+    /// Returns true if there is memory for a large value beside all other responses.
     large: &'a (dyn Fn(usize) -> bool + Send + Sync),
 }
 
-/// What becomes of a value of an answer.
+/// The result of adding a value to a response.
 enum Fit {
     Fits,
-    /// The answer is as large as it gets.
+    /// The response has its largest size.
     Full,
-    /// It is too large by itself.
+    /// The value alone is too large.
     Refused(StatusCode),
 }
 
@@ -92,7 +94,7 @@ impl<'a> Room<'a> {
 }
 
 impl Series {
-    /// Of what is kept of the topic of a node.
+    /// Creates the series of a node from the kept values of its topic.
     pub(crate) fn new(
         (topic, field): (Arc<TopicNode>, Option<usize>),
         kept: Vec<(u64, Shown)>,
@@ -105,7 +107,7 @@ impl Series {
                 shown,
             })
             .collect();
-        // Those of one time stay in the order they came.
+        // The sort is stable: values with the same time stay in the order of their arrival.
         shown.sort_by_key(|one| one.time);
         Self {
             topic,
@@ -119,7 +121,7 @@ impl Series {
         Some(one.shown.view(&self.topic, self.field))
     }
 
-    /// ReadRaw (OPC 10000-11, 6.4.3.2).
+    /// Executes ReadRaw (OPC 10000-11, 6.4.3.2).
     pub(crate) fn raw(
         &self,
         details: &ReadRawModifiedDetails,
@@ -162,7 +164,7 @@ impl Series {
         });
     }
 
-    /// All that is asked for, or what is left of it.
+    /// Returns all steps of a request, or the remaining steps of a continuation point.
     fn begun(
         &self,
         details: &ReadRawModifiedDetails,
@@ -190,7 +192,7 @@ impl Series {
         Ok(steps.collect())
     }
 
-    /// The values of the first steps, as many as one answer has.
+    /// Returns the values of the first steps, as many as fit into one response.
     fn values(
         &self,
         steps: &[Step],
@@ -218,7 +220,7 @@ impl Series {
         values
     }
 
-    /// ReadProcessed (OPC 10000-11, 6.4.4), with the aggregate of that node.
+    /// Executes ReadProcessed (OPC 10000-11, 6.4.4) with the aggregate of that node.
     pub(crate) fn processed(
         &self,
         (details, kind): (&ReadProcessedDetails, &NodeId),
@@ -272,7 +274,7 @@ impl Series {
         Ok(values)
     }
 
-    /// ReadAtTime (OPC 10000-11, 6.4.5).
+    /// Executes ReadAtTime (OPC 10000-11, 6.4.5).
     pub(crate) fn at_times(
         &self,
         details: &ReadAtTimeDetails,
@@ -312,10 +314,10 @@ impl Series {
         samples.collect()
     }
 
-    /// What an aggregate comes to, at the time it is of.
+    /// Converts the outcome of an aggregate into a value at the given time.
     ///
     /// # Errors
-    /// `BadResponseTooLarge` where the answer has no room for it.
+    /// Returns `BadResponseTooLarge` if the response has no space for the value.
     fn outcome(
         &self,
         outcome: Outcome,
@@ -361,7 +363,7 @@ impl Series {
     }
 }
 
-/// Gives a node these values, or says why it gets none.
+/// Sets the values or the error status of a node.
 fn answer(
     node: &mut HistoryNode,
     values: Result<Vec<DataValue>, StatusCode>,
@@ -379,7 +381,7 @@ fn answer(
     }
 }
 
-/// What an interval comes to, and how it was found.
+/// Builds the value of an interval. `how` is the historian bits of its status.
 fn made(value: Option<Variant>, (quality, how): (Quality, u32), time: i64) -> DataValue {
     let base = match quality {
         Quality::Good => StatusCode::Good,
@@ -392,7 +394,7 @@ fn made(value: Option<Variant>, (quality, how): (Quality, u32), time: i64) -> Da
     }
 }
 
-/// Of an interval that is shorter than the others; one that has no value stays as it is.
+/// Marks the value of an interval that is shorter than the others. A bad status stays unchanged.
 fn partial(status: StatusCode) -> StatusCode {
     match status.is_bad() {
         true => status,
@@ -400,7 +402,7 @@ fn partial(status: StatusCode) -> StatusCode {
     }
 }
 
-/// A value that is small enough to be a number.
+/// Decodes a value if it is small enough to be a number.
 fn decoded(view: &View<'_>) -> Option<Variant> {
     let small = view.weight() <= SMALL;
     small.then(|| view.data_value(&NumericRange::None).value)?
@@ -417,8 +419,9 @@ fn rules(asked: &AggregateConfiguration) -> Rules {
     }
 }
 
-/// The values of a span: from the start on, or from the end back where there is no start or it is the later one. Its end is
-/// not in it. With bounds there is one at or before the start, and one at or behind the end (OPC 10000-11, 6.4.3.2).
+/// Returns the values of a span, without its end. The order is forward from the start, or backward
+/// if the start is missing or later than the end. With bounds there is also a value at or before
+/// the start and a value at or after the end (OPC 10000-11, 6.4.3.2).
 fn steps(
     times: &[i64],
     (start, end): (Option<i64>, Option<i64>),
@@ -457,7 +460,7 @@ fn steps(
     Ok(steps)
 }
 
-/// From `start` back to `end`, which is earlier.
+/// Returns the values from `start` backward to the earlier `end`.
 fn backwards(times: &[i64], (start, end): (i64, Option<i64>), bounds: bool) -> Vec<Step> {
     let behind = times.partition_point(|time| *time <= start);
     let first = end.map_or(0, |end| times.partition_point(|time| *time <= end));
@@ -473,7 +476,7 @@ fn backwards(times: &[i64], (start, end): (i64, Option<i64>), bounds: bool) -> V
     steps
 }
 
-/// When a value is of: the time of its source, or when it came.
+/// Returns the time of a value: its source timestamp, or else its time of arrival.
 fn time(shown: &Shown) -> i64 {
     let source = shown.stamp.source;
     let time = source.map_or_else(
@@ -483,12 +486,12 @@ fn time(shown: &Shown) -> i64 {
     time.ticks()
 }
 
-/// A time, where there is one.
+/// Returns a time, or `None` for a null time.
 fn given(time: DateTime) -> Option<i64> {
     (time != DateTime::null()).then(|| time.ticks())
 }
 
-/// A Duration in ticks of 100 ns; `None` for what is none.
+/// Converts a Duration into ticks of 100 ns. Returns `None` for an invalid Duration.
 fn ticks(milliseconds: f64) -> Option<u64> {
     let time = std::time::Duration::try_from_secs_f64(milliseconds / 1e3).ok()?;
     u64::try_from(time.as_nanos() / 100).ok()
@@ -504,7 +507,7 @@ fn no_value(status: StatusCode, time: i64) -> DataValue {
     }
 }
 
-/// Without the timestamps that were not asked for.
+/// Removes the timestamps that were not requested.
 fn stamped(mut value: DataValue, wanted: TimestampsToReturn) -> DataValue {
     let both = wanted == TimestampsToReturn::Both;
     if !both && wanted != TimestampsToReturn::Source {
@@ -516,7 +519,7 @@ fn stamped(mut value: DataValue, wanted: TimestampsToReturn) -> DataValue {
     value
 }
 
-/// The aggregates, by their nodes.
+/// The aggregates by their nodes.
 const AGGREGATES: [(ObjectId, Aggregate); 5] = [
     (
         ObjectId::AggregateFunction_Interpolative,
@@ -528,7 +531,7 @@ const AGGREGATES: [(ObjectId, Aggregate); 5] = [
     (ObjectId::AggregateFunction_Count, Aggregate::Count),
 ];
 
-/// Has the server list the aggregates where clients look for them.
+/// Adds the aggregates to the folders in which clients look for them.
 pub(crate) fn list_aggregates(core: &mut AddressSpace) {
     let folders = [
         ObjectId::HistoryServerCapabilities_AggregateFunctions,
@@ -545,7 +548,7 @@ pub(crate) fn list_aggregates(core: &mut AddressSpace) {
     }
 }
 
-/// What the server says of its history.
+/// Returns the history capabilities of the server.
 pub(crate) fn capabilities() -> Vec<(VariableId, Variant)> {
     let most = u32::try_from(MOST_VALUES).unwrap_or(u32::MAX);
     vec![
@@ -583,7 +586,7 @@ fn number(value: &Variant) -> Option<f64> {
     }
 }
 
-/// A number in the type of others, where it fits that.
+/// Converts a number to the type of `others`, if it fits.
 fn like(number: f64, others: Option<&Variant>) -> Variant {
     let given = Variant::Double(number);
     match others.map(Variant::type_id) {
@@ -606,12 +609,12 @@ fn like(number: f64, others: Option<&Variant>) -> Variant {
 const CALCULATED: u32 = 0x0401;
 const INTERPOLATED: u32 = 0x0402;
 const PARTIAL: u32 = 0x0404;
-/// What a value of an answer takes up beside itself.
+/// Size of a value of a response in addition to its data, in bytes.
 const BESIDE: usize = size_of::<DataValue>();
-/// Values of one answer.
+/// Largest number of values in one response.
 const MOST_VALUES: usize = 10_000;
 const MOST_INTERVALS: u64 = 10_000;
-/// Bytes that the values of one answer take up.
+/// Largest size of the values in one response, in bytes.
 const MOST_WEIGHT: usize = 16 << 20;
 
 #[cfg(test)]

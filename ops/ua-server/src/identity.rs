@@ -1,6 +1,6 @@
-//! What the server says of itself: its limits, its build, and whose namespaces it has (OPC 10000-5, 6.3).
+//! The identity of the server: its limits, its build and its namespaces (OPC 10000-5, 6.3).
 //!
-//! The library leaves these empty, or has no nodes for them.
+//! The library leaves these nodes empty, or does not have them.
 
 use opcua::nodes::{ObjectBuilder, VariableBuilder};
 use opcua::server::Limits;
@@ -13,7 +13,7 @@ use opcua::types::{
 use crate::endpoint::{APPLICATION_NAME, PRODUCT_URI};
 use crate::value;
 
-/// What the program is.
+/// Returns the BuildInfo of the program.
 pub(crate) fn build_info() -> BuildInfo {
     BuildInfo {
         product_uri: UAString::from(PRODUCT_URI),
@@ -25,7 +25,8 @@ pub(crate) fn build_info() -> BuildInfo {
     }
 }
 
-/// When the program file was made; packages keep that. Null where the system does not say.
+/// Returns the modification time of the program file, which packages preserve. The time is null if
+/// the system does not report it.
 fn built() -> DateTime {
     let file = std::env::current_exe().and_then(std::fs::metadata);
     let modified = file.and_then(|file| file.modified()).ok();
@@ -35,7 +36,7 @@ fn built() -> DateTime {
     time.map_or_else(DateTime::null, |time| value::date_time(time.time))
 }
 
-/// The limits that clients can read beside those that the library tells.
+/// Returns the limits that clients can read in addition to the limits that the library reports.
 pub(crate) fn capabilities(limits: &Limits) -> Vec<(VariableId, Variant)> {
     let count = |number: usize| Variant::from(u32::try_from(number).unwrap_or(u32::MAX));
     let (sessions, each) = (limits.max_sessions, &limits.subscriptions);
@@ -79,7 +80,8 @@ pub(crate) fn capabilities(limits: &Limits) -> Vec<(VariableId, Variant)> {
     ]
 }
 
-/// Adds an object below Namespaces for each namespace of ours. None of their nodes is the same in other servers, so none is static.
+/// Adds an object below Namespaces for each own namespace. No node is the same in other servers, so
+/// none is static.
 pub(crate) fn add_namespaces<'a>(
     namespaces: impl Iterator<Item = (u16, &'a str)>,
     address_space: &mut AddressSpace,
@@ -136,7 +138,7 @@ pub(crate) fn add_namespaces<'a>(
     }
 }
 
-/// Whose program it is.
+/// ManufacturerName of the program.
 const MANUFACTURER: &str = "UA bridge";
 /// The namespace index of the application's own URI.
 const APPLICATION: u16 = 1;

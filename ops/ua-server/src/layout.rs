@@ -1,4 +1,4 @@
-//! Which nodes the address space has: decided from the mapping before the server is built.
+//! The nodes of the address space, computed from the mapping before the server is built.
 
 use std::collections::{BTreeMap, HashSet};
 
@@ -11,13 +11,14 @@ use uadp::BuiltinType;
 use crate::address::unmapped_node;
 use crate::structures::{Structure, Structures, Types};
 
-/// The nodes of the mapped topics and the namespaces they are in.
+/// The nodes of the mapped topics and their namespaces.
 #[derive(Debug)]
 pub(crate) struct Layout {
-    /// The NamespaceArray: index 0 is OPC UA's, index 1 the application's (OPC 10000-5, 6.3.1).
+    /// The NamespaceArray. Index 0 is the namespace of OPC UA, index 1 the namespace of the
+    /// application (OPC 10000-5, 6.3.1).
     pub(crate) namespaces: Vec<String>,
     pub(crate) topics: Vec<TopicNode>,
-    /// The DataTypes that the topics' fields have.
+    /// The DataTypes of the topics' fields.
     pub(crate) structures: Vec<Structure>,
 }
 
@@ -27,17 +28,20 @@ pub(crate) struct TopicNode {
     pub(crate) topic: TopicId,
     pub(crate) node: NodeId,
     pub(crate) name: String,
-    /// One for each field of the DataSet. The only field of a topic that is one value has the topic's own node.
+    /// The nodes of the fields of the DataSet. If the topic has a single field, the field has the
+    /// node of the topic.
     pub(crate) fields: Vec<FieldNode>,
-    /// The fields are component variables of the topic's variable, which has them all as a Variant array.
+    /// True if the fields are component variables of the topic's variable. The value of that
+    /// variable is a Variant array of all fields.
     pub(crate) compound: bool,
-    /// What its numbers mean.
+    /// Units, ranges and descriptions of the values.
     pub(crate) meaning: Meaning,
-    /// Its values come from another server, and from no client.
+    /// True if the values come from another server. Clients cannot write them.
     pub(crate) sourced: bool,
-    /// Its values are written to another server, whose result answers the writes of clients.
+    /// True if the values are written to another server, whose result answers the writes of
+    /// clients.
     pub(crate) targeted: bool,
-    /// Whether past values of it are kept.
+    /// True if past values are kept.
     pub(crate) historizing: bool,
 }
 
@@ -47,15 +51,16 @@ pub(crate) struct FieldNode {
     pub(crate) node: NodeId,
     pub(crate) name: String,
     pub(crate) shape: Shape,
-    /// The DataType of the structure it is, or of those in its array, as far as known.
+    /// The DataType of the structure, or of the structures in its array, if it is known.
     pub(crate) structure: Option<NodeId>,
 }
 
-/// What values a variable takes; nothing is known of those a mapping leaves open.
+/// The builtin type of a variable's values and if they are arrays; `None` if the mapping leaves the
+/// type open.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Shape(pub(crate) Option<(BuiltinType, bool)>);
 
-/// Why a mapping cannot be served as it is written.
+/// The reason why a mapping cannot be served.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub(crate) enum LayoutError {
     #[error(
@@ -86,10 +91,10 @@ pub(crate) enum LayoutError {
 }
 
 impl Layout {
-    /// The nodes of `mapping`.
+    /// Computes the nodes of `mapping`.
     ///
     /// # Errors
-    /// As [`new`](Self::new).
+    /// Returns the errors of [`new`](Self::new).
     pub(crate) fn of(mapping: &Mapping, types: &mut Types) -> Result<Self, LayoutError> {
         let mut structures = Structures::default();
         let topics = mapping.variables().iter();
@@ -107,11 +112,12 @@ impl Layout {
         })
     }
 
-    /// The nodes of another mapping in a server that runs with these namespaces; and what of it a server only takes when it
-    /// starts, for people.
+    /// Computes the nodes of another mapping in a server that runs with these namespaces. Also
+    /// returns the parts of the mapping that need a restart of the server, as text for the
+    /// operator.
     ///
     /// # Errors
-    /// A node that cannot be there with the others.
+    /// Returns an error for a node that conflicts with other nodes.
     pub(crate) fn within(
         running: &[String],
         mapping: &Mapping,
@@ -146,12 +152,12 @@ impl Layout {
         Ok((layout, restart.collect()))
     }
 
-    /// Gives every namespace its index and checks that the nodes can be there together.
+    /// Gives every namespace its index and checks that the nodes do not conflict.
     ///
-    /// Indexes that the mapping skips are filled, since the NamespaceArray has no holes.
+    /// Indexes that the mapping skips are filled, because the NamespaceArray has no gaps.
     ///
     /// # Errors
-    /// An index that cannot be had, or a node that cannot.
+    /// Returns an error for an index or a node that is not available.
     pub(crate) fn new(
         application_uri: &str,
         wanted: &BTreeMap<u16, String>,
@@ -166,7 +172,7 @@ impl Layout {
         Ok(layout)
     }
 
-    /// Whether the nodes can be there together.
+    /// Checks that the nodes do not conflict.
     fn check(&self) -> Result<(), LayoutError> {
         let mut taken = HashSet::new();
         for topic in &self.topics {
@@ -277,8 +283,8 @@ impl TopicNode {
         node
     }
 
-    /// A topic whose DataSet has `fields`, in order: the path of each in the message, and its shape. None or one is
-    /// a topic that is one value.
+    /// Creates the nodes of a topic whose DataSet has `fields`, each with its path in the message
+    /// and its shape. Without fields, or with one field, the topic is a single value.
     pub(crate) fn new(
         topic: TopicId,
         node: NodeId,
@@ -318,7 +324,7 @@ impl TopicNode {
         }
     }
 
-    /// The name it has in its folder, and the names of the folders around it, the outermost first.
+    /// Returns the name of the topic in its folder, and the names of the folders, outermost first.
     pub(crate) fn parts(&self) -> (&str, Vec<&str>) {
         let mut parts: Vec<&str> = self
             .name
@@ -329,18 +335,19 @@ impl TopicNode {
         (parts.pop().unwrap_or(&self.name), parts)
     }
 
-    /// Clients may write what this server produces. In space 0 that is what the mapping names: the rest is of components.
+    /// Returns true if clients may write the topic: the server produces its values. In space 0
+    /// these are the mapped topics; the other topics belong to components.
     pub(crate) fn writable(&self) -> bool {
         let ours = self.topic.space == SpaceId::UA && self.node != unmapped_node(self.topic);
         ours && !self.sourced
     }
 
-    /// Every node of the topic, its own first.
+    /// Returns every node of the topic, its own node first.
     pub(crate) fn nodes(&self) -> impl Iterator<Item = &NodeId> {
         self.places().map(|(node, _)| node)
     }
 
-    /// Every node of the topic, its own first, with the place of the field it is of.
+    /// Returns every node of the topic, its own node first, with the index of the field.
     pub(crate) fn places(&self) -> impl Iterator<Item = (&NodeId, Option<usize>)> {
         let components = if self.compound {
             self.fields.as_slice()
@@ -357,7 +364,7 @@ pub(crate) fn node_id(text: &NodeIdText) -> NodeId {
     let identifier = match &text.identifier {
         mappings::Identifier::Numeric(number) => Identifier::Numeric(*number),
         mappings::Identifier::String(text) => Identifier::String(text.as_str().into()),
-        // The mapping has checked the two texts.
+        // The mapping has validated both texts.
         mappings::Identifier::Guid(text) => Identifier::Guid(text.parse().unwrap_or_default()),
         mappings::Identifier::Opaque(text) => {
             Identifier::ByteString(ByteString::from_base64(text).unwrap_or_default())
@@ -380,7 +387,7 @@ pub(crate) fn component(parent: &NodeId, path: &str) -> NodeId {
 }
 
 impl FieldNode {
-    /// The DataType attribute.
+    /// Returns the DataType attribute.
     pub(crate) fn data_type(&self) -> NodeId {
         let structure = self.structure.clone();
         structure.unwrap_or_else(|| self.shape.data_type())
@@ -388,7 +395,7 @@ impl FieldNode {
 }
 
 impl Shape {
-    /// What values a field of a call has.
+    /// Returns the shape of a field of a call.
     pub(crate) fn of(field: &CallField) -> Self {
         Self(Some((
             field.builtin,
@@ -396,7 +403,8 @@ impl Shape {
         )))
     }
 
-    /// The DataType attribute: the builtin types have the numbers of their encoding ids (OPC 10000-6, 5.1.2).
+    /// Returns the DataType attribute. The builtin types have the numbers of their encoding ids
+    /// (OPC 10000-6, 5.1.2).
     pub(crate) fn data_type(self) -> NodeId {
         match self.0 {
             Some((builtin, _)) => NodeId::new(0, u32::from(builtin.id())),
@@ -404,7 +412,8 @@ impl Shape {
         }
     }
 
-    /// The ValueRank attribute: -1 scalar, 1 array of one dimension, -2 any (OPC 10000-3, 8.6).
+    /// Returns the ValueRank attribute: -1 scalar, 1 array of one dimension, -2 any (OPC 10000-3,
+    /// 8.6).
     pub(crate) fn value_rank(self) -> i32 {
         match self.0 {
             Some((_, false)) => -1,
@@ -413,7 +422,7 @@ impl Shape {
         }
     }
 
-    /// Whether a variable of this shape may have this value, as it stands in a DataSet.
+    /// Returns true if a variable of this shape may have this value of a DataSet.
     pub(crate) fn fits(self, value: &uadp::Variant<'_>) -> bool {
         let Some(wanted) = self.0 else {
             return true;
@@ -425,7 +434,7 @@ impl Shape {
         }
     }
 
-    /// Whether a variable of this shape may have this value.
+    /// Returns true if a variable of this shape may have this value.
     pub(crate) fn accepts(self, value: &Variant) -> bool {
         let Some((builtin, array)) = self.0 else {
             return true;
@@ -434,7 +443,8 @@ impl Shape {
             VariantTypeId::Empty => false,
             VariantTypeId::Scalar(scalar) => !array && scalar.encoding_mask() == builtin.id(),
             VariantTypeId::Array(element, dimensions) => {
-                // The published library gives an array without elements an empty list of dimensions.
+                // The published library gives an array without elements an empty list of
+                // dimensions.
                 array
                     && dimensions.is_none_or(|d| d.len() <= 1)
                     && element.encoding_mask() == builtin.id()
@@ -443,10 +453,10 @@ impl Shape {
     }
 }
 
-/// Folders around one variable, and its own name.
+/// Largest number of folders around one variable, plus its own name.
 const MOST_PARTS: usize = 9;
 pub(crate) const OPC_UA_URI: &str = "http://opcfoundation.org/UA/";
-/// A mapping with a higher index is a slip of the keyboard, not a server.
+/// Limit of namespace indexes. A higher index in a mapping is a typing error.
 const MOST_NAMESPACES: u16 = 1_000;
 
 #[cfg(test)]

@@ -1,19 +1,26 @@
-//! The OPC UA server of the cell: the values of the space as nodes.
+//! The OPC UA server of the cell, which shows the values of the space as nodes.
 //!
-//! It is one of the programs of origin 0, beside components: that of the namespaces of its mapping. Values of the other spaces
-//! and of components come by UADP and are read here; what clients write to the variables of origin 0 goes out by UADP. It knows
-//! no ROS.
+//! It is one of the programs of origin 0, beside components, and owns the namespaces of its
+//! mapping. Values of the other spaces and of components arrive by UADP and are read here. Values
+//! that clients write to the variables of origin 0 are sent by UADP. The server has no ROS code.
 //!
-//! Reading order: `layout` (which nodes), `structures` (their DataTypes), `address` (as they stand in the address space),
-//! `values` (what they show), `wear` (how that grows old), `history` (what they showed), `nodes` (the node manager), `browse`
-//! (in which order), `budget` (what clients may take up), `space` (values in), `components` and `presence` (which servers are
-//! there), `methods` and `argument_types` (calls of the space as Methods), `programs` (actions as Programs), `asking` (how
-//! clients ask for both), `nodesets` (nodes from files), `folders` (those of dotted names), `executing` (Methods of other servers as calls), `sources` (their nodes as values), `clients` (the
-//! sessions for both), `finding` (those with skills that discovery finds), `others` (all of these), `port` (the shell's side),
-//! `endpoint` (how clients get in), `changes` (what is told of a reload), `identity` (what the server says of itself), `confirm`
-//! and `arrivals` (what says that a write has arrived), `access` (what each may do), `auditing` (what is told of it), `sks` (keys of secured
-//! groups), `pubsub` (the PubSub configuration as nodes), `value` (between the two codecs), `verbs` (certificates and users by
-//! hand).
+//! Modules in reading order:
+//! - Nodes and values: `layout` (nodes of the mapping), `structures` (their DataTypes), `address`
+//!   (nodes of the address space), `values` (current values), `wear` (ageing of values), `history`
+//!   (past values), `nodes` (the node manager), `browse` (the order of nodes), `budget` (memory
+//!   limits of clients), `space` (received values), `nodesets` (nodes from files), `folders`
+//!   (folders of dotted names), `value` (conversion between the two codecs).
+//! - Calls and discovery: `components` and `presence` (servers in the network), `methods` and
+//!   `argument_types` (calls of the space as Methods), `programs` (actions as Programs), `asking`
+//!   (client requests for both).
+//! - Other servers: `executing` (Methods of other servers as calls), `sources` (their nodes as
+//!   values), `clients` (the sessions for both), `finding` (discovered servers with skills),
+//!   `others` (all of these).
+//! - The server itself: `port` (the interface to the shell), `endpoint` (endpoints and security),
+//!   `changes` (notifications of reloads), `identity` (BuildInfo and limits), `confirm` and
+//!   `arrivals` (confirmation of writes), `commanders` (sessions that wrote commands), `access`
+//!   (permissions), `auditing` (audit events), `sks` (keys of secured groups), `pubsub` (the PubSub
+//!   configuration as nodes), `verbs` (commands for certificates and users).
 
 mod access;
 mod address;
@@ -103,7 +110,8 @@ struct UaServer {
     sks: OnceLock<Arc<Sks>>,
 }
 
-/// Runs `ua-server` from its command line to its end. `arguments` begin with the name of the program.
+/// Runs `ua-server` from its command line to its end. `arguments` begin with the name of the
+/// program.
 #[must_use]
 pub fn run(arguments: Vec<OsString>) -> ExitCode {
     match verbs::asked(&arguments) {
@@ -118,17 +126,18 @@ impl UaServer {
         self.pki.clone().unwrap_or_else(usual)
     }
 
-    /// The keys of the groups that the server makes them for stand beside its own private key.
+    /// Returns the key service. The keys of its groups are stored beside the private key of the
+    /// server.
     fn sks(&self) -> Arc<Sks> {
         let made = || Arc::new(Sks::new(self.pki_root().join("private/sks.json")));
         Arc::clone(self.sks.get_or_init(made))
     }
 
-    /// To whom the server is told of, if to anybody.
+    /// Returns the settings for announcing the server, or `None` if it is not announced.
     fn announcement(&self, mapping: &Mapping) -> Option<AnnounceSettings> {
         let found = mapping.server().find_skills.as_ref();
         let networks = found.into_iter().flat_map(|found| &found.networks);
-        // The mapping has checked them.
+        // The mapping has validated the texts.
         let networks: Vec<Range> = networks.filter_map(|text| text.parse().ok()).collect();
         let interface = self
             .arguments
@@ -141,7 +150,7 @@ impl UaServer {
                 .announce
                 .then(|| interface.unwrap_or(Interface::LOOPBACK))
                 .map(|interface| interface.with_networks(networks)),
-            // That of --pki is made by then.
+            // The directory of --pki exists by then.
             pki: Some(self.pki_root()),
             ..AnnounceSettings::registering(self.lds.as_deref())
         };
@@ -154,8 +163,9 @@ impl Program for UaServer {
 
     const NAME: &'static str = "ua-server";
     const LOCAL: bridge_core::Local = bridge_core::Local::Fields;
-    // The libraries say at level info what they do for each client, and at level error what a bad client did, or that
-    // one looked whether the server is there. What becomes of other servers is told here.
+    // The libraries log at level info each action for a client, and at level error faults of
+    // clients and checks if the server is reachable. Events of other servers are logged by this
+    // program.
     const QUIET: &'static str = "opcua_server=warn,opcua_server::session::controller=off,opcua_client=off,\
         opcua_crypto=warn,opcua_core=warn,opcua_nodes=warn,opcua_types=off";
 
@@ -169,7 +179,8 @@ impl Program for UaServer {
         &self.arguments
     }
 
-    /// Those of the mapping, of servers that are found, and the server's own: in all others of space 0 components publish.
+    /// Returns the namespaces of the mapping, of discovered servers and of the server itself.
+    /// Components publish in all other namespaces of space 0.
     fn owned(mapping: &Mapping) -> Owned {
         let own = std::iter::once(presence::NAMESPACE);
         let found = mapping.server().find_skills.as_ref();

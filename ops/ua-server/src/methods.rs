@@ -1,7 +1,7 @@
-//! Calls of other spaces, as Methods: what a client calls is asked of whoever executes it.
+//! Calls of other spaces as Methods. A call of a client is forwarded to its executor.
 //!
-//! A Method stands in the object that the dots of its name say (`Conveyor.Switch`), below the folder `Calls`. It goes when the
-//! call does.
+//! A Method is placed in the object that the dots of its name denote (`Conveyor.Switch`), below the
+//! folder `Calls`. The Method is removed with its call.
 
 use std::collections::{HashMap, VecDeque};
 use std::path::Path;
@@ -25,42 +25,43 @@ use crate::nodes::SpaceManager;
 use crate::programs::Programs;
 use crate::structures::Structure;
 
-/// Shows the calls of other spaces, and hands on what clients ask them.
+/// Shows the calls of other spaces and forwards the requests of clients.
 pub(crate) struct Methods {
     manager: Arc<SpaceManager>,
     mapping: Arc<Mapping>,
     heard: Heard,
     shown: HashMap<TopicId, NodeId>,
-    /// Calls without a Method, since something else has their node.
+    /// Calls without a Method, because another node has their NodeId.
     refused: HashMap<TopicId, Arc<CallDescription>>,
-    /// How many Methods are in each object, or in one in it.
+    /// Number of Methods in each object, including nested objects.
     objects: HashMap<NodeId, usize>,
-    /// The objects around each Method, the outermost first.
+    /// The parent objects of each Method, outermost first.
     around: HashMap<TopicId, Vec<NodeId>>,
     types: ArgumentTypes,
     /// Actions, as Programs beside their Methods.
     programs: Programs,
     asked: HashMap<AskId, oneshot::Sender<Answered<Bytes>>>,
-    /// Those whose clients wait no longer, to be told.
+    /// Requests that clients have abandoned, to be reported.
     given_up: VecDeque<AskId>,
     next: u64,
     told_full: bool,
 }
 
-/// What clients want.
+/// A request of a client, or its end.
 pub(crate) enum Wish {
-    /// An answer.
+    /// The client requests an answer.
     Ask {
         ask: AskId,
         topic: TopicId,
         request: Bytes,
         timeout: Duration,
     },
-    /// No answer any longer.
+    /// The client has abandoned its request.
     GiveUp(AskId),
 }
 
-/// The calls that another mapping has under another node, without a Method in between.
+/// The calls that have another node in the new mapping. They have no Method until they are added
+/// again.
 pub(crate) struct Moved(Vec<(TopicId, Arc<CallDescription>)>);
 
 impl Methods {
@@ -95,7 +96,8 @@ impl Methods {
         }
     }
 
-    /// Shows a call, in the place of what it was. The parts of an action are Methods too, and together a Program.
+    /// Shows a call, replacing its previous version. The parts of an action are Methods too, and
+    /// together a Program.
     pub(crate) fn known(&mut self, topic: TopicId, description: &Arc<CallDescription>) {
         self.show(topic, description);
         self.programs.known(topic, description, &self.types);
@@ -127,7 +129,7 @@ impl Methods {
         }
     }
 
-    /// Puts a Method in, unless there is something under its node. Gives the objects around it.
+    /// Adds a Method, unless its node is in use. Returns the parent objects of the Method.
     fn insert(
         &mut self,
         node: &NodeId,
@@ -142,7 +144,8 @@ impl Methods {
         }
         let namespace = topic.namespace.get();
         let mut served = self.manager.inner().served_namespaces();
-        // The TypeIds of its values are in that namespace, which means another one to a client else.
+        // The TypeIds of its values are in that namespace. A client would map them to another
+        // namespace otherwise.
         if served.any(|(index, _)| index == namespace) {
             self.types.add(&mut address_space, (topic, description));
         }
@@ -158,7 +161,8 @@ impl Methods {
         Some(around)
     }
 
-    /// A mapped call has the node that the mapping says, if the server has its namespace.
+    /// Returns the node of a call. A mapped call has the node of the mapping, if the server has its
+    /// namespace.
     fn node(&self, topic: TopicId) -> NodeId {
         let mapped = self
             .mapping
@@ -174,13 +178,13 @@ impl Methods {
             .unwrap_or_else(|| address::unmapped_call(topic))
     }
 
-    /// Takes a call away. What was asked is still answered.
+    /// Removes a call. Pending requests are still answered.
     pub(crate) fn gone(&mut self, topic: TopicId) {
         self.programs.gone(topic);
         self.remove(topic);
     }
 
-    /// What an action reports of one of its goals.
+    /// Handles a report of an action about one of its goals.
     pub(crate) fn reported(&self, topic: TopicId, block: &[u8]) {
         self.programs.reported(topic, block);
     }
@@ -210,7 +214,7 @@ impl Methods {
             drop(address_space.delete(&node, true));
         }
         self.types.remove(&mut address_space, topic);
-        // An object without a Method in it would stay for ever.
+        // Objects without any Method are removed.
         for object in self.around.remove(&topic).unwrap_or_default().iter().rev() {
             let left = self.objects.get_mut(object).map_or(0, |methods| {
                 *methods = methods.saturating_sub(1);
@@ -223,7 +227,8 @@ impl Methods {
         }
     }
 
-    /// Takes the Methods out that another mapping has under another node: a variable may have theirs.
+    /// Removes the Methods that have another node in the new mapping, because a variable may have
+    /// their node.
     pub(crate) fn take_moved(&mut self, mapping: &Arc<Mapping>) -> Moved {
         self.mapping = Arc::clone(mapping);
         let moved = self
@@ -242,7 +247,7 @@ impl Methods {
         Moved(moved)
     }
 
-    /// Puts them in again, beside variables of these DataTypes.
+    /// Adds the moved calls again, beside variables of these DataTypes.
     pub(crate) fn put(&mut self, Moved(moved): Moved, structures: &[Structure]) {
         self.types.set_variables(structures);
         for (topic, description) in moved {
@@ -250,7 +255,7 @@ impl Methods {
         }
     }
 
-    /// What a client wants next. Cancel-safe.
+    /// Waits for the next request of a client. Cancel-safe.
     pub(crate) async fn next(&mut self) -> Wish {
         loop {
             if let Some(ask) = self.given_up.pop_front() {
@@ -258,7 +263,7 @@ impl Methods {
             }
             tokio::select! {
                 Some(question) = self.heard.questions.recv() => {
-                    // Whoever has given up meanwhile has not asked.
+                    // Requests that were abandoned in the meantime are dropped.
                     if !question.answer.is_closed() {
                         return self.ask(question);
                     }
@@ -294,13 +299,13 @@ impl Methods {
 
     pub(crate) fn answered(&mut self, ask: AskId, answer: Answered<Bytes>) {
         if let Some(asked) = self.asked.remove(&ask) {
-            // Who asked may have gone.
+            // The client may be lost.
             drop(asked.send(answer));
         }
     }
 }
 
-/// Puts the Method in, and the objects around it that are not there. Gives the objects, the outermost first.
+/// Adds the Method and its missing parent objects. Returns the parent objects, outermost first.
 fn add(
     address_space: &mut AddressSpace,
     node: &NodeId,
@@ -362,9 +367,10 @@ fn arguments_node(method: &NodeId, which: &str) -> NodeId {
     )
 }
 
-/// Calls that are shown: anybody in the space can announce some.
+/// Largest number of calls that are shown. The limit exists because every participant of the space
+/// can announce calls.
 const MOST_METHODS: usize = 4_096;
-/// Objects around one Method.
+/// Largest number of objects around one Method.
 const MOST_PARTS: usize = 8;
-/// How long an answer is waited for where the mapping says nothing.
+/// Time limit of a call without a limit in the mapping.
 const TIMEOUT: Duration = Duration::from_secs(30);

@@ -1,8 +1,8 @@
-//! The node manager of the space: what the nodes show, what clients may write, and who watches.
+//! The node manager of the space: values of nodes, writes of clients, and monitored items.
 //!
-//! Locks are taken in this order and never across an await: the address space, the places, the values, the past, the
-//! subscriptions, the watched items. Nothing here calls out while one is held but the subscriptions: a write leaves through a
-//! bounded channel.
+//! Locks are taken in this order and never across an await: the address space, the places, the
+//! values, the past values, the subscriptions, the watched items. While a lock is held, only the
+//! subscriptions are called: a write leaves through a bounded channel.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -49,14 +49,14 @@ use crate::pubsub::PubSub;
 use crate::value;
 use crate::values::{self, Shown, Stamp, Values, View};
 
-/// The node manager as the server has it.
+/// The node manager in the server.
 pub(crate) type SpaceManager = InMemoryNodeManager<SpaceNodes>;
 
 /// Serves the nodes of the space.
 pub(crate) struct SpaceNodes {
     namespaces: Vec<NamespaceMetadata>,
     places: RwLock<Places>,
-    /// Where each node is among those with its parent.
+    /// Rank of each node among the children of its parent.
     order: RwLock<HashMap<NodeId, usize>>,
     values: RwLock<Values>,
     past: RwLock<Past>,
@@ -65,71 +65,74 @@ pub(crate) struct SpaceNodes {
     genuine: Genuine,
     exits: Exits,
     nodesets: Loaded,
-    /// What clients can call.
+    /// The Methods that clients can call.
     methods: Table,
     programs: Drives,
-    /// One client writes at a time.
+    /// Serializes the writes of clients.
     writing: Mutex<()>,
-    /// Bytes of the largest value that may be written.
+    /// Size limit of a written value, in bytes.
     largest_write: AtomicUsize,
-    /// How often a client was refused a value for its size.
+    /// Number of values that were refused to clients because of their size.
     refused: AtomicU64,
 }
 
-/// Whose value a node has, and the place of the field, if it is a component.
+/// The topic of each node, and the index of the field if the node is a component.
 type Places = HashMap<NodeId, (Arc<TopicNode>, Option<usize>)>;
 
-/// What leaves the node manager.
+/// Channels and shared state that the node manager uses.
 #[derive(Clone)]
 pub(crate) struct Exits {
-    /// Values clients wrote. A client is told when there is no room.
+    /// Values written by clients. If the channel is full, the client gets an error.
     pub(crate) writes: mpsc::Sender<ClientWrite>,
-    /// Room for the bytes of those values, in KiB.
+    /// Limits the total size of these values, in KiB.
     pub(crate) room: Arc<Semaphore>,
-    /// Monitored items as they are made, to be looked at once more. Without room a look is missed.
+    /// Created monitored items, for a second check of their values. If the channel is full, the
+    /// second check is skipped.
     pub(crate) created: mpsc::Sender<(NodeId, MonitoredItemHandle)>,
-    /// What clients ask of calls. A client is told when there is no room.
+    /// Calls of clients. If the channel is full, the client gets an error.
     pub(crate) questions: Questions,
-    /// What users may do.
+    /// Permissions of users.
     pub(crate) access: Arc<Access>,
-    /// The PubSub configuration, which clients can disable parts of.
+    /// The PubSub configuration; clients can disable parts of it.
     pub(crate) pubsub: Arc<PubSub>,
     /// The confirmations of writes.
     pub(crate) confirms: Arc<Confirms>,
 }
 
-/// A value a client wrote to a topic of the OPC UA side.
+/// A value that a client wrote to a topic of the OPC UA side.
 #[derive(Debug)]
 pub(crate) struct ClientWrite {
     pub(crate) topic: TopicId,
     /// The fields of the DataSet as a key frame carries them.
     pub(crate) block: Bytes,
     pub(crate) source: Timestamp,
-    /// The session that wrote it.
+    /// The session of the write.
     pub(crate) commander: Commander,
-    /// Given back when it has left.
+    /// Released when the value has been sent.
     pub(crate) room: OwnedSemaphorePermit,
-    /// Told when it has left.
+    /// Notified when the value has been sent.
     pub(crate) gone_out: oneshot::Sender<()>,
-    /// Takes the result of the server that the value is written to. Dropped if there is no such server.
+    /// Receives the result of the server that the value is written to. Dropped if there is no such
+    /// server.
     pub(crate) answer: oneshot::Sender<StatusCode>,
-    /// Takes what the bridges confirm.
+    /// Receives the confirmation of the bridges.
     pub(crate) awaited: Option<Awaited>,
 }
 
-/// What becomes of a value that is on its way.
+/// The pending results of a value that is being sent.
 struct OnItsWay {
     gone_out: oneshot::Receiver<()>,
     answered: oneshot::Receiver<StatusCode>,
 }
 
-/// What is done with the fields of a write before it is sent, and the confirmation that it waits for.
+/// A callback for the fields of a write before it is sent, and the confirmation that the write
+/// waits for.
 type Registration<'r> = (&'r dyn Fn(&[Variant]), Option<Awaited>);
 
 impl OnItsWay {
-    /// Waits until the value has left.
+    /// Waits until the value has been sent.
     async fn left(self) -> Result<oneshot::Receiver<StatusCode>, StatusCode> {
-        // The sender is dropped when the server ends.
+        // The sender is dropped when the server stops.
         match tokio::time::timeout(LONGEST_WAY_OUT, self.gone_out).await {
             Ok(Ok(())) => Ok(self.answered),
             Ok(Err(_)) => Err(StatusCode::BadShutdown),
@@ -139,7 +142,7 @@ impl OnItsWay {
 }
 
 impl SpaceNodes {
-    /// Registers the namespaces and puts the nodes of `layout` into `address_space`.
+    /// Registers the namespaces and adds the nodes of `layout` to `address_space`.
     pub(crate) fn build(
         (layout, sets): (&Layout, &NodeSets),
         exits: Exits,
@@ -198,27 +201,28 @@ impl SpaceNodes {
         }
     }
 
-    /// The nodes that are there by NodeSets.
+    /// Returns the nodes of NodeSets.
     pub(crate) const fn nodesets(&self) -> &Loaded {
         &self.nodesets
     }
 
-    /// What clients can call.
+    /// Returns the Methods that clients can call.
     pub(crate) const fn methods(&self) -> &Table {
         &self.methods
     }
 
-    /// The Programs they can drive, by their methods.
+    /// Returns the Programs that clients can control, by their methods.
     pub(crate) const fn programs(&self) -> &Drives {
         &self.programs
     }
 
-    /// What clients ask of calls.
+    /// Returns the channel for calls of clients.
     pub(crate) const fn questions(&self) -> &Questions {
         &self.exits.questions
     }
 
-    /// Takes the nodes of some topics out and puts those of others in. Who watches a node that is gone is told.
+    /// Removes the nodes of the topics in `gone` and adds the nodes of the topics in `new`. Clients
+    /// that monitor a removed node are notified.
     pub(crate) fn exchange(
         &self,
         address_space: &RwLock<AddressSpace>,
@@ -243,7 +247,8 @@ impl SpaceNodes {
             }
             places.remove(node);
         }
-        // Nodes of their own: what stays behind would keep the new ones out. One that is the node of a variable is that.
+        // Property nodes that stay would conflict with the new nodes. A property node that is also
+        // the node of a variable is kept.
         for node in gone.iter().flat_map(properties::nodes) {
             if !places.contains_key(&node) && !self.nodesets.has(&node) {
                 drop(address_space.delete(&node, true));
@@ -270,27 +275,27 @@ impl SpaceNodes {
         }
     }
 
-    /// Takes note of the nodes of a topic that was not there, or has another type now.
+    /// Registers the nodes of a topic that is new or has another type.
     pub(crate) fn know(&self, topic: &TopicNode) {
         put(&mut self.places.write(), topic);
     }
 
-    /// Has the nodes in the order of `layout` from now on.
+    /// Sorts the nodes in the order of `layout`.
     pub(crate) fn set_order(&self, layout: &Layout) {
         *self.order.write() = folders::order(layout);
     }
 
-    /// Where a node is among those with its parent; 0 for one that has no place.
+    /// Returns the rank of a node among the children of its parent, or 0 for a node without a rank.
     pub(crate) fn rank(&self, node: &NodeId) -> usize {
         self.order.read().get(node).copied().unwrap_or_default()
     }
 
-    /// Whether what is below a node has an order.
+    /// Returns true if the children of a node are ordered.
     pub(crate) fn has_order(&self, node: &NodeId) -> bool {
         self.order.read().contains_key(node)
     }
 
-    /// How much is kept of what was.
+    /// Sets the limits of past values.
     pub(crate) fn limit_past(&self, mapping: &Mapping) {
         let usual = mapping.server().history;
         let variables = mapping.variables().iter();
@@ -299,28 +304,30 @@ impl SpaceNodes {
         self.past.write().limit(most, own.collect());
     }
 
-    /// How large a value may be that clients write, in bytes.
+    /// Sets the size limit of written values, in bytes.
     pub(crate) fn limit_writes(&self, largest: usize) {
         self.largest_write.store(largest, Ordering::Relaxed);
     }
 
-    /// The namespaces of these nodes with the indexes the server gave them.
+    /// Returns the namespaces of these nodes with the indexes that the server assigned.
     pub(crate) fn served_namespaces(&self) -> impl Iterator<Item = (u16, &str)> {
         self.namespaces
             .iter()
             .map(|ns| (ns.namespace_index, ns.namespace_uri.as_str()))
     }
 
-    /// What the topic shows.
+    /// Returns the current value of a topic.
     pub(crate) fn shown(&self, topic: TopicId) -> Shown {
         let shown = self.values.read().get(topic).cloned();
         shown.unwrap_or_else(Shown::waiting)
     }
 
-    /// Shows a value that is new for a topic, tells who watches its nodes, and keeps it for its history.
+    /// Shows a new value of a topic, notifies the monitored items of its nodes, and adds the value
+    /// to the history.
     ///
     /// # Errors
-    /// `BadOutOfMemory` where there is no room for the value; the nodes show that then.
+    /// Returns `BadOutOfMemory` if there is not enough memory for the value; the nodes then show
+    /// this status.
     pub(crate) fn show(
         &self,
         subscriptions: &SubscriptionCache,
@@ -330,14 +337,14 @@ impl SpaceNodes {
         self.put(subscriptions, topic, (shown, true))
     }
 
-    /// Shows what a topic shows already, with another status.
+    /// Shows the current value of a topic with another status.
     pub(crate) fn show_again(
         &self,
         subscriptions: &SubscriptionCache,
         topic: &TopicNode,
         shown: Shown,
     ) {
-        // It is there already, so there is room for it.
+        // The value is stored already, so the memory limit does not apply.
         let _kept = self.put(subscriptions, topic, (shown, false));
     }
 
@@ -347,7 +354,7 @@ impl SpaceNodes {
         topic: &TopicNode,
         (shown, is_new): (Shown, bool),
     ) -> Result<(), StatusCode> {
-        // Until all are told, so that nobody is told in another order.
+        // The lock is held until all items are notified, so that notifications keep their order.
         let mut values = self.values.write();
         let (before, kept) = values.put(topic.topic, shown);
         let Some(shown) = values.get(topic.topic) else {
@@ -365,9 +372,10 @@ impl SpaceNodes {
         kept
     }
 
-    /// The server compares values alone for an item without filter, though a status that changed is to be reported
-    /// too (OPC 10000-4, 7.22.2: the default trigger is StatusValue). No value in between makes it report both;
-    /// clients with a queue of one see only the second.
+    /// Notifies the monitored items of a node. For an item without a filter the server compares
+    /// values only, although a changed status has to be reported too (OPC 10000-4, 7.22.2: the
+    /// default trigger is StatusValue). A DataValue without a value in between makes the server
+    /// report both; clients with a queue of one see only the second.
     fn notify(
         &self,
         subscriptions: &SubscriptionCache,
@@ -406,7 +414,8 @@ impl SpaceNodes {
         }
     }
 
-    /// The value for one monitored item, or why it gets none, and whether it has no filter. It is decoded once for all.
+    /// Returns the value for one monitored item, or the reason why it is refused, and if the item
+    /// has no filter. The value is decoded once for all items.
     fn for_item(
         &self,
         handle: MonitoredItemHandle,
@@ -432,7 +441,8 @@ impl SpaceNodes {
         (value, unfiltered)
     }
 
-    /// A value a client does not get, told at the 1st, 10th, 100th ... time.
+    /// Returns the DataValue of a refused value. The refusal is logged at the 1st, 10th, 100th ...
+    /// time.
     fn refuse(&self, view: &View<'_>, weight: usize, status: StatusCode) -> DataValue {
         let total = self.refused.fetch_add(1, Ordering::Relaxed) + 1;
         if 10_u64.pow(total.ilog10()) == total {
@@ -446,7 +456,8 @@ impl SpaceNodes {
         view.refused(status)
     }
 
-    /// The value of a node for a client, or why it does not get it; `None` for nodes without a place.
+    /// Returns the value of a node for a client, or the reason why it is refused. Returns `None`
+    /// for nodes without a topic.
     fn answer(&self, node: &NodeId, range: &NumericRange) -> Option<DataValue> {
         let (topic, field) = self.place(node)?;
         let shown = self.shown(topic.topic);
@@ -464,12 +475,12 @@ impl SpaceNodes {
         })
     }
 
-    /// Whether everybody who is let in may read a node.
+    /// Returns true if every admitted client may read a node.
     pub(crate) fn is_public(&self, node: &NodeId) -> bool {
         self.exits.access.is_public(node)
     }
 
-    /// What a node shows, unless it is large.
+    /// Returns the value of a node, unless it is large.
     pub(crate) fn shown_at(&self, node: &NodeId) -> Option<Variant> {
         let (topic, field) = self.place(node)?;
         let shown = self.shown(topic.topic);
@@ -478,7 +489,7 @@ impl SpaceNodes {
         small.then(|| view.data_value(&NumericRange::None).value)?
     }
 
-    /// Gives one monitored item what its node shows.
+    /// Sends the current value of a node to one monitored item.
     fn look_at(
         &self,
         subscriptions: &SubscriptionCache,
@@ -488,7 +499,7 @@ impl SpaceNodes {
         let Some((topic, field)) = self.place(node) else {
             return;
         };
-        // Held until it is told, as for any value.
+        // The lock is held until the item is notified, as for every value.
         let values = self.values.read();
         if let Some(shown) = values.get(topic.topic) {
             let (value, _) = self.for_item(handle, &shown.view(&topic, field), &mut None);
@@ -499,7 +510,7 @@ impl SpaceNodes {
         }
     }
 
-    /// The value of a node for one monitored item.
+    /// Returns the value of a node for one monitored item.
     fn answer_item(&self, node: &NodeId, handle: MonitoredItemHandle) -> Option<DataValue> {
         let (topic, field) = self.place(node)?;
         let shown = self.shown(topic.topic);
@@ -534,7 +545,7 @@ impl SpaceNodes {
             let send =
                 |register: &dyn Fn(&[Variant])| self.send_written(context, place, write, register);
             let arrived = self.exits.confirms.write(topic.topic, &rule, send).await?;
-            // It has arrived, whether there is room to show it or not.
+            // The value has arrived, even if there is not enough memory to show it.
             let _shown = self.show(&context.subscriptions, &topic, arrived);
             return Ok(StatusCode::Good);
         }
@@ -569,21 +580,23 @@ impl SpaceNodes {
         Ok(StatusCode::Good)
     }
 
-    /// Has a value sent and shows it.
+    /// Sends a value and shows it.
     fn write_and_show(
         &self,
         context: &RequestContext,
         place: (&TopicNode, Option<usize>),
         (write, awaited): (&ParsedWriteValue, Option<Awaited>),
     ) -> Result<OnItsWay, StatusCode> {
-        // Until it is shown nobody else may write: what is not written stays as it is.
+        // No other write may come between sending and showing, because a write of one field keeps
+        // the current values of the others.
         let _alone = self.writing.lock();
         let (sent, on_its_way) = self.send_alone(context, place, write, (&|_| {}, awaited))?;
         let _shown = self.show(&context.subscriptions, place.0, sent);
         Ok(on_its_way)
     }
 
-    /// As [`send_alone`](Self::send_alone), while nobody else writes; an answer says more than that it has left.
+    /// Calls [`send_alone`](Self::send_alone) with the write lock held. The confirmation replaces
+    /// the result of sending.
     fn send_written(
         &self,
         context: &RequestContext,
@@ -596,8 +609,8 @@ impl SpaceNodes {
         Ok(sent)
     }
 
-    /// Works out all fields of the topic after a write, and has them sent; they are registered before. Gives what is to be
-    /// shown then, and what tells that it has left.
+    /// Computes all fields of the topic after a write, registers and sends them. Returns the value
+    /// to show afterwards, and the pending results of sending. The caller holds the write lock.
     fn send_alone(
         &self,
         context: &RequestContext,
@@ -606,7 +619,7 @@ impl SpaceNodes {
         (register, awaited): Registration<'_>,
     ) -> Result<(Shown, OnItsWay), StatusCode> {
         if self.exits.pubsub.is_off(topic.topic) {
-            // Its writer is disabled, so it would not go out.
+            // The writer of the topic is disabled, so the value would not be sent.
             return Err(StatusCode::BadInvalidState);
         }
         if write
@@ -642,7 +655,7 @@ impl SpaceNodes {
         Ok((Shown { block, stamp }, on_its_way))
     }
 
-    /// Hands a written value to the run loop.
+    /// Passes a written value to the run loop.
     fn send(
         &self,
         topic: &TopicNode,
@@ -676,14 +689,14 @@ impl SpaceNodes {
         self.programs.lock().get(method).cloned()
     }
 
-    /// Calls a method of a Program, which goes on when its client does not.
+    /// Calls a method of a Program. The call continues if its client is lost.
     async fn drive(
         &self,
         context: &RequestContext,
         asked: Drive,
         arguments: &[Variant],
     ) -> Result<Vec<Variant>, Refused> {
-        // Whoever may send goals may.
+        // Clients with permission to send goals may call the method.
         let may = context
             .authenticator
             .is_user_executable(&context.token, &asked.goal);
@@ -709,14 +722,14 @@ impl SpaceNodes {
         })
     }
 
-    /// The past values of a node.
+    /// Returns the past values of a node.
     fn series(&self, node: &NodeId) -> Option<Series> {
         let place = self.place(node).filter(|(topic, _)| topic.historizing)?;
         let kept = self.past.read().of(place.0.topic);
         Some(Series::new(place, kept))
     }
 
-    /// Has each node answered from its past values.
+    /// Answers the request of each node from its past values.
     fn answer_past(
         &self,
         context: &RequestContext,
@@ -747,7 +760,7 @@ impl SpaceNodes {
     }
 }
 
-/// When a client says its value is of, or now.
+/// Returns the source timestamp of a client's value, or the current time.
 fn source_of(value: &DataValue) -> Timestamp {
     let picoseconds = value.source_picoseconds.unwrap_or_default().min(9_999);
     let (time, picoseconds) = match value.source_timestamp {
@@ -760,19 +773,20 @@ fn source_of(value: &DataValue) -> Timestamp {
     }
 }
 
-/// Notes where the values of a topic's nodes are.
+/// Registers the topic and fields of a topic's nodes.
 fn put(places: &mut Places, topic: &TopicNode) {
     let topic = Arc::new(topic.clone());
     let all = topic.places();
     places.extend(all.map(|(node, field)| (node.clone(), (Arc::clone(&topic), field))));
 }
 
-/// Whether a monitored item has no filter. The server keeps the filter's type to itself; it can be printed.
+/// Returns true if a monitored item has no filter. The type of the filter is private in the
+/// library, but it can be printed.
 fn unfiltered(item: &CreateMonitoredItem) -> bool {
     format!("{:?}", item.filter()) == "None"
 }
 
-/// All fields of a topic after a write to it or to one of its fields.
+/// Returns all fields of a topic after a write to the topic or to one of its fields.
 fn new_fields(
     shown: &Shown,
     topic: &TopicNode,
@@ -782,7 +796,7 @@ fn new_fields(
     let current = |field: Option<usize>| {
         let view = shown.view(topic, field);
         let weight = view.weight();
-        // What is written is as large as that, and was taken in.
+        // The written value is as large and was accepted.
         (weight <= LARGEST).then(|| view.data_value(&NumericRange::None).value)?
     };
     let current = |field| current(field).filter(|value| !matches!(value, Variant::Empty));
@@ -823,7 +837,7 @@ fn new_fields(
     }
 }
 
-/// The elements of a Variant array.
+/// Returns the elements of a Variant array.
 fn members(value: Variant) -> Result<Vec<Variant>, StatusCode> {
     let Variant::Array(array) = value else {
         return Err(StatusCode::BadTypeMismatch);
@@ -841,7 +855,7 @@ fn members(value: Variant) -> Result<Vec<Variant>, StatusCode> {
         .collect())
 }
 
-/// Without the timestamps that were not asked for.
+/// Removes the timestamps that were not requested.
 fn stamped(mut value: DataValue, wanted: TimestampsToReturn) -> DataValue {
     if !matches!(
         wanted,
@@ -928,12 +942,13 @@ impl InMemoryNodeManagerImpl for SpaceNodes {
                 item.set_initial_value(value);
             }
             item.set_status(StatusCode::Good);
-            // Every change is reported as it comes, with its own time: the server would put off a value that comes
-            // within the sampling interval, and give it another source timestamp.
+            // Every change is reported on arrival, with its own time. The server would delay a
+            // value that arrives within the sampling interval, and change its source timestamp.
             if item.sampling_interval() > 0.0 {
                 item.revise_sampling_interval(AS_IT_COMES_MS);
             }
-            // A value that comes between this look and the item's being there is only seen by a second look.
+            // A value that arrives between this read and the registration of the item is seen only
+            // by a second check.
             let _missed = self
                 .exits
                 .created
@@ -995,7 +1010,7 @@ impl InMemoryNodeManagerImpl for SpaceNodes {
         nodes: &mut [&mut &mut HistoryNode],
         wanted: TimestampsToReturn,
     ) -> Result<(), StatusCode> {
-        // All of them are the same one.
+        // All aggregates of the request are equal.
         let kind = details
             .aggregate_type
             .as_ref()
@@ -1025,14 +1040,14 @@ impl InMemoryNodeManagerImpl for SpaceNodes {
         methods_to_call: &mut [&mut &mut MethodCall],
     ) -> Result<(), StatusCode> {
         self.genuine.check(context)?;
-        // An answer goes by the channel that the request came by, or not at all.
+        // A response is sent over the secure channel of its request, or not at all.
         let channel = context.session().read().secure_channel_id();
         let gone = || {
             let session = context.session().read();
             !session.is_activated() || session.secure_channel_id() != channel
         };
         let calls = methods_to_call.iter_mut().map(|method| async {
-            // It may have gone since the server looked.
+            // The Method may have been removed after the check of the server.
             let callable = self.methods.lock().get(method.method_id()).cloned();
             let called = match callable {
                 Some(callable) => {
@@ -1068,7 +1083,8 @@ impl InMemoryNodeManagerImpl for SpaceNodes {
     }
 }
 
-/// Looks once more at monitored items some time after they were made, for values that came while they were.
+/// Checks created monitored items again after a delay, for values that arrived while they were
+/// created.
 pub(crate) async fn look_again(
     manager: Arc<SpaceManager>,
     subscriptions: Arc<SubscriptionCache>,
@@ -1091,12 +1107,13 @@ fn now() -> Instant {
     Instant::now()
 }
 
-/// The node manager's name in the server's log.
+/// The name of the node manager in the server's log.
 const NAME: &str = "space";
-/// Counts as no interval at all, yet is above the 0 that the server takes for "not asked for".
+/// A sampling interval that is practically zero, but above the 0 that the server treats as "not
+/// requested".
 const AS_IT_COMES_MS: f64 = 0.000_1;
-/// How long a write may wait for the run loop.
+/// Time limit for a write to be sent by the run loop.
 const LONGEST_WAY_OUT: Duration = Duration::from_secs(10);
 const SECOND_LOOK: Duration = Duration::from_millis(100);
-/// Bytes of all values that are shown.
+/// Size limit of all current values, in bytes.
 const MOST_HELD: usize = 512 << 20;

@@ -1,5 +1,6 @@
-//! The NodeSet2 files that a mapping names, in the address space: their nodes are there as the files have them, and a Variable
-//! or Method of theirs that the mapping has lives.
+//! The NodeSet2 files of a mapping in the address space. Their nodes are added as the files define
+//! them. Variables and Methods that the mapping uses are updated and callable; they are called live
+//! here.
 
 use std::collections::{HashMap, HashSet};
 use std::path::PathBuf;
@@ -22,7 +23,8 @@ use crate::properties::{self, Property};
 /// Reads the files of a mapping for a server that starts.
 ///
 /// # Errors
-/// What is wrong with any of them; the check of the mapping has told all of it, unless a file changed since.
+/// Returns the first fatal error of the files. The check of the mapping has reported all errors,
+/// unless a file changed in the meantime.
 pub(crate) fn read(mapping: &Mapping) -> Result<NodeSets, Failure> {
     let (sets, faults) = NodeSets::read(&mapping.server().nodesets);
     let mut faults = faults.into_iter();
@@ -35,7 +37,7 @@ pub(crate) fn read(mapping: &Mapping) -> Result<NodeSets, Failure> {
     }
 }
 
-/// Gives the namespaces of NodeSets that a server has not yet indexes behind those it has.
+/// Appends the namespaces of NodeSets that the server does not have yet.
 pub(crate) fn add_namespaces(sets: &NodeSets, namespaces: &mut Vec<String>) {
     for uri in sets.provides() {
         if !namespaces.iter().any(|known| known == uri) {
@@ -44,7 +46,7 @@ pub(crate) fn add_namespaces(sets: &NodeSets, namespaces: &mut Vec<String>) {
     }
 }
 
-/// Which files a server runs with: it takes others when it starts.
+/// The NodeSet files of a running server. Other files take effect at the next start.
 pub(crate) struct Running {
     files: Vec<PathBuf>,
     fingerprint: u64,
@@ -58,7 +60,8 @@ impl Running {
         }
     }
 
-    /// What of another mapping takes effect only then, for people.
+    /// Returns the part of another mapping that takes effect at the next start only, as text for
+    /// the operator.
     pub(crate) fn differs(&self, mapping: &Mapping) -> Option<String> {
         let files = &mapping.server().nodesets;
         if *files != self.files {
@@ -70,18 +73,18 @@ impl Running {
     }
 }
 
-/// The nodes of NodeSets, and which of them live.
+/// The nodes of NodeSets, and the live nodes among them.
 #[derive(Default)]
 pub(crate) struct Loaded {
     nodes: HashSet<NodeId>,
     live: Mutex<HashMap<NodeId, Before>>,
-    /// The namespaces that their files describe by NamespaceMetadata.
+    /// The namespaces that the files describe by NamespaceMetadata.
     told: HashSet<String>,
     fault: Option<String>,
     types: DefaultTypeTree,
 }
 
-/// What a node was before it lived.
+/// The state of a node before it became live.
 struct Before {
     folder: NodeId,
     level: AccessLevel,
@@ -91,7 +94,7 @@ struct Before {
 }
 
 impl Loaded {
-    /// Puts the nodes in. What nobody keeps up is not to be written or called.
+    /// Adds the nodes of NodeSets. Nodes that are not live are neither writable nor callable.
     pub(crate) fn put_in(
         sets: &NodeSets,
         address_space: &mut AddressSpace,
@@ -149,22 +152,23 @@ impl Loaded {
         loaded
     }
 
-    /// Why they are not all there.
+    /// Returns the error because of which nodes are missing.
     pub(crate) fn fault(&self) -> Option<&str> {
         self.fault.as_deref()
     }
 
-    /// Whether a NodeSet has the metadata of a namespace.
+    /// Returns true if a NodeSet has the metadata of a namespace.
     pub(crate) fn tell_of(&self, uri: &str) -> bool {
         self.told.contains(uri)
     }
 
-    /// Whether it is a node of a NodeSet.
+    /// Returns true if a node belongs to a NodeSet.
     pub(crate) fn has(&self, node: &NodeId) -> bool {
         self.nodes.contains(node)
     }
 
-    /// Has the Variable of a NodeSet live that a topic has for its node, and stand in `folder` too. `false` where it is none.
+    /// Makes the Variable of a NodeSet live that is the node of a topic, and adds it to `folder`.
+    /// Returns `false` if the node belongs to no NodeSet.
     pub(crate) fn adopt(
         &self,
         address_space: &mut AddressSpace,
@@ -199,7 +203,7 @@ impl Loaded {
         true
     }
 
-    /// Says what the numbers of a Variable mean: in the Property that the NodeSet has for that, or in one of ours.
+    /// Sets a Property of a Variable: the Property of the NodeSet, or else a new Property.
     fn property(
         &self,
         address_space: &mut AddressSpace,
@@ -226,7 +230,8 @@ impl Loaded {
         }
     }
 
-    /// Leaves a Variable to its NodeSet again, and gives what it shows from then on. `None` where it is none that lives.
+    /// Restores the state of a Variable from its NodeSet, and returns its value from then on.
+    /// Returns `None` if the Variable was not live.
     pub(crate) fn release(
         &self,
         address_space: &mut AddressSpace,
@@ -249,7 +254,8 @@ impl Loaded {
         Some(of_now(value.unwrap_or_default()))
     }
 
-    /// Whether a Method of a NodeSet takes and gives so many arguments; `None` where the node is none of theirs.
+    /// Returns true if a Method of a NodeSet has these numbers of arguments. Returns `None` if the
+    /// node belongs to no NodeSet.
     pub(crate) fn suits(
         &self,
         address_space: &AddressSpace,
@@ -278,7 +284,8 @@ impl Loaded {
         Some(is_method && count("InputArguments") == inputs && count("OutputArguments") == outputs)
     }
 
-    /// Has clients call a Method of a NodeSet, or not. `false` where the node is none of theirs.
+    /// Allows or forbids clients to call a Method of a NodeSet. Returns `false` if the node belongs
+    /// to no NodeSet.
     pub(crate) fn let_call(
         &self,
         address_space: &mut AddressSpace,
@@ -309,7 +316,8 @@ impl Loaded {
     }
 }
 
-/// Without the picoseconds that the library adds: there are none, and asyncua takes the times for others with them.
+/// Returns a DataValue without the picoseconds that the library adds. They are meaningless, and
+/// asyncua misreads the timestamps with them.
 fn of_now(value: Variant) -> DataValue {
     DataValue {
         source_picoseconds: None,

@@ -1,5 +1,5 @@
-//! What the cell has of servers that exist already: their Methods as calls, their nodes as values, their skills as those of
-//! components.
+//! Existing OPC UA servers in the cell: their Methods as calls, their nodes as values, and their
+//! skills as skills of components.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -28,7 +28,8 @@ pub(crate) struct Others {
 }
 
 impl Others {
-    /// Those of `mapping`, with the certificates in `pki`; others are heard of where this one is told of.
+    /// Connects to the servers of `mapping`, with the certificates in `pki`. `told` are the
+    /// settings for announcing this server; other servers are discovered in the same way.
     pub(crate) fn new(mapping: &Arc<Mapping>, told: Option<&AnnounceSettings>, pki: &Path) -> Self {
         let mut clients = Clients::new(mapping.server(), pki);
         let lds = told.and_then(|told| told.lds.as_deref());
@@ -50,7 +51,8 @@ impl Others {
         others
     }
 
-    /// Goes over to those of another mapping. Gives the topics whose source is new or another.
+    /// Switches to the servers of another mapping. Returns the topics whose source is new or has
+    /// changed.
     pub(crate) fn reload(&mut self, mapping: &Arc<Mapping>) -> Vec<TopicId> {
         self.mapping = Arc::clone(mapping);
         self.executing.reload(mapping, &mut self.clients);
@@ -61,20 +63,20 @@ impl Others {
         new
     }
 
-    /// Something has happened to a server on the network.
+    /// Handles a change of a server in the network.
     pub(crate) fn heard(&mut self, found: &Found) {
         self.finding.heard(found);
         self.found();
     }
 
-    /// Speaks for servers that are found, and no longer for those that are gone.
+    /// Offers the skills of discovered servers, and withdraws the skills of lost servers.
     pub(crate) fn found(&mut self) {
         if self.look() {
             self.follow();
         }
     }
 
-    /// Whether other servers have a place now.
+    /// Updates the slots of discovered servers. Returns true if they have changed.
     fn look(&mut self) -> bool {
         for name in self.skills.speaking() {
             let mut placed = self.placed.iter();
@@ -92,7 +94,8 @@ impl Others {
         is_new
     }
 
-    /// Speaks for the skills of the servers that the mapping gives a place in the space, and for those that are found.
+    /// Offers the skills of the servers to which the mapping assigns a namespace, and of discovered
+    /// servers.
     fn follow(&mut self) {
         let clients = &mut self.clients;
         let named = self.mapping.servers().iter().filter_map(|server| {
@@ -121,7 +124,7 @@ impl Others {
         self.clients.keep(&self.mapping, found);
     }
 
-    /// What there is to tell of each server.
+    /// Returns the state of the connection to each server.
     pub(crate) fn links(&self) -> Vec<LinkState> {
         let mut links = self.sources.links();
         links.extend(self.placed.iter().map(|placed| self.link(placed)));

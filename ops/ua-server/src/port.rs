@@ -55,19 +55,19 @@ use crate::sources::{self, Sourced};
 use crate::space::Space;
 use crate::structures::Types;
 
-/// What [`ServerPort::start`] needs besides the mapping.
+/// The arguments of [`ServerPort::start`] in addition to the mapping.
 pub(crate) struct Setup {
     pub(crate) url: EndpointUrl,
     pub(crate) pki: Pki,
-    /// The keys that it makes itself.
+    /// The key service of the groups for which this server creates the keys.
     pub(crate) sks: Arc<Sks>,
     pub(crate) trust_any_client: bool,
     pub(crate) types: Types,
-    /// Whether the mapping says the endpoint; else the command line does.
+    /// True if the endpoint comes from the mapping, false if it comes from the command line.
     pub(crate) mapped_url: bool,
-    /// To whom the server is told of.
+    /// Settings for announcing the server.
     pub(crate) announce: Option<AnnounceSettings>,
-    /// The Global Discovery Server that keeps its certificate young.
+    /// The Global Discovery Server that renews the certificate.
     pub(crate) gds: Option<Invitation>,
 }
 
@@ -75,15 +75,16 @@ pub(crate) struct Setup {
 pub(crate) struct ServerPort {
     space: Space,
     handle: ServerHandle,
-    /// The server's own threads: signing for a client takes longer than a value should wait. Taken at the end.
+    /// The server's own threads, because signing for a client takes longer than a value should
+    /// wait. Taken at shutdown.
     runtime: Option<Runtime>,
     serving: Option<JoinHandle<Result<(), String>>>,
     writes: mpsc::Receiver<ClientWrite>,
-    /// The topics clients can write, not yet said to have a producer, or to have none.
+    /// Topics that clients can write, whose start or end of production is not reported yet.
     live: VecDeque<(TopicId, bool)>,
-    /// Topics that are gone, or others now.
+    /// Topics that were removed or replaced.
     unbound: VecDeque<TopicId>,
-    /// As the server was started.
+    /// The namespaces at the start of the server.
     namespaces: Vec<String>,
     nodesets: nodesets::Running,
     described: Server,
@@ -93,29 +94,29 @@ pub(crate) struct ServerPort {
     sks: Arc<Sks>,
     access: Arc<Access>,
     look: Interval,
-    /// Tells of the server until the end. Taken then.
+    /// Announces the server. Taken at shutdown.
     told: Option<Announced>,
     components: Option<Components>,
     /// Calls of other spaces.
     methods: Methods,
     /// Other servers.
     others: Others,
-    /// What is to be reported before anything else.
+    /// Events that are reported before all others.
     events: VecDeque<PortEvent>,
-    /// The PubSub configuration, and how the readers of it are.
+    /// The PubSub configuration, and the state of its readers.
     pubsub: Arc<PubSub>,
     readers: Readers,
-    /// Writes that wait for an answer.
+    /// Writes that wait for a confirmation.
     confirms: Arc<Confirms>,
-    /// The sessions that wrote what is stopped when they are gone.
+    /// The sessions that wrote commands. Their topics are stopped when the session is lost.
     commanders: Commanders,
-    /// Who is told that the write that was reported last has left.
+    /// Notified when the last reported write has been sent.
     leaving: Option<oneshot::Sender<()>>,
-    /// When a publisher that is not heard counts as away.
+    /// Time without messages after which a publisher counts as offline.
     receive_timeout: Duration,
-    /// As the group is told.
+    /// The application as it is described to the group.
     application: Application,
-    /// Its certificates, as clients manage them.
+    /// The certificates of the server, which clients can manage.
     certificates: Arc<Configuration>,
 }
 
@@ -123,8 +124,8 @@ impl ServerPort {
     /// Builds the address space of `mapping` and listens.
     ///
     /// # Errors
-    /// A mapping that cannot be served, an address that cannot be listened on, a certificate store that cannot be
-    /// used.
+    /// Returns an error if the mapping cannot be served, if the address cannot be bound, or if the
+    /// certificate store cannot be used.
     pub(crate) fn start(mapping: &Arc<Mapping>, setup: Setup) -> Result<Self, Failure> {
         let configuration = |error: String| Failure::new(FailureKind::Configuration, error);
         let mut types = setup.types;
@@ -210,13 +211,13 @@ impl ServerPort {
 }
 
 impl ServerPort {
-    /// Carries out what has become of writers and readers that somebody enabled or disabled.
+    /// Applies changes of writers and readers that clients enabled or disabled.
     fn switch(&mut self) {
         for (topic, on) in self.pubsub.switched() {
             if topic.space == SpaceId::UA {
                 self.live.push_back((topic, on));
             } else {
-                // What is shown is no longer kept up.
+                // Values of a disabled reader are not updated.
                 let silent = !on || self.readers.of(topic) == State::Error;
                 self.space.set_silent(topic, silent);
             }
@@ -226,9 +227,9 @@ impl ServerPort {
 
 impl Port for ServerPort {
     async fn recv(&mut self) -> PortEvent {
-        // What was reported before has been carried out.
+        // The event that was reported before has been handled.
         if let Some(gone_out) = self.leaving.take() {
-            // Who wrote may have gone.
+            // The client of the write may be lost.
             let _gone = gone_out.send(());
         }
         self.space.settle();
@@ -270,7 +271,7 @@ impl Port for ServerPort {
                 },
                 () = self.others.finding.changed() => self.others.found(),
                 lost = self.commanders.lost() => {
-                    // The bridges that hear the writer fall silent publish `on_loss`.
+                    // The bridges publish `on_loss` when the writer goes silent.
                     self.live.extend(lost.into_iter().map(|topic| (topic, false)));
                 }
                 () = self.confirms.called() => {
@@ -296,10 +297,11 @@ impl Port for ServerPort {
             return Err("its reader is disabled");
         }
         if sample.kept == Kept::Again {
-            // A variable has one value, and shows the last one.
+            // A variable has one value and shows the last one.
             return Ok(());
         }
-        // Of several values side by side, who comes late hears an older one after the last.
+        // If several values are kept for late joiners, an older value may arrive after the last
+        // one.
         if sample.kept == Kept::Beside && sample.source < self.space.shown(sample.topic) {
             return Ok(());
         }
@@ -364,7 +366,7 @@ impl Port for ServerPort {
     }
 
     fn abandoned(&mut self, execution: ExecutionId, _topic: TopicId) {
-        // A Method that was called goes on.
+        // A Method that was called continues.
         self.others.skills.abandoned(execution);
     }
 
@@ -404,7 +406,7 @@ impl Port for ServerPort {
                 self.live
                     .extend(written(new.into_iter()).map(|topic| (topic, true)));
                 self.pubsub.show(mapping, &layout);
-                // Those that are disabled stay so.
+                // Disabled readers and writers stay disabled.
                 self.switch();
             }
             Err(error) => restart.push(format!("variables ({error})")),
@@ -416,7 +418,7 @@ impl Port for ServerPort {
         for topic in self.others.reload(mapping) {
             let waiting = StatusCode::BadWaitingForInitialData;
             let block = Bytes::from(sources::no_value(waiting));
-            // It is none that there is no room for.
+            // The block has no large value, so there is enough memory.
             let _shown = self.space.update(topic, block, (None, status(waiting)));
         }
         restart
@@ -441,7 +443,7 @@ impl Port for ServerPort {
     async fn shutdown(mut self) {
         self.methods.end();
         if let Some(told) = self.told.take() {
-            // Late: others find out by themselves.
+            // If the time is over, other applications detect the loss themselves.
             let _late = tokio::time::timeout(GOODBYE, told.leave()).await;
         }
         self.handle.cancel();
@@ -457,7 +459,7 @@ impl Port for ServerPort {
 }
 
 impl ServerPort {
-    /// Shows a value of another server, and has it sent.
+    /// Shows a value of another server and sends it.
     fn sourced(&mut self, sourced: Sourced) -> PortEvent {
         let Sourced {
             topic,
@@ -479,7 +481,7 @@ impl ServerPort {
                 status: said,
             };
         };
-        // What the node shows in its place is what others are told.
+        // The group receives the status that the node shows instead of the value.
         let refused = self.space.status(topic);
         self.events.push_back(PortEvent::Lost {
             topic: Some(topic),
@@ -496,7 +498,7 @@ impl ServerPort {
     }
 }
 
-/// The upper half of a StatusCode.
+/// Returns the upper half of a StatusCode.
 fn status(code: StatusCode) -> u16 {
     u16::try_from(code.bits() >> 16).unwrap_or(u16::MAX)
 }
@@ -504,13 +506,13 @@ fn status(code: StatusCode) -> u16 {
 impl Drop for ServerPort {
     fn drop(&mut self) {
         if let Some(runtime) = self.runtime.take() {
-            // A runtime may not be waited for inside another one.
+            // A runtime must not be waited for inside another runtime.
             runtime.shutdown_background();
         }
     }
 }
 
-/// Shows the calls of other spaces.
+/// Creates the Methods for the calls of other spaces.
 fn shown_calls(
     nodes: &(Arc<SpaceManager>, Arc<SubscriptionCache>),
     mapping: &Arc<Mapping>,
@@ -521,7 +523,7 @@ fn shown_calls(
     Methods::new(nodes.clone(), mapping, asked, pki.root())
 }
 
-/// Who the server lets in.
+/// Reads the users of the server.
 fn users(pki: &Pki, address: SocketAddr) -> Result<Arc<Access>, Failure> {
     let folder = pki.root().join(users::FOLDER);
     let access = Access::new(Some(folder), address.ip().is_loopback());
@@ -529,10 +531,10 @@ fn users(pki: &Pki, address: SocketAddr) -> Result<Arc<Access>, Failure> {
     access.map(Arc::new).map_err(faulty)
 }
 
-/// NodeSets to be loaded, and what is remembered of them.
+/// NodeSets to be loaded, and the record of their files.
 type Loading = (NodeSets, nodesets::Running);
 
-/// The nodes of the mapping, and the NodeSets beside them.
+/// Returns the nodes of the mapping and the NodeSets.
 fn laid_out(mapping: &Mapping, types: &mut Types) -> Result<(Layout, Loading), Failure> {
     let configuration =
         |error: LayoutError| Failure::new(FailureKind::Configuration, error.to_string());
@@ -543,7 +545,7 @@ fn laid_out(mapping: &Mapping, types: &mut Types) -> Result<(Layout, Loading), F
     Ok((layout, (sets, running)))
 }
 
-/// Makes the certificate where there is none, and listens.
+/// Creates the certificate if it is missing, and listens.
 fn listen(
     pki: &Pki,
     url: &EndpointUrl,
@@ -564,7 +566,8 @@ fn listen(
     Ok((listener, (address, security)))
 }
 
-/// Says what a server that other hosts reach leaves open to them: what it asks of other programs comes from its own address.
+/// Warns about the access that a server grants to other hosts. Requests that the server sends to
+/// other programs come from its own address.
 fn tell_open(url: &EndpointUrl, described: &Server, security: &[Security]) {
     if security.contains(&Security::None) {
         warn!(
@@ -582,14 +585,14 @@ fn tell_open(url: &EndpointUrl, described: &Server, security: &[Security]) {
     }
 }
 
-/// Has the audit told of who comes in.
+/// Reports logins to the audit.
 fn audit(access: &Access, handle: &ServerHandle) {
     let subscriptions = Arc::clone(handle.subscriptions());
     let server = handle.info().application_uri.as_ref().to_owned();
     access.on_login(move |login| auditing::came_in(login, &server).tell(&subscriptions));
 }
 
-/// The core namespace, with what is carried out and shown of it here.
+/// Builds the core namespace with its methods and values.
 fn core(
     sks: &Arc<Sks>,
     pubsub: &Arc<PubSub>,
@@ -601,7 +604,7 @@ fn core(
     core_with(methods, values, prepared)
 }
 
-/// Has the server say that there is an audit, and how it works out what was.
+/// Sets the Auditing variable of the server and lists the aggregates.
 fn prepared(core: &mut AddressSpace) {
     history::list_aggregates(core);
     let auditing: NodeId = VariableId::Server_Auditing.into();
@@ -611,8 +614,7 @@ fn prepared(core: &mut AddressSpace) {
     }
 }
 
-/// Where the nodes of the PubSub configuration are to stand.
-/// Shows the limits of the server and the PubSub configuration in the address space.
+/// Sets the limits of the node manager, and shows the PubSub configuration in the address space.
 fn show_limits(
     mapping: &Mapping,
     layout: &Layout,
@@ -632,7 +634,7 @@ fn places(handle: &ServerHandle, manager: &Arc<SpaceManager>) -> Places {
     }
 }
 
-/// Has a second look at monitored items that are made.
+/// Starts the second check of created monitored items.
 fn look_at_created(
     runtime: &Runtime,
     (manager, subscriptions): (Arc<SpaceManager>, Arc<SubscriptionCache>),
@@ -649,32 +651,32 @@ fn tell_serving(layout: &Layout, pki: &Pki, (url, port): (&EndpointUrl, u16)) {
     );
 }
 
-/// When to look at certificates that were refused.
+/// Returns the interval of checking refused certificates.
 fn looks() -> Interval {
     let mut look = tokio::time::interval(LOOK_AT_REJECTED);
     look.set_missed_tick_behavior(MissedTickBehavior::Delay);
     look
 }
 
-/// How large what clients write may be, and how much is kept of what was.
+/// Sets the limits of written values and of past values.
 fn limit(nodes: &SpaceNodes, mapping: &Mapping) {
     nodes.limit_writes(largest_write(mapping));
     nodes.limit_past(mapping);
 }
 
-/// What the server tells of its own of what it can do.
+/// Returns the capabilities of the server.
 fn capabilities(described: &Server) -> Vec<(VariableId, Variant)> {
     let limits = endpoint::within(described.limits);
     [history::capabilities(), identity::capabilities(&limits)].concat()
 }
 
-/// The topics that are written from here, as they begin.
+/// Returns the topics that are written here, in their initial state.
 fn live(layout: &Layout) -> VecDeque<(TopicId, bool)> {
     let topics = written(layout.topics.iter().map(|node| node.topic));
     topics.map(|topic| (topic, true)).collect()
 }
 
-/// What leaves the node manager, and the other ends of that.
+/// Creates the channels of the node manager, with their receivers.
 fn exits(mapping: &Mapping, access: &Arc<Access>, pubsub: &Arc<PubSub>) -> (Exits, Entries) {
     let (writes, written) = mpsc::channel(MOST_WRITES);
     let (created, created_items) = mpsc::channel(MOST_CREATED);
@@ -692,14 +694,14 @@ fn exits(mapping: &Mapping, access: &Arc<Access>, pubsub: &Arc<PubSub>) -> (Exit
     (exits, (written, created_items, heard))
 }
 
-/// What clients wrote, the monitored items they made, and what they ask.
+/// The receivers of written values, of created monitored items, and of client calls.
 type Entries = (
     mpsc::Receiver<ClientWrite>,
     mpsc::Receiver<(NodeId, MonitoredItemHandle)>,
     Heard,
 );
 
-/// Ready at that time; never without one.
+/// Waits until a time; pends without a time.
 async fn at(time: Option<Instant>) {
     match time {
         Some(time) => tokio::time::sleep_until(time.into()).await,
@@ -707,7 +709,7 @@ async fn at(time: Option<Instant>) {
     }
 }
 
-/// What happens next to the servers that are there.
+/// Waits for the next event of the servers in the network.
 async fn next(components: &mut Option<Components>) -> Happened {
     match components {
         Some(components) => components.next().await,
@@ -715,7 +717,7 @@ async fn next(components: &mut Option<Components>) -> Happened {
     }
 }
 
-/// Tells of the server where that is asked for, and hears of others where it is announced.
+/// Announces the server if the settings request it, and watches other servers if mDNS is enabled.
 fn tell(
     server: discovery::Server,
     settings: Option<AnnounceSettings>,
@@ -741,7 +743,7 @@ fn tell(
     Ok((Some(told), components))
 }
 
-/// The server as others are told of it, and the group.
+/// Returns the description of the server for discovery and for the group.
 fn told_of(
     described: &Server,
     url: String,
@@ -759,7 +761,7 @@ fn told_of(
     (server, application)
 }
 
-/// The same for the group.
+/// Returns the description of the server for the group.
 fn application(server: &discovery::Server, security: &[Security]) -> Application {
     let ways = security.iter().flat_map(|security| security.ways());
     Application {
@@ -773,18 +775,18 @@ fn application(server: &discovery::Server, security: &[Security]) -> Application
     .talked_to(ways)
 }
 
-/// Bytes of fields that fit a DataSetMessage beside its header.
+/// Returns the largest size of the fields in a DataSetMessage, without its header, in bytes.
 fn largest_write(mapping: &Mapping) -> usize {
     let message = usize::try_from(mapping.pubsub().max_message).unwrap_or(usize::MAX);
     message.saturating_sub(MESSAGE_HEADER)
 }
 
-/// Those topics that clients can write.
+/// Returns the topics that clients can write.
 fn written(topics: impl Iterator<Item = TopicId>) -> impl Iterator<Item = TopicId> {
     topics.filter(|topic| topic.space == SpaceId::UA)
 }
 
-/// Ready, once, when the server has ended by itself.
+/// Waits until the server has ended by itself; ready once.
 async fn ended(serving: &mut Option<JoinHandle<Result<(), String>>>) -> String {
     let Some(running) = serving else {
         return std::future::pending().await;
@@ -813,7 +815,8 @@ impl InMemoryNodeManagerImplBuilder for NodesBuilder {
     }
 }
 
-/// The node manager of the space, held to the indexes of the mapping: the server hands them out itself.
+/// Returns the node manager of the space. The server assigns the namespace indexes itself, so they
+/// are compared with the mapping.
 fn manager(handle: &ServerHandle, layout: &Layout) -> Result<Arc<SpaceManager>, String> {
     let manager = handle
         .node_managers()
@@ -838,18 +841,18 @@ fn manager(handle: &ServerHandle, layout: &Layout) -> Result<Arc<SpaceManager>, 
     Ok(manager)
 }
 
-/// The severity of what is no value, in the upper half of a StatusCode.
+/// The Bad severity in the upper half of a StatusCode.
 const BAD: u16 = 0x8000;
-/// How many values clients wrote wait for the run loop; a client is refused when that many do.
+/// Largest number of written values that wait for the run loop. Further writes are refused.
 const MOST_WRITES: usize = 1_024;
-/// How many KiB all of these may have together.
+/// Size limit of all waiting writes, in KiB.
 const ROOM_FOR_WRITES: usize = 128 << 10;
-/// Bytes that a DataSetMessage has beside its fields, at most.
+/// Largest size of a DataSetMessage without its fields, in bytes.
 const MESSAGE_HEADER: usize = 64;
-/// How many monitored items wait for their second look.
+/// Largest number of monitored items that wait for their second check.
 const MOST_CREATED: usize = 10_000;
 const LOOK_AT_REJECTED: Duration = Duration::from_secs(1);
-/// Within the 2 s a port has to end.
+/// Within the limit of 2 s for the shutdown of a port.
 const SHUTDOWN: Duration = Duration::from_millis(1_500);
-/// Of those, to say goodbye.
+/// Part of [`SHUTDOWN`] for the mDNS goodbye.
 const GOODBYE: Duration = Duration::from_millis(400);

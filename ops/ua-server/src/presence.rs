@@ -1,6 +1,8 @@
-//! Who is there as values of the space: `ua_0_1_<n>` for the component with the number n (`ua_msgs/Component`).
+//! The servers in the network as values of the space: `ua_0_1_<n>` for the component with the
+//! number n (`ua_msgs/Component`).
 //!
-//! Namespace 1 is that of the server's own URI (OPC 10000-5, 6.3.1), so that it is nobody else's.
+//! Namespace 1 is the namespace of the server's own URI (OPC 10000-5, 6.3.1), so no component owns
+//! it.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::time::{SystemTime, UNIX_EPOCH};
@@ -17,30 +19,31 @@ use uadp::BuiltinType;
 
 use crate::value;
 
-/// A server that is told of.
+/// A server whose presence is published.
 #[derive(Debug)]
 struct Told {
     identifier: u16,
-    /// The name it has on the network: another with each port it is started at.
+    /// The name on the network. A component has another name for each port at which it is started.
     name: String,
     online: bool,
 }
 
-/// The values, and what is to be reported of them.
+/// The values, and the events to be reported.
 #[derive(Debug)]
 pub(crate) struct Presence {
-    /// The network the servers are heard of on.
+    /// The network on which the servers are discovered.
     level: String,
-    /// Those that are told of, by who they are.
+    /// The published servers by their identities.
     told: BTreeMap<String, Told>,
-    /// Those of servers without a number, by who they are: they are the same as long as this program runs.
+    /// Identifiers of servers without a number, by their identities. They are stable as long as
+    /// this program runs.
     given: BTreeMap<String, u16>,
     events: VecDeque<PortEvent>,
     told_full: bool,
 }
 
 impl Presence {
-    /// Without anybody, for those that will be heard of on that network.
+    /// Creates an empty state for servers discovered on that network.
     pub(crate) const fn new(level: String) -> Self {
         Self {
             level,
@@ -51,12 +54,13 @@ impl Presence {
         }
     }
 
-    /// The network.
+    /// Returns the network.
     pub(crate) fn level(&self) -> &str {
         &self.level
     }
 
-    /// A server is there, or is so no longer since then. Gives its name in the space.
+    /// Publishes that a server is online, or offline from the given time. Returns its name in the
+    /// space.
     pub(crate) fn show(
         &mut self,
         known: &Known,
@@ -66,7 +70,7 @@ impl Presence {
         let before = self.told.get(who);
         let other = before.filter(|before| before.name != known.name && before.online);
         if let Some(other) = other.filter(|_| !online) {
-            // It is there under another name by now.
+            // The server is online under another name.
             return TopicId::new(0, NAMESPACE, other.identifier);
         }
         let before = before.map(|before| before.identifier);
@@ -74,7 +78,7 @@ impl Presence {
         if let Some(before) = before.filter(|before| *before != identifier) {
             self.withdraw(before);
         }
-        // Whoever is gone gives way to one that is there.
+        // An offline server gives way to an online server.
         let is_new = self.give_way(identifier, who) || before != Some(identifier);
         let told = Told {
             identifier,
@@ -89,7 +93,7 @@ impl Presence {
                 .push_back(PortEvent::Described { topic, description });
             self.events.push_back(PortEvent::Live { topic, live: true });
         }
-        // What is to be said of it and was not yet is no longer true.
+        // Unreported samples of this server are outdated.
         let of_it = |event: &PortEvent| matches!(event, PortEvent::Sample { topic: of, .. } if *of == topic);
         self.events.retain(|event| !of_it(event));
         let fields = fields(known, (online, since), &self.level);
@@ -105,7 +109,7 @@ impl Presence {
         Some(topic)
     }
 
-    /// A server of that name that is gone is not told of any longer.
+    /// Stops publishing an offline server with that name.
     pub(crate) fn forget(&mut self, name: &str) {
         let is_it = |told: &Told| told.name == name && !told.online;
         let gone = self.told.values().filter(|told| is_it(told));
@@ -116,7 +120,7 @@ impl Presence {
         }
     }
 
-    /// What is to be reported next.
+    /// Returns the next event to be reported.
     pub(crate) fn event(&mut self) -> Option<PortEvent> {
         self.events.pop_front()
     }
@@ -127,7 +131,7 @@ impl Presence {
         }
     }
 
-    /// Takes an identifier from one that is gone; whether there was one.
+    /// Takes an identifier from an offline server. Returns true if the identifier was in use.
     fn give_way(&mut self, identifier: u16, to: &str) -> bool {
         let before = self.told.len();
         self.told
@@ -135,8 +139,9 @@ impl Presence {
         self.told.len() < before
     }
 
-    /// What it was where it is only taken back; else its number, where it tells one that no other has that is there; else one
-    /// that is its own from now on.
+    /// Returns the identifier of a server. `before` is kept if the server goes offline. Otherwise
+    /// the identifier is the server's number if no other online server has it, or else an own
+    /// identifier that stays assigned.
     fn identifier(&mut self, known: &Known, before: Option<u16>) -> Option<u16> {
         if before.is_some() {
             return before;
@@ -164,7 +169,7 @@ impl Presence {
     }
 }
 
-/// What a server is told apart by.
+/// Returns the identity of a server.
 fn who(known: &Known) -> &str {
     known.application_uri.as_deref().unwrap_or(&known.name)
 }
@@ -215,7 +220,7 @@ fn fields(known: &Known, (online, since): (bool, SystemTime), level: &str) -> [V
     ]
 }
 
-/// Since 1970.
+/// Returns the seconds since 1970.
 fn seconds(at: SystemTime) -> f64 {
     at.duration_since(UNIX_EPOCH)
         .unwrap_or_default()
@@ -224,7 +229,7 @@ fn seconds(at: SystemTime) -> f64 {
 
 /// The server's own namespace.
 pub(crate) const NAMESPACE: u16 = 1;
-/// Those without a number get theirs from here on.
+/// First identifier of servers without a number.
 const FIRST_GIVEN: u16 = 60_001;
 
 #[cfg(test)]
@@ -258,7 +263,7 @@ mod tests {
         assert_eq!(shown(&mut presence, &known("thief", 7)), FIRST_GIVEN + 1);
         assert_eq!(shown(&mut presence, &known("gripper", 7)), 7);
         assert_eq!(shown(&mut presence, &known("plc", 0)), FIRST_GIVEN);
-        // The gripper is gone: its number is free for whoever is there.
+        // The gripper is offline: its number is free for an online server.
         presence.show(&known("gripper", 7), (false, UNIX_EPOCH));
         assert_eq!(shown(&mut presence, &known("thief", 7)), 7);
     }
@@ -274,7 +279,7 @@ mod tests {
         assert_eq!(shown(&mut presence, &first), 7);
         assert_eq!(shown(&mut presence, &again), 7);
         while presence.event().is_some() {}
-        // The one before is missed only now.
+        // The previous name is reported as lost only after that.
         let topic = presence.show(&first, (false, UNIX_EPOCH));
         assert_eq!(topic.unwrap().triple(), (0, 1, 7));
         assert!(presence.event().is_none(), "it is there");

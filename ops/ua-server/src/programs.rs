@@ -1,9 +1,10 @@
-//! Actions of other spaces as Programs (OPC 10000-10): a client starts one with a goal, and watches and halts it, without a
-//! word of goals and their ids.
+//! Actions of other spaces as Programs (OPC 10000-10). A client starts a Program with a goal,
+//! watches and halts it, without knowing goals and their ids.
 //!
-//! A Program stands under the dotted name of its action below the folder `Programs`, while all three calls of the action are
-//! there. It is Ready at first and after success, Halted after anything else. Others may send goals of the same action
-//! meanwhile: it shows its own only.
+//! A Program has the dotted name of its action below the folder `Programs`. It exists while all
+//! three calls of the action exist. A Program is Ready at first and after success, and Halted after
+//! every other end. Other callers may send goals of the same action in the meantime; the Program
+//! shows its own goals only.
 
 mod nodes;
 mod run;
@@ -33,9 +34,9 @@ pub(crate) struct Programs {
     subscriptions: Arc<SubscriptionCache>,
     /// The calls that are parts of actions.
     parts: HashMap<TopicId, Arc<CallDescription>>,
-    /// By the calls that send goals.
+    /// The Programs, by the calls that send goals.
     shown: HashMap<TopicId, Shown>,
-    /// Whose feedback each value is.
+    /// The action of each feedback topic.
     feedback: HashMap<TopicId, TopicId>,
     /// The Programs that need a Reset.
     unknown: Arc<UnknownOutcomes>,
@@ -44,13 +45,13 @@ pub(crate) struct Programs {
 
 struct Shown {
     run: Arc<Run>,
-    /// The objects around it, the outermost first.
+    /// The parent objects, outermost first.
     around: Vec<NodeId>,
     feedback: Option<TopicId>,
 }
 
 impl Programs {
-    /// Keeps the Programs that need a Reset in a file below `root`.
+    /// Creates the Programs. Programs that need a Reset are stored in a file below `root`.
     pub(crate) fn new(
         manager: Arc<SpaceManager>,
         subscriptions: Arc<SubscriptionCache>,
@@ -73,7 +74,7 @@ impl Programs {
         }
     }
 
-    /// Takes note of a call. One that is no part of an action is none of ours.
+    /// Registers a call. A call that is not a part of an action is ignored.
     pub(crate) fn known(
         &mut self,
         topic: TopicId,
@@ -142,7 +143,7 @@ impl Programs {
         self.shown.insert(goal, shown);
     }
 
-    /// Takes a call away, and the Program of which it was a part. What that was at has ended for its clients.
+    /// Removes a call and its Program. The current goal of the Program ends for its clients.
     pub(crate) fn gone(&mut self, topic: TopicId) {
         let Some(part) = self.parts.remove(&topic) else {
             return;
@@ -171,20 +172,20 @@ impl Programs {
         nodes.remove(&around.collect::<Vec<_>>());
     }
 
-    /// The Programs whose goals are being cancelled and have not ended, a line each.
+    /// Returns a line for each Program whose goal is being cancelled and has not ended.
     pub(crate) fn pending(&self) -> Vec<String> {
         let all = self.shown.values();
         all.filter_map(|shown| shown.run.pending()).collect()
     }
 
-    /// Ends all Programs with the server.
+    /// Ends all Programs when the server stops.
     pub(crate) fn end(&self) {
         for shown in self.shown.values() {
             shown.run.leave(run::ENDS);
         }
     }
 
-    /// Shows what an action reports of a goal, if that is a Program's.
+    /// Shows the feedback of an action, if its goal belongs to a Program.
     pub(crate) fn reported(&self, topic: TopicId, block: &[u8]) {
         let goal = self.feedback.get(&topic);
         if let Some(shown) = goal.and_then(|goal| self.shown.get(goal)) {
@@ -193,7 +194,8 @@ impl Programs {
     }
 }
 
-/// The node of the Method that sends goals: who may call it may drive the Program.
+/// Returns the node of the Method that sends goals. Clients with permission to call the Method may
+/// control the Program.
 fn goal_node(goal: TopicId, nodes: &crate::nodes::SpaceNodes) -> NodeId {
     let methods = nodes.methods().lock();
     let mut all = methods.iter();
@@ -201,7 +203,7 @@ fn goal_node(goal: TopicId, nodes: &crate::nodes::SpaceNodes) -> NodeId {
     found.map_or_else(|| address::unmapped_call(goal), |(node, _)| node.clone())
 }
 
-/// The call that sends the goals of the action that a call is a part of.
+/// Returns the call that sends the goals of the action to which a call belongs.
 fn goal_of(topic: TopicId, role: CallRole) -> Option<TopicId> {
     match role {
         CallRole::Call => None,
@@ -210,7 +212,7 @@ fn goal_of(topic: TopicId, role: CallRole) -> Option<TopicId> {
     }
 }
 
-/// The topic of another DataSetWriterId in the same namespace.
+/// Returns the topic of another DataSetWriterId in the same namespace.
 fn beside(topic: TopicId, id: u16) -> Option<TopicId> {
     let (space, namespace, _) = topic.triple();
     TopicId::new(space, namespace, id)
@@ -218,5 +220,6 @@ fn beside(topic: TopicId, id: u16) -> Option<TopicId> {
 
 /// The file of the Programs that need a Reset.
 const UNKNOWN: &str = "programs-to-reset";
-/// Calls that are parts of actions: anybody in the space can announce some.
+/// Largest number of calls of actions. The limit exists because every participant of the space can
+/// announce calls.
 const MOST_PARTS: usize = 3 * 256;

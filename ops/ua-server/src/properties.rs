@@ -1,4 +1,5 @@
-//! The Properties that say what the numbers of a variable mean (OPC 10000-8, 5.3.2, and OPC 10000-3, 5.8.3).
+//! The Properties that describe the values of a variable (OPC 10000-8, 5.3.2, and OPC 10000-3,
+//! 5.8.3).
 
 use mappings::Unit;
 use opcua::nodes::VariableBuilder;
@@ -10,14 +11,14 @@ use opcua::types::{
 
 use crate::layout::{TopicNode, component};
 
-/// The nodes that a topic may have of them.
+/// Returns the Property nodes that a topic may have.
 pub(crate) fn nodes(topic: &TopicNode) -> impl Iterator<Item = NodeId> {
     // Below a compound these are the names of fields.
     let names: &'static [&'static str] = if topic.compound { &[] } else { &NAMES };
     names.iter().map(move |name| component(&topic.node, name))
 }
 
-/// One of them.
+/// A Property of a variable.
 pub(crate) struct Property {
     pub(crate) name: &'static str,
     data_type: DataTypeId,
@@ -26,7 +27,7 @@ pub(crate) struct Property {
 }
 
 impl Property {
-    /// Adds it to a node.
+    /// Adds the Property to a node.
     pub(crate) fn insert(self, address_space: &mut AddressSpace, node: &NodeId) {
         VariableBuilder::new(
             &component(node, self.name),
@@ -42,14 +43,14 @@ impl Property {
     }
 }
 
-/// Adds those that the mapping has of the one value of a topic.
+/// Adds the Properties of a topic with a single value, as the mapping defines them.
 pub(crate) fn add(address_space: &mut AddressSpace, topic: &TopicNode) {
     each(topic, &mut |property| {
         property.insert(address_space, &topic.node)
     });
 }
 
-/// Those that the mapping has of the one value of a topic.
+/// Passes each Property of a topic to `with`, as the mapping defines them.
 pub(crate) fn each(topic: &TopicNode, with: &mut dyn FnMut(Property)) {
     let meaning = &topic.meaning;
     let mut add = |name, data_type, rank, value| {
@@ -108,7 +109,7 @@ pub(crate) fn each(topic: &TopicNode, with: &mut dyn FnMut(Property)) {
     }
 }
 
-/// Whether the numbers are in the range that the mapping has of the one value of a topic.
+/// Returns true if the values are within the range that the mapping defines for the topic.
 pub(crate) fn are_within(topic: &TopicNode, values: &[Variant]) -> bool {
     let Some((low, high)) = topic.meaning.range() else {
         return true;
@@ -121,7 +122,7 @@ pub(crate) fn are_within(topic: &TopicNode, values: &[Variant]) -> bool {
     })
 }
 
-/// What is no number is in every range.
+/// Values that are not numbers are within every range.
 fn is_within(value: &Variant, (low, high): (f64, f64)) -> bool {
     let number = value.as_f64();
     number.is_none_or(|number| (low..=high).contains(&number))

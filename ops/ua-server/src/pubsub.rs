@@ -1,8 +1,10 @@
-//! The PubSub configuration in the address space (OPC 10000-14, 9.1): below the object PublishSubscribe stand the one
-//! connection of the program, a WriterGroup for each namespace it writes in, a ReaderGroup for each it hears, and a
-//! DataSetWriter or DataSetReader for each value of the mapping, with their states and counters; and a file that says it all.
+//! The PubSub configuration in the address space (OPC 10000-14, 9.1). The object PublishSubscribe
+//! has the connection of the program, a WriterGroup for each namespace it writes, a ReaderGroup for
+//! each namespace it reads, and a DataSetWriter or DataSetReader for each variable of the mapping.
+//! The components have states and counters, and a file contains the whole configuration.
 //!
-//! One lock guards the states; with it held the address spaces are written, one after the other.
+//! One lock guards the states. The address spaces are written while it is held, one after the
+//! other.
 
 mod counts;
 mod file;
@@ -36,23 +38,23 @@ use self::states::{Change, States};
 use crate::layout::Layout;
 use crate::nodes::SpaceManager;
 
-/// The configuration as it stands in the address spaces.
+/// The configuration in the address spaces.
 pub(crate) struct PubSub {
     inner: Mutex<Inner>,
-    /// The topics that are neither sent nor taken now.
+    /// The topics whose writer or reader is off.
     off: RwLock<HashSet<TopicId>>,
-    /// Somebody has enabled or disabled something.
+    /// Notified when a client has enabled or disabled a component.
     called: Notify,
-    /// Once there are any.
+    /// Set when the nodes exist.
     places: OnceLock<Places>,
-    /// Those that have the configuration open as a file. No other lock is held when this one is taken.
+    /// The open handles of the configuration file. No other lock is held when this lock is taken.
     file: Mutex<Handles>,
 }
 
-/// Where the nodes are, and who is told of them.
+/// The node managers of the nodes, and their subscriptions.
 #[derive(Clone)]
 pub(crate) struct Places {
-    /// Those of the object PublishSubscribe itself.
+    /// The node manager of the object PublishSubscribe itself.
     pub(crate) core: Option<Arc<CoreNodeManager>>,
     pub(crate) space: Arc<SpaceManager>,
     pub(crate) subscriptions: Arc<SubscriptionCache>,
@@ -62,18 +64,18 @@ pub(crate) struct Places {
 struct Inner {
     states: States,
     parts: Vec<Part>,
-    /// By the nodes of their methods.
+    /// The methods of components by their nodes.
     methods: HashMap<NodeId, (usize, Ask)>,
-    /// The nodes of all of them.
+    /// The nodes of all components.
     made: Vec<NodeId>,
-    /// What has become of topics since somebody asked: whether they are sent, or taken.
+    /// Topics that were switched on or off and not yet returned by [`PubSub::switched`].
     switched: HashMap<TopicId, bool>,
-    /// What all of it is as a file.
+    /// The configuration as a file.
     content: Content,
 }
 
 impl Inner {
-    /// What somebody has disabled.
+    /// Returns the components that clients have disabled.
     fn disabled(&self) -> HashSet<Kind> {
         let parts = self.parts.iter().enumerate();
         let disabled = parts.filter(|(at, _)| !self.states.is_enabled(*at));
@@ -87,12 +89,13 @@ struct Part {
     parent: Option<usize>,
     state: NodeId,
     diagnostics: Option<Diagnostics>,
-    /// Of a group: how many are below it, and how many of those are operational, as it is shown.
+    /// The number of components below a group, and the number of operational components among them,
+    /// as they are shown. `None` for other components.
     live: Option<([NodeId; 2], [u16; 2])>,
     counts: Counts,
 }
 
-/// What a component is.
+/// The kind of a component.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 enum Kind {
     Whole,
@@ -103,7 +106,7 @@ enum Kind {
     Reader(TopicId),
 }
 
-/// What a client asks of a component.
+/// A method call for a component.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Ask {
     Enable,
@@ -122,7 +125,7 @@ impl PubSub {
         }
     }
 
-    /// The methods of the object PublishSubscribe itself.
+    /// Returns the methods of the object PublishSubscribe itself.
     pub(crate) fn methods(self: &Arc<Self>) -> Vec<CoreMethod> {
         let status: NodeId = ObjectId::PublishSubscribe_Status.into();
         let diagnostics: NodeId = ObjectId::PublishSubscribe_Diagnostics.into();
@@ -155,7 +158,7 @@ impl PubSub {
         methods
     }
 
-    /// Has the nodes stand there from now on.
+    /// Sets the node managers and adds the missing methods of PublishSubscribe.
     pub(crate) fn stand(&self, places: Places) {
         if let Some(core) = &places.core {
             let mut address_space = core.address_space().write();
@@ -169,7 +172,8 @@ impl PubSub {
         drop(self.places.set(places));
     }
 
-    /// Shows the configuration of a mapping, in the place of the one before. What was disabled and is there again stays so.
+    /// Shows the configuration of a mapping, replacing the previous configuration. Disabled
+    /// components that still exist stay disabled.
     pub(crate) fn show(&self, mapping: &Mapping, layout: &Layout) {
         let Some(places) = self.places.get() else {
             return;
@@ -201,7 +205,7 @@ impl PubSub {
         self.show_file();
     }
 
-    /// Whether a client means a method of a component, and if so what becomes of it.
+    /// Calls a method of a component. Returns `None` if the node is no such method.
     pub(crate) fn call(&self, method: &NodeId, user: &str) -> Option<StatusCode> {
         let asked = self.inner.lock().methods.get(method).copied()?;
         Some(self.ask(asked, user).err().unwrap_or(StatusCode::Good))
@@ -234,22 +238,22 @@ impl PubSub {
         Ok(())
     }
 
-    /// Waits until something was enabled or disabled; cancel-safe.
+    /// Waits until a component was enabled or disabled. Cancel-safe.
     pub(crate) async fn called(&self) {
         self.called.notified().await;
     }
 
-    /// What has become of topics since this was asked last: whether they are sent, or taken.
+    /// Returns the topics that were switched on or off after the previous call.
     pub(crate) fn switched(&self) -> Vec<(TopicId, bool)> {
         self.inner.lock().switched.drain().collect()
     }
 
-    /// Whether a topic is neither sent nor taken.
+    /// Returns true if the writer or reader of a topic is off.
     pub(crate) fn is_off(&self, topic: TopicId) -> bool {
         self.off.read().contains(&topic)
     }
 
-    /// Takes in how the readers are, and what was counted of each topic.
+    /// Updates the states of the readers and the counters of each topic.
     pub(crate) fn look(&self, readers: &Readers, router: &Router) {
         self.tidy_file();
         let counted: HashMap<TopicId, &Counters> = router.topics().collect();
@@ -285,7 +289,7 @@ impl PubSub {
         self.show_counts(inner);
     }
 
-    /// Works the states out anew, and shows and carries out what is other than before.
+    /// Computes all states, then shows and applies the changes.
     fn settle(&self, inner: &mut Inner) {
         let changes = inner.states.settle();
         if changes.is_empty() {
@@ -367,7 +371,7 @@ impl PubSub {
         self.write(changes);
     }
 
-    /// Shows values of variables of the core namespace and of ours.
+    /// Shows values of variables of the core namespace and of the own namespace.
     fn write(&self, values: Vec<(NodeId, Variant)>) {
         let Some(places) = self.places.get() else {
             return;
@@ -383,7 +387,7 @@ impl PubSub {
     }
 }
 
-/// Whether something is sent or taken in that state.
+/// Returns true if messages are sent or received in that state.
 const fn is_on(state: State) -> bool {
     !matches!(state, State::Disabled | State::Paused)
 }
@@ -413,7 +417,7 @@ fn write(
     );
 }
 
-/// Methods of the object PublishSubscribe that the library leaves out, as they are optional.
+/// Optional methods of the object PublishSubscribe that the library omits.
 const WHOLE: [(MethodId, &str); 2] = [
     (MethodId::PublishSubscribe_Status_Enable, "Enable"),
     (MethodId::PublishSubscribe_Status_Disable, "Disable"),

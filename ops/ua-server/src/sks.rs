@@ -1,7 +1,8 @@
-//! The server as the Security Key Service of the cell (OPC 10000-14, 8.3): it makes the keys of groups, replaces them as
-//! time goes by, and hands them out over encrypted sessions to those that are to have them.
+//! The server as the Security Key Service of the cell (OPC 10000-14, 8.3). It creates and rotates
+//! the keys of groups, and distributes them over encrypted sessions to authorized clients.
 //!
-//! Keys stand in a file beside the private key of the server: after a restart everybody goes on with the same ones.
+//! The keys are stored in a file beside the private key of the server. After a restart the same
+//! keys remain in use.
 
 mod ring;
 mod store;
@@ -24,7 +25,7 @@ use uadp::SecurityPolicy;
 use self::ring::{Handed, Ring};
 use self::store::Store;
 
-/// Makes keys and hands them out. Where the mapping has no group of its own it has none.
+/// Creates and distributes keys. It is empty if the mapping has no group with own keys.
 #[derive(Debug)]
 pub(crate) struct Sks {
     state: Mutex<State>,
@@ -53,7 +54,8 @@ struct Members {
 }
 
 impl Sks {
-    /// One that keeps its keys in `file`, which is not looked at before there is a group.
+    /// Creates a service that stores its keys in `file`. The file is not opened before there is a
+    /// group.
     pub(crate) const fn new(file: PathBuf) -> Self {
         Self {
             state: Mutex::new(State {
@@ -63,10 +65,10 @@ impl Sks {
         }
     }
 
-    /// Makes the keys of the groups of a mapping from now on, and of no others.
+    /// Sets the groups of a mapping as the groups whose keys are created.
     ///
     /// # Errors
-    /// The file with the keys cannot be used.
+    /// Returns an error if the file with the keys cannot be used.
     pub(crate) fn follow(&self, mapping: &Mapping) -> Result<(), Failure> {
         let unusable = |error: String| Failure::new(FailureKind::Io, error);
         let wanted: Vec<(&SecurityGroup, &Served)> =
@@ -76,7 +78,7 @@ impl Sks {
         let now = now();
         if !wanted.is_empty() && state.groups.is_empty() {
             state.load(now).map_err(unusable)?;
-            // By the lifetimes they had.
+            // The previous lifetimes apply to the stored keys.
             state.renew(now).map_err(unusable)?;
         }
         if wanted.is_empty() && state.groups.is_empty() {
@@ -108,7 +110,7 @@ impl Sks {
         state.renew(now).map_err(unusable)
     }
 
-    /// The methods by which clients ask.
+    /// Returns the methods of the key service.
     pub(crate) fn methods(self: &Arc<Self>) -> Vec<CoreMethod> {
         let sks = Arc::clone(self);
         let handler: Arc<dyn MethodHandler> =
@@ -125,7 +127,7 @@ impl Sks {
         )]
     }
 
-    /// GetSecurityKeys, OPC 10000-14, 8.3.2.
+    /// Executes GetSecurityKeys (OPC 10000-14, 8.3.2).
     fn get_security_keys(&self, request: &MethodRequest) -> Result<Vec<Variant>, Refusal> {
         let [
             Variant::String(group),
@@ -184,7 +186,7 @@ impl Sks {
         state.of(group, wanted).ok_or(StatusCode::BadNotFound)
     }
 
-    /// The keys of a group for this program itself.
+    /// Returns the keys of a group for this program itself.
     fn own(&self, group: &str) -> Result<Fetched, String> {
         let mut state = self.state.lock();
         let (policy, handed) = state
@@ -201,7 +203,7 @@ impl Sks {
 }
 
 impl State {
-    /// Takes up the keys of a run before.
+    /// Loads the keys of the previous run.
     fn load(&mut self, now: Now) -> Result<(), String> {
         for (id, policy, ring) in self.store.load(now)? {
             let members = Members::default();
@@ -217,7 +219,8 @@ impl State {
         Ok(())
     }
 
-    /// Makes the keys whose time comes next. None is used that would be another one after a restart.
+    /// Creates the next keys. New keys are used only after they are stored, because other keys
+    /// would be created after a restart.
     fn renew(&mut self, now: Now) -> Result<(), String> {
         let mut changed = false;
         let mut before = Vec::new();
@@ -256,14 +259,15 @@ impl State {
 }
 
 impl Group {
-    /// Returns whether a client gets the keys: by the ApplicationUri in its certificate, whatever its user.
+    /// Returns true if a client gets the keys: the ApplicationUri of its certificate decides,
+    /// whatever its user.
     fn has(&self, caller: &Caller) -> bool {
         caller.proven && self.members.contains(&caller.application_uri)
     }
 }
 
 impl Members {
-    /// Returns whether an ApplicationUri is listed, or that of a program of the cell.
+    /// Returns true if an ApplicationUri is listed or belongs to a program of the cell.
     fn contains(&self, uri: &str) -> bool {
         let is_listed = |member: &String| match member.strip_suffix('*') {
             Some(start) => uri.starts_with(start),
@@ -278,7 +282,8 @@ impl Members {
     }
 }
 
-/// How the server itself gets keys: its own from itself, those of others as everybody does.
+/// Fetches keys for the server: keys of its own groups from itself, other keys from their key
+/// services.
 #[derive(Debug)]
 pub(crate) struct ServerKeys {
     pub(crate) own: Arc<Sks>,
@@ -294,7 +299,7 @@ impl KeyService for ServerKeys {
     }
 }
 
-/// A group whose keys this server makes.
+/// Returns a group whose keys this server creates.
 fn served(group: &SecurityGroup) -> Option<(&SecurityGroup, &Served)> {
     match group.keys.as_ref()? {
         KeySource::Own(served) => Some((group, served)),

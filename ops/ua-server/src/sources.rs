@@ -1,7 +1,8 @@
-//! Nodes of servers that exist already, as values of the cell: what comes from them, and what is written to them.
+//! Nodes of existing OPC UA servers as values of the cell, read from and written to these servers.
 //!
-//! Each server has two tasks of its own: `reading` watches over its subscriptions and `writing` empties what waits for it. A
-//! server that is away makes its values bad and nothing else; it is connected to again for ever, so it may boot after us.
+//! Each server has two tasks: `reading` monitors its subscriptions and `writing` empties its
+//! outbox. If a server is offline, its values are bad, without any other effect. The connection is
+//! retried without limit, so a server may start after this program.
 
 mod outbox;
 mod reading;
@@ -24,10 +25,10 @@ use self::state::State;
 use crate::clients::Clients;
 use crate::value;
 
-/// What a node of another server is worth at one moment.
+/// A value of a node of another server.
 pub(crate) struct Sourced {
     pub(crate) topic: TopicId,
-    /// The fields of the DataSet; a StatusCode in place of a value that is bad.
+    /// The fields of the DataSet; a StatusCode in place of a bad value.
     pub(crate) block: Bytes,
     pub(crate) taken: Timestamp,
     pub(crate) status: StatusCode,
@@ -36,17 +37,17 @@ pub(crate) struct Sourced {
 /// The servers of the mapping.
 pub(crate) struct Sources {
     servers: HashMap<String, Running>,
-    /// In the order of the mapping.
+    /// Names of the servers in the order of the mapping.
     order: Vec<String>,
-    /// Who comes from where.
+    /// The topics that are read from servers.
     reads: HashMap<TopicId, Arc<Read>>,
-    /// Who goes where.
+    /// The topics that are written to servers.
     writes: HashMap<TopicId, Arc<Outbox>>,
     heard: mpsc::Receiver<News>,
     tell: mpsc::Sender<News>,
 }
 
-/// A variable that comes from a node.
+/// A variable that is read from a node.
 #[derive(Debug, PartialEq)]
 struct Read {
     topic: TopicId,
@@ -54,7 +55,7 @@ struct Read {
     source: NodeSource,
 }
 
-/// A variable that goes to a node.
+/// A variable that is written to a node.
 #[derive(Debug, PartialEq)]
 struct Write {
     topic: TopicId,
@@ -63,14 +64,14 @@ struct Write {
     overflow: Overflow,
 }
 
-/// What is wanted of one server.
+/// The variables of one server.
 #[derive(Debug, Default, PartialEq)]
 struct Plan {
     reads: Vec<Arc<Read>>,
     writes: Vec<Arc<Write>>,
 }
 
-/// One server, as it is used.
+/// A server in use.
 struct Running {
     access: Access,
     plan: watch::Sender<Arc<Plan>>,
@@ -87,14 +88,14 @@ impl Drop for Running {
     }
 }
 
-/// What is new of a variable.
+/// A new value of a variable.
 struct News {
     read: Arc<Read>,
     value: DataValue,
 }
 
 impl Sources {
-    /// The servers of `mapping`, from now on.
+    /// Starts the tasks of the servers of `mapping`.
     pub(crate) fn new(mapping: &Mapping, clients: &mut Clients) -> Self {
         let (tell, heard) = mpsc::channel(MOST_NEWS);
         let mut sources = Self {
@@ -109,8 +110,8 @@ impl Sources {
         sources
     }
 
-    /// Goes over to another mapping: what both say alike goes on undisturbed. Gives the topics whose source is new or another,
-    /// which show nothing yet.
+    /// Switches to another mapping; unchanged variables stay undisturbed. Returns the topics whose
+    /// source is new or has changed, which have no value yet.
     pub(crate) fn reload(&mut self, mapping: &Mapping, clients: &mut Clients) -> Vec<TopicId> {
         let plans = self.plans(mapping);
         let named = |name: &String| mapping.servers().iter().find(|one| one.name == *name);
@@ -166,7 +167,7 @@ impl Sources {
         new
     }
 
-    /// What is wanted of each server; what was wanted before is the same object.
+    /// Returns the variables of each server. Unchanged variables keep their object.
     fn plans(&self, mapping: &Mapping) -> Vec<Plan> {
         let names = mapping.servers().iter().zip(0..);
         let places: HashMap<&str, usize> = names
@@ -230,7 +231,7 @@ impl Sources {
         }
     }
 
-    /// What comes next of any server. Cancel-safe.
+    /// Waits for the next value of any server. Cancel-safe.
     pub(crate) async fn next(&mut self) -> Sourced {
         loop {
             let Some(News { read, value }) = self.heard.recv().await else {
@@ -243,35 +244,37 @@ impl Sources {
         }
     }
 
-    /// A value of the cell, which goes on to another server where the mapping says so.
+    /// Forwards a value of the cell to another server, if the mapping requests it.
     pub(crate) fn put(&self, topic: TopicId, block: &[u8]) {
         if let Some(outbox) = self.writes.get(&topic) {
             outbox.put(topic, block);
         }
     }
 
-    /// A value that a client wrote. `answer` takes the result of the other server, and is dropped where there is none.
+    /// Forwards a value that a client wrote. `answer` receives the result of the other server, and
+    /// is dropped if there is no such server.
     pub(crate) fn write(&self, topic: TopicId, block: &[u8], answer: oneshot::Sender<StatusCode>) {
         if let Some(outbox) = self.writes.get(&topic) {
             outbox.write(topic, block, answer);
         }
     }
 
-    /// The writer of a value is not heard: what it said is not said again to a server that comes back.
+    /// Handles that the writer of a value is silent: its last value is not repeated to a server
+    /// that reconnects.
     pub(crate) fn set_silent(&self, topic: TopicId) {
         if let Some(outbox) = self.writes.get(&topic) {
             outbox.forget(topic);
         }
     }
 
-    /// What there is to tell of each server.
+    /// Returns the state of the connection to each server.
     pub(crate) fn links(&self) -> Vec<LinkState> {
         let running = self.order.iter().filter_map(|name| self.servers.get(name));
         running.map(|running| running.state.told()).collect()
     }
 }
 
-/// A value of a server in the form of the cell.
+/// Converts a value of a server into a value of the cell.
 fn sourced(topic: TopicId, value: &DataValue) -> Sourced {
     let time = value.source_timestamp.or(value.server_timestamp);
     let taken = match time {
@@ -307,12 +310,13 @@ fn sourced(topic: TopicId, value: &DataValue) -> Sourced {
     }
 }
 
-/// The fields of a value that is none, with the reason in its place (OPC 10000-14, 7.2.4.5.5).
+/// Returns the fields of a missing value, with the status in its place (OPC 10000-14, 7.2.4.5.5).
 pub(crate) fn no_value(status: StatusCode) -> Vec<u8> {
     value::fields_block(&[Variant::StatusCode(status)]).unwrap_or_default()
 }
 
-/// Whether a value means here what it means at its server: structures and NodeIds are of that server's namespaces.
+/// Returns true if a value has the same meaning here as at its server. Structures and NodeIds
+/// depend on the namespaces of that server.
 fn is_carried(value: &Variant) -> bool {
     let known = |node: &NodeId| node.namespace == 0;
     match value {
@@ -346,7 +350,7 @@ fn is_carried(value: &Variant) -> bool {
     }
 }
 
-/// The one value in the fields of a DataSet; `None` where there is none, or several.
+/// Returns the single value in the fields of a DataSet, or `None` if there is no value or several.
 fn one_value(block: &[u8]) -> Option<Variant> {
     let mut fields = Fields::parse(block).ok()?;
     if fields.len() != 1 {
@@ -357,7 +361,8 @@ fn one_value(block: &[u8]) -> Option<Variant> {
     (!matches!(value, Variant::Empty)).then_some(value)
 }
 
-/// What the servers said, waiting for the run loop. Beyond it they are heard later, and keep what their queues hold.
+/// Largest number of values that wait for the run loop. Beyond it, reading is delayed and values
+/// stay in the queues of the servers.
 const MOST_NEWS: usize = 1_024;
 
 #[cfg(test)]
@@ -407,7 +412,7 @@ mod tests {
         let failed = StatusCode::BadSensorFailure;
         assert_eq!(bad(Some(Variant::Double(7.0)), Some(failed)), failed);
         assert_eq!(bad(None, None), StatusCode::BadNoData);
-        // It is of that server's namespaces.
+        // The NodeId depends on the namespaces of that server.
         let node = Variant::from(NodeId::new(3, "x"));
         assert_eq!(
             bad(Some(node), None),

@@ -98,8 +98,8 @@ impl Space {
         }
     }
 
-    /// Goes over to the nodes of another layout: those that are the same in both keep their values. Returns the topics
-    /// that are gone or other ones now, and those that are new or other ones.
+    /// Goes over to the nodes of another layout: those that are the same in both keep their values.
+    /// Returns the topics that are gone or other ones now, and those that are new or other ones.
     pub(crate) fn exchange(&mut self, layout: &Layout) -> (Vec<TopicId>, Vec<TopicId>) {
         self.exchange_structures(&layout.structures);
         self.manager.inner().set_order(layout);
@@ -164,13 +164,13 @@ impl Space {
         self.manager.inner().limit_writes(largest);
     }
 
-    /// Takes in a sample: the fields of its DataSet as a key frame carries them. One that cannot be shown leaves a status
-    /// that says why in the place of the value before it, which is no longer true either. Whose nodes had to go
-    /// for its own says [`take_gave_way`](Self::take_gave_way).
+    /// Takes in a sample: the fields of its DataSet as a key frame carries them. One that cannot be
+    /// shown leaves a status that says why in the place of the value before it, which is no longer
+    /// true either. Whose nodes had to go for its own says [`take_gave_way`](Self::take_gave_way).
     ///
     /// # Errors
-    /// Why it is not shown: fields that are malformed or not those of the mapping, no memory, or too many unmapped
-    /// topics.
+    /// Why it is not shown: fields that are malformed or not those of the mapping, no memory, or
+    /// too many unmapped topics.
     pub(crate) fn update(
         &mut self,
         topic: TopicId,
@@ -239,8 +239,8 @@ impl Space {
         self.manager.inner().shown(topic).stamp.source
     }
 
-    /// Marks the last value of a topic as no longer kept up, or as kept up again. The value and its source timestamp
-    /// stay (OPC 10000-8, 6.3.2); a topic that never had one goes on waiting.
+    /// Marks the last value of a topic as no longer kept up, or as kept up again. The value and its
+    /// source timestamp stay (OPC 10000-8, 6.3.2); a topic that never had one goes on waiting.
     pub(crate) fn set_silent(&mut self, topic: TopicId, silent: bool) {
         let Some(known) = self.topics.get_mut(&topic) else {
             return;
@@ -257,14 +257,16 @@ impl Space {
         }
     }
 
-    /// Gives the last values their own status back where a writer speaks again but has nothing new to say.
+    /// Gives the last values their own status back where a writer speaks again but has nothing new
+    /// to say.
     pub(crate) fn settle(&mut self) {
         for topic in std::mem::take(&mut self.returned) {
             self.wear(topic);
         }
     }
 
-    /// Says when anything was last heard of each topic: values whose publisher is not heard at all for `timeout` are shown so.
+    /// Says when anything was last heard of each topic: values whose publisher is not heard at all
+    /// for `timeout` are shown so.
     pub(crate) fn hear(
         &mut self,
         heard: impl Iterator<Item = (TopicId, Instant)>,
@@ -325,7 +327,8 @@ impl Space {
         }
     }
 
-    /// Shows the last sample anew, under another status than its own or under its own; one that is too old is kept here.
+    /// Shows the last sample anew, under another status than its own or under its own; one that is
+    /// too old is kept here.
     fn show_worn(&mut self, topic: TopicId, worn: Worn) {
         let Some(known) = self.topics.get_mut(&topic) else {
             return;
@@ -346,8 +349,8 @@ impl Space {
         nodes.show_again(&self.subscriptions, &known.node, shown);
     }
 
-    /// Takes out the nodes of topics that nobody mapped and whose writers fell silent, of those first that are silent
-    /// longest, when it is time to look for room.
+    /// Takes out the nodes of topics that nobody mapped and whose writers fell silent, of those
+    /// first that are silent longest, when it is time to look for room.
     fn let_unmapped_go(&mut self) {
         let now = now().monotonic;
         if !self.room.wants_look(now) {
@@ -411,7 +414,8 @@ impl Known {
         }
     }
 
-    /// Whether the topic's nodes take the fields. A topic of which nothing is known beforehand takes any.
+    /// Whether the topic's nodes take the fields. A topic of which nothing is known beforehand
+    /// takes any.
     fn fit(&self, block: &[u8]) -> Result<(), (StatusCode, &'static str)> {
         let malformed = |_| (StatusCode::BadDecodingError, "malformed fields");
         let fields = Fields::parse(block).map_err(malformed)?;

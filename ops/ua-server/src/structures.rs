@@ -1,8 +1,9 @@
-//! The DataTypes of messages that are structures: those in arrays, those that a mapping has `as: structure`, those of calls, and
-//! those nested in them.
+//! The DataTypes of messages that are structures: those in arrays, those that a mapping has `as:
+//! structure`, those of calls, and those nested in them.
 //!
-//! On the wire an ExtensionObject has the name of its message type as TypeId, in the namespace of its topic, and a TypeId
-//! is the NodeId of an encoding (OPC 10000-6, 5.2.2.15): so that is the encoding's, and the DataType has one of its own.
+//! On the wire an ExtensionObject has the name of its message type as TypeId, in the namespace of
+//! its topic, and a TypeId is the NodeId of an encoding (OPC 10000-6, 5.2.2.15): so that is the
+//! encoding's, and the DataType has one of its own.
 
 use std::sync::Arc;
 
@@ -83,8 +84,9 @@ enum Kind {
 pub(crate) struct Structures(Vec<Structure>);
 
 impl Structures {
-    /// Takes in the message at a path of a message type, with those nested in it, and gives its DataType. `None` where
-    /// there is none, or where another definition has its name in this namespace.
+    /// Takes in the message at a path of a message type, with those nested in it, and gives its
+    /// DataType. `None` where there is none, or where another definition has its name in this
+    /// namespace.
     pub(crate) fn add(&mut self, of: &MessageType, path: &str, namespace: u16) -> Option<NodeId> {
         let found: Vec<Structure> = of
             .structures(path)
@@ -212,7 +214,8 @@ impl Structure {
         }
     }
 
-    /// Puts the DataType and its encoding into the address space, in the place of one of the same name.
+    /// Puts the DataType and its encoding into the address space, in the place of one of the same
+    /// name.
     pub(crate) fn insert(&self, address_space: &mut AddressSpace) {
         self.remove(address_space);
         let id = self.data_type();

@@ -1,7 +1,8 @@
 //! Values between the two codecs: UADP's borrowed Variants and the OPC UA server's owned ones.
 //!
-//! Inwards a null array becomes an empty one, which is all the server's type can say. Outwards values are encoded as
-//! they are (OPC 10000-6, 5.2.2.16), and what UADP does not carry, a Variant directly in a Variant, is refused.
+//! Inwards a null array becomes an empty one, which is all the server's type can say. Outwards
+//! values are encoded as they are (OPC 10000-6, 5.2.2.16), and what UADP does not carry, a Variant
+//! directly in a Variant, is refused.
 
 use opcua::types::type_loader::{ByteStringBody, XmlBody};
 use opcua::types::{
@@ -56,7 +57,8 @@ pub(crate) fn fields_block(fields: &[Variant]) -> Result<Vec<u8>, StatusCode> {
     }
 }
 
-/// What a field never set is sent as beside those that are: zero, empty, or null where the type has such.
+/// What a field never set is sent as beside those that are: zero, empty, or null where the type has
+/// such.
 pub(crate) fn zero(shape: Option<(BuiltinType, bool)>) -> Variant {
     let Some((builtin, array)) = shape else {
         return Variant::Empty;

@@ -1,7 +1,7 @@
 //! The last value of each topic in the form it came in: the fields of its DataSet, encoded.
 //!
-//! The server's own Variants take up many times that (24 bytes for each byte of an array), so they are made when a
-//! client wants them, of the part it wants, and live as long as its answer takes.
+//! The server's own Variants take up many times that (24 bytes for each byte of an array), so they
+//! are made when a client wants them, of the part it wants, and live as long as its answer takes.
 
 use std::collections::HashMap;
 
@@ -26,7 +26,8 @@ pub(crate) struct Values {
 /// What the nodes of one topic show.
 #[derive(Debug, Clone)]
 pub(crate) struct Shown {
-    /// FieldCount and a Variant for each field, all of them readable; `None` where there is nothing to be used.
+    /// FieldCount and a Variant for each field, all of them readable; `None` where there is nothing
+    /// to be used.
     pub(crate) block: Option<Bytes>,
     pub(crate) stamp: Stamp,
 }
@@ -53,8 +54,8 @@ impl Values {
         self.topics.get(&topic)
     }
 
-    /// Shows something else, and gives what was shown before. A value there is no room for is not kept: its place takes
-    /// `BadOutOfMemory`, and it is given back as the error.
+    /// Shows something else, and gives what was shown before. A value there is no room for is not
+    /// kept: its place takes `BadOutOfMemory`, and it is given back as the error.
     pub(crate) fn put(
         &mut self,
         topic: TopicId,
@@ -177,7 +178,8 @@ impl<'a> View<'a> {
         }
     }
 
-    /// What an IndexRange leaves of an array whose elements are all of one size, still not decoded; else, all.
+    /// What an IndexRange leaves of an array whose elements are all of one size, still not decoded;
+    /// else, all.
     pub(crate) fn narrowed(self, range: &NumericRange) -> (Self, NumericRange) {
         if let Self::One(uadp::Variant::Array(array), stamp) = self
             && let Some((first, last)) = bounds(range)
@@ -203,7 +205,8 @@ impl<'a> View<'a> {
         }
     }
 
-    /// The value with its stamps, decoded; the status is that of the range where that cannot be had.
+    /// The value with its stamps, decoded; the status is that of the range where that cannot be
+    /// had.
     pub(crate) fn data_value(&self, range: &NumericRange) -> DataValue {
         let value = match self {
             Self::One(value, _) => value::from_field(value),
@@ -246,15 +249,17 @@ pub(crate) fn data_value(value: Option<Variant>, stamp: Stamp) -> DataValue {
         value,
         status: Some(stamp.status),
         source_timestamp: stamp.source.map(|source| value::date_time(source.time)),
-        // asyncua takes the picoseconds for the first bytes of the server timestamp (its order of the fields is not
-        // that of OPC 10000-6, 5.2.2.17), so there are none: 100 ns are left, and clients read right times.
+        // asyncua takes the picoseconds for the first bytes of the server timestamp (its order of
+        // the fields is not that of OPC 10000-6, 5.2.2.17), so there are none: 100 ns are left, and
+        // clients read right times.
         source_picoseconds: None,
         server_timestamp: Some(stamp.server),
         server_picoseconds: None,
     }
 }
 
-/// The bytes without the room behind them, which may be many times as much: buffers of the Router are used again.
+/// The bytes without the room behind them, which may be many times as much: buffers of the Router
+/// are used again.
 pub(crate) fn compact(payload: Bytes) -> Bytes {
     match payload.try_into_mut() {
         Ok(buffer) if buffer.capacity() - buffer.len() <= SLACK => buffer.freeze(),

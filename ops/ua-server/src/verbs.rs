@@ -1,6 +1,8 @@
-//! What people type about certificates and users: `ua-server trust`, `reject`, `certificates` and `user`.
+//! What people type about certificates and users: `ua-server trust`, `reject`, `certificates` and
+//! `user`.
 //!
-//! A server that runs takes notice by itself: certificates are looked for at each connection, and users within a second.
+//! A server that runs takes notice by itself: certificates are looked for at each connection, and
+//! users within a second.
 
 use std::ffi::OsString;
 use std::io::{self, BufRead as _, IsTerminal as _, Write as _};
@@ -145,7 +147,8 @@ enum VerbFault {
     Output(io::Error),
 }
 
-/// Does what the command line asks about certificates and users; `None` where it asks for the server.
+/// Does what the command line asks about certificates and users; `None` where it asks for the
+/// server.
 pub(crate) fn asked(arguments: &[OsString]) -> Option<ExitCode> {
     let first = arguments.get(1)?;
     if !VERBS.iter().any(|verb| first == verb) {

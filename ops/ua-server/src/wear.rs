@@ -130,7 +130,8 @@ impl Wear {
 pub(crate) struct Looks(BinaryHeap<Reverse<(Instant, TopicId)>>);
 
 impl Looks {
-    /// Plans the next look at a topic. An earlier one stays, and plans the next: that spares an entry for each value.
+    /// Plans the next look at a topic. An earlier one stays, and plans the next: that spares an
+    /// entry for each value.
     pub(crate) fn plan(&mut self, topic: TopicId, wear: &mut Wear, now: Instant) {
         if let Some(due) = wear.due(now)
             && wear.look.is_none_or(|look| due < look)

@@ -1,4 +1,4 @@
-//! What a Method of another server takes and gives, read from that server.
+//! The signature of a Method of another server, read from that server.
 
 use bridge_node::{CallDescription, CallField, CallRole};
 use mappings::{ExpandedNodeIdText, MethodTarget, NamespaceText, NodeIdText};
@@ -13,7 +13,7 @@ use uadp::BuiltinType;
 use super::Wanted;
 use crate::layout;
 
-/// Where a Method is, and what it takes and gives.
+/// The nodes of a Method, and its input and output arguments.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Signature {
     pub(super) object: NodeId,
@@ -23,7 +23,7 @@ pub(super) struct Signature {
 }
 
 impl Signature {
-    /// What is announced of it.
+    /// Returns the description of the call that is announced in the space.
     pub(super) fn description(&self, wanted: &Wanted) -> CallDescription {
         CallDescription {
             name: wanted.name.clone(),
@@ -35,10 +35,10 @@ impl Signature {
     }
 }
 
-/// Reads it over the connection there is.
+/// Reads the signature over the current connection.
 ///
 /// # Errors
-/// Why it cannot be called, for people.
+/// Returns the reason why the Method cannot be called, as text for the operator.
 pub(super) async fn read(client: &Client, target: &MethodTarget) -> Result<Signature, String> {
     let object = node(client, &target.object)?;
     let method = node(client, &target.method)?;
@@ -85,10 +85,10 @@ pub(super) async fn read(client: &Client, target: &MethodTarget) -> Result<Signa
     })
 }
 
-/// The NodeId at that server, over the connection there is.
+/// Converts a NodeId into a NodeId of that server, over the current connection.
 ///
 /// # Errors
-/// Why there is none, for people.
+/// Returns the reason why there is no such NodeId, as text for the operator.
 pub(crate) fn node(client: &Client, text: &ExpandedNodeIdText) -> Result<NodeId, String> {
     let namespace = match &text.namespace {
         NamespaceText::Index(index) => *index,
@@ -155,8 +155,9 @@ async fn fields(
     Ok(fields)
 }
 
-/// The builtin type that values of a DataType have, where a call can carry them: structures and NodeIds are of that server's
-/// namespaces, and of an abstract type values may be of any.
+/// Returns the builtin type of the values of a DataType, or `None` if a call cannot carry them.
+/// Structures and NodeIds depend on the namespaces of that server, and values of an abstract type
+/// may have any type.
 async fn builtin(client: &Client, data_type: &NodeId) -> Result<Option<BuiltinType>, ClientError> {
     if let Some(known) = standard(data_type) {
         return Ok(known);
@@ -169,7 +170,8 @@ async fn builtin(client: &Client, data_type: &NodeId) -> Result<Option<BuiltinTy
     Ok(None)
 }
 
-/// Whether a DataType says what values are, and then what.
+/// Returns the builtin type that a DataType of the standard defines. The inner `None` is a type
+/// that a call cannot carry; the outer `None` is a DataType that does not define it.
 fn standard(data_type: &NodeId) -> Option<Option<BuiltinType>> {
     let Identifier::Numeric(number) = data_type.identifier else {
         return None;
@@ -210,9 +212,9 @@ fn standard(data_type: &NodeId) -> Option<Option<BuiltinType>> {
     })
 }
 
-/// Fields of a request or response that are believed when they are announced.
+/// Largest number of announced fields of a request or response.
 const MOST_FIELDS: usize = 256;
-/// Bytes of a name that is believed.
+/// Largest length of an announced name, in bytes.
 const LONGEST_NAME: usize = 255;
 
 #[cfg(test)]

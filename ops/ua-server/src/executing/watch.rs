@@ -1,4 +1,4 @@
-//! The life of one server with Methods: whether it is there, and what they take and give.
+//! Watches one server with Methods: its connection, and the signatures of its Methods.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -16,20 +16,20 @@ use super::signature::{self, Signature};
 pub(crate) struct Found {
     pub(super) wanted: Arc<Wanted>,
     pub(super) client: Client,
-    /// The connection that its NodeIds are of.
+    /// Number of the connection for which the NodeIds are valid.
     pub(super) connects: u64,
     pub(super) signature: Signature,
 }
 
-/// What is new of a Method.
+/// A change of a Method.
 pub(super) enum News {
-    /// It can be called, or is another one.
+    /// The Method can be called, or it has changed.
     Found(Found),
-    /// It cannot be called.
+    /// The Method cannot be called.
     Lost(TopicId),
 }
 
-/// Looks at the server whenever there is another connection or something else is wanted, and from time to time.
+/// Checks the server at each change of the connection or of the wanted Methods, and periodically.
 pub(super) async fn run(
     client: Client,
     url: String,
@@ -54,7 +54,7 @@ pub(super) async fn run(
             Link::Connecting | Link::Closed => Ok(()),
         };
         if told.is_err() {
-            // Nobody executes any longer.
+            // The receiver has stopped.
             return;
         }
         let again = tokio::time::timeout(LOOK_AGAIN, async {
@@ -73,11 +73,11 @@ struct Watcher {
     client: Client,
     url: String,
     tell: mpsc::Sender<News>,
-    /// What was told of each Method, by its connection.
+    /// The last reported state of each Method, with its connection.
     known: HashMap<TopicId, (Arc<Wanted>, u64, Signature)>,
-    /// What was said for people.
+    /// The last logged error of each Method.
     troubles: HashMap<TopicId, String>,
-    /// Whether it was said that the server is not there.
+    /// True if the loss of the server was logged.
     away: bool,
 }
 
@@ -118,7 +118,7 @@ impl Watcher {
         self.tell.send(News::Found(found)).await
     }
 
-    /// None of its Methods can be called, which is told once until they can.
+    /// Reports all Methods as lost. The loss is logged once until the server is connected again.
     async fn lose(&mut self, all: &[Arc<Wanted>], reason: &str) -> Told {
         self.troubles.clear();
         if !std::mem::replace(&mut self.away, true) {
@@ -146,5 +146,5 @@ impl Watcher {
     }
 }
 
-/// How often a server is asked for its Methods anew.
+/// Interval between two reads of the Methods of a server.
 const LOOK_AGAIN: Duration = Duration::from_secs(30);

@@ -1,37 +1,38 @@
-//! Which number and name a server that was found has in the space.
+//! The namespace numbers and names of discovered servers in the space.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::RangeInclusive;
 
-/// The place of a server.
+/// The slot of a server.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Place {
     pub(super) namespace: u16,
     pub(super) name: String,
 }
 
-/// The places that were given, by ApplicationUri. A server keeps its place while it is away, as long as there is another
-/// one for who comes.
+/// The assigned slots, by ApplicationUri. An offline server keeps its slot as long as another slot
+/// is free for new servers.
 #[derive(Debug, Default)]
 pub(super) struct Places {
     given: BTreeMap<String, Place>,
 }
 
-/// What places there are.
+/// The available slots.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(super) struct Room {
-    /// None for nobody.
+    /// The range of namespace numbers, or `None` if there are no slots.
     pub(super) namespaces: Option<RangeInclusive<u16>>,
-    /// Those that are kept for somebody, by their ApplicationUri.
+    /// Namespace numbers that are reserved, with their ApplicationUris.
     pub(super) kept: BTreeMap<u16, String>,
-    /// Names that others have.
+    /// Names that are in use by other servers.
     pub(super) named: BTreeSet<String>,
 }
 
 impl Places {
-    /// The place of a server: what is kept for it, or what it had; else one that follows from its ApplicationUri, so that
-    /// it is the same tomorrow, or the next one that is free. `there` are the servers that are there. `None` where all
-    /// places are taken by these.
+    /// Returns the slot of a server: its reserved slot, or its previous slot. A new server gets the
+    /// slot that follows from its ApplicationUri, so that it is the same after a restart, or else
+    /// the next free slot. `there` are the ApplicationUris of the servers that are online. Returns
+    /// `None` if these occupy all slots.
     pub(super) fn give(
         &mut self,
         application_uri: &str,
@@ -60,7 +61,7 @@ impl Places {
             Some(own) => own,
             None => self.free(application_uri, (&range, room), there)?,
         };
-        // Whoever had it is away, or has one of its own now.
+        // The previous owner is offline, or has a reserved slot.
         self.given.retain(|_, place| place.namespace != namespace);
         let name = self.name(application_uri, namespace, &room.named);
         let place = Place { namespace, name };
@@ -87,7 +88,8 @@ impl Places {
         unused.or_else(left).copied()
     }
 
-    /// The last part of the ApplicationUri; with the number behind it where another is called so.
+    /// Returns the last part of the ApplicationUri. The namespace number is appended if another
+    /// server has that name.
     fn name(&self, application_uri: &str, namespace: u16, named: &BTreeSet<String>) -> String {
         let plain = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
         let mut parts = application_uri.rsplit([':', '/']);
@@ -106,13 +108,13 @@ impl Places {
     }
 }
 
-/// FNV-1a.
+/// Returns the FNV-1a hash of a text.
 fn hash(text: &str) -> u32 {
     let step = |hash: u32, byte: u8| (hash ^ u32::from(byte)).wrapping_mul(0x0100_0193);
     text.bytes().fold(0x811c_9dc5, step)
 }
 
-/// Letters of a name.
+/// Largest length of a name, in characters.
 const MOST_NAME: usize = 48;
 
 #[cfg(test)]

@@ -1,15 +1,15 @@
-//! Aggregates of past values (OPC 10000-13, 5.4.3): pure, over times in ticks of 100 ns.
+//! Aggregates of past values (OPC 10000-13, 5.4.3) as pure functions. Times are in ticks of 100 ns.
 
-/// A past value as a number, and how good it is.
+/// A past value as a number, with its quality.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Sample {
     pub(super) time: i64,
-    /// `None` for what is no number.
+    /// The number, or `None` if the value is not a number.
     pub(super) value: Option<f64>,
     pub(super) quality: Quality,
 }
 
-/// Of a past value.
+/// The quality of a past value.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Quality {
     Good,
@@ -17,7 +17,7 @@ pub(super) enum Quality {
     Bad,
 }
 
-/// The aggregates that are worked out.
+/// The supported aggregates.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Aggregate {
     Interpolative,
@@ -27,28 +27,28 @@ pub(super) enum Aggregate {
     Count,
 }
 
-/// What an interval comes to.
+/// The outcome of an interval.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Outcome {
-    /// The value of that sample as it is.
+    /// The value of that sample, unchanged.
     Raw(usize),
     /// The value of that sample, at the time of the interval.
     Picked(usize, Quality),
-    /// Worked out from several.
+    /// A value calculated from several samples.
     Calculated(f64, Quality),
     /// A number of samples.
     Count(u32, Quality),
-    /// Between two samples, or behind the last one.
+    /// A value between two samples, or after the last sample.
     Interpolated(f64, Quality),
-    /// As the sample before, which is no number.
+    /// The value of the sample before, which is not a number.
     Held(usize),
-    /// There is nothing to work it out from.
+    /// The interval has no data.
     NoData,
-    /// There is something, and too much of it is bad.
+    /// The interval has data, but too much of it is bad.
     Bad,
 }
 
-/// What of the data of an interval makes its aggregate good or bad (AggregateConfiguration, OPC 10000-13, 4.2.1.2).
+/// The rules for the quality of an aggregate (AggregateConfiguration, OPC 10000-13, 4.2.1.2).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Rules {
     pub(super) uncertain_is_bad: bool,
@@ -66,7 +66,8 @@ impl Default for Rules {
     }
 }
 
-/// The aggregate of the samples in an interval from `start`, which is in it, to `end`, which is not; `samples` ascend in time.
+/// Returns the aggregate of the samples in an interval that includes `start` and excludes `end`.
+/// `samples` ascend in time.
 pub(super) fn of(
     aggregate: Aggregate,
     samples: &[Sample],
@@ -81,7 +82,7 @@ pub(super) fn of(
     } else {
         (end, start)
     };
-    // Backwards the earlier end is not in it, forwards the later one.
+    // The earlier bound is excluded in backward intervals, the later bound in forward intervals.
     let place = |bound: i64| {
         samples.partition_point(|sample| match start <= end {
             true => sample.time < bound,
@@ -118,7 +119,7 @@ pub(super) fn of(
             })
         }
         Aggregate::Maximum => {
-            // Of equal ones the first.
+            // The first of equal samples is used.
             let found = good.iter().copied().rev().max_by(least);
             found.map_or(Outcome::NoData, |(at, _)| {
                 picked(samples, at, (start, quality))
@@ -133,7 +134,8 @@ pub(super) fn of(
     }
 }
 
-/// A sample that is the aggregate: itself where it stands at the start of the interval.
+/// Returns the outcome for a selected sample: the raw value if the sample is good and at the start
+/// of the interval.
 fn picked(samples: &[Sample], at: usize, (start, quality): (i64, Quality)) -> Outcome {
     match samples.get(at) {
         Some(sample) if sample.time == start && quality == Quality::Good => Outcome::Raw(at),
@@ -141,8 +143,9 @@ fn picked(samples: &[Sample], at: usize, (start, quality): (i64, Quality)) -> Ou
     }
 }
 
-/// The value at a time (OPC 10000-13, 5.4.3.4): that of the sample then, or between the two around it; behind the last it is
-/// held. What is no number is held likewise.
+/// Returns the value at a time (OPC 10000-13, 5.4.3.4): the sample at that time, or the
+/// interpolation between its neighbours. After the last sample its value is held. Values that are
+/// not numbers are held too.
 pub(super) fn at(samples: &[Sample], time: i64, rules: Rules) -> Outcome {
     let usable = |sample: &Sample| rules.takes(sample.quality);
     let behind = samples.partition_point(|sample| sample.time <= time);
@@ -162,7 +165,7 @@ pub(super) fn at(samples: &[Sample], time: i64, rules: Rules) -> Outcome {
     let Some(from) = low.value else {
         return Outcome::Held(last);
     };
-    // What is bad in between leaves a doubt.
+    // Bad samples in between make the value uncertain.
     let skipped = before.len() - 1 != last || after.first() != first;
     match first {
         Some(Sample {
@@ -192,7 +195,8 @@ impl Rules {
         }
     }
 
-    /// Of an interval by the shares of what is good and bad in it; `None` where nothing is in it.
+    /// Returns the quality of an interval by the shares of good and bad samples, or `None` for an
+    /// interval without samples.
     fn quality(self, all: impl Iterator<Item = Quality>) -> Option<Quality> {
         let (mut good, mut bad) = (0_u64, 0_u64);
         for quality in all {

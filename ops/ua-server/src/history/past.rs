@@ -1,4 +1,4 @@
-//! The last values of each topic, within a bound for each and one for all together.
+//! The last values of each topic, limited for each topic and for all topics together.
 
 use std::collections::{HashMap, VecDeque};
 
@@ -6,14 +6,14 @@ use mappings::TopicId;
 
 use crate::values::Shown;
 
-/// Past values, the oldest of each topic first.
+/// Past values, oldest first in each topic.
 #[derive(Debug)]
 pub(crate) struct Past {
-    /// For each topic that has none of its own.
+    /// Largest number of values of topics without an own limit.
     most_values: usize,
-    /// For single ones.
+    /// Limits of single topics.
     own: HashMap<TopicId, usize>,
-    /// Of all together.
+    /// Largest size of all values, in bytes.
     most_bytes: usize,
     bytes: usize,
     /// The number of the next value.
@@ -28,7 +28,7 @@ struct Kept {
 }
 
 impl Past {
-    /// Keeps so many values of each topic, in so many bytes for all.
+    /// Creates a store with `most_values` for each topic and `most_bytes` for all topics.
     pub(crate) fn new(most_values: usize, most_bytes: usize) -> Self {
         Self {
             most_values,
@@ -40,7 +40,7 @@ impl Past {
         }
     }
 
-    /// Keeps so many values of each topic from now on, and of single ones so many, in so many bytes for all.
+    /// Changes the limits: values of each topic, bytes of all topics, and values of single topics.
     pub(crate) fn limit(
         &mut self,
         (most_values, most_bytes): (usize, usize),
@@ -57,8 +57,8 @@ impl Past {
         }
     }
 
-    /// Takes in the value that a topic shows now. Where there is no room for all, topics that take up about their share of it or
-    /// more give up the older half of their values.
+    /// Stores the current value of a topic. If the store is full, topics that occupy three quarters
+    /// of their share or more drop the older half of their values.
     pub(crate) fn keep(&mut self, topic: TopicId, shown: &Shown) {
         let size = size(shown);
         let most = self.own.get(&topic).copied().unwrap_or(self.most_values);
@@ -78,8 +78,8 @@ impl Past {
         }
     }
 
-    /// Those below three quarters of their share have less than three quarters of all, so each pass sets free a good part of
-    /// the rest, and the next one is far.
+    /// Topics below three quarters of their share hold less than three quarters of all bytes. Each
+    /// pass therefore frees a large part of the rest, and passes are rare.
     fn make_room(&mut self) {
         let share = self.most_bytes / self.topics.len().max(1);
         for kept in self.topics.values_mut() {
@@ -90,13 +90,13 @@ impl Past {
         }
     }
 
-    /// What is kept of a topic, in the order it came, each with a number that no other has.
+    /// Returns the values of a topic in the order of their arrival, each with its unique number.
     pub(crate) fn of(&self, topic: TopicId) -> Vec<(u64, Shown)> {
         let kept = self.topics.get(&topic);
         kept.map_or_else(Vec::new, |kept| kept.values.iter().cloned().collect())
     }
 
-    /// Forgets a topic.
+    /// Removes a topic.
     pub(crate) fn remove(&mut self, topic: TopicId) {
         if let Some(gone) = self.topics.remove(&topic) {
             self.bytes -= gone.bytes;
@@ -105,7 +105,7 @@ impl Past {
 }
 
 impl Kept {
-    /// How many bytes that sets free.
+    /// Drops the oldest values and returns the number of freed bytes.
     fn drop_oldest(&mut self, count: usize) -> usize {
         let gone = self.values.drain(..count.min(self.values.len()));
         let freed: usize = gone.map(|(_, gone)| size(&gone)).sum();
@@ -114,12 +114,12 @@ impl Kept {
     }
 }
 
-/// What a value takes up here.
+/// Returns the memory size of a value.
 fn size(shown: &Shown) -> usize {
     shown.block.as_ref().map_or(0, bytes::Bytes::len) + BESIDE
 }
 
-/// Stamps, room for more of them, and what the bytes are held by.
+/// Size of the stamps, spare capacity for further entries, and the allocation of the bytes.
 const BESIDE: usize = 2 * size_of::<(u64, Shown)>() + 48;
 
 #[cfg(test)]

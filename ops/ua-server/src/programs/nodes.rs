@@ -1,4 +1,4 @@
-//! The nodes of a Program, and what they show (OPC 10000-10, 5.2).
+//! The nodes of a Program and their values (OPC 10000-10, 5.2).
 
 use std::sync::Arc;
 
@@ -28,20 +28,20 @@ pub(super) struct Nodes {
     name: String,
     /// The fields of a result that have a node.
     results: Vec<String>,
-    /// All of them, the Program first.
+    /// All nodes, the Program first.
     made: Vec<NodeId>,
 }
 
-/// What came out of a goal.
+/// The outcome of a goal.
 pub(super) struct Outcome {
-    /// Of `action_msgs/GoalStatus`; 0 where it is not known.
+    /// Status of `action_msgs/GoalStatus`, or 0 if it is unknown.
     pub(super) status: i64,
     message: String,
     fields: Vec<Variant>,
 }
 
 impl Outcome {
-    /// Of the answer: status, message, and the fields of the result.
+    /// Decodes an answer: status, message, and the fields of the result.
     pub(super) fn of(answer: Vec<Variant>) -> Self {
         let mut fields = answer.into_iter();
         let status = fields.next().as_ref().and_then(whole).unwrap_or_default();
@@ -56,7 +56,7 @@ impl Outcome {
         }
     }
 
-    /// It was rejected, or not sent.
+    /// Returns the outcome of a goal that was rejected or not sent.
     pub(super) const fn never_ran(message: String) -> Self {
         Self {
             status: NEVER_RAN,
@@ -65,7 +65,7 @@ impl Outcome {
         }
     }
 
-    /// Nothing is known of it.
+    /// Returns the outcome of a goal whose end is unknown.
     pub(super) const fn lost(message: String) -> Self {
         Self {
             status: 0,
@@ -74,7 +74,7 @@ impl Outcome {
         }
     }
 
-    /// For people.
+    /// Returns the outcome as text for the operator.
     pub(super) fn said(&self) -> String {
         match (&self.message[..], self.status) {
             ("", SUCCEEDED) => "the goal is reached".to_owned(),
@@ -88,7 +88,8 @@ impl Outcome {
 }
 
 impl Nodes {
-    /// Puts the Program of an action in, and the objects around it. Gives those too, the outermost first.
+    /// Adds the Program of an action and its parent objects. Also returns the parent objects,
+    /// outermost first.
     pub(super) fn insert(
         (manager, subscriptions): (Arc<SpaceManager>, Arc<SubscriptionCache>),
         (topic, name): (TopicId, &str),
@@ -142,7 +143,8 @@ impl Nodes {
         address::program(self.topic, path)
     }
 
-    /// Takes them out, and what was around them alone. Who watches one is told.
+    /// Removes the nodes, and the given parent objects. Clients that monitor a removed node are
+    /// notified.
     pub(super) fn remove(&self, around: &[&NodeId]) {
         let mut address_space = self.manager.address_space().write();
         for node in &self.made {
@@ -159,12 +161,12 @@ impl Nodes {
         }
     }
 
-    /// What is so before anything happens.
+    /// Shows the initial state.
     pub(super) fn show_first(&self, now: State) {
         self.show(state(now).to_vec());
     }
 
-    /// The goal that is at work, before anything is known of its end.
+    /// Shows the current goal, whose end is not known yet.
     pub(super) fn show_goal(&self, id: &ByteString) {
         self.show(vec![
             ("FinalResultData.GoalId", Variant::from(id.clone())),
@@ -173,7 +175,7 @@ impl Nodes {
         ]);
     }
 
-    /// How a goal ended, for people, with the reason that its result has.
+    /// Returns the end of a goal as text for the operator, with the reason in its result.
     pub(super) fn said(&self, outcome: &Outcome) -> String {
         let said = outcome.said();
         if !outcome.message.is_empty() || outcome.status == SUCCEEDED {
@@ -206,7 +208,8 @@ impl Nodes {
         self.write(nodes.zip(outcome.fields.iter().cloned()).collect());
     }
 
-    /// Shows why a goal that is being cancelled has not ended, or is not cancelled, and raises an event without a transition.
+    /// Shows why a goal that is being cancelled has not ended or is not cancelled, and raises an
+    /// event without a transition.
     pub(super) fn show_pending(&self, why: &str, now: State) {
         self.show(vec![("FinalResultData.Message", Variant::from(why))]);
         let state = StateRef {
@@ -219,7 +222,7 @@ impl Nodes {
         event.raise(&self.subscriptions);
     }
 
-    /// What its action reports: the only field, or all of them.
+    /// Shows the feedback of the action: a single field as its value, several fields as an array.
     pub(super) fn show_feedback(&self, fields: &[Variant]) {
         let value = match fields {
             [one] => one.clone(),
@@ -300,7 +303,8 @@ impl Nodes {
     }
 }
 
-/// The objects that the dots of a name say, made where they are not there, and what is behind the last dot.
+/// Creates the missing objects that the dots of a name denote. Returns the objects and the part
+/// after the last dot.
 fn around<'n>(address_space: &mut AddressSpace, name: &'n str) -> (Vec<NodeId>, &'n str) {
     let mut parts = name
         .split('.')
@@ -321,7 +325,7 @@ fn around<'n>(address_space: &mut AddressSpace, name: &'n str) -> (Vec<NodeId>, 
     (around, last)
 }
 
-/// Puts nodes in, and remembers which.
+/// Adds nodes and records them.
 struct Tree<'a> {
     address_space: &'a mut AddressSpace,
     topic: TopicId,
@@ -368,7 +372,7 @@ impl Tree<'_> {
         );
     }
 
-    /// What is shown of a result: the goal, its end, and its fields under their names.
+    /// Adds the nodes of a result: the goal, its end, and its fields under their names.
     fn results(&mut self, fields: &[CallField], types: &ArgumentTypes) -> Vec<String> {
         let node = self.made("FinalResultData");
         let parent = address::program(self.topic, "");
@@ -446,7 +450,8 @@ impl Tree<'_> {
             let id = self.made(&format!("{name}.OutputArguments"));
             builder = builder.output_args(self.address_space, &id, gives);
         }
-        // It stays executable: the library refuses others as BadUserAccessDenied, where OPC 10000-10 has BadInvalidState.
+        // The Method stays executable, because the library refuses calls of other Methods with
+        // BadUserAccessDenied. OPC 10000-10 requires BadInvalidState.
         builder.insert(self.address_space);
     }
 
@@ -471,7 +476,7 @@ fn state(state: State) -> [(&'static str, Variant); 3] {
     ]
 }
 
-/// The fields of a message under their own names.
+/// Returns the fields of a message without its prefix.
 fn without(message: &str, mut fields: Vec<Argument>) -> Vec<Argument> {
     for field in &mut fields {
         if let Some(name) = field.name.as_ref().strip_prefix(message) {
@@ -485,17 +490,17 @@ fn result(name: &str) -> String {
     format!("FinalResultData.{name}")
 }
 
-/// A name that OPC 10000-10 gives.
+/// Returns a name that OPC 10000-10 defines.
 fn core(name: &str) -> QualifiedName {
     QualifiedName::new(0, name)
 }
 
-/// A name of our own.
+/// Returns a name in the namespace of the application.
 fn names(name: &str) -> QualifiedName {
     QualifiedName::new(address::programs_folder().namespace, name)
 }
 
-/// Beside the fields of a result.
+/// Nodes in addition to the fields of a result.
 const OWN_RESULTS: [(&str, DataTypeId); 3] = [
     ("GoalId", DataTypeId::ByteString),
     ("Status", DataTypeId::Int32),
@@ -516,12 +521,12 @@ const TRANSITION: (VariableTypeId, ReferenceTypeId) = (
     VariableTypeId::FiniteTransitionVariableType,
     ReferenceTypeId::HasComponent,
 );
-/// Objects around one Program.
+/// Largest number of objects around one Program.
 const MOST_PARTS: usize = 8;
-/// What the fields of a goal and of a result are announced behind.
+/// Prefixes of the announced fields of a goal and of a result.
 const GOAL: &str = "goal.";
 const RESULT: &str = "result.";
-/// Of `action_msgs/GoalStatus`.
+/// STATUS_EXECUTING of `action_msgs/GoalStatus`.
 const EXECUTING: i32 = 2;
 /// Severities from 1 to 1000 (OPC 10000-5, 6.4.2).
 const USUAL: u16 = 100;

@@ -1,4 +1,4 @@
-//! What becomes of a Program: the goal that it has sent, and the state that follows.
+//! The execution of a Program: the goal that was sent, and the resulting state.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -18,7 +18,7 @@ use super::unknown::UnknownOutcomes;
 use crate::asking::{Callable, Drive, Questions, Refused};
 use crate::value;
 
-/// One Program. Of all its methods one is carried out at a time.
+/// One Program. Its methods are executed one at a time.
 pub(crate) struct Run {
     name: String,
     nodes: Nodes,
@@ -30,33 +30,33 @@ pub(crate) struct Run {
     /// The Programs that need a Reset.
     unknown: Arc<UnknownOutcomes>,
     inner: Mutex<Inner>,
-    /// The state, for who waits for another; closed never.
+    /// The state, for tasks that wait for a change. Never closed.
     state: watch::Sender<State>,
 }
 
 struct Inner {
     program: Program,
-    /// The goal that is at work, or is being sent.
+    /// The current goal, which is executed or being sent.
     goal: Option<ByteString>,
-    /// It is being sent: Halt alone may be called.
+    /// The goal is being sent: only Halt may be called.
     starting: bool,
-    /// It is being cancelled, and its end is not known.
+    /// The goal is being cancelled, and its end is not known.
     halting: Option<Halting>,
-    /// The action is gone.
+    /// The action was removed, or the server stops.
     left: bool,
 }
 
-/// A cancellation that is pending.
+/// A pending cancellation.
 struct Halting {
     why: String,
-    /// From when on a second Halt ends the run with an unknown outcome.
+    /// Time after which a second Halt ends the run with an unknown outcome.
     over: Instant,
     /// The action server has lost the goal: a second Halt ends the run at once.
     is_lost: bool,
 }
 
 impl Inner {
-    /// The cancellation that is pending from now on, if it is not already.
+    /// Returns the pending cancellation, and creates it if there is none.
     fn cancel(&mut self) -> &mut Halting {
         self.halting.get_or_insert_with(|| Halting {
             why: PENDING.to_owned(),
@@ -67,7 +67,7 @@ impl Inner {
 }
 
 impl Run {
-    /// Makes a Program in Ready, or in Halted after a goal with an unknown outcome.
+    /// Creates a Program in Ready, or in Halted after a goal with an unknown outcome.
     pub(super) fn new(
         (name, goal): (String, TopicId),
         nodes: Nodes,
@@ -80,7 +80,7 @@ impl Run {
             rests_in: Rest::Ready,
         });
         if !needs_reset {
-            // An action that is there is ready.
+            // An announced action is ready.
             let _ready = program.call(Method::Reset);
         }
         let (state, _) = watch::channel(program.state());
@@ -107,7 +107,7 @@ impl Run {
         })
     }
 
-    /// A method of it, for clients that may call the Method at `goal`.
+    /// Returns a method of the Program, for clients that may call the Method at `goal`.
     pub(super) fn drive(
         self: &Arc<Self>,
         method: Method,
@@ -142,13 +142,13 @@ impl Run {
         &self.nodes
     }
 
-    /// Sends a goal, and is running once that is accepted.
+    /// Sends a goal, and starts the Program when the goal is accepted.
     async fn start(
         self: Arc<Self>,
         arguments: Vec<Variant>,
         questions: Questions,
     ) -> Result<Vec<Variant>, Refused> {
-        // Behind the id that we choose.
+        // The first argument is the goal id, which is generated here.
         let most = self.send.description().request.len().saturating_sub(1);
         if arguments.len() > most {
             return Err(Refused::Status(StatusCode::BadTooManyArguments));
@@ -160,7 +160,7 @@ impl Run {
                 return Err(Refused::Status(StatusCode::BadInvalidState));
             }
             inner.starting = true;
-            // Feedback may come before the answer.
+            // Feedback may arrive before the answer.
             inner.goal = Some(id.clone());
         }
         let mut goal = vec![Variant::from(id.clone())];
@@ -175,7 +175,8 @@ impl Run {
         if inner.left {
             return Err(Refused::Status(StatusCode::BadNoCommunication));
         }
-        // Where it runs already, it was halted meanwhile, and what the goal comes to is followed.
+        // If the Program runs already, it was halted in the meantime, and the outcome of the goal
+        // is awaited.
         let runs = inner.program.state() == State::Running;
         match accepted {
             Ok(()) if runs => {}
@@ -209,7 +210,7 @@ impl Run {
         Ok(vec![Variant::from(id)])
     }
 
-    /// Is running from now on, and follows the goal.
+    /// Starts the Program and waits for the end of the goal.
     fn runs(
         self: &Arc<Self>,
         inner: &mut Inner,
@@ -235,14 +236,15 @@ impl Run {
         why.clone_into(&mut inner.cancel().why);
     }
 
-    /// Why a goal that was cancelled has not ended, if there is one.
+    /// Returns why a cancelled goal has not ended, if there is one.
     pub(super) fn pending(&self) -> Option<String> {
         let inner = self.inner.lock();
         let halting = inner.halting.as_ref()?;
         Some(format!("Program {}: {}", self.name, halting.why))
     }
 
-    /// With the reason of a rejection, for people.
+    /// Checks if a goal is accepted. The error has the reason of a rejection as text for the
+    /// operator.
     fn is_accepted(&self, answer: &[Variant]) -> Result<(), (Refused, Option<String>)> {
         match answer {
             [Variant::Boolean(true), ..] => Ok(()),
@@ -275,7 +277,8 @@ impl Run {
                     let why = "the result cannot be asked for".to_owned();
                     return self.ended(run, Outcome::lost(why));
                 }
-                // It goes on, or nobody is heard for the moment; when it is gone for good, so is the action.
+                // The goal continues, or the action server is unreachable for the moment. If it is
+                // lost permanently, the action is removed.
                 Err(Refused::Status(_) | Refused::Asked(_)) => {}
             }
             if self.is_over(run) {
@@ -292,8 +295,9 @@ impl Run {
         inner.left || !runs
     }
 
-    /// The action server knows nothing of the goal. Returns true if it is being cancelled: then it stays Running until a client
-    /// has taken note of that by a second Halt.
+    /// Handles that the action server does not know the goal. Returns true if the goal is being
+    /// cancelled: the Program then stays Running until a client acknowledges the loss by a second
+    /// Halt.
     fn is_lost(&self, said: &str) -> bool {
         let mut inner = self.inner.lock();
         let Some(halting) = &mut inner.halting else {
@@ -306,7 +310,8 @@ impl Run {
         true
     }
 
-    /// Cancels a goal again and again until it has ended: a request may come before the goal, or get lost.
+    /// Repeats the cancellation until the goal has ended, because a request may arrive before the
+    /// goal or be lost.
     async fn cancel_until_ended(self: Arc<Self>, id: ByteString, questions: Questions) {
         loop {
             let answer = self.ask_to_cancel(&id, &questions).await;
@@ -325,7 +330,7 @@ impl Run {
         }
     }
 
-    /// The action server refuses to cancel the goal, which goes on.
+    /// Handles that the action server refuses to cancel the goal, which continues.
     fn refused(&self, inner: &mut Inner) {
         inner.halting = None;
         let why = "the action server refuses to cancel the goal, which goes on";
@@ -348,7 +353,7 @@ impl Run {
         };
         inner.goal = None;
         inner.halting = None;
-        // Whoever sees the state change can read what came out.
+        // Clients that see the state change can read the result.
         self.nodes.show_outcome(&outcome);
         if let Some(transition) = ended {
             self.nodes.show_transition(transition, &message);
@@ -356,9 +361,9 @@ impl Run {
         self.state.send_replace(inner.program.state());
     }
 
-    /// Has the goal cancelled. Returns once the cancellation is on its way, and has waited a moment for the end of the goal. A
-    /// second Halt after [`HALT_TIMEOUT`], or when the action server has lost the goal, ends the run with an unknown outcome.
-    /// A Program that is ready is so no longer.
+    /// Cancels the goal. Returns when the cancellation has been sent, after a short wait for the
+    /// end of the goal. A second Halt after [`HALT_TIMEOUT`], or when the action server has lost
+    /// the goal, ends the run with an unknown outcome. A Program that is Ready becomes Halted.
     async fn halt(self: &Arc<Self>, questions: &Questions) -> Result<Vec<Variant>, Refused> {
         let (id, is_first) = {
             let mut inner = self.inner.lock();
@@ -406,7 +411,7 @@ impl Run {
         Ok(Vec::new())
     }
 
-    /// Ends a run whose goal goes on elsewhere, or may.
+    /// Ends a run whose goal continues or may continue elsewhere.
     fn give_up(&self, inner: &mut Inner) -> Result<Vec<Variant>, Refused> {
         let halting = inner.halting.take();
         let why = halting.map(|halting| halting.why).unwrap_or_default();
@@ -418,7 +423,7 @@ impl Run {
         self.called(inner, Method::Halt)
     }
 
-    /// The `return_code` of `action_msgs/CancelGoal`.
+    /// Sends a cancel request and returns the `return_code` of `action_msgs/CancelGoal`.
     async fn ask_to_cancel(&self, id: &ByteString, questions: &Questions) -> Result<i64, Refused> {
         let asked = [Variant::from(id.clone()), Variant::from(DateTime::null())];
         let answer = self.cancel.call(&asked, questions, || false).await?;
@@ -464,7 +469,7 @@ impl Run {
         self.state.send_replace(State::Halted);
     }
 
-    /// Shows feedback, if it is of the goal that is at work.
+    /// Shows feedback of the current goal.
     pub(super) fn reported(&self, block: &[u8]) {
         let Ok(fields) = Fields::parse(block) else {
             return;
@@ -482,12 +487,12 @@ impl Run {
     }
 }
 
-/// Whether the goal may be at work all the same.
+/// Returns true if the goal may be executed nevertheless.
 fn is_unknown(refused: &Refused) -> bool {
     matches!(refused, Refused::Asked(error) if error.kind == AskErrorKind::Unknown)
 }
 
-/// The arguments of Start are those behind the id.
+/// Converts argument errors to the arguments of Start, which exclude the goal id.
 fn in_terms_of_start(refused: Refused) -> Refused {
     match refused {
         Refused::Arguments(mut statuses) => {
@@ -498,7 +503,7 @@ fn in_terms_of_start(refused: Refused) -> Refused {
     }
 }
 
-/// A number of any width.
+/// Converts an integer of any width.
 pub(super) fn whole(value: &Variant) -> Option<i64> {
     if let Variant::SByte(number) = value {
         Some((*number).into())
@@ -518,16 +523,16 @@ const PENDING: &str = "cancellation pending: the goal has not ended";
 pub(super) const GONE: &str =
     "the executor of the action is lost: the outcome is unknown, the goal may go on";
 pub(super) const ENDS: &str = "the server ends: the outcome is unknown, the goal may go on";
-/// Of `action_msgs/GoalStatus`, and of goals that never ran.
+/// Statuses of `action_msgs/GoalStatus`; `NEVER_RAN` marks goals that were not executed.
 pub(super) const SUCCEEDED: i64 = 4;
 pub(super) const NEVER_RAN: i64 = -1;
 const UNKNOWN: i64 = 0;
-/// Of `action_msgs/CancelGoal`: ERROR_REJECTED.
+/// ERROR_REJECTED of `action_msgs/CancelGoal`.
 const REJECTED: i64 = 1;
-/// How long Halt waits for the end of the goal before it says that the cancellation is pending.
+/// Time that Halt waits for the end of the goal before it reports a pending cancellation.
 const AT_ONCE: Duration = Duration::from_secs(1);
-/// How long the end of a goal is waited for until a second Halt ends the run with an unknown outcome.
+/// Time that a cancelled goal has to end before a second Halt ends the run with an unknown outcome.
 const HALT_TIMEOUT: Duration = Duration::from_secs(10);
-/// Before a result is asked for anew, doubling from the first to the last.
+/// Pause before the result is requested again, doubling from the first to the last.
 const FIRST_PAUSE: Duration = Duration::from_millis(100);
 const LAST_PAUSE: Duration = Duration::from_secs(1);

@@ -1,5 +1,5 @@
-//! The Programs whose last goal has an unknown outcome. A file keeps them, so that they need a Reset after a restart of the
-//! server too.
+//! The Programs whose last goal has an unknown outcome. They are stored in a file, so that they
+//! need a Reset after a restart of the server too.
 
 use std::collections::BTreeSet;
 use std::io;
@@ -10,7 +10,7 @@ use opcua::sync::Mutex;
 use plant_opcua::synced::replace;
 use tracing::warn;
 
-/// The calls that send the goals of these Programs, one a line in the file.
+/// The calls that send the goals of these Programs. The file has a line for each call.
 pub(crate) struct UnknownOutcomes {
     file: PathBuf,
     goals: Mutex<BTreeSet<TopicId>>,
@@ -66,7 +66,8 @@ impl UnknownOutcomes {
     }
 }
 
-/// Number of Programs; any member of the space can announce some.
+/// Largest number of Programs. The limit exists because every participant of the space can announce
+/// Programs.
 const MOST: usize = 3 * 256;
 
 #[cfg(test)]

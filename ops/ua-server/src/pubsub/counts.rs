@@ -1,4 +1,5 @@
-//! PubSubDiagnostics (OPC 10000-14, 9.1.11): the counters of a component, from the same numbers as `/metrics`.
+//! PubSubDiagnostics (OPC 10000-14, 9.1.11): the counters of a component, from the same numbers as
+//! `/metrics`.
 
 use bridge_node::{Counters, Reason};
 use opcua::types::{DataTypeId, NodeId, ObjectTypeId, ReferenceTypeId, VariableTypeId, Variant};
@@ -6,23 +7,24 @@ use opcua::types::{DataTypeId, NodeId, ObjectTypeId, ReferenceTypeId, VariableTy
 use super::states::{Cause, Change, State};
 use super::tree::{At, Tree};
 
-/// What was counted of a topic, or of all topics of a group.
+/// The counters of a topic, or of all topics of a group.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(crate) struct Counts {
-    /// Messages sent, with those that say something again or nothing.
+    /// Messages sent, including repetitions and keep-alives.
     pub(crate) sent: u64,
-    /// Messages that the network did not take.
+    /// Messages that could not be sent.
     pub(crate) failed: u64,
     /// Messages that could not be secured.
     pub(crate) unsealed: u64,
-    /// Messages taken.
+    /// Messages accepted.
     pub(crate) received: u64,
-    /// Messages heard and not taken, for what is wrong with them.
+    /// Messages received and rejected because of faults.
     pub(crate) wrong: u64,
 }
 
 impl Counts {
-    /// Those of a topic. What came for a reader that is disabled, `ignored`, was not wrong.
+    /// Returns the counters of a topic. `ignored` messages for disabled readers do not count as
+    /// faults.
     pub(super) fn of(counters: &Counters, ignored: u64) -> Self {
         let dropped = |reasons: &[Reason]| -> u64 {
             reasons.iter().map(|reason| counters.dropped(*reason)).sum()
@@ -63,7 +65,7 @@ pub(super) enum Counter {
 }
 
 impl Counter {
-    /// Those of every component.
+    /// The counters of every component.
     pub(super) const OF_ALL: [Self; 6] = [
         Self::StateError,
         Self::OperationalByMethod,
@@ -126,15 +128,15 @@ impl Counter {
     }
 }
 
-/// The counters of a component as they stand in the address space.
+/// The counters of a component in the address space.
 pub(super) struct Diagnostics {
     counters: Vec<Shown>,
     information: NodeId,
     error: NodeId,
     sub_error: NodeId,
-    /// Whether something below it has errors, as it is shown.
+    /// True if a component below has errors, as it is shown.
     below: bool,
-    /// Changes of the state, by their kinds.
+    /// Numbers of state changes, by their kinds.
     states: [u64; 6],
     totals: (u32, u32),
 }
@@ -142,13 +144,13 @@ pub(super) struct Diagnostics {
 struct Shown {
     counter: Counter,
     node: NodeId,
-    /// What had been counted when they were reset.
+    /// The count at the last reset.
     base: u64,
     shown: u32,
 }
 
 impl Diagnostics {
-    /// Puts the counters below a component; also gives the method that resets them.
+    /// Adds the counters below a component. Also returns the method that resets them.
     pub(super) fn insert(
         tree: &mut Tree<'_>,
         above: &At,
@@ -182,7 +184,7 @@ impl Diagnostics {
         (made, reset)
     }
 
-    /// Those of the object PublishSubscribe, which stand in the core namespace.
+    /// Returns the counters of the object PublishSubscribe, which are in the core namespace.
     pub(super) fn of_the_whole() -> Self {
         let node = |id: u32| NodeId::new(0, id);
         let counters = Counter::OF_ALL.iter().zip(WHOLE);
@@ -218,7 +220,7 @@ impl Diagnostics {
         *which = which.saturating_add(1);
     }
 
-    /// Begins to count from nothing.
+    /// Resets the counters.
     pub(super) fn reset(&mut self, counts: Counts) {
         self.states = [0; 6];
         for shown in &mut self.counters {
@@ -226,7 +228,7 @@ impl Diagnostics {
         }
     }
 
-    /// What is another number now.
+    /// Returns the values that have changed.
     pub(super) fn changes(&mut self, counts: Counts, below: bool) -> Vec<(NodeId, Variant)> {
         let mut changes = Vec::new();
         let mut totals = (0_u32, 0_u32);
@@ -255,13 +257,13 @@ impl Diagnostics {
         changes
     }
 
-    /// Whether anything went wrong so far.
+    /// Returns true if an error was counted.
     pub(super) const fn has_errors(&self) -> bool {
         self.totals.1 > 0
     }
 }
 
-/// A counter with what the standard says of it.
+/// Adds a counter with the properties of the standard.
 fn total(tree: &mut Tree<'_>, name: &str, is_error: bool, above: &At) -> NodeId {
     let as_ = (
         VariableTypeId::PubSubDiagnosticsCounterType,
@@ -278,7 +280,7 @@ fn total(tree: &mut Tree<'_>, name: &str, is_error: bool, above: &At) -> NodeId 
     node
 }
 
-/// The identifier of a node that has a text for one.
+/// Returns the identifier of a node as text.
 fn node_text(node: &NodeId) -> String {
     match &node.identifier {
         opcua::types::Identifier::String(text) => text.as_ref().to_owned(),
@@ -290,14 +292,14 @@ fn node_text(node: &NodeId) -> String {
 
 /// DiagnosticsLevel Basic.
 const BASIC: i32 = 0;
-/// StateError and so on below PublishSubscribe.Diagnostics.Counters.
+/// StateError and the following counters below PublishSubscribe.Diagnostics.Counters.
 const WHOLE: [u32; 6] = [17_424, 17_431, 17_436, 17_441, 17_446, 17_451];
 const WHOLE_INFORMATION: u32 = 17_411;
 const WHOLE_ERROR: u32 = 17_416;
 const WHOLE_SUB_ERROR: u32 = 17_422;
-/// Why the network does not take a message.
+/// Reasons why a message could not be sent.
 const FAILED: [Reason; 2] = [Reason::NotSent, Reason::TooBig];
-/// Why a message that was heard is not taken although it was meant for here.
+/// Reasons why a message for this program was rejected.
 const WRONG: [Reason; 13] = [
     Reason::Malformed,
     Reason::Unsupported,

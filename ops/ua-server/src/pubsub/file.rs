@@ -1,7 +1,8 @@
-//! The PubSub configuration as a file that clients read (OPC 10000-14, 9.1.3.7): what the nodes show, in one structure.
+//! The PubSub configuration as a file that clients can read (OPC 10000-14, 9.1.3.7): the content of
+//! the nodes in one structure.
 //!
-//! It is a UABinaryFileDataType as an ExtensionObject, whose Body is a PubSubConfiguration2DataType. Nobody writes it: what runs is
-//! what the mapping says.
+//! The file is a UABinaryFileDataType as an ExtensionObject, whose Body is a
+//! PubSubConfiguration2DataType. It is read-only, because the mapping defines the configuration.
 
 use std::collections::{BTreeMap, HashSet};
 use std::sync::Arc;
@@ -23,16 +24,16 @@ use super::insert::{self, DATA_SET_MESSAGE, NETWORK_MESSAGE, UDP_UADP};
 use super::{Kind, PubSub};
 use crate::layout::{Layout, TopicNode};
 
-/// What the file holds while everything is enabled.
+/// The content of the file while all components are enabled.
 #[derive(Debug, Default)]
 pub(super) struct Content {
-    /// Of the NamespaceArray, from index 1 on: index 0 is left out in files (OPC 10000-5, 12.31).
+    /// The NamespaceArray from index 1 on. Index 0 is omitted in files (OPC 10000-5, 12.31).
     namespaces: Vec<UAString>,
     configuration: PubSubConfiguration2DataType,
 }
 
 impl Content {
-    /// That of the topics that are shown.
+    /// Returns the content for the topics that are shown.
     pub(super) fn of(mapping: &Mapping, layout: &Layout) -> Self {
         let mut writers: BTreeMap<u16, WriterGroupDataType> = BTreeMap::new();
         let mut readers: BTreeMap<(SpaceId, u16), ReaderGroupDataType> = BTreeMap::new();
@@ -83,7 +84,7 @@ impl Content {
         }
     }
 
-    /// The bytes of the file, with what somebody has disabled.
+    /// Returns the bytes of the file, with the disabled components.
     pub(super) fn bytes(&self, disabled: &HashSet<Kind>) -> Vec<u8> {
         let mut configuration = self.configuration.clone();
         if !disabled.is_empty() {
@@ -99,7 +100,7 @@ impl Content {
     }
 }
 
-/// Says of each component that is disabled that it is.
+/// Marks the disabled components.
 fn disable(configuration: &mut PubSubConfiguration2DataType, disabled: &HashSet<Kind>) {
     let is_enabled = |kind| !disabled.contains(&kind);
     configuration.enabled = is_enabled(Kind::Whole);
@@ -124,7 +125,7 @@ fn disable(configuration: &mut PubSubConfiguration2DataType, disabled: &HashSet<
     }
 }
 
-/// Writers and readers are called as their topics.
+/// Writers and readers have the names of their topics.
 fn topic(name: &str) -> Option<TopicId> {
     name.parse().ok()
 }
@@ -187,7 +188,7 @@ fn writer(topic: &TopicNode) -> DataSetWriterDataType {
     }
 }
 
-/// The DataSet that a writer sends.
+/// Returns the DataSet that a writer sends.
 fn published(topic: &TopicNode) -> PublishedDataSetDataType {
     let source = PublishedDataItemsDataType {
         published_data: Some(insert::published(topic).collect()),
@@ -224,7 +225,7 @@ fn reader(mapping: &Mapping, topic: &TopicNode) -> DataSetReaderDataType {
 }
 
 impl PubSub {
-    /// The methods of the file.
+    /// Returns the methods of the file.
     pub(super) fn file_methods(self: &Arc<Self>) -> Vec<CoreMethod> {
         let methods = METHODS.iter().map(|(own, of_type, name, what)| {
             let this = Arc::clone(self);
@@ -247,7 +248,7 @@ impl PubSub {
             (Some(FileMethod::Open), [Variant::Byte(mode)]) if MODES.contains(mode) => {
                 Err(StatusCode::BadNotWritable.into())
             }
-            // ReserveIds and CloseAndUpdate are for who writes.
+            // ReserveIds and CloseAndUpdate are for clients that write the file.
             (None, _) => Err(StatusCode::BadNotWritable.into()),
             (Some(what), _) => handles.call(what, request),
         };
@@ -257,7 +258,7 @@ impl PubSub {
         answer
     }
 
-    /// Closes what sessions that are gone left open.
+    /// Closes the handles of closed sessions.
     pub(super) fn tidy_file(&self) {
         let mut handles = self.file.lock();
         let before = handles.len();
@@ -278,7 +279,7 @@ impl PubSub {
         self.write(vec![(node.into(), Variant::UInt16(count))]);
     }
 
-    /// Says how large the file is, and that nobody writes it.
+    /// Shows the size of the file and that it is read-only.
     pub(super) fn show_file(&self) {
         let size = u64::try_from(self.file_bytes().len()).unwrap_or(u64::MAX);
         self.write(vec![
@@ -298,12 +299,14 @@ impl PubSub {
     }
 }
 
-/// The file.
+/// The file object.
 pub(super) const OBJECT: ObjectId = ObjectId::PublishSubscribe_PubSubConfiguration;
-/// To write anew, and to read and write: the modes of the file beside that to read (OPC 10000-14, 9.1.3.7.1).
+/// The other modes of the file beside read: erase and write, and read and write (OPC 10000-14,
+/// 9.1.3.7.1).
 const MODES: [u8; 2] = [6, 3];
 
-/// Each method: its node, that of the type, and what it is of a file; none of what only who writes has a use for.
+/// The methods: own node, node of the type, name, and function of the file. Methods that are only
+/// useful for writing have no function.
 const METHODS: [(MethodId, MethodId, &str, Option<FileMethod>); 8] = [
     (
         MethodId::PublishSubscribe_PubSubConfiguration_Open,
@@ -354,7 +357,7 @@ const METHODS: [(MethodId, MethodId, &str, Option<FileMethod>); 8] = [
         None,
     ),
 ];
-/// Those that nobody executes.
+/// The methods that are not executable.
 pub(super) const OF_WRITERS: [MethodId; 3] = [
     MethodId::PublishSubscribe_PubSubConfiguration_Write,
     MethodId::PublishSubscribe_PubSubConfiguration_ReserveIds,

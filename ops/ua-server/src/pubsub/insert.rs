@@ -1,4 +1,4 @@
-//! A mapping as PubSub components, and their nodes.
+//! A mapping as PubSub components and their nodes.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -20,7 +20,7 @@ use super::tree::{At, Tree};
 use super::{Ask, Inner, Kind, Part};
 use crate::layout::{Layout, TopicNode};
 
-/// Puts the components of a mapping and their nodes in.
+/// Adds the components of a mapping and their nodes.
 pub(super) fn all(mapping: &Mapping, layout: &Layout, address_space: &mut AddressSpace) -> Inner {
     let mut insert = Insert {
         mapping,
@@ -68,7 +68,7 @@ struct Insert<'a> {
 }
 
 impl Insert<'_> {
-    /// The object PublishSubscribe, which is there.
+    /// Adds the object PublishSubscribe, whose node exists already.
     fn whole(&mut self) -> usize {
         let at = self.inner.states.add(None, State::Operational);
         self.inner.parts.push(Part {
@@ -82,14 +82,14 @@ impl Insert<'_> {
         at
     }
 
-    /// What the file of the configuration has besides: it is there.
+    /// Adds the MimeType of the configuration file. The file object exists already.
     fn file(&mut self) {
         let file = At::core(file::OBJECT, "PubSub.Configuration");
         let mime = (DataTypeId::String, -1);
         self.tree.property("MimeType", mime, UA_BINARY, &file);
     }
 
-    /// A component with its Status, and with counters where it has any.
+    /// Adds a component with its Status, and with counters if it has any.
     fn part(
         &mut self,
         kind: Kind,
@@ -125,7 +125,7 @@ impl Insert<'_> {
         at
     }
 
-    /// The one connection: the group that all programs send to.
+    /// Adds the connection, whose address is the group that all programs send to.
     fn connection(&mut self, whole: usize) -> (usize, At) {
         let pubsub = self.mapping.pubsub();
         let root = At::core(ObjectId::PublishSubscribe, "PubSub");
@@ -158,7 +158,7 @@ impl Insert<'_> {
         (at, object)
     }
 
-    /// The writers or readers of one namespace.
+    /// Adds the group of the writers or readers of one namespace.
     fn group(
         &mut self,
         (space, namespace): (SpaceId, u16),
@@ -212,7 +212,7 @@ impl Insert<'_> {
         (at, object)
     }
 
-    /// What a group of writers has besides.
+    /// Adds the nodes that only a WriterGroup has.
     fn writer_group(&mut self, namespace: u16, object: &At) {
         let pubsub = self.mapping.pubsub();
         let tree = &mut self.tree;
@@ -242,7 +242,7 @@ impl Insert<'_> {
         tree.property("PublishingOffset", offsets, Vec::<f64>::new(), &settings);
     }
 
-    /// How many are below a group, and how many of them are operational.
+    /// Adds the numbers of configured and operational components of a group.
     fn live(&mut self, group: usize, object: &At, writes: bool) {
         let id = format!("{}.Diagnostics", text(object));
         let values = At::core(object.below("Diagnostics"), &id);
@@ -260,7 +260,7 @@ impl Insert<'_> {
         }
     }
 
-    /// A value that this program sends: its writer, and what is published.
+    /// Adds the writer of a value that this program sends, and its PublishedDataSet.
     fn writer(&mut self, topic: &TopicNode, (above, group): (usize, &At), detailed: bool) {
         let name = topic.topic.to_string();
         let how = (group, ReferenceTypeId::HasDataSetWriter);
@@ -312,7 +312,7 @@ impl Insert<'_> {
         );
     }
 
-    /// A value that this program hears.
+    /// Adds the reader of a value that this program receives.
     fn reader(&mut self, topic: &TopicNode, (above, group): (usize, &At), detailed: bool) {
         let name = topic.topic.to_string();
         let how = (group, ReferenceTypeId::HasDataSetReader);
@@ -360,7 +360,7 @@ impl Insert<'_> {
     }
 }
 
-/// The variables whose values a writer sends.
+/// Returns the variables whose values a writer sends.
 pub(super) fn published(topic: &TopicNode) -> impl Iterator<Item = PublishedVariableDataType> {
     variables(topic).map(|node| PublishedVariableDataType {
         published_variable: node.clone(),
@@ -369,7 +369,7 @@ pub(super) fn published(topic: &TopicNode) -> impl Iterator<Item = PublishedVari
     })
 }
 
-/// The variables that have the values a reader hears.
+/// Returns the variables that show the values of a reader.
 pub(super) fn targets(topic: &TopicNode) -> impl Iterator<Item = FieldTargetDataType> {
     variables(topic).map(|node| FieldTargetDataType {
         target_node_id: node.clone(),
@@ -378,7 +378,7 @@ pub(super) fn targets(topic: &TopicNode) -> impl Iterator<Item = FieldTargetData
     })
 }
 
-/// One for each field of a DataSet.
+/// Returns the variable of each field of a DataSet.
 fn variables(topic: &TopicNode) -> impl Iterator<Item = &NodeId> {
     let fields = topic
         .places()
@@ -386,7 +386,7 @@ fn variables(topic: &TopicNode) -> impl Iterator<Item = &NodeId> {
     fields.map(|(node, _)| node)
 }
 
-/// The fields of a DataSet, as they are known before anybody sends them.
+/// Returns the fields of a DataSet, as far as they are known before a publisher sends them.
 pub(super) fn meta_data(topic: &TopicNode) -> DataSetMetaDataType {
     let fields = topic.fields.iter().map(|field| FieldMetaData {
         name: UAString::from(field.name.as_str()),
@@ -409,10 +409,10 @@ fn show_meta_data(tree: &mut Tree<'_>, topic: &TopicNode, above: &At) {
     tree.property("DataSetMetaData", kind, object_of(meta_data(topic)), above);
 }
 
-/// How a group is secured, and who has its keys.
+/// The security mode of a group, and its key services.
 pub(super) struct Secured {
     pub(super) mode: MessageSecurityMode,
-    /// Null where it is not secured, as `services` is.
+    /// Null for an unsecured group, like `services`.
     pub(super) group: UAString,
     pub(super) services: Option<Vec<EndpointDescription>>,
 }
@@ -463,7 +463,7 @@ fn security(tree: &mut Tree<'_>, group: Option<&SecurityGroup>, above: &At) {
     tree.property("SecurityKeyServices", kind, services, above);
 }
 
-/// A list of properties, which is empty.
+/// Adds an empty list of properties.
 fn properties(tree: &mut Tree<'_>, name: &str, above: &At) {
     let none: Vec<ExtensionObject> = Vec::new();
     tree.property(name, (DataTypeId::KeyValuePair, 1), none, above);
@@ -485,7 +485,7 @@ fn text(at: &At) -> String {
     }
 }
 
-/// Where the group is.
+/// Returns the URL of the group address.
 pub(super) fn url(mapping: &Mapping) -> String {
     format!("opc.udp://{}", mapping.pubsub().address)
 }
@@ -500,12 +500,12 @@ pub(super) fn readers_name(space: SpaceId, namespace: u16) -> String {
     format!("readers {space} {namespace}")
 }
 
-/// A Duration.
+/// Converts a time into a Duration of OPC UA.
 pub(super) fn milliseconds(time: Duration) -> f64 {
     time.as_secs_f64() * 1e3
 }
 
-/// The BrowseName of the one connection.
+/// The BrowseName of the connection.
 pub(super) const CONNECTION: &str = "space";
 pub(super) const UDP_UADP: &str = "http://opcfoundation.org/UA-Profile/Transport/pubsub-udp-uadp";
 const UINT16: (DataTypeId, i32) = (DataTypeId::UInt16, -1);
@@ -516,10 +516,10 @@ const FIELDS: (DataTypeId, i32) = (DataTypeId::DataSetFieldContentMask, -1);
 pub(super) const NETWORK_MESSAGE: u32 = 0b0100_0111;
 /// Timestamp, PicoSeconds, Status, MajorVersion, SequenceNumber (OPC 10000-14, 6.3.1.2.2).
 pub(super) const DATA_SET_MESSAGE: u32 = 0b0010_1111;
-/// The BuiltInType of a field that can be anything.
+/// The BuiltInType of a field of any type.
 const VARIANT: u8 = 24;
-/// Of a file in the binary encoding (OPC 10000-5, 12.36).
+/// The MIME type of a file in the binary encoding (OPC 10000-5, 12.36).
 const UA_BINARY: &str = "application/opcua+uabinary";
-/// Writers and readers that are shown, and those of them that have counters.
+/// Largest number of writers and readers that are shown, and largest number with counters.
 pub(super) const MOST_SHOWN: usize = 5_000;
 const MOST_DETAILED: usize = 500;

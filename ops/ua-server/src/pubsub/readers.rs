@@ -1,4 +1,4 @@
-//! How the readers are, as the program notices it.
+//! The states of the readers.
 
 use std::collections::HashMap;
 
@@ -6,26 +6,26 @@ use mappings::TopicId;
 
 use super::states::State;
 
-/// What became of what was heard last of each topic.
+/// The state of the reader of each topic, after its last message.
 #[derive(Debug, Default)]
 pub(crate) struct Readers {
     states: HashMap<TopicId, State>,
-    /// Messages that came while a reader was disabled.
+    /// Numbers of messages that arrived while their reader was disabled.
     ignored: HashMap<TopicId, u64>,
 }
 
 impl Readers {
-    /// A value of a topic came.
+    /// Records that a value of a topic arrived.
     pub(crate) fn heard(&mut self, topic: TopicId) {
         self.states.insert(topic, State::Operational);
     }
 
-    /// It was not taken, for its reader is disabled.
+    /// Records that a message was dropped because its reader is disabled.
     pub(crate) fn ignored(&mut self, topic: TopicId) {
         *self.ignored.entry(topic).or_default() += 1;
     }
 
-    /// The writer of a topic is silent, or speaks again.
+    /// Records that the writer of a topic is silent or active again.
     pub(crate) fn silent(&mut self, topic: TopicId, silent: bool) {
         let state = if silent {
             State::Error
@@ -35,7 +35,7 @@ impl Readers {
         self.states.insert(topic, state);
     }
 
-    /// Knows nothing of these topics any longer.
+    /// Removes these topics.
     pub(crate) fn forget(&mut self, gone: &[TopicId]) {
         for topic in gone {
             self.states.remove(topic);
@@ -43,13 +43,13 @@ impl Readers {
         }
     }
 
-    /// How the reader of a topic is: it waits for its first value at first.
+    /// Returns the state of the reader of a topic, which is PreOperational until the first value.
     pub(crate) fn of(&self, topic: TopicId) -> State {
         let state = self.states.get(&topic).copied();
         state.unwrap_or(State::PreOperational)
     }
 
-    /// How many messages were not taken for that reason.
+    /// Returns the number of messages that were dropped because the reader was disabled.
     pub(super) fn count_ignored(&self, topic: TopicId) -> u64 {
         self.ignored.get(&topic).copied().unwrap_or_default()
     }

@@ -1,36 +1,36 @@
-//! The states of PubSub components (OPC 10000-14, 6.2.1): each has its own, and none is operational while the one above it
-//! is not.
+//! The states of PubSub components (OPC 10000-14, 6.2.1). Each component has a state, and no
+//! component is operational unless its parent is.
 
-/// PubSubState (OPC 10000-14, 6.2.1), by its number.
+/// PubSubState (OPC 10000-14, 6.2.1) by its number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum State {
-    /// Somebody has disabled it.
+    /// A client has disabled the component.
     Disabled = 0,
-    /// What is above it is not operational.
+    /// The parent is not operational.
     Paused = 1,
-    /// It does its work.
+    /// The component is operational.
     Operational = 2,
-    /// It cannot.
+    /// The component is in error.
     Error = 3,
-    /// It waits for what it needs at first.
+    /// The component waits for its prerequisites.
     PreOperational = 4,
 }
 
-/// Why a state is another one than before.
+/// The cause of a state change.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Cause {
-    /// Somebody called Enable or Disable of it.
+    /// A client called Enable or Disable of the component.
     Method,
-    /// What is above it has another state.
+    /// The state of the parent changed.
     Parent,
-    /// What it meets with.
+    /// The component's own condition changed.
     Itself,
 }
 
-/// A state that is another one now.
+/// A changed state.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Change {
-    /// Of which component.
+    /// The number of the component.
     pub(crate) at: usize,
     pub(crate) was: State,
     pub(crate) is: State,
@@ -41,21 +41,22 @@ pub(crate) struct Change {
 struct Component {
     parent: Option<usize>,
     enabled: bool,
-    /// Whether `enabled` was changed since the last look.
+    /// True if `enabled` has changed after the last update.
     called: bool,
-    /// What it meets with, while it is enabled and what is above it is operational.
+    /// The component's own condition, which is its state while it is enabled and its parent is
+    /// operational.
     own: State,
     state: State,
 }
 
-/// All components; one that is above another has the lower number.
+/// All components. A parent has a lower number than its children.
 #[derive(Debug, Default)]
 pub(crate) struct States {
     all: Vec<Component>,
 }
 
 impl States {
-    /// One more below `parent`; its number.
+    /// Adds a component below `parent` and returns its number.
     pub(crate) fn add(&mut self, parent: Option<usize>, own: State) -> usize {
         let component = Component {
             parent,
@@ -68,20 +69,21 @@ impl States {
         self.all.len() - 1
     }
 
-    /// The state of a component.
+    /// Returns the state of a component.
     pub(crate) fn of(&self, at: usize) -> State {
         let component = self.all.get(at);
         component.map_or(State::Disabled, |component| component.state)
     }
 
-    /// Says what a component meets with.
+    /// Sets the own condition of a component.
     pub(crate) fn set_own(&mut self, at: usize, own: State) {
         if let Some(component) = self.all.get_mut(at) {
             component.own = own;
         }
     }
 
-    /// Enables or disables a component; false where it is so already (OPC 10000-14, 9.1.10).
+    /// Enables or disables a component. Returns false if it is in that state already (OPC 10000-14,
+    /// 9.1.10).
     pub(crate) fn enable(&mut self, at: usize, enabled: bool) -> bool {
         let Some(component) = self.all.get_mut(at) else {
             return false;
@@ -92,12 +94,12 @@ impl States {
         other
     }
 
-    /// Which components are enabled by themselves.
+    /// Returns true if a component itself is enabled.
     pub(crate) fn is_enabled(&self, at: usize) -> bool {
         self.all.get(at).is_some_and(|component| component.enabled)
     }
 
-    /// Works out all states anew, and gives those that are others now.
+    /// Computes all states and returns the changes.
     pub(crate) fn settle(&mut self) -> Vec<Change> {
         let mut changes = Vec::new();
         for at in 0..self.all.len() {

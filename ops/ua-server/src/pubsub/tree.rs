@@ -1,4 +1,4 @@
-//! Objects, variables and methods of the PubSub configuration, as they are put into the address space.
+//! Adds objects, variables and methods of the PubSub configuration to the address space.
 
 use opcua::nodes::{MethodBuilder, NodeType, ObjectBuilder, ReferenceDirection, VariableBuilder};
 use opcua::server::address_space::AddressSpace;
@@ -7,13 +7,13 @@ use opcua::types::{
     ReferenceTypeId, UAString, VariableTypeId, Variant,
 };
 
-/// Puts nodes in, and remembers which.
+/// Adds nodes and records them.
 pub(super) struct Tree<'a> {
     pub(super) address_space: &'a mut AddressSpace,
     pub(super) made: Vec<NodeId>,
 }
 
-/// An object that nodes are put below.
+/// An object to which nodes are added.
 #[derive(Clone)]
 pub(super) struct At {
     pub(super) node: NodeId,
@@ -21,7 +21,7 @@ pub(super) struct At {
 }
 
 impl At {
-    /// A node of the core namespace; what is put below it has identifiers that begin with `id`.
+    /// Returns a node of the core namespace. Nodes below it have identifiers that begin with `id`.
     pub(super) fn core(node: impl Into<NodeId>, id: &str) -> Self {
         Self {
             node: node.into(),
@@ -29,14 +29,14 @@ impl At {
         }
     }
 
-    /// The node of that name below it.
+    /// Returns the node of that name below the object.
     pub(super) fn below(&self, name: &str) -> NodeId {
         NodeId::new(APPLICATION, format!("{}.{name}", self.id))
     }
 }
 
 impl Tree<'_> {
-    /// An object below another.
+    /// Adds an object below another object.
     pub(super) fn object(
         &mut self,
         name: &str,
@@ -55,12 +55,12 @@ impl Tree<'_> {
         }
     }
 
-    /// A component below an object.
+    /// Adds an object as a component of another object.
     pub(super) fn part(&mut self, name: &str, kind: ObjectTypeId, above: &At) -> At {
         self.object(name, kind, (above, ReferenceTypeId::HasComponent))
     }
 
-    /// A property.
+    /// Adds a property.
     pub(super) fn property(
         &mut self,
         name: &str,
@@ -72,7 +72,7 @@ impl Tree<'_> {
         self.variable(name, kind, value, (above, as_));
     }
 
-    /// A variable that is a component.
+    /// Adds a variable as a component.
     pub(super) fn value(
         &mut self,
         name: &str,
@@ -87,7 +87,7 @@ impl Tree<'_> {
         self.variable(name, kind, value, (above, as_))
     }
 
-    /// A variable of which one of several texts is chosen.
+    /// Adds a variable that selects one of several texts.
     pub(super) fn selection(&mut self, name: &str, text: &str, above: &At) {
         let as_ = (
             VariableTypeId::SelectionListType,
@@ -102,7 +102,7 @@ impl Tree<'_> {
         self.property("Selections", (DataTypeId::BaseDataType, 1), texts, &list);
     }
 
-    /// A variable.
+    /// Adds a variable.
     pub(super) fn variable(
         &mut self,
         name: &str,
@@ -122,7 +122,7 @@ impl Tree<'_> {
         node
     }
 
-    /// A method that takes and gives nothing.
+    /// Adds a method without arguments.
     pub(super) fn method(&mut self, name: &str, above: &At) -> NodeId {
         let node = above.below(name);
         MethodBuilder::new(&node, browse_name(name), LocalizedText::from(name))
@@ -134,13 +134,13 @@ impl Tree<'_> {
         node
     }
 
-    /// Says that a node is to be found from another one too.
+    /// Adds a reference between two nodes.
     pub(super) fn refer(&mut self, from: &NodeId, to: &NodeId, reference: ReferenceTypeId) {
         self.address_space.insert_reference(from, to, reference);
     }
 }
 
-/// A method of the Status of the object PublishSubscribe, where it has none.
+/// Adds a method of the Status of the object PublishSubscribe, unless it exists.
 pub(super) fn core_method(address_space: &mut AddressSpace, method: MethodId, name: &str) {
     let node: NodeId = method.into();
     if !address_space.node_exists(&node) {
@@ -156,7 +156,7 @@ pub(super) fn core_method(address_space: &mut AddressSpace, method: MethodId, na
     }
 }
 
-/// Says of a method that is there that nobody executes it.
+/// Makes an existing method not executable.
 pub(super) fn nobody_executes(address_space: &mut AddressSpace, method: MethodId) {
     if let Some(NodeType::Method(method)) = address_space.find_mut(&method.into()) {
         method.set_executable(false);
@@ -164,7 +164,7 @@ pub(super) fn nobody_executes(address_space: &mut AddressSpace, method: MethodId
     }
 }
 
-/// The names are those of the standard.
+/// Returns a BrowseName. Names that begin with a capital letter are names of the standard.
 fn browse_name(name: &str) -> QualifiedName {
     let namespace = if name.starts_with(|c: char| c.is_ascii_uppercase()) {
         0

@@ -1,4 +1,5 @@
-//! The keys of one group in the order of their SecurityTokenIds: those before, the one that is used, and those to come.
+//! The keys of one group in the order of their SecurityTokenIds: past keys, the current key, and
+//! future keys.
 
 use std::collections::VecDeque;
 use std::fmt;
@@ -6,19 +7,19 @@ use std::time::{Duration, Instant};
 
 use bridge_core::Now;
 
-/// Keys of a group, and since when the current one is used.
+/// The keys of a group, and the start of use of the current key.
 #[derive(Clone, PartialEq, Eq)]
 pub(super) struct Ring {
     lifetime: Duration,
-    /// The SecurityTokenId of the first key there is; that of the first to be made, where there is none.
+    /// The SecurityTokenId of the first key, or of the next key if there are no keys.
     first: u32,
     keys: VecDeque<Vec<u8>>,
-    /// How many keys stand before the current one.
+    /// Number of keys before the current key.
     past: usize,
     since: Instant,
 }
 
-/// What is handed out.
+/// The keys for a client.
 #[derive(PartialEq, Eq)]
 pub(super) struct Handed {
     pub(super) first_token_id: u32,
@@ -28,7 +29,7 @@ pub(super) struct Handed {
 }
 
 impl Ring {
-    /// Without a key so far.
+    /// Creates a ring without keys.
     pub(super) const fn new(lifetime: Duration, now: Now) -> Self {
         Self {
             lifetime,
@@ -39,7 +40,8 @@ impl Ring {
         }
     }
 
-    /// Without a key so far, and its SecurityTokenIds go on behind those of another, whose keys nobody takes any more.
+    /// Creates a ring without keys. Its SecurityTokenIds continue after the keys of another ring,
+    /// which are not accepted any more.
     pub(super) fn after(before: &Self, lifetime: Duration, now: Now) -> Self {
         Self {
             first: before.token(before.keys.len()),
@@ -47,7 +49,7 @@ impl Ring {
         }
     }
 
-    /// As it was kept: the key at `past` of `keys` was used for `used` so far.
+    /// Restores a stored ring. The key at index `past` of `keys` has been in use for `used`.
     pub(super) fn kept(
         lifetime: Duration,
         (first, keys): (u32, VecDeque<Vec<u8>>),
@@ -64,7 +66,7 @@ impl Ring {
         }
     }
 
-    /// Has each key used so long from now on; the current one not longer than that.
+    /// Changes the lifetime of the keys. The current key ends after this lifetime at the latest.
     pub(super) fn set_lifetime(&mut self, lifetime: Duration, now: Now) {
         if self.used(now.monotonic) > lifetime {
             let since = now.monotonic.checked_sub(lifetime);
@@ -73,8 +75,9 @@ impl Ring {
         self.lifetime = lifetime;
     }
 
-    /// Goes on to the key whose time it is, and makes those that come next. The SecurityTokenId grows with each lifetime
-    /// that is over, whether somebody has asked for keys or not. False where all is as it was.
+    /// Advances to the current key and creates the next keys. The SecurityTokenId increases with
+    /// each elapsed lifetime, even if no client requests keys. Returns false if nothing has
+    /// changed.
     pub(super) fn advance(&mut self, now: Instant, mut make: impl FnMut() -> Vec<u8>) -> bool {
         let used = now.saturating_duration_since(self.since);
         let over = used.as_nanos() / self.lifetime.as_nanos().max(1);
@@ -89,7 +92,7 @@ impl Ring {
             if next < self.keys.len() {
                 self.past = next;
             } else {
-                // Keys nobody has heard of were never used: their numbers are over.
+                // Keys that were not distributed were not used, and their numbers are skipped.
                 self.first = self.token(next);
                 self.keys.clear();
                 self.past = 0;
@@ -111,8 +114,9 @@ impl Ring {
         changed
     }
 
-    /// Keys from the one with the SecurityTokenId `starting`, or the current one for 0, or the oldest there is where that is
-    /// not known; `count` of them, at least one (OPC 10000-14, 8.3.2). `None` before there is any.
+    /// Returns keys from the SecurityTokenId `starting` on, from the current key for 0, or from the
+    /// oldest key if the id is unknown. `count` keys are returned, but at least one (OPC 10000-14,
+    /// 8.3.2). Returns `None` before there are keys.
     pub(super) fn hand_out(&self, starting: u32, count: u32, now: Instant) -> Option<Handed> {
         let at = match starting {
             0 => self.past,
@@ -120,7 +124,7 @@ impl Ring {
                 .find(|at| self.token(*at) == token)
                 .unwrap_or(0),
         };
-        // The current one, and as many of those to come.
+        // The first key, and `count` keys after it.
         let count = usize::try_from(count)
             .unwrap_or(usize::MAX)
             .saturating_add(1);
@@ -134,7 +138,8 @@ impl Ring {
         })
     }
 
-    /// The SecurityTokenId of the key at a place. 0 is none: behind the last comes 1.
+    /// Returns the SecurityTokenId of the key at an index. The id 0 is reserved: the largest id is
+    /// followed by 1.
     fn token(&self, at: usize) -> u32 {
         let at = u64::try_from(at).unwrap_or(u64::MAX);
         let all = u64::from(u32::MAX);
@@ -146,7 +151,7 @@ impl Ring {
         self.lifetime
     }
 
-    /// The SecurityTokenId of the first key, and all keys.
+    /// Returns the SecurityTokenId of the first key, and all keys.
     pub(super) const fn keys(&self) -> (u32, &VecDeque<Vec<u8>>) {
         (self.first, &self.keys)
     }
@@ -155,7 +160,7 @@ impl Ring {
         self.past
     }
 
-    /// How long the current key is used by now.
+    /// Returns how long the current key has been in use.
     pub(super) fn used(&self, now: Instant) -> Duration {
         now.saturating_duration_since(self.since)
     }
@@ -180,9 +185,9 @@ impl fmt::Debug for Handed {
     }
 }
 
-/// Keys that are kept once their time is over.
+/// Number of past keys that are kept.
 const PAST: usize = 2;
-/// Keys that are made before their time.
+/// Number of keys that are created in advance.
 pub(super) const FUTURE: u32 = 4;
 
 #[cfg(test)]
@@ -193,7 +198,7 @@ mod tests {
 
     const HOUR: Duration = Duration::from_secs(3600);
 
-    /// Keys that tell which they are.
+    /// Creates keys with consecutive numbers.
     fn maker() -> impl FnMut() -> Vec<u8> {
         let mut count = 0_u8;
         move || {

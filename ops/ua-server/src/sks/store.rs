@@ -1,4 +1,4 @@
-//! The file with the keys of the groups this server makes keys for.
+//! The file with the keys of the groups for which this server creates keys.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::fs::File;
@@ -14,13 +14,13 @@ use uadp::SecurityPolicy;
 
 use super::ring::Ring;
 
-/// A file in a folder that only its owner can read.
+/// The key file, which only its owner can read.
 #[derive(Debug)]
 pub(super) struct Store {
     file: PathBuf,
 }
 
-/// The keys of a group as they are kept.
+/// The stored keys of a group.
 #[derive(Serialize, Deserialize)]
 #[serde(rename_all = "camelCase", deny_unknown_fields)]
 struct Kept {
@@ -29,9 +29,9 @@ struct Kept {
     lifetime_ms: u64,
     /// The SecurityTokenId of the first key.
     first_token_id: u32,
-    /// How many keys stand before the one that is used.
+    /// Number of keys before the current key.
     past: usize,
-    /// Since when it is used, in milliseconds since 1970.
+    /// Start of use of the current key, in milliseconds since 1970.
     since: i64,
     /// The key data, hexadecimal.
     keys: Vec<String>,
@@ -42,10 +42,10 @@ impl Store {
         Self { file }
     }
 
-    /// What the file has; nothing where there is none.
+    /// Loads the keys. Returns no keys if the file does not exist.
     ///
     /// # Errors
-    /// What is wrong with it, without a key.
+    /// Returns the fault of the file, without key data.
     pub(super) fn load(&self, now: Now) -> Result<Vec<(String, SecurityPolicy, Ring)>, String> {
         let name = self.file.display();
         let unusable = |error: io::Error| format!("the keys in {name} cannot be read: {error}");
@@ -66,7 +66,7 @@ impl Store {
             .read_to_string(&mut text)
             .map_err(unusable)?;
         let kept: BTreeMap<String, Kept> = serde_json::from_str(&text).map_err(|error| {
-            // What the file holds is not told.
+            // The content of the file is not logged.
             format!(
                 "{name}, line {}: no keys as this program keeps them; remove it for new ones",
                 error.line()
@@ -81,10 +81,10 @@ impl Store {
         rings.collect()
     }
 
-    /// Keeps these in place of what the file had.
+    /// Replaces the content of the file.
     ///
     /// # Errors
-    /// Why it cannot be written.
+    /// Returns the reason why the file cannot be written.
     pub(super) fn save<'a>(
         &self,
         rings: impl Iterator<Item = (&'a str, SecurityPolicy, &'a Ring)>,
@@ -130,7 +130,7 @@ impl Kept {
             .map(|key| bytes(key).filter(|key| key.len() == policy.key_data_length()))
             .collect::<Option<_>>()?;
         let whole = !keys.is_empty() && self.first_token_id > 0 && self.lifetime_ms > 0;
-        // A clock that was set back has the key begin now.
+        // If the clock was set back, the use of the key starts at the current time.
         let used = unix(now).saturating_sub(self.since);
         let used = Duration::from_millis(u64::try_from(used).unwrap_or_default());
         let lifetime = Duration::from_millis(self.lifetime_ms);
@@ -141,7 +141,7 @@ impl Kept {
     }
 }
 
-/// Milliseconds since 1970.
+/// Returns the milliseconds since 1970.
 fn unix(now: Now) -> i64 {
     i64::try_from(now.utc.unix_nanos() / 1_000_000).unwrap_or(i64::MAX)
 }
@@ -150,7 +150,7 @@ fn hex(bytes: &[u8]) -> String {
     use std::fmt::Write as _;
     let mut text = String::with_capacity(bytes.len() * 2);
     for byte in bytes {
-        // To a String nothing fails.
+        // Writing to a String cannot fail.
         let _written = write!(text, "{byte:02x}");
     }
     text
@@ -172,7 +172,7 @@ fn bytes(hex: &str) -> Option<Vec<u8>> {
     pairs.collect()
 }
 
-/// Far more than the keys of all groups take.
+/// Size limit of the file, far above the size of the keys of all groups.
 const MOST_BYTES: u64 = 1 << 20;
 
 #[cfg(test)]
@@ -192,7 +192,7 @@ mod tests {
     fn later(now: Now, by: Duration) -> Now {
         let nanos = now.utc.unix_nanos() + i128::try_from(by.as_nanos()).unwrap();
         Now {
-            // Of another run of the program, whose clock began anew.
+            // Simulates another run of the program, whose monotonic clock restarts.
             monotonic: now.monotonic,
             utc: uadp::Timestamp::from_unix_nanos(nanos),
         }

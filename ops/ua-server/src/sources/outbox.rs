@@ -1,4 +1,4 @@
-//! What waits to be written to one server.
+//! The values that wait to be written to one server.
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
@@ -12,11 +12,12 @@ use tokio::sync::{Notify, oneshot};
 use super::state::{State, Way};
 use super::{Plan, Write};
 
-/// Values on their way to one server, as fields. Of a state the newest waits, also for a server that is away, and is written
-/// anew when it comes back; events are written while the server is there, or not at all.
+/// Values to be written to one server, as fields. Of a state only the newest value waits, also
+/// while the server is offline; it is written again after a reconnect. Events are written while the
+/// server is connected, and dropped otherwise.
 pub(super) struct Outbox {
     waiting: Mutex<Waiting>,
-    /// Something waits.
+    /// Notified when a value waits.
     pub(super) filled: Notify,
     pub(super) state: Arc<State>,
 }
@@ -24,16 +25,16 @@ pub(super) struct Outbox {
 #[derive(Default)]
 struct Waiting {
     topics: HashMap<TopicId, Lane>,
-    /// Whose turn it is.
+    /// The topics in the order of writing.
     turns: VecDeque<TopicId>,
     up: bool,
 }
 
-/// A value that waits, as fields.
+/// A waiting value, as fields.
 #[derive(Debug)]
 pub(super) struct Value {
     pub(super) block: Bytes,
-    /// Takes the result, where a client waits for it.
+    /// Receives the result if a client waits for it.
     answer: Option<oneshot::Sender<StatusCode>>,
 }
 
@@ -41,13 +42,13 @@ impl Value {
     /// Answers the client that wrote the value.
     fn answer(&mut self, status: StatusCode) {
         if let Some(answer) = self.answer.take() {
-            // The client may have gone.
+            // The client may be lost.
             let _gone = answer.send(status);
         }
     }
 }
 
-/// One variable.
+/// The queue of one variable.
 struct Lane {
     write: Arc<Write>,
     values: VecDeque<Value>,
@@ -64,7 +65,7 @@ impl Outbox {
         }
     }
 
-    /// Goes over to what another mapping wants. What waits for the same node goes on waiting.
+    /// Switches to another plan. Values for unchanged nodes continue to wait.
     pub(super) fn plan(&self, plan: &Plan) {
         let mut waiting = self.waiting.lock();
         let mut before = std::mem::take(&mut waiting.topics);
@@ -81,14 +82,15 @@ impl Outbox {
         turns.retain(|topic| topics.contains_key(topic));
     }
 
-    /// A value to be written.
+    /// Adds a value to be written.
     pub(super) fn put(&self, topic: TopicId, block: &[u8]) {
         self.add(topic, block, None);
     }
 
-    /// A value to be written, and who takes the result: the status of the server, BadRequestCancelledByRequest if a newer
-    /// value took its place, BadNoCommunication for an event that the server did not get, and GoodCompletesAsynchronously for
-    /// a state that waits for the server.
+    /// Adds a value to be written. `answer` receives the result: the status of the server,
+    /// BadRequestCancelledByRequest if a newer value superseded it, BadNoCommunication for an event
+    /// that did not reach the server, and GoodCompletesAsynchronously for a state that waits for
+    /// the server.
     pub(super) fn write(&self, topic: TopicId, block: &[u8], answer: oneshot::Sender<StatusCode>) {
         self.add(topic, block, Some(answer));
     }
@@ -139,14 +141,14 @@ impl Outbox {
         self.filled.notify_one();
     }
 
-    /// The last value of a topic is not to be written again.
+    /// Forgets the last value of a topic, so that it is not repeated.
     pub(super) fn forget(&self, topic: TopicId) {
         if let Some(lane) = self.waiting.lock().topics.get_mut(&topic) {
             lane.last = None;
         }
     }
 
-    /// The server is there, or there again: it is told the state of the cell.
+    /// Handles a connect of the server: the states of the cell are written to it.
     pub(super) fn up(&self) {
         let mut waiting = self.waiting.lock();
         waiting.up = true;
@@ -166,7 +168,7 @@ impl Outbox {
         self.filled.notify_one();
     }
 
-    /// The server is away: no event waits for it.
+    /// Handles the loss of the server: waiting events are dropped.
     pub(super) fn down(&self) {
         let mut waiting = self.waiting.lock();
         waiting.up = false;
@@ -189,7 +191,7 @@ impl Outbox {
         }
     }
 
-    /// The next values to be written, each of another variable.
+    /// Returns the next values to be written, at most one of each variable.
     pub(super) fn take(&self, most: usize) -> Vec<(Arc<Write>, Value)> {
         let mut waiting = self.waiting.lock();
         let mut taken = Vec::new();
@@ -211,7 +213,8 @@ impl Outbox {
         taken
     }
 
-    /// A value that may not have reached the server: a state is written again unless there is a newer one, an event is not.
+    /// Handles a value that may not have reached the server. A state is written again unless there
+    /// is a newer value; an event is dropped.
     pub(super) fn untold(&self, write: &Write, mut value: Value) {
         if write.overflow == Overflow::KeepLatest {
             value.answer(StatusCode::GoodCompletesAsynchronously);
@@ -221,7 +224,7 @@ impl Outbox {
         }
     }
 
-    /// A value that the server did not take.
+    /// Handles a value that the server rejected.
     pub(super) fn refused(&self, write: &Write, mut value: Value, why: (StatusCode, &str)) {
         let (status, why) = why;
         value.answer(status);
@@ -229,7 +232,7 @@ impl Outbox {
         self.state.fault(&write.name, Way::To, why);
     }
 
-    /// A value that the server took.
+    /// Handles a value that the server accepted.
     pub(super) fn written(&self, write: &Write, mut value: Value, status: StatusCode) {
         value.answer(status);
         self.state.written(1);
@@ -241,7 +244,8 @@ fn count(many: usize) -> u64 {
     u64::try_from(many).unwrap_or(u64::MAX)
 }
 
-/// How many events wait for one node, whatever the mapping says: each is a request of the server's time.
+/// Largest number of events that wait for one node, whatever the mapping allows, because each event
+/// is a request to the server.
 const MOST_EVENTS: usize = 1_000;
 
 #[cfg(test)]
@@ -306,7 +310,8 @@ mod tests {
         outbox.down();
         outbox.up();
         assert_eq!(taken(&outbox), [""; 0]);
-        // The first, the second, and the one that waited as the server fell.
+        // The first event, the second event, and the event that waited when the connection was
+        // lost.
         assert_eq!(outbox.state.told().not_written, 3);
     }
     #[test]
@@ -321,14 +326,14 @@ mod tests {
         let answer = |mut answered: oneshot::Receiver<StatusCode>| answered.try_recv().ok();
         let only = |outbox: &Outbox| outbox.take(1).pop().unwrap();
 
-        // The server is away.
+        // The server is offline.
         let waits = answer(write(&state, topic, b"1"));
         assert_eq!(waits, Some(StatusCode::GoodCompletesAsynchronously));
         let lost = answer(write(&event, event_topic, b"1"));
         assert_eq!(lost, Some(StatusCode::BadNoCommunication));
         state.up();
         event.up();
-        // A newer value takes the place of an older one.
+        // A newer value supersedes an older value.
         for (outbox, topic) in [(&state, topic), (&event, event_topic)] {
             let (older, newer) = (write(outbox, topic, b"2"), write(outbox, topic, b"3"));
             let superseded = Some(StatusCode::BadRequestCancelledByRequest);

@@ -1,7 +1,8 @@
-//! Hears of the nodes of one server that variables come from.
+//! Subscribes to the nodes of one server from which variables are read.
 //!
-//! NodeIds hold for one connection: a server that was started anew may number its namespaces otherwise. So each connection has
-//! subscriptions of its own, and what the old ones say after it is not heard.
+//! NodeIds are valid for one connection only, because a restarted server may number its namespaces
+//! differently. Each connection therefore has its own subscriptions, and later notifications of old
+//! subscriptions are ignored.
 
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
@@ -18,7 +19,7 @@ use super::state::{State, Way};
 use super::{News, Plan, Read};
 use crate::executing::local_node;
 
-/// Hears of the nodes for as long as the server is wanted.
+/// Reads the nodes for as long as the server is in use.
 pub(super) async fn run(
     client: Client,
     mut plan: watch::Receiver<Arc<Plan>>,
@@ -58,7 +59,7 @@ pub(super) async fn run(
             _ = again.tick(), if !reader.faulty.is_empty() => reader.retry().await,
         };
         if told.is_err() {
-            // Nobody hears of it any longer.
+            // The receiver has stopped.
             return;
         }
     }
@@ -70,11 +71,11 @@ struct Reader {
     tell: mpsc::Sender<News>,
     wanted: Vec<Arc<Read>>,
     batches: Vec<Batch>,
-    /// Those that the server does not have.
+    /// Variables whose node does not exist on the server.
     faulty: HashMap<TopicId, Arc<Read>>,
-    /// The connection that the subscriptions are of.
+    /// The connection of the subscriptions.
     at: Option<u64>,
-    /// Whether it was told that the server is away.
+    /// True if the loss of the server was reported.
     away: bool,
 }
 
@@ -86,7 +87,8 @@ struct Batch {
 
 type Told = Result<(), mpsc::error::SendError<News>>;
 
-/// The next thing that one of the subscriptions tells, and of which it is.
+/// Waits for the next notification of a subscription, and returns it with the index of the
+/// subscription.
 async fn heard(batches: &mut [Batch]) -> (usize, Option<Notice>) {
     if batches.is_empty() {
         return std::future::pending().await;
@@ -100,7 +102,7 @@ async fn heard(batches: &mut [Batch]) -> (usize, Option<Notice>) {
 }
 
 impl Reader {
-    /// Goes with the connection.
+    /// Follows the state of the connection.
     async fn follow(&mut self, link: &Link) -> Told {
         self.state.link(link, self.client.certificates_refused());
         match link {
@@ -130,7 +132,7 @@ impl Reader {
         }
     }
 
-    /// Subscribes to what is new, and lets go of what is not wanted any longer.
+    /// Subscribes to new variables and drops the subscriptions without wanted variables.
     async fn change(&mut self, reads: Vec<Arc<Read>>) -> Told {
         let same = |one: &Arc<Read>, all: &[Arc<Read>]| all.iter().any(|of| Arc::ptr_eq(of, one));
         let new: Vec<Arc<Read>> = {
@@ -196,7 +198,7 @@ impl Reader {
         (at, notice): (usize, Option<Notice>),
         link: &watch::Receiver<Link>,
     ) -> Told {
-        // After the next connection the NodeIds may be those of other nodes.
+        // After a reconnect the NodeIds may denote other nodes.
         let now = match &*link.borrow() {
             Link::Up { connects, .. } => Some(*connects),
             Link::Connecting | Link::Down { .. } | Link::Closed => None,
@@ -232,7 +234,7 @@ impl Reader {
         }
     }
 
-    /// Looks whether the server has by now what it had not.
+    /// Checks if the missing nodes exist on the server in the meantime.
     async fn retry(&mut self) -> Told {
         let faulty: Vec<Arc<Read>> = self.faulty.values().cloned().collect();
         let mut nodes = Vec::new();
@@ -258,7 +260,7 @@ impl Reader {
         }
     }
 
-    /// One variable has no source, and all others go on.
+    /// Marks one variable as faulty without affecting the others.
     async fn fault(&mut self, read: &Arc<Read>, status: StatusCode, why: &str) -> Told {
         self.state.fault(&read.name, Way::From, why);
         self.faulty.insert(read.topic, Arc::clone(read));
@@ -278,7 +280,7 @@ impl Reader {
     }
 }
 
-/// Whether that says that there is no such value to be had.
+/// Returns true if a status means that the value is not available.
 fn is_away(status: StatusCode) -> bool {
     matches!(
         status,
@@ -290,9 +292,10 @@ fn is_away(status: StatusCode) -> bool {
     )
 }
 
-/// How often a server is asked for nodes that it did not have.
+/// Interval between two checks of missing nodes.
 const LOOK_AGAIN: Duration = Duration::from_secs(10);
-/// More subscriptions than that are made into one: servers have few.
+/// Largest number of subscriptions. Beyond it they are merged into one, because servers support
+/// few.
 const MOST_BATCHES: usize = 8;
-/// Notices that wait at least; beyond what waits they are lost, and counted.
+/// Smallest queue size of notifications. Notifications beyond the queue are lost and counted.
 const SMALLEST_QUEUE: usize = 1_000;

@@ -1,4 +1,4 @@
-//! What is told of one server.
+//! The state of one server as it is reported.
 
 use std::collections::BTreeMap;
 
@@ -10,12 +10,12 @@ use tracing::{info, warn};
 
 use super::Plan;
 
-/// One server, as its two tasks see it.
+/// One server, shared by its two tasks.
 pub(super) struct State {
     told: Mutex<LinkState>,
 }
 
-/// What is done with a node.
+/// The direction of a node's values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Way {
     From,
@@ -46,7 +46,7 @@ impl State {
         self.told.lock().clone()
     }
 
-    /// Takes note of the link. What changes is told for people, once.
+    /// Records the state of the connection. Each change is logged once.
     pub(super) fn link(&self, link: &Link, certificates_refused: u64) {
         let mut told = self.told.lock();
         told.certificates_refused = certificates_refused;
@@ -95,7 +95,7 @@ impl State {
         self.told.lock().not_written += many;
     }
 
-    /// Something of a variable cannot be had: that is told once for each reason.
+    /// Records a fault of a variable. Each reason is logged once.
     pub(super) fn fault(&self, variable: &str, way: Way, why: &str) {
         let mut told = self.told.lock();
         let before = told.faults.insert(key(variable, way), why.to_owned());
@@ -121,7 +121,7 @@ impl State {
         }
     }
 
-    /// What is wrong with what is not wanted any longer is nobody's business.
+    /// Removes the faults of variables that are not wanted any more.
     pub(super) fn keep(&self, plan: &Plan) {
         let mut told = self.told.lock();
         if told.faults.is_empty() {

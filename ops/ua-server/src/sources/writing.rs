@@ -1,4 +1,4 @@
-//! Empties what waits for one server.
+//! Writes the waiting values of one server.
 
 use std::sync::Arc;
 
@@ -12,7 +12,7 @@ use super::outbox::{Outbox, Value};
 use super::{Plan, Write, one_value};
 use crate::executing::local_node;
 
-/// Writes for as long as the server is wanted.
+/// Writes for as long as the server is in use.
 pub(super) async fn run(client: Client, mut plan: watch::Receiver<Arc<Plan>>, outbox: Arc<Outbox>) {
     let mut link = client.link();
     outbox.plan(&plan.borrow_and_update().clone());
@@ -45,7 +45,7 @@ pub(super) async fn run(client: Client, mut plan: watch::Receiver<Arc<Plan>>, ou
     }
 }
 
-/// Writes all that waits, as far as the server takes it.
+/// Writes all waiting values that the server accepts.
 async fn write(client: &Client, outbox: &Outbox) {
     loop {
         let batch = outbox.take(MOST_PER_REQUEST);
