@@ -1,4 +1,4 @@
-//! The values of the other spaces, as they come, into the address space.
+//! Shows the received values of the other spaces in the address space.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -19,24 +19,24 @@ use crate::structures::Structure;
 use crate::values::{self, Shown, Stamp};
 use crate::wear::{Looks, Wear, Worn};
 
-/// The writing end of the address space for values that come from the space.
+/// Writes values of the space to the address space.
 pub(crate) struct Space {
     manager: Arc<SpaceManager>,
     subscriptions: Arc<SubscriptionCache>,
     topics: HashMap<TopicId, Known>,
     structures: Vec<Structure>,
-    /// For those that nobody mapped.
+    /// Limits the number of unmapped topics.
     room: Room,
-    /// Topics whose writer speaks again, without a sample so far.
+    /// Topics whose writer is active again, but without a new sample.
     returned: Vec<TopicId>,
-    /// Topics whose nodes had to go for others.
+    /// Topics whose nodes were removed to make room for others.
     gave_way: Vec<TopicId>,
     looks: Looks,
-    /// When uncertain values of those that nobody mapped are bad.
+    /// Maximum age of uncertain values of unmapped topics.
     unmapped_ages: Ages,
 }
 
-/// A topic of another space, and what was last heard of it.
+/// A topic of another space, and its last received state.
 struct Known {
     node: TopicNode,
     mapped: bool,
@@ -71,13 +71,13 @@ impl Space {
         }
     }
 
-    /// The same, with how old values may become.
+    /// Sets the maximum ages of values and returns the space.
     pub(crate) fn with_ages(mut self, mapping: &Mapping) -> Self {
         self.set_ages(mapping);
         self
     }
 
-    /// Takes over how old values may become.
+    /// Sets the maximum ages of values.
     pub(crate) fn set_ages(&mut self, mapping: &Mapping) {
         let usual = mapping.server().bad_after;
         self.unmapped_ages = Ages::default().or(usual);
@@ -98,8 +98,8 @@ impl Space {
         }
     }
 
-    /// Goes over to the nodes of another layout: those that are the same in both keep their values.
-    /// Returns the topics that are gone or other ones now, and those that are new or other ones.
+    /// Switches to the nodes of another layout. Unchanged nodes keep their values. Returns the
+    /// topics that were removed or replaced, and the topics that are new or replaced.
     pub(crate) fn exchange(&mut self, layout: &Layout) -> (Vec<TopicId>, Vec<TopicId>) {
         self.exchange_structures(&layout.structures);
         self.manager.inner().set_order(layout);
@@ -110,7 +110,7 @@ impl Space {
             .collect();
         let is_gone = |topic: &TopicId, known: &mut Known| match wanted.get(topic) {
             Some(node) => !known.mapped || known.node != **node,
-            // Those that nobody mapped are there as long as the server.
+            // Unmapped topics are not removed by a reload.
             None => known.mapped,
         };
         let gone: Vec<Known> = self
@@ -138,7 +138,7 @@ impl Space {
         (topics(gone), topics(new))
     }
 
-    /// DataTypes that no variable has any more stay: clients may have read them.
+    /// Adds new DataTypes. Unused DataTypes stay, because clients may have read them.
     fn exchange_structures(&mut self, wanted: &[Structure]) {
         let mut address_space = self.manager.address_space().write();
         for structure in wanted {
@@ -149,28 +149,29 @@ impl Space {
         self.structures = wanted.to_vec();
     }
 
-    /// The DataTypes of the mapped variables.
+    /// Returns the DataTypes of the mapped variables.
     pub(crate) fn structures(&self) -> &[Structure] {
         &self.structures
     }
 
-    /// How much is kept of what was.
+    /// Sets the limits of past values.
     pub(crate) fn limit_past(&self, mapping: &Mapping) {
         self.manager.inner().limit_past(mapping);
     }
 
-    /// How large a value may be that clients write, in bytes.
+    /// Sets the size limit of written values, in bytes.
     pub(crate) fn limit_writes(&self, largest: usize) {
         self.manager.inner().limit_writes(largest);
     }
 
-    /// Takes in a sample: the fields of its DataSet as a key frame carries them. One that cannot be
-    /// shown leaves a status that says why in the place of the value before it, which is no longer
-    /// true either. Whose nodes had to go for its own says [`take_gave_way`](Self::take_gave_way).
+    /// Handles a sample: the fields of its DataSet as a key frame carries them. A sample that
+    /// cannot be shown replaces the previous value by a status with the reason, because that value
+    /// is outdated too. [`take_gave_way`](Self::take_gave_way) returns the topics whose nodes were
+    /// removed for new nodes.
     ///
     /// # Errors
-    /// Why it is not shown: fields that are malformed or not those of the mapping, no memory, or
-    /// too many unmapped topics.
+    /// Returns the reason why the sample is not shown: malformed fields, fields that do not match
+    /// the mapping, not enough memory, or too many unmapped topics.
     pub(crate) fn update(
         &mut self,
         topic: TopicId,
@@ -219,28 +220,28 @@ impl Space {
         }
     }
 
-    /// Whether the mapping has a variable of a topic.
+    /// Returns true if the mapping has a variable for a topic.
     pub(crate) fn is_mapped(&self, topic: TopicId) -> bool {
         self.topics.get(&topic).is_some_and(|known| known.mapped)
     }
 
-    /// The topics whose nodes had to go for others, since this was asked.
+    /// Takes the topics whose nodes were removed to make room for others.
     pub(crate) fn take_gave_way(&mut self) -> Vec<TopicId> {
         std::mem::take(&mut self.gave_way)
     }
 
-    /// The status a topic is shown with.
+    /// Returns the status of a topic as it is shown.
     pub(crate) fn status(&self, topic: TopicId) -> StatusCode {
         self.manager.inner().shown(topic).stamp.status
     }
 
-    /// When the value shown of a topic was taken.
+    /// Returns the source timestamp of the value that is shown.
     pub(crate) fn shown(&self, topic: TopicId) -> Option<Timestamp> {
         self.manager.inner().shown(topic).stamp.source
     }
 
-    /// Marks the last value of a topic as no longer kept up, or as kept up again. The value and its
-    /// source timestamp stay (OPC 10000-8, 6.3.2); a topic that never had one goes on waiting.
+    /// Marks the last value of a topic as stale or as current. The value and its source timestamp
+    /// stay (OPC 10000-8, 6.3.2). A topic without a value continues to wait.
     pub(crate) fn set_silent(&mut self, topic: TopicId, silent: bool) {
         let Some(known) = self.topics.get_mut(&topic) else {
             return;
@@ -252,21 +253,21 @@ impl Space {
         if silent {
             self.wear(topic);
         } else {
-            // Most likely a sample follows at once, which says more than the one before.
+            // A sample probably follows at once; the status of the previous sample need not be
+            // restored.
             self.returned.push(topic);
         }
     }
 
-    /// Gives the last values their own status back where a writer speaks again but has nothing new
-    /// to say.
+    /// Restores the status of the last values whose writer is active again without a new sample.
     pub(crate) fn settle(&mut self) {
         for topic in std::mem::take(&mut self.returned) {
             self.wear(topic);
         }
     }
 
-    /// Says when anything was last heard of each topic: values whose publisher is not heard at all
-    /// for `timeout` are shown so.
+    /// Updates the times of the last messages. Values whose publisher sends nothing for `timeout`
+    /// are shown as offline.
     pub(crate) fn hear(
         &mut self,
         heard: impl Iterator<Item = (TopicId, Instant)>,
@@ -299,12 +300,12 @@ impl Space {
         }
     }
 
-    /// When a value becomes too old.
+    /// Returns the time at which the next value becomes too old.
     pub(crate) fn due(&self) -> Option<Instant> {
         self.looks.due()
     }
 
-    /// Looks at the values that have become too old.
+    /// Updates the values that have become too old.
     pub(crate) fn grow_old(&mut self) {
         let now = now().monotonic;
         while let Some((at, topic)) = self.looks.take(now) {
@@ -315,7 +316,7 @@ impl Space {
         }
     }
 
-    /// Shows a topic as what has become of its value meanwhile.
+    /// Updates the staleness of a topic's value.
     fn wear(&mut self, topic: TopicId) {
         let Some(known) = self.topics.get_mut(&topic) else {
             return;
@@ -327,8 +328,8 @@ impl Space {
         }
     }
 
-    /// Shows the last sample anew, under another status than its own or under its own; one that is
-    /// too old is kept here.
+    /// Shows the last sample with the status of its staleness. A sample that is too old is kept
+    /// here.
     fn show_worn(&mut self, topic: TopicId, worn: Worn) {
         let Some(known) = self.topics.get_mut(&topic) else {
             return;
@@ -349,8 +350,8 @@ impl Space {
         nodes.show_again(&self.subscriptions, &known.node, shown);
     }
 
-    /// Takes out the nodes of topics that nobody mapped and whose writers fell silent, of those
-    /// first that are silent longest, when it is time to look for room.
+    /// Removes the nodes of unmapped topics whose writers are silent, longest silent first, if it
+    /// is time to make room.
     fn let_unmapped_go(&mut self) {
         let now = now().monotonic;
         if !self.room.wants_look(now) {
@@ -377,7 +378,7 @@ impl Space {
         self.gave_way.extend(topics);
     }
 
-    /// A topic nobody mapped gets a node of its own when its first value comes.
+    /// Adds a node for an unmapped topic at its first value.
     fn add_unmapped(&mut self, topic: TopicId, block: &[u8]) -> Result<(), &'static str> {
         self.let_unmapped_go();
         if !self.room.take() {
@@ -414,8 +415,8 @@ impl Known {
         }
     }
 
-    /// Whether the topic's nodes take the fields. A topic of which nothing is known beforehand
-    /// takes any.
+    /// Checks if the fields match the topic's nodes. A topic without a known type accepts any
+    /// fields.
     fn fit(&self, block: &[u8]) -> Result<(), (StatusCode, &'static str)> {
         let malformed = |_| (StatusCode::BadDecodingError, "malformed fields");
         let fields = Fields::parse(block).map_err(malformed)?;
@@ -438,7 +439,7 @@ impl Known {
         Ok(())
     }
 
-    /// The node of an unmapped topic has the type of what came last.
+    /// Changes the type of an unmapped topic's node to the type of the last value.
     fn retype(&mut self, block: &[u8], manager: &SpaceManager) {
         let Some(field) = self.node.fields.first_mut() else {
             return;
@@ -452,13 +453,13 @@ impl Known {
     }
 }
 
-/// Whose values a topic is of: a program writes a space, and of space 0 a namespace.
+/// Returns the publisher of a topic. A program publishes a whole space, or a namespace of space 0.
 fn publisher(topic: TopicId) -> (SpaceId, Option<u16>) {
     let namespace = (topic.space == SpaceId::UA).then(|| topic.namespace.get());
     (topic.space, namespace)
 }
 
-/// The shape of the only field; of several, none.
+/// Returns the shape of a single field. Several fields have no shape.
 fn shape_of(block: &[u8]) -> Shape {
     let only = match Fields::parse(block) {
         Ok(mut fields) if fields.len() == 1 => fields.next(),
@@ -471,9 +472,10 @@ fn shape_of(block: &[u8]) -> Shape {
     })
 }
 
-/// How many topics without a mapping are shown. Anyone who reaches the group can make them up.
+/// Largest number of unmapped topics that are shown. Every member of the group can publish such
+/// topics.
 const MOST_UNMAPPED: usize = 1_000;
-/// Of them, how many go at a time.
+/// Number of unmapped topics that are removed at a time.
 const MOST_LET_GO: usize = MOST_UNMAPPED / 8;
 
 #[cfg(test)]

@@ -1,9 +1,9 @@
-//! The DataTypes of messages that are structures: those in arrays, those that a mapping has `as:
-//! structure`, those of calls, and those nested in them.
+//! The DataTypes of messages that are structures: messages in arrays, in variables with `as:
+//! structure`, in calls, and nested in these messages.
 //!
-//! On the wire an ExtensionObject has the name of its message type as TypeId, in the namespace of
-//! its topic, and a TypeId is the NodeId of an encoding (OPC 10000-6, 5.2.2.15): so that is the
-//! encoding's, and the DataType has one of its own.
+//! On the wire, the TypeId of an ExtensionObject is the name of its message type in the namespace
+//! of its topic. A TypeId is the NodeId of an encoding (OPC 10000-6, 5.2.2.15), so this NodeId
+//! belongs to the encoding, and the DataType has another NodeId.
 
 use std::sync::Arc;
 
@@ -19,7 +19,7 @@ use opcua::types::{
 use tracing::warn;
 use uadp::BuiltinType;
 
-/// The definitions of message types that the mapping names, of either ROS.
+/// The definitions of the message types of the mapping, for ROS 1 and ROS 2.
 pub(crate) struct Types {
     ros1: Definitions,
     ros2: Definitions,
@@ -34,13 +34,13 @@ impl Types {
         }
     }
 
-    /// Takes what the `type_paths` have by now.
+    /// Switches to the current `type_paths`.
     pub(crate) fn replace(&mut self, types: &Arc<TypePaths>) {
         self.ros1.replace(types);
         self.ros2.replace(types);
     }
 
-    /// The message type that the values of a variable are of, if it is known.
+    /// Returns the message type of a variable's values, if it is known.
     pub(crate) fn of(&mut self, variable: &Variable) -> Option<Arc<MessageType>> {
         let origin = variable.binding(variable.topic.space);
         let Binding {
@@ -52,12 +52,12 @@ impl Types {
             SpaceId::ROS1 => &mut self.ros1,
             _ => &mut self.ros2,
         };
-        // What is wrong with it was told with the mapping.
+        // Faults of the definition were reported with the mapping.
         definitions.find(message_type).ok()
     }
 }
 
-/// A message type as the address space has it.
+/// A message type in the address space.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Structure {
     pub(crate) namespace: u16,
@@ -84,9 +84,9 @@ enum Kind {
 pub(crate) struct Structures(Vec<Structure>);
 
 impl Structures {
-    /// Takes in the message at a path of a message type, with those nested in it, and gives its
-    /// DataType. `None` where there is none, or where another definition has its name in this
-    /// namespace.
+    /// Adds the message at a path of a message type, with its nested messages, and returns its
+    /// DataType. Returns `None` if there is no message at the path, or if another definition has
+    /// its name in this namespace.
     pub(crate) fn add(&mut self, of: &MessageType, path: &str, namespace: u16) -> Option<NodeId> {
         let found: Vec<Structure> = of
             .structures(path)
@@ -137,7 +137,8 @@ impl Structure {
         }
     }
 
-    /// A message in a field of a call, and those in it, the outermost first and each once.
+    /// Returns the message in a field of a call and its nested messages, outermost first and each
+    /// once.
     pub(crate) fn of_call(of: &CallStructure, namespace: u16) -> Vec<Self> {
         let mut all: Vec<&CallStructure> = vec![of];
         let mut at = 0;
@@ -170,19 +171,19 @@ impl Structure {
         structures.collect()
     }
 
-    /// Its DataType.
+    /// Returns the DataType.
     pub(crate) fn data_type(&self) -> NodeId {
         data_type(self.namespace, &self.name)
     }
 
-    /// Takes the DataType and its encoding out of the address space.
+    /// Removes the DataType and its encoding from the address space.
     pub(crate) fn remove(&self, address_space: &mut AddressSpace) {
         for node in [self.data_type(), encoding(self.namespace, &self.name)] {
             drop(address_space.delete(&node, true));
         }
     }
 
-    /// Whether it has the same nodes.
+    /// Returns true if both have the same nodes.
     pub(crate) fn is_same(&self, other: &Self) -> bool {
         (self.namespace, &self.name) == (other.namespace, &other.name)
     }
@@ -214,8 +215,8 @@ impl Structure {
         }
     }
 
-    /// Puts the DataType and its encoding into the address space, in the place of one of the same
-    /// name.
+    /// Adds the DataType and its encoding to the address space. A DataType of the same name is
+    /// replaced.
     pub(crate) fn insert(&self, address_space: &mut AddressSpace) {
         self.remove(address_space);
         let id = self.data_type();

@@ -1,8 +1,9 @@
-//! Values between the two codecs: UADP's borrowed Variants and the OPC UA server's owned ones.
+//! Conversion of values between the two codecs: the borrowed Variants of UADP and the owned
+//! Variants of the OPC UA server.
 //!
-//! Inwards a null array becomes an empty one, which is all the server's type can say. Outwards
-//! values are encoded as they are (OPC 10000-6, 5.2.2.16), and what UADP does not carry, a Variant
-//! directly in a Variant, is refused.
+//! A received null array becomes an empty array, because the type of the server cannot express
+//! null. Sent values are encoded unchanged (OPC 10000-6, 5.2.2.16). A Variant directly in a Variant
+//! is refused, because UADP cannot carry it.
 
 use opcua::types::type_loader::{ByteStringBody, XmlBody};
 use opcua::types::{
@@ -12,7 +13,7 @@ use opcua::types::{
 };
 use uadp::{BuiltinType, ExtensionBody, Scalar};
 
-/// The server's form of a field's value.
+/// Converts the value of a field into a Variant of the server.
 pub(crate) fn from_field(field: &uadp::Variant<'_>) -> Variant {
     match field {
         uadp::Variant::Null => Variant::Empty,
@@ -34,10 +35,12 @@ pub(crate) fn from_field(field: &uadp::Variant<'_>) -> Variant {
     }
 }
 
-/// The fields of a DataSet as a key frame carries them: their number (UInt16), then a Variant each.
+/// Encodes the fields of a DataSet as a key frame carries them: their number (UInt16), then a
+/// Variant for each field.
 ///
 /// # Errors
-/// `BadNotSupported` for a value UADP does not carry, `BadOutOfRange` for more than 65535 fields.
+/// Returns `BadNotSupported` for a value that UADP does not carry, and `BadOutOfRange` for more
+/// than 65535 fields.
 pub(crate) fn fields_block(fields: &[Variant]) -> Result<Vec<u8>, StatusCode> {
     let count = u16::try_from(fields.len()).map_err(|_| StatusCode::BadOutOfRange)?;
     let context = ContextOwned::default();
@@ -57,8 +60,8 @@ pub(crate) fn fields_block(fields: &[Variant]) -> Result<Vec<u8>, StatusCode> {
     }
 }
 
-/// What a field never set is sent as beside those that are: zero, empty, or null where the type has
-/// such.
+/// Returns the value of a field that was never set: zero, empty, or null if the type has a null
+/// value.
 pub(crate) fn zero(shape: Option<(BuiltinType, bool)>) -> Variant {
     let Some((builtin, array)) = shape else {
         return Variant::Empty;
@@ -141,7 +144,7 @@ fn scalar(value: &Scalar<'_>) -> Variant {
             text: string(v.text),
         }),
         Scalar::ExtensionObject(v) => Variant::ExtensionObject(extension_object(v)),
-        // What is nested was checked with the message: getting it does not fail.
+        // Nested values were validated with the message, so reading them cannot fail.
         Scalar::Variant(v) => {
             let inner = v.get().unwrap_or(uadp::Variant::Null);
             Variant::Variant(Box::new(from_field(&inner)))
@@ -186,7 +189,7 @@ fn diagnostic_info(info: &uadp::DiagnosticInfo<'_>) -> DiagnosticInfo {
 fn extension_object(object: uadp::ExtensionObject<'_>) -> ExtensionObject {
     let type_id = node_id(object.type_id);
     match object.body {
-        // The server's type has no room for a type id without a body.
+        // The type of the server cannot express a type id without a body.
         ExtensionBody::None => ExtensionObject::null(),
         ExtensionBody::Binary(bytes) => ExtensionObject::new(ByteStringBody::new(
             ByteString::from(bytes.to_vec()),
@@ -214,7 +217,7 @@ fn node_id(node: uadp::NodeId<'_>) -> NodeId {
 }
 
 fn guid(value: uadp::Guid) -> Guid {
-    // By the text form, which both sides have; the server's type gives no way in by bytes.
+    // The text form is used, because the type of the server cannot be created from bytes.
     value.to_string().parse().unwrap_or_default()
 }
 
@@ -260,7 +263,7 @@ fn scalar_type(builtin: BuiltinType) -> VariantScalarTypeId {
 mod tests {
     use super::*;
 
-    /// One value of every builtin type that a field can have, with the server's form of it.
+    /// Returns a value of every builtin type that a field can have, in both forms.
     #[expect(
         clippy::too_many_lines,
         reason = "one entry for each of the builtin types"

@@ -1,7 +1,7 @@
-//! The last value of each topic in the form it came in: the fields of its DataSet, encoded.
+//! The last value of each topic in its received form: the encoded fields of its DataSet.
 //!
-//! The server's own Variants take up many times that (24 bytes for each byte of an array), so they
-//! are made when a client wants them, of the part it wants, and live as long as its answer takes.
+//! The Variants of the server need far more memory (24 bytes for each byte of an array). They are
+//! therefore created for each response, for the requested part only, and dropped afterwards.
 
 use std::collections::HashMap;
 
@@ -15,7 +15,7 @@ use uadp::{BuiltinType, Fields, Scalar, Timestamp};
 use crate::layout::TopicNode;
 use crate::value;
 
-/// What the topics show, within a bound for all of them together.
+/// The current values of the topics, with a common memory limit.
 #[derive(Debug)]
 pub(crate) struct Values {
     topics: HashMap<TopicId, Shown>,
@@ -23,16 +23,16 @@ pub(crate) struct Values {
     most: usize,
 }
 
-/// What the nodes of one topic show.
+/// The current value of the nodes of one topic.
 #[derive(Debug, Clone)]
 pub(crate) struct Shown {
-    /// FieldCount and a Variant for each field, all of them readable; `None` where there is nothing
-    /// to be used.
+    /// FieldCount and a Variant for each field, all of them readable; `None` without a usable
+    /// value.
     pub(crate) block: Option<Bytes>,
     pub(crate) stamp: Stamp,
 }
 
-/// What all values of one sample have in common.
+/// The properties that all values of a sample share.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Stamp {
     pub(crate) status: StatusCode,
@@ -41,7 +41,7 @@ pub(crate) struct Stamp {
 }
 
 impl Values {
-    /// None yet, and never more than `most` bytes.
+    /// Creates an empty store with a limit of `most` bytes.
     pub(crate) fn new(most: usize) -> Self {
         Self {
             topics: HashMap::new(),
@@ -54,8 +54,8 @@ impl Values {
         self.topics.get(&topic)
     }
 
-    /// Shows something else, and gives what was shown before. A value there is no room for is not
-    /// kept: its place takes `BadOutOfMemory`, and it is given back as the error.
+    /// Stores a value and returns the previous value. A value beyond the memory limit is not
+    /// stored: `BadOutOfMemory` is shown instead and returned as the error.
     pub(crate) fn put(
         &mut self,
         topic: TopicId,
@@ -84,7 +84,7 @@ impl Values {
 }
 
 impl Shown {
-    /// No value, for that reason.
+    /// Returns a missing value with this status.
     pub(crate) fn nothing(status: StatusCode) -> Self {
         Self {
             block: None,
@@ -96,7 +96,7 @@ impl Shown {
         }
     }
 
-    /// No value came yet.
+    /// Returns the state before the first value.
     pub(crate) fn waiting() -> Self {
         Self::nothing(StatusCode::BadWaitingForInitialData)
     }
@@ -105,7 +105,7 @@ impl Shown {
         self.block.as_ref().map_or(0, Bytes::len)
     }
 
-    /// What the topic's own node has, or the field at that place.
+    /// Returns the value of the topic's own node, or of the field with this index.
     pub(crate) fn view(&self, topic: &TopicNode, field: Option<usize>) -> View<'_> {
         let Some(fields) = self.fields() else {
             return View::One(uadp::Variant::Null, self.stamp);
@@ -119,7 +119,7 @@ impl Shown {
         self.one(topic, place, value.unwrap_or(uadp::Variant::Null))
     }
 
-    /// What each of the topic's nodes has, in the order of [`TopicNode::places`].
+    /// Returns the value of each of the topic's nodes, in the order of [`TopicNode::places`].
     pub(crate) fn views<'a>(&'a self, topic: &'a TopicNode) -> impl Iterator<Item = View<'a>> {
         let mut fields = self.fields();
         let components = topic.places().filter_map(|(_, field)| field);
@@ -131,9 +131,10 @@ impl Shown {
         std::iter::once(self.view(topic, None)).chain(components)
     }
 
-    /// The value of the field at a place.
+    /// Returns the value of the field with this index.
     fn one<'a>(&'a self, topic: &TopicNode, place: usize, value: uadp::Variant<'a>) -> View<'a> {
-        // In place of a value of another type it says why there is none (OPC 10000-14, 7.2.4.5.5).
+        // A StatusCode in place of a value of another type is the reason why there is no value (OPC
+        // 10000-14, 7.2.4.5.5).
         if let uadp::Variant::Scalar(Scalar::StatusCode(status)) = value
             && let Some(field) = topic.fields.get(place)
             && !field.shape.fits(&value)
@@ -148,13 +149,13 @@ impl Shown {
         View::One(value, self.stamp)
     }
 
-    /// The fields, if there are values.
+    /// Returns the fields, if there are values.
     pub(crate) fn fields(&self) -> Option<Fields<'_>> {
         Fields::parse(self.block.as_ref()?).ok()
     }
 }
 
-/// The value of one node, not decoded.
+/// The encoded value of one node.
 #[derive(Debug, Clone)]
 pub(crate) enum View<'a> {
     One(uadp::Variant<'a>, Stamp),
@@ -169,7 +170,7 @@ impl<'a> View<'a> {
         }
     }
 
-    /// Whether the value is the same, whatever its status.
+    /// Returns true if both values are equal, whatever their statuses.
     pub(crate) fn has_value_of(&self, other: &View<'_>) -> bool {
         match (self, other) {
             (Self::One(value, _), View::One(other, _)) => value == other,
@@ -178,8 +179,8 @@ impl<'a> View<'a> {
         }
     }
 
-    /// What an IndexRange leaves of an array whose elements are all of one size, still not decoded;
-    /// else, all.
+    /// Applies an IndexRange to an encoded array with elements of a fixed size. Other values are
+    /// returned whole, with the range still to be applied.
     pub(crate) fn narrowed(self, range: &NumericRange) -> (Self, NumericRange) {
         if let Self::One(uadp::Variant::Array(array), stamp) = self
             && let Some((first, last)) = bounds(range)
@@ -193,7 +194,7 @@ impl<'a> View<'a> {
         (self, range.clone())
     }
 
-    /// About how many bytes the decoded value takes up.
+    /// Returns the approximate size of the decoded value, in bytes.
     pub(crate) fn weight(&self) -> usize {
         match self {
             Self::One(value, _) => weight(value),
@@ -205,8 +206,8 @@ impl<'a> View<'a> {
         }
     }
 
-    /// The value with its stamps, decoded; the status is that of the range where that cannot be
-    /// had.
+    /// Decodes the value with its stamps. If the range cannot be applied, the status is the error
+    /// of the range.
     pub(crate) fn data_value(&self, range: &NumericRange) -> DataValue {
         let value = match self {
             Self::One(value, _) => value::from_field(value),
@@ -221,7 +222,7 @@ impl<'a> View<'a> {
             })),
         };
         let stamp = self.stamp();
-        // Where there is no value its status says more than that nothing is in the range.
+        // Without a value, its status is more useful than an error of the range.
         if matches!(value, Variant::Empty) {
             return data_value(Some(value), stamp);
         }
@@ -231,35 +232,36 @@ impl<'a> View<'a> {
         }
     }
 
-    /// No value at all: it is another one than any before it or behind it, a null value included.
+    /// Returns an empty DataValue. It differs from every value, including null, so subscribers are
+    /// notified of the value after it.
     pub(crate) fn between(&self) -> DataValue {
         data_value(None, self.stamp())
     }
 
-    /// In place of the value, why it is not given.
+    /// Returns a DataValue without the value and with the reason.
     pub(crate) fn refused(&self, status: StatusCode) -> DataValue {
         let stamp = self.stamp();
         data_value(Some(Variant::Empty), Stamp { status, ..stamp })
     }
 }
 
-/// A value of a sample.
+/// Returns a value of a sample as a DataValue.
 pub(crate) fn data_value(value: Option<Variant>, stamp: Stamp) -> DataValue {
     DataValue {
         value,
         status: Some(stamp.status),
         source_timestamp: stamp.source.map(|source| value::date_time(source.time)),
-        // asyncua takes the picoseconds for the first bytes of the server timestamp (its order of
-        // the fields is not that of OPC 10000-6, 5.2.2.17), so there are none: 100 ns are left, and
-        // clients read right times.
+        // asyncua reads the picoseconds as the first bytes of the server timestamp, because its
+        // order of the fields is not the order of OPC 10000-6, 5.2.2.17. The picoseconds are
+        // therefore omitted: the resolution stays 100 ns, and clients read correct times.
         source_picoseconds: None,
         server_timestamp: Some(stamp.server),
         server_picoseconds: None,
     }
 }
 
-/// The bytes without the room behind them, which may be many times as much: buffers of the Router
-/// are used again.
+/// Returns the bytes without spare capacity, which may be many times as large, because buffers of
+/// the Router are reused.
 pub(crate) fn compact(payload: Bytes) -> Bytes {
     match payload.try_into_mut() {
         Ok(buffer) if buffer.capacity() - buffer.len() <= SLACK => buffer.freeze(),
@@ -268,7 +270,7 @@ pub(crate) fn compact(payload: Bytes) -> Bytes {
     }
 }
 
-/// First and last element of a range of one dimension.
+/// Returns the first and last element of a range of one dimension.
 fn bounds(range: &NumericRange) -> Option<(usize, usize)> {
     let (first, last) = match range {
         NumericRange::Index(at) => (*at, *at),
@@ -278,7 +280,8 @@ fn bounds(range: &NumericRange) -> Option<(usize, usize)> {
     Some((usize::try_from(first).ok()?, usize::try_from(last).ok()?))
 }
 
-/// `None` for elements of various sizes, and where nothing is in the range.
+/// Returns the part of an array. Returns `None` for elements of variable size, and for an empty
+/// range.
 fn part(array: uadp::Array<'_>, first: usize, last: usize) -> Option<uadp::Array<'_>> {
     let size = array.element().fixed_size()?;
     let last = last.min(array.len().checked_sub(1)?);
@@ -325,7 +328,7 @@ fn scalar_weight(value: &Scalar<'_>) -> usize {
             uadp::ExtensionBody::Binary(bytes) => bytes.len(),
             uadp::ExtensionBody::Xml(text) => text.len(),
         },
-        // Of the size of their types, or a few bytes more.
+        // The values are as large as their types, or a few bytes larger.
         Scalar::DateTime(_)
         | Scalar::Guid(_)
         | Scalar::NodeId(_)
@@ -348,7 +351,7 @@ fn scalar_weight(value: &Scalar<'_>) -> usize {
     VARIANT + BOXED + inner
 }
 
-/// Whether the server's Variant has such a value elsewhere.
+/// Returns true if the Variant of the server stores such a value in a separate allocation.
 const fn is_boxed(builtin: BuiltinType) -> bool {
     !matches!(
         builtin,
@@ -368,9 +371,9 @@ const fn is_boxed(builtin: BuiltinType) -> bool {
 }
 
 const VARIANT: usize = size_of::<Variant>();
-/// About what a value takes up that is not in its Variant, with its allocation.
+/// Approximate size of a value outside its Variant, including its allocation.
 const BOXED: usize = 2 * size_of::<DataValue>();
-/// Room behind a value that is not worth a copy.
+/// Spare capacity that is not worth a copy.
 const SLACK: usize = 64;
 
 #[cfg(test)]
@@ -384,7 +387,7 @@ mod tests {
         TopicId::new(1, 2, identifier).unwrap()
     }
 
-    /// A topic of that many SByte arrays.
+    /// Returns a topic with that number of SByte arrays.
     fn topic(fields: usize) -> TopicNode {
         let shape = Shape(Some((BuiltinType::SByte, true)));
         let fields = (0..fields).map(|at| (format!("f{at}"), shape)).collect();

@@ -1,8 +1,8 @@
-//! What people type about certificates and users: `ua-server trust`, `reject`, `certificates` and
-//! `user`.
+//! The commands for certificates and users: `ua-server trust`, `reject`, `certificates`, `renew`
+//! and `user`.
 //!
-//! A server that runs takes notice by itself: certificates are looked for at each connection, and
-//! users within a second.
+//! A running server applies the changes by itself: certificates at each connection, and users
+//! within a second.
 
 use std::ffi::OsString;
 use std::io::{self, BufRead as _, IsTerminal as _, Write as _};
@@ -130,7 +130,7 @@ impl Store {
     }
 }
 
-/// Why a verb came to nothing.
+/// The reason why a command failed.
 #[derive(Debug, thiserror::Error)]
 enum VerbFault {
     #[error(transparent)]
@@ -147,7 +147,7 @@ enum VerbFault {
     Output(io::Error),
 }
 
-/// Does what the command line asks about certificates and users; `None` where it asks for the
+/// Executes a command for certificates and users. Returns `None` if the command line starts the
 /// server.
 pub(crate) fn asked(arguments: &[OsString]) -> Option<ExitCode> {
     let first = arguments.get(1)?;
@@ -157,7 +157,7 @@ pub(crate) fn asked(arguments: &[OsString]) -> Option<ExitCode> {
     let verbs = match Verbs::try_parse_from(arguments) {
         Ok(verbs) => verbs,
         Err(usage) => {
-            // Nobody is left to tell when stdout or stderr is closed.
+            // Output errors are ignored, because stdout or stderr may be closed.
             let _printed = usage.print();
             let help = matches!(usage.kind(), ErrorKind::DisplayHelp);
             return Some(if help {
@@ -345,7 +345,7 @@ const fn by(credential: &Credential) -> &'static str {
     }
 }
 
-/// A line of stdin, without what ends it.
+/// Reads a line of stdin, without its line ending.
 fn password(name: &str) -> Result<String, VerbFault> {
     let stdin = io::stdin();
     if stdin.is_terminal() {
@@ -364,7 +364,8 @@ fn password(name: &str) -> Result<String, VerbFault> {
     }
 }
 
-/// A certificate for people. What its maker chose is escaped.
+/// Returns a line about a certificate for the operator. Texts of the certificate's creator are
+/// escaped.
 fn line(one: &Stored) -> String {
     let now = if one.is_valid {
         "until"
@@ -400,7 +401,7 @@ fn as_json(one: &Stored) -> String {
     )
 }
 
-/// A JSON string.
+/// Returns a JSON string.
 fn quoted(text: &str) -> String {
     let mut out = String::from('"');
     for c in text.chars() {
@@ -418,9 +419,9 @@ fn say(text: &str) -> Result<(), VerbFault> {
     writeln!(io::stdout(), "{text}").map_err(VerbFault::Output)
 }
 
-/// The verbs; all else is a mapping or a flag of the server.
+/// The commands. Every other first argument is a mapping or an option of the server.
 const VERBS: [&str; 5] = ["trust", "reject", "certificates", "renew", "user"];
-/// What the help of the server says of them.
+/// The section of the server's help about these commands.
 pub(crate) const HELP: &str = "Certificates and users (each with --help):
   ua-server trust THUMBPRINT|FILE        let a client in that was refused, or all that an authority has issued
   ua-server reject THUMBPRINT            let it in no longer

@@ -1,4 +1,4 @@
-//! How values of other programs become old: uncertain, and then bad.
+//! Ageing of values of other programs: they become uncertain, and then bad.
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
@@ -7,21 +7,21 @@ use std::time::Instant;
 use mappings::{Ages, TopicId};
 use opcua::types::StatusCode;
 
-/// What a topic is shown as for want of a newer value.
+/// The staleness of a topic's value.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Worn {
-    /// It has the status it came with.
+    /// The value has its own status.
     Fresh,
-    /// It is the last one there was.
+    /// The value is the last usable value.
     Last,
-    /// So it is, and nothing at all is heard of its publisher.
+    /// The value is the last usable value, and its publisher is offline.
     Away,
-    /// It is too old to be of use.
+    /// The value is too old to be used.
     Over,
 }
 
 impl Worn {
-    /// The status in the place of the value's own.
+    /// Returns the status that replaces the status of the value.
     pub(crate) const fn status(self) -> Option<StatusCode> {
         match self {
             Self::Fresh => None,
@@ -32,19 +32,19 @@ impl Worn {
     }
 }
 
-/// Since when a topic is without a newer value, and what follows from it.
+/// The age of a topic's value, and its staleness.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Wear {
     ages: Ages,
-    /// When its last value came; `None` before the first.
+    /// Arrival of the last value; `None` before the first value.
     came: Option<Instant>,
-    /// Since when its writer is silent.
+    /// Time since which the writer is silent.
     silent: Option<Instant>,
-    /// Whether nothing is heard of its publisher.
+    /// True if the publisher is offline.
     away: bool,
-    /// What it is shown as.
+    /// The staleness that is shown.
     shown: Worn,
-    /// When it is looked at next.
+    /// Time of the next check.
     look: Option<Instant>,
 }
 
@@ -60,12 +60,12 @@ impl Wear {
         }
     }
 
-    /// Since when its writer is silent.
+    /// Returns the time since which the writer is silent.
     pub(crate) const fn silent(&self) -> Option<Instant> {
         self.silent
     }
 
-    /// A value came, which is shown as it is.
+    /// Records a new value, which is fresh.
     pub(crate) const fn came(&mut self, now: Instant) {
         self.came = Some(now);
         self.silent = None;
@@ -73,13 +73,13 @@ impl Wear {
         self.shown = Worn::Fresh;
     }
 
-    /// Its writer is silent, or speaks again.
+    /// Records that the writer is silent or active again.
     pub(crate) fn set_silent(&mut self, silent: bool, now: Instant) {
         self.silent = silent.then_some(now);
         self.away &= silent;
     }
 
-    /// Whether nothing is heard of its publisher; says nothing of one whose writer is heard.
+    /// Records if the publisher is offline. Ignored if the writer is active.
     pub(crate) const fn set_away(&mut self, away: bool) {
         self.away = away && self.silent.is_some();
     }
@@ -88,18 +88,19 @@ impl Wear {
         self.ages = ages;
     }
 
-    /// Since when it is uncertain, if it is.
+    /// Returns the time since which the value is uncertain, if it is.
     fn uncertain(&self, now: Instant) -> Option<Instant> {
         let old = self.old().filter(|old| *old <= now);
         self.silent.into_iter().chain(old).min()
     }
 
-    /// When it is older than it may be.
+    /// Returns the time at which the value exceeds its maximum age.
     fn old(&self) -> Option<Instant> {
         Some(self.came? + self.ages.uncertain_after?)
     }
 
-    /// What it is now, if that is something else than it is shown as; it is taken to be shown so.
+    /// Returns the current staleness if it differs from the staleness that is shown, and records it
+    /// as shown.
     pub(crate) fn turn(&mut self, now: Instant) -> Option<Worn> {
         let worn = match (self.came, self.uncertain(now)) {
             (None, _) | (_, None) => Worn::Fresh,
@@ -112,7 +113,7 @@ impl Wear {
         (std::mem::replace(&mut self.shown, worn) != worn).then_some(worn)
     }
 
-    /// When it becomes something else by itself.
+    /// Returns the time of the next change of the staleness.
     fn due(&self, now: Instant) -> Option<Instant> {
         match (self.came, self.uncertain(now)) {
             (None, _) => None,
@@ -125,13 +126,13 @@ impl Wear {
     }
 }
 
-/// When topics are to be looked at.
+/// The planned checks of topics.
 #[derive(Debug, Default)]
 pub(crate) struct Looks(BinaryHeap<Reverse<(Instant, TopicId)>>);
 
 impl Looks {
-    /// Plans the next look at a topic. An earlier one stays, and plans the next: that spares an
-    /// entry for each value.
+    /// Plans the next check of a topic. An earlier check is kept and plans the next one, so that
+    /// there is not an entry for each value.
     pub(crate) fn plan(&mut self, topic: TopicId, wear: &mut Wear, now: Instant) {
         if let Some(due) = wear.due(now)
             && wear.look.is_none_or(|look| due < look)
@@ -141,12 +142,12 @@ impl Looks {
         }
     }
 
-    /// When the next one is due.
+    /// Returns the time of the next check.
     pub(crate) fn due(&self) -> Option<Instant> {
         self.0.peek().map(|Reverse((at, _))| *at)
     }
 
-    /// The next topic whose look is due.
+    /// Returns the next topic whose check is due.
     pub(crate) fn take(&mut self, now: Instant) -> Option<(Instant, TopicId)> {
         let Reverse((at, topic)) = self.0.peek().copied()?;
         (at <= now).then(|| {
@@ -157,7 +158,7 @@ impl Looks {
 }
 
 impl Wear {
-    /// A look is due: whether it is the one that was planned last.
+    /// Handles a due check. Returns true if it is the check that was planned last.
     pub(crate) fn looked(&mut self, at: Instant) -> bool {
         let is_planned = self.look == Some(at);
         if is_planned {
