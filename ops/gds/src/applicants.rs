@@ -1,4 +1,5 @@
-//! Applications without a trusted certificate that want to be registered. They are registered when their certificate is issued.
+//! Applications without a trusted certificate that request registration. They are registered when
+//! their certificate is issued.
 
 use std::collections::VecDeque;
 
@@ -8,15 +9,16 @@ use trust::Fingerprint;
 use crate::records::Record;
 use crate::service::OWN;
 
-/// The applicants, oldest first. The oldest give way: they register again.
+/// The applicants, oldest first. The oldest are dropped if there are too many; they can register
+/// again.
 #[derive(Debug, Default)]
 pub(crate) struct Applicants {
     all: VecDeque<(NodeId, Record)>,
 }
 
 impl Applicants {
-    /// Keeps an application and returns its provisional ApplicationId, which depends on its key: an applicant cannot change
-    /// the record of another.
+    /// Adds an application and returns its provisional ApplicationId. The id depends on the key, so
+    /// that an applicant cannot change the record of another applicant.
     pub(crate) fn put(&mut self, record: Record, key: Fingerprint) -> NodeId {
         let of = Fingerprint::of(format!("{key} {}", record.uri).as_bytes());
         let id = NodeId::new(OWN, format!("applicant-{of}"));

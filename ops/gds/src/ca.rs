@@ -1,4 +1,4 @@
-//! What people type about the authority: `ua-gds ca init|issue|revoke|list`.
+//! The commands of the authority: `ua-gds ca init|issue|revoke|list`.
 
 use std::fs;
 use std::io::{self, Write as _};
@@ -74,7 +74,7 @@ pub(crate) enum CaVerb {
     },
 }
 
-/// Does what is asked.
+/// Executes a command.
 pub(crate) fn run(verb: CaVerb) -> Result<(), Failure> {
     match verb {
         CaVerb::Init {
@@ -164,7 +164,7 @@ fn read(file: &Path) -> Result<Vec<u8>, Failure> {
     })
 }
 
-/// Bytes of the largest certificate or signing request.
+/// Size limit of a certificate or signing request, in bytes.
 const LARGEST: u64 = 64 << 10;
 
 fn with_key(
@@ -213,7 +213,7 @@ fn write(file: &Path, issued: &Certificate) -> Result<(), Failure> {
     written.map_err(|error| io_fault(file, &error))
 }
 
-/// What was issued for people. What its owner chose is escaped.
+/// Returns a line about an issued certificate for the operator. Texts of its owner are escaped.
 fn line(one: &Issued) -> String {
     let certificate = &one.certificate;
     let standing = match one.revoked {
@@ -257,5 +257,5 @@ pub(crate) fn say(text: &str) -> Result<(), Failure> {
 }
 
 const KEY_BITS: u32 = 2048;
-/// Characters of a common name.
+/// Largest length of a common name, in characters.
 const LONGEST_NAME: usize = 64;

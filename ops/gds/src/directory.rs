@@ -8,7 +8,7 @@ use crate::records::{Query, Record, check};
 use crate::service::{Answer, Gds, Standing, id, number, refused, texts, time, unregistered};
 use plant_opcua::directory::ApplicationRecord;
 
-/// FindApplications: those of an ApplicationUri.
+/// FindApplications: returns the applications with an ApplicationUri.
 pub(crate) fn find(gds: &Gds, request: &MethodRequest) -> Answer {
     let [Variant::String(uri)] = request.arguments.as_slice() else {
         return Err(StatusCode::BadInvalidArgument.into());
@@ -19,7 +19,7 @@ pub(crate) fn find(gds: &Gds, request: &MethodRequest) -> Answer {
     Ok(vec![Variant::from(told)])
 }
 
-/// RegisterApplication: answers with the ApplicationId.
+/// RegisterApplication: returns the ApplicationId.
 pub(crate) fn register(gds: &Gds, request: &MethodRequest) -> Answer {
     let (told, caller) = (record(request)?, &request.caller);
     let standing = gds.standing(caller, told.application_uri.as_ref())?;
@@ -40,7 +40,7 @@ pub(crate) fn register(gds: &Gds, request: &MethodRequest) -> Answer {
     Ok(vec![Variant::from(id(number))])
 }
 
-/// UpdateApplication: all but the ApplicationUri.
+/// UpdateApplication: changes everything except the ApplicationUri.
 pub(crate) fn update(gds: &Gds, request: &MethodRequest) -> Answer {
     let (told, caller) = (record(request)?, &request.caller);
     let known = gds.own(caller, &told.application_id)?;
@@ -50,7 +50,7 @@ pub(crate) fn update(gds: &Gds, request: &MethodRequest) -> Answer {
     Ok(Vec::new())
 }
 
-/// UnregisterApplication: its certificates are revoked (OPC 10000-12, 6.6.8).
+/// UnregisterApplication: also revokes the certificates of the application (OPC 10000-12, 6.6.8).
 pub(crate) fn unregister(gds: &Gds, request: &MethodRequest) -> Answer {
     let [Variant::NodeId(id)] = request.arguments.as_slice() else {
         return Err(StatusCode::BadInvalidArgument.into());
@@ -67,7 +67,7 @@ pub(crate) fn unregister(gds: &Gds, request: &MethodRequest) -> Answer {
     Ok(Vec::new())
 }
 
-/// GetApplication: that of an ApplicationId.
+/// GetApplication: returns the application with an ApplicationId.
 pub(crate) fn get(gds: &Gds, request: &MethodRequest) -> Answer {
     let [Variant::NodeId(id)] = request.arguments.as_slice() else {
         return Err(StatusCode::BadInvalidArgument.into());
@@ -78,7 +78,8 @@ pub(crate) fn get(gds: &Gds, request: &MethodRequest) -> Answer {
     Ok(vec![Variant::from(told(known))])
 }
 
-/// QueryApplications: what each is, with the number to go on after.
+/// QueryApplications: returns the descriptions of applications, and the number after which the next
+/// query continues.
 pub(crate) fn query(gds: &Gds, request: &MethodRequest) -> Answer {
     let [
         Variant::UInt32(after),
@@ -108,7 +109,7 @@ pub(crate) fn query(gds: &Gds, request: &MethodRequest) -> Answer {
     ])
 }
 
-/// QueryServers: the same of servers alone, as FindServersOnNetwork has them (OPC 10000-12, 6.6.11).
+/// QueryServers: returns servers only, in the form of FindServersOnNetwork (OPC 10000-12, 6.6.11).
 pub(crate) fn query_servers(gds: &Gds, request: &MethodRequest) -> Answer {
     let [
         Variant::UInt32(after),
@@ -133,13 +134,15 @@ pub(crate) fn query_servers(gds: &Gds, request: &MethodRequest) -> Answer {
     Ok(vec![time(records.since()), Variant::from(found)])
 }
 
-/// What a query looks for: the number to go on after, how many at most and their kinds; name, ApplicationUri and ProductUri.
+/// Returns the query of these arguments: the number after which it continues, the largest number of
+/// results, and the kinds; name, ApplicationUri and ProductUri.
 fn looked_for<'q>(
     (after, most, kinds): (u32, u32, u32),
     [name, uri, product_uri]: [&'q UAString; 3],
     capabilities: &'q [String],
 ) -> Result<Query<'q>, StatusCode> {
-    // Everybody may ask, and each character of a pattern is held against each of a name.
+    // Every client may send queries, and each character of a pattern is compared with each
+    // character of a name.
     if name.as_ref().len() > LONGEST_PATTERN {
         return Err(StatusCode::BadInvalidArgument);
     }
@@ -158,7 +161,7 @@ fn told(record: &Record) -> ExtensionObject {
     ExtensionObject::new(record.told(id(record.number)))
 }
 
-/// The one argument, an application.
+/// Returns the application that is the only argument.
 fn record(request: &MethodRequest) -> Result<&ApplicationRecord, StatusCode> {
     let [Variant::ExtensionObject(told)] = request.arguments.as_slice() else {
         return Err(StatusCode::BadInvalidArgument);
@@ -167,7 +170,7 @@ fn record(request: &MethodRequest) -> Result<&ApplicationRecord, StatusCode> {
         .ok_or(StatusCode::BadInvalidArgument)
 }
 
-/// Bytes of the pattern of a name.
+/// Size limit of a name pattern, in bytes.
 const LONGEST_PATTERN: usize = 256;
 /// Servers, among the kinds of a query.
 const SERVERS: u32 = 1;

@@ -1,6 +1,8 @@
-//! Invitations: one-time tokens with which an application gets its first certificate without an administrator.
+//! Invitations: one-time tokens with which an application gets its first certificate without an
+//! administrator.
 //!
-//! A token is a number that finds the invitation, and a secret of 128 random bits of which only the SHA-256 is stored.
+//! A token is a number that finds the invitation, and a secret of 128 random bits of which only the
+//! SHA-256 is stored.
 
 use std::time::Duration;
 
@@ -22,11 +24,11 @@ pub(crate) struct Invited {
     pub(crate) number: String,
     /// The SHA-256 of the secret.
     hash: String,
-    /// The ApplicationUri or the name of the application; any application without.
+    /// The ApplicationUri or the name of the application; `None` for any application.
     pub(crate) application: Option<String>,
-    /// The last second, since 1970.
+    /// The last second of validity, in seconds since 1970.
     pub(crate) until: u64,
-    /// The application that has used it.
+    /// The application that has used the invitation.
     pub(crate) used: Option<Used>,
 }
 
@@ -38,7 +40,7 @@ pub(crate) struct Used {
     key: String,
 }
 
-/// An application that shows a token.
+/// An application that presents a token.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Shows<'a> {
     pub(crate) uri: &'a str,
@@ -47,7 +49,7 @@ pub(crate) struct Shows<'a> {
     pub(crate) key: Fingerprint,
 }
 
-/// Why a token is refused.
+/// The reason why a token is refused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub(crate) enum Uninvited {
     #[error("no invitation has the token")]
@@ -61,7 +63,7 @@ pub(crate) enum Uninvited {
 }
 
 impl Invitations {
-    /// Makes an invitation of these random bytes.
+    /// Creates an invitation from these random bytes.
     pub(crate) fn add(
         &mut self,
         random: &[u8; RANDOM],
@@ -69,7 +71,7 @@ impl Invitations {
         (now, life): (Duration, Duration),
     ) -> Token {
         self.all.retain(|one| one.is_kept(now));
-        // The oldest give way.
+        // The oldest invitations are dropped.
         let excess = (self.all.len() + 1).saturating_sub(MOST);
         self.all.drain(..excess);
         let (number, secret) = random.split_at(NUMBER);
@@ -86,8 +88,8 @@ impl Invitations {
         Token::of(&format!("{number}-{secret}"))
     }
 
-    /// Uses an invitation: returns its number. The same key may show the token again until it expires, because the answer may
-    /// have been lost.
+    /// Redeems an invitation and returns its number. The same key may present the token again until
+    /// it expires, because the answer may have been lost.
     pub(crate) fn redeem(
         &mut self,
         token: &str,
@@ -122,7 +124,7 @@ impl Invitations {
         }
     }
 
-    /// Withdraws an invitation. Returns false without such an invitation.
+    /// Withdraws an invitation. Returns false if there is no such invitation.
     pub(crate) fn withdraw(&mut self, number: &str) -> bool {
         let before = self.all.len();
         self.all.retain(|one| one.number != number);
@@ -143,9 +145,9 @@ impl Invited {
 
 /// The file of the invitations, in the folder of the authority.
 pub(crate) const FILE: &str = "invitations.json";
-/// Random bytes of a token.
+/// Number of random bytes of a token.
 pub(crate) const RANDOM: usize = NUMBER + 16;
-/// Bytes of its number.
+/// Number of bytes of the token's number.
 const NUMBER: usize = 4;
 const MOST: usize = 1000;
 

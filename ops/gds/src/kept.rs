@@ -1,5 +1,5 @@
-//! Small lists that the server and the verbs of the command line share: each change reads the file, and writes it as a whole
-//! while others wait.
+//! Small lists that the server and the command line share. Each change locks and reads the file,
+//! and replaces it as a whole.
 
 use std::fs::{self, File};
 use std::io;
@@ -10,10 +10,10 @@ use serde::de::DeserializeOwned;
 
 use crate::records::replace;
 
-/// Reads the list in a file; an empty one without the file.
+/// Reads the list in a file. A missing file is an empty list.
 ///
 /// # Errors
-/// A file that cannot be read as the list.
+/// Returns an error if the file cannot be read as the list.
 pub(crate) fn read<T: DeserializeOwned + Default>(path: &Path) -> io::Result<T> {
     match fs::read(path) {
         Ok(bytes) => Ok(serde_json::from_slice(&bytes)?),
@@ -22,10 +22,10 @@ pub(crate) fn read<T: DeserializeOwned + Default>(path: &Path) -> io::Result<T> 
     }
 }
 
-/// Waits until no other process holds the lock of a file, and holds it until the file is dropped.
+/// Waits for the lock of a file. The lock is held until the returned file is dropped.
 ///
 /// # Errors
-/// The file cannot be made.
+/// Returns an error if the file cannot be created.
 pub(crate) fn lock(path: &Path) -> io::Result<File> {
     let file = File::create(path)?;
     match file.lock() {
@@ -35,10 +35,10 @@ pub(crate) fn lock(path: &Path) -> io::Result<File> {
     }
 }
 
-/// Changes the list in a file. Nothing is written if the list stays as it is.
+/// Changes the list in a file. An unchanged list is not written.
 ///
 /// # Errors
-/// A file that cannot be read as the list, or cannot be written.
+/// Returns an error if the file cannot be read as the list, or cannot be written.
 pub(crate) fn change<T, R>(path: &Path, change: impl FnOnce(&mut T) -> R) -> io::Result<R>
 where
     T: Serialize + DeserializeOwned + Default + Clone + PartialEq,

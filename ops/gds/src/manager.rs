@@ -1,4 +1,4 @@
-//! The certificates of applications (OPC 10000-12, 7.9): requested, finished, revoked.
+//! The certificates of applications (OPC 10000-12, 7.9): requests, issue and revocation.
 
 use std::io;
 use std::net::IpAddr;
@@ -18,7 +18,7 @@ use crate::requests::{self, Asked, Requests, State, Wanted};
 use crate::service::{Answer, Gds, OWN, Standing, now, number, refused, texts, time};
 use crate::store::{new_key, pem_of};
 
-/// StartSigningRequest: keeps the request, and answers with the RequestId.
+/// StartSigningRequest: stores the request and returns the RequestId.
 pub(crate) fn start_signing(gds: &Gds, request: &MethodRequest) -> Answer {
     let [
         Variant::NodeId(application),
@@ -54,7 +54,7 @@ pub(crate) fn start_signing(gds: &Gds, request: &MethodRequest) -> Answer {
     Ok(vec![Variant::from(request_id(number))])
 }
 
-/// StartNewKeyPairRequest: makes a key, too.
+/// StartNewKeyPairRequest: also creates the key.
 pub(crate) struct StartNewKeyPair(pub(crate) Arc<Gds>);
 
 #[async_trait]
@@ -98,7 +98,8 @@ impl MethodHandler for StartNewKeyPair {
     }
 }
 
-/// FinishRequest: issues the certificate, and answers with it, its key if that was made here, and the authority.
+/// FinishRequest: issues the certificate. Returns it with its key, if the key was created here, and
+/// with the authority.
 pub(crate) fn finish(gds: &Gds, request: &MethodRequest) -> Answer {
     let [Variant::NodeId(application), Variant::NodeId(id)] = request.arguments.as_slice() else {
         return Err(StatusCode::BadInvalidArgument.into());
@@ -120,7 +121,8 @@ pub(crate) fn finish(gds: &Gds, request: &MethodRequest) -> Answer {
     let issued = match (&asked.state, standing) {
         (State::Issued { .. }, _) => asked.certificate().ok_or(StatusCode::BadNotFound)?,
         (State::Approved { by }, _) => gds.issue(asked, by)?,
-        // An administrator approves a request by fetching the certificate, and by trusting the application.
+        // An administrator approves a request by fetching the certificate. A request of a trusted
+        // application needs no approval.
         (State::Waiting | State::Refused, Standing::Administrator)
         | (State::Waiting, Standing::Itself) => gds.issue(asked, &caller.user)?,
         (State::Waiting, _) => return Err(StatusCode::BadRequestNotComplete.into()),
@@ -135,7 +137,7 @@ pub(crate) fn finish(gds: &Gds, request: &MethodRequest) -> Answer {
     ])
 }
 
-/// RevokeCertificate: one that the application has.
+/// RevokeCertificate: revokes a certificate of the application.
 pub(crate) fn revoke(gds: &Gds, request: &MethodRequest) -> Answer {
     let [Variant::NodeId(application), Variant::ByteString(bytes)] = request.arguments.as_slice()
     else {
@@ -153,7 +155,7 @@ pub(crate) fn revoke(gds: &Gds, request: &MethodRequest) -> Answer {
     Ok(Vec::new())
 }
 
-/// GetCertificateGroups: there is one.
+/// GetCertificateGroups: returns the only group.
 pub(crate) fn groups(gds: &Gds, request: &MethodRequest) -> Answer {
     let [Variant::NodeId(application)] = request.arguments.as_slice() else {
         return Err(StatusCode::BadInvalidArgument.into());
@@ -162,7 +164,7 @@ pub(crate) fn groups(gds: &Gds, request: &MethodRequest) -> Answer {
     Ok(vec![Variant::from(vec![gds.group()])])
 }
 
-/// GetTrustList: where the trust list of a group is.
+/// GetTrustList: returns the node of the group's trust list.
 pub(crate) fn trust_list(gds: &Gds, request: &MethodRequest) -> Answer {
     let [Variant::NodeId(application), Variant::NodeId(group)] = request.arguments.as_slice()
     else {
@@ -173,7 +175,7 @@ pub(crate) fn trust_list(gds: &Gds, request: &MethodRequest) -> Answer {
     Ok(vec![Variant::from(NodeId::new(gds.namespace, TRUST_LIST))])
 }
 
-/// GetCertificates: the latest that the application has.
+/// GetCertificates: returns the latest certificate of the application.
 pub(crate) fn certificates(gds: &Gds, request: &MethodRequest) -> Answer {
     let [Variant::NodeId(application), Variant::NodeId(group)] = request.arguments.as_slice()
     else {
@@ -192,7 +194,7 @@ pub(crate) fn certificates(gds: &Gds, request: &MethodRequest) -> Answer {
     Ok(vec![Variant::from(kinds), Variant::from(latest)])
 }
 
-/// GetCertificateStatus: whether the application is to ask for another one.
+/// GetCertificateStatus: returns true if the application has to request a new certificate.
 pub(crate) fn status(gds: &Gds, request: &MethodRequest) -> Answer {
     let [
         Variant::NodeId(application),
@@ -213,7 +215,8 @@ pub(crate) fn status(gds: &Gds, request: &MethodRequest) -> Answer {
     Ok(vec![Variant::Boolean(is_due)])
 }
 
-/// CheckRevocationStatus: how a certificate stands by what the authority knows.
+/// CheckRevocationStatus: returns the revocation status of a certificate, as far as the authority
+/// knows it.
 pub(crate) fn check(gds: &Gds, request: &MethodRequest) -> Answer {
     let [Variant::ByteString(bytes)] = request.arguments.as_slice() else {
         return Err(StatusCode::BadInvalidArgument.into());
@@ -231,7 +234,7 @@ pub(crate) fn check(gds: &Gds, request: &MethodRequest) -> Answer {
     let list = list.map_err(|fault| refused(&fault))?;
     let status = match trust::check(&certificate, &[], &known, now()) {
         Ok(()) => StatusCode::Good,
-        // Of another authority: nothing is known of it.
+        // The status of certificates of another authority is unknown.
         Err(Fault::Incomplete | Fault::Untrusted) => StatusCode::BadCertificateRevocationUnknown,
         Err(fault) => StatusCode::from(fault.status()),
     };
@@ -240,7 +243,8 @@ pub(crate) fn check(gds: &Gds, request: &MethodRequest) -> Answer {
 }
 
 impl Gds {
-    /// Returns the application that a caller requests a certificate for: registered, or waiting for its first certificate.
+    /// Returns the application for which a caller requests a certificate: a registered application,
+    /// or an applicant for its first certificate.
     fn asking(&self, caller: &Caller, id: &NodeId) -> Result<(Record, Standing), StatusCode> {
         self.is_unread(caller)?;
         let known = number(id).and_then(|number| self.records.lock().get(number).cloned());
@@ -259,8 +263,8 @@ impl Gds {
         }
     }
 
-    /// Keeps the request of an application that is not known by its certificate: with the token of an invitation it is
-    /// approved, otherwise it waits for an administrator.
+    /// Handles the request of an application without a trusted certificate. With the token of an
+    /// invitation it is approved, otherwise it waits for an administrator.
     fn apply(&self, record: &Record, wanted: Request, key: Fingerprint) -> Result<u32, Refusal> {
         if wanted.key_fingerprint() != key {
             return Err(unfit(record, "it is for another key than the channel's"));
@@ -271,7 +275,7 @@ impl Gds {
         }
     }
 
-    /// Keeps a request until an administrator decides.
+    /// Stores a request until an administrator decides.
     fn wait(&self, record: &Record, wanted: Request, key: Fingerprint) -> Result<u32, Refusal> {
         let number = self.keep_request(wanted, (Some(record.clone()), None))?;
         if let Some(suppressed) = self.another(&format!("waits {number}")) {
@@ -317,7 +321,7 @@ impl Gds {
         Ok(kept.map_err(|error| unkept(&error))?)
     }
 
-    /// Keeps a request in the file, and returns its number.
+    /// Stores a request in the file and returns its number.
     fn keep_request(
         &self,
         request: Request,
@@ -338,7 +342,7 @@ impl Gds {
         })
     }
 
-    /// Issues the certificate of a request that was approved.
+    /// Issues the certificate of an approved request.
     fn issue(&self, asked: &Asked, by: &str) -> Result<Certificate, Refusal> {
         let request = asked.request().ok_or(StatusCode::BadNotFound)?;
         let issued = self.register_and_issue(asked.record.as_ref(), &request, by)?;
@@ -350,7 +354,7 @@ impl Gds {
         Ok(issued)
     }
 
-    /// Registers an application that was approved, and issues its certificate.
+    /// Registers an approved application and issues its certificate.
     fn register_and_issue(
         &self,
         record: Option<&Record>,
@@ -386,8 +390,9 @@ impl Gds {
         self.logged.lock().admit(message, Instant::now())
     }
 
-    /// Checks the hosts that a certificate is to name: those of the DiscoveryUrls of the application and of the certificate that
-    /// it has, and the computer itself. A security administrator may ask for others.
+    /// Checks the hosts of a requested certificate. Allowed are the hosts of the application's
+    /// DiscoveryUrls and current certificate, and the computer itself. A security administrator may
+    /// request others.
     fn may_have_hosts(
         &self,
         caller: &Caller,
@@ -400,7 +405,7 @@ impl Gds {
         }
     }
 
-    /// The same of an application without an administrator.
+    /// Checks the hosts of a requested certificate of an application without an administrator.
     fn may_name_hosts(&self, record: &Record, hosts: &[String]) -> Result<(), Refusal> {
         let current = self.store.lock().of_application(&record.uri);
         let current = current.map_err(|fault| refused(&fault))?;
@@ -426,10 +431,10 @@ impl Gds {
         NodeId::new(self.namespace, GROUP)
     }
 
-    /// Whether somebody may read the trust list: whoever is registered, and administrators.
+    /// Checks if a caller may read the trust list: registered applications and administrators may.
     ///
     /// # Errors
-    /// What the caller is told.
+    /// Returns the status for the caller.
     pub(crate) fn may_read_list(&self, caller: &Caller) -> Result<(), StatusCode> {
         self.is_unread(caller)?;
         let uri = &caller.application_uri;
@@ -444,7 +449,8 @@ impl Gds {
     }
 }
 
-/// Whether a group and a type of certificates are those that there are; null is any (OPC 10000-12, 7.9.3).
+/// Checks that a certificate group and type are supported. A null NodeId stands for any (OPC
+/// 10000-12, 7.9.3).
 fn is_ours(gds: &Gds, group: &NodeId, wanted: &NodeId) -> Result<(), StatusCode> {
     let is = |given: &NodeId, own: &NodeId| given.is_null() || given == own;
     let all: NodeId = ObjectTypeId::ApplicationCertificateType.into();
@@ -459,7 +465,7 @@ pub(crate) fn kind() -> NodeId {
     ObjectTypeId::RsaSha256ApplicationCertificateType.into()
 }
 
-/// Returns whether a host is the computer itself, wherever that is.
+/// Returns true if a host is the computer itself, whatever its name.
 fn is_loopback(host: &str) -> bool {
     match host.parse::<IpAddr>() {
         Ok(address) => address.is_loopback(),
@@ -478,7 +484,7 @@ fn unkept(error: &io::Error) -> StatusCode {
     StatusCode::BadResourceUnavailable
 }
 
-/// The RequestId of a number.
+/// Returns the RequestId of a number.
 fn request_id(number: u32) -> NodeId {
     NodeId::new(OWN, format!("request-{number}"))
 }
@@ -495,7 +501,8 @@ fn certificate(bytes: &ByteString) -> Option<Certificate> {
     Certificate::read(bytes).ok()
 }
 
-/// The common name and the organization of a subject, as `CN=Robot,O=Plant` or `CN=Robot/O=Plant`.
+/// Returns the common name and the organization of a subject, as `CN=Robot,O=Plant` or
+/// `CN=Robot/O=Plant`.
 fn parts(subject: &UAString, record: &Record) -> (String, String) {
     let text = subject.as_ref();
     let part = |wanted: &str| {
@@ -511,8 +518,8 @@ fn parts(subject: &UAString, record: &Record) -> (String, String) {
 
 /// DefaultApplicationGroup.
 const GROUP: u32 = 615;
-/// Its trust list.
+/// The trust list of the DefaultApplicationGroup.
 pub(crate) const TRUST_LIST: u32 = 616;
 const KEY_BITS: u32 = 2048;
-/// Private keys that wait to be fetched.
+/// Largest number of private keys that wait to be fetched.
 const MOST_KEYS: usize = 100;

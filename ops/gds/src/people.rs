@@ -1,4 +1,5 @@
-//! The verbs of an administrator: `ua-gds invite|requests|approve|reject`. A server that runs reads their lists at each request.
+//! The commands of an administrator: `ua-gds invite|requests|approve|reject`. A running server
+//! reads the lists at each request.
 
 use std::io::{self, Write as _};
 use std::path::PathBuf;
@@ -68,7 +69,7 @@ pub(crate) enum PeopleVerb {
     },
 }
 
-/// Runs a verb.
+/// Executes a command.
 pub(crate) fn run(verb: PeopleVerb) -> Result<(), Failure> {
     match verb {
         PeopleVerb::Invite {
@@ -111,7 +112,7 @@ fn invite(
         token: Some(token),
     };
     say(&invitation.to_string())?;
-    // Beside the invitation, which a script may read from stdout.
+    // The hint goes to stderr, because a script may read the invitation from stdout.
     let _nobody_reads = writeln!(
         io::stderr(),
         "give it to one program as --gds INVITATION, in the variable UA_GDS, or in a file as --gds @FILE; it is valid for \
@@ -188,7 +189,7 @@ fn unknown(number: &str) -> Failure {
     Failure::new(FailureKind::Usage, message)
 }
 
-/// A request for people. What its owner chose is escaped.
+/// Returns a line about a request for the operator. Texts of its owner are escaped.
 fn line(one: &Asked) -> String {
     let request = one.request();
     let request = request.as_ref();
@@ -227,7 +228,7 @@ const fn state(one: &Asked) -> &'static str {
 }
 
 fn path(folders: &Folders, file: &str) -> Result<PathBuf, Failure> {
-    // The folder of an authority that is not there is not made.
+    // A missing folder of an authority is not created.
     open(folders)?;
     Ok(folders.authority().join(file))
 }

@@ -1,4 +1,4 @@
-//! The applications that are registered, in a file.
+//! The registered applications, in a file.
 
 use std::fs;
 use std::io::{self, Write as _};
@@ -15,19 +15,19 @@ use plant_opcua::directory::ApplicationRecord;
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Record {
-    /// Its number here, which no other has ever had.
+    /// Unique number of the application, which is never reused.
     pub(crate) number: u32,
     pub(crate) uri: String,
     /// ApplicationType of OPC 10000-4, 7.4.
     pub(crate) kind: i32,
-    /// Locales and texts.
+    /// Pairs of locale and text.
     pub(crate) names: Vec<(String, String)>,
     pub(crate) product_uri: String,
     pub(crate) urls: Vec<String>,
     pub(crate) capabilities: Vec<String>,
 }
 
-/// Why an application is not taken.
+/// The reason why an application is refused.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum RecordFault {
     #[error("an application of that ApplicationUri is registered already")]
@@ -46,17 +46,17 @@ pub(crate) enum RecordFault {
     },
 }
 
-/// What is looked for; what is empty says nothing.
+/// A query. Empty fields match every application.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Query<'q> {
-    /// Those after that number.
+    /// Only applications with a larger number match.
     pub(crate) after: u32,
-    /// How many at most; 0 is as many as there may be.
+    /// Largest number of results; 0 for the limit of the server.
     pub(crate) most: u32,
     /// A pattern of the name, with `%` and `_` (OPC 10000-4, 7.7.3).
     pub(crate) name: &'q str,
     pub(crate) uri: &'q str,
-    /// 1 is servers, 2 is clients.
+    /// 1 for servers, 2 for clients, 0 or 3 for both.
     pub(crate) kinds: u32,
     pub(crate) product_uri: &'q str,
     pub(crate) capabilities: Vec<&'q str>,
@@ -65,13 +65,13 @@ pub(crate) struct Query<'q> {
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Kept {
-    /// When the numbers began, in seconds since 1970.
+    /// Start of the numbering, in seconds since 1970.
     since: u64,
     last: u32,
     records: Vec<Record>,
 }
 
-/// All of them.
+/// All registered applications.
 #[derive(Debug)]
 pub(crate) struct Records {
     path: PathBuf,
@@ -79,7 +79,7 @@ pub(crate) struct Records {
 }
 
 impl Records {
-    /// Reads those of a file; there are none where there is no file.
+    /// Reads the applications of a file. A missing file is an empty register.
     pub(crate) fn open(path: PathBuf, now: u64) -> Result<Self, RecordFault> {
         let kept = match fs::read(&path) {
             Ok(bytes) => serde_json::from_slice(&bytes).map_err(|error| RecordFault::Io {
@@ -96,7 +96,7 @@ impl Records {
         Ok(Self { path, kept })
     }
 
-    /// When the numbers began, in seconds since 1970.
+    /// Returns the start of the numbering, in seconds since 1970.
     pub(crate) fn since(&self) -> u64 {
         self.kept.since
     }
@@ -113,7 +113,7 @@ impl Records {
         self.kept.records.iter().filter(move |one| one.uri == uri)
     }
 
-    /// Takes up an application, and says its number.
+    /// Registers an application and returns its number.
     pub(crate) fn register(&mut self, record: Record) -> Result<u32, RecordFault> {
         check(&record)?;
         if self.of_uri(&record.uri).next().is_some() {
@@ -131,7 +131,7 @@ impl Records {
         Ok(number)
     }
 
-    /// Puts a record in the place of that of its number. The ApplicationUri stays.
+    /// Replaces the record with the same number. The ApplicationUri must not change.
     pub(crate) fn update(&mut self, record: Record) -> Result<(), RecordFault> {
         check(&record)?;
         let all = &mut self.kept.records;
@@ -150,7 +150,7 @@ impl Records {
         })
     }
 
-    /// Forgets an application.
+    /// Removes an application.
     pub(crate) fn remove(&mut self, number: u32) -> Result<Record, RecordFault> {
         let mut places = self.kept.records.iter();
         let place = places.position(|one| one.number == number);
@@ -161,7 +161,8 @@ impl Records {
         Ok(gone)
     }
 
-    /// Those that are looked for, and the number to go on after; 0 where there are no more.
+    /// Returns the matching applications, and the number after which the next query continues, or 0
+    /// if there are no more.
     pub(crate) fn query(&self, query: &Query<'_>) -> (Vec<&Record>, u32) {
         let most = match usize::try_from(query.most).unwrap_or(MOST_AT_ONCE) {
             0 => MOST_AT_ONCE,
@@ -192,7 +193,7 @@ impl Records {
 }
 
 impl Record {
-    /// As a client tells it.
+    /// Converts the record of a client.
     pub(crate) fn of(told: &ApplicationRecord, number: u32) -> Self {
         let texts = |all: &Option<Vec<UAString>>| -> Vec<String> {
             let all = all.iter().flatten();
@@ -212,7 +213,7 @@ impl Record {
         }
     }
 
-    /// As clients are told.
+    /// Converts the record for a client.
     pub(crate) fn told(&self, id: NodeId) -> ApplicationRecord {
         let texts = |all: &[String]| Some(all.iter().map(UAString::from).collect());
         let names = self.names.iter();
@@ -253,7 +254,7 @@ impl Record {
         }
     }
 
-    /// Whether it serves.
+    /// Returns true if the application is a server.
     pub(crate) fn is_server(&self) -> bool {
         self.application_type() != ApplicationType::Client
     }
@@ -267,7 +268,7 @@ impl Record {
         ApplicationType::try_from(self.kind).unwrap_or(ApplicationType::Client)
     }
 
-    /// Returns the hosts of the DiscoveryUrls, addresses of IPv6 without brackets.
+    /// Returns the hosts of the DiscoveryUrls. IPv6 addresses have no brackets.
     pub(crate) fn hosts(&self) -> Vec<String> {
         self.urls.iter().filter_map(|url| host(url)).collect()
     }
@@ -312,7 +313,7 @@ fn host(url: &str) -> Option<String> {
     (!host.is_empty()).then(|| host.to_owned())
 }
 
-/// Whether what a client tells of an application can be kept.
+/// Checks if the record of a client can be stored.
 pub(crate) fn check(record: &Record) -> Result<(), RecordFault> {
     let fits = |ok: bool, why: &'static str| ok.then_some(()).ok_or(RecordFault::Unfit(why));
     let short = |text: &String| text.len() <= LONGEST_TEXT;
@@ -346,10 +347,11 @@ pub(crate) fn check(record: &Record) -> Result<(), RecordFault> {
     fits(texts.all(short), "a text that is too long")
 }
 
-/// Whether a text is of a pattern: `%` is any text, `_` is any character, and `\` stands before one that is meant itself.
+/// Returns true if a text matches a pattern: `%` is any text, `_` is any character, and `\` escapes
+/// the next character.
 fn is_like(text: &str, pattern: &str) -> bool {
     let text: Vec<char> = text.chars().collect();
-    // The places of the text that the pattern so far may end at.
+    // The positions of the text at which the pattern read so far may end.
     let mut ends = vec![false; text.len() + 1];
     if let Some(first) = ends.first_mut() {
         *first = true;
@@ -378,7 +380,7 @@ fn is_like(text: &str, pattern: &str) -> bool {
     ends.last().copied().unwrap_or_default()
 }
 
-/// Writes a file beside, and puts it in the place of what is there.
+/// Replaces a file: writes the content beside it and renames it.
 pub(crate) fn replace(path: &Path, content: &[u8]) -> io::Result<()> {
     let beside = path.with_extension("new");
     let mut file = fs::File::create(&beside)?;
@@ -390,7 +392,7 @@ pub(crate) fn replace(path: &Path, content: &[u8]) -> io::Result<()> {
 const MOST_RECORDS: usize = 10_000;
 const MOST_AT_ONCE: usize = 500;
 const MOST_TEXTS: usize = 32;
-/// Bytes of a text; a URI may have 4096 (OPC 10000-3, 8.31).
+/// Size limit of a text, in bytes. A URI may have 4096 (OPC 10000-3, 8.31).
 const LONGEST_TEXT: usize = 4096;
 
 #[cfg(test)]

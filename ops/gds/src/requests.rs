@@ -1,5 +1,5 @@
-//! Requests for certificates in a file: an administrator decides on them with the command line, and the answer to a client is
-//! kept until it expires, because the client may not have received it.
+//! Requests for certificates in a file. An administrator decides on them with the command line. The
+//! answer to a client is kept until it expires, because the client may not have received it.
 
 use std::time::Duration;
 
@@ -25,16 +25,16 @@ pub(crate) struct Asked {
     pub(crate) uri: String,
     /// The SHA-256 of the key.
     pub(crate) key: String,
-    /// The application as it wants to be registered; `None` for one that is.
+    /// The record to be registered; `None` for a registered application.
     pub(crate) record: Option<Record>,
     /// The request in hexadecimal digits, without a challengePassword.
     request: String,
-    /// In seconds since 1970.
+    /// Time of the request or of the last decision, in seconds since 1970.
     since: u64,
     pub(crate) state: State,
 }
 
-/// What became of a request.
+/// The state of a request.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub(crate) enum State {
@@ -45,7 +45,7 @@ pub(crate) enum State {
         /// The user or invitation that approved.
         by: String,
     },
-    /// An administrator has refused it.
+    /// An administrator has refused the request.
     Refused,
     /// The certificate, in hexadecimal digits.
     Issued { certificate: String },
@@ -60,7 +60,7 @@ pub(crate) struct Wanted {
     pub(crate) approved: Option<String>,
 }
 
-/// Why a request is not kept.
+/// The reason why a request is not stored.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub(crate) enum Unkept {
     #[error(
@@ -70,8 +70,8 @@ pub(crate) enum Unkept {
 }
 
 impl Requests {
-    /// Keeps a request and returns its number. A repeated request of the same key for the same names keeps its number and what
-    /// was decided on it.
+    /// Stores a request and returns its number. A repeated request of the same key for the same
+    /// names keeps its number and its decision.
     pub(crate) fn put(&mut self, wanted: Wanted, now: Duration) -> Result<u32, Unkept> {
         self.all.retain(|one| one.is_kept(now));
         let request = &wanted.request;
@@ -95,7 +95,8 @@ impl Requests {
         }
         let is_approved = wanted.approved.is_some();
         if self.all.len() >= MOST {
-            // Strangers never displace each other; an approved request displaces the oldest of a stranger.
+            // Unapproved requests never displace each other; an approved request displaces the
+            // oldest unapproved request.
             let oldest = self.all.iter().position(|one| one.state == State::Waiting);
             let displaced = oldest.filter(|_| is_approved).ok_or(Unkept::Full)?;
             self.all.remove(displaced);
@@ -116,7 +117,8 @@ impl Requests {
         Ok(self.last)
     }
 
-    /// Keeps a certificate that was issued at once. The request itself is not stored: it has a secret.
+    /// Stores a certificate that was issued at once. The request itself is not stored, because it
+    /// contains a secret.
     pub(crate) fn put_issued(
         &mut self,
         (request, certificate): (&Request, &Certificate),
@@ -142,7 +144,7 @@ impl Requests {
         self.last
     }
 
-    /// Returns the request of a number.
+    /// Returns the request with a number.
     pub(crate) fn get(&self, number: u32, now: Duration) -> Option<&Asked> {
         let mut kept = self.kept(now);
         kept.find(|one| one.number == number)
@@ -153,7 +155,7 @@ impl Requests {
         self.all.iter().filter(move |one| one.is_kept(now))
     }
 
-    /// Approves or refuses a request whose certificate is not issued; returns the request.
+    /// Approves or refuses a request whose certificate is not issued, and returns the request.
     pub(crate) fn decide(&mut self, number: u32, state: State, now: Duration) -> Option<&Asked> {
         let mut all = self.all.iter_mut().filter(|one| one.is_kept(now));
         let one = all.find(|one| one.number == number)?;
@@ -161,12 +163,12 @@ impl Requests {
             return None;
         }
         one.state = state;
-        // The time to fetch the certificate begins now.
+        // The time limit for fetching the certificate starts at the decision.
         one.since = now.as_secs();
         Some(one)
     }
 
-    /// Keeps the certificate that was issued for a request.
+    /// Stores the certificate that was issued for a request.
     pub(crate) fn issued(&mut self, number: u32, certificate: &Certificate, now: Duration) {
         if let Some(one) = self.all.iter_mut().find(|one| one.number == number) {
             one.state = State::Issued {
@@ -183,7 +185,7 @@ impl Asked {
         Request::read(&unhex(&self.request)?).ok()
     }
 
-    /// Reads the certificate that was issued.
+    /// Reads the issued certificate.
     pub(crate) fn certificate(&self) -> Option<Certificate> {
         let State::Issued { certificate } = &self.state else {
             return None;
@@ -191,7 +193,7 @@ impl Asked {
         Certificate::read(&unhex(certificate)?).ok()
     }
 
-    /// Returns whether the request is of that key.
+    /// Returns true if the request is of that key.
     pub(crate) fn is_of_key(&self, key: Fingerprint) -> bool {
         self.key.parse() == Ok(key)
     }
@@ -230,7 +232,7 @@ const MOST: usize = 100;
 const DAY: Duration = Duration::from_secs(86_400);
 const KEPT_OPEN: Duration = DAY.saturating_mul(7);
 const KEPT_REFUSED: Duration = Duration::from_secs(3600);
-/// For a client that has not received the answer.
+/// Time for a client to fetch an answer again that it has not received.
 const KEPT_ISSUED: Duration = DAY;
 
 #[cfg(test)]

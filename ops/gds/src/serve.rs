@@ -34,7 +34,7 @@ use crate::store::{Store, StoreFault, claim};
 use crate::{directory, service};
 use plant_opcua::directory::{NAMESPACE, Types};
 
-/// How it runs.
+/// The settings of the server.
 #[derive(Debug)]
 pub(crate) struct Settings {
     pub(crate) endpoint: EndpointUrl,
@@ -45,7 +45,7 @@ pub(crate) struct Settings {
     pub(crate) interface: Option<Interface>,
 }
 
-/// Serves until it is told to stop.
+/// Runs the server until `stop` is ready.
 pub(crate) async fn serve(
     settings: Settings,
     stop: impl Future<Output = ()>,
@@ -85,7 +85,8 @@ impl Serving {
     fn start(settings: &Settings, store: Store) -> Result<Self, Failure> {
         let failed = |kind| move |error: String| Failure::new(kind, error);
         let io = failed(FailureKind::Io);
-        // Those whom the authority issued certificates are let in. The door of the server stands where an authority is trusted.
+        // Clients with a certificate of the authority are admitted. The door of the server is
+        // active if an authority is trusted.
         let authority = store.certificate_path();
         let trusted = Pki::open(settings.pki.clone())
             .map_err(|error| io(error.to_string()))
@@ -148,7 +149,8 @@ impl Serving {
         Ok(serving)
     }
 
-    /// Renews the server's own certificate, for which the program restarts, and warns once a day before the authority ends.
+    /// Renews the server's own certificate, which restarts the program. Warns once a day before the
+    /// certificate of the authority expires.
     fn look_at_certificates(&self, settings: &Settings, warned: &mut Option<Duration>) {
         let now = now();
         let store = self.gds.store.lock();
@@ -177,7 +179,8 @@ impl Serving {
         }
     }
 
-    /// Has each method carried out, and says that everybody may call them: each looks itself at who calls.
+    /// Registers the handler of each method. Every client may call the methods; each handler checks
+    /// its caller itself.
     fn methods(&self) -> Rules {
         let mut rules = Rules::default();
         let mut add = |object: u32, ids: &[u32], handler: Arc<dyn MethodHandler>| {
@@ -217,7 +220,7 @@ impl Serving {
         rules
     }
 
-    /// Values of the nodes that say what there is.
+    /// Shows the values of the informational nodes.
     fn show(&self) {
         let node = |number: u32| NodeId::new(self.gds.namespace, number);
         let values = [
@@ -263,8 +266,9 @@ pub(crate) fn own_uri() -> String {
     format!("urn:{}:ua-gds", discovery::host_name())
 }
 
-/// Makes the pair of the server at its first start. Its own authority issues the certificate, so that all programs that trust
-/// the authority trust the server. An existing certificate stays until its renewal.
+/// Creates the key and the certificate of the server at its first start. Its own authority issues
+/// the certificate, so that all programs that trust the authority trust the server. An existing
+/// certificate stays until its renewal.
 pub(crate) fn ensure_own(
     store: &Store,
     pki: &Path,
@@ -272,7 +276,8 @@ pub(crate) fn ensure_own(
     now: Duration,
 ) -> Result<(), Failure> {
     let io = |error: String| Failure::new(FailureKind::Io, error);
-    // The server and `ua-gds invite` may start at once: an invitation names the certificate that stays.
+    // The server and `ua-gds invite` may start at the same time, and an invitation names the
+    // certificate that is kept.
     let alone = kept::lock(&store.folder().join(OWN_LOCK));
     let _alone = alone.map_err(|error| io(error.to_string()))?;
     let is_new = own::read(pki).is_none();
@@ -285,8 +290,9 @@ pub(crate) fn ensure_own(
     }
 }
 
-/// Renews the certificate of the server at four fifths of its life; a self-made one, which clients may trust by its file, near
-/// its end. Returns whether there is a new one.
+/// Renews the certificate of the server after four fifths of its life. A self-signed certificate,
+/// which clients may trust by its file, is renewed near its end. Returns true if there is a new
+/// certificate.
 fn renew_own(
     store: &Store,
     pki: &Path,
@@ -300,7 +306,8 @@ fn renew_own(
         true => trust::is_near_end(&certificate, now),
         false => !matches!(Renewal::of(&certificate).step(now), Step::Wait { .. }),
     };
-    // A certificate of an authority that ends is not renewed without end.
+    // If the authority expires first, a renewal would not extend the certificate and be repeated
+    // without end.
     let (_, last) = store.certificate().validity();
     if !is_due || certificate.validity().1 >= last {
         return Ok(false);
@@ -330,7 +337,7 @@ fn issue_own(
     })
 }
 
-/// As a failure of the program.
+/// Converts a fault of the store into a failure of the program.
 pub(crate) fn of_store(fault: &StoreFault) -> Failure {
     let kind = match fault {
         StoreFault::Io { .. } | StoreFault::Key(_) => FailureKind::Io,
@@ -348,9 +355,9 @@ pub(crate) fn of_store(fault: &StoreFault) -> Failure {
 type CarryOut = fn(&Gds, &MethodRequest) -> Answer;
 
 const NAME: &str = "UA bridge global discovery server";
-/// The object of the NodeSet.
+/// The Directory object of the NodeSet.
 const DIRECTORY: u32 = 141;
-/// The object's own node of each method and that of its type, and what carries it out.
+/// The methods: node of the object, node of the type, and handler.
 const METHODS: [(&[u32], CarryOut); 15] = [
     (&[143, 15], directory::find),
     (&[146, 18], directory::register),
@@ -369,7 +376,7 @@ const METHODS: [(&[u32], CarryOut); 15] = [
     (&[177, 126], manager::check),
 ];
 const START_NEW_KEY_PAIR: [u32; 2] = [154, 76];
-/// Of the trust list.
+/// The methods of the trust list.
 const FILE: [(u32, FileMethod); 7] = [
     (622, FileMethod::Open),
     (625, FileMethod::Close),
@@ -386,13 +393,13 @@ const OPEN_COUNT: u32 = 620;
 const LAST_UPDATE: u32 = 637;
 const CERTIFICATE_TYPES: u32 = 648;
 const DAY: Duration = Duration::from_secs(86_400);
-/// Held while the server's own certificate is made.
+/// Locked while the server's own certificate is created.
 const OWN_LOCK: &str = "own.lock";
 /// The life of the server's own certificate.
 const OWN_LIFE: Duration = Duration::from_secs(365 * 86_400);
-/// The same cause is logged once in this time.
+/// Interval in which the same cause is logged once.
 const LOGGED_EVERY: Duration = Duration::from_secs(60);
-/// How often it is looked whether the revocation list is another, or is to be signed anew.
+/// Interval of checking if the revocation list has changed or needs a new signature.
 const LOOK: Duration = Duration::from_secs(2);
 
 #[cfg(test)]

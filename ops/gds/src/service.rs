@@ -1,4 +1,4 @@
-//! What the methods share: who may do what, and what is registered and issued.
+//! The shared state of the methods: permissions, the register and the authority.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -23,40 +23,41 @@ use crate::applicants::Applicants;
 use crate::records::{Record, RecordFault, Records};
 use crate::store::{Store, StoreFault};
 
-/// What a method answers.
+/// The result of a method.
 pub(crate) type Answer = Result<Vec<Variant>, Refusal>;
 
 /// The register and the authority.
 pub(crate) struct Gds {
     pub(crate) store: Mutex<Store>,
     pub(crate) records: Mutex<Records>,
-    /// Applications that wait for their first certificate, and are not registered.
+    /// Applications that wait for their first certificate and are not registered.
     pub(crate) applicants: Mutex<Applicants>,
-    /// The private keys that were made for requests, in PEM, by the numbers of the requests. They are never stored.
+    /// The private keys that were created for requests, in PEM, by the numbers of the requests.
+    /// They are never stored.
     pub(crate) keys: Mutex<BTreeMap<u32, String>>,
     /// The folder of the authority, with the lists that the command line shares.
     pub(crate) folder: PathBuf,
-    /// Judges the certificates of callers by the store of the server.
+    /// Checks the certificates of callers with the store of the server.
     pub(crate) judge: Judge,
-    /// Limits what strangers can have logged.
+    /// Limits the log entries that unauthenticated clients can cause.
     pub(crate) logged: Mutex<LogLimit>,
-    /// The revocation list that the server itself has.
+    /// The revocation list in the store of the server itself.
     pub(crate) known: Mutex<Vec<u8>>,
     pub(crate) access: Arc<Access>,
     /// The certificate store of the server itself.
     pub(crate) pki: PathBuf,
-    /// How long what is issued is valid.
+    /// The life of issued certificates.
     pub(crate) life: Duration,
     /// The index of the GDS namespace.
     pub(crate) namespace: u16,
 }
 
 impl Gds {
-    /// Whether somebody may change an application, or ask for its certificates: a security administrator may, and the
-    /// application itself, which has proven that it is that by its certificate.
+    /// Checks if a caller may change an application or request its certificates. Allowed are a
+    /// security administrator, and the application itself if its certificate proves its identity.
     ///
     /// # Errors
-    /// What the caller is told.
+    /// Returns the status for the caller.
     pub(crate) fn may(&self, caller: &Caller, uri: &str) -> Result<(), StatusCode> {
         match self.standing(caller, uri)? {
             Standing::Administrator | Standing::Itself => Ok(()),
@@ -64,10 +65,10 @@ impl Gds {
         }
     }
 
-    /// Returns who a caller is for the application of a URI.
+    /// Returns the standing of a caller for the application with a URI.
     ///
     /// # Errors
-    /// Others could read or change what is said.
+    /// Returns `BadSecurityModeInsufficient` if the channel is not encrypted.
     pub(crate) fn standing(&self, caller: &Caller, uri: &str) -> Result<Standing, StatusCode> {
         self.is_unread(caller)?;
         if self.is_administrator(caller) {
@@ -89,7 +90,8 @@ impl Gds {
         }
     }
 
-    /// Returns whether the authority has issued a certificate to an application with that key, and revoked none of the key.
+    /// Returns true if the authority has issued a certificate for that application and key, and
+    /// revoked no certificate of the key.
     fn has_issued(&self, uri: &str, key: Fingerprint) -> bool {
         let all = self.store.lock().list().unwrap_or_default();
         let mut own = all.iter().filter(|one| {
@@ -100,8 +102,10 @@ impl Gds {
         first.is_some_and(|one| one.revoked.is_none()) && own.all(|one| one.revoked.is_none())
     }
 
+    /// Requires an encrypted channel.
+    ///
     /// # Errors
-    /// Others could read or change what is said.
+    /// Returns `BadSecurityModeInsufficient` if others could read the messages.
     pub(crate) fn is_unread(&self, caller: &Caller) -> Result<(), StatusCode> {
         match caller.encrypted {
             true => Ok(()),
@@ -110,7 +114,7 @@ impl Gds {
     }
 
     pub(crate) fn is_administrator(&self, caller: &Caller) -> bool {
-        // No user can be called so.
+        // No user can have the name of this token.
         let name = match caller.user.as_str() {
             "anonymous" => ANONYMOUS_USER_TOKEN_ID,
             name => name,
@@ -119,10 +123,10 @@ impl Gds {
         self.access.roles(&token).contains(Role::SecurityAdmin)
     }
 
-    /// The application of an ApplicationId, which the caller may change.
+    /// Returns the application with an ApplicationId that the caller may change.
     ///
     /// # Errors
-    /// What the caller is told.
+    /// Returns the status for the caller.
     pub(crate) fn own(&self, caller: &Caller, id: &NodeId) -> Result<Record, StatusCode> {
         self.is_unread(caller)?;
         let known = number(id).and_then(|number| self.records.lock().get(number).cloned());
@@ -133,7 +137,8 @@ impl Gds {
         Ok(record)
     }
 
-    /// Revokes what an application has, and has the server itself know.
+    /// Revokes certificates of an application, and updates the revocation list of the server
+    /// itself.
     pub(crate) fn revoke(&self, gone: &[Certificate], now: Duration) -> Result<(), StoreFault> {
         let store = self.store.lock();
         for one in gone {
@@ -144,7 +149,8 @@ impl Gds {
         self.know(now)
     }
 
-    /// Has the server itself let in whom the authority has issued a certificate, and nobody whose is revoked.
+    /// Copies the current revocation list to the store of the server itself, so that it refuses
+    /// revoked certificates.
     pub(crate) fn know(&self, now: Duration) -> Result<(), StoreFault> {
         let list = self.store.lock().current_list(now)?;
         let mut known = self.known.lock();
@@ -160,20 +166,21 @@ impl Gds {
     }
 }
 
-/// Who a caller is for an application.
+/// The standing of a caller for an application.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Standing {
     /// A user with the role SecurityAdmin.
     Administrator,
-    /// The application, by a trusted certificate or a key that the authority has issued one for.
+    /// The application, with a trusted certificate or with a key that has a certificate of the
+    /// authority.
     Itself,
     /// A client whose untrusted certificate names the application, with the SHA-256 of its key.
     Applicant(Fingerprint),
-    /// Anybody else.
+    /// Any other client.
     Stranger,
 }
 
-/// The authority and its list, as those that trust it are to have them.
+/// The certificate and the revocation list of the authority, as a trust list for applications.
 pub(crate) struct GroupList(pub(crate) Arc<Gds>);
 
 impl TrustList for GroupList {
@@ -204,12 +211,12 @@ impl TrustList for GroupList {
     }
 }
 
-/// The ApplicationId of a number.
+/// Returns the ApplicationId of a number.
 pub(crate) fn id(number: u32) -> NodeId {
     NodeId::new(OWN, number)
 }
 
-/// The number in an ApplicationId.
+/// Returns the number in an ApplicationId.
 pub(crate) fn number(id: &NodeId) -> Option<u32> {
     match (id.namespace, &id.identifier) {
         (OWN, Identifier::Numeric(number)) => Some(*number),
@@ -217,7 +224,7 @@ pub(crate) fn number(id: &NodeId) -> Option<u32> {
     }
 }
 
-/// Tells what went wrong, and what the caller is told of it.
+/// Logs a fault of the authority and returns the status for the caller.
 pub(crate) fn refused(fault: &StoreFault) -> StatusCode {
     warn!("{fault}");
     match fault.is_io() {
@@ -226,7 +233,7 @@ pub(crate) fn refused(fault: &StoreFault) -> StatusCode {
     }
 }
 
-/// The same of the register.
+/// Logs a fault of the register and returns the status for the caller.
 pub(crate) fn unregistered(fault: &RecordFault, caller: &Caller) -> StatusCode {
     warn!(application = ?caller.application_uri, user = ?caller.user, "what a client tells of an application is refused: {fault}");
     match fault {
@@ -238,19 +245,19 @@ pub(crate) fn unregistered(fault: &RecordFault, caller: &Caller) -> StatusCode {
     }
 }
 
-/// The time since 1970.
+/// Returns the time since 1970.
 pub(crate) fn now() -> Duration {
     plant_opcua::known::now()
 }
 
-/// A time in seconds since 1970, as clients get it.
+/// Converts a time in seconds since 1970 into a DateTime.
 pub(crate) fn time(seconds: u64) -> Variant {
     let ticks = i64::try_from(seconds).unwrap_or_default();
     let ticks = ticks.saturating_mul(TICKS).saturating_add(TICKS_TO_1970);
     Variant::from(DateTime::from(ticks))
 }
 
-/// The texts of an argument, as many as there may be.
+/// Returns the texts of an argument, up to a limit.
 pub(crate) fn texts(argument: &Variant) -> Vec<String> {
     let Variant::Array(array) = argument else {
         return Vec::new();
@@ -267,8 +274,8 @@ pub(crate) fn texts(argument: &Variant) -> Vec<String> {
 
 /// The namespace of the server itself.
 pub(crate) const OWN: u16 = 1;
-/// 100 ns each, in a second.
+/// Ticks of 100 ns in a second.
 const TICKS: i64 = 10_000_000;
-/// From 1601 to 1970.
+/// Ticks from 1601 to 1970.
 const TICKS_TO_1970: i64 = 116_444_736_000_000_000;
 const MOST_TEXTS: usize = 32;

@@ -1,4 +1,5 @@
-//! The authority in its folder: its certificate and key, what it has issued and revoked.
+//! The authority in its folder: its certificate and key, the issued certificates, and the
+//! revocations.
 
 use std::fmt;
 use std::fs::{self, File, TryLockError};
@@ -19,15 +20,15 @@ pub(crate) struct Store {
     authority: Authority,
 }
 
-/// A certificate that was issued.
+/// An issued certificate.
 #[derive(Debug, Clone)]
 pub(crate) struct Issued {
     pub(crate) certificate: Certificate,
-    /// Since when it is revoked.
+    /// Time of the revocation.
     pub(crate) revoked: Option<Duration>,
 }
 
-/// Why the authority cannot do it.
+/// The reason why the authority failed.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum StoreFault {
     #[error("{path}: {source}")]
@@ -57,14 +58,14 @@ pub(crate) enum StoreFault {
 }
 
 impl StoreFault {
-    /// Whether it is for want of something that the system has, and not of what was asked for.
+    /// Returns true for an I/O fault, and false for a fault of the request or the authority.
     pub(crate) const fn is_io(&self) -> bool {
         matches!(self, Self::Io { .. })
     }
 }
 
 impl Store {
-    /// Makes an authority that lives so long.
+    /// Creates an authority with this life.
     pub(crate) fn init(
         folder: &Path,
         names: (&str, &str),
@@ -76,7 +77,7 @@ impl Store {
         if folder.join(CERTIFICATE).exists() {
             return Err(StoreFault::Present(folder.to_owned()));
         }
-        // A key without a certificate is of an interrupted start, and has signed nothing.
+        // A key without a certificate remains from an interrupted start, and has signed nothing.
         let path = folder.join(KEY);
         let known = match path.exists() {
             true => Some(read_key(&path)?),
@@ -139,7 +140,7 @@ impl Store {
         &self.folder
     }
 
-    /// Issues what is asked for, from now on and for that long.
+    /// Issues the requested certificate with this life.
     pub(crate) fn issue(
         &self,
         request: &Request,
@@ -157,12 +158,12 @@ impl Store {
         let folder = self.folder.join(ISSUED);
         fs::create_dir_all(&folder).map_err(io_at(&folder))?;
         let path = folder.join(format!("{}.der", made.serial()));
-        // What is not kept could not be revoked.
+        // A certificate that is not stored could not be revoked.
         replace(&path, made.der()).map_err(io_at(&path))?;
         Ok(made)
     }
 
-    /// Revokes a certificate that was issued here; once more changes nothing.
+    /// Revokes a certificate that was issued here. Repeating it has no effect.
     pub(crate) fn revoke(&self, serial: &Serial, now: Duration) -> Result<(), StoreFault> {
         let _alone = lock(&self.folder)?;
         let name = format!("{serial}.der");
@@ -181,7 +182,7 @@ impl Store {
         self.sign_list(now)
     }
 
-    /// All that was issued, by name.
+    /// Returns all issued certificates, sorted by name.
     pub(crate) fn list(&self) -> Result<Vec<Issued>, StoreFault> {
         let revoked = self.revoked()?;
         let folder = self.folder.join(ISSUED);
@@ -218,7 +219,7 @@ impl Store {
         Ok(all)
     }
 
-    /// Those that an application has and that are not revoked, the latest first.
+    /// Returns the certificates of an application that are not revoked, latest first.
     pub(crate) fn of_application(&self, uri: &str) -> Result<Vec<Certificate>, StoreFault> {
         let all = self.list()?.into_iter();
         let mut own: Vec<Certificate> = all
@@ -230,7 +231,7 @@ impl Store {
         Ok(own)
     }
 
-    /// The revocation list, signed anew where half of its life is over.
+    /// Returns the revocation list. It is signed again after half of its life.
     pub(crate) fn current_list(&self, now: Duration) -> Result<Crl, StoreFault> {
         let path = self.folder.join(LIST);
         let read = || Crl::read(&fs::read(&path).ok()?).ok();
@@ -251,19 +252,19 @@ impl Store {
         })
     }
 
-    /// Where the revocation list is.
+    /// Returns the path of the revocation list.
     pub(crate) fn list_path(&self) -> PathBuf {
         self.folder.join(LIST)
     }
 
-    /// Where the certificate of the authority is.
+    /// Returns the path of the authority's certificate.
     pub(crate) fn certificate_path(&self) -> PathBuf {
         self.folder.join(CERTIFICATE)
     }
 
     fn sign_list(&self, now: Duration) -> Result<(), StoreFault> {
         let revoked = self.revoked()?;
-        // Ascends, as the time does.
+        // The number increases with time.
         let number = u64::try_from(now.as_millis()).unwrap_or(u64::MAX);
         let list = self.authority.crl(&revoked, number, (now, now + LIST_LIFE));
         let list = list.map_err(StoreFault::Request)?;
@@ -285,7 +286,7 @@ impl Store {
                 since: Duration::from_secs(since.parse().ok()?),
             })
         };
-        // One that is left out would be valid again.
+        // A revocation that is skipped would make its certificate valid again.
         let all: Option<Vec<Revoked>> = text.lines().map(line).collect();
         all.ok_or(StoreFault::Unfit {
             path,
@@ -294,7 +295,7 @@ impl Store {
     }
 }
 
-/// A new private key in the DER of PKCS #8. Takes some time.
+/// Creates a private key in the DER of PKCS #8. Takes some time.
 pub(crate) fn new_key(bits: u32) -> Result<Vec<u8>, StoreFault> {
     let failed = |error: &dyn fmt::Display| StoreFault::Key(error.to_string());
     let key = PrivateKey::new(bits).map_err(|error| failed(&error))?;
@@ -302,13 +303,13 @@ pub(crate) fn new_key(bits: u32) -> Result<Vec<u8>, StoreFault> {
     Ok(der.as_bytes().to_vec())
 }
 
-/// A private key in PEM.
+/// Encodes a private key in PEM.
 pub(crate) fn pem_of(key: &[u8]) -> Result<String, StoreFault> {
     pem::encode_string("PRIVATE KEY", LineEnding::LF, key)
         .map_err(|error| StoreFault::Key(error.to_string()))
 }
 
-/// Reads the DER of PKCS #8 of a key.
+/// Reads a key in the DER of PKCS #8.
 fn read_key(path: &Path) -> Result<Vec<u8>, StoreFault> {
     let bytes = fs::read(path).map_err(io_at(path))?;
     let (_, der) = pem::decode_vec(&bytes).map_err(|_| StoreFault::Unfit {
@@ -318,7 +319,7 @@ fn read_key(path: &Path) -> Result<Vec<u8>, StoreFault> {
     Ok(der)
 }
 
-/// Writes a key that only its owner reads, beside and as a whole. A key that is there already is never replaced.
+/// Writes a key that only its owner can read, atomically. An existing key is never replaced.
 pub(crate) fn write_key(path: &Path, pem: &str) -> io::Result<()> {
     let beside = path.with_extension("new");
     match fs::remove_file(&beside) {
@@ -336,7 +337,7 @@ pub(crate) fn write_key(path: &Path, pem: &str) -> io::Result<()> {
     let written = file
         .write_all(pem.as_bytes())
         .and_then(|()| file.sync_all())
-        // Unlike a rename, a link fails where there is a file already.
+        // Unlike a rename, a link fails if the file exists.
         .and_then(|()| match fs::hard_link(&beside, path) {
             // Some file systems have no links.
             Err(error) if error.kind() != io::ErrorKind::AlreadyExists && !path.exists() => {
@@ -350,10 +351,10 @@ pub(crate) fn write_key(path: &Path, pem: &str) -> io::Result<()> {
     }
 }
 
-/// Keeps other servers from a folder until the file is dropped.
+/// Locks a folder against other servers until the file is dropped.
 ///
 /// # Errors
-/// Another server has it.
+/// Returns an error if another server has locked the folder.
 pub(crate) fn claim(folder: &Path) -> Result<File, StoreFault> {
     let path = folder.join("running");
     let file = File::create(&path).map_err(io_at(&path))?;
@@ -376,7 +377,8 @@ fn io_at(path: &Path) -> impl FnOnce(io::Error) -> StoreFault + use<> {
     move |source| StoreFault::Io { path, source }
 }
 
-/// Waits until nobody else issues or revokes here, and keeps others from it until the file is dropped.
+/// Waits until no other process issues or revokes here, and locks the folder until the file is
+/// dropped.
 fn lock(folder: &Path) -> Result<File, StoreFault> {
     let path = folder.join("lock");
     let locked = File::create(&path).and_then(|file| match file.lock() {
@@ -416,9 +418,11 @@ const ISSUED: &str = "issued";
 const REVOKED: &str = "revoked";
 const LIST: &str = "authority.crl";
 const AUTHORITY_BITS: u32 = 3072;
-/// What is issued is valid that much earlier, for those whose clock is behind.
+/// Certificates are valid from this time before their issue, for applications whose clock is
+/// behind.
 const CLOCKS_DIFFER: Duration = Duration::from_secs(3600);
-/// Whoever does not fetch the list for that long trusts nobody here any more.
+/// The life of the revocation list. Applications without a current list trust no certificate of the
+/// authority.
 const LIST_LIFE: Duration = Duration::from_secs(30 * 86_400);
 
 #[cfg(test)]
