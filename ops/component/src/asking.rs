@@ -1,4 +1,4 @@
-//! What skills of the component ask of others in the space.
+//! Requests of the component's skills to other participants of the space.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 use std::sync::Arc;
@@ -11,10 +11,10 @@ use mappings::TopicId;
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::timeout;
 
-/// The calls that drivers ask for, as far as somebody executes them.
+/// The calls that drivers need, as far as they have an executor.
 type Known = BTreeMap<TopicId, Arc<CallDescription>>;
 
-/// The way of drivers to the space.
+/// The sender of the drivers' requests to the space.
 #[derive(Debug, Clone)]
 pub(crate) struct Asks {
     known: watch::Receiver<Known>,
@@ -34,14 +34,14 @@ enum Wish {
     GiveUp(AskId),
 }
 
-/// The other end: what the port reports and is told.
+/// The receiver of the drivers' requests. The port reports the requests and passes the answers on.
 #[derive(Debug)]
 pub(crate) struct Asking {
     asks: Asks,
     known: watch::Sender<Known>,
     wishes: mpsc::Receiver<Wish>,
     asked: HashMap<AskId, oneshot::Sender<Answered<Bytes>>>,
-    /// Those that drivers ask for.
+    /// The calls that drivers need.
     wanted: BTreeSet<TopicId>,
     events: VecDeque<PortEvent>,
 }
@@ -64,7 +64,7 @@ impl Asking {
         }
     }
 
-    /// The way of a driver that asks for that call.
+    /// Returns a sender for a driver that needs this call.
     pub(crate) fn asks(&mut self, topic: TopicId) -> Asks {
         self.want(topic);
         self.asks.clone()
@@ -76,13 +76,13 @@ impl Asking {
         }
     }
 
-    /// What there is to report. Cancel-safe.
+    /// Waits for the next event to report. Cancel-safe.
     pub(crate) async fn next(&mut self) -> PortEvent {
         loop {
             if let Some(event) = self.events.pop_front() {
                 return event;
             }
-            // Never `None` while we hold a sender ourselves.
+            // Never `None`, because `asks` holds a sender.
             match self.wishes.recv().await {
                 None => return std::future::pending().await,
                 Some(Wish::Ask {
@@ -110,7 +110,8 @@ impl Asking {
     }
 
     pub(crate) fn known(&mut self, topic: TopicId, description: &Arc<CallDescription>) {
-        // Also what nobody wants yet: the calls of an action are told of once, in any order.
+        // Calls that no driver needs are recorded too, because the calls of an action are announced
+        // once and in any order.
         if self.wanted.contains(&topic)
             && let CallRole::Goal(family) = description.role
         {
@@ -133,17 +134,17 @@ impl Asking {
 
     pub(crate) fn answered(&mut self, ask: AskId, answer: Answered<Bytes>) {
         if let Some(asked) = self.asked.remove(&ask) {
-            // Who asked may have given up meanwhile.
+            // The driver may have abandoned the request.
             drop(asked.send(answer));
         }
     }
 }
 
 impl Asks {
-    /// What a call is, once somebody executes it.
+    /// Waits until a call has an executor, and returns its description.
     ///
     /// # Errors
-    /// Nobody does within that time.
+    /// Returns an error if the call has no executor within that time.
     pub(crate) async fn known(
         &self,
         topic: TopicId,
@@ -156,15 +157,15 @@ impl Asks {
         found.ok_or_else(|| format!("nobody in the space executes {topic}"))
     }
 
-    /// Whether somebody executes it now.
+    /// Returns true if a call has an executor.
     pub(crate) fn is_known(&self, topic: TopicId) -> bool {
         self.known.borrow().contains_key(&topic)
     }
 
-    /// Asks. Given up when it is dropped.
+    /// Sends a request and waits for the answer. Dropping the future abandons the request.
     ///
     /// # Errors
-    /// Why there is no answer; `None` where the component ends.
+    /// Returns the reason why there is no answer, or `None` if the component stops.
     pub(crate) async fn ask(
         &self,
         topic: TopicId,
@@ -192,7 +193,7 @@ impl Asks {
     }
 }
 
-/// Something that is asked and not answered.
+/// A pending request.
 struct Open<'a> {
     ask: AskId,
     wish: &'a mpsc::Sender<Wish>,
@@ -202,11 +203,12 @@ struct Open<'a> {
 impl Drop for Open<'_> {
     fn drop(&mut self) {
         if !self.over {
-            // Where there is no room it ends at its deadline.
+            // If the queue is full, the request ends at its deadline.
             drop(self.wish.try_send(Wish::GiveUp(self.ask)));
         }
     }
 }
 
-/// What drivers have asked and the port has not taken: each skill asks for one or two at a time.
+/// Largest number of requests of drivers that the port has not taken. Each skill sends one or two
+/// at a time.
 const MOST_WISHES: usize = 256;

@@ -1,5 +1,5 @@
-//! The skill types as actions of ROS (`ua_msgs/Grasp`), and what their goals, results and feedback are in the space: both out
-//! of the one table of skill types.
+//! The skill types as ROS actions (`ua_msgs/Grasp`), and the fields of their goals, results and
+//! feedback in the space. Both follow from the same table of skill types.
 
 use bridge_core::CallField;
 use messages::{Leaf, Rank};
@@ -12,7 +12,7 @@ use crate::fields;
 /// The package of the types.
 pub const PACKAGE: &str = "ua_msgs";
 
-/// What a goal says while it runs.
+/// The fields of feedback.
 pub(crate) const FEEDBACK: [(&str, Builtin, &str); 4] = [
     (
         "state",
@@ -28,11 +28,12 @@ pub(crate) const FEEDBACK: [(&str, Builtin, &str); 4] = [
     ("run", Builtin::UInt32, RUN_ABOUT),
 ];
 
-/// First of a result: the run.
+/// The first field of a result: the run.
 pub(crate) const RUN: &str = "run";
 const RUN_ABOUT: &str = "Which run of the skill it is, counted from 1.";
 
-/// The name of a skill type's action: `Grasp` of `GraspSkillType`, and `RunSkill` of the type that all are of.
+/// Returns the name of a skill type's action: `Grasp` for `GraspSkillType`, and `RunSkill` for the
+/// base type of all skills.
 #[must_use]
 pub fn action_name(skill_type: &SkillType) -> &'static str {
     match skill_type.name {
@@ -41,7 +42,8 @@ pub fn action_name(skill_type: &SkillType) -> &'static str {
     }
 }
 
-/// The action that a skill is of: that of its type, or of the nearest supertype that is ours.
+/// Returns the action type of a skill: the action of its type, or of its nearest supertype in the
+/// [`NAMESPACE`] of this project.
 #[must_use]
 pub fn action_type(types: &[TypeName]) -> Option<String> {
     let ours = types.iter().filter(|of| of.namespace == NAMESPACE);
@@ -49,12 +51,12 @@ pub fn action_type(types: &[TypeName]) -> Option<String> {
     Some(format!("{PACKAGE}/{}", action_name(nearest)))
 }
 
-/// The action of the type that all skills are of.
+/// Returns the action of the base type of all skills.
 pub(crate) fn of_all() -> String {
     format!("{PACKAGE}/RunSkill")
 }
 
-/// A name of OPC UA as ROS spells those of fields: `target_position` of `TargetPosition`.
+/// Converts a name of OPC UA into a field name of ROS: `target_position` for `TargetPosition`.
 #[must_use]
 pub fn field_name(name: &str) -> String {
     let mut spelled = String::new();
@@ -67,7 +69,7 @@ pub fn field_name(name: &str) -> String {
         }
         match c.is_ascii_alphanumeric() {
             true => spelled.push(c.to_ascii_lowercase()),
-            // Two in a row ROS 2 does not take.
+            // ROS 2 forbids two consecutive underscores.
             false if !spelled.ends_with('_') => spelled.push('_'),
             false => {}
         }
@@ -76,7 +78,7 @@ pub fn field_name(name: &str) -> String {
     spelled
 }
 
-/// The text of a skill type's `.action`, the same for both ROS.
+/// Returns the text of a skill type's `.action` file, which is the same for ROS 1 and ROS 2.
 #[must_use]
 pub fn definition(skill_type: &'static SkillType) -> String {
     let mut text = format!(
@@ -99,10 +101,10 @@ pub fn definition(skill_type: &'static SkillType) -> String {
     text
 }
 
-/// Unit, range and default, as far as there are any.
+/// Returns the unit, range and default of a parameter, as far as it has them.
 fn note(parameter: &Parameter) -> String {
     let mut note = String::new();
-    // Not every tool of ROS 1 reads more than ASCII.
+    // Some tools of ROS 1 read only ASCII.
     let unit = parameter
         .unit
         .iter()
@@ -153,10 +155,10 @@ const fn ros(builtin: Builtin) -> &'static str {
     }
 }
 
-/// Whether it is what a message of ROS has where nothing was set.
+/// Returns true if a value is the default value of a ROS message.
 pub(crate) fn is_nothing(value: &Value) -> bool {
     match value {
-        // A Boolean that is not set cannot be told from one that is.
+        // A Boolean that is not set cannot be distinguished from a Boolean that is set.
         Value::Boolean(_) => false,
         Value::String(text) => text.is_empty(),
         Value::Array(_, elements) => elements.is_empty(),
@@ -173,7 +175,7 @@ pub(crate) fn is_nothing(value: &Value) -> bool {
     }
 }
 
-/// The fields of a goal.
+/// Returns the fields of a goal.
 pub(crate) fn goal_fields(parameters: &[Parameter]) -> Vec<CallField> {
     let fields = parameters.iter().map(|parameter| {
         let field = call_field(parameter);
@@ -185,7 +187,7 @@ pub(crate) fn goal_fields(parameters: &[Parameter]) -> Vec<CallField> {
     fields.collect()
 }
 
-/// The fields of a result.
+/// Returns the fields of a result.
 pub(crate) fn result_fields(results: &[Parameter]) -> Vec<CallField> {
     let run = CallField::scalar(RUN, BuiltinType::UInt32);
     [run]
@@ -194,7 +196,7 @@ pub(crate) fn result_fields(results: &[Parameter]) -> Vec<CallField> {
         .collect()
 }
 
-/// The fields of feedback.
+/// Returns the fields of feedback.
 pub(crate) fn feedback_fields() -> Vec<Leaf> {
     let leaves = FEEDBACK.iter().map(|(name, builtin, _)| Leaf {
         path: (*name).to_owned(),
@@ -220,7 +222,7 @@ fn call_field(parameter: &Parameter) -> CallField {
     }
 }
 
-/// A value of a result with nothing in it.
+/// Returns the empty value of a result.
 pub(crate) fn nothing(of: &Parameter) -> Value {
     let Shape { builtin, array } = of.shape;
     let one = match builtin {

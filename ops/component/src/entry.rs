@@ -1,4 +1,4 @@
-//! The program `ua-component`: a component of the cell, by its own YAML.
+//! The program `ua-component`: a component of the cell that its YAML file defines.
 
 use std::ffi::OsString;
 use std::io::Write as _;
@@ -67,14 +67,15 @@ struct UaComponent {
     read: OnceLock<Read>,
 }
 
-/// The YAML as it was read.
+/// The YAML file that was read.
 #[derive(Debug)]
 struct Read {
     component: Component,
     text: String,
 }
 
-/// Runs `ua-component` from its command line to its end. `arguments` begin with the name of the program.
+/// Runs `ua-component` from its command line to its end. `arguments` begin with the name of the
+/// program.
 #[must_use]
 pub fn run(arguments: Vec<OsString>) -> ExitCode {
     match arguments.get(1) {
@@ -84,7 +85,7 @@ pub fn run(arguments: Vec<OsString>) -> ExitCode {
 }
 
 impl UaComponent {
-    /// The YAML; an empty path where the command line did not have to say one.
+    /// Returns the path of the YAML file, which is empty if the command line need not name it.
     fn file(&self) -> &Path {
         self.component.as_deref().unwrap_or_else(|| Path::new(""))
     }
@@ -116,7 +117,7 @@ impl UaComponent {
         Ok(self.read.get_or_init(|| Read { component, text }))
     }
 
-    /// The certificate store, where anything is secured.
+    /// Returns the certificate store, if a secured endpoint or the GDS needs it.
     fn pki_root(&self, read: &Read) -> PathBuf {
         let root = || plant_opcua::pki::default_root(|name| std::env::var(name).ok());
         let usual = || root().join(&read.component.name);
@@ -176,7 +177,8 @@ impl Program for UaComponent {
         Ok(Some(Made::Run(made(&read.component))))
     }
 
-    /// As whom its server and its clients come, from the same certificate store.
+    /// The key service uses the identity of the server and its clients, from the same certificate
+    /// store.
     fn key_service(&self, _mapping: &Mapping) -> Option<Arc<dyn KeyService>> {
         let read = self.read().ok()?;
         Some(Arc::new(plant_keys::Service::new(plant_keys::Identity {

@@ -1,4 +1,4 @@
-//! Who executes a skill that is in the space: this program, or a server that it speaks for.
+//! The executor of a skill in the space: this program, or another server that it represents.
 
 use std::sync::Arc;
 
@@ -7,12 +7,12 @@ use skills::{Facts, Mirror, Outcome, Owner, Shown, Skill, Value};
 
 use crate::fields;
 
-/// A skill to be run. Clones are of the same one.
+/// An executable skill. Clones refer to the same skill.
 #[derive(Debug, Clone)]
 pub(crate) enum Executor {
-    /// Executed here.
+    /// Executed by this program.
     Own(Skill),
-    /// Executed by a server that knows nothing of the space.
+    /// Executed by a server that is not a participant of the space.
     Theirs(Mirror),
 }
 
@@ -31,7 +31,7 @@ impl Executor {
         }
     }
 
-    /// How a run ended, of the newest ones.
+    /// Returns the outcome of a run, if it is one of the latest.
     pub(crate) fn outcome(&self, run: u32) -> Option<Arc<Outcome>> {
         match self {
             Self::Own(skill) => skill.outcome(run),
@@ -39,10 +39,10 @@ impl Executor {
         }
     }
 
-    /// Calls a method: gives the number of the newest run.
+    /// Calls a method and returns the number of the latest run.
     ///
     /// # Errors
-    /// The name of a StatusCode and why, for people.
+    /// Returns the name of a StatusCode and the reason as text for the operator.
     pub(crate) async fn call(&self, by: Owner, method: Method) -> Result<u32, String> {
         match self {
             Self::Own(skill) => skill.call(by, method).await.map_err(|why| why.to_string()),
@@ -50,10 +50,10 @@ impl Executor {
         }
     }
 
-    /// Begins a run with these parameters: gives its number.
+    /// Starts a run with these parameters and returns its number.
     ///
     /// # Errors
-    /// As [`call`](Self::call).
+    /// Returns the errors of [`call`](Self::call).
     pub(crate) async fn start_with(
         &self,
         by: Owner,
@@ -68,7 +68,7 @@ impl Executor {
         }
     }
 
-    /// What a call of the space answers: success, message and run.
+    /// Executes a call of the space and returns its response: success, message and run.
     pub(crate) async fn answer(&self, by: Owner, method: Method, request: &[u8]) -> [Value; 3] {
         let answer = match method {
             Method::Start => match self.parameters(request) {
@@ -85,7 +85,8 @@ impl Executor {
         }
     }
 
-    /// The parameters of a request: a field for each of the type's, in its order, or none at all. What is null is not given.
+    /// Decodes the parameters of a request: a field for each parameter of the type, in its order,
+    /// or no field at all. Null fields are not set.
     fn parameters(&self, request: &[u8]) -> Result<Vec<(String, Value)>, String> {
         let values = fields::values(request)?;
         let declared = &self.facts().parameters;

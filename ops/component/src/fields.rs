@@ -1,10 +1,11 @@
-//! Values as the space carries them: a block of fields is their number (UInt16) and a Variant each (OPC 10000-6, 5.2.2.16).
+//! Values in the encoding of the space: a block of fields is their number (UInt16) and a Variant
+//! for each field (OPC 10000-6, 5.2.2.16).
 
 use messages::Rank;
 use skills::{Builtin, Shape, Value};
 use uadp::{BuiltinType, Fields, Scalar, Variant};
 
-/// The block of these values.
+/// Encodes a block of values.
 pub(crate) fn block(values: &[Value]) -> Vec<u8> {
     // A skill has a few hundred values at most.
     let mut out = Vec::from(
@@ -18,10 +19,10 @@ pub(crate) fn block(values: &[Value]) -> Vec<u8> {
     out
 }
 
-/// The values of a block; `None` for one that is null.
+/// Decodes the values of a block; `None` for a null value.
 ///
 /// # Errors
-/// What of it a skill has no values of, for people.
+/// Returns the unsupported type or the encoding error, as text for the operator.
 pub(crate) fn values(block: &[u8]) -> Result<Vec<Option<Value>>, String> {
     let fields = Fields::parse(block).map_err(|error| error.to_string())?;
     fields
@@ -29,7 +30,7 @@ pub(crate) fn values(block: &[u8]) -> Result<Vec<Option<Value>>, String> {
         .collect()
 }
 
-/// The type of a field.
+/// Returns the type of a field.
 pub(crate) fn builtin(of: Builtin) -> BuiltinType {
     match of {
         Builtin::Boolean => BuiltinType::Boolean,
@@ -47,7 +48,7 @@ pub(crate) fn builtin(of: Builtin) -> BuiltinType {
     }
 }
 
-/// The rank of a field.
+/// Returns the rank of a field.
 pub(crate) fn rank(of: Shape) -> Rank {
     if of.array {
         Rank::Array { fixed: None }
@@ -86,7 +87,7 @@ fn scalar(value: &Value, out: &mut Vec<u8>) {
             length(text.len(), out);
             out.extend(text.as_bytes());
         }
-        // An array has single values in it.
+        // Arrays contain scalars only.
         Value::Array(..) => {}
     }
 }
@@ -95,10 +96,10 @@ fn length(of: usize, out: &mut Vec<u8>) {
     out.extend(i32::try_from(of).unwrap_or(i32::MAX).to_le_bytes());
 }
 
-/// The value of a field; `None` for null.
+/// Converts the value of a field; `None` for null.
 ///
 /// # Errors
-/// As [`values`].
+/// Returns the errors of [`values`].
 pub(crate) fn value(field: &Variant<'_>) -> Result<Option<Value>, String> {
     match field {
         Variant::Null => Ok(None),

@@ -1,6 +1,8 @@
-//! A skill as an action of the space: a goal starts a run, its feedback is how far that is, and cancelling halts it.
+//! A skill as an action of the space: a goal starts a run, its feedback is the progress of the run,
+//! and cancelling halts the run.
 //!
-//! A goal resets a skill that is Halted: who sends goals knows no Reset, and every run ends in Halted that does not succeed.
+//! A goal resets a skill that is Halted, because clients of actions have no Reset, and every run
+//! that fails ends in Halted.
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -22,11 +24,11 @@ use crate::definition;
 use crate::executor::Executor;
 use crate::fields;
 
-/// What a skill is as an action. `name` is that of the skill in its component.
+/// Returns the action of a skill. The first part of the tuple is the name of the component.
 pub(crate) fn action(topic: TopicId, (component, open): (&str, bool), facts: &Facts) -> OwnAction {
     let of = facts.types.first();
     let of = of.map(|of| format!("{} nsu={}", of.name, of.namespace));
-    // A Program that is no skill is run as one of the type that all are of.
+    // A Program that is not a skill has the action of the base type of all skills.
     let ros = definition::action_type(&facts.types).unwrap_or_else(definition::of_all);
     OwnAction {
         topic,
@@ -40,7 +42,7 @@ pub(crate) fn action(topic: TopicId, (component, open): (&str, bool), facts: &Fa
     }
 }
 
-/// The fields of a result. What is not given has nothing in it.
+/// Encodes the fields of a result. Missing values are empty.
 fn result(facts: &Facts, (run, given): (u32, &[(String, Value)])) -> Bytes {
     let values = facts.results.iter().map(|declared| {
         let found = given.iter().find(|(name, _)| *name == declared.name);
@@ -50,21 +52,21 @@ fn result(facts: &Facts, (run, given): (u32, &[(String, Value)])) -> Bytes {
     Bytes::from(fields::block(&values))
 }
 
-/// What a skill says of its runs.
+/// A notification of a skill about its runs.
 #[derive(Debug, Clone)]
 enum Heard {
     Stands {
         run: u32,
         feedback: [Value; 4],
-        /// No more than its progress is another.
+        /// True if only the progress has changed.
         passing: bool,
     },
     Ended(Arc<Outcome>),
-    /// Nothing more is known of them.
+    /// The state of the runs is unknown from now on.
     Lost(String),
 }
 
-/// Hears what happens to a skill, for its goals.
+/// Observes a skill for its goals.
 #[derive(Debug, Clone)]
 pub(crate) struct Reporter(broadcast::Sender<Heard>);
 
@@ -82,7 +84,7 @@ impl Observer for Reporter {
             Told::Outcome(outcome) => Heard::Ended(Arc::new(outcome.clone())),
             Told::Parameters(_) | Told::Called => return,
         };
-        // Without any goal nobody hears it.
+        // Without goals there is no receiver.
         let _heard_by = self.0.send(heard);
     }
 
@@ -105,7 +107,7 @@ fn stands(shown: &Shown, passing: bool) -> Heard {
     }
 }
 
-/// Has goals done by a skill.
+/// Executes goals with a skill.
 #[derive(Debug)]
 pub(crate) struct Doer {
     skill: Executor,
@@ -117,18 +119,19 @@ pub(crate) struct Doer {
 #[derive(Debug, Default)]
 struct Doing {
     current: Option<Current>,
-    /// Goals whose runs are about to begin, and whether each is cancelled meanwhile.
+    /// Goals whose runs are about to start, and if each was cancelled in the meantime.
     beginning: HashMap<GoalId, bool>,
 }
 
 impl Doing {
-    /// A run has begun or failed to begin. Returns true if its goal was cancelled meanwhile.
+    /// Handles that a run has started or failed to start. Returns true if its goal was cancelled in
+    /// the meantime.
     fn begun(&mut self, id: GoalId) -> bool {
         self.beginning.remove(&id).unwrap_or_default()
     }
 }
 
-/// The goal whose run is the newest of those that goals began.
+/// The goal with the latest run among the runs that goals started.
 #[derive(Debug, Clone, Copy)]
 struct Current {
     id: GoalId,
@@ -150,7 +153,7 @@ impl ActionClient for Doer {
     type Goal = Sent;
 
     fn send_goal(&self, id: GoalId, body: &[u8]) -> Sent {
-        // Before it begins: nothing of it is missed.
+        // The subscription starts before the run, so that no notification is missed.
         let heard = self.reporter.0.subscribe();
         let (skill, body) = (self.skill.clone(), body.to_vec());
         let doing = Arc::clone(&self.doing);
@@ -171,7 +174,7 @@ impl ActionClient for Doer {
                 cancelled
             };
             if cancelled && run.is_ok() {
-                // The end of the run tells whether it could be halted.
+                // The end of the run shows if it could be halted.
                 let _halted = skill.call(OWNER, Method::Halt).await;
             }
             run
@@ -235,7 +238,7 @@ impl ActionClient for Doer {
             }),
             Err(_) if self.skill.outcome(open.run).is_some() => none(TERMINATED),
             Err(_) => {
-                // It goes on.
+                // The run continues.
                 let mut doing = lock(&self.doing);
                 if let Some(current) = doing.current.as_mut().filter(|now| now.run == open.run) {
                     current.cancelled = false;
@@ -246,11 +249,11 @@ impl ActionClient for Doer {
     }
 }
 
-/// Begins a run: gives its number.
+/// Starts a run and returns its number.
 async fn begin(skill: &Executor, body: &[u8]) -> Result<u32, String> {
     let given =
         parameters(skill.facts(), body).map_err(|why| format!("BadInvalidArgument: {why}"))?;
-    // Looked at before anything moves; Start looks again.
+    // The parameters are checked before the machine moves; Start checks them again.
     let complete = Parameters::complete(&skill.facts().parameters, given.clone());
     complete.map_err(|refusal| refusal.to_string())?;
     let shown = skill.shown();
@@ -266,8 +269,8 @@ async fn begin(skill: &Executor, body: &[u8]) -> Result<u32, String> {
     skill.start_with(OWNER, given).await
 }
 
-/// The parameters of a goal. What is null is not given, and neither is what is zero or empty and has a default: a message of
-/// ROS has no fields that are not there.
+/// Decodes the parameters of a goal. Null values are not set. Zero or empty values of parameters
+/// with a default are not set either, because all fields of a ROS message have a value.
 fn parameters(facts: &Facts, body: &[u8]) -> Result<Vec<(String, Value)>, String> {
     let values = fields::values(body)?;
     let declared = &facts.parameters;
@@ -295,9 +298,10 @@ pub(crate) struct Sent {
     heard: broadcast::Receiver<Heard>,
     stage: Stage,
     events: VecDeque<GoalEvent>,
-    /// Progress that is not told yet, since the last was a moment ago.
+    /// Progress that is held back, because the previous feedback was sent a moment ago.
     passing: Option<[Value; 4]>,
-    /// When feedback was told last, and what: a run that stands still is heard all the same by who came late.
+    /// Time of the last feedback, and its values in `last`. Feedback is repeated, so that late
+    /// subscribers receive it while nothing changes.
     told: Option<Instant>,
     last: Option<[Value; 4]>,
 }
@@ -306,7 +310,7 @@ pub(crate) struct Sent {
 enum Stage {
     Begins(JoinHandle<Result<u32, String>>),
     Runs(u32),
-    /// It has ended, which is told then.
+    /// The run has ended; the end is reported at this time.
     Cancelled(Arc<Outcome>, Instant),
     Ended,
 }
@@ -329,7 +333,7 @@ impl SentGoal for Sent {
                         None => REPEATED,
                     };
                     let next = self.told.map(|told| told + pause);
-                    // Both are cancel-safe.
+                    // Both futures are cancel-safe.
                     tokio::select! {
                         heard = self.heard.recv() => self.heard(run, heard),
                         () = at(next) => self.tell(None),
@@ -346,7 +350,7 @@ impl SentGoal for Sent {
     }
 }
 
-/// Ready at that time; never without one.
+/// Waits until a time; pends without a time.
 async fn at(time: Option<Instant>) {
     match time {
         Some(time) => sleep_until(time).await,
@@ -396,7 +400,7 @@ impl Sent {
             }
             Ok(Heard::Stands { .. } | Heard::Ended(_)) => {}
             Ok(Heard::Lost(why)) => self.lost(why),
-            // Too much of it was not taken: its end may have been among that.
+            // Notifications were lost, which may include the end of the run.
             Err(broadcast::error::RecvError::Lagged(_)) => {
                 if let Some(outcome) = self.skill.outcome(run) {
                     self.end(&outcome);
@@ -415,7 +419,7 @@ impl Sent {
         self.events.push_back(GoalEvent::Lost { text, ran });
     }
 
-    /// Tells that feedback, or what waits to be told, or the last once more.
+    /// Sends this feedback, or else the held-back progress, or else the last feedback again.
     fn tell(&mut self, feedback: Option<[Value; 4]>) {
         let waited = self.passing.take();
         if let Some(feedback) = feedback.or(waited).or_else(|| self.last.clone()) {
@@ -450,27 +454,28 @@ impl Sent {
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    // Each change is whole before the lock is given back.
+    // Each change is complete before the lock is released.
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Goals are nobody's: any client may cancel them, as in ROS.
+/// Goals have no owner: any client may cancel them, as in ROS.
 const OWNER: Owner = Owner::Local("a goal of the space");
-/// What of a skill waits for one of its goals to take it.
+/// Largest number of notifications that wait for a goal.
 const MOST_HEARD: usize = 256;
-/// Progress alone is told no more often: 20 times a second.
+/// Shortest interval between two feedbacks of progress only: 20 a second.
 const BETWEEN_PROGRESS: Duration = Duration::from_millis(50);
-/// The end of a goal that is cancelled comes so long behind: a client of ROS 2 that has it first is told that it cancelled nothing.
+/// Delay of the end of a cancelled goal. A ROS 2 client that receives the end before the cancel
+/// response is informed that it cancelled nothing.
 const BEHIND_CANCEL: Duration = Duration::from_millis(200);
-/// The last feedback is told again while nothing changes.
+/// Interval in which the last feedback is repeated while nothing changes.
 const REPEATED: Duration = Duration::from_secs(1);
-/// As `action_msgs/GoalStatus` has them.
+/// Statuses of `action_msgs/GoalStatus`.
 const EXECUTING: i8 = 2;
 const CANCELING: i8 = 3;
 const SUCCEEDED: i8 = 4;
 const CANCELED: i8 = 5;
 const ABORTED: i8 = 6;
-/// As `action_msgs/CancelGoal` has them.
+/// Return codes of `action_msgs/CancelGoal`.
 const NONE: i8 = 0;
 const REJECTED: i8 = 1;
 const UNKNOWN_GOAL: i8 = 2;

@@ -1,9 +1,9 @@
-//! A component of the cell: skills, served by OPC UA, as values and calls of the space, and announced to who looks for
-//! them.
+//! A component of the cell: skills, served by OPC UA, as values and calls of the space, and
+//! announced by discovery.
 //!
-//! The program `ua-component` is [`ComponentPort`] with the YAML of a component; a program with drivers of its own is the
-//! same with a [`skills::Component`] that it makes. For servers that have skills and know nothing of the space a program speaks
-//! with [`ForeignSkills`].
+//! The program `ua-component` runs [`ComponentPort`] with the YAML file of a component. A program
+//! with own drivers runs it with its own [`skills::Component`]. [`ForeignSkills`] represents
+//! servers with skills that are not participants of the space.
 
 mod asking;
 pub mod definition;

@@ -1,5 +1,6 @@
-//! Skills of servers that know nothing of the space, in the space: as values, calls and actions under the number of each server,
-//! with the identifiers that a component's own have.
+//! Skills of servers that are not participants of the space, as values, calls and actions of the
+//! space. Each server has a namespace number, and its skills have the same identifiers as skills of
+//! a component.
 
 use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
 use std::time::Duration;
@@ -20,20 +21,22 @@ use crate::goals::{self, Doer, Reporter};
 use crate::port::run_number_of_now;
 use crate::space::{GOAL, MOST_IN_SPACE, Outbox, Place, Speaker};
 
-/// A server with skills that knows nothing of the space.
+/// A server with skills that is not a participant of the space.
 #[derive(Clone)]
 pub struct Foreign {
-    /// What it is called; its skills are `<name>.<skill>`, or `<name>.<object>.<skill>` where it has several objects with skills.
+    /// The name of the server. Its skills are `<name>.<skill>`, or `<name>.<object>.<skill>` if
+    /// several objects have skills.
     pub name: String,
-    /// Its number in the space.
+    /// The namespace number in the space.
     pub namespace: u16,
-    /// Whether its skills are run for other hosts too.
+    /// True if other hosts may run its skills too.
     pub open: bool,
-    /// Whether nobody named it: one that was found may speak for itself in the space, and is left alone then.
+    /// True if the server was discovered and not configured. A discovered server that is a
+    /// participant of the space itself is skipped.
     pub is_found: bool,
-    /// Where it is, for people.
+    /// The endpoint, as text for the operator.
     pub endpoint: String,
-    /// The session with it.
+    /// The session with the server.
     pub client: Client,
 }
 
@@ -52,10 +55,10 @@ impl Foreign {
     }
 }
 
-/// What of the skills of a server is not in the space, and why, by their names.
+/// The faults of a server's skills, by the names of the skills.
 pub type ForeignFaults = BTreeMap<String, String>;
 
-/// The skills of such servers, for the port of a program that speaks for them.
+/// The skills of such servers, for the port of the program that represents them.
 pub struct ForeignSkills {
     servers: HashMap<String, Server>,
     outbox: Outbox,
@@ -73,13 +76,13 @@ struct Server {
     mirrors: Option<Mirrors>,
     skills: BTreeMap<u16, Shown>,
     faults: ForeignFaults,
-    /// Whether it was found, and is in the space by itself.
+    /// True if the server was discovered and is a participant of the space itself.
     speaks: bool,
 }
 
-/// A skill as it is in the space.
+/// A skill in the space.
 struct Shown {
-    /// As `press.Grasp`.
+    /// The full name, as in `press.Grasp`.
     name: String,
     executor: Executor,
     values: Vec<TopicId>,
@@ -92,7 +95,7 @@ impl Drop for Server {
     }
 }
 
-/// What is new of a server, by its name.
+/// A change of a server, with its name.
 struct News {
     name: String,
     what: Change,
@@ -121,7 +124,7 @@ impl Default for ForeignSkills {
 }
 
 impl ForeignSkills {
-    /// Speaks for these servers from now on, and for no others. Those that are as before go on undisturbed. Needs a tokio
+    /// Represents these servers and no others. Unchanged servers stay undisturbed. Needs a tokio
     /// runtime.
     pub fn follow(&mut self, servers: Vec<Foreign>) {
         let stays = |name: &String, server: &Server| {
@@ -159,7 +162,7 @@ impl ForeignSkills {
         }
     }
 
-    /// What happens next. Cancel-safe; pends without any server.
+    /// Waits for the next event. Cancel-safe; pends without any server.
     pub async fn next(&mut self) -> PortEvent {
         loop {
             if let Some(event) = self.first.pop_front() {
@@ -175,7 +178,7 @@ impl ForeignSkills {
         }
     }
 
-    /// Whether a call is one of a skill of these servers.
+    /// Returns true if a call belongs to a skill of these servers.
     #[must_use]
     pub fn serves(&self, topic: TopicId) -> bool {
         let namespace = topic.namespace.get();
@@ -184,7 +187,7 @@ impl ForeignSkills {
             && servers.any(|server| server.of.namespace == namespace)
     }
 
-    /// Executes a call. False where it is none that can be executed now.
+    /// Executes a call. Returns false if the call cannot be executed now.
     pub fn execute(&mut self, execution: Execution) -> bool {
         if self.actions.serves(execution.topic) {
             let id = execution.id;
@@ -199,7 +202,7 @@ impl ForeignSkills {
         let Some((executor, method)) = self.skill(execution.topic) else {
             return false;
         };
-        // Room for the answer before anything moves.
+        // Space for the answer is reserved before the machine moves.
         let Ok(room) = self.executes.clone().try_reserve_owned() else {
             return false;
         };
@@ -225,12 +228,13 @@ impl ForeignSkills {
         Some((shown.executor.clone(), method))
     }
 
-    /// Who asked for an execution does not want it any longer; a run goes on.
+    /// Handles that the caller has abandoned an execution. Its run continues.
     pub fn abandoned(&mut self, execution: ExecutionId) {
         self.actions.abandoned(execution);
     }
 
-    /// A call of another program is heard of: people are told where it is called like one of these servers.
+    /// Handles the announcement of another program's call. A fault is recorded and logged if it has
+    /// the name of a skill of these servers.
     pub fn others(&mut self, topic: TopicId, name: &str) {
         for server in self.servers.values_mut() {
             let mut skills = server.skills.values();
@@ -252,13 +256,14 @@ impl ForeignSkills {
         }
     }
 
-    /// What is not as it should be, by the names of the servers.
+    /// Returns the faults of the skills, by the names of the servers.
     pub fn faults(&self) -> impl Iterator<Item = (&str, &ForeignFaults)> {
         let servers = self.servers.iter();
         servers.map(|(name, server)| (name.as_str(), &server.faults))
     }
 
-    /// The names of those that were found and are in the space by themselves: nobody has to speak for them.
+    /// Returns the names of discovered servers that are participants of the space themselves and
+    /// need no representation.
     pub fn speaking(&self) -> impl Iterator<Item = &str> {
         let servers = self.servers.iter().filter(|(_, server)| server.speaks);
         servers.map(|(name, _)| name.as_str())
@@ -272,7 +277,7 @@ impl ForeignSkills {
             Change::Gone(why) => withdraw(server, &mut self.first, &why),
             Change::Found(found) => {
                 withdraw(server, &mut self.first, "it has other skills now");
-                // A component says its number of itself.
+                // A component reports its namespace number.
                 let has_number = found.found().any(|of| of.namespace.is_some());
                 server.speaks = server.of.is_found && has_number;
                 if server.speaks {
@@ -295,7 +300,7 @@ impl ForeignSkills {
     }
 }
 
-/// Puts the skills of a server into the space.
+/// Adds the skills of a server to the space.
 fn show(
     server: &mut Server,
     found: &Watchable,
@@ -341,7 +346,7 @@ fn show(
         let topic = |n| place.topic(named.number, n);
         let mut calls: Vec<TopicId> = (5..10).filter_map(topic).collect();
         let mut values: Vec<TopicId> = (1..5).filter_map(topic).collect();
-        // An action halts what is cancelled, and resets what has ended.
+        // An action needs Halt to cancel goals, and Reset after a run has ended.
         let runs = [Method::Start, Method::Halt, Method::Reset];
         if let Some(goal) = topic(GOAL)
             && runs.iter().all(|method| mirror.methods().contains(method))
@@ -371,7 +376,7 @@ fn show(
     server.mirrors = Some(mirrors);
 }
 
-/// Takes the skills of a server out of the space.
+/// Removes the skills of a server from the space.
 fn withdraw(server: &mut Server, first: &mut VecDeque<PortEvent>, why: &str) {
     if let Some(mirrors) = &server.mirrors {
         mirrors.lose(why);
@@ -385,7 +390,7 @@ fn withdraw(server: &mut Server, first: &mut VecDeque<PortEvent>, why: &str) {
     }
 }
 
-/// Where a skill is in the space, and what it is called there.
+/// The identifier and the names of a skill in the space.
 struct Named {
     number: u16,
     component: String,
@@ -409,11 +414,13 @@ impl Named {
     }
 }
 
-/// Names and numbers of the skills of a server; none for those that have no place. And what people are to know of them.
+/// Returns the names and numbers of a server's skills, `None` for skills that are not shown, and
+/// the faults of the skills.
 fn names(server: &str, found: &Watchable) -> (Vec<Option<Named>>, ForeignFaults) {
     let all: Vec<_> = found.found().collect();
     let components: HashSet<&str> = all.iter().map(|of| of.component.as_str()).collect();
-    // Those of a component that has numbers; of others an identifier of a node says nothing.
+    // Numbers of skills are used for components only; the identifiers of other servers' nodes have
+    // no such meaning.
     let own = all
         .iter()
         .filter_map(|of| of.number.filter(|_| of.namespace.is_some()));
@@ -466,7 +473,7 @@ fn names(server: &str, found: &Watchable) -> (Vec<Option<Named>>, ForeignFaults)
     (named, faults)
 }
 
-/// A name without what parts names.
+/// Replaces the separators in a name.
 fn plain(name: &str) -> String {
     let parts = |c: char| c == '.' || c.is_whitespace() || c.is_control();
     name.chars()
@@ -474,7 +481,7 @@ fn plain(name: &str) -> String {
         .collect()
 }
 
-/// Looks which skills a server has, with each connection and from time to time.
+/// Reads the skills of a server at each connection and periodically.
 async fn look(of: Foreign, tell: mpsc::Sender<News>) {
     let mut link = of.client.link();
     let mut told: Option<(u64, Watchable)> = None;
@@ -522,9 +529,9 @@ async fn look(of: Foreign, tell: mpsc::Sender<News>) {
     }
 }
 
-/// How often a server is asked for its skills anew.
+/// Interval between two reads of a server's skills.
 const LOOK_AGAIN: Duration = Duration::from_secs(30);
-/// What was found out and waits for the run loop.
+/// Largest number of changes that wait for the run loop.
 const MOST_NEWS: usize = 16;
-/// So many calls may be executed at once; more are refused.
+/// Largest number of simultaneous calls; more are refused.
 const MOST_EXECUTIONS: usize = 64;

@@ -1,11 +1,11 @@
-//! The components that those of this program are made of, found by discovery.
+//! Discovers the components on which skills of this component depend.
 
 use discovery::{Found, Interface, WatchSettings, watch};
 use skills::{ClientOptions, Component, Detector};
 use tokio::task::JoinSet;
 use tracing::warn;
 
-/// Looks for others where a skill of the component needs them, for as long as the task is kept.
+/// Starts to discover other components if a skill needs them, for as long as the tasks are kept.
 pub(crate) fn look(
     component: &Component,
     mdns: Option<&Interface>,

@@ -34,58 +34,59 @@ use crate::partners;
 use crate::space::{GOAL, MOST_IN_SPACE, Outbox, Place, Speaker};
 use crate::work::with_drivers;
 
-/// What a component is started with beside what it is.
+/// The options of a component beside its definition.
 #[derive(Debug, Clone, Default)]
 pub struct Options {
-    /// The directory of certificates, which Basic256Sha256 needs.
+    /// The certificate store, which Basic256Sha256 needs.
     pub pki: Option<PathBuf>,
-    /// Trusts every client's certificate. For tests and demonstrations only.
+    /// Trusts every client certificate. For tests and demonstrations only.
     pub trust_any_client: bool,
-    /// Where it announces itself by mDNS; `None` for nowhere.
+    /// The network interface for announcements by mDNS; `None` for no announcements.
     pub mdns: Option<Interface>,
-    /// Codes of OPC 10000-12, annex D, that it is announced with.
+    /// The announced capability codes of OPC 10000-12, annex D.
     pub capabilities: Vec<String>,
-    /// The Global Discovery Server that issues its certificate. Needs `pki`.
+    /// The Global Discovery Server that issues the certificate. Needs `pki`.
     pub gds: Option<Invitation>,
-    /// The text of its YAML and the name of that file, for findings.
+    /// The text and the name of the YAML file, for findings.
     pub source: Option<(String, String)>,
 }
 
-/// The mapping that a component runs with: it has one namespace, and no variables.
+/// Returns the mapping of a component, which has one namespace and no variables.
 #[must_use]
 pub fn made(component: &Component) -> Mapping {
     let namespaces = BTreeMap::from([(component.namespace, component.application_uri.clone())]);
     Mapping::made(PubSub::default(), namespaces)
 }
 
-/// A component that runs.
+/// A running component.
 pub struct ComponentPort {
     server: ComponentServer,
     announced: Option<Announced>,
     outbox: Outbox,
-    /// What is said before all else: what there is, and the requests that are refused.
+    /// Events that are reported before all others: announcements and refused requests.
     first: VecDeque<PortEvent>,
     executed: mpsc::Receiver<PortEvent>,
     executes: mpsc::Sender<PortEvent>,
     /// The skills as actions.
     actions: OwnActions,
-    /// Who looks for others, for as long as there is the component.
+    /// The tasks of discovery, which run as long as the component.
     _looks: JoinSet<()>,
-    /// What skills ask of others.
+    /// Requests of skills to others.
     asking: Asking,
-    /// As the group is told.
+    /// The application as it is described to the group.
     application: Application,
-    /// The skills that are being halted for the end of the component.
+    /// The skills that are being halted because the component stops.
     closing: Arc<Mutex<BTreeSet<String>>>,
     /// The certificate store.
     pki: Option<PathBuf>,
 }
 
 impl ComponentPort {
-    /// Serves a component, and announces it. Needs a tokio runtime.
+    /// Serves a component and announces it. Needs a tokio runtime.
     ///
     /// # Errors
-    /// What is wrong with it, all printed by then; an address that cannot be listened on; certificates that cannot be used.
+    /// Returns an error if the definition has faults, which are printed before; if the address
+    /// cannot be bound; or if the certificates cannot be used.
     pub fn start(component: &Component, options: &Options) -> Result<Self, Failure> {
         let place = Place {
             component: component.name.clone(),
@@ -159,13 +160,13 @@ impl ComponentPort {
         })
     }
 
-    /// Where clients connect.
+    /// Returns the URL of the server.
     #[must_use]
     pub fn url(&self) -> &str {
         self.server.url()
     }
 
-    /// Its skills, by their numbers from 1.
+    /// Returns the skills, by their numbers from 1.
     #[must_use]
     pub fn skills(&self) -> &[Skill] {
         self.server.skills()
@@ -203,7 +204,7 @@ impl Port for ComponentPort {
         Some(self.application.clone())
     }
 
-    /// A component has no use for what others say; that is no loss to tell of.
+    /// Ignores values of others. A component does not use them, so they do not count as losses.
     fn publish(&mut self, _sample: Delivery) -> Result<(), &'static str> {
         Ok(())
     }
@@ -214,7 +215,7 @@ impl Port for ComponentPort {
         _shape: &[(BuiltinType, bool)],
         _described: Option<&Described>,
     ) {
-        // Values of others are none of its business.
+        // A component does not use values of others.
     }
 
     fn silent(&mut self, _topic: TopicId, _silent: bool) {}
@@ -245,7 +246,7 @@ impl Port for ComponentPort {
         let Some((skill, method)) = self.skill(execution.topic) else {
             return false;
         };
-        // Room for the answer before anything moves.
+        // Space for the answer is reserved before the machine moves.
         let Ok(room) = self.executes.clone().try_reserve_owned() else {
             return false;
         };
@@ -268,7 +269,7 @@ impl Port for ComponentPort {
     }
 
     fn abandoned(&mut self, execution: ExecutionId, _topic: TopicId) {
-        // A call is over within a second or two, and a run that it began goes on: its outcome can be asked for later.
+        // A call lasts a second or two. Its run continues, and the outcome can be requested later.
         self.actions.abandoned(execution);
     }
 
@@ -308,7 +309,7 @@ impl Port for ComponentPort {
                 announced.leave().await;
             }
         };
-        // Both within a second or so; whoever is not done then is left.
+        // Both take about a second; connections that are still open then are dropped.
         let ended = tokio::time::timeout(SHUTDOWN, async {
             tokio::join!(leaving, self.server.stop())
         });
@@ -318,10 +319,11 @@ impl Port for ComponentPort {
     }
 }
 
-/// Looks whether a component could be served: its types, NodeSets and drivers. Listens nowhere that anybody knows of.
+/// Checks if a component could be served: its types, NodeSets and drivers. The server listens on a
+/// random port of the loopback interface, which is not announced.
 ///
 /// # Errors
-/// As [`ComponentPort::start`].
+/// Returns the errors of [`ComponentPort::start`].
 pub fn check(component: &Component, options: &Options) -> Result<(), Failure> {
     let component = Component {
         endpoint: "opc.tcp://127.0.0.1:0".to_owned(),
@@ -345,8 +347,8 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// The number of the first run of a component that starts now: above all that it had before, if it ran fewer than 62 a second
-/// since then. It comes round after two years.
+/// Returns the number of the first run of a component that starts now. It is larger than all
+/// previous numbers if there were fewer than 62 runs a second. It wraps around after two years.
 #[expect(
     clippy::disallowed_methods,
     reason = "what a host remembers over a restart without a file is its clock"
@@ -384,14 +386,14 @@ fn failure(fault: ServeFault, options: &Options) -> Failure {
     }
 }
 
-/// Prints findings, where those of mappings go.
+/// Prints findings to stderr, like the findings of mappings.
 pub fn print(text: &str) {
     use std::io::Write as _;
-    // Nobody is left to tell when it is closed.
+    // An error is ignored, because stderr may be closed.
     let _printed = std::io::stderr().lock().write_all(text.as_bytes());
 }
 
-/// The component as others are told of it.
+/// Returns the description of the component for discovery.
 fn told_of(component: &Component, url: &str, options: &Options) -> discovery::Server {
     discovery::Server {
         application_uri: component.application_uri.clone(),
@@ -403,7 +405,7 @@ fn told_of(component: &Component, url: &str, options: &Options) -> discovery::Se
     }
 }
 
-/// Keeps the certificate of the component current at the Global Discovery Server.
+/// Renews the certificate of the component at the Global Discovery Server.
 fn enrol(
     tasks: &mut JoinSet<()>,
     (component, announced): (&Component, &discovery::Server),
@@ -426,7 +428,8 @@ fn enrol(
     });
 }
 
-/// Restarts the program as soon as no skill runs: a restart for a certificate stops no machine.
+/// Restarts the program when no skill runs, because a restart for a certificate must not stop a
+/// machine.
 async fn restart_when_idle(skills: Vec<Skill>) {
     let runs = |skill: &Skill| matches!(skill.shown().state, State::Running | State::Suspended);
     if skills.iter().any(runs) {
@@ -438,7 +441,7 @@ async fn restart_when_idle(skills: Vec<Skill>) {
     bridge_node::restart();
 }
 
-/// The same for the group.
+/// Returns the description of the component for the group.
 fn application(server: &discovery::Server, security: &[Security]) -> Application {
     let ways = security.iter().flat_map(|security| match security {
         Security::None => plant_opcua::server::Security::None.ways(),
@@ -480,9 +483,9 @@ fn announce(
     }
 }
 
-/// How often skills are looked at before a restart.
+/// Interval between two checks of the skills before a restart.
 const IDLE_LOOK: Duration = Duration::from_millis(500);
-/// Within the 2 s a port has to end.
+/// Within the limit of 2 s for the shutdown of a port.
 const SHUTDOWN: Duration = Duration::from_millis(1_900);
-/// So many calls may be executed at once; more are refused.
+/// Largest number of simultaneous calls; more are refused.
 const MOST_EXECUTIONS: usize = 64;

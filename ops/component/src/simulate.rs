@@ -1,4 +1,4 @@
-//! `ua-component simulate`: devices that move nothing real behind the protocols of real ones.
+//! `ua-component simulate`: simulated devices behind the protocols of real devices.
 
 use std::io::{self, Write as _};
 use std::process::ExitCode;
@@ -8,7 +8,7 @@ use clap::Parser as _;
 use devices::{Faults, Line, Registers, Serving, kelvin, robotiq, schmalz, ur};
 use tokio::signal::unix::{SignalKind, signal};
 
-/// The word after the program's name that stands for this.
+/// The argument that selects the simulation.
 pub(crate) const VERB: &str = "simulate";
 
 /// Simulates a device behind its protocol, until SIGINT or SIGTERM. Says on standard output where it is
@@ -118,13 +118,13 @@ fn docked(text: &str) -> Result<kelvin::simulator::Docked, &'static str> {
     read().ok_or("a number from 1 to 10, @, and six numbers with commas")
 }
 
-/// Simulates what the arguments say. `arguments` begin with the verb.
+/// Simulates the device of the arguments. `arguments` begin with `simulate`.
 pub(crate) fn run(arguments: impl Iterator<Item = std::ffi::OsString>) -> ExitCode {
     let simulate = match Simulate::try_parse_from(arguments) {
         Ok(simulate) => simulate,
         Err(error) => {
             let code = if error.use_stderr() { USAGE } else { 0 };
-            // When nothing can be printed the exit code still says it.
+            // If printing fails, the exit code still reports the error.
             error.print().ok();
             return ExitCode::from(code);
         }
@@ -146,7 +146,7 @@ async fn simulated(device: Device) -> io::Result<()> {
         signal(SignalKind::interrupt())?,
         signal(SignalKind::terminate())?,
     );
-    // What is served goes when this ends.
+    // The simulated device stops when this value is dropped.
     let _served: Box<dyn std::any::Any> = match device {
         Device::Robotiq {
             listen,

@@ -1,4 +1,5 @@
-//! The skills of a component as values and calls of the space: skill k has the identifiers `100*k + n`.
+//! The skills of a component as values and calls of the space. Skill k has the identifiers `100*k +
+//! n`.
 
 use std::collections::VecDeque;
 use std::num::NonZeroU16;
@@ -18,12 +19,12 @@ use uadp::{BuiltinType, Timestamp};
 
 use crate::fields;
 
-/// What the identifiers of a skill are.
+/// The values of a skill, by their identifiers.
 pub(crate) const STATE: u16 = 1;
 pub(crate) const EVENTS: u16 = 2;
 pub(crate) const PARAMETERS: u16 = 3;
 pub(crate) const RESULT: u16 = 4;
-/// The methods, by their identifiers.
+/// The methods of a skill, by their identifiers.
 pub(crate) const CALLS: [(u16, Method); 5] = [
     (5, Method::Start),
     (6, Method::Halt),
@@ -32,22 +33,23 @@ pub(crate) const CALLS: [(u16, Method); 5] = [
     (9, Method::Reset),
 ];
 
-/// The goals of a skill that is an action; the four behind it are its cancel, result, feedback and status.
+/// The goals of a skill as an action. The next four identifiers are its cancel, result, feedback
+/// and status.
 pub(crate) const GOAL: u16 = 10;
 
-/// Where a component is in the space.
+/// The location of a component in the space.
 #[derive(Debug, Clone)]
 pub(crate) struct Place {
-    /// Its name there.
+    /// The name of the component in the space.
     pub(crate) component: String,
-    /// Its number.
+    /// The namespace number of the component.
     pub(crate) namespace: u16,
-    /// Whether its calls are open to other hosts.
+    /// True if other hosts may use its calls.
     pub(crate) open: bool,
 }
 
 impl Place {
-    /// The name of a value or call of skill `number`. `None` for a namespace 0.
+    /// Returns the topic of a value or call of skill `number`. Returns `None` for namespace 0.
     pub(crate) fn topic(&self, number: u16, n: u16) -> Option<TopicId> {
         TopicId::new(
             0,
@@ -56,7 +58,7 @@ impl Place {
         )
     }
 
-    /// The skill and the call behind a name.
+    /// Returns the skill and the method of a topic.
     pub(crate) fn call(topic: TopicId) -> Option<(u16, Method)> {
         let identifier = topic.identifier.get();
         let (number, n) = (identifier / PER_SKILL, identifier % PER_SKILL);
@@ -64,7 +66,7 @@ impl Place {
         Some((number, method))
     }
 
-    /// What is said of a skill that has these methods, before anything is sent of it.
+    /// Returns the announcements of a skill with these methods, which precede its values.
     pub(crate) fn announce(
         &self,
         number: u16,
@@ -219,8 +221,8 @@ fn leaves<const N: usize>(fields: [(&str, (BuiltinType, Rank)); N]) -> Vec<Leaf>
     fields.into_iter().map(leaf).collect()
 }
 
-/// Values on their way to the space, in the order in which they came to be. Bounded: when it is full the oldest goes, and is
-/// counted.
+/// Values to be sent to the space, in the order of their creation. The queue is bounded: if it is
+/// full, the oldest value is dropped and counted.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Outbox {
     inner: Arc<Mutex<Waiting>>,
@@ -238,12 +240,12 @@ struct Sample {
     topic: TopicId,
     payload: Bytes,
     at: Timestamp,
-    /// A newer one of the topic may take its place.
+    /// True if a newer value of the topic may replace this value.
     passing: bool,
 }
 
 impl Outbox {
-    /// The next value, or what was lost before it.
+    /// Waits for the next value, or for the loss of values before it.
     pub(crate) async fn next(&self) -> PortEvent {
         loop {
             let more = self.more.notified();
@@ -310,22 +312,23 @@ impl Outbox {
     }
 
     fn lock(&self) -> MutexGuard<'_, Waiting> {
-        // Each change is whole before the lock is given back.
+        // Each change is complete before the lock is released.
         self.inner.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-/// Puts what happens to one skill into the outbox.
+/// Puts the changes of one skill into the outbox.
 #[derive(Debug)]
 pub(crate) struct Speaker {
     outbox: Outbox,
     topics: [TopicId; 4],
-    /// When progress alone was last said.
+    /// Time of the last report of progress only.
     progressed: Mutex<Option<Instant>>,
 }
 
 impl Speaker {
-    /// Of skill `number`. `None` where it has no place in the space.
+    /// Creates the speaker of skill `number`. Returns `None` if the skill has no identifiers in the
+    /// space.
     pub(crate) fn new(outbox: Outbox, place: &Place, number: u16) -> Option<Self> {
         let topic = |n| place.topic(number, n);
         let topics = [
@@ -341,7 +344,7 @@ impl Speaker {
         })
     }
 
-    /// How it is before anything has happened, in that state where it is known.
+    /// Publishes the values before the first run, and the state if it is known.
     pub(crate) fn at_first(&self, facts: &Facts, state: Option<State>) {
         let defaults = facts
             .parameters
@@ -452,7 +455,7 @@ fn state_of(state: State, last: &str, (progress, step, run): (f32, &str, u32)) -
     ]
 }
 
-/// Names and values, each of them as JSON.
+/// Returns the names and the values, each value as JSON.
 fn named(of: &[(String, Value)]) -> [Value; 2] {
     let names = of
         .iter()
@@ -468,13 +471,13 @@ fn named(of: &[(String, Value)]) -> [Value; 2] {
     ]
 }
 
-/// Identifiers are 16 bit wide, and a skill has a hundred.
+/// Largest number of skills. Identifiers have 16 bits, and a skill has a hundred of them.
 pub(crate) const MOST_IN_SPACE: usize = 654;
-/// Identifiers of a skill.
+/// Number of identifiers of a skill.
 const PER_SKILL: u16 = 100;
-/// So many events of a skill wait for the network beside the first.
+/// Largest number of events of a skill that wait for the network, in addition to the first.
 const QUEUED_EVENTS: u16 = 63;
-/// So many values of a component wait for the run loop.
+/// Largest number of values of a component that wait for the run loop.
 const MOST_WAITING: usize = 1_024;
-/// Progress alone is said no more often: 20 times a second.
+/// Shortest interval between two reports of progress only: 20 a second.
 const BETWEEN_PROGRESS: Duration = Duration::from_millis(50);

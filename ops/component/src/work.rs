@@ -1,4 +1,5 @@
-//! A skill whose work a call or an action of the space does: of ROS, of another component, of a server.
+//! A skill that is executed by a call or an action of the space: of ROS, of another component, or
+//! of a server.
 
 use std::hash::{BuildHasher as _, RandomState};
 use std::pin::pin;
@@ -22,7 +23,7 @@ use crate::asking::{Asking, Asks};
 use crate::definition::field_name;
 use crate::fields;
 
-/// The component with drivers for the skills whose work others in the space do.
+/// Returns the component with drivers for the skills that other participants of the space execute.
 pub(crate) fn with_drivers(component: &Component, asking: &mut Asking) -> Component {
     let mut component = component.clone();
     for skill in &mut component.skills {
@@ -61,11 +62,11 @@ impl Driver for SpaceDriver {
     }
 }
 
-/// Why a goal was not accepted.
+/// The reason why a goal was not accepted.
 enum NotSent {
-    /// It never ran.
+    /// The goal was not executed.
     Never(String),
-    /// It may run, or may run later.
+    /// The goal may be executed, or may be executed later.
     Unknown(String),
 }
 
@@ -105,12 +106,12 @@ impl SpaceDriver {
             () = work.stopped() => Err(NotSent::Unknown(Stopped.to_string())),
             sent = self.send(work, id, &sending) => sent,
         };
-        // Without it no request is on its way.
+        // Without an action, no request was sent.
         let action = sending.get();
         let action = match (sent, action) {
             (Ok(()), Some(action)) => action,
             (Err(NotSent::Unknown(why)), Some(action)) => {
-                // It may have been accepted, or may be later.
+                // The goal may have been accepted, or may be accepted later.
                 return self.withdraw(work, action, (id, &why)).await;
             }
             (Err(NotSent::Never(why) | NotSent::Unknown(why)), _) => return Err(why),
@@ -169,7 +170,8 @@ impl SpaceDriver {
                     Err(why) => why,
                 };
                 work.unknown(why.clone()).await;
-                // After Halt, the skill stays Running until its client knows that the outcome is unknown.
+                // After Halt, the skill stays Running until its client knows that the outcome is
+                // unknown.
                 if !work.is_stopped() {
                     return Err(why);
                 }
@@ -212,7 +214,8 @@ impl SpaceDriver {
         )
     }
 
-    /// Sends the goal: it is accepted then. Notes when the request is on its way.
+    /// Sends the goal. Returns when the goal is accepted. `sending` is set when the request is
+    /// sent.
     async fn send(
         &self,
         work: &Work,
@@ -242,7 +245,8 @@ impl SpaceDriver {
         Ok(())
     }
 
-    /// The calls that cancel goals of the action and wait for their results, once somebody executes them.
+    /// Waits until the calls for cancelling goals and for their results have executors, and returns
+    /// them.
     async fn action(&self, within: Duration) -> Result<Action, String> {
         let goal = self.asks.known(self.topic, within).await?;
         let CallRole::Goal(family) = goal.role else {
@@ -259,7 +263,7 @@ impl SpaceDriver {
         })
     }
 
-    /// A call of the action, by its identifier.
+    /// Returns a call of the action by its identifier.
     fn part(&self, id: u16) -> Result<TopicId, String> {
         let (space, namespace, _) = self.topic.triple();
         TopicId::new(space, namespace, id).ok_or_else(|| format!("{} names no parts", self.topic))
@@ -283,12 +287,14 @@ impl SpaceDriver {
                     why(fault)
                 ));
             }
-            // It asked for as long as it may, or nobody is heard for the moment.
+            // The request has reached its time limit, or the executor is unreachable for the
+            // moment.
             sleep(PAUSE).await;
         }
     }
 
-    /// Asks to cancel the goal. Returns the code of `action_msgs/CancelGoal`, or `None` without an answer.
+    /// Sends a cancel request. Returns the code of `action_msgs/CancelGoal`, or `None` without an
+    /// answer.
     async fn cancel(&self, action: &Action, id: [u8; 16]) -> Option<i64> {
         let no_time = [&[DATE_TIME][..], &UNIX_EPOCH.to_le_bytes()].concat();
         let request = Bytes::from(block(&[bytes(&id), no_time]));
@@ -298,7 +304,8 @@ impl SpaceDriver {
         code.as_i64()
     }
 
-    /// The request: what the YAML says of its fields, the parameters of their names, and nothing in the others.
+    /// Encodes the request: fields that the YAML file sets, parameters with the same names, and
+    /// default values for the others.
     fn request(
         &self,
         takes: &[CallField],
@@ -346,7 +353,7 @@ impl SpaceDriver {
         Ok(Bytes::from(block(&written)))
     }
 
-    /// The results, where the answer says that the work is done.
+    /// Returns the results if the answer reports success.
     fn outcome(
         &self,
         answer: &Answer,
@@ -373,7 +380,7 @@ impl SpaceDriver {
         let mut results = Vec::new();
         for (name, source) in &self.work.results {
             let value = source.value(parameters, &of)?;
-            // As constants are written.
+            // The texts of constants in the YAML file.
             let value = match value.as_str() {
                 Some("true") => true.into(),
                 Some("false") => false.into(),
@@ -400,13 +407,13 @@ struct Action {
     described: Arc<CallDescription>,
 }
 
-/// How a goal ended.
+/// The end of a goal.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum End {
     Succeeded,
     Canceled,
     Aborted,
-    /// It was rejected, or not sent.
+    /// The goal was rejected or not sent.
     NeverRan,
     Unknown,
 }
@@ -423,7 +430,8 @@ impl End {
     }
 }
 
-/// How a goal ended, for people: what its server says, and otherwise how.
+/// Returns the end of a goal as text for the operator, with the message of its server if there is
+/// one.
 fn end(how: &str, answer: &Answer) -> String {
     let message = text(answer, "message").trim();
     let fields = answer.iter();
@@ -435,12 +443,12 @@ fn end(how: &str, answer: &Answer) -> String {
     }
 }
 
-/// Whether what was asked for may have been executed, or may be later.
+/// Returns true if the request may have been executed, or may be executed later.
 fn is_unknown(fault: Option<&AskError>) -> bool {
     fault.is_none_or(|fault| fault.kind == AskErrorKind::Unknown)
 }
 
-/// The fields of an answer, as far as a skill has values of their types.
+/// The fields of an answer whose types a skill supports.
 type Answer = Vec<(String, Json)>;
 
 fn read(block: &[u8], response: &[CallField]) -> Result<Answer, String> {
@@ -467,7 +475,7 @@ fn text<'a>(answer: &'a Answer, name: &str) -> &'a str {
         .unwrap_or_default()
 }
 
-/// Whether a value is what is written there.
+/// Returns true if a value equals the written value.
 fn is(value: &Json, wanted: &str) -> bool {
     match value {
         Json::String(text) => text == wanted,
@@ -480,7 +488,8 @@ fn is(value: &Json, wanted: &str) -> bool {
     }
 }
 
-/// A value of an answer in the widest type of its kind, which the type of the skill narrows.
+/// Converts a value of an answer into the widest type of its kind. The type of the skill narrows
+/// it.
 fn plain(value: &Json) -> Option<Value> {
     let of = |builtin| Shape::scalar(builtin).read_json(value).ok();
     match value {
@@ -500,7 +509,7 @@ fn plain(value: &Json) -> Option<Value> {
     }
 }
 
-/// A name of ROS as OPC UA spells those of results: `TargetPosition` of `target_position`.
+/// Converts a name of ROS into a result name of OPC UA: `TargetPosition` for `target_position`.
 fn camel(name: &str) -> String {
     let mut spelled = String::new();
     let mut begins = true;
@@ -517,7 +526,7 @@ fn camel(name: &str) -> String {
     spelled
 }
 
-/// The Variant of a value in the type of a field.
+/// Encodes a value as a Variant of the type of a field.
 fn encoded(field: &CallField, value: &Json) -> Result<Vec<u8>, String> {
     let none = || format!("a {:?} cannot be said in a component", field.builtin);
     let builtin = Builtin::of_id(u32::from(field.builtin as u8)).ok_or_else(none)?;
@@ -548,7 +557,7 @@ fn encoded(field: &CallField, value: &Json) -> Result<Vec<u8>, String> {
     Ok(one.get(2..).unwrap_or_default().to_vec())
 }
 
-/// A constant as it is written, and a number without fraction, as JSON of that type.
+/// Converts a constant, or a number without a fraction, into JSON of that type.
 fn typed(builtin: Builtin, value: &Json) -> Json {
     let whole = |text: &str| serde_json::from_str::<Json>(text).ok();
     match (builtin, value) {
@@ -565,7 +574,7 @@ fn typed(builtin: Builtin, value: &Json) -> Json {
     }
 }
 
-/// What a message of ROS has where nothing is set; `None` for a message in a field.
+/// Returns the default value of a ROS message field, or `None` for a field that is a message.
 fn nothing(field: &CallField) -> Option<Vec<u8>> {
     let width = match field.builtin {
         BuiltinType::Boolean | BuiltinType::SByte | BuiltinType::Byte => 1,
@@ -573,7 +582,7 @@ fn nothing(field: &CallField) -> Option<Vec<u8>> {
         BuiltinType::Int32
         | BuiltinType::UInt32
         | BuiltinType::Float
-        // Of texts the length.
+        // The length of the text.
         | BuiltinType::String
         | BuiltinType::ByteString => 4,
         BuiltinType::Int64
@@ -610,14 +619,14 @@ fn nothing(field: &CallField) -> Option<Vec<u8>> {
     }
 }
 
-/// A ByteString as a Variant.
+/// Encodes a ByteString as a Variant.
 fn bytes(of: &[u8; 16]) -> Vec<u8> {
     [&[BYTE_STRING][..], &16_i32.to_le_bytes(), of].concat()
 }
 
-/// The block of these Variants.
+/// Encodes a block of Variants.
 fn block(variants: &[Vec<u8>]) -> Vec<u8> {
-    // A call has no more than a few thousand fields.
+    // A call has a few thousand fields at most.
     let count = u16::try_from(variants.len()).unwrap_or(u16::MAX);
     [count.to_le_bytes().to_vec(), variants.concat()].concat()
 }
@@ -642,21 +651,21 @@ fn why(fault: Option<AskError>) -> String {
 }
 
 const GOAL_ID: &str = "goal_id";
-/// How long a request for a result is held at a time.
+/// Time limit of a single request for a result.
 const RESULT_WITHIN: Duration = Duration::from_secs(30);
 const CANCEL_WITHIN: Duration = Duration::from_secs(4);
-/// Before a goal is cancelled once more.
+/// Pause before a goal is cancelled again.
 const ASK_AGAIN: Duration = Duration::from_millis(500);
-/// Before it is asked anew.
+/// Pause before the result is requested again.
 const PAUSE: Duration = Duration::from_millis(200);
-/// `action_msgs/CancelGoal`, ERROR_REJECTED.
+/// ERROR_REJECTED of `action_msgs/CancelGoal`.
 const REJECTED: i64 = 1;
 /// EncodingMasks of OPC 10000-6, 5.2.2.16.
 const NULL: u8 = 0;
 const ARRAY: u8 = 0x80;
 const BYTE_STRING: u8 = 15;
 const DATE_TIME: u8 = 13;
-/// 1970 as a DateTime, which is no time in messages of ROS.
+/// 1970 as a DateTime, which stands for no time in ROS messages.
 const UNIX_EPOCH: i64 = 116_444_736_000_000_000;
 
 #[cfg(test)]
@@ -693,7 +702,7 @@ mod tests {
         Parameters::complete(&declared, given.collect()).unwrap()
     }
 
-    /// The fields of a goal as they are asked for, without its id.
+    /// Returns the fields of an encoded request.
     fn asked(block: &[u8]) -> Vec<Option<Value>> {
         let fields = Fields::parse(block).unwrap();
         fields

@@ -1,4 +1,5 @@
-//! What is shipped for ROS of the skill types: the actions of `ros/ua_msgs`, and the same built in.
+//! The shipped ROS definitions of the skill types: the actions of `ros/ua_msgs`, and the same
+//! actions built in.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -19,10 +20,10 @@ fn definitions() -> BTreeMap<&'static str, String> {
     all.collect()
 }
 
-/// What stands in a file, after that was refreshed where it is to be.
+/// Returns the content of a file, which is updated before if UA_REFRESH is set.
 fn shipped(path: &Path, wanted: &str) -> String {
     if std::env::var_os("UA_REFRESH").is_some() {
-        // What could not be written is not what is wanted, which the caller says.
+        // A failed write leaves other content, which the caller reports.
         drop(fs::write(path, wanted));
     }
     fs::read_to_string(path).unwrap_or_default()
