@@ -80,7 +80,7 @@ impl Arrivals {
     }
 
     /// Records that a write is sent. Earlier writes are answered as superseded, except writes of
-    /// other fields, whose values it contains.
+    /// other fields, because the new write contains their values.
     pub(crate) fn sent(&self, topic: TopicId, write: Option<Awaited>) {
         let mut waiting = self.waiting.lock();
         let field = write.as_ref().and_then(|write| write.field);

@@ -38,7 +38,7 @@ pub(crate) struct Questions {
 #[derive(Debug)]
 pub(crate) struct Heard {
     pub(crate) questions: mpsc::Receiver<Question>,
-    /// Notified when clients have abandoned one or more requests that were handed on.
+    /// Notified when clients have abandoned requests that were handed on.
     pub(crate) given_up: Arc<Notify>,
 }
 
@@ -73,8 +73,8 @@ pub(crate) type Drives = Mutex<HashMap<NodeId, Drive>>;
 /// A method of a Program.
 #[derive(Clone)]
 pub(crate) struct Drive {
-    /// The node of the Method that sends goals of the action. Clients with permission to call that
-    /// Method may call this one.
+    /// The node of the Method that sends goals of the action. Permission to call that Method
+    /// includes permission to call this method.
     pub(crate) goal: NodeId,
     /// Calls the method with the given arguments.
     pub(crate) carry_out: CarryOut,

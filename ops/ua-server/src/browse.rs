@@ -50,7 +50,7 @@ impl Ordered {
     }
 }
 
-/// Browses a node whose children are ordered.
+/// Browses a node with ordered children.
 fn browse(
     space: &SpaceManager,
     address_space: &AddressSpace,
@@ -236,9 +236,9 @@ impl NodeManager for Ordered {
             .await
     }
 
-    /// Reads processed history. `details` has one aggregate for each node, but the inner node
-    /// manager does not know which nodes of the request it receives. It therefore receives the
-    /// nodes one at a time, or all nodes at once if there is only one aggregate.
+    /// Reads processed history. `details` has an aggregate for each node, but the inner node
+    /// manager does not know which nodes of the request it receives. The nodes are therefore passed
+    /// individually, or all together if their aggregates are equal.
     async fn history_read_processed(
         &self,
         context: &RequestContext,

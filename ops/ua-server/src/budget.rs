@@ -60,8 +60,8 @@ impl Item {
 }
 
 impl Watched {
-    /// Adds a monitored item. Beyond the largest number of items, an item receives no status
-    /// changes without a value and no large values.
+    /// Adds a monitored item. Items beyond the limit are not notified if only the status changes,
+    /// and get no large values.
     pub(crate) fn insert(&mut self, handle: MonitoredItemHandle, unfiltered: bool, queue: usize) {
         if self.items.len() < MOST_ITEMS {
             let item = Item {
@@ -121,7 +121,7 @@ impl Watched {
 /// Values up to this size are not counted. The limits of sessions, items and queue sizes suffice
 /// for them.
 pub(crate) const SMALL: usize = 64 << 10;
-/// The largest decoded value in one response. It is large enough for the largest ByteString.
+/// The largest decoded value in a response. It is large enough for the largest ByteString.
 pub(crate) const LARGEST: usize = 128 << 20;
 const MOST_ANSWERED: usize = 512 << 20;
 /// Time within which a response is expected to be encoded. Responses are encoded as soon as their

@@ -13,7 +13,7 @@ pub(crate) fn tell(subscriptions: &SubscriptionCache, gone: &[TopicNode], new: &
     changes::tell(subscriptions, &changed(gone, new));
 }
 
-/// Returns one change for each node: removed and retyped nodes first, then added nodes.
+/// Returns a change for each node: removed and retyped nodes first, then added nodes.
 fn changed(gone: &[TopicNode], new: &[TopicNode]) -> Vec<ModelChange> {
     let nodes = |topics: &[TopicNode]| -> Vec<NodeId> {
         let nodes = topics.iter().flat_map(TopicNode::nodes);

@@ -72,8 +72,8 @@ impl Commanders {
         }
     }
 
-    /// Returns the topics whose commander is lost, each once. Cancel-safe; waits until there is
-    /// such a topic.
+    /// Returns the topics of lost commanders, each once. Cancel-safe; waits until there is such a
+    /// topic.
     pub(crate) async fn lost(&mut self) -> Vec<TopicId> {
         loop {
             if self.last.is_empty() {

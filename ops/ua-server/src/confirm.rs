@@ -1,8 +1,8 @@
 //! Writes that succeed when the robot answers (`confirm:` in the mapping).
 //!
-//! Each topic has at most one pending write. The write is registered before the value is sent, so
-//! that no answer is missed. Without an answer the value counts as not written: it is not shown,
-//! and it is not repeated to late joiners.
+//! A topic never has two pending writes. The write is registered before the value is sent, so that
+//! no answer is missed. Without an answer the value counts as not written: it is not shown, and it
+//! is not repeated to late joiners.
 
 use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
@@ -22,7 +22,7 @@ use crate::values::Shown;
 pub(crate) struct Confirms {
     rules: RwLock<HashMap<TopicId, Arc<Rule>>>,
     waiting: Mutex<Waiting>,
-    /// Topics whose last value was not confirmed, until the run loop has handled them.
+    /// Topics with an unconfirmed last value, until the run loop has handled them.
     taken_back: Mutex<BTreeSet<TopicId>>,
     called: Notify,
     /// The writes that bridges confirm.
@@ -62,7 +62,8 @@ struct Pending<'c> {
 }
 
 impl Confirms {
-    /// Sets the rules of a mapping. Unchanged rules keep their pending writes.
+    /// Sets the rules of a mapping. Unchanged rules are kept, with the writes that wait for their
+    /// turn.
     pub(crate) fn follow(&self, mapping: &Mapping) {
         self.arrivals.follow(mapping);
         let mut rules = self.rules.write();
@@ -77,7 +78,7 @@ impl Confirms {
         *rules = wanted.collect();
     }
 
-    /// Returns the confirmation rule of a topic, if there is one.
+    /// Returns the confirmation rule of a topic, or `None` if it has no rule.
     pub(crate) fn of(&self, topic: TopicId) -> Option<Arc<Rule>> {
         self.rules.read().get(&topic).cloned()
     }
@@ -174,7 +175,7 @@ impl Confirms {
         self.called.notified().await;
     }
 
-    /// Takes the topics whose last value was not confirmed.
+    /// Takes the topics with an unconfirmed last value.
     pub(crate) fn take_back(&self) -> BTreeSet<TopicId> {
         std::mem::take(&mut *self.taken_back.lock())
     }

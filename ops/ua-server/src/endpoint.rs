@@ -51,8 +51,8 @@ pub(crate) fn server(
         .certificate_path(OWN_CERTIFICATE)
         .private_key_path(OWN_KEY)
         .subscription_poll_interval_ms(limits::POLL_MS)
-        // The library lets a request take the longer of this timeout and the timeout of its client,
-        // and the client's timeout has to hold. Each call has its own deadline.
+        // The library lets a request take the longer of this timeout and the client's timeout, and
+        // the client's timeout has to hold. Each call has its own deadline.
         .max_timeout_ms(0)
         .limits(within(described.limits));
     for security in security {

@@ -1,8 +1,8 @@
 //! Executes Methods of other OPC UA servers for callers in the space.
 //!
-//! Each server has one client, however many of its Methods are mapped. A Method is offered while
-//! the server is connected and the types of its arguments are supported. No call is repeated: a
-//! request that was sent when the connection was lost may have been executed.
+//! Each server has a single client, however many of its Methods are mapped. A Method is offered
+//! while the server is connected and the types of its arguments are supported. No call is repeated:
+//! a request that was sent when the connection was lost may have been executed.
 
 mod signature;
 mod watch;
@@ -341,7 +341,7 @@ fn status(status: StatusCode) -> uadp::StatusCode {
 
 /// Largest number of simultaneous executions of all Methods.
 const MOST_EXECUTIONS: usize = 1_024;
-/// Largest number of simultaneous executions of one Method.
+/// Largest number of simultaneous executions of a single Method.
 const MOST_OF_ONE: usize = 256;
 /// Largest number of news of the watchers that wait for the run loop.
 const MOST_NEWS: usize = 64;

@@ -1,8 +1,8 @@
 //! Servers with skills that are found by discovery. Servers are discovered by mDNS and in the lists
-//! of discovery servers; some of them have a slot in the space.
+//! of discovery servers; accepted servers get a namespace number in the space.
 //!
 //! Discovery data is unauthenticated, so each server is queried for its identity before it gets a
-//! slot.
+//! number.
 
 mod places;
 
@@ -18,7 +18,7 @@ use tracing::{info, warn};
 use self::places::{Places, Room};
 use crate::endpoint::PRODUCT_URI;
 
-/// A server with a slot in the space.
+/// A server with a number in the space.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Placed {
     pub(crate) name: String,
@@ -31,13 +31,13 @@ pub(crate) struct Placed {
 pub(crate) struct Finding {
     wanted: Option<FindSkills>,
     room: Room,
-    /// Endpoints of `servers` in the mapping, which get no second slot.
+    /// Endpoints of `servers` in the mapping, which get no second number.
     named: Vec<Endpoint>,
     own_uri: String,
     heard: BTreeMap<String, Heard>,
     /// Components with their own number in the space, by their announced names.
     speaking: BTreeMap<String, String>,
-    /// Discovery servers whose lists are read, by their sources.
+    /// Discovery servers to read lists from, by their sources.
     lists: BTreeMap<Source, String>,
     /// Allowed locations of servers that an announced discovery server lists.
     near: Option<Interface>,
@@ -47,7 +47,7 @@ pub(crate) struct Finding {
     is_time: bool,
     places: Places,
     placed: Vec<Placed>,
-    /// Servers without a slot, each logged once.
+    /// Servers without a free number, each logged once.
     crowded: BTreeSet<String>,
     /// True if the limit of discovered servers was logged.
     is_full: bool,
@@ -99,8 +99,7 @@ enum Answer {
 }
 
 impl Finding {
-    /// Creates the state from the mapping, with the discovery server of the command line, if there
-    /// is one.
+    /// Creates the state from the mapping, with the discovery server of the command line.
     pub(crate) fn new(mapping: &Mapping, lds: Option<&str>, near: Option<Interface>) -> Self {
         let mut look = interval(LOOK_AGAIN);
         look.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -213,7 +212,7 @@ impl Finding {
         }
     }
 
-    /// Excludes a server that is a participant of the space itself. The server gets no slot until
+    /// Excludes a server that is a participant of the space itself. The server gets no number until
     /// its program restarts.
     pub(crate) fn leave_alone(&mut self, access: &Access) {
         if let Some(heard) = self.heard.get_mut(&access.endpoint.to_string()) {
@@ -221,8 +220,8 @@ impl Finding {
         }
     }
 
-    /// Waits until the slots may have changed. Cancel-safe; pends if discovery of skills is
-    /// disabled.
+    /// Waits until the numbered servers may have changed. Cancel-safe; pends if discovery of skills
+    /// is disabled.
     pub(crate) async fn changed(&mut self) {
         if self.wanted.is_none() {
             return std::future::pending().await;
@@ -301,7 +300,7 @@ impl Finding {
         }
     }
 
-    /// Returns the servers that have a slot. A server without any source keeps its slot as long as
+    /// Returns the servers with a number. A server without any source keeps its number as long as
     /// `is_up` returns true.
     pub(crate) fn look(&mut self, is_up: impl Fn(&Access) -> bool) -> &[Placed] {
         let lists: BTreeSet<&String> = self.lists.values().collect();
@@ -358,7 +357,7 @@ impl Finding {
             {
                 continue;
             }
-            // Of several endpoints of one server, the endpoint in use is kept.
+            // Of several endpoints of a server, the endpoint in use is kept.
             let mut placed = self.placed.iter();
             let is_used = placed.any(|placed| placed.access == access);
             if is_used || !at.contains_key(&says.application_uri) {
@@ -390,8 +389,8 @@ impl Finding {
         all
     }
 
-    /// Returns true if a server may have a slot. Servers of cells, whose Programs are in the space
-    /// already, and participants of the space are excluded.
+    /// Returns true if a server may have a number. Excluded are servers of cells, because their
+    /// Programs are in the space already, and participants of the space.
     fn may(&self, says: &Says, wanted: &FindSkills) -> bool {
         let Says {
             application_uri: uri,
@@ -466,7 +465,7 @@ const ANSWERS_WITHIN: Duration = Duration::from_secs(3);
 const MOST_HEARD: usize = 256;
 /// Largest number of simultaneous queries.
 const MOST_ASKED: usize = 8;
-/// Largest number of discovery servers whose lists are read.
+/// Largest number of discovery servers to read lists from.
 const MOST_LISTS: usize = 8;
 
 #[cfg(test)]

@@ -23,7 +23,7 @@ use crate::layout::TopicNode;
 use crate::value;
 use crate::values::{Shown, View};
 
-/// The past values of one node, in the order of their times.
+/// The past values of a node, in the order of their times.
 pub(crate) struct Series {
     topic: Arc<TopicNode>,
     field: Option<usize>,
@@ -38,7 +38,7 @@ struct One {
     shown: Shown,
 }
 
-/// One value of a response.
+/// A value of a response.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Step {
     Value(usize),
@@ -57,7 +57,7 @@ enum Left {
     NoBound(i64),
 }
 
-/// Accounts for the bytes of the values of one response.
+/// Accounts for the bytes of the values of a response.
 pub(crate) struct Room<'a> {
     used: usize,
     /// Returns true if there is memory for a large value beside all other responses.
@@ -192,7 +192,7 @@ impl Series {
         Ok(steps.collect())
     }
 
-    /// Returns the values of the first steps, as many as fit into one response.
+    /// Returns the values of the first steps, as many as fit into a response.
     fn values(
         &self,
         steps: &[Step],
@@ -611,10 +611,10 @@ const INTERPOLATED: u32 = 0x0402;
 const PARTIAL: u32 = 0x0404;
 /// Size of a value of a response in addition to its data, in bytes.
 const BESIDE: usize = size_of::<DataValue>();
-/// Largest number of values in one response.
+/// Largest number of values in a response.
 const MOST_VALUES: usize = 10_000;
 const MOST_INTERVALS: u64 = 10_000;
-/// Largest size of the values in one response, in bytes.
+/// Largest size of the values in a response, in bytes.
 const MOST_WEIGHT: usize = 16 << 20;
 
 #[cfg(test)]

@@ -72,7 +72,7 @@ pub(crate) fn capabilities(limits: &Limits) -> Vec<(VariableId, Variant)> {
             VariableId::Server_ServerCapabilities_MaxMonitoredItemsQueueSize,
             count(each.max_monitored_item_queue_size),
         ),
-        // RedundancySupport None: there is one server.
+        // RedundancySupport None: the server is not redundant.
         (
             VariableId::Server_ServerRedundancy_RedundancySupport,
             Variant::from(0_i32),
@@ -80,8 +80,8 @@ pub(crate) fn capabilities(limits: &Limits) -> Vec<(VariableId, Variant)> {
     ]
 }
 
-/// Adds an object below Namespaces for each own namespace. No node is the same in other servers, so
-/// none is static.
+/// Adds an object below Namespaces for each own namespace. Their nodes differ between servers, so
+/// no node is static.
 pub(crate) fn add_namespaces<'a>(
     namespaces: impl Iterator<Item = (u16, &'a str)>,
     address_space: &mut AddressSpace,

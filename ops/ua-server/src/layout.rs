@@ -22,7 +22,7 @@ pub(crate) struct Layout {
     pub(crate) structures: Vec<Structure>,
 }
 
-/// The nodes of one topic.
+/// The nodes of a topic.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct TopicNode {
     pub(crate) topic: TopicId,
@@ -38,14 +38,13 @@ pub(crate) struct TopicNode {
     pub(crate) meaning: Meaning,
     /// True if the values come from another server. Clients cannot write them.
     pub(crate) sourced: bool,
-    /// True if the values are written to another server, whose result answers the writes of
-    /// clients.
+    /// True if the values are written to another server; its result answers the writes of clients.
     pub(crate) targeted: bool,
     /// True if past values are kept.
     pub(crate) historizing: bool,
 }
 
-/// The node of one field of a DataSet.
+/// The node of a field of a DataSet.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct FieldNode {
     pub(crate) node: NodeId,
@@ -283,8 +282,8 @@ impl TopicNode {
         node
     }
 
-    /// Creates the nodes of a topic whose DataSet has `fields`, each with its path in the message
-    /// and its shape. Without fields, or with one field, the topic is a single value.
+    /// Creates the nodes of a topic from the `fields` of its DataSet, each with its path in the
+    /// message and its shape. Without fields, or with a single field, the topic is a single value.
     pub(crate) fn new(
         topic: TopicId,
         node: NodeId,
@@ -453,7 +452,7 @@ impl Shape {
     }
 }
 
-/// Largest number of folders around one variable, plus its own name.
+/// Largest number of folders around a variable, plus its own name.
 const MOST_PARTS: usize = 9;
 pub(crate) const OPC_UA_URI: &str = "http://opcfoundation.org/UA/";
 /// Limit of namespace indexes. A higher index in a mapping is a typing error.

@@ -370,7 +370,7 @@ fn arguments_node(method: &NodeId, which: &str) -> NodeId {
 /// Largest number of calls that are shown. The limit exists because every participant of the space
 /// can announce calls.
 const MOST_METHODS: usize = 4_096;
-/// Largest number of objects around one Method.
+/// Largest number of objects around a Method.
 const MOST_PARTS: usize = 8;
 /// Time limit of a call without a limit in the mapping.
 const TIMEOUT: Duration = Duration::from_secs(30);

@@ -375,7 +375,7 @@ impl SpaceNodes {
     /// Notifies the monitored items of a node. For an item without a filter the server compares
     /// values only, although a changed status has to be reported too (OPC 10000-4, 7.22.2: the
     /// default trigger is StatusValue). A DataValue without a value in between makes the server
-    /// report both; clients with a queue of one see only the second.
+    /// report both; clients with a queue size of 1 see only the second.
     fn notify(
         &self,
         subscriptions: &SubscriptionCache,
@@ -414,8 +414,8 @@ impl SpaceNodes {
         }
     }
 
-    /// Returns the value for one monitored item, or the reason why it is refused, and if the item
-    /// has no filter. The value is decoded once for all items.
+    /// Returns the value for a monitored item, or the reason why it is refused, and if the item has
+    /// no filter. The value is decoded once for all items.
     fn for_item(
         &self,
         handle: MonitoredItemHandle,
@@ -489,7 +489,7 @@ impl SpaceNodes {
         small.then(|| view.data_value(&NumericRange::None).value)?
     }
 
-    /// Sends the current value of a node to one monitored item.
+    /// Sends the current value of a node to a single monitored item.
     fn look_at(
         &self,
         subscriptions: &SubscriptionCache,
@@ -510,7 +510,7 @@ impl SpaceNodes {
         }
     }
 
-    /// Returns the value of a node for one monitored item.
+    /// Returns the value of a node for a single monitored item.
     fn answer_item(&self, node: &NodeId, handle: MonitoredItemHandle) -> Option<DataValue> {
         let (topic, field) = self.place(node)?;
         let shown = self.shown(topic.topic);
@@ -587,8 +587,8 @@ impl SpaceNodes {
         place: (&TopicNode, Option<usize>),
         (write, awaited): (&ParsedWriteValue, Option<Awaited>),
     ) -> Result<OnItsWay, StatusCode> {
-        // No other write may come between sending and showing, because a write of one field keeps
-        // the current values of the others.
+        // No other write may come between sending and showing, because a write of a single field
+        // keeps the current values of the other fields.
         let _alone = self.writing.lock();
         let (sent, on_its_way) = self.send_alone(context, place, write, (&|_| {}, awaited))?;
         let _shown = self.show(&context.subscriptions, place.0, sent);

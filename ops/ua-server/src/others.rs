@@ -28,8 +28,8 @@ pub(crate) struct Others {
 }
 
 impl Others {
-    /// Connects to the servers of `mapping`, with the certificates in `pki`. `told` are the
-    /// settings for announcing this server; other servers are discovered in the same way.
+    /// Connects to the servers of `mapping`, with the certificates in `pki`. Other servers are
+    /// discovered with the settings for announcing this server.
     pub(crate) fn new(mapping: &Arc<Mapping>, told: Option<&AnnounceSettings>, pki: &Path) -> Self {
         let mut clients = Clients::new(mapping.server(), pki);
         let lds = told.and_then(|told| told.lds.as_deref());
@@ -51,8 +51,7 @@ impl Others {
         others
     }
 
-    /// Switches to the servers of another mapping. Returns the topics whose source is new or has
-    /// changed.
+    /// Switches to the servers of another mapping. Returns the topics with a new or changed source.
     pub(crate) fn reload(&mut self, mapping: &Arc<Mapping>) -> Vec<TopicId> {
         self.mapping = Arc::clone(mapping);
         self.executing.reload(mapping, &mut self.clients);
@@ -76,7 +75,7 @@ impl Others {
         }
     }
 
-    /// Updates the slots of discovered servers. Returns true if they have changed.
+    /// Updates the numbers of discovered servers. Returns true if they have changed.
     fn look(&mut self) -> bool {
         for name in self.skills.speaking() {
             let mut placed = self.placed.iter();

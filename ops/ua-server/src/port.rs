@@ -80,7 +80,7 @@ pub(crate) struct ServerPort {
     runtime: Option<Runtime>,
     serving: Option<JoinHandle<Result<(), String>>>,
     writes: mpsc::Receiver<ClientWrite>,
-    /// Topics that clients can write, whose start or end of production is not reported yet.
+    /// Topics that clients can write, with a start or end of production that is not reported yet.
     live: VecDeque<(TopicId, bool)>,
     /// Topics that were removed or replaced.
     unbound: VecDeque<TopicId>,
@@ -297,11 +297,11 @@ impl Port for ServerPort {
             return Err("its reader is disabled");
         }
         if sample.kept == Kept::Again {
-            // A variable has one value and shows the last one.
+            // A variable shows a single value, the last.
             return Ok(());
         }
         // If several values are kept for late joiners, an older value may arrive after the last
-        // one.
+        // value.
         if sample.kept == Kept::Beside && sample.source < self.space.shown(sample.topic) {
             return Ok(());
         }
@@ -604,7 +604,7 @@ fn core(
     core_with(methods, values, prepared)
 }
 
-/// Sets the Auditing variable of the server and lists the aggregates.
+/// Lists the aggregates and sets the Auditing variable of the server.
 fn prepared(core: &mut AddressSpace) {
     history::list_aggregates(core);
     let auditing: NodeId = VariableId::Server_Auditing.into();
@@ -651,7 +651,7 @@ fn tell_serving(layout: &Layout, pki: &Pki, (url, port): (&EndpointUrl, u16)) {
     );
 }
 
-/// Returns the interval of checking refused certificates.
+/// Returns the interval of checking refused certificates and the users.
 fn looks() -> Interval {
     let mut look = tokio::time::interval(LOOK_AT_REJECTED);
     look.set_missed_tick_behavior(MissedTickBehavior::Delay);

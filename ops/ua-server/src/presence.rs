@@ -19,7 +19,7 @@ use uadp::BuiltinType;
 
 use crate::value;
 
-/// A server whose presence is published.
+/// A published server.
 #[derive(Debug)]
 struct Told {
     identifier: u16,

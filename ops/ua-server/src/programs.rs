@@ -172,7 +172,7 @@ impl Programs {
         nodes.remove(&around.collect::<Vec<_>>());
     }
 
-    /// Returns a line for each Program whose goal is being cancelled and has not ended.
+    /// Returns a line for each Program with a pending cancellation of its goal.
     pub(crate) fn pending(&self) -> Vec<String> {
         let all = self.shown.values();
         all.filter_map(|shown| shown.run.pending()).collect()

@@ -3,8 +3,7 @@
 //! each namespace it reads, and a DataSetWriter or DataSetReader for each variable of the mapping.
 //! The components have states and counters, and a file contains the whole configuration.
 //!
-//! One lock guards the states. The address spaces are written while it is held, one after the
-//! other.
+//! A single lock guards the states. The address spaces are written in turn while it is held.
 
 mod counts;
 mod file;
@@ -41,7 +40,7 @@ use crate::nodes::SpaceManager;
 /// The configuration in the address spaces.
 pub(crate) struct PubSub {
     inner: Mutex<Inner>,
-    /// The topics whose writer or reader is off.
+    /// The topics with a writer or reader that is off.
     off: RwLock<HashSet<TopicId>>,
     /// Notified when a client has enabled or disabled a component.
     called: Notify,
@@ -158,7 +157,8 @@ impl PubSub {
         methods
     }
 
-    /// Sets the node managers and adds the missing methods of PublishSubscribe.
+    /// Sets the node managers, adds the missing methods of PublishSubscribe, and makes the methods
+    /// for writing the file not executable.
     pub(crate) fn stand(&self, places: Places) {
         if let Some(core) = &places.core {
             let mut address_space = core.address_space().write();

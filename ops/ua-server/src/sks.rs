@@ -65,7 +65,7 @@ impl Sks {
         }
     }
 
-    /// Sets the groups of a mapping as the groups whose keys are created.
+    /// Creates the keys of the groups of a mapping from now on, and of no other groups.
     ///
     /// # Errors
     /// Returns an error if the file with the keys cannot be used.
@@ -259,8 +259,8 @@ impl State {
 }
 
 impl Group {
-    /// Returns true if a client gets the keys: the ApplicationUri of its certificate decides,
-    /// whatever its user.
+    /// Returns true if a client gets the keys. The ApplicationUri of its certificate decides, not
+    /// its user.
     fn has(&self, caller: &Caller) -> bool {
         caller.proven && self.members.contains(&caller.application_uri)
     }
@@ -299,7 +299,7 @@ impl KeyService for ServerKeys {
     }
 }
 
-/// Returns a group whose keys this server creates.
+/// Returns a group with keys that this server creates.
 fn served(group: &SecurityGroup) -> Option<(&SecurityGroup, &Served)> {
     match group.keys.as_ref()? {
         KeySource::Own(served) => Some((group, served)),

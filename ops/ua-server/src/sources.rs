@@ -64,7 +64,7 @@ struct Write {
     overflow: Overflow,
 }
 
-/// The variables of one server.
+/// The variables of a server.
 #[derive(Debug, Default, PartialEq)]
 struct Plan {
     reads: Vec<Arc<Read>>,
@@ -110,8 +110,8 @@ impl Sources {
         sources
     }
 
-    /// Switches to another mapping; unchanged variables stay undisturbed. Returns the topics whose
-    /// source is new or has changed, which have no value yet.
+    /// Switches to another mapping; unchanged variables stay undisturbed. Returns the topics with a
+    /// new or changed source, which have no value yet.
     pub(crate) fn reload(&mut self, mapping: &Mapping, clients: &mut Clients) -> Vec<TopicId> {
         let plans = self.plans(mapping);
         let named = |name: &String| mapping.servers().iter().find(|one| one.name == *name);

@@ -27,9 +27,9 @@ pub(crate) struct Space {
     structures: Vec<Structure>,
     /// Limits the number of unmapped topics.
     room: Room,
-    /// Topics whose writer is active again, but without a new sample.
+    /// Topics with a writer that is active again, but without a new sample.
     returned: Vec<TopicId>,
-    /// Topics whose nodes were removed to make room for others.
+    /// Topics that lost their nodes to other topics.
     gave_way: Vec<TopicId>,
     looks: Looks,
     /// Maximum age of uncertain values of unmapped topics.
@@ -166,8 +166,8 @@ impl Space {
 
     /// Handles a sample: the fields of its DataSet as a key frame carries them. A sample that
     /// cannot be shown replaces the previous value by a status with the reason, because that value
-    /// is outdated too. [`take_gave_way`](Self::take_gave_way) returns the topics whose nodes were
-    /// removed for new nodes.
+    /// is outdated too. [`take_gave_way`](Self::take_gave_way) returns the topics that lost their
+    /// nodes to a new topic.
     ///
     /// # Errors
     /// Returns the reason why the sample is not shown: malformed fields, fields that do not match
@@ -225,7 +225,7 @@ impl Space {
         self.topics.get(&topic).is_some_and(|known| known.mapped)
     }
 
-    /// Takes the topics whose nodes were removed to make room for others.
+    /// Takes the topics that lost their nodes to other topics.
     pub(crate) fn take_gave_way(&mut self) -> Vec<TopicId> {
         std::mem::take(&mut self.gave_way)
     }
@@ -253,21 +253,21 @@ impl Space {
         if silent {
             self.wear(topic);
         } else {
-            // A sample probably follows at once; the status of the previous sample need not be
-            // restored.
+            // A sample probably follows at once. Otherwise `settle` restores the status of the last
+            // sample.
             self.returned.push(topic);
         }
     }
 
-    /// Restores the status of the last values whose writer is active again without a new sample.
+    /// Restores the status of last values if the writer is active again without a new sample.
     pub(crate) fn settle(&mut self) {
         for topic in std::mem::take(&mut self.returned) {
             self.wear(topic);
         }
     }
 
-    /// Updates the times of the last messages. Values whose publisher sends nothing for `timeout`
-    /// are shown as offline.
+    /// Updates the times of the last messages. If a publisher sends nothing for `timeout`, its
+    /// values are shown as offline.
     pub(crate) fn hear(
         &mut self,
         heard: impl Iterator<Item = (TopicId, Instant)>,
@@ -350,8 +350,8 @@ impl Space {
         nodes.show_again(&self.subscriptions, &known.node, shown);
     }
 
-    /// Removes the nodes of unmapped topics whose writers are silent, longest silent first, if it
-    /// is time to make room.
+    /// Removes the nodes of unmapped topics with silent writers, longest silent first, if it is
+    /// time to make room.
     fn let_unmapped_go(&mut self) {
         let now = now().monotonic;
         if !self.room.wants_look(now) {

@@ -23,7 +23,7 @@ pub(crate) struct Values {
     most: usize,
 }
 
-/// The current value of the nodes of one topic.
+/// The current value of the nodes of a topic.
 #[derive(Debug, Clone)]
 pub(crate) struct Shown {
     /// FieldCount and a Variant for each field, all of them readable; `None` without a usable
@@ -155,7 +155,7 @@ impl Shown {
     }
 }
 
-/// The encoded value of one node.
+/// The encoded value of a node.
 #[derive(Debug, Clone)]
 pub(crate) enum View<'a> {
     One(uadp::Variant<'a>, Stamp),
@@ -170,7 +170,7 @@ impl<'a> View<'a> {
         }
     }
 
-    /// Returns true if both values are equal, whatever their statuses.
+    /// Returns true if both values are equal. Their statuses are not compared.
     pub(crate) fn has_value_of(&self, other: &View<'_>) -> bool {
         match (self, other) {
             (Self::One(value, _), View::One(other, _)) => value == other,
@@ -270,7 +270,7 @@ pub(crate) fn compact(payload: Bytes) -> Bytes {
     }
 }
 
-/// Returns the first and last element of a range of one dimension.
+/// Returns the first and last element of a one-dimensional range.
 fn bounds(range: &NumericRange) -> Option<(usize, usize)> {
     let (first, last) = match range {
         NumericRange::Index(at) => (*at, *at),

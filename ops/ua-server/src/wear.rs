@@ -94,7 +94,7 @@ impl Wear {
         self.silent.into_iter().chain(old).min()
     }
 
-    /// Returns the time at which the value exceeds its maximum age.
+    /// Returns the time at which the value becomes uncertain because of its age.
     fn old(&self) -> Option<Instant> {
         Some(self.came? + self.ages.uncertain_after?)
     }
@@ -131,8 +131,8 @@ impl Wear {
 pub(crate) struct Looks(BinaryHeap<Reverse<(Instant, TopicId)>>);
 
 impl Looks {
-    /// Plans the next check of a topic. An earlier check is kept and plans the next one, so that
-    /// there is not an entry for each value.
+    /// Plans the next check of a topic. An earlier check is kept and plans the following check, so
+    /// that the queue does not get an entry for each value.
     pub(crate) fn plan(&mut self, topic: TopicId, wear: &mut Wear, now: Instant) {
         if let Some(due) = wear.due(now)
             && wear.look.is_none_or(|look| due < look)
@@ -147,7 +147,7 @@ impl Looks {
         self.0.peek().map(|Reverse((at, _))| *at)
     }
 
-    /// Returns the next topic whose check is due.
+    /// Returns the next topic with a due check.
     pub(crate) fn take(&mut self, now: Instant) -> Option<(Instant, TopicId)> {
         let Reverse((at, topic)) = self.0.peek().copied()?;
         (at <= now).then(|| {

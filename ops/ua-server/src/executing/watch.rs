@@ -1,4 +1,4 @@
-//! Watches one server with Methods: its connection, and the signatures of its Methods.
+//! Watches a server with Methods: its connection, and the signatures of its Methods.
 
 use std::collections::HashMap;
 use std::sync::Arc;

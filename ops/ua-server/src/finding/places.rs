@@ -3,24 +3,24 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::RangeInclusive;
 
-/// The slot of a server.
+/// The namespace number and the name of a server.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Place {
     pub(super) namespace: u16,
     pub(super) name: String,
 }
 
-/// The assigned slots, by ApplicationUri. An offline server keeps its slot as long as another slot
-/// is free for new servers.
+/// The assigned numbers, by ApplicationUri. An offline server keeps its number as long as other
+/// numbers are free.
 #[derive(Debug, Default)]
 pub(super) struct Places {
     given: BTreeMap<String, Place>,
 }
 
-/// The available slots.
+/// The available numbers and the names in use.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(super) struct Room {
-    /// The range of namespace numbers, or `None` if there are no slots.
+    /// The range of namespace numbers, or `None` if no servers are to be found.
     pub(super) namespaces: Option<RangeInclusive<u16>>,
     /// Namespace numbers that are reserved, with their ApplicationUris.
     pub(super) kept: BTreeMap<u16, String>,
@@ -29,10 +29,10 @@ pub(super) struct Room {
 }
 
 impl Places {
-    /// Returns the slot of a server: its reserved slot, or its previous slot. A new server gets the
-    /// slot that follows from its ApplicationUri, so that it is the same after a restart, or else
-    /// the next free slot. `there` are the ApplicationUris of the servers that are online. Returns
-    /// `None` if these occupy all slots.
+    /// Returns the number and the name of a server. The number is reserved for the server, or is
+    /// its previous number. A new server gets the number that follows from its ApplicationUri, so
+    /// that it is the same after a restart, or else the next free number. `there` are the
+    /// ApplicationUris of the servers that are online. Returns `None` if these use all numbers.
     pub(super) fn give(
         &mut self,
         application_uri: &str,
@@ -61,7 +61,7 @@ impl Places {
             Some(own) => own,
             None => self.free(application_uri, (&range, room), there)?,
         };
-        // The previous owner is offline, or has a reserved slot.
+        // The previous owner is offline, or has a reserved number.
         self.given.retain(|_, place| place.namespace != namespace);
         let name = self.name(application_uri, namespace, &room.named);
         let place = Place { namespace, name };

@@ -20,7 +20,7 @@ use crate::address;
 use crate::argument_types::ArgumentTypes;
 use crate::nodes::SpaceManager;
 
-/// The nodes of one Program.
+/// The nodes of a Program.
 pub(super) struct Nodes {
     manager: Arc<SpaceManager>,
     subscriptions: Arc<SubscriptionCache>,
@@ -65,7 +65,7 @@ impl Outcome {
         }
     }
 
-    /// Returns the outcome of a goal whose end is unknown.
+    /// Returns an outcome with an unknown end.
     pub(super) const fn lost(message: String) -> Self {
         Self {
             status: 0,
@@ -166,7 +166,7 @@ impl Nodes {
         self.show(state(now).to_vec());
     }
 
-    /// Shows the current goal, whose end is not known yet.
+    /// Shows the current goal before its end.
     pub(super) fn show_goal(&self, id: &ByteString) {
         self.show(vec![
             ("FinalResultData.GoalId", Variant::from(id.clone())),
@@ -521,7 +521,7 @@ const TRANSITION: (VariableTypeId, ReferenceTypeId) = (
     VariableTypeId::FiniteTransitionVariableType,
     ReferenceTypeId::HasComponent,
 );
-/// Largest number of objects around one Program.
+/// Largest number of objects around a Program.
 const MOST_PARTS: usize = 8;
 /// Prefixes of the announced fields of a goal and of a result.
 const GOAL: &str = "goal.";

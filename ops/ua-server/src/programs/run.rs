@@ -18,7 +18,7 @@ use super::unknown::UnknownOutcomes;
 use crate::asking::{Callable, Drive, Questions, Refused};
 use crate::value;
 
-/// One Program. Its methods are executed one at a time.
+/// A Program. Its methods are executed one at a time.
 pub(crate) struct Run {
     name: String,
     nodes: Nodes,
@@ -56,7 +56,7 @@ struct Halting {
 }
 
 impl Inner {
-    /// Returns the pending cancellation, and creates it if there is none.
+    /// Returns the pending cancellation, which is created if necessary.
     fn cancel(&mut self) -> &mut Halting {
         self.halting.get_or_insert_with(|| Halting {
             why: PENDING.to_owned(),
@@ -236,7 +236,7 @@ impl Run {
         why.clone_into(&mut inner.cancel().why);
     }
 
-    /// Returns why a cancelled goal has not ended, if there is one.
+    /// Returns why a cancelled goal has not ended, or `None` if no cancellation is pending.
     pub(super) fn pending(&self) -> Option<String> {
         let inner = self.inner.lock();
         let halting = inner.halting.as_ref()?;
@@ -411,7 +411,7 @@ impl Run {
         Ok(Vec::new())
     }
 
-    /// Ends a run whose goal continues or may continue elsewhere.
+    /// Ends a run although its goal continues or may continue elsewhere.
     fn give_up(&self, inner: &mut Inner) -> Result<Vec<Variant>, Refused> {
         let halting = inner.halting.take();
         let why = halting.map(|halting| halting.why).unwrap_or_default();

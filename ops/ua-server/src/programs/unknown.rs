@@ -1,4 +1,4 @@
-//! The Programs whose last goal has an unknown outcome. They are stored in a file, so that they
+//! The Programs with an unknown outcome of their last goal. They are stored in a file, so that they
 //! need a Reset after a restart of the server too.
 
 use std::collections::BTreeSet;

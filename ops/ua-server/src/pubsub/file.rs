@@ -1,7 +1,7 @@
 //! The PubSub configuration as a file that clients can read (OPC 10000-14, 9.1.3.7): the content of
-//! the nodes in one structure.
+//! the nodes in a single structure.
 //!
-//! The file is a UABinaryFileDataType as an ExtensionObject, whose Body is a
+//! The file is a UABinaryFileDataType as an ExtensionObject; its Body is a
 //! PubSubConfiguration2DataType. It is read-only, because the mapping defines the configuration.
 
 use std::collections::{BTreeMap, HashSet};

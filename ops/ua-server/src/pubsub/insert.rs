@@ -68,7 +68,7 @@ struct Insert<'a> {
 }
 
 impl Insert<'_> {
-    /// Adds the object PublishSubscribe, whose node exists already.
+    /// Adds the object PublishSubscribe; its node exists already.
     fn whole(&mut self) -> usize {
         let at = self.inner.states.add(None, State::Operational);
         self.inner.parts.push(Part {
@@ -125,7 +125,7 @@ impl Insert<'_> {
         at
     }
 
-    /// Adds the connection, whose address is the group that all programs send to.
+    /// Adds the connection. Its address is the group that all programs send to.
     fn connection(&mut self, whole: usize) -> (usize, At) {
         let pubsub = self.mapping.pubsub();
         let root = At::core(ObjectId::PublishSubscribe, "PubSub");
@@ -158,7 +158,7 @@ impl Insert<'_> {
         (at, object)
     }
 
-    /// Adds the group of the writers or readers of one namespace.
+    /// Adds the group of the writers or readers of a namespace.
     fn group(
         &mut self,
         (space, namespace): (SpaceId, u16),
@@ -360,7 +360,7 @@ impl Insert<'_> {
     }
 }
 
-/// Returns the variables whose values a writer sends.
+/// Returns the variables with the values that a writer sends.
 pub(super) fn published(topic: &TopicNode) -> impl Iterator<Item = PublishedVariableDataType> {
     variables(topic).map(|node| PublishedVariableDataType {
         published_variable: node.clone(),

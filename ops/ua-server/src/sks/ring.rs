@@ -1,4 +1,4 @@
-//! The keys of one group in the order of their SecurityTokenIds: past keys, the current key, and
+//! The keys of a group in the order of their SecurityTokenIds: past keys, the current key, and
 //! future keys.
 
 use std::collections::VecDeque;

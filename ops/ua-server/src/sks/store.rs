@@ -192,7 +192,7 @@ mod tests {
     fn later(now: Now, by: Duration) -> Now {
         let nanos = now.utc.unix_nanos() + i128::try_from(by.as_nanos()).unwrap();
         Now {
-            // Simulates another run of the program, whose monotonic clock restarts.
+            // Simulates another run of the program with a restarted monotonic clock.
             monotonic: now.monotonic,
             utc: uadp::Timestamp::from_unix_nanos(nanos),
         }

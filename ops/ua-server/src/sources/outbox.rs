@@ -1,4 +1,4 @@
-//! The values that wait to be written to one server.
+//! The values that wait to be written to a server.
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
@@ -12,8 +12,8 @@ use tokio::sync::{Notify, oneshot};
 use super::state::{State, Way};
 use super::{Plan, Write};
 
-/// Values to be written to one server, as fields. Of a state only the newest value waits, also
-/// while the server is offline; it is written again after a reconnect. Events are written while the
+/// Values to be written to a server, as fields. Only the newest value of a state waits, also while
+/// the server is offline; it is written again after a reconnect. Events are written while the
 /// server is connected, and dropped otherwise.
 pub(super) struct Outbox {
     waiting: Mutex<Waiting>,
@@ -48,7 +48,7 @@ impl Value {
     }
 }
 
-/// The queue of one variable.
+/// The queue of a variable.
 struct Lane {
     write: Arc<Write>,
     values: VecDeque<Value>,
@@ -244,8 +244,8 @@ fn count(many: usize) -> u64 {
     u64::try_from(many).unwrap_or(u64::MAX)
 }
 
-/// Largest number of events that wait for one node, whatever the mapping allows, because each event
-/// is a request to the server.
+/// Largest number of events that wait for a node, independent of the mapping, because each event is
+/// a request to the server.
 const MOST_EVENTS: usize = 1_000;
 
 #[cfg(test)]

@@ -1,8 +1,8 @@
-//! Subscribes to the nodes of one server from which variables are read.
+//! Subscribes to the nodes of a server from which variables are read.
 //!
-//! NodeIds are valid for one connection only, because a restarted server may number its namespaces
-//! differently. Each connection therefore has its own subscriptions, and later notifications of old
-//! subscriptions are ignored.
+//! NodeIds are valid for a single connection only, because a restarted server may number its
+//! namespaces differently. Each connection therefore has its own subscriptions, and later
+//! notifications of old subscriptions are ignored.
 
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
@@ -71,7 +71,7 @@ struct Reader {
     tell: mpsc::Sender<News>,
     wanted: Vec<Arc<Read>>,
     batches: Vec<Batch>,
-    /// Variables whose node does not exist on the server.
+    /// Variables without a node on the server.
     faulty: HashMap<TopicId, Arc<Read>>,
     /// The connection of the subscriptions.
     at: Option<u64>,
@@ -79,7 +79,7 @@ struct Reader {
     away: bool,
 }
 
-/// One subscription.
+/// A subscription.
 struct Batch {
     subscription: Subscription,
     reads: Vec<Arc<Read>>,
@@ -260,7 +260,7 @@ impl Reader {
         }
     }
 
-    /// Marks one variable as faulty without affecting the others.
+    /// Marks a variable as faulty without affecting the others.
     async fn fault(&mut self, read: &Arc<Read>, status: StatusCode, why: &str) -> Told {
         self.state.fault(&read.name, Way::From, why);
         self.faulty.insert(read.topic, Arc::clone(read));
@@ -294,8 +294,7 @@ fn is_away(status: StatusCode) -> bool {
 
 /// Interval between two checks of missing nodes.
 const LOOK_AGAIN: Duration = Duration::from_secs(10);
-/// Largest number of subscriptions. Beyond it they are merged into one, because servers support
-/// few.
+/// Largest number of subscriptions. Beyond it they are merged, because servers support few.
 const MOST_BATCHES: usize = 8;
 /// Smallest queue size of notifications. Notifications beyond the queue are lost and counted.
 const SMALLEST_QUEUE: usize = 1_000;

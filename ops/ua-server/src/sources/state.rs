@@ -1,4 +1,4 @@
-//! The state of one server as it is reported.
+//! The state of a server as it is reported.
 
 use std::collections::BTreeMap;
 
@@ -10,7 +10,7 @@ use tracing::{info, warn};
 
 use super::Plan;
 
-/// One server, shared by its two tasks.
+/// The state of a server, shared by its two tasks.
 pub(super) struct State {
     told: Mutex<LinkState>,
 }

@@ -1,4 +1,4 @@
-//! Writes the waiting values of one server.
+//! Writes the waiting values of a server.
 
 use std::sync::Arc;
 
