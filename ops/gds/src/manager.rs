@@ -385,7 +385,8 @@ impl Gds {
         Ok(issued)
     }
 
-    /// Returns the number of messages that were suppressed, if this one should be logged now.
+    /// Returns the number of suppressed messages if this message should be logged, or `None` if it
+    /// is suppressed too.
     pub(crate) fn another(&self, message: &str) -> Option<u64> {
         self.logged.lock().admit(message, Instant::now())
     }
@@ -465,7 +466,7 @@ pub(crate) fn kind() -> NodeId {
     ObjectTypeId::RsaSha256ApplicationCertificateType.into()
 }
 
-/// Returns true if a host is the computer itself, whatever its name.
+/// Returns true if a host is the computer itself, by a loopback address or the name `localhost`.
 fn is_loopback(host: &str) -> bool {
     match host.parse::<IpAddr>() {
         Ok(address) => address.is_loopback(),

@@ -29,7 +29,7 @@ pub(crate) struct Asked {
     pub(crate) record: Option<Record>,
     /// The request in hexadecimal digits, without a challengePassword.
     request: String,
-    /// Time of the request or of the last decision, in seconds since 1970.
+    /// Time of the request, of the decision, or of the issue, in seconds since 1970.
     since: u64,
     pub(crate) state: State,
 }
@@ -95,8 +95,8 @@ impl Requests {
         }
         let is_approved = wanted.approved.is_some();
         if self.all.len() >= MOST {
-            // Unapproved requests never displace each other; an approved request displaces the
-            // oldest unapproved request.
+            // Waiting requests never displace each other; an approved request displaces the oldest
+            // waiting request.
             let oldest = self.all.iter().position(|one| one.state == State::Waiting);
             let displaced = oldest.filter(|_| is_approved).ok_or(Unkept::Full)?;
             self.all.remove(displaced);
@@ -155,7 +155,7 @@ impl Requests {
         self.all.iter().filter(move |one| one.is_kept(now))
     }
 
-    /// Approves or refuses a request whose certificate is not issued, and returns the request.
+    /// Approves or refuses a request without an issued certificate, and returns the request.
     pub(crate) fn decide(&mut self, number: u32, state: State, now: Duration) -> Option<&Asked> {
         let mut all = self.all.iter_mut().filter(|one| one.is_kept(now));
         let one = all.find(|one| one.number == number)?;

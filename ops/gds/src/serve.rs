@@ -108,7 +108,7 @@ impl Serving {
                 Security::Aes256Sha256RsaPss,
             ],
             pki: Some(settings.pki.clone()),
-            // An application without a certificate of the plant requests one here.
+            // An application without a certificate of the plant requests its certificate here.
             unknown_clients: UnknownClients::Admit,
             ..ServerConfig::new(&uri, NAME, settings.endpoint.clone())
         };

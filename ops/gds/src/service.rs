@@ -174,7 +174,8 @@ pub(crate) enum Standing {
     /// The application, with a trusted certificate or with a key that has a certificate of the
     /// authority.
     Itself,
-    /// A client whose untrusted certificate names the application, with the SHA-256 of its key.
+    /// A client with an untrusted certificate that names the application. Contains the SHA-256 of
+    /// its key.
     Applicant(Fingerprint),
     /// Any other client.
     Stranger,

@@ -418,8 +418,8 @@ const ISSUED: &str = "issued";
 const REVOKED: &str = "revoked";
 const LIST: &str = "authority.crl";
 const AUTHORITY_BITS: u32 = 3072;
-/// Certificates are valid from this time before their issue, for applications whose clock is
-/// behind.
+/// Certificates are valid from this time before their issue, because the clock of an application
+/// may be behind.
 const CLOCKS_DIFFER: Duration = Duration::from_secs(3600);
 /// The life of the revocation list. Applications without a current list trust no certificate of the
 /// authority.
