@@ -43,7 +43,7 @@ pub fn action_name(skill_type: &SkillType) -> &'static str {
 }
 
 /// Returns the action type of a skill: the action of its type, or of its nearest supertype in the
-/// [`NAMESPACE`] of this project.
+/// namespace of the built-in skill types.
 #[must_use]
 pub fn action_type(types: &[TypeName]) -> Option<String> {
     let ours = types.iter().filter(|of| of.namespace == NAMESPACE);

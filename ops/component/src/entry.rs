@@ -117,7 +117,7 @@ impl UaComponent {
         Ok(self.read.get_or_init(|| Read { component, text }))
     }
 
-    /// Returns the certificate store, if a secured endpoint or the GDS needs it.
+    /// Returns the path of the certificate store.
     fn pki_root(&self, read: &Read) -> PathBuf {
         let root = || plant_opcua::pki::default_root(|name| std::env::var(name).ok());
         let usual = || root().join(&read.component.name);

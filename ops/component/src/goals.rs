@@ -119,7 +119,7 @@ pub(crate) struct Doer {
 #[derive(Debug, Default)]
 struct Doing {
     current: Option<Current>,
-    /// Goals whose runs are about to start, and if each was cancelled in the meantime.
+    /// Goals with a run that is about to start, and if each goal was cancelled in the meantime.
     beginning: HashMap<GoalId, bool>,
 }
 

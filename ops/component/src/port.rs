@@ -51,7 +51,7 @@ pub struct Options {
     pub source: Option<(String, String)>,
 }
 
-/// Returns the mapping of a component, which has one namespace and no variables.
+/// Returns the mapping of a component, which has a single namespace and no variables.
 #[must_use]
 pub fn made(component: &Component) -> Mapping {
     let namespaces = BTreeMap::from([(component.namespace, component.application_uri.clone())]);

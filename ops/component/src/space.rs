@@ -317,7 +317,7 @@ impl Outbox {
     }
 }
 
-/// Puts the changes of one skill into the outbox.
+/// Puts the changes of a skill into the outbox.
 #[derive(Debug)]
 pub(crate) struct Speaker {
     outbox: Outbox,

@@ -380,7 +380,7 @@ impl SpaceDriver {
         let mut results = Vec::new();
         for (name, source) in &self.work.results {
             let value = source.value(parameters, &of)?;
-            // The texts of constants in the YAML file.
+            // The texts `true` and `false` become Booleans, because constants are written as texts.
             let value = match value.as_str() {
                 Some("true") => true.into(),
                 Some("false") => false.into(),
@@ -399,7 +399,7 @@ impl SpaceDriver {
     }
 }
 
-/// An action whose goal was accepted.
+/// An action with an accepted goal.
 struct Action {
     cancel: TopicId,
     cancels: Arc<CallDescription>,
@@ -430,8 +430,8 @@ impl End {
     }
 }
 
-/// Returns the end of a goal as text for the operator, with the message of its server if there is
-/// one.
+/// Returns the end of a goal as text for the operator, with the message of its server if it has a
+/// message.
 fn end(how: &str, answer: &Answer) -> String {
     let message = text(answer, "message").trim();
     let fields = answer.iter();
@@ -448,7 +448,7 @@ fn is_unknown(fault: Option<&AskError>) -> bool {
     fault.is_none_or(|fault| fault.kind == AskErrorKind::Unknown)
 }
 
-/// The fields of an answer whose types a skill supports.
+/// The fields of an answer with types that a skill supports.
 type Answer = Vec<(String, Json)>;
 
 fn read(block: &[u8], response: &[CallField]) -> Result<Answer, String> {
