@@ -9,7 +9,8 @@
 //!   (nodes of the address space), `values` (current values), `wear` (ageing of values), `history`
 //!   (past values), `nodes` (the node manager), `browse` (the order of nodes), `budget` (memory
 //!   limits of clients), `space` (received values), `nodesets` (nodes from files), `folders`
-//!   (folders of dotted names), `value` (conversion between the two codecs).
+//!   (folders of dotted names), `properties` (units, ranges and texts of values), `value`
+//!   (conversion between the two codecs).
 //! - Calls and discovery: `components` and `presence` (servers in the network), `methods` and
 //!   `argument_types` (calls of the space as Methods), `programs` (actions as Programs), `asking`
 //!   (client requests for both).
