@@ -1,7 +1,8 @@
-//! Audit events: who came in, wrote and called, and who was refused (OPC 10000-5, 6.4).
+//! Audit events for sessions, writes and method calls, accepted or refused (OPC 10000-5, 6.4).
 //!
-//! They are events of the Server object, for whoever watches it, and lines of the log with the target `audit`, at level debug but for who is refused. What was called
-//! with is not told: it may be a secret.
+//! Clients receive the events from the Server object. The log receives the events with the target
+//! `audit`: at level warn if a session is refused, otherwise at level debug. The arguments of calls
+//! are left out because an argument may be a secret.
 
 use opcua::nodes::{BaseEventType, Event, EventField};
 use opcua::server::node_manager::RequestContext;
@@ -12,55 +13,55 @@ use opcua::types::{
 };
 use tracing::{debug, warn};
 
-/// What is told.
+/// An audited action and its result.
 #[derive(Debug, Clone)]
 pub struct Audit {
-    /// What somebody did.
+    /// The action.
     pub action: Action,
-    /// How it ended.
+    /// The status code of the result.
     pub status: StatusCode,
-    /// Who did it: the name of a user, or `anonymous`.
+    /// The name of the user, or `anonymous`.
     pub user: String,
-    /// The session; `None` where it is not known yet.
+    /// The session; `None` if the session is not identified yet.
     pub session: Option<NodeId>,
-    /// The id that the client gave the request for its own books.
+    /// The ClientAuditEntryId, which the client chooses for its own records.
     pub client_entry: String,
     /// The ApplicationUri of the server.
     pub server: String,
 }
 
-/// What somebody did.
+/// An action that is audited.
 #[derive(Debug, Clone)]
 pub enum Action {
-    /// Came in, or wanted to, by these means.
+    /// A client activated a session or tried to.
     CameIn {
-        /// `anonymous`, `password` or `certificate`.
+        /// The kind of user identity: `anonymous`, `password` or `certificate`.
         by: &'static str,
-        /// The policy and mode of the endpoint.
+        /// The security policy and mode of the endpoint.
         endpoint: String,
     },
-    /// Wrote the value of a node.
+    /// A client wrote the value of a node.
     Wrote {
         /// The node.
         node: NodeId,
-        /// The IndexRange; empty for all of it.
+        /// The IndexRange; empty for the whole value.
         range: String,
-        /// What was there, as far as everybody may know it.
+        /// The previous value, without content that not every user may read.
         old: Variant,
-        /// What it wrote, as far as everybody may know it.
+        /// The written value, without content that not every user may read.
         new: Variant,
     },
-    /// Called a Method.
+    /// A client called a method.
     Called {
         /// The object.
         object: NodeId,
-        /// The Method.
+        /// The method.
         method: NodeId,
     },
 }
 
 impl Action {
-    /// The type of the event, and those above it.
+    /// Returns the type of the event and its supertypes.
     const fn types(&self) -> &'static [ObjectTypeId] {
         match self {
             Self::CameIn { .. } => &[
@@ -84,7 +85,7 @@ impl Action {
         }
     }
 
-    /// The SourceName that the standard gives the event.
+    /// Returns the SourceName of the event in the standard.
     const fn source(&self) -> &'static str {
         match self {
             Self::CameIn { .. } => "Session/ActivateSession",
@@ -113,7 +114,7 @@ impl std::fmt::Display for Action {
 }
 
 impl Audit {
-    /// What whoever is behind a request did.
+    /// Creates the audit of an action by the session of a request.
     #[must_use]
     pub fn of(context: &RequestContext, action: Action, status: StatusCode) -> Self {
         Self {
@@ -126,7 +127,7 @@ impl Audit {
         }
     }
 
-    /// The name that is told of a user.
+    /// Returns the name of a user in audits.
     #[must_use]
     pub fn named(user: &str) -> String {
         match user {
@@ -135,7 +136,7 @@ impl Audit {
         }
     }
 
-    /// Writes it into the log, and tells who watches the Server object.
+    /// Logs the audit and sends its event to the subscribers of the Server object.
     pub fn tell(self, subscriptions: &SubscriptionCache) {
         self.log();
         let told = Told::new(self);
@@ -145,7 +146,8 @@ impl Audit {
 
     fn log(&self) {
         let (user, action, status) = (&self.user, &self.action, self.status);
-        // Each who is not let in has waited for a second or shown a trusted certificate: there are not many.
+        // Refusals are few: each refused client waited for a second or presented a trusted
+        // certificate.
         let is_turned_away = !status.is_good() && matches!(action, Action::CameIn { .. });
         if is_turned_away {
             warn!(target: "audit", user, %status, "{action}: refused");
@@ -155,7 +157,7 @@ impl Audit {
     }
 }
 
-/// An audit on its way to clients.
+/// The audit as an OPC UA event.
 struct Told {
     base: BaseEventType,
     audit: Audit,

@@ -1,4 +1,4 @@
-//! What a certificate store holds, and who decides on it: certificates that are trusted, and those that were refused.
+//! The certificates of a certificate store: list, trust, reject.
 
 use std::fs;
 use std::io::{self, Read as _};
@@ -10,21 +10,21 @@ use x509_cert::der::Decode as _;
 use x509_cert::ext::pkix::SubjectAltName;
 use x509_cert::ext::pkix::name::GeneralName;
 
-/// Where in the store a certificate is, and so what becomes of who has it.
+/// The role of a certificate in the store, which decides on access.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Standing {
-    /// The application's own.
+    /// The application's own certificate.
     Own,
-    /// Who has it is let in.
+    /// A trusted certificate: its holder may connect.
     Trusted,
-    /// Of an authority that others are checked with, and that is not trusted itself.
+    /// The certificate of an authority that completes chains and is not trusted itself.
     Issuer,
-    /// Who has it was refused, and is refused until it is trusted.
+    /// A rejected certificate: its holder is refused until an operator trusts the certificate.
     Rejected,
 }
 
 impl Standing {
-    /// As it is told.
+    /// Returns the name of the role, which is also the name of the folder.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -39,25 +39,26 @@ impl Standing {
 /// A certificate in a store.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Stored {
-    /// Where it is.
+    /// The role of the certificate.
     pub standing: Standing,
-    /// Its file.
+    /// The path of the file.
     pub path: PathBuf,
-    /// The SHA-1 thumbprint in hexadecimal of lower case.
+    /// The SHA-1 thumbprint in lower-case hexadecimal.
     pub thumbprint: String,
-    /// The common name of its subject, which whoever made it chose.
+    /// The common name of the subject. The creator of the certificate chose it freely.
     pub name: String,
-    /// The ApplicationUri in it.
+    /// The ApplicationUri of the certificate.
     pub application_uri: Option<String>,
-    /// The last day it is valid, as 2031-11-25.
+    /// The last day of the validity, for example 2031-11-25.
     pub until: String,
-    /// Whether it is valid now.
+    /// Whether the certificate is valid at the moment.
     pub is_valid: bool,
-    /// Whether it is one of an authority, with which all that it issues are trusted.
+    /// Whether the certificate belongs to an authority. If trusted, it covers all certificates that
+    /// the authority issues.
     pub is_authority: bool,
 }
 
-/// Why a certificate is not where it is to be.
+/// An error of the certificate store.
 #[derive(Debug, thiserror::Error)]
 pub enum StoreFault {
     /// The store cannot be read or written.
@@ -65,39 +66,41 @@ pub enum StoreFault {
     Io {
         /// The file or directory.
         path: PathBuf,
-        /// What the system says.
+        /// The error of the operating system.
         #[source]
         source: io::Error,
     },
-    /// The file is no certificate.
+    /// The file is not a certificate.
     #[error("{path} is no certificate: {why}")]
     Certificate {
         /// The file.
         path: PathBuf,
-        /// What is wrong.
+        /// The reason.
         why: String,
     },
-    /// None in the store begins so.
+    /// No certificate has a thumbprint with this prefix.
     #[error(
         "no {standing} certificate has a thumbprint that begins with `{given}`, and there is no such file"
     )]
     Unknown {
-        /// Where it was looked.
+        /// The folder that was searched.
         standing: &'static str,
-        /// What was given.
+        /// The given prefix.
         given: String,
     },
-    /// Several begin so.
+    /// Several certificates have a thumbprint with this prefix.
     #[error(
         "several certificates have a thumbprint that begins with `{0}`: give more digits of it"
     )]
     Several(String),
 }
 
-/// The certificates of a store: its own, those that are trusted, those of authorities between, those that were refused. A file that is none is left out.
+/// Returns the certificates of a store: own, trusted, issuers and rejected. Files that are not
+/// certificates are skipped.
 ///
 /// # Errors
-/// A directory that is there and cannot be read.
+///
+/// Returns an error if an existing directory cannot be read.
 pub fn list(root: &Path) -> Result<Vec<Stored>, StoreFault> {
     let mut found: Vec<Stored> = stored(&root.join(OWN), Standing::Own).into_iter().collect();
     for standing in [Standing::Trusted, Standing::Issuer, Standing::Rejected] {
@@ -122,10 +125,12 @@ pub fn list(root: &Path) -> Result<Vec<Stored>, StoreFault> {
     Ok(found)
 }
 
-/// Trusts a certificate: one that was refused, by the first digits of its thumbprint, or that of a file in DER or PEM.
+/// Trusts a certificate: a rejected certificate, by the first digits of its thumbprint, or a
+/// certificate in a DER or PEM file.
 ///
 /// # Errors
-/// There is none, or the store cannot be written.
+///
+/// Returns an error if no certificate matches or if the store cannot be written.
 pub fn trust(root: &Path, given: &str) -> Result<Stored, StoreFault> {
     let file = Path::new(given);
     if file.is_file() {
@@ -141,10 +146,12 @@ pub fn trust(root: &Path, given: &str) -> Result<Stored, StoreFault> {
     transfer(root, given, (Standing::Rejected, Standing::Trusted))
 }
 
-/// Trusts a certificate no longer, by the first digits of its thumbprint: who has it is refused from the next connection on.
+/// Moves a trusted certificate to the rejected certificates, by the first digits of its thumbprint.
+/// Its holder is refused from the next connection on.
 ///
 /// # Errors
-/// There is none, or the store cannot be written.
+///
+/// Returns an error if no certificate matches or if the store cannot be written.
 pub fn reject(root: &Path, given: &str) -> Result<Stored, StoreFault> {
     transfer(root, given, (Standing::Trusted, Standing::Rejected))
 }
@@ -170,7 +177,7 @@ fn transfer(
         return Err(StoreFault::Several(begin));
     }
     let kept = keep(root, &read(&first.path)?, to)?;
-    // Both at once would count as refused.
+    // The library refuses a certificate that is both trusted and rejected.
     let same = all
         .iter()
         .filter(|one| one.standing == from && one.thumbprint == first.thumbprint);
@@ -188,10 +195,12 @@ fn remove<'s>(gone: impl Iterator<Item = &'s Stored>) -> Result<(), StoreFault> 
     Ok(())
 }
 
-/// Keeps a certificate that was refused, for whoever decides on it. Of many the oldest give way: anybody can have one kept.
+/// Stores a rejected certificate so that an operator can decide on it. The oldest rejected
+/// certificates are deleted beyond the limit, because any peer can add certificates.
 ///
 /// # Errors
-/// It cannot be read by the library, or the store cannot be written.
+///
+/// Returns an error if the library cannot read the certificate or if the store cannot be written.
 pub fn keep_refused(root: &Path, certificate: &trust::Certificate) -> Result<Stored, StoreFault> {
     let folder = root.join(Standing::Rejected.name());
     let of_library =
@@ -218,7 +227,7 @@ pub fn keep_refused(root: &Path, certificate: &trust::Certificate) -> Result<Sto
     keep(root, &of_library, Standing::Rejected)
 }
 
-/// Puts a certificate where the library looks for it.
+/// Writes a certificate to the folder and file name that the library expects.
 fn keep(root: &Path, certificate: &X509, standing: Standing) -> Result<Stored, StoreFault> {
     let folder = root.join(standing.name());
     let path = folder.join(CertificateStore::cert_file_name(certificate));
@@ -261,7 +270,7 @@ fn read(path: &Path) -> Result<X509, StoreFault> {
     certificate.map_err(|_| why("neither DER nor PEM"))
 }
 
-/// What is known of the certificate in a file.
+/// Reads the certificate in a file, and returns its description.
 #[must_use]
 pub fn stored(path: &Path, standing: Standing) -> Option<Stored> {
     let certificate = read(path).ok()?;
@@ -285,10 +294,12 @@ fn is_authority(certificate: &X509) -> bool {
     trust::Certificate::read(&der).is_ok_and(|one| one.is_authority())
 }
 
-/// Keeps the certificate of an authority that others are checked with, from a file in DER or PEM.
+/// Stores the certificate of an authority that completes chains, from a DER or PEM file.
 ///
 /// # Errors
-/// It is none of an authority, or the store cannot be written.
+///
+/// Returns an error if the certificate does not belong to an authority or if the store cannot be
+/// written.
 pub fn keep_issuer(root: &Path, file: &Path) -> Result<Stored, StoreFault> {
     let certificate = read(file)?;
     if !is_authority(&certificate) {
@@ -300,7 +311,8 @@ pub fn keep_issuer(root: &Path, file: &Path) -> Result<Stored, StoreFault> {
     keep(root, &certificate, Standing::Issuer)
 }
 
-/// The ApplicationUri in a certificate: the one URI among its alternative names (OPC 10000-6, 6.2.2).
+/// Returns the ApplicationUri of a certificate: the URI of its subject alternative names (OPC
+/// 10000-6, 6.2.2).
 #[must_use]
 pub fn application_uri(certificate: &X509) -> Option<String> {
     let der = certificate.to_der().ok()?;
@@ -314,14 +326,14 @@ pub fn application_uri(certificate: &X509) -> Option<String> {
     })
 }
 
-/// The application's own certificate, below the root.
+/// The path of the application's own certificate below the root.
 pub(crate) const OWN: &str = "own/cert.der";
-/// Digits of a thumbprint that tell a certificate.
+/// Fewest digits of a thumbprint that identify a certificate.
 const FEWEST_DIGITS: usize = 4;
-/// How many certificates that were refused are kept.
+/// Most rejected certificates in the store.
 pub(crate) const REJECTED_KEPT: usize = 100;
 const LARGEST_CERTIFICATE: u64 = 64 << 10;
-/// Files of a folder that are looked at.
+/// Most files of a folder that are read.
 const MOST_LISTED: usize = 10_000;
 
 #[cfg(test)]

@@ -1,6 +1,7 @@
-//! What clients are told of nodes that a server has added, taken away or changed (OPC 10000-3, 9.32).
+//! Events for nodes that a server added, deleted or changed (OPC 10000-3, 9.32).
 //!
-//! GeneralModelChangeEvents of the Server object: who watches it browses again what they name, and nothing else.
+//! A GeneralModelChangeEvent of the Server object names the changed nodes, so that its subscribers
+//! browse only these nodes again.
 
 use opcua::nodes::{BaseEventType, Event, EventField};
 use opcua::server::SubscriptionCache;
@@ -9,19 +10,19 @@ use opcua::types::{
     NumericRange, ObjectId, ObjectTypeId, QualifiedName, Variant,
 };
 
-/// What became of a node.
+/// The kind of a change.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Became {
-    /// It is new.
+    /// The node was added.
     Added,
-    /// It is gone.
+    /// The node was deleted.
     Deleted,
-    /// It is of another type.
+    /// The type definition of the node changed.
     OfAnotherType,
 }
 
 impl Became {
-    /// The bit of ModelChangeStructureDataType (OPC 10000-3, 9.32.7).
+    /// Returns the verb bit of ModelChangeStructureDataType (OPC 10000-3, 9.32.7).
     fn verb(self) -> u8 {
         match self {
             Self::Added => 1,
@@ -31,18 +32,18 @@ impl Became {
     }
 }
 
-/// One node, and what became of it.
+/// A changed node.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ModelChange {
     /// The node.
     pub node: NodeId,
-    /// Its type definition.
+    /// The type definition of the node.
     pub type_definition: NodeId,
-    /// What became of it.
+    /// The kind of the change.
     pub became: Became,
 }
 
-/// Tells who watches the Server object, 500 changes an event.
+/// Sends the changes to the subscribers of the Server object, at most 500 changes in an event.
 pub fn tell(subscriptions: &SubscriptionCache, changes: &[ModelChange]) {
     let server: NodeId = ObjectId::Server.into();
     for changes in changes.chunks(MOST_TOLD) {
@@ -51,10 +52,10 @@ pub fn tell(subscriptions: &SubscriptionCache, changes: &[ModelChange]) {
     }
 }
 
-/// Changes of one event; more come in several.
+/// Most changes in an event; further changes follow in further events.
 const MOST_TOLD: usize = 500;
 
-/// An event on its way to clients.
+/// A list of changes as an OPC UA event.
 struct Changed {
     base: BaseEventType,
     changes: Variant,
@@ -137,7 +138,7 @@ impl EventField for Changed {
     }
 }
 
-/// The type of the event, and those above it.
+/// The type of the event and its supertypes.
 const TYPES: [ObjectTypeId; 3] = [
     ObjectTypeId::GeneralModelChangeEventType,
     ObjectTypeId::BaseModelChangeEventType,

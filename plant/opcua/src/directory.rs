@@ -1,5 +1,6 @@
-//! The Directory of a Global Discovery Server (OPC 10000-12, 6 and 7.9): the structure of an application, and a client that keeps one
-//! application registered, asks for its certificates and reads the trust list.
+//! The Directory of a Global Discovery Server (OPC 10000-12, 6 and 7.9): the structure of an
+//! application record, and a client that registers an application, requests its certificates and
+//! reads its trust list.
 
 use std::sync::{Arc, LazyLock};
 
@@ -31,19 +32,19 @@ pub const NAMESPACE: &str = "http://opcfoundation.org/UA/GDS/";
     UaNullable,
 )]
 pub struct ApplicationRecord {
-    /// The ApplicationId; null of one that is to be registered.
+    /// The ApplicationId; null for an application that is not registered.
     pub application_id: NodeId,
     /// The ApplicationUri.
     pub application_uri: UAString,
     /// Server, client, or both.
     pub application_type: ApplicationType,
-    /// Names for people.
+    /// The application names.
     pub application_names: Option<Vec<LocalizedText>>,
     /// The ProductUri.
     pub product_uri: UAString,
-    /// Where it is asked who it is.
+    /// The DiscoveryUrls.
     pub discovery_urls: Option<Vec<UAString>>,
-    /// Capabilities as `DA`; at least one of a server.
+    /// Server capabilities such as `DA`; at least one for a server.
     pub server_capabilities: Option<Vec<UAString>>,
 }
 
@@ -81,7 +82,7 @@ impl ExpandedMessageInfo for ApplicationRecord {
     }
 }
 
-/// Reads it in what clients send.
+/// Decodes application records that clients send.
 pub struct Types;
 
 impl StaticTypeLoader for Types {
@@ -99,29 +100,29 @@ impl StaticTypeLoader for Types {
     }
 }
 
-/// Why a Directory does not do what it is asked for.
+/// An error of a Directory request.
 #[derive(Debug, thiserror::Error)]
 pub enum DirectoryError {
-    /// There is no connection.
+    /// The client is not connected.
     #[error(transparent)]
     Client(#[from] ClientError),
-    /// It refuses, or does not answer.
+    /// The Directory refuses the call or does not answer.
     #[error("{method}: {error}")]
     Call {
-        /// What it was asked for.
+        /// The name of the method.
         method: &'static str,
-        /// Why not.
+        /// The error of the call.
         error: CallError,
     },
-    /// It has no Directory.
+    /// The server has no Directory.
     #[error("the server has no namespace {NAMESPACE}: it is no Global Discovery Server")]
     None,
-    /// It answers with something else than the standard says.
+    /// The response does not conform to the standard.
     #[error("{0} answers with what OPC 10000-12 does not say")]
     Answer(&'static str),
 }
 
-/// The Directory of the server that a client is connected to.
+/// The Directory of a connected server.
 #[derive(Clone)]
 pub struct Directory {
     client: Client,
@@ -129,10 +130,11 @@ pub struct Directory {
 }
 
 impl Directory {
-    /// That of a client that is connected.
+    /// Returns the Directory of a connected client's server.
     ///
     /// # Errors
-    /// There is no connection, or the server has none.
+    ///
+    /// Returns an error if the client is not connected or the server has no Directory.
     pub fn of(client: &Client) -> Result<Self, DirectoryError> {
         client.knows(Arc::new(Types))?;
         let namespace = client.namespace(NAMESPACE);
@@ -152,10 +154,12 @@ impl Directory {
         called.map_err(|error| DirectoryError::Call { method, error })
     }
 
-    /// Returns the ApplicationId of an application. It is registered if it is not, and updated if its record differs.
+    /// Returns the ApplicationId of an application. An unknown application is registered, and a
+    /// different record is updated.
     ///
     /// # Errors
-    /// The server does not say.
+    ///
+    /// Returns an error if a call fails.
     pub async fn registered(&self, record: &ApplicationRecord) -> Result<NodeId, DirectoryError> {
         let uri = Variant::String(record.application_uri.clone());
         let found = self.call(FIND_APPLICATIONS, vec![uri]).await?;
@@ -177,7 +181,8 @@ impl Directory {
                 return Ok(wanted.application_id);
             }
             let updated = Variant::from(ExtensionObject::from_message(wanted));
-            // An application that is not known here by its certificate yet registers as a new one.
+            // UpdateApplication fails if the Directory does not know the certificate of this
+            // application yet. The application is then registered again.
             if self.call(UPDATE_APPLICATION, vec![updated]).await.is_ok() {
                 return Ok(known.application_id.clone());
             }
@@ -214,10 +219,12 @@ impl Directory {
         }
     }
 
-    /// Returns the certificate that an authority issued for a request, and the certificates of the authorities above it.
+    /// Returns the certificate that an authority issued for a request, and its issuer certificates.
     ///
     /// # Errors
-    /// None is issued; BadRequestNotComplete while the server has not decided.
+    ///
+    /// Returns an error if no certificate was issued; BadRequestNotComplete if the decision is
+    /// pending.
     pub async fn finished(
         &self,
         application: &NodeId,
@@ -268,9 +275,9 @@ impl Directory {
         })
     }
 
-    /// The content of a file object, which is closed afterwards (OPC 10000-20, 4.2).
+    /// Reads the content of a file object, and closes the file (OPC 10000-20, 4.2).
     async fn file(&self, file: &NodeId) -> Result<Vec<u8>, DirectoryError> {
-        // Each file has methods of its own.
+        // A file object may have its own method nodes.
         let below = self.client.browse(file, Browse::hierarchical()).await?;
         let call = async |of_type: MethodId, name: &'static str, arguments: Vec<Variant>| {
             let own = below
@@ -317,11 +324,12 @@ impl Directory {
 /// The trust list of an application (OPC 10000-12, 7.8.2.7).
 #[derive(Debug, Clone, Default)]
 pub struct TrustLists {
-    /// Certificates that are trusted: of applications, and of authorities with all that they have issued.
+    /// Trusted certificates: of applications, and of authorities together with all certificates
+    /// that they issue.
     pub trusted: Vec<Certificate>,
-    /// Authorities between.
+    /// Issuer certificates, which complete chains.
     pub issuers: Vec<Certificate>,
-    /// Revocation lists of both.
+    /// Revocation lists of the trusted and of the issuer certificates.
     pub revocation_lists: Vec<Crl>,
 }
 
@@ -332,7 +340,8 @@ fn certificate(bytes: &Variant) -> Option<Certificate> {
     Certificate::read(bytes.value.as_deref()?).ok()
 }
 
-/// Nodes of the Directory object of every Global Discovery Server.
+/// Numeric NodeIds of the Directory object and its methods, the same at every Global Discovery
+/// Server.
 const DIRECTORY: u32 = 141;
 const FIND_APPLICATIONS: (u32, &str) = (143, "FindApplications");
 const REGISTER_APPLICATION: (u32, &str) = (146, "RegisterApplication");
@@ -340,9 +349,9 @@ const UPDATE_APPLICATION: (u32, &str) = (200, "UpdateApplication");
 const START_SIGNING_REQUEST: (u32, &str) = (157, "StartSigningRequest");
 const FINISH_REQUEST: (u32, &str) = (163, "FinishRequest");
 const GET_TRUST_LIST: (u32, &str) = (204, "GetTrustList");
-/// The mode of a file that is read.
+/// The open mode for reading.
 const READ: u8 = 1;
-/// So many bytes of a file are read at once.
+/// Bytes per Read call.
 const AT_ONCE: i32 = 16 * 1024;
 const DATA_TYPE: u32 = 1;
 const BINARY: u32 = 134;

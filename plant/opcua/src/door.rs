@@ -1,12 +1,13 @@
-//! Where clients are looked at before they reach the server: the library compares certificates with files, and knows neither
-//! authorities nor revocation lists.
+//! Checks clients before they reach the server, because the library compares certificates with
+//! files only and supports neither authorities nor revocation lists.
 //!
-//! A [`Door`] listens in the place of the server, which listens for the door alone. It lets the greeting through, judges the
-//! certificate that opens the channel ([`trust::check`]), and either hands on what both say from then on or tells the client what is
-//! wrong. Whom it lets in the library finds among those that it trusts, in a store of its own, for as long as the connection is open. What
-//! is trusted or revoked later counts for open connections too.
+//! A [`Door`] listens on the public address, and the server listens for the door only. The door
+//! forwards the Hello message and checks the certificate in the OpenSecureChannel request
+//! ([`trust::check`]). It then forwards the connection in both directions, or sends an error to the
+//! client. Each admitted certificate is copied into a temporary trust store of the library, and
+//! removed when its connection closes. Changes of the store also apply to open connections.
 //!
-//! Only a store that trusts an authority has a door: it costs each message another way through the system.
+//! Only a store that trusts an authority has a door, because a door adds a hop to each message.
 
 use std::collections::HashMap;
 use std::fs;
@@ -38,39 +39,41 @@ use crate::pki::{OWN_CERTIFICATE, OWN_KEY};
 
 mod connections;
 
-/// In front of a server that lets in whom a trusted authority has issued a certificate.
+/// The front of a server that admits clients with certificates of a trusted authority.
 #[derive(Debug)]
 pub struct Door {
     shared: Arc<Shared>,
 }
 
-/// The rule for clients whose sound certificate is not trusted, nor its authority.
+/// The rule for clients with a valid certificate that is not trusted and whose authority is not
+/// trusted.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum UnknownClients {
     /// The channel is refused, and the certificate is kept in `rejected`.
     #[default]
     Refuse,
-    /// The channel is opened. The server itself decides what such clients may do, by [`Caller::certificate`].
+    /// The channel is opened. The server decides on the rights of such clients by
+    /// [`Caller::certificate`].
     ///
     /// [`Caller::certificate`]: crate::server::Caller::certificate
     Admit,
 }
 
-/// Where the library finds what it needs behind a door.
+/// The configuration of the library behind a door.
 #[derive(Debug, Clone)]
 pub struct Behind {
-    /// Its store.
+    /// The certificate store of the library.
     pub pki: PathBuf,
-    /// The server's own certificate.
+    /// The path of the server's own certificate.
     pub certificate: PathBuf,
-    /// Its key.
+    /// The path of the server's private key.
     pub key: PathBuf,
-    /// The number of clients.
+    /// The limits of clients.
     pub clients: ClientLimits,
 }
 
 impl Behind {
-    /// Has a server of the library use it.
+    /// Applies the configuration to the builder of a library server.
     #[must_use]
     pub fn used_by(
         &self,
@@ -91,24 +94,27 @@ struct Shared {
     root: PathBuf,
     behind: Behind,
     unknown: UnknownClients,
-    /// Where the server listens.
+    /// The address of the server behind the door.
     inner: SocketAddr,
     known: RwLock<Arc<Known>>,
-    /// The files of the store as they were before that was read first.
+    /// The state of the files of the store before they were read first.
     first: Stamp,
-    /// How many connections each of those has that the library trusts now, by the file.
+    /// The number of connections per admitted certificate, by the path of its copy.
     admitted: Mutex<HashMap<PathBuf, usize>>,
-    /// Counts the changes of what is known.
+    /// Counts the changes of the store.
     changes: watch::Sender<u64>,
-    /// Who was turned away, by the certificate and why.
+    /// Limits the log messages per refused certificate and reason.
     refused: Mutex<LogLimit>,
 }
 
 impl Door {
-    /// A door for the store at `root`, whose own certificate is there, and where the server is to listen behind it; `None` where the store trusts no authority.
+    /// Creates the door of the store at `root`, which contains the server's own certificate, and
+    /// the listening socket of the server behind the door. Returns `None` if the store trusts no
+    /// authority.
     ///
     /// # Errors
-    /// The store or the address behind the door cannot be used.
+    ///
+    /// Returns an error if the store or the address behind the door cannot be used.
     pub fn of(
         root: &Path,
         clients: ClientLimits,
@@ -119,7 +125,7 @@ impl Door {
         }
         let root = std::path::absolute(root)?;
         let pki = root.join(BEHIND);
-        // What an earlier run let in does not count.
+        // Certificates that an earlier run admitted do not count.
         match fs::remove_dir_all(&pki) {
             Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
             Ok(()) | Err(_) => {}
@@ -136,7 +142,7 @@ impl Door {
         let listener = std::net::TcpListener::bind((Ipv4Addr::LOCALHOST, 0))?;
         listener.set_nonblocking(true)?;
         socket2::SockRef::from(&listener).set_tcp_nodelay(true)?;
-        // Taken before: what is written while the store is read is to be seen later.
+        // The stamp is taken before reading, so that changes during the reading are detected later.
         let first = known::stamp(&root);
         let shared = Shared {
             first,
@@ -158,13 +164,13 @@ impl Door {
         )))
     }
 
-    /// Where the library is to look.
+    /// Returns the configuration of the library.
     #[must_use]
     pub fn behind(&self) -> &Behind {
         &self.shared.behind
     }
 
-    /// Lets clients in, until it is dropped.
+    /// Accepts clients until the future is dropped.
     pub async fn stand(self, listener: TcpListener) {
         let shared = self.shared;
         let limits = shared.behind.clients;
@@ -183,7 +189,7 @@ impl Door {
                         if let Some(suppressed) = shared.another_now("accept") {
                             warn!(%error, suppressed, "cannot accept a connection");
                         }
-                        // There may be no free descriptor.
+                        // The process may have no free file descriptor.
                         connections.give_way(|_| true);
                         tokio::time::sleep(PAUSE).await;
                     }
@@ -200,7 +206,7 @@ impl Door {
 }
 
 impl Shared {
-    /// Serves a client as one of the tasks, unless all connections are those of admitted clients.
+    /// Serves a client in a task, unless admitted clients use all connections.
     fn take(
         self: &Arc<Self>,
         tasks: &mut JoinSet<u64>,
@@ -230,7 +236,8 @@ impl Shared {
         self.refused.lock().admit(message, Instant::now())
     }
 
-    /// Reads what the store knows where that has changed, and has each connection judged anew.
+    /// Reads the store again if its files changed, and makes each connection judge its certificate
+    /// again.
     fn look(&self, stamp: &mut Stamp) {
         let now = known::stamp(&self.root);
         if now == *stamp {
@@ -285,7 +292,7 @@ impl Shared {
                         && let Err(fault) = self.judge(shown)
                     {
                         self.tell(&shown.0, fault, peer, "is cut off");
-                        // The library drops its session when the connection is gone.
+                        // The library ends the session when the connection closes.
                         break;
                     }
                 }
@@ -308,7 +315,7 @@ impl Shared {
         }
     }
 
-    /// Has the library trust a certificate, if it is to be trusted.
+    /// Judges a certificate, and adds it to the trust store of the library if it is trusted.
     fn admit(&self, shown: &Shown, peer: SocketAddr) -> Result<Admitted<'_>, StatusCode> {
         let certificate = &shown.0;
         let Ok(of_library) = X509::from_der(certificate.der()) else {
@@ -318,14 +325,15 @@ impl Shared {
         if let Err(fault) = self.judge(shown) {
             let unknown = matches!(fault, Fault::Untrusted | Fault::Incomplete);
             if unknown {
-                // Told from there, with what is to be typed.
+                // The watcher of the store logs the certificate together with the command that
+                // trusts it.
                 if let Err(error) = certificates::keep_refused(&self.root, certificate) {
                     warn!(%error, "a refused certificate is not kept");
                 }
             } else {
                 self.tell(certificate, fault, peer, "is refused");
             }
-            // A stranger is not told which of the checks it was (OPC 10000-4, 6.1.3).
+            // An untrusted client does not learn which check failed (OPC 10000-4, 6.1.3).
             let status = match fault.may_be_told() {
                 true => StatusCode::from(fault.status()),
                 false => StatusCode::BadSecurityChecksFailed,
@@ -333,7 +341,7 @@ impl Shared {
             return Err(status);
         }
         if !shown.1.is_empty() {
-            // The library reads one certificate where a client sends several.
+            // The library does not support certificate chains.
             self.tell_chain(certificate, peer);
             return Err(StatusCode::BadCertificateInvalid);
         }
@@ -370,7 +378,8 @@ impl Shared {
         }
     }
 
-    /// How often that was not told of a certificate, where it is to be told now.
+    /// Returns the number of rejections of this certificate that were not logged since the last log
+    /// entry, if this rejection is to be logged.
     fn another(&self, certificate: &Certificate, why: &str) -> Option<u64> {
         let what = format!(
             "{} {} {why}",
@@ -381,7 +390,7 @@ impl Shared {
     }
 }
 
-/// Trusted by the library until it is dropped.
+/// A certificate that the library trusts until this value is dropped.
 struct Admitted<'s> {
     shared: &'s Shared,
     path: PathBuf,
@@ -403,11 +412,11 @@ impl Drop for Admitted<'_> {
     }
 }
 
-/// The certificate that opens a channel; `None` for one without security.
+/// Returns the certificate in an OpenSecureChannel request; `None` for a channel without security.
 fn shown(open: &[u8]) -> Result<Option<Shown>, StatusCode> {
-    // Type and size, and the number of the channel (OPC 10000-6, 6.7.2).
+    // Message type, size and SecureChannelId (OPC 10000-6, 6.7.2).
     let Some(after) = open.get(12..).filter(|_| open.starts_with(b"OPN")) else {
-        // The server says what is wrong with it.
+        // The server answers a wrong message type with an error.
         return Ok(None);
     };
     let bad = StatusCode::BadTcpMessageTypeInvalid;
@@ -421,15 +430,15 @@ fn shown(open: &[u8]) -> Result<Option<Shown>, StatusCode> {
         .map_err(|_| StatusCode::BadCertificateInvalid)
 }
 
-/// A ByteString, and what is behind it.
+/// Splits a ByteString from the rest of the bytes.
 fn bytes(from: &[u8]) -> Option<(&[u8], &[u8])> {
     let (length, rest) = from.split_first_chunk::<4>()?;
     let length = i32::from_le_bytes(*length);
-    // Null is empty.
+    // A null ByteString counts as empty.
     rest.split_at_checked(usize::try_from(length.max(0)).ok()?)
 }
 
-/// A message of the protocol, which is a chunk of one.
+/// Receives a message of the protocol that consists of a single chunk.
 async fn message(from: &mut TcpStream) -> io::Result<Vec<u8>> {
     let mut head = [0; 8];
     from.read_exact(&mut head).await?;
@@ -445,27 +454,27 @@ async fn message(from: &mut TcpStream) -> io::Result<Vec<u8>> {
     Ok(all)
 }
 
-/// Tells a client what is wrong, and ends the connection (OPC 10000-6, 7.1.2.5).
+/// Sends an Error message to a client, and closes the connection (OPC 10000-6, 7.1.2.5).
 async fn refuse(client: &mut TcpStream, status: StatusCode) -> io::Result<()> {
     let mut error = b"ERRF".to_vec();
     error.extend(16_u32.to_le_bytes());
     error.extend(status.bits().to_le_bytes());
-    // No reason beside it.
+    // A null reason.
     error.extend((-1_i32).to_le_bytes());
     client.write_all(&error).await?;
     client.shutdown().await
 }
 
-/// The library's store behind a door, below the server's.
+/// The folder of the library's store behind a door, below the store of the server.
 const BEHIND: &str = "admitted";
-/// The same client is told of in the log once in this time.
+/// Shortest interval between two log messages for the same client.
 const TOLD_EVERY: Duration = Duration::from_secs(10);
 const GREETING: Duration = Duration::from_secs(5);
 const LOOK: Duration = Duration::from_secs(1);
 const PAUSE: Duration = Duration::from_millis(100);
-/// What opens a channel has a certificate and a signature, and little else.
+/// Largest OpenSecureChannel request in bytes: a certificate, a signature, and little else.
 const LARGEST_OPENING: usize = 64 << 10;
-/// Bytes that are handed on at once.
+/// Bytes of the buffer for each direction.
 const AT_ONCE: usize = 16 << 10;
 
 #[cfg(test)]
@@ -495,7 +504,7 @@ mod tests {
         for cut in 12..whole.len() - 4 {
             assert!(shown(&whole[..cut]).is_err(), "{cut}");
         }
-        // A length that is larger than what there is.
+        // A length beyond the end of the message.
         let mut long = open(b"");
         long[12] = 0xff;
         long[14] = 0x7f;

@@ -1,4 +1,4 @@
-//! Endpoint URLs: where a server listens, and what it tells clients.
+//! Endpoint URLs: the listening address of a server, and the URL for its clients.
 
 use std::fmt;
 use std::io;
@@ -17,8 +17,8 @@ pub struct EndpointUrl {
 }
 
 impl EndpointUrl {
-    /// The host clients are told: that of the URL, or this computer's name where the URL has the wildcard address,
-    /// which no client can connect to.
+    /// Returns the host for clients: the host of the URL, or the name of this computer if the URL
+    /// has the wildcard address, to which no client can connect.
     #[must_use]
     pub fn advertised_host(&self) -> String {
         let bare = self.host.trim_matches(['[', ']']);
@@ -30,8 +30,8 @@ impl EndpointUrl {
         }
     }
 
-    /// The hosts that a certificate for the URL is to name: its own, or with the wildcard address this computer's name and the
-    /// addresses it has now.
+    /// Returns the hosts for the certificate of the server: the host of the URL, or for the
+    /// wildcard address the name of this computer and its current addresses.
     #[must_use]
     pub fn hosts(&self) -> Vec<String> {
         let bare = self.host.trim_matches(['[', ']']);
@@ -48,7 +48,7 @@ impl EndpointUrl {
         hosts
     }
 
-    /// Returns a URL for each of the [hosts](Self::hosts), with the port that is listened on.
+    /// Returns a URL for each of the [hosts](Self::hosts), with the actual port.
     #[must_use]
     pub fn urls(&self, port: u16) -> Vec<String> {
         let url = |host: &String| {
@@ -61,41 +61,42 @@ impl EndpointUrl {
         self.hosts().iter().map(url).collect()
     }
 
-    /// The path of the URL, `/` at least.
+    /// Returns the path of the URL, at least `/`.
     #[must_use]
     pub fn path(&self) -> &str {
         &self.path
     }
 
-    /// The host as it is written: a name, or an address, without brackets.
+    /// Returns the host of the URL: a name, or an address without brackets.
     #[must_use]
     pub fn host(&self) -> &str {
         self.host.trim_matches(['[', ']'])
     }
 
-    /// The port as it is written; 0 is any free one.
+    /// Returns the port of the URL; 0 stands for any free port.
     #[must_use]
     pub const fn port(&self) -> u16 {
         self.port
     }
 
-    /// Host and port, as they are connected to.
+    /// Returns `host:port`, for connecting.
     #[must_use]
     pub fn authority(&self) -> String {
         format!("{}:{}", self.host, self.port)
     }
 
-    /// The URL clients are told, with the port that is listened on.
+    /// Returns the URL for clients, with the actual port.
     #[must_use]
     pub fn advertised(&self, port: u16) -> String {
         format!("opc.tcp://{}:{port}{}", self.advertised_host(), self.path)
     }
 
-    /// Opens the listening socket, with no delay for small packets on the connections it accepts.
+    /// Opens the listening socket, with TCP_NODELAY for the accepted connections.
     ///
     /// # Errors
-    /// The host has no address, or none of its addresses can be listened on; or other hosts reach one, and the libraries are
-    /// as published ([`crate::patches`]).
+    ///
+    /// Returns an error if the host has no address or if listening fails on its addresses. With
+    /// unpatched libraries, an address that other hosts reach is an error too ([`crate::patches`]).
     pub fn bind(&self) -> Result<TcpListener, BindError> {
         let failed = |address: String| {
             move |source: io::Error| {
@@ -127,7 +128,8 @@ impl EndpointUrl {
         listener
             .set_nonblocking(true)
             .map_err(failed(shown.clone()))?;
-        // Connections take it over. Without it a notification waits for the client's delayed acknowledgement, 40 ms.
+        // Accepted connections inherit the option. Without it a notification waits 40 ms for the
+        // delayed acknowledgement of the client.
         socket2::SockRef::from(&listener)
             .set_tcp_nodelay(true)
             .map_err(failed(shown))?;
@@ -171,24 +173,24 @@ impl fmt::Display for EndpointUrl {
     }
 }
 
-/// Why a text is not an endpoint URL.
+/// An error in an endpoint URL.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum UrlError {
-    /// Not `opc.tcp`.
+    /// The scheme is not `opc.tcp`.
     #[error("an endpoint URL begins with `opc.tcp://`, such as opc.tcp://127.0.0.1:4840")]
     Scheme,
-    /// No host, or one that cannot be.
+    /// The host is missing or invalid.
     #[error("the host of the endpoint URL is a name or an address (an IPv6 address in brackets)")]
     Host,
-    /// Not a number, or too large.
+    /// The port is not a number, or too large.
     #[error("the port of the endpoint URL is a number up to 65535")]
     Port,
 }
 
-/// Why nothing listens.
+/// An error of opening the listening socket.
 #[derive(Debug, thiserror::Error)]
 pub enum BindError {
-    /// Another program has the port.
+    /// Another program uses the port.
     #[error(
         "another program listens on {address} already (see `ss -ltnp 'sport = :{port}'`); \
          stop it, or choose another endpoint"
@@ -199,36 +201,36 @@ pub enum BindError {
         /// The port.
         port: u16,
     },
-    /// The host is another computer.
+    /// The address does not belong to this computer.
     #[error("{0} is no address of this computer; choose one of its own as endpoint")]
     NotOurs(String),
-    /// The host has no address.
+    /// The host cannot be resolved.
     #[error("the host {host} of the endpoint has no address: {source}")]
     Unresolved {
         /// The host.
         host: String,
-        /// What the system says.
+        /// The error of the operating system.
         #[source]
         source: io::Error,
     },
-    /// Other hosts reach the address, and the libraries are as published.
+    /// Other hosts reach the address, and the libraries are unpatched.
     #[cfg(feature = "server")]
     #[error(transparent)]
     AsPublished(#[from] OtherHosts),
-    /// Anything else.
+    /// Any other error.
     #[error("cannot listen on {address}: {source}")]
     Other {
         /// Address and port.
         address: String,
-        /// What the system says.
+        /// The error of the operating system.
         #[source]
         source: io::Error,
     },
 }
 
-/// The port of OPC UA Connection Protocol registered with IANA.
+/// The port that IANA assigned to the OPC UA Connection Protocol.
 const DEFAULT_PORT: u16 = 4840;
-/// Addresses of this computer that a certificate names.
+/// Most addresses of this computer in a certificate.
 const MOST_ADDRESSES: usize = 64;
 
 #[cfg(test)]

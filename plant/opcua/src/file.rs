@@ -1,7 +1,8 @@
-//! Files that clients open, read and write by Methods (OPC 10000-20, 4.2).
+//! Files that clients open, read and write with Methods (OPC 10000-20, 4.2).
 //!
-//! [`Handles`] are those that have one file open: who reads has the content as it was when it was opened. What is read, and what
-//! becomes of what was written, is for who has the file.
+//! [`Handles`] contains the open handles of a file. Each read handle has a copy of the content at
+//! the time of its opening. The owner of the file provides the content, and applies the written
+//! content.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -11,28 +12,28 @@ use tokio::time::Instant;
 
 use crate::server::{MethodRequest, Presence, Refusal};
 
-/// A method of a file.
+/// A method of a file object.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum FileMethod {
-    /// Opens it to be read, or to be written from its beginning.
+    /// Opens the file for reading, or for writing from its beginning.
     Open,
-    /// Opens some of its parts to be read.
+    /// Opens selected parts of the file for reading.
     OpenWithMasks,
-    /// Reads on.
+    /// Reads from the position of the handle.
     Read,
-    /// Writes on.
+    /// Writes at the position of the handle.
     Write,
-    /// Closes it; what was written is forgotten.
+    /// Closes the handle and discards the written content.
     Close,
-    /// Closes it, and what was written counts.
+    /// Closes the handle and applies the written content.
     CloseAndUpdate,
-    /// Says where it is read on.
+    /// Returns the position of the handle.
     GetPosition,
-    /// Has it read on from elsewhere.
+    /// Sets the position of the handle.
     SetPosition,
 }
 
-/// Those that have a file open.
+/// The open handles of a file.
 #[derive(Default)]
 pub struct Handles {
     last: u32,
@@ -45,43 +46,46 @@ struct Handle {
     content: Vec<u8>,
     position: usize,
     is_writing: bool,
-    /// When it was used last.
+    /// When the handle was used last.
     used: Instant,
 }
 
-/// What a method of a file answers.
+/// The result of a method of a file.
 pub type Answer = Result<Vec<Variant>, Refusal>;
 
 impl Handles {
-    /// How many there are.
+    /// Returns the number of open handles.
     #[must_use]
     pub fn len(&self) -> usize {
         self.all.len()
     }
 
-    /// Whether nobody has it open.
+    /// Returns whether the file is not open.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.all.is_empty()
     }
 
-    /// Closes those whose sessions are gone, and those that nobody has used for long: a client that does nothing would keep
-    /// others from writing.
+    /// Closes the handles of ended sessions and handles that timed out: an idle client would block
+    /// writers.
     pub fn tidy(&mut self) {
         let lasts =
             |handle: &Handle| handle.presence.lasts() && handle.used.elapsed() < LONGEST_UNUSED;
         self.all.retain(|_, handle| lasts(handle));
     }
 
-    /// Closes those of a session that is gone.
+    /// Closes the handles of an ended session.
     pub fn close_session(&mut self, session: u32) {
         self.all.retain(|_, handle| handle.session != session);
     }
 
-    /// One more, of the session of a request: to read the content, or to write on behind it. Answers its number.
+    /// Opens a handle for the session of a request, for reading the content or for writing after
+    /// it. Returns the number of the handle.
     ///
     /// # Errors
-    /// `BadInvalidState` while another one is written, or, to write, while another one is there; `BadTooManyOperations`.
+    ///
+    /// `BadInvalidState` if the file is open for writing, or if a writer finds the file open;
+    /// `BadTooManyOperations`.
     pub fn add(&mut self, request: &MethodRequest, content: Vec<u8>, is_writing: bool) -> Answer {
         self.tidy();
         let is_read = self.all.values().all(|handle| !handle.is_writing);
@@ -107,10 +111,11 @@ impl Handles {
         Ok(vec![Variant::UInt32(number)])
     }
 
-    /// Carries out a method of one that has it open: Read, Write, Close, GetPosition or SetPosition.
+    /// Executes a method of an open handle: Read, Write, Close, GetPosition or SetPosition.
     ///
     /// # Errors
-    /// Why it is refused; `BadInvalidArgument` for the other methods.
+    ///
+    /// Returns the refusal of the method; `BadInvalidArgument` for the other methods.
     pub fn call(&mut self, method: FileMethod, request: &MethodRequest) -> Answer {
         let session = request.caller.session;
         match (method, request.arguments.as_slice()) {
@@ -148,10 +153,12 @@ impl Handles {
         }
     }
 
-    /// Closes one that a session has written, and gives what it wrote.
+    /// Closes a handle of a session, and returns the written content.
     ///
     /// # Errors
-    /// `BadInvalidArgument` where the session has none of that number; `BadInvalidState` where it was opened to be read.
+    ///
+    /// `BadInvalidArgument` if the session has no handle with this number; `BadInvalidState` if the
+    /// handle was opened for reading.
     pub fn written(&mut self, session: u32, number: u32) -> Result<Vec<u8>, Refusal> {
         let handle = self.take(session, number)?;
         match handle.is_writing {
@@ -167,7 +174,7 @@ impl Handles {
                 handle.used = Instant::now();
                 Ok(handle)
             }
-            // Handles are of the session that opened (OPC 10000-20, 4.2.2).
+            // A handle belongs to the session that opened it (OPC 10000-20, 4.2.2).
             Some(_) | None => Err(StatusCode::BadInvalidArgument.into()),
         }
     }
@@ -196,7 +203,7 @@ impl Handle {
         if !self.is_writing {
             return Err(StatusCode::BadInvalidState.into());
         }
-        // Whoever goes back writes over what is there.
+        // Writing after SetPosition overwrites existing content.
         let end = self.position.saturating_add(data.len());
         if end > LARGEST {
             return Err(StatusCode::BadRequestTooLarge.into());
@@ -210,17 +217,17 @@ impl Handle {
     }
 }
 
-/// Bytes that a file that is written may have.
+/// Largest size of a written file in bytes.
 pub const LARGEST: usize = 1 << 20;
-/// A file that is not used for that long is closed.
+/// Timeout of an unused handle.
 pub const LONGEST_UNUSED: Duration = Duration::from_secs(60);
-/// Bits of the modes that a file is opened in (OPC 10000-20, 4.2.2).
+/// The open mode for reading, a bit mask (OPC 10000-20, 4.2.2).
 pub const READ: u8 = 1;
-/// To write, with what is there erased.
+/// The open mode for writing with EraseExisting.
 pub const WRITE_ANEW: u8 = 6;
 const MOST_OPEN: usize = 20;
 const MOST_OF_SESSION: usize = 5;
-/// Bytes of an answer.
+/// Most bytes of a Read response.
 const MOST_READ: usize = 1 << 20;
 
 #[cfg(test)]
@@ -233,7 +240,7 @@ pub(crate) mod tests {
     use super::*;
     use crate::server::Caller;
 
-    /// A call of a session that is there.
+    /// Returns a call of an active session.
     pub(crate) fn request(session: u32, arguments: &[Variant]) -> MethodRequest {
         request_while(session, arguments, || true)
     }

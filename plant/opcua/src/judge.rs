@@ -1,6 +1,8 @@
-//! The certificate that a peer shows, judged by what a store knows: chain, trust, dates, names, use and revocation (OPC 10000-4, 6.1.3).
+//! Judges the certificate of a peer by the content of a certificate store: chain, trust, dates,
+//! names, key usage and revocation (OPC 10000-4, 6.1.3).
 //!
-//! What is refused says why, with the command that mends it. Files of the store count as soon as they are there.
+//! A refusal states the reason and the command that solves it. Changes of the store's files take
+//! effect at once.
 
 use std::collections::BTreeSet;
 use std::fmt;
@@ -15,28 +17,28 @@ use trust::{Certificate, Fault, Fingerprint, Known, Names};
 use crate::certificates;
 use crate::known::{self, Stamp};
 
-/// A certificate, and those sent along with it.
+/// A certificate, and the issuer certificates that the peer sent.
 pub type Shown = (Certificate, Vec<Certificate>);
 
-/// Judges by the store at one root.
+/// Judges certificates by the store at a root.
 #[derive(Debug)]
 pub struct Judge {
     root: PathBuf,
     trusts_all: bool,
-    /// A certificate that is trusted beside those of the store.
+    /// A certificate that is trusted in addition to the store.
     pinned: Option<Fingerprint>,
     /// Whether a missing or outdated revocation list is accepted.
     allows_outdated_lists: bool,
     host_names: HostNames,
-    /// The hosts that were warned of, each with the certificate.
+    /// The pairs of certificate and host for which a warning was logged.
     warned: Mutex<BTreeSet<(String, String)>>,
-    /// What was read last, and how the files were then.
+    /// The content that was read last, and the state of the files at that time.
     read: Mutex<Option<(Stamp, Arc<Known>)>>,
 }
 
-/// The rule for a server at a host that its certificate does not name. It holds for certificates that are trusted themselves
-/// and have the expected ApplicationUri. A client may suppress this check (OPC 10000-4, 6.1.3): a lease of DHCP changes the
-/// address, and the certificate stays.
+/// The rule for a server whose certificate does not name its host. The rule applies to certificates
+/// that are trusted themselves and have the expected ApplicationUri. A client may suppress this
+/// check (OPC 10000-4, 6.1.3), because DHCP may change the address while the certificate stays.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum HostNames {
     /// The client connects and logs a warning.
@@ -46,16 +48,16 @@ pub enum HostNames {
     Refuse,
 }
 
-/// Why a peer is not talked to.
+/// The refusal of a peer's certificate.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Refused {
-    /// The status of it.
+    /// The status code.
     pub status: StatusCode,
-    /// Whether the peer may be told the status (OPC 10000-4, 6.1.3).
+    /// Whether the peer may receive the status code (OPC 10000-4, 6.1.3).
     pub may_be_told: bool,
-    /// The common name in the certificate, which whoever made it chose.
+    /// The common name in the certificate. The creator of the certificate chose it freely.
     pub name: String,
-    /// What is wrong, and what mends it.
+    /// The reason and its solution.
     pub why: String,
 }
 
@@ -69,7 +71,8 @@ impl fmt::Display for Refused {
 }
 
 impl Judge {
-    /// One for a store; for tests and demonstrations, whom nobody trusts can be trusted too.
+    /// Creates the judge of a store. With `trusts_all` every valid certificate is trusted, for
+    /// tests and demonstrations.
     #[must_use]
     pub fn of(root: &Path, trusts_all: bool) -> Self {
         Self {
@@ -83,19 +86,20 @@ impl Judge {
         }
     }
 
-    /// Judges host names so.
+    /// Sets the rule for host names.
     #[must_use]
     pub fn host_names(self, host_names: HostNames) -> Self {
         Self { host_names, ..self }
     }
 
-    /// Trusts the certificate with that SHA-256 too.
+    /// Trusts the certificate with this fingerprint in addition.
     #[must_use]
     pub fn pinned(self, pinned: Option<Fingerprint>) -> Self {
         Self { pinned, ..self }
     }
 
-    /// Accepts peers of an authority without a current revocation list. For the server that hands out the list.
+    /// Accepts certificates of an authority without a current revocation list. For connections to
+    /// the server that distributes the list.
     #[must_use]
     pub fn outdated_lists(self, allows_outdated_lists: bool) -> Self {
         Self {
@@ -104,16 +108,16 @@ impl Judge {
         }
     }
 
-    /// The root of the store.
+    /// Returns the root of the store.
     #[must_use]
     pub fn root(&self) -> &Path {
         &self.root
     }
 
-    /// What the store knows now.
+    /// Returns the current content of the store.
     #[must_use]
     pub fn known(&self) -> Arc<Known> {
-        // Taken before: what is written while the store is read is to be seen later.
+        // The stamp is taken before reading, so that changes during the reading are detected later.
         let stamp = known::stamp(&self.root);
         let mut read = self.read.lock();
         if let Some((before, known)) = &*read
@@ -126,10 +130,12 @@ impl Judge {
         known
     }
 
-    /// Reads what a peer shows and judges it. One that nobody has decided on is kept in `rejected` of the store.
+    /// Decodes and judges the certificate of a peer. An undecided certificate is stored in
+    /// `rejected`.
     ///
     /// # Errors
-    /// It is refused.
+    ///
+    /// Returns an error if the certificate is refused.
     pub fn take(&self, der: &[u8], names: Names<'_>) -> Result<Shown, Refused> {
         let shown = Certificate::read_chain(der).map_err(|unfit| Refused {
             status: StatusCode::BadCertificateInvalid,
@@ -139,7 +145,7 @@ impl Judge {
         })?;
         self.judge(&shown, names)?;
         if !shown.1.is_empty() {
-            // The library reads one certificate where a peer sends several.
+            // The library does not support certificate chains.
             return Err(Refused {
                 status: StatusCode::BadCertificateInvalid,
                 may_be_told: true,
@@ -150,10 +156,11 @@ impl Judge {
         Ok(shown)
     }
 
-    /// Judges what was taken before, as it stands now.
+    /// Judges a decoded certificate by the current content of the store.
     ///
     /// # Errors
-    /// It is refused.
+    ///
+    /// Returns an error if the certificate is refused.
     pub fn judge(&self, shown: &Shown, names: Names<'_>) -> Result<(), Refused> {
         let (certificate, sent) = shown;
         let mut known = self.known();
@@ -189,7 +196,7 @@ impl Judge {
         })
     }
 
-    /// Warns once of each host and certificate.
+    /// Logs one warning per host and certificate.
     fn warn_of_host(&self, certificate: &Certificate, host: &str) {
         let mut warned = self.warned.lock();
         if warned.len() >= MOST_WARNED {
@@ -253,7 +260,7 @@ impl Judge {
     }
 }
 
-/// What mends it where nothing in the store does.
+/// Returns the solution of a fault that the store cannot solve.
 pub(crate) const fn help(fault: Fault) -> &'static str {
     match fault {
         Fault::Revoked | Fault::IssuerRevoked => "it needs another certificate",
@@ -273,9 +280,9 @@ pub(crate) const fn help(fault: Fault) -> &'static str {
     }
 }
 
-/// Hosts and certificates that are remembered for not being warned of again.
+/// Most pairs of host and certificate that are stored to suppress repeated warnings.
 const MOST_WARNED: usize = 256;
-/// Digits of a thumbprint that people are told.
+/// Digits of a thumbprint in messages.
 const SHOWN_DIGITS: usize = 16;
 
 #[cfg(test)]

@@ -1,4 +1,5 @@
-//! What a certificate store knows of authorities: those that are trusted, those between, and their revocation lists.
+//! The authorities in a certificate store: trusted certificates, issuer certificates and revocation
+//! lists.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -9,7 +10,8 @@ use trust::{Certificate, Crl, Known};
 
 use crate::certificates::StoreFault;
 
-/// Reads what a store knows. A file that is neither a certificate nor a list is left out.
+/// Reads the content of a store. Files that are neither certificates nor revocation lists are
+/// skipped.
 #[must_use]
 pub fn read(root: &Path) -> Known {
     let certificates = |folder: &str| -> Vec<Certificate> {
@@ -27,7 +29,7 @@ pub fn read(root: &Path) -> Known {
     }
 }
 
-/// Whether an authority is trusted in a store, so that those whom it issued certificates are let in.
+/// Returns whether a store trusts an authority, so that certificates of the authority are accepted.
 #[must_use]
 pub fn trusts_authorities(root: &Path) -> bool {
     let trusted = files(&root.join(TRUSTED)).into_iter();
@@ -35,10 +37,11 @@ pub fn trusts_authorities(root: &Path) -> bool {
     read.any(|one| one.is_authority())
 }
 
-/// The files of a store, with their lengths and the times of their last change.
+/// The files of a store with their lengths and modification times.
 pub type Stamp = Vec<(PathBuf, u64, Option<SystemTime>)>;
 
-/// What a look at the files of a store says without reading them: another value once one has changed.
+/// Returns the state of the files of a store without reading them. The value changes when a file
+/// changes.
 #[must_use]
 pub fn stamp(root: &Path) -> Stamp {
     let mut all = Vec::new();
@@ -52,16 +55,18 @@ pub fn stamp(root: &Path) -> Stamp {
     all
 }
 
-/// Whether a file is a revocation list.
+/// Returns whether a file is a revocation list.
 #[must_use]
 pub fn is_crl(file: &Path) -> bool {
     bytes(file).is_some_and(|bytes| Crl::read(&bytes).is_ok())
 }
 
-/// Keeps a revocation list of an authority, in the place of an older one of it.
+/// Stores the revocation list of an authority, and replaces an older list of the authority.
 ///
 /// # Errors
-/// The file is no list, its authority is not known to the store, or the store cannot be written.
+///
+/// Returns an error if the file is not a revocation list, if the store does not contain its
+/// authority, or if the store cannot be written.
 pub fn keep_crl(root: &Path, file: &Path) -> Result<PathBuf, StoreFault> {
     let why = |why: &str| StoreFault::Certificate {
         path: file.to_owned(),
@@ -74,10 +79,11 @@ pub fn keep_crl(root: &Path, file: &Path) -> Result<PathBuf, StoreFault> {
     })
 }
 
-/// The same of a list that is at hand; `None` where its authority is not known.
+/// Stores a decoded revocation list. Returns `None` if the store does not contain its authority.
 ///
 /// # Errors
-/// The store cannot be written.
+///
+/// Returns an error if the store cannot be written.
 pub fn put_crl(root: &Path, list: &Crl) -> Result<Option<PathBuf>, StoreFault> {
     let known = read(root);
     let mut authorities = known.trusted.iter().chain(&known.issuers);
@@ -91,7 +97,8 @@ pub fn put_crl(root: &Path, list: &Crl) -> Result<Option<PathBuf>, StoreFault> {
         source,
     };
     fs::create_dir_all(&folder).map_err(failed)?;
-    // Others of the same authority under other names are older, or the same.
+    // Lists of the same authority under other file names are older or identical, unless they are
+    // newer and stay.
     for other in files(&folder) {
         let of_it = bytes(&other).and_then(|bytes| Crl::read(&bytes).ok());
         let Some(of_it) = of_it.filter(|crl| crl.is_of(authority)) else {
@@ -109,7 +116,7 @@ pub fn put_crl(root: &Path, list: &Crl) -> Result<Option<PathBuf>, StoreFault> {
     Ok(Some(path))
 }
 
-/// The time that certificates are judged by, since 1970.
+/// Returns the time for judging certificates, since 1970.
 #[must_use]
 pub fn now() -> Duration {
     let now = opcua::types::DateTime::now().as_chrono().timestamp();
@@ -129,12 +136,12 @@ fn bytes(path: &Path) -> Option<Vec<u8>> {
     fits.then(|| fs::read(path).ok()).flatten()
 }
 
-/// Who is trusted: applications, and authorities.
+/// The folder of trusted certificates, of applications and of authorities.
 pub const TRUSTED: &str = "trusted";
-/// Authorities that are known and not trusted themselves.
+/// The folder of issuer certificates, which are not trusted themselves.
 pub const ISSUERS: &str = "issuers";
-/// Revocation lists of both.
+/// The folder of revocation lists of trusted authorities and of issuers.
 pub const CRLS: &str = "crl";
 const MOST_FILES: usize = 10_000;
-/// A list of some ten thousand revoked certificates.
+/// Largest file, in bytes: a list of about ten thousand revoked certificates.
 const LARGEST: u64 = 1 << 20;

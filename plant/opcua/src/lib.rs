@@ -1,9 +1,12 @@
-//! OPC UA for the programs of the plant: servers whose address space is made of NodeSets and of instances of their
-//! types, and clients that come back by themselves. It knows no skills, no discovery, no space and no ROS.
+//! OPC UA for the programs of the plant: servers with an address space of NodeSets and of instances
+//! of their types, and clients that reconnect. This crate does not depend on skills, discovery,
+//! spaces or ROS.
 //!
-//! Reading order: `limits` (the bounds of both sides), `endpoint`, `pair`, `own` and `pki`, `certificates`, `known`, `judge` and `door` (who gets
-//! in), `nodeset` (types from files), `users`, `supervision`, `audit` and `changes`, `server` and `client`, `file`, `trust_file`, `directory` and
-//! `configuration` (a server's certificates as clients manage them), `enrolment` (as a Global Discovery Server issues them).
+//! Reading order: `limits` (the limits of both sides), `endpoint`, `pair`, `own` and `pki`,
+//! `certificates`, `known`, `judge` and `door` (access), `nodeset` (types from files), `users`,
+//! `supervision`, `audit` and `changes`, `server` and `client`, `file`, `trust_file`, `directory`
+//! and `configuration` (certificate management by clients), `enrolment` (certificates of a Global
+//! Discovery Server).
 
 #[cfg(feature = "server")]
 pub mod audit;
@@ -44,10 +47,10 @@ pub mod users;
 
 pub use opcua::types;
 
-/// What programs hide of the logs of the OPC UA libraries, in the syntax of `tracing` filters: they say at level info
-/// what they do for each peer, and at level error what a bad peer did, or that there is no certificate where none is
-/// needed. Certificates that are refused are told by the servers here.
+/// The `tracing` filter that programs apply to the OPC UA libraries. The libraries log their work
+/// for each peer at level info. They log faults of peers at level error, and also a missing
+/// certificate that is not needed. The servers of this crate log refused certificates themselves.
 ///
-/// A connection that is opened and closed is somebody looking whether the server is there, and no error.
+/// A TCP connection that is opened and closed is a probe of the server, and no error.
 pub const QUIET: &str = "opcua_server=warn,opcua_server::session::controller=off,opcua_client=off,\
     opcua_crypto=off,opcua_core=warn,opcua_core::comms::secure_channel=off,opcua_nodes=warn,opcua_types=off";

@@ -1,57 +1,61 @@
-//! The bounds servers and clients of the plant put on each other, in one place: what one side sends, the other takes.
+//! The limits that servers and clients of the plant apply to each other. Both sides use the same
+//! values, so that each side accepts the messages of the other side.
 
 use std::time::Duration;
 
 #[cfg(feature = "server")]
 use opcua::server::{Limits, OperationalLimits, SubscriptionLimits};
 
-/// Bytes of the largest string, byte string or message.
+/// Largest string, ByteString or message body, in bytes.
 pub const LARGEST_VALUE: usize = 64 << 20;
-/// Elements of the largest array. Each takes up 24 bytes and more while a message is read.
+/// Most elements of an array. Each element takes at least 24 bytes while a message is decoded.
 pub const LARGEST_ARRAY: usize = 4 << 20;
-/// Room of a message beside the value in it.
+/// Largest message in bytes, with space for the headers.
 pub const LARGEST_MESSAGE: usize = LARGEST_VALUE + (1 << 20);
-/// Chunks of a message, with room for peers that send chunks of half the usual size.
+/// Most chunks of a message, with a reserve for peers that send chunks of half the usual size.
 pub const MOST_CHUNKS: usize = 2_100;
-/// How often subscriptions are looked at, in milliseconds: how late a notification may be beyond its publishing interval.
+/// Interval of processing subscriptions in milliseconds: the largest delay of a notification after
+/// its publishing interval.
 pub const POLL_MS: u64 = 5;
-/// The shortest publishing interval a client gets.
+/// Shortest publishing interval of a server.
 pub const SHORTEST_PUBLISHING: Duration = Duration::from_millis(10);
-/// Notifications in one response. Clients commonly refuse arrays of more than 1000 elements, and then hear nothing more.
+/// Most notifications in a response. Many clients refuse arrays of more than 1000 elements, and
+/// then receive no further notifications.
 pub const MOST_NOTIFICATIONS: usize = 1_000;
-/// Nodes or items in one request of a client; servers commonly take 1000.
+/// Most nodes or items in a request of a client. Many servers accept 1000.
 pub const MOST_PER_REQUEST: usize = 500;
-/// Sessions of a server.
+/// Most sessions of a server.
 pub const MOST_SESSIONS: usize = 50;
-/// Bytes of the notifications that wait for all clients of a server.
+/// Most bytes of queued notifications, for all clients of a server.
 pub const QUEUED_NOTIFICATIONS: usize = 64 << 20;
-/// Requests of one connection that a server processes at a time, Publish requests apart.
+/// Most requests of a connection that a server processes at a time, without Publish requests.
 pub const REQUESTS_IN_FLIGHT: usize = 1_000;
-/// How long a method or a write may take until its client is told `BadTimeout`.
+/// Timeout of a method call or a write, after which the client receives `BadTimeout`.
 pub const LONGEST_REQUEST: Duration = Duration::from_secs(10);
-/// Bytes of the largest NodeSet file.
+/// Largest NodeSet file in bytes.
 pub const LARGEST_NODESET: u64 = 64 << 20;
-/// Bytes of all NodeSet files of a server.
+/// Most bytes of all NodeSet files of a server.
 pub const LARGEST_NODESETS: u64 = 128 << 20;
-/// NodeSet files of a server.
+/// Most NodeSet files of a server.
 pub const MOST_NODESETS: usize = 64;
 
-/// The number of clients that a server serves.
+/// The limits of the clients of a server.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ClientLimits {
-    /// Sessions.
+    /// Most sessions.
     pub sessions: usize,
-    /// Sessions of one client address, while less than an eighth of the sessions is free; 0 is no limit. SCADA hosts and
-    /// gateways run many clients on one address.
+    /// Most sessions of a client address. The limit applies while less than an eighth of the
+    /// sessions is free; 0 for no limit. SCADA hosts and gateways run many clients at one address.
     pub sessions_per_address: usize,
-    /// Connections. The oldest one without an activated session gives way.
+    /// Most connections. A new connection replaces the oldest connection without an activated
+    /// session.
     pub connections: usize,
-    /// Connections of one client address; 0 is no limit.
+    /// Most connections of a client address; 0 for no limit.
     pub connections_per_address: usize,
 }
 
 impl ClientLimits {
-    /// Returns the limits of a server with that number of sessions.
+    /// Returns the limits of a server with this number of sessions.
     #[must_use]
     pub const fn of(sessions: usize) -> Self {
         Self {
@@ -62,8 +66,8 @@ impl ClientLimits {
         }
     }
 
-    /// Returns the limits that a file sets: sessions, sessions per address, connections, and connections per address. `None`
-    /// is the usual limit.
+    /// Returns the limits of a configuration file: sessions, sessions per address, connections, and
+    /// connections per address. `None` selects the default.
     #[must_use]
     pub fn given([sessions, per_address, connections, per_peer]: [Option<u16>; 4]) -> Self {
         let set = |given: Option<u16>, usual| given.map_or(usual, usize::from);
@@ -76,8 +80,8 @@ impl ClientLimits {
         }
     }
 
-    /// Returns the limits of a server behind a [`crate::door::Door`]. All its connections come from one address, and the
-    /// door has bounded those of each client.
+    /// Returns the limits of a server behind a [`crate::door::Door`]. All its connections come from
+    /// the same address, and the door limits the connections of each client.
     #[must_use]
     pub const fn behind_door(self) -> Self {
         Self {
@@ -87,8 +91,8 @@ impl ClientLimits {
         }
     }
 
-    /// Sets these limits in those of the library. The published library has the number of sessions only, and ignores
-    /// the others.
+    /// Applies the limits to the limits of the library. The unpatched library supports the number
+    /// of sessions only, and ignores the other limits.
     #[cfg(feature = "server")]
     #[must_use]
     pub fn bound(self, mut limits: Limits) -> Limits {
@@ -127,7 +131,7 @@ pub fn server(clients: ClientLimits) -> Limits {
         max_chunk_count: MOST_CHUNKS,
         subscriptions: SubscriptionLimits {
             max_subscriptions_per_session: 50,
-            // 0 is what a client gets that asks for exception-based reporting: every change, as it comes.
+            // Value 0 permits exception-based reporting: every change is reported at once.
             min_sampling_interval_ms: 0.0,
             min_publishing_interval_ms: SHORTEST_PUBLISHING.as_secs_f64() * 1e3,
             max_monitored_items_per_sub: 10_000,
@@ -154,7 +158,7 @@ mod tests {
         let shown = serde_json::to_value(server(clients.behind_door())).unwrap();
         for name in ["max_sessions_per_address", "max_connections_per_address"] {
             let limit = shown.get(name).and_then(serde_json::Value::as_u64);
-            // The published library has none of them.
+            // The unpatched library has none of these limits.
             assert!(limit.is_none_or(|limit| limit == 0), "{name}: {limit:?}");
         }
     }

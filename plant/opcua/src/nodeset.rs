@@ -1,4 +1,5 @@
-//! NodeSet2 files (OPC 10000-6, Annex F): read, checked and put into an order in which each has what it needs.
+//! NodeSet2 files (OPC 10000-6, Annex F): reads and checks them, and orders them by their
+//! dependencies.
 
 mod document;
 mod files;
@@ -32,7 +33,7 @@ use self::outline::Outline;
 /// The namespace of the OPC Foundation, index 0 of every server.
 pub const CORE: &str = "http://opcfoundation.org/UA/";
 
-/// Why NodeSets cannot be used.
+/// An error of a NodeSet.
 #[derive(Debug, thiserror::Error)]
 pub enum NodeSetError {
     /// The file cannot be read.
@@ -40,95 +41,96 @@ pub enum NodeSetError {
     Read {
         /// The file.
         file: String,
-        /// What the system says.
+        /// The error of the operating system.
         #[source]
         source: io::Error,
     },
-    /// The text is no NodeSet2 document.
+    /// The text is not a NodeSet2 document.
     #[error("{file} is not a NodeSet2 document: {reason}")]
     Xml {
         /// The file.
         file: String,
-        /// What is wrong and where.
+        /// The reason and its location.
         reason: String,
     },
-    /// A node of the document is wrong.
+    /// A node of the document is invalid.
     #[error("{file}:{line}: node {node}: {reason}")]
     Node {
         /// The file.
         file: String,
         /// The line, from 1.
         line: usize,
-        /// The NodeId as the file has it.
+        /// The NodeId as written in the file.
         node: String,
-        /// What is wrong.
+        /// The reason.
         reason: String,
     },
-    /// Values of nodes cannot be read, such as structures of types that are not known.
+    /// The values of some nodes cannot be decoded, for example structures of unknown types.
     #[error("{file}: {missing} of its {all} nodes cannot be used, for a value that cannot be read")]
     Values {
         /// The file.
         file: String,
-        /// How many nodes are left out.
+        /// The number of nodes that were left out.
         missing: usize,
-        /// How many nodes the file has.
+        /// The number of nodes of the file.
         all: usize,
     },
-    /// The value of a node cannot be read, such as a structure of an unknown type. The node is there without the value.
+    /// The value of a node cannot be decoded, for example a structure of an unknown type. The node
+    /// exists without the value.
     #[error("{file}:{line}: node {node}: the value cannot be read: {reason}")]
     Unread {
         /// The file.
         file: String,
         /// The line of the node, from 1.
         line: usize,
-        /// The NodeId, as the file has it.
+        /// The NodeId as written in the file.
         node: String,
-        /// What is wrong.
+        /// The reason.
         reason: String,
     },
-    /// Number of nodes whose unreadable values have no finding each.
+    /// The number of further nodes with values that cannot be decoded.
     #[error("{file}: the values of {count} more nodes cannot be read")]
     MoreUnread {
         /// The file.
         file: String,
-        /// How many there are.
+        /// The number of further nodes.
         count: usize,
     },
-    /// The file has nodes of the namespace that every server has.
+    /// The file contains only nodes of the core namespace, which every server has.
     #[error("{file} has nodes of the core namespace, as {node}")]
     Core {
         /// The file.
         file: String,
-        /// The NodeId of the first of them.
+        /// The NodeId of the first node.
         node: String,
     },
     /// There are too many files.
     #[error("there are more than {MOST_NODESETS} NodeSets")]
     Many,
-    /// No file has the nodes of a namespace that is needed.
+    /// No file provides a namespace that is required.
     #[error("{file} needs the namespace {uri}, and no NodeSet given has it")]
     Missing {
         /// The file.
         file: String,
-        /// The namespace.
+        /// The required namespace.
         uri: String,
     },
-    /// Each of some files needs another of them.
+    /// Some files depend on each other.
     #[error("these NodeSets need each other: {0}")]
     Circle(String),
-    /// Two files have the same namespace.
+    /// Two files contain nodes of the same namespace.
     #[error("{first} and {second} both have nodes of the namespace {uri}")]
     Twice {
-        /// One file.
+        /// The first file.
         first: String,
-        /// The other file.
+        /// The second file.
         second: String,
         /// The namespace.
         uri: String,
     },
 }
 
-/// Where a NodeSet comes from.
+/// The source of a NodeSet.
 #[derive(Debug)]
 pub(crate) enum Source {
     Text { name: String, xml: String },
@@ -136,31 +138,31 @@ pub(crate) enum Source {
     File(PathBuf),
 }
 
-/// A NodeSet that can be imported.
+/// A NodeSet that is ready for import.
 pub(crate) struct NodeSet {
     file: String,
     facts: Facts,
-    /// Its DataTypes and their encodings.
+    /// The DataTypes and their encodings.
     types: NodeSet2Import,
-    /// All its other nodes.
+    /// All other nodes.
     others: NodeSet2Import,
-    /// Those of them whose values are left out, for they cannot be read.
+    /// The nodes without their values, which cannot be decoded.
     unread: Vec<NodeId>,
 }
 
-/// What is known of a document whose nodes are sound.
+/// The properties of a valid document.
 struct Facts {
-    /// The namespaces of its table, by their index less `offset`.
+    /// The namespace table, by index minus `offset`.
     uris: Vec<String>,
     offset: usize,
-    /// The namespaces it has nodes of.
+    /// The namespaces of its nodes.
     provides: BTreeSet<String>,
-    /// The namespaces it refers to beside those and [`CORE`].
+    /// The other namespaces that it refers to, without [`CORE`].
     needs: BTreeSet<String>,
     nodes: Outline,
 }
 
-/// A document as two: its DataTypes with their encodings, and all other nodes.
+/// Splits a document into the DataTypes with their encodings, and all other nodes.
 fn parted(mut set: UANodeSet) -> (UANodeSet, UANodeSet) {
     let is_type = |node: &UANode| match node {
         UANode::DataType(_) => true,
@@ -195,7 +197,8 @@ fn imported(set: UANodeSet) -> NodeSet2Import {
 /// Reads the sources and orders them.
 ///
 /// # Errors
-/// The first thing that is wrong with any of them.
+///
+/// Returns the first error of a source.
 pub(crate) fn load(sources: Vec<Source>) -> Result<Vec<NodeSet>, NodeSetError> {
     let read = sources.into_iter().map(NodeSet::read);
     ordered(read.collect::<Result<_, _>>()?)
@@ -215,22 +218,23 @@ impl NodeSet {
         })
     }
 
-    /// Its DataTypes and their encodings.
+    /// Returns the DataTypes and their encodings.
     fn types(&self, namespaces: &NodeSetNamespaceMapper<'_>) -> Vec<ImportedItem> {
         let mut items: Vec<ImportedItem> = self.types.load(namespaces).collect();
         encoded(&mut items);
         items
     }
 
-    /// The namespaces it has nodes of.
+    /// Returns the namespaces of its nodes.
     pub(crate) fn provides(&self) -> impl Iterator<Item = &str> {
         self.facts.provides.iter().map(String::as_str)
     }
 
-    /// Puts the nodes into an address space, which owns the namespaces from now on.
+    /// Imports the nodes into an address space, to which the namespaces are added.
     ///
     /// # Errors
-    /// Nodes that are left out.
+    ///
+    /// Returns an error if nodes were left out.
     pub(crate) fn import(
         &self,
         address_space: &mut AddressSpace,
@@ -311,7 +315,7 @@ impl Facts {
         })
     }
 
-    /// The URI of a namespace of its table.
+    /// Returns the URI of a namespace index of the file.
     fn uri(&self, index: u16) -> Option<&str> {
         if index == 0 {
             return Some(CORE);
@@ -320,7 +324,7 @@ impl Facts {
         self.uris.get(at).map(String::as_str)
     }
 
-    /// A node as the file numbers its namespace.
+    /// Returns a NodeId with the namespace index of the file.
     fn local(&self, uri: &str, identifier: &Identifier) -> Option<NodeId> {
         let at = self.uris.iter().position(|one| one == uri)?;
         Some(NodeId {
@@ -338,7 +342,7 @@ impl Facts {
     }
 }
 
-/// The import of the library, without what it prints to the standard output for each namespace.
+/// The import of the library, without its output to stdout for each namespace.
 struct Counted<'a> {
     set: &'a NodeSet,
     loaded: AtomicUsize,
@@ -367,8 +371,8 @@ impl NodeSetImport for Counted<'_> {
     }
 }
 
-/// Has each structure say by which id it is encoded, which the library leaves out: clients that make a type of its definition
-/// send that id.
+/// Sets the DefaultEncodingId of each structure definition, which the library leaves out. Clients
+/// that build a type from the definition send this id.
 fn encoded(items: &mut [ImportedItem]) {
     let has_encoding: NodeId = ReferenceTypeId::HasEncoding.into();
     let mut ids = HashMap::new();
@@ -402,14 +406,14 @@ fn encoded(items: &mut [ImportedItem]) {
     }
 }
 
-/// The BrowseName of what stands for the binary encoding of a structure (OPC 10000-3, 5.8.4).
+/// The BrowseName of the binary encoding of a structure (OPC 10000-3, 5.8.4).
 const BINARY: &str = "Default Binary";
-/// What the BrowseNames of encodings begin with.
+/// The prefix of the BrowseNames of encodings.
 const ENCODING: &str = "Default ";
-/// Supertypes of a DataType.
+/// Most supertypes of a DataType.
 const DEEPEST: usize = 64;
 
-/// What the library would panic at, or leave out without saying so.
+/// Checks for faults at which the library would panic or silently leave out nodes.
 struct Check<'a> {
     file: &'a str,
     text: &'a Text,
@@ -451,7 +455,7 @@ impl Check<'_> {
         }
     }
 
-    /// The NodeId of a node, and the namespaces it refers to.
+    /// Returns the NodeId of a node, and the namespaces that the node refers to.
     fn node(&self, node: &UANode) -> Result<(NodeId, BTreeSet<String>), NodeSetError> {
         let base = node.base();
         let mut used = BTreeSet::new();
@@ -490,7 +494,7 @@ impl Check<'_> {
     }
 }
 
-/// The NodeSets with each after those it needs.
+/// Orders the NodeSets so that each NodeSet follows its dependencies.
 fn ordered(sets: Vec<NodeSet>) -> Result<Vec<NodeSet>, NodeSetError> {
     let mut owners: HashMap<&str, &NodeSet> = HashMap::new();
     for set in &sets {

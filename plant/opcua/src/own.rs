@@ -1,8 +1,10 @@
-//! The application's own certificate: the reasons to make it anew, and its description for people.
+//! The application's own certificate: the reasons for making a new certificate, and its
+//! description.
 //!
-//! A self-made certificate stays for as long as it can: other applications trust this very file. It is made anew by command
-//! ([`Pki::renew`]), when the ApplicationUri changes, when it has expired, and when it was made before the clock was set.
-//! [`crate::enrolment`] replaces it by one of an authority.
+//! A self-made certificate is kept as long as possible, because other applications trust this very
+//! file. It is replaced by command ([`Pki::renew`]), when the ApplicationUri changes, when it has
+//! expired, and when it was made before the clock was set. [`crate::enrolment`] replaces it by a
+//! certificate of an authority.
 //!
 //! [`Pki::renew`]: crate::pki::Pki::renew
 
@@ -20,10 +22,10 @@ use trust::Certificate;
 
 use crate::pki::OWN_CERTIFICATE;
 
-/// The reason for which an application has the certificate that it has.
+/// The reason why an application has its present certificate.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Cause {
-    /// There was none.
+    /// The application had no certificate.
     Missing,
     /// The key of the previous certificate was missing.
     KeyMissing,
@@ -35,13 +37,13 @@ pub enum Cause {
     Expired,
     /// The previous certificate named another ApplicationUri.
     ApplicationUri,
-    /// A person asked for it.
+    /// An operator requested it.
     Command,
     /// A Global Discovery Server issued it.
     Enrolment,
-    /// The authority of the plant issued it to its own server.
+    /// The authority of the plant issued it for its own server.
     Authority,
-    /// An administrator replaced it over OPC UA.
+    /// An administrator installed it over OPC UA.
     Administrator,
 }
 
@@ -64,17 +66,17 @@ impl fmt::Display for Cause {
     }
 }
 
-/// The application of a certificate.
+/// The role of the application that owns a certificate.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Owner {
-    /// A server, which has the store for itself.
+    /// A server, which does not share its store.
     Server,
-    /// A client, which may share the store of a server with another ApplicationUri.
+    /// A client, which may share the store of a server with a different ApplicationUri.
     Client,
 }
 
-/// Returns the reason to make a certificate anew; `None` if it stays. Certificates of authorities stay: a self-made certificate
-/// would not be trusted in their place.
+/// Returns the reason for replacing a certificate; `None` if it is kept. Certificates of
+/// authorities are kept, because a self-made certificate would not be trusted.
 pub(crate) fn outdated(
     certificate: &Certificate,
     (application_uri, owner): (&str, Owner),
@@ -93,7 +95,7 @@ pub(crate) fn outdated(
     }
 }
 
-/// Returns whether this project makes such certificates for itself, without an authority.
+/// Returns whether the certificate is self-signed and was made by this project.
 pub(crate) fn is_self_made(certificate: &Certificate) -> bool {
     certificate.is_self_signed() && certificate.name().contains(ORGANIZATION)
 }
@@ -104,17 +106,18 @@ pub fn read(root: &Path) -> Option<Certificate> {
     Certificate::read(&fs::read(root.join(OWN_CERTIFICATE)).ok()?).ok()
 }
 
-/// Puts a certificate of the own key in the place of the application's own.
+/// Replaces the application's own certificate. The key stays the same.
 ///
 /// # Errors
-/// It cannot be written.
+///
+/// Returns an error if the certificate cannot be written.
 pub fn replace(root: &Path, certificate: &Certificate, cause: &Cause) -> io::Result<()> {
     crate::pair::write(root, certificate.der(), None)?;
     report(root, cause);
     Ok(())
 }
 
-/// Logs a new certificate, and notes its cause for [`status`].
+/// Logs a new certificate, and stores its cause for [`status`].
 pub(crate) fn report(root: &Path, cause: &Cause) {
     let Some(certificate) = read(root) else {
         return;
@@ -129,8 +132,8 @@ pub(crate) fn report(root: &Path, cause: &Cause) {
     );
 }
 
-/// Describes the application's own certificate for `/status`: its name and ApplicationUri, who made it, its last day and why
-/// it was made.
+/// Describes the application's own certificate for `/status`: name, ApplicationUri, issuer, last
+/// day of validity and cause.
 #[cfg(feature = "server")]
 #[must_use]
 pub fn status(root: &Path) -> Option<Value> {
@@ -162,7 +165,7 @@ fn note(root: &Path, certificate: &Certificate, cause: &Cause) -> io::Result<()>
     write!(file, "{}\n{cause}\n", certificate.fingerprint())
 }
 
-/// Writes a day as 2031-11-25.
+/// Formats a day, for example 2031-11-25.
 #[must_use]
 pub fn day(at: Duration) -> String {
     let seconds = i64::try_from(at.as_secs()).unwrap_or_default();
@@ -171,14 +174,15 @@ pub fn day(at: Duration) -> String {
     time.as_chrono().format("%Y-%m-%d").to_string()
 }
 
-/// Returns the number of days for which a certificate is valid that is made now. One that is made while the clock is not set is
-/// valid from then on, and for the usual time from the first plausible day.
+/// Returns the validity in days of a certificate made at this time. A certificate that is made
+/// while the clock is not set is valid at once, and for the usual time from the first plausible
+/// day.
 pub(crate) fn days_from(now: Duration) -> u32 {
     let early = PLAUSIBLE.saturating_sub(now).as_secs() / 86_400;
     CERTIFICATE_DAYS.saturating_add(u32::try_from(early).unwrap_or_default())
 }
 
-/// Describes a certificate of the application for these hosts, and for the computer itself.
+/// Describes a certificate of the application for these hosts and for the loopback addresses.
 pub(crate) fn described(
     application_uri: &str,
     hosts: &[String],
@@ -198,7 +202,8 @@ pub(crate) fn described(
         organizational_unit: ORGANIZATION.to_owned(),
         country: "XX".to_owned(),
         state: "-".to_owned(),
-        // Without the addresses of the computer's name: they are asked of a name service, which may not answer.
+        // The addresses of the host name are omitted, because resolving them needs a name service,
+        // which may not answer.
         alt_host_names: X509Data::alt_host_names(
             application_uri,
             Some(addresses),
@@ -210,14 +215,15 @@ pub(crate) fn described(
     }
 }
 
-/// Holds the fingerprint of the own certificate and why it was made.
+/// The file with the fingerprint of the own certificate and its cause.
 const NOTE: &str = "own/reason";
-/// Five years, as other stacks make them: clients trust this very file, so a new one is work for people.
+/// Five years, as in other OPC UA stacks: clients trust this very file, so a new certificate causes
+/// manual work.
 pub(crate) const CERTIFICATE_DAYS: u32 = 1826;
 const ORGANIZATION: &str = "UA bridge";
-/// The first day that a clock can show: 2026-01-01, before this version was made.
+/// The earliest plausible time of a clock: 2026-01-01, before this version was made.
 pub(crate) const PLAUSIBLE: Duration = Duration::from_secs(1_767_225_600);
-/// 100 ns each, from 1601 to 1970.
+/// Units of 100 ns from 1601 to 1970.
 const TICKS_TO_1970: i64 = 116_444_736_000_000_000;
 
 #[cfg(test)]
@@ -230,7 +236,7 @@ mod tests {
 
     const DAY: Duration = Duration::from_secs(86_400);
 
-    /// A certificate that was made now for `urn:a`.
+    /// Returns a certificate of `urn:a`, made at this moment.
     fn made() -> Certificate {
         let data = described("urn:a", &["localhost".to_owned()], "UA bridge", DAY);
         let key = PrivateKey::new(2048).unwrap();
@@ -276,7 +282,7 @@ mod tests {
         assert_eq!(said["made_by"], "itself");
         assert_eq!(said["reason"], "a person asked for it");
         assert_eq!(said["until"].as_str().unwrap().len(), 10);
-        // A note of another certificate says nothing of this one.
+        // A stored cause of another certificate is ignored.
         fs::write(root.join(NOTE), "0000\nit was found\n").unwrap();
         assert_eq!(status(&root).unwrap()["reason"], Value::Null);
         fs::remove_dir_all(root).unwrap();

@@ -1,5 +1,6 @@
-//! The files of an application's own certificate and private key. They are written so that a program that is killed, or a
-//! disk that is full, leaves a pair that the next start can use: beside, synced, and renamed with the key first.
+//! The files of an application's own certificate and private key. Files are written beside the old
+//! files, synced and renamed, the key first. After a killed process or a full disk, the next start
+//! therefore finds a usable pair.
 
 use std::fs;
 use std::io;
@@ -11,23 +12,25 @@ use x509_cert::der::pem::{self, LineEnding};
 use crate::pki::{OWN_CERTIFICATE, OWN_KEY};
 use crate::synced::{rename_synced, write_synced, write_synced_for_owner};
 
-/// The state of the files of a pair.
+/// The existing files of a pair.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum PairFiles {
-    /// Both are there.
+    /// Certificate and key exist.
     Both,
-    /// The key alone.
+    /// Only the key exists.
     Key,
-    /// The certificate alone.
+    /// Only the certificate exists.
     Certificate,
-    /// Neither is there.
+    /// Neither exists.
     Neither,
 }
 
-/// Puts a certificate, and a key in the DER of PKCS #8 if there is a new one, in the place of the pair below `root`.
+/// Replaces the certificate below `root`, and the private key (DER of PKCS #8) if a new key is
+/// given.
 ///
 /// # Errors
-/// A file that cannot be written. The pair that was there is left as it was then.
+///
+/// Returns an error if a file cannot be written. The previous pair is then unchanged.
 pub(crate) fn write(root: &Path, certificate: &[u8], key: Option<&[u8]>) -> io::Result<()> {
     let (path, key_path) = (root.join(OWN_CERTIFICATE), root.join(OWN_KEY));
     let beside = path.with_extension(BESIDE);
@@ -42,7 +45,7 @@ pub(crate) fn write(root: &Path, certificate: &[u8], key: Option<&[u8]>) -> io::
     });
     if let Err(error) = written {
         for path in [&beside, &key_beside] {
-            // What is left of them is removed at the next start.
+            // The next start removes remaining files.
             drop(fs::remove_file(path));
         }
         return Err(error);
@@ -53,10 +56,11 @@ pub(crate) fn write(root: &Path, certificate: &[u8], key: Option<&[u8]>) -> io::
     rename_synced(&beside, &path)
 }
 
-/// Completes or removes what an interrupted [`write`] has left, and gives the key to its owner alone.
+/// Completes or removes the result of an interrupted [`write`], and restricts the key to its owner.
 ///
 /// # Errors
-/// A file that cannot be read, renamed or removed.
+///
+/// Returns an error if a file cannot be read, renamed or removed.
 pub(crate) fn settle(root: &Path) -> io::Result<PairFiles> {
     let (path, key_path) = (root.join(OWN_CERTIFICATE), root.join(OWN_KEY));
     let beside = path.with_extension(BESIDE);
@@ -67,7 +71,7 @@ pub(crate) fn settle(root: &Path) -> io::Result<PairFiles> {
         && waiting.is_of_private_key(&key)
     {
         let current = content(&path)?.and_then(|bytes| Certificate::read(&bytes).ok());
-        // The key was renamed already, and its certificate was not.
+        // The key was renamed, but its certificate was not.
         if !current.is_some_and(|current| current.is_of_private_key(&key)) {
             rename_synced(&beside, &path)?;
         }
@@ -90,13 +94,13 @@ pub(crate) fn settle(root: &Path) -> io::Result<PairFiles> {
     })
 }
 
-/// Reads the DER of PKCS #8 of a key in PEM.
+/// Decodes a PEM key into the DER of PKCS #8.
 pub(crate) fn from_pem(bytes: &[u8]) -> Option<Vec<u8>> {
     let key = opcua::crypto::PrivateKey::from_pem(bytes).ok()?;
     Some(key.to_der().ok()?.as_bytes().to_vec())
 }
 
-/// Reads a file. One that is not there, or that a full disk has left empty, has no content.
+/// Reads a file. Returns `None` for a missing file and for an empty file, which a full disk leaves.
 fn content(path: &Path) -> io::Result<Option<Vec<u8>>> {
     match fs::read(path) {
         Ok(bytes) => Ok(Some(bytes).filter(|bytes| !bytes.is_empty())),
@@ -105,7 +109,7 @@ fn content(path: &Path) -> io::Result<Option<Vec<u8>>> {
     }
 }
 
-/// Takes a key away from other users. Of a key that belongs to another user nothing is changed.
+/// Removes the access of other users to a key. A key that belongs to another user is not changed.
 #[cfg(unix)]
 fn for_owner_alone(path: &Path) -> io::Result<()> {
     use std::os::unix::fs::PermissionsExt as _;
@@ -129,5 +133,5 @@ fn for_owner_alone(_path: &Path) -> io::Result<()> {
     Ok(())
 }
 
-/// The extension of files that are being written.
+/// The extension of files during writing.
 const BESIDE: &str = "new";

@@ -1,6 +1,8 @@
-//! Whether the OPC UA libraries are built with the patches of this project, and where a server may listen without them.
+//! Detects whether the OPC UA libraries are built with the patches of this project, and restricts
+//! the listening addresses of a server without patches.
 //!
-//! The libraries as published do not bound the memory, sessions and connections that a client without credentials takes.
+//! The unpatched libraries do not limit the memory, sessions and connections of a client without
+//! credentials.
 
 use std::net::SocketAddr;
 use std::sync::{LazyLock, Once};
@@ -8,10 +10,11 @@ use std::sync::{LazyLock, Once};
 use opcua::server::Limits;
 use tracing::warn;
 
-/// The environment variable that lets a server with the libraries as published serve other hosts, if its value is `1`.
+/// The environment variable that permits a server with unpatched libraries to serve other hosts, if
+/// its value is `1`.
 pub const SERVE_AS_PUBLISHED: &str = "UA_SERVE_AS_PUBLISHED";
 
-/// An address that the libraries as published do not serve.
+/// An address that unpatched libraries do not serve.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error(
     "{library} does not bound what clients take, and serves loopback only, not {0}: build with `cargo xtask build`, which \
@@ -20,7 +23,8 @@ pub const SERVE_AS_PUBLISHED: &str = "UA_SERVE_AS_PUBLISHED";
 )]
 pub struct OtherHosts(pub SocketAddr);
 
-/// Returns whether the libraries are built with the patches. The limits of a server have fields that only a patch adds.
+/// Returns whether the libraries are built with the patches. The limits of a server have fields
+/// that only a patch adds.
 #[must_use]
 pub fn are_applied() -> bool {
     static APPLIED: LazyLock<bool> = LazyLock::new(|| {
@@ -39,7 +43,7 @@ pub fn library() -> &'static str {
     }
 }
 
-/// Returns the version of a program of this workspace, with that of the libraries.
+/// Returns the version of a program of this workspace, with the version of the libraries.
 #[must_use]
 pub fn version() -> &'static str {
     static VERSION: LazyLock<String> =
@@ -47,10 +51,11 @@ pub fn version() -> &'static str {
     &VERSION
 }
 
-/// Checks the addresses that a server is to listen on. Logs one warning if the libraries are as published.
+/// Checks the listening addresses of a server. Logs one warning if the libraries are unpatched.
 ///
 /// # Errors
-/// Returns an error for an address that other hosts reach, if the libraries are as published and
+///
+/// Returns an error for an address that other hosts reach, if the libraries are unpatched and
 /// [`SERVE_AS_PUBLISHED`] is not set.
 pub fn check(addresses: &[SocketAddr]) -> Result<(), OtherHosts> {
     if are_applied() {
@@ -68,7 +73,8 @@ pub fn check(addresses: &[SocketAddr]) -> Result<(), OtherHosts> {
     served(addresses, is_allowed)
 }
 
-/// The addresses that the libraries as published serve.
+/// Checks that unpatched libraries serve only loopback addresses, unless other addresses are
+/// allowed.
 fn served(addresses: &[SocketAddr], is_allowed: bool) -> Result<(), OtherHosts> {
     let other = |address: &&SocketAddr| !address.ip().to_canonical().is_loopback();
     match addresses.iter().find(other) {

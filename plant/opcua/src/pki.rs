@@ -1,4 +1,4 @@
-//! The application's own certificate, and the certificates of clients that were refused.
+//! The application's own certificate, and the rejected certificates of clients.
 
 use std::collections::BTreeSet;
 use std::fs::{self, File};
@@ -13,45 +13,47 @@ use crate::known;
 use crate::own::{self, Cause, Owner};
 use crate::pair::{self, PairFiles};
 
-/// The directories of an OPC UA certificate store: `own`, `private`, `trusted` and `rejected` under one root.
+/// An OPC UA certificate store with the directories `own`, `private`, `trusted` and `rejected`
+/// below a root.
 #[derive(Debug)]
 pub struct Pki {
     root: PathBuf,
     reported: BTreeSet<PathBuf>,
 }
 
-/// Why the certificate store cannot be used.
+/// An error of the certificate store.
 #[derive(Debug, thiserror::Error)]
 pub enum PkiError {
-    /// A directory cannot be made or read.
+    /// A directory cannot be created or read.
     #[error(
         "the certificate store {path} cannot be used: {source}; choose another directory for it"
     )]
     Directory {
         /// The directory.
         path: PathBuf,
-        /// What the system says.
+        /// The error of the operating system.
         #[source]
         source: io::Error,
     },
-    /// Half of the pair is there: a new one would silently replace what clients trust.
+    /// Only the certificate or only the key exists. A new pair would silently replace a certificate
+    /// that clients trust.
     #[error("{present} is there but {missing} is not: put it back, or remove both for a new pair")]
     Half {
-        /// What is there.
+        /// The existing file.
         present: PathBuf,
-        /// What is not.
+        /// The missing file.
         missing: PathBuf,
     },
-    /// The files are there and cannot be read as a certificate and its key.
+    /// The files exist, but are not a valid certificate and key.
     #[error("{0}; put back the certificate and its key, or remove both for a new pair")]
     Unreadable(String),
-    /// A new pair cannot be made or written.
+    /// A new pair cannot be created or written.
     #[error("no certificate could be made: {0}")]
     Make(String),
-    /// There is no certificate that could be made anew.
+    /// The store has no certificate to renew.
     #[error("there is no certificate in {0}: the program of the store makes it when it starts")]
     None(PathBuf),
-    /// The certificate is one of an authority.
+    /// An authority issued the certificate.
     #[error(
         "the certificate was issued by {0:?}, which other applications trust: have it renewed there (--gds), or give --self-made \
          to replace it by a self-made one"
@@ -60,10 +62,11 @@ pub enum PkiError {
 }
 
 impl Pki {
-    /// Uses the store under `root`, making what is missing of its directories.
+    /// Opens the store under `root`, and creates missing directories.
     ///
     /// # Errors
-    /// A directory cannot be made or read.
+    ///
+    /// Returns an error if a directory cannot be created or read.
     pub fn open(root: PathBuf) -> Result<Self, PkiError> {
         for name in ["own", "private", "trusted", "rejected"] {
             let path = root.join(name);
@@ -88,37 +91,45 @@ impl Pki {
         Ok(pki)
     }
 
-    /// The directory.
+    /// Returns the root of the store.
     #[must_use]
     pub fn root(&self) -> &Path {
         &self.root
     }
 
-    /// Makes the application instance certificate and its key when neither is there, naming the application and
-    /// the hosts it is reached under (OPC 10000-6, 6.2.2), and makes a self-made certificate anew that has expired. Warns if
-    /// the certificate does not fit otherwise. Of several servers that start at once in one store the first makes the pair,
-    /// and the others take it. For a client, which may share the store of a server.
+    /// Makes sure that a client has an application instance certificate and its key (OPC 10000-6,
+    /// 6.2.2).
+    ///
+    /// Creates a missing pair for the application and its host. Replaces a self-made certificate
+    /// that has expired. Logs a warning if an existing certificate does not fit otherwise. If
+    /// several programs start with the same store, the first program creates the pair and the other
+    /// programs use it. The store may belong to a server.
     ///
     /// # Errors
-    /// Files that cannot be read or written, or half a pair.
+    ///
+    /// Returns an error if files cannot be read or written, or if only half of a pair exists.
     pub fn ensure_own(&self, application_uri: &str, host: &str) -> Result<(), PkiError> {
         let hosts = [host.to_owned()];
         self.ensure((application_uri, Owner::Client), &hosts, NAME)
     }
 
-    /// The same for a server that is reached under several hosts. A self-made certificate of another ApplicationUri is made
-    /// anew too.
+    /// Makes sure that a server with several hosts has a certificate, like
+    /// [`ensure_own`](Self::ensure_own). Also replaces a self-made certificate of another
+    /// ApplicationUri.
     ///
     /// # Errors
-    /// Files that cannot be read or written, or half a pair.
+    ///
+    /// Returns an error if files cannot be read or written, or if only half of a pair exists.
     pub fn ensure_own_at(&self, application_uri: &str, hosts: &[String]) -> Result<(), PkiError> {
         self.ensure_own_named(application_uri, hosts, NAME)
     }
 
-    /// The same, for a server of that name.
+    /// Makes sure that a server with a name has a certificate, like
+    /// [`ensure_own_at`](Self::ensure_own_at).
     ///
     /// # Errors
-    /// Files that cannot be read or written, or half a pair.
+    ///
+    /// Returns an error if files cannot be read or written, or if only half of a pair exists.
     pub fn ensure_own_named(
         &self,
         application_uri: &str,
@@ -157,11 +168,13 @@ impl Pki {
         }
     }
 
-    /// Makes the self-made certificate anew by command, for the same key, ApplicationUri and hosts. With `even_issued` a
-    /// certificate of an authority is replaced too.
+    /// Replaces the self-made certificate by command, with the same key, ApplicationUri and hosts.
+    /// With `even_issued` a certificate of an authority is replaced too.
     ///
     /// # Errors
-    /// There is none, it is one of an authority, or files cannot be read or written.
+    ///
+    /// Returns an error if the store has no certificate, if an authority issued the certificate, or
+    /// if files cannot be read or written.
     pub fn renew(&self, even_issued: bool) -> Result<(), PkiError> {
         let _alone = self.lock()?;
         let Some(known) = own::read(&self.root) else {
@@ -178,13 +191,13 @@ impl Pki {
         };
         let computer = opcua::crypto::hostname().unwrap_or_default();
         let mut hosts = known.hosts();
-        // A certificate for the computer itself has these names anyway.
+        // A certificate contains the names of the computer itself anyway.
         hosts.retain(|host| *host != computer && host != "localhost");
         let data = own::described(&uri, &hosts, name, known::now());
         self.make_anew(&data, &Cause::Command)
     }
 
-    /// Makes a new certificate for the key that is there.
+    /// Makes a new certificate for the existing key.
     fn make_anew(&self, data: &X509Data, cause: &Cause) -> Result<(), PkiError> {
         let key = CertificateStore::read_pkey(&self.root.join(OWN_KEY));
         let key = key.map_err(PkiError::Unreadable)?;
@@ -193,9 +206,10 @@ impl Pki {
         Ok(())
     }
 
-    /// Makes a new pair in place of a self-made certificate without key.
+    /// Makes a new pair to replace a self-made certificate without key.
     ///
-    /// Earlier versions wrote the certificate first, so an interrupted start left no key.
+    /// An interrupted start can leave a certificate without its key if the certificate is written
+    /// first.
     fn replace_without_key(
         &self,
         data: &X509Data,
@@ -217,7 +231,7 @@ impl Pki {
         self.make_own(data, None, &Cause::KeyMissing)
     }
 
-    /// Makes the certificate of a key whose certificate is missing.
+    /// Makes a certificate for a key without certificate.
     fn certify_key(
         &self,
         data: &X509Data,
@@ -233,7 +247,7 @@ impl Pki {
         self.make_own(data, Some(known), &Cause::CertificateMissing)
     }
 
-    /// Makes the pair, or a certificate for a key that is there.
+    /// Makes a new pair, or a certificate for an existing key.
     fn make_own(
         &self,
         data: &X509Data,
@@ -257,21 +271,23 @@ impl Pki {
         Ok(())
     }
 
-    /// Waits until no other server is making its certificate here, and keeps others from it until the file is dropped.
+    /// Waits for the exclusive lock of the store. Dropping the file releases the lock.
     fn lock(&self) -> Result<File, PkiError> {
         let path = self.root.join(LOCK);
         let locked = File::create(&path).and_then(|file| match file.lock() {
-            // Some network file systems have no locks; two servers that start at once there are left to chance.
+            // Some network file systems do not support locks; servers that start at the same time
+            // are then not synchronized.
             Err(error) if error.kind() != io::ErrorKind::Unsupported => Err(error),
             Ok(()) | Err(_) => Ok(file),
         });
         locked.map_err(|source| PkiError::Directory { path, source })
     }
 
-    /// Says how to trust each client certificate refused since the last call, and keeps the newest
-    /// `REJECTED_KEPT` of them: anyone who reaches the port can have one stored.
+    /// Logs how to trust each client certificate that was rejected since the last call. Keeps the
+    /// newest `REJECTED_KEPT` certificates, because anyone who reaches the port can add
+    /// certificates.
     pub fn report_rejected(&mut self) {
-        // Clients' certificates are refused all the same when the directory is gone: the server says so itself.
+        // If the directory is missing, the server still refuses the certificates and logs it.
         let rejected = self.rejected().unwrap_or_default();
         let oldest = rejected.len().saturating_sub(REJECTED_KEPT);
         for (at, path) in rejected.iter().enumerate() {
@@ -284,7 +300,8 @@ impl Pki {
         self.reported = rejected.into_iter().collect();
     }
 
-    /// Names who was refused, and what to type to let it in: by the thumbprint, since all else the client chose.
+    /// Logs a rejected client and the command that trusts it, by thumbprint: the client chose all
+    /// other data freely.
     fn tell_refused(&self, path: &Path) {
         let trusted = self.root.join("trusted");
         let Some(stored) = certificates::stored(path, Standing::Rejected) else {
@@ -301,7 +318,7 @@ impl Pki {
         );
     }
 
-    /// The refused certificates, oldest first.
+    /// Returns the rejected certificates, oldest first.
     fn rejected(&self) -> io::Result<Vec<PathBuf>> {
         let mut found = Vec::new();
         for entry in fs::read_dir(self.root.join("rejected"))? {
@@ -313,7 +330,8 @@ impl Pki {
     }
 }
 
-/// Where the store is when nobody says so: systemd's state directory, the user's, or the system's.
+/// Returns the default root of the store: the state directory of systemd, of the user, or of the
+/// system.
 #[must_use]
 pub fn default_root(variable: impl Fn(&str) -> Option<String>) -> PathBuf {
     let given = |name| {
@@ -330,16 +348,18 @@ pub fn default_root(variable: impl Fn(&str) -> Option<String>) -> PathBuf {
     state.join("ua-bridge/pki")
 }
 
-/// Returns the store of that name beside the usual one, for a program that shares its host with others.
+/// Returns the store with this name beside the default store, for a program that shares its host
+/// with other programs.
 #[must_use]
 pub fn default_named(name: &str) -> PathBuf {
     default_root(|variable| std::env::var(variable).ok()).with_file_name(name)
 }
 
-/// Lets certificates in `trusted` of the store at `root` be trusted that people put there, whatever they called the file: the
-/// library looks them up by a name of its own, and holds those in `rejected` for refused even so.
+/// Makes all certificates in `trusted` of the store at `root` effective, whatever their file names:
+/// the library expects a file name of its own. Also removes them from `rejected`, because the
+/// library refuses a certificate that is both trusted and rejected.
 pub fn know_trusted(root: &Path) {
-    // Without the directory there is nothing to know.
+    // Without the directory, no certificate is trusted.
     let Ok(entries) = fs::read_dir(root.join("trusted")) else {
         return;
     };
@@ -401,15 +421,15 @@ fn owner_only(_path: &Path) -> io::Result<()> {
     Ok(())
 }
 
-/// The application's own certificate, below the root.
+/// The path of the application's own certificate below the root.
 pub const OWN_CERTIFICATE: &str = certificates::OWN;
-/// Its private key, below the root.
+/// The path of its private key below the root.
 pub const OWN_KEY: &str = "private/private.pem";
-/// The folder of certificates of a peer without certificates: no folder can be made there.
+/// The certificate folder of a peer without certificates: this folder cannot be created.
 pub(crate) const NO_PKI: &str = "/dev/null/pki";
-/// Held while the pair is looked for and made.
+/// The lock file for creating the pair.
 const LOCK: &str = "private/lock";
-/// The common name of an application without a name of its own.
+/// The common name of an application without its own name.
 const NAME: &str = "UA bridge";
 
 #[cfg(test)]

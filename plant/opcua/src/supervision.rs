@@ -1,4 +1,5 @@
-//! Who may configure a program: the supervisor that it registered with, and users with the role ConfigureAdmin.
+//! The right to configure a program: held by the supervisor that it registered with, and by users
+//! with the role ConfigureAdmin.
 
 use std::sync::Arc;
 
@@ -8,7 +9,7 @@ use opcua::types::{Argument, DataTypeId, LocalizedText, StatusCode};
 use crate::server::Caller;
 use crate::users::{Role, Roles};
 
-/// The BrowseName of the method by which a supervisor configures a program, in any namespace.
+/// The BrowseName of the method with which a supervisor configures a program, in any namespace.
 pub const CONFIGURE: &str = "Configure";
 
 /// The arguments of [`CONFIGURE`], in this order, all Strings.
@@ -37,20 +38,22 @@ pub fn configure_takes() -> Vec<Argument> {
     CONFIGURED.map(argument).to_vec()
 }
 
-/// The discovery server that a program registered with, which supervises its level.
+/// The discovery server that a program registered with. It supervises the level of the program.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Registrar {
     /// The ApplicationUri.
     pub application_uri: String,
-    /// Whether a trusted certificate has that ApplicationUri: the program registered over a secured channel.
+    /// Whether a trusted certificate contains the ApplicationUri: the program registered over a
+    /// secured channel.
     pub proven: bool,
 }
 
-/// The supervisor of a program. Clones share it: the registration sets it, the method `Configure` asks for it.
+/// The supervisor of a program. Clones share it: the registration sets it, and the method
+/// `Configure` checks it.
 #[derive(Debug, Clone, Default)]
 pub struct Supervision(Arc<RwLock<Option<Registrar>>>);
 
-/// Two are equal where they are the same.
+/// Compares by identity.
 impl PartialEq for Supervision {
     fn eq(&self, other: &Self) -> bool {
         Arc::ptr_eq(&self.0, &other.0)
@@ -60,7 +63,7 @@ impl PartialEq for Supervision {
 impl Eq for Supervision {}
 
 impl Supervision {
-    /// The program is registered with this discovery server.
+    /// Sets the discovery server that the program is registered with.
     pub fn registered_with(&self, registrar: Registrar) {
         *self.0.write() = Some(registrar);
     }
@@ -68,14 +71,16 @@ impl Supervision {
     /// Checks that a caller with these roles may configure the program.
     ///
     /// # Errors
-    /// BadUserAccessDenied for all but the supervisor and users with the role ConfigureAdmin.
+    ///
+    /// BadUserAccessDenied unless the caller is the supervisor or has the role ConfigureAdmin.
     pub fn admits(&self, caller: &Caller, roles: Roles) -> Result<(), StatusCode> {
         if roles.contains(Role::ConfigureAdmin) {
             return Ok(());
         }
         let supervisor = self.0.read();
         let is_supervisor = supervisor.as_ref().is_some_and(|supervisor| {
-            // Channels without security prove no identity, neither here nor at the registration.
+            // Channels without security prove no identity, neither for the caller nor at the
+            // registration.
             let may_claim = !supervisor.proven && !caller.encrypted;
             caller.application_uri == supervisor.application_uri && (caller.proven || may_claim)
         });

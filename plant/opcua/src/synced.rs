@@ -1,13 +1,16 @@
-//! Files that are written so that a program that is killed, or a disk that is full, leaves the old or the new content.
+//! Crash-safe replacement of files: after a killed process or a full disk, a file has its old or
+//! its new content.
 
 use std::fs::{self, File};
 use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 
-/// Replaces the content of a file that its owner alone reads. A reader sees the old or the new content.
+/// Replaces the content of a file that only its owner may read. A reader sees the old or the new
+/// content.
 ///
 /// # Errors
-/// A file that cannot be written. The old content is left as it was then.
+///
+/// Returns an error if the file cannot be written. The old content is then unchanged.
 pub fn replace(path: &Path, content: &[u8]) -> io::Result<()> {
     let mut beside = path.as_os_str().to_owned();
     beside.push(".new");
@@ -22,7 +25,7 @@ pub(crate) fn write_synced(path: &Path, content: &[u8]) -> io::Result<()> {
     file.sync_all()
 }
 
-/// Writes a file that its owner alone reads, from the first byte on.
+/// Writes a file that only its owner may read, from its creation on.
 pub(crate) fn write_synced_for_owner(path: &Path, content: &[u8]) -> io::Result<()> {
     match fs::remove_file(path) {
         Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
@@ -33,11 +36,11 @@ pub(crate) fn write_synced_for_owner(path: &Path, content: &[u8]) -> io::Result<
     file.sync_all()
 }
 
-/// Renames a file, and has the folder know it after a loss of power.
+/// Renames a file, and syncs the folder so that the rename survives a power failure.
 pub(crate) fn rename_synced(from: &Path, to: &Path) -> io::Result<()> {
     fs::rename(from, to)?;
     match to.parent() {
-        // Some file systems cannot sync a folder; the file itself is written.
+        // Some file systems cannot sync a folder. The file itself is already synced.
         Some(folder) => {
             drop(File::open(folder).and_then(|folder| folder.sync_all()));
             Ok(())

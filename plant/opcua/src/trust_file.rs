@@ -1,7 +1,8 @@
-//! A trust list as a file that clients open, read and write (OPC 10000-12, 7.8.2; OPC 10000-20, 4.2).
+//! A trust list as a file that clients open, read and write (OPC 10000-12, 7.8.2; OPC 10000-20,
+//! 4.2).
 //!
-//! Its content is a TrustListDataType in the binary encoding, as it is when the file is opened; what is written counts when it is
-//! closed by CloseAndUpdate.
+//! The content is a TrustListDataType in the binary encoding, as it is when the file is opened.
+//! Written content takes effect with CloseAndUpdate.
 
 use std::io::Cursor;
 
@@ -14,33 +15,34 @@ use opcua::types::{
 use crate::file::{Answer, FileMethod, Handles, READ, WRITE_ANEW};
 use crate::server::MethodRequest;
 
-/// Which lists are meant, as bits (TrustListMasks of OPC 10000-12, 7.8.2.8).
+/// The parts of a trust list, as bits (TrustListMasks of OPC 10000-12, 7.8.2.8).
 pub mod masks {
-    /// Certificates that are trusted.
+    /// Trusted certificates.
     pub const TRUSTED_CERTIFICATES: u32 = 1;
-    /// Revocation lists of those.
+    /// Revocation lists of trusted authorities.
     pub const TRUSTED_CRLS: u32 = 2;
-    /// Certificates of authorities that are not trusted themselves.
+    /// Issuer certificates, which are not trusted themselves.
     pub const ISSUER_CERTIFICATES: u32 = 4;
-    /// Revocation lists of those.
+    /// Revocation lists of issuers.
     pub const ISSUER_CRLS: u32 = 8;
-    /// All of them.
+    /// All parts.
     pub const ALL: u32 = 15;
 }
 
-/// What is behind the file.
+/// The trust list behind a file.
 pub trait TrustList: Send + Sync + 'static {
-    /// The lists of these [`masks`].
+    /// Returns the parts selected by [`masks`].
     fn list(&self, masks: u32) -> TrustListDataType;
 
-    /// Puts the lists that are given in the place of those there. Says whether that counts only after ApplyChanges.
+    /// Replaces the given parts. Returns whether the change requires ApplyChanges.
     ///
     /// # Errors
-    /// The lists cannot be written, or are none.
+    ///
+    /// Returns an error if the list is invalid or cannot be written.
     fn replace(&self, list: TrustListDataType) -> Result<bool, StatusCode>;
 }
 
-/// The file, with those that have it open.
+/// A trust list file and its open handles.
 pub struct TrustFile {
     list: Box<dyn TrustList>,
     is_writable: bool,
@@ -54,7 +56,7 @@ impl std::fmt::Debug for TrustFile {
 }
 
 impl TrustFile {
-    /// The file of a list, which clients may write or not.
+    /// Creates the file of a trust list. `is_writable` states whether clients may write it.
     pub fn new(list: impl TrustList, is_writable: bool) -> Self {
         Self {
             list: Box::new(list),
@@ -63,21 +65,22 @@ impl TrustFile {
         }
     }
 
-    /// How many have it open.
+    /// Returns the number of open handles.
     #[must_use]
     pub fn open_count(&self) -> usize {
         self.open.lock().len()
     }
 
-    /// A session is gone, and what it had open is closed.
+    /// Closes the handles of an ended session.
     pub fn close_session(&self, session: u32) {
         self.open.lock().close_session(session);
     }
 
-    /// Carries out a method. Who may is looked at before.
+    /// Executes a method. The caller of this function has checked the permissions.
     ///
     /// # Errors
-    /// Why it is refused.
+    ///
+    /// Returns the refusal of the method.
     pub fn call(&self, method: FileMethod, request: &MethodRequest) -> Answer {
         match (method, request.arguments.as_slice()) {
             (FileMethod::Open, [Variant::Byte(mode)]) => self.open(request, *mode),
@@ -106,7 +109,8 @@ impl TrustFile {
             READ => self.open_with(request, masks::ALL),
             WRITE_ANEW if self.is_writable => self.open.lock().add(request, Vec::new(), true),
             WRITE_ANEW => Err(StatusCode::BadNotWritable.into()),
-            // A list is read, or put in the place of another: nothing between (OPC 10000-12, 7.8.2.2).
+            // A list is read or replaced as a whole; other modes are invalid (OPC 10000-12,
+            // 7.8.2.2).
             _ => Err(StatusCode::BadInvalidArgument.into()),
         }
     }

@@ -1,4 +1,5 @@
-//! Clients whose servers die, come back, want certificates, or are pestered by others.
+//! Tests of clients whose servers stop, restart, require certificates, or receive garbage from
+//! other peers.
 
 #![expect(
     clippy::unwrap_used,
@@ -118,7 +119,7 @@ async fn a_server_that_is_started_again_is_found_with_all_subscriptions() {
 #[tokio::test]
 async fn a_server_that_says_nothing_more_is_taken_for_down() {
     let cell = Cell::new();
-    // Between the two is a line that falls silent, as when a cable is pulled.
+    // A proxy between client and server stops forwarding, as if a cable were pulled.
     let line = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let url = format!("opc.tcp://{}", line.local_addr().unwrap());
     let (cut, is_cut) = tokio::sync::watch::channel(false);
@@ -169,7 +170,7 @@ async fn a_queue_that_is_full_loses_notices_and_counts_them() {
         cell.server.show(&force, n).unwrap();
         assert_eq!(next_value(&mut roomy).await, (0, Some(Variant::Double(n))));
     }
-    // What was there first is still there.
+    // The first notices are still in the queue.
     assert_eq!(next(&mut full).await, Notice::Subscribed);
     assert_eq!(roomy.dropped(), 0);
 }
@@ -206,7 +207,7 @@ async fn a_client_with_certificates_has_the_best_security_there_is() {
     config.accept_untrusted = true;
     let client = Client::open(config, cell.server.url());
     until(&client, is_refused).await;
-    // The server does not know the client either, until somebody trusts it.
+    // The server does not trust the client's certificate until an operator trusts it.
     for rejected in std::fs::read_dir(server_pki.join("rejected")).unwrap() {
         let path = rejected.unwrap().path();
         std::fs::rename(
@@ -235,7 +236,7 @@ async fn a_client_with_certificates_has_the_best_security_there_is() {
     }
 }
 
-/// What a peer sends that is no client.
+/// Returns invalid messages of a peer.
 fn garbage(url: &str) -> Vec<Vec<u8>> {
     let message = |kind: &[u8], size: u32, rest: &[u8]| {
         let mut bytes = kind.to_vec();
@@ -260,7 +261,7 @@ fn garbage(url: &str) -> Vec<Vec<u8>> {
         message(b"HELF", u32::MAX, &[0; 32]),
         hello_of(size - 5),
         hello_of(size + 1_000_000),
-        // A URL longer than the message.
+        // A URL length beyond the end of the message.
         message(
             b"HELF",
             32,
@@ -295,9 +296,9 @@ async fn a_peer_that_sends_garbage_disturbs_nobody() {
     let garbage = garbage(cell.server.url());
     for (n, bytes) in garbage.iter().enumerate() {
         let mut peer = TcpStream::connect(&authority).await.unwrap();
-        // It may close before it has read everything.
+        // The server may close the connection before it has read everything.
         drop(peer.write_all(bytes).await);
-        // A reader sees every value meanwhile.
+        // Meanwhile a client receives every value.
         let shown = f64::from(u32::try_from(n).unwrap());
         cell.server.show(&force, shown).unwrap();
         assert_eq!(
@@ -330,7 +331,8 @@ async fn still_serves(server: &Server) {
     assert!(!below.is_empty());
 }
 
-/// A server of the library that takes few operations in a request and few items in a subscription.
+/// Creates a server of the library that accepts few operations in a request and few items in a
+/// subscription.
 async fn small_server() -> (String, opcua::server::ServerHandle) {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let port = listener.local_addr().unwrap().port();
@@ -361,7 +363,7 @@ async fn a_server_with_small_limits_is_asked_in_parts() {
         "{values:?}"
     );
 
-    // The server refuses each value by itself, because the variable is not writable.
+    // The server refuses each value individually, because the variable is not writable.
     let written = client
         .write_each(&vec![(state.clone(), Variant::Int32(0)); 15])
         .await;

@@ -1,4 +1,4 @@
-//! Servers made of NodeSets, asked by clients over loopback.
+//! Tests of servers with NodeSets, with clients over loopback.
 
 #![expect(clippy::unwrap_used, clippy::panic, reason = "test code")]
 
@@ -24,23 +24,23 @@ async fn an_instance_has_what_its_types_make_mandatory() {
     let press = press(&cell.server, 100, &["Remark", "ProgramDiagnostic"]);
     let paths: Vec<&str> = press.nodes().map(|(path, _)| path).collect();
     for path in [
-        // Of the core namespace, two types above.
+        // Children of the core namespace, two supertypes above.
         "CurrentState",
         "CurrentState/Id",
         "CurrentState/Number",
         "LastTransition/TransitionTime",
         "Deletable",
-        // Optional there, and asked for.
+        // Optional children of the supertype that the test selects.
         "ProgramDiagnostic/LastMethodCall",
         "Remark",
-        // Placeholders there, made mandatory by a subtype.
+        // Placeholders of the supertype that a subtype makes mandatory.
         "Start",
         "Halt",
         "Turn/InputArguments",
-        // One object that two types add to.
+        // An object with children of two types.
         "ParameterSet/Force",
         "ParameterSet/Depth",
-        // Of an interface.
+        // A child of an interface.
         "SerialNumber",
     ] {
         assert!(paths.contains(&path), "{path} is missing in {paths:?}");
@@ -49,7 +49,7 @@ async fn an_instance_has_what_its_types_make_mandatory() {
         assert!(!paths.contains(&path), "nobody asked for {path}");
     }
 
-    // And clients see the same.
+    // Clients see the same nodes.
     let client = cell.client().await;
     let machines = client.namespace(MACHINES).unwrap();
     let force = [
@@ -80,7 +80,7 @@ async fn an_instance_has_what_its_types_make_mandatory() {
         NodeId::new(0, 2760),
         "FiniteStateVariableType"
     );
-    // Nothing has been shown yet, which is no value either.
+    // Before the first value, the variable has a Bad status.
     let read = client.read(std::slice::from_ref(state)).await.unwrap();
     assert_eq!(
         read[0].status,
@@ -132,7 +132,7 @@ async fn types_and_nodes_that_cannot_be_are_refused_and_nothing_is_made() {
         ..spec(&press_type, NodeId::new(1, 1))
     };
     assert_eq!(make(&orphan), InstanceError::NoParent(NodeId::new(1, 77)));
-    // Two children with one NodeId.
+    // Two children with the same NodeId.
     let twice = server.instantiate(&spec(&press_type, NodeId::new(1, 1)), &mut |_| {
         NodeId::new(1, 2)
     });
@@ -202,18 +202,18 @@ async fn a_method_of_one_object_is_none_of_another() {
     cell.server.on_call(&press.node_id, start, invalid_state());
     let client = cell.client().await;
     let start_of_type: NodeId = MethodId::ProgramStateMachineType_Start.into();
-    // Another object of the type has its own handler, or none.
+    // Another object of the type has its own handler, or no handler.
     assert_eq!(
         status(client.call(&other.node_id, &start_of_type, vec![]).await),
         StatusCode::BadNotImplemented
     );
-    // The type has it, the object has not.
+    // The type has the method, but the object does not.
     let suspend: NodeId = MethodId::ProgramStateMachineType_Suspend.into();
     assert_eq!(
         status(client.call(&press.node_id, &suspend, vec![]).await),
         StatusCode::BadMethodInvalid
     );
-    // A method of one object does not become that of another.
+    // A method of an object cannot be called on another object.
     assert_eq!(
         status(client.call(&other.node_id, start, vec![]).await),
         StatusCode::BadMethodInvalid
@@ -223,7 +223,7 @@ async fn a_method_of_one_object_is_none_of_another() {
         status(client.call(&nobody, &start_of_type, vec![]).await),
         StatusCode::BadNodeIdUnknown
     );
-    // The methods of the server itself are still there.
+    // The methods of the Server object still work.
     let server: NodeId = ObjectId::Server.into();
     let items: NodeId = MethodId::Server_GetMonitoredItems.into();
     assert_eq!(
@@ -231,7 +231,7 @@ async fn a_method_of_one_object_is_none_of_another() {
         StatusCode::BadSessionIdInvalid,
         "it has no subscriptions"
     );
-    // What cannot be called now is shown, and the handler says why.
+    // Executable is false, and the handler returns the reason.
     cell.server.set_executable(start, false).unwrap();
     let shown = client
         .read_attributes(&[(start.clone(), AttributeId::Executable)])
@@ -289,7 +289,7 @@ async fn arguments_that_do_not_fit_never_reach_the_handler() {
             StatusCode::BadInvalidArgument,
             vec![StatusCode::BadTypeMismatch, StatusCode::Good],
         ),
-        // By the handler.
+        // Refused by the handler.
         (
             vec![Variant::Double(91.0), names()],
             StatusCode::BadInvalidArgument,
@@ -423,7 +423,7 @@ async fn an_event_comes_on_its_source_and_on_the_server_with_the_fields_of_each_
             ObjectTypeId::ProgramTransitionEventType,
             "IntermediateResult",
         ),
-        // Fields of a supertype are those of its subtypes too.
+        // Fields of a supertype can be selected by a subtype.
         Select::new(declared.clone(), "Transition/Id"),
         Select::new(ObjectTypeId::BaseEventType, "Transition/Name"),
         run,
@@ -444,7 +444,7 @@ async fn an_event_comes_on_its_source_and_on_the_server_with_the_fields_of_each_
     ];
     let mut subscription = client.subscribe(watches, Duration::from_millis(10), 16);
     assert_eq!(subscription.next().await, Some(Notice::Subscribed));
-    // The items are made after the subscription, and events before are nobody's.
+    // The monitored items are created after the subscription, so earlier events are lost.
     let raise = transition(&cell.server, &press.node_id);
     let mut seen = [false; 2];
     while seen != [true; 2] {
@@ -522,7 +522,7 @@ async fn sessions_that_called_are_told_when_they_are_closed() {
         .on_session_closed(move |session| tell.try_send(session).unwrap());
     let silent = cell.client().await;
     let caller = cell.client().await;
-    // A subscription outlives its session, and must not keep it.
+    // A subscription outlives its session, and must not keep the session alive.
     let watches = vec![Watch::Value(press.node("CurrentState").unwrap().clone())];
     let mut subscription = caller.subscribe(watches, Duration::from_millis(10), 4);
     assert_eq!(subscription.next().await, Some(Notice::Subscribed));
@@ -681,7 +681,7 @@ async fn a_node_that_is_removed_is_gone_for_everybody() {
         arguments: vec![],
     };
     assert_eq!(gone, wanted);
-    // And can be made anew.
+    // The object can be created again.
     let again = cell::press(&cell.server, 100, &[]);
     assert_eq!(again, press);
 }

@@ -1,4 +1,5 @@
-//! TCP connections without delay for small packets: a request must not wait for the acknowledgement of another.
+//! TCP connections with TCP_NODELAY: a request does not wait for the acknowledgement of another
+//! request.
 
 use std::io;
 use std::sync::Arc;
@@ -67,7 +68,7 @@ async fn connect(
     Ok(StreamConnection::new(reader, writer, url))
 }
 
-/// Has the kernel notice a host that is gone, also while nothing is sent.
+/// Enables TCP keep-alive, so that the kernel detects an unreachable host while nothing is sent.
 fn keep_alive(socket: &TcpStream) -> io::Result<()> {
     let socket = SockRef::from(socket);
     let keep_alive = TcpKeepalive::new()
@@ -79,9 +80,9 @@ fn keep_alive(socket: &TcpStream) -> io::Result<()> {
     Ok(())
 }
 
-/// After so long without data the kernel asks whether the host is there, and again.
+/// Idle time before the first TCP keep-alive probe, and interval between the probes.
 const KEEP_ALIVE: Duration = Duration::from_secs(1);
-/// How long data may stay unacknowledged; a server that is busy for long may have no room for more of it.
+/// Longest time that data may stay unacknowledged. A busy server may have a full receive window.
 #[cfg(target_os = "linux")]
 const UNACKNOWLEDGED: Duration = Duration::from_secs(5);
 

@@ -1,7 +1,8 @@
-//! A client that connects, watches over its connection, and comes back with all its subscriptions.
+//! An OPC UA client that supervises its connection and reconnects with all its subscriptions.
 //!
-//! Reading order: `supervisor` (the life of a connection), `reach` (whether the host of a busy server answers), `shown` (whom the server proves to be), `subscription`, `types` (type
-//! closures), `connector`.
+//! Reading order: `supervisor` (the life of a connection), `reach` (checks whether the host of a
+//! busy server answers), `shown` (the verified identity of the server), `subscription`, `types`
+//! (type closures), `connector`.
 
 mod connector;
 mod parts;
@@ -29,41 +30,45 @@ pub use crate::judge::HostNames;
 
 use self::supervisor::{Shared, failed};
 
-/// Who a client is, and what it bears.
+/// The identity, the security and the timing of a client.
 #[derive(Debug, Clone)]
 pub struct ClientConfig {
-    /// The ApplicationUri.
+    /// The ApplicationUri of the client.
     pub application_uri: String,
-    /// The name for people.
+    /// The application name.
     pub application_name: String,
-    /// The directory of certificates; without one nothing is secured.
+    /// The directory of the certificate store; `None` for a client without security.
     pub pki: Option<PathBuf>,
-    /// Trusts the certificate of any server that is sound otherwise. For tests and demonstrations only.
+    /// Trusts every server certificate that is otherwise valid. For tests and demonstrations only.
     pub accept_untrusted: bool,
-    /// The SHA-256 of a certificate that is trusted beside the certificates of the store.
+    /// The SHA-256 fingerprint of a certificate that is trusted in addition to the certificates of
+    /// the store.
     pub pinned: Option<Fingerprint>,
-    /// Accepts a server of a trusted authority without a current revocation list: the server that hands out that list.
+    /// Accepts a server of a trusted authority without a current revocation list. For connections
+    /// to the server that distributes the list.
     pub allow_outdated_lists: bool,
-    /// The rule for servers at hosts that their trusted certificates do not name.
+    /// The rule for a server whose trusted certificate does not name its host.
     pub host_names: HostNames,
-    /// What it wants of what servers offer.
+    /// The required security of the endpoint.
     pub security: SecurityChoice,
-    /// As whom it comes. A password is sent over a session without security only with [`SecurityChoice::None`].
+    /// The user identity; `None` for anonymous. A password is sent over an unencrypted session only
+    /// with [`SecurityChoice::None`].
     pub user: Option<ClientUser>,
-    /// How long each request may take.
+    /// The timeout of a request.
     pub timeout: Duration,
-    /// How often it asks the server whether it lives.
+    /// The interval of keep-alive requests.
     pub keep_alive: Duration,
-    /// How long it waits before it connects again: at first, and at most.
+    /// The delay before a new connection attempt: the first delay and the longest delay.
     pub backoff: (Duration, Duration),
-    /// How long the server may leave requests unanswered while its host is reachable. A server that serves one request at a
-    /// time answers nothing while it executes a method for another client. With zero the connection is dropped once
-    /// keep-alives are missed; while a call of this client goes on, only the transport decides either way.
+    /// Longest time without responses while the host of the server is reachable. A server that
+    /// handles one request at a time does not answer while it executes a method for another client.
+    /// With zero, the connection is dropped after missed keep-alives. During a call of this client,
+    /// only the transport decides.
     pub patience: Duration,
 }
 
 impl ClientConfig {
-    /// A client without certificates, with 2 s for each request.
+    /// Creates the configuration of a client without certificates, with 2 s for each request.
     #[must_use]
     pub fn new(application_uri: &str, application_name: &str) -> Self {
         Self {
@@ -84,12 +89,12 @@ impl ClientConfig {
     }
 }
 
-/// A user of a server.
+/// The user name and password for a server.
 #[derive(Clone)]
 pub struct ClientUser {
     /// The user name.
     pub name: String,
-    /// What proves it.
+    /// The password of the user.
     pub password: String,
 }
 
@@ -101,63 +106,65 @@ impl std::fmt::Debug for ClientUser {
     }
 }
 
-/// What a client wants of what servers offer.
+/// The security that a client requires of an endpoint.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum SecurityChoice {
-    /// The best that the server offers: signed and encrypted where the client has certificates.
+    /// The best security that the server offers: signed and encrypted if the client has
+    /// certificates.
     Best,
-    /// No security.
+    /// SecurityPolicy None.
     None,
-    /// Signed and encrypted.
+    /// SignAndEncrypt with Basic256Sha256.
     Basic256Sha256,
-    /// Signed and encrypted, with AES of 128 bits.
+    /// SignAndEncrypt with Aes128_Sha256_RsaOaep.
     Aes128Sha256RsaOaep,
-    /// Signed with RSA-PSS and encrypted.
+    /// SignAndEncrypt with Aes256_Sha256_RsaPss.
     Aes256Sha256RsaPss,
 }
 
-/// Whether there is a connection.
+/// The state of the connection.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Link {
-    /// For the first time.
+    /// The client connects for the first time.
     Connecting,
-    /// There is.
+    /// The client is connected.
     Up {
-        /// Whether the server was started again since the last time: what was known of it may be wrong.
+        /// Whether the server restarted after the previous connection. Cached data of the server
+        /// may be invalid then.
         restarted: bool,
-        /// How often there has been one.
+        /// The number of connections so far, including this connection.
         connects: u64,
-        /// Where.
+        /// The EndpointUrl.
         endpoint: String,
-        /// Whether it is signed and encrypted.
+        /// Whether the connection is signed and encrypted.
         secured: bool,
         /// The ApplicationUri of the server.
         application_uri: String,
     },
-    /// There is none, and it is tried again.
+    /// The client is disconnected, and tries to reconnect.
     Down {
-        /// Why.
+        /// The reason.
         reason: String,
-        /// The status, where the certificate of the server is refused.
+        /// The status code if the certificate of the server is refused.
         certificate: Option<StatusCode>,
     },
     /// The client is closed.
     Closed,
 }
 
-/// Why there is no answer.
+/// An error of a request.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum ClientError {
-    /// There is no connection.
+    /// The client is not connected.
     #[error("there is no connection: {0}")]
     NotConnected(String),
-    /// The server does not answer in time, or the connection is lost while it is waited for.
+    /// The server does not answer in time, or the connection is lost before the response.
     #[error("the server did not answer: {0}")]
     Lost(String),
-    /// The server refuses.
+    /// The server answers with a Bad status code.
     #[error("the server answers {0}")]
     Status(StatusCode),
-    /// The answer is not what was asked for.
+    /// The response does not fit the request.
     #[error("the server answers with {0}")]
     Answer(&'static str),
 }
@@ -171,11 +178,12 @@ impl From<PartFault> for ClientError {
     }
 }
 
-/// A client of one server. Clones are handles to the same one; it is closed when the last is dropped.
+/// A client of a server. Clones share the same connection, which is closed when the last clone is
+/// dropped.
 #[derive(Clone)]
 pub struct Client {
     shared: Arc<Shared>,
-    /// Closes it when the last clone is gone.
+    /// Closes the connection when the last clone is dropped.
     _open: Arc<Open>,
 }
 
@@ -188,20 +196,21 @@ impl Drop for Open {
 }
 
 impl Client {
-    /// Connects to the server at `url` from now on, in a task of its own.
+    /// Starts a task that connects to the server at `url`.
     #[must_use]
     pub fn open(config: ClientConfig, url: &str) -> Self {
         Self::start(Shared::new(config, url))
     }
 
-    /// Connects to the same server once more, in a session of its own. Both clients know that the server may be busy with a
-    /// call of the other.
+    /// Opens a second connection to the same server, with its own session. Both clients take into
+    /// account that the server may be busy with a call of the other client.
     #[must_use]
     pub fn another(&self) -> Self {
         Self::start(self.shared.another())
     }
 
-    /// Returns whether calls of this client, or of one made by [`another`](Self::another), wait for their results.
+    /// Returns whether calls wait for their results, on this client or on a client made by
+    /// [`another`](Self::another).
     #[must_use]
     pub fn is_calling(&self) -> bool {
         self.shared.calls.any()
@@ -216,22 +225,24 @@ impl Client {
         }
     }
 
-    /// Whether both are handles to one client, and so of one session.
+    /// Returns whether both handles share a connection, and therefore a session.
     #[must_use]
     pub fn is_same(&self, other: &Self) -> bool {
         Arc::ptr_eq(&self.shared, &other.shared)
     }
 
-    /// What holds now, and each change. Between two looks there may have been several: `connects` tells.
+    /// Returns a receiver of the connection state. A receiver may miss intermediate states;
+    /// `connects` counts the connections.
     #[must_use]
     pub fn link(&self) -> watch::Receiver<Link> {
         self.shared.link.subscribe()
     }
 
-    /// Waits until there is a connection.
+    /// Waits until the client is connected.
     ///
     /// # Errors
-    /// Why there was none in time.
+    ///
+    /// Returns the reason if the client is not connected in time.
     pub async fn up(&self, within: Duration) -> Result<(), ClientError> {
         let mut link = self.link();
         let up = link.wait_for(|link| matches!(link, Link::Up { .. } | Link::Closed));
@@ -243,7 +254,8 @@ impl Client {
         }
     }
 
-    /// Closes the session and waits until it is, at most as long as a request may take.
+    /// Closes the session, and waits for the end of the session for at most twice the request
+    /// timeout.
     pub async fn close(&self) {
         let mut link = self.link();
         self.shared.close();
@@ -251,23 +263,25 @@ impl Client {
         drop(tokio::time::timeout(self.shared.config.timeout * 2, closed).await);
     }
 
-    /// The NamespaceArray of the server, as it was when the connection was made; empty before the first.
+    /// Returns the NamespaceArray of the server at the start of the connection; empty without a
+    /// connection.
     #[must_use]
     pub fn namespaces(&self) -> Vec<String> {
         let connected = self.shared.connected();
         connected.map_or_else(|_| Vec::new(), |one| one.namespaces.clone())
     }
 
-    /// How often the certificate of the server was refused, each attempt to connect counted.
+    /// Returns how often the certificate of the server was refused. Each connection attempt counts.
     #[must_use]
     pub fn certificates_refused(&self) -> u64 {
         self.shared.refused.load(Ordering::Relaxed)
     }
 
-    /// Reads structures of these types from now on, over the connection that there is.
+    /// Registers a type loader for structures on the current connection.
     ///
     /// # Errors
-    /// There is no connection.
+    ///
+    /// Returns an error if the client is not connected.
     pub fn knows(&self, types: Arc<dyn TypeLoader>) -> Result<(), ClientError> {
         let connected = self.shared.connected()?;
         let mut namespaces = NamespaceMap::new();
@@ -279,7 +293,7 @@ impl Client {
         Ok(())
     }
 
-    /// The index of a namespace at the server.
+    /// Returns the index of a namespace at the server.
     #[must_use]
     pub fn namespace(&self, uri: &str) -> Option<u16> {
         let connected = self.shared.connected().ok()?;

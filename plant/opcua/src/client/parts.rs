@@ -1,7 +1,8 @@
-//! Requests in parts of the size that a server takes.
+//! Splits requests into parts that a server accepts.
 //!
-//! A server says in its OperationLimits how many operations it takes in one request (OPC 10000-5, 6.3.11), or answers
-//! BadTooManyOperations. Then the request is sent again in halves, and the smaller size is kept for the connection.
+//! The OperationLimits of a server limit the number of operations in a request (OPC 10000-5,
+//! 6.3.11). If a server answers BadTooManyOperations, the request is sent again in halves, and the
+//! smaller size applies to the rest of the connection.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -9,7 +10,7 @@ use opcua::types::{DataValue, Error, StatusCode, VariableId, Variant};
 
 use crate::limits::MOST_PER_REQUEST;
 
-/// Services with a limit of their own.
+/// The services that have an OperationLimit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Service {
     /// Read.
@@ -34,12 +35,13 @@ impl Service {
         }
     }
 
-    /// Whether the status says that a smaller request may succeed, and that nothing of this one was executed.
+    /// Returns whether the status means that the request was too large and that no operation was
+    /// executed.
     fn is_too_large(self, status: StatusCode) -> bool {
         match status {
             StatusCode::BadTooManyOperations | StatusCode::BadRequestTooLarge => true,
             StatusCode::BadTooManyMonitoredItems => self == Self::MonitoredItems,
-            // The values may be written when their answer is too large.
+            // A Write may have been executed although its response was too large.
             StatusCode::BadResponseTooLarge | StatusCode::BadEncodingLimitsExceeded => {
                 matches!(self, Self::Read | Self::Browse)
             }
@@ -48,7 +50,7 @@ impl Service {
     }
 }
 
-/// The most operations that a server takes in one request of each service.
+/// The most operations per request that a server accepts, for each service.
 #[derive(Debug)]
 pub struct OperationLimits([AtomicUsize; 4]);
 
@@ -59,7 +61,7 @@ impl Default for OperationLimits {
 }
 
 impl OperationLimits {
-    /// The variables of a server whose values [`learn`](Self::learn) takes, in its order.
+    /// The variables whose values are the argument of [`learn`](Self::learn), in this order.
     pub const VARIABLES: [VariableId; 4] = [
         VariableId::Server_ServerCapabilities_OperationLimits_MaxNodesPerRead,
         VariableId::Server_ServerCapabilities_OperationLimits_MaxNodesPerWrite,
@@ -67,7 +69,7 @@ impl OperationLimits {
         VariableId::Server_ServerCapabilities_OperationLimits_MaxMonitoredItemsPerCall,
     ];
 
-    /// Takes the limits that a server names. A missing value, or 0, is no limit.
+    /// Adopts the limits of a server. A missing value and 0 mean no limit.
     pub fn learn(&self, values: &[DataValue]) {
         for (service, value) in Service::ALL.into_iter().zip(values) {
             if let Some(Variant::UInt32(most)) = value.value
@@ -91,7 +93,7 @@ impl OperationLimits {
         }
     }
 
-    /// Splits a request.
+    /// Splits a request into parts.
     #[must_use]
     pub fn parts<'l, 'q, Q, A>(
         &'l self,
@@ -109,40 +111,43 @@ impl OperationLimits {
     }
 }
 
-/// A request that is sent in parts, and its answers.
+/// A request that is sent in parts, and the results so far.
 #[derive(Debug)]
 pub struct Parts<'l, 'q, Q, A> {
     limits: &'l OperationLimits,
     service: Service,
     rest: &'q [Q],
-    /// The most operations in a part of this request, where it is less than the limit of the connection.
+    /// The most operations in a part of this request, if smaller than the limit of the connection.
     most: usize,
-    /// Length of the part that is on its way.
+    /// The length of the part that was sent last.
     sent: usize,
     answers: Vec<A>,
 }
 
-/// A part without an answer.
+/// A part failed.
 #[derive(Debug)]
 pub enum PartFault {
     /// The request failed.
     Failed(Error),
-    /// The answer has another number of results.
+    /// The response has a wrong number of results.
     Short,
 }
 
 impl<'q, Q, A> Parts<'_, 'q, Q, A> {
-    /// Returns the next part to send; `None` when all are answered.
+    /// Returns the next part to send, or `None` if all operations have results.
     pub fn next_part(&mut self) -> Option<&'q [Q]> {
         let most = self.limits.most(self.service).min(self.most);
         self.sent = most.min(self.rest.len());
         self.rest.get(..self.sent).filter(|part| !part.is_empty())
     }
 
-    /// Takes the answer to the part that was sent last. A part that is too large for the server comes again, smaller.
+    /// Stores the response to the last part. A part that was too large for the server is repeated
+    /// in smaller parts.
     ///
     /// # Errors
-    /// The request failed, or its answer is short. The part comes again unless [`skip`](Self::skip) is called.
+    ///
+    /// Returns an error if the request failed or if its response has a wrong number of results. The
+    /// part is repeated unless [`skip`](Self::skip) is called.
     pub fn answered(&mut self, answer: Result<Vec<A>, Error>) -> Result<(), PartFault> {
         match answer {
             Ok(answers) if answers.len() == self.sent => {
@@ -153,7 +158,7 @@ impl<'q, Q, A> Parts<'_, 'q, Q, A> {
             Ok(_) => Err(PartFault::Short),
             Err(error) if self.sent > 1 && self.service.is_too_large(error.status()) => {
                 self.most = self.sent / 2;
-                // A subscription that is full says nothing about the next one.
+                // The limit of a full subscription does not apply to the next subscription.
                 if error.status() != StatusCode::BadTooManyMonitoredItems {
                     self.limits.lower(self.service, self.most);
                 }
@@ -163,7 +168,7 @@ impl<'q, Q, A> Parts<'_, 'q, Q, A> {
         }
     }
 
-    /// Answers each operation of the part that was sent last alike.
+    /// Uses the same result for each operation of the last part.
     pub fn skip(&mut self, answer: &A)
     where
         A: Clone,
@@ -173,7 +178,7 @@ impl<'q, Q, A> Parts<'_, 'q, Q, A> {
         self.rest = self.rest.get(self.sent..).unwrap_or_default();
     }
 
-    /// Answers each operation that is not answered alike.
+    /// Uses the same result for each operation that has no result yet.
     pub fn skip_all(&mut self, answer: &A)
     where
         A: Clone,
@@ -182,7 +187,7 @@ impl<'q, Q, A> Parts<'_, 'q, Q, A> {
         self.skip(answer);
     }
 
-    /// Returns the answers, in the order of the questions.
+    /// Returns the results, in the order of the operations.
     #[must_use]
     pub fn into_answers(self) -> Vec<A> {
         self.answers
@@ -193,7 +198,7 @@ impl<'q, Q, A> Parts<'_, 'q, Q, A> {
 mod tests {
     use super::*;
 
-    /// A server that takes at most `most` operations and answers each with its number.
+    /// A server that accepts at most `most` operations and answers each operation with its number.
     struct Server {
         most: usize,
         status: StatusCode,
@@ -272,7 +277,7 @@ mod tests {
         ended.unwrap();
         assert_eq!(answers.len(), 60);
         assert_eq!(limits.most(Service::MonitoredItems), MOST_PER_REQUEST);
-        // To a reader the status says nothing about the size of its request.
+        // For a Read request this status does not mean that the request was too large.
         let mut plc = server(25, StatusCode::BadTooManyMonitoredItems);
         let (_, ended) = ask(&limits, Service::Read, 60, &mut plc);
         assert!(matches!(ended, Err(PartFault::Failed(_))));

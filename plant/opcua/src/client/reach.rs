@@ -1,8 +1,8 @@
-//! Whether a server that does not answer is busy or lost.
+//! Decides whether an unresponsive server is busy or lost.
 //!
-//! A server that serves one request at a time answers nothing while it executes a method, and requests on its session say
-//! nothing about it. Its host does answer: the kernel accepts connections for a program that is busy. A host that is gone is
-//! noticed within two seconds.
+//! A server that handles one request at a time does not answer while it executes a method, so
+//! requests on its session do not show the difference. Its host does answer: the kernel accepts TCP
+//! connections for a busy program. The loss of a host is detected within two seconds.
 
 use std::io::ErrorKind;
 use std::time::Duration;
@@ -13,7 +13,7 @@ use tokio::time::{Instant, timeout};
 
 use crate::endpoint::EndpointUrl;
 
-/// How long a server has left keep-alives unanswered.
+/// The keep-alives that a server did not answer.
 #[derive(Debug)]
 pub(super) struct Silence {
     patience: Duration,
@@ -32,29 +32,30 @@ impl Silence {
         }
     }
 
-    /// The server answered a keep-alive.
+    /// Records the answer to a keep-alive.
     pub(super) fn answered(&mut self, now: Instant) {
         self.answered = now;
         self.missed = 0;
         self.not_running = 0;
     }
 
-    /// A keep-alive was not answered in time.
+    /// Records a keep-alive that timed out.
     pub(super) fn missed(&mut self) {
         self.missed += 1;
     }
 
-    /// The server answered a keep-alive that it does not run.
+    /// Records an answer of a server that is not in the state Running.
     pub(super) fn not_running(&mut self) {
         self.not_running += 1;
     }
 
-    /// Returns whether the server is silent, and is given time to answer.
+    /// Returns whether the server is unresponsive but still within the patience.
     pub(super) fn is_tolerated(&self, now: Instant) -> bool {
         self.missed > 0 && now.saturating_duration_since(self.answered) < self.patience
     }
 
-    /// Returns whether the connection is to be dropped. `is_calling`: a call waits for its result, which has a limit itself.
+    /// Returns whether the connection is lost. With `is_calling`, a call waits for its result, and
+    /// has its own timeout.
     pub(super) fn is_too_long(&self, is_calling: bool, now: Instant) -> bool {
         if self.not_running >= MOST_MISSED {
             return true;
@@ -63,7 +64,7 @@ impl Silence {
     }
 }
 
-/// Tries to reach the host of a server that is busy.
+/// Probes the host of a busy server with TCP connections.
 #[derive(Debug)]
 pub(super) struct Reach {
     url: String,
@@ -71,15 +72,15 @@ pub(super) struct Reach {
     state: State,
 }
 
-/// What is known of the host; time is given.
+/// The state of the probes. Callers pass the time.
 #[derive(Debug, Default)]
 struct State {
-    /// When the host answered last, or the tries began; `None` while there are none.
+    /// When the host answered last, or when the probes started; `None` without probes.
     reached: Option<Instant>,
     made: u32,
 }
 
-/// What is to be done.
+/// The next step of the probes.
 #[derive(Debug, PartialEq, Eq)]
 enum Step {
     Nothing,
@@ -95,7 +96,8 @@ impl State {
         }
         let reached = *self.reached.get_or_insert(now);
         if self.made >= MOST_TRIES {
-            // The queue of a program that accepts nothing is full some time; the session's own connection still tells.
+            // The accept queue of the program may be full. The TCP connection of the session still
+            // detects a lost host.
             return Step::Nothing;
         }
         if now.saturating_duration_since(reached) >= LOST_AFTER {
@@ -121,10 +123,11 @@ impl Reach {
         }
     }
 
-    /// Makes the next try where the server is busy; to be called every half second.
+    /// Starts the next probe if the server is busy. To be called every half second.
     ///
     /// # Errors
-    /// The host has not answered for too long.
+    ///
+    /// Returns an error if the host has not answered for too long.
     pub(super) fn look(&mut self, is_busy: bool, now: Instant) -> Result<(), String> {
         match self.state.look(is_busy, now) {
             Step::Nothing => Ok(()),
@@ -136,12 +139,12 @@ impl Reach {
         }
     }
 
-    /// The host, or the server itself, answered.
+    /// Records an answer of the host or of the server.
     pub(super) fn answered(&mut self, now: Instant) {
         self.state.answered(now);
     }
 
-    /// Ready when a try reached the host. Whoever drops it before loses nothing.
+    /// Waits until a probe reaches the host. Cancel safe.
     pub(super) async fn tried(&mut self) {
         loop {
             match self.tries.join_next().await {
@@ -153,14 +156,14 @@ impl Reach {
     }
 }
 
-/// Connects, and closes the connection at once.
+/// Connects and closes the connection at once.
 async fn is_reached(url: String) -> bool {
     let Ok(endpoint) = url.parse::<EndpointUrl>() else {
         return false;
     };
     match timeout(TRY_LIMIT, TcpStream::connect(endpoint.authority())).await {
         Ok(Ok(_)) => true,
-        // The host answers for a program that takes no more connections.
+        // The host refuses connections for a program that accepts no more.
         Ok(Err(error)) => matches!(
             error.kind(),
             ErrorKind::ConnectionRefused | ErrorKind::ConnectionReset
@@ -169,12 +172,12 @@ async fn is_reached(url: String) -> bool {
     }
 }
 
-/// How many keep-alives in a row may be missed.
+/// Most consecutive keep-alives that may be missed.
 const MOST_MISSED: u32 = 2;
-/// How long the host may leave connections unanswered; three tries fit in.
+/// Longest time without an answer of the host: time for three probes.
 const LOST_AFTER: Duration = Duration::from_millis(1_700);
 const TRY_LIMIT: Duration = Duration::from_secs(1);
-/// Servers commonly have a queue of 100 connections that are not accepted yet.
+/// Most probes. Servers commonly have an accept queue of 100 connections.
 const MOST_TRIES: u32 = 64;
 
 #[cfg(test)]
@@ -188,7 +191,7 @@ mod tests {
         let now = Instant::now();
         let mut state = State::default();
         assert_eq!(state.look(false, now), Step::Nothing, "nothing is called");
-        // The host answers each try for 8 s.
+        // The host answers each probe for 8 s.
         let mut at = now;
         for _ in 0..16 {
             assert_eq!(state.look(true, at), Step::Connect);

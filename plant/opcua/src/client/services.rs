@@ -1,4 +1,4 @@
-//! What a client asks of a server.
+//! The services that a client calls: Read, Write, Browse, TranslateBrowsePathsToNodeIds and Call.
 
 use std::time::Duration;
 
@@ -14,27 +14,27 @@ use opcua::types::{
 use super::supervisor::failed;
 use super::{Client, ClientError, Service};
 
-/// Which references are followed.
+/// The references to follow.
 #[derive(Debug, Clone)]
 pub struct Browse {
-    /// Their type.
+    /// The reference type.
     pub reference: NodeId,
-    /// Whether those of subtypes are too.
+    /// Whether subtypes of the reference type are included.
     pub subtypes: bool,
-    /// Backwards.
+    /// Whether inverse references are followed.
     pub inverse: bool,
-    /// Which nodes are wanted; empty for all.
+    /// The NodeClasses of the targets; empty for all.
     pub classes: NodeClassMask,
 }
 
 impl Browse {
-    /// Down the hierarchy.
+    /// Follows hierarchical references forward.
     #[must_use]
     pub fn hierarchical() -> Self {
         Self::of(ReferenceTypeId::HierarchicalReferences)
     }
 
-    /// Forward, by this type of reference and its subtypes.
+    /// Follows references of this type and its subtypes forward.
     pub fn of(reference: impl Into<NodeId>) -> Self {
         Self {
             reference: reference.into(),
@@ -44,7 +44,7 @@ impl Browse {
         }
     }
 
-    /// Backwards instead.
+    /// Follows inverse references instead.
     #[must_use]
     pub fn inverse(mut self) -> Self {
         self.inverse = true;
@@ -52,12 +52,13 @@ impl Browse {
     }
 }
 
-/// How a method is called.
+/// The options of a method call.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct CallOptions {
-    /// How long the answer is waited for.
+    /// The timeout of the call.
     pub within: Duration,
-    /// Only over that connection (`connects` of [`Link::Up`](super::Link::Up)): a NodeId may name another node after the next one.
+    /// Restricts the call to this connection (`connects` of [`Link::Up`](super::Link::Up)): after a
+    /// reconnect a NodeId may identify another node.
     pub connection: Option<u64>,
 }
 
@@ -72,27 +73,29 @@ pub struct CallResult {
     pub outputs: Vec<Variant>,
 }
 
-/// Why a method has no outputs.
+/// An error of a method call.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum CallError {
-    /// The server says no.
+    /// The server refused the call.
     #[error("the call is refused with {status}")]
     Refused {
-        /// Why.
+        /// The status code.
         status: StatusCode,
-        /// What is wrong with each argument, where the server says so.
+        /// The status of each input argument, if the server sends it.
         arguments: Vec<StatusCode>,
     },
-    /// There is no answer. With [`ClientError::Lost`] nobody knows whether the method was executed.
+    /// The call has no response. After [`ClientError::Lost`] it is unknown whether the method was
+    /// executed.
     #[error(transparent)]
     Client(#[from] ClientError),
 }
 
 impl Client {
-    /// Reads values; one for each node, bad ones too.
+    /// Reads the values of nodes. The result has one value per node, including bad values.
     ///
     /// # Errors
-    /// No answer.
+    ///
+    /// Returns an error if a request has no response.
     pub async fn read(&self, nodes: &[NodeId]) -> Result<Vec<DataValue>, ClientError> {
         let what: Vec<_> = nodes
             .iter()
@@ -101,10 +104,11 @@ impl Client {
         self.read_attributes(&what).await
     }
 
-    /// Reads attributes; one value for each, bad ones too.
+    /// Reads attributes. The result has one value per attribute, including bad values.
     ///
     /// # Errors
-    /// No answer.
+    ///
+    /// Returns an error if a request has no response.
     pub async fn read_attributes(
         &self,
         what: &[(NodeId, AttributeId)],
@@ -126,10 +130,12 @@ impl Client {
         Ok(parts.into_answers())
     }
 
-    /// Writes values; one status for each.
+    /// Writes values, and returns a status code for each value.
     ///
     /// # Errors
-    /// The first error. Other values may have been written; [`write_each`](Self::write_each) returns the result of each.
+    ///
+    /// Returns the first error. Other values may have been written;
+    /// [`write_each`](Self::write_each) returns the result of each value.
     pub async fn write(
         &self,
         values: &[(NodeId, Variant)],
@@ -137,7 +143,8 @@ impl Client {
         self.write_each(values).await.into_iter().collect()
     }
 
-    /// Writes values, and returns the result of each, also if the server takes fewer values in a request.
+    /// Writes values, and returns the result of each value, also if the server accepts fewer values
+    /// in a request.
     pub async fn write_each(
         &self,
         values: &[(NodeId, Variant)],
@@ -175,10 +182,11 @@ impl Client {
         parts.into_answers()
     }
 
-    /// The references of a node, at most [`MOST_REFERENCES`].
+    /// Returns the references of a node, at most [`MOST_REFERENCES`].
     ///
     /// # Errors
-    /// No answer, or the node is not there.
+    ///
+    /// Returns an error if the request has no response or the node does not exist.
     pub async fn browse(
         &self,
         node: &NodeId,
@@ -220,10 +228,11 @@ impl Client {
         Ok(found)
     }
 
-    /// The node at a path of BrowseNames down the hierarchy.
+    /// Returns the node at a path of BrowseNames along hierarchical references.
     ///
     /// # Errors
-    /// No answer, or `BadNoMatch`.
+    ///
+    /// Returns an error if the request has no response, or `BadNoMatch`.
     pub async fn translate(
         &self,
         node: &NodeId,
@@ -264,7 +273,8 @@ impl Client {
     /// Calls a method of an object.
     ///
     /// # Errors
-    /// A refusal, or no answer.
+    ///
+    /// Returns an error if the server refuses the call or the call has no response.
     pub async fn call(
         &self,
         object: &NodeId,
@@ -278,11 +288,12 @@ impl Client {
         self.call_within((object, method), arguments, options).await
     }
 
-    /// Calls a method of an object that may take longer than other requests: the server is told how long (the TimeoutHint,
-    /// OPC 10000-4, 7.33).
+    /// Calls a method of an object with its own timeout, which the server receives as TimeoutHint
+    /// (OPC 10000-4, 7.33).
     ///
     /// # Errors
-    /// A refusal, or no answer.
+    ///
+    /// Returns an error if the server refuses the call or the call has no response.
     pub async fn call_within(
         &self,
         target: (&NodeId, &NodeId),
@@ -299,10 +310,11 @@ impl Client {
         Ok(result.outputs)
     }
 
-    /// Calls a method of an object, and returns the result with its own status, Good or not.
+    /// Calls a method of an object, and returns the result with its status code, Good or not.
     ///
     /// # Errors
-    /// No result.
+    ///
+    /// Returns an error if the call has no result.
     pub async fn call_result(
         &self,
         (object, method): (&NodeId, &NodeId),
@@ -339,7 +351,7 @@ impl Client {
     }
 }
 
-/// The answer, if it has as many results as there were questions.
+/// Returns the results of a response if their number is as expected.
 fn as_many<T>(
     answer: Result<Vec<T>, opcua::types::Error>,
     wanted: usize,
@@ -351,5 +363,5 @@ fn as_many<T>(
     Ok(answer)
 }
 
-/// How many references of one node are taken.
+/// Most references of a node that are returned.
 pub const MOST_REFERENCES: usize = 10_000;

@@ -1,5 +1,6 @@
-//! What a server shows of itself before anything is said to it: its certificate, judged here. The library compares certificates
-//! with files, and knows neither authorities nor revocation lists; it is given a store of its own, with that one certificate.
+//! Checks the certificate of a server before the client sends anything secured to it. The library
+//! compares certificates with files only, and supports neither authorities nor revocation lists. It
+//! therefore gets a separate store that contains the accepted certificates.
 
 use std::fs;
 use std::io;
@@ -19,12 +20,12 @@ use crate::judge::{Judge, Refused, Shown};
 use crate::known;
 use crate::pki::{OWN_CERTIFICATE, OWN_KEY};
 
-/// Judges the servers that a client connects to.
+/// Judges the certificates of the servers of a client.
 pub(super) struct Servers {
     judge: Judge,
 }
 
-/// What a server has shown, and what it is judged by as long as the connection lasts.
+/// An accepted server certificate, and the names for checking it again while the connection lasts.
 pub(super) struct Taken {
     shown: Shown,
     host: String,
@@ -32,7 +33,7 @@ pub(super) struct Taken {
 }
 
 impl Servers {
-    /// `None` for a client that has no certificates.
+    /// Creates the judge of a client; `None` for a client without certificates.
     pub(super) fn of(config: &ClientConfig) -> Option<Self> {
         let root = config.pki.as_ref()?;
         Some(Self {
@@ -43,10 +44,11 @@ impl Servers {
         })
     }
 
-    /// Judges the certificate of an endpoint; `None` for one without security.
+    /// Judges the certificate of an endpoint; `None` for an endpoint without security.
     ///
     /// # Errors
-    /// It is refused.
+    ///
+    /// Returns an error if the certificate is refused.
     pub(super) fn take(&self, endpoint: &EndpointDescription) -> Result<Option<Taken>, Refused> {
         if endpoint.security_mode == MessageSecurityMode::None {
             return Ok(None);
@@ -68,10 +70,11 @@ impl Servers {
         }))
     }
 
-    /// Judges it by what the store knows by now.
+    /// Judges an accepted certificate again, by the current content of the store.
     ///
     /// # Errors
-    /// It is refused.
+    ///
+    /// Returns an error if the certificate is refused.
     pub(super) fn again(&self, taken: &Taken) -> Result<(), Refused> {
         let names = Names {
             host: Some(&taken.host),
@@ -80,10 +83,12 @@ impl Servers {
         self.judge.judge(&taken.shown, names)
     }
 
-    /// A store for the library that has what was taken, and the client's own pair.
+    /// Creates the certificate store of the library, with the accepted certificate and the client's
+    /// own certificate and key.
     ///
     /// # Errors
-    /// It cannot be written.
+    ///
+    /// Returns an error if the store cannot be written.
     pub(super) fn store(&self, taken: &Taken) -> Result<Arc<RwLock<CertificateStore>>, String> {
         let root = std::path::absolute(self.judge.root()).map_err(|error| error.to_string())?;
         let folder = root.join(JUDGED);
@@ -98,7 +103,8 @@ impl Servers {
     }
 }
 
-/// Puts a certificate where the library looks for it, whole at once: other clients of the store do the same.
+/// Writes a certificate atomically to the file name that the library expects, because several
+/// clients may share the store.
 fn put(folder: &Path, certificate: &Certificate) -> io::Result<()> {
     let of_library =
         X509::from_der(certificate.der()).map_err(|error| io::Error::other(error.to_string()))?;
@@ -117,10 +123,10 @@ fn put(folder: &Path, certificate: &Certificate) -> io::Result<()> {
     fs::rename(&whole, &path)
 }
 
-/// Why there is no connection.
+/// The reason for a missing connection.
 pub(super) struct Why {
     pub(super) reason: String,
-    /// The status, where the certificate of the server is refused.
+    /// The status code if the certificate of the server is refused.
     pub(super) certificate: Option<StatusCode>,
 }
 
@@ -144,5 +150,6 @@ impl From<Refused> for Why {
 
 static NUMBERS: AtomicU64 = AtomicU64::new(0);
 const NONE_IS_MADE: Option<X509Data> = None;
-/// The library's store, below the client's. Nobody is trusted for being there.
+/// The folder of the library's store below the root of the client's store. A certificate is not
+/// trusted because of its presence in this folder.
 const JUDGED: &str = "judged";

@@ -1,4 +1,4 @@
-//! Subscriptions that survive their connection.
+//! Subscriptions that are restored after a reconnect.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -18,34 +18,35 @@ use super::supervisor::{Connected, Shared};
 use super::{Client, ClientError, Service};
 use crate::limits::MOST_NOTIFICATIONS;
 
-/// What is watched.
+/// A monitored item.
 #[derive(Debug, Clone)]
 pub enum Watch {
-    /// The value of a variable, looked at as often as the subscription tells.
+    /// The value of a variable, sampled at the interval of the subscription.
     Value(NodeId),
-    /// The value of a variable, looked at and kept otherwise.
+    /// The value of a variable with its own sampling interval, queue and deadband.
     Sampled(Sampled),
     /// The events of an object.
     Events {
-        /// The object, as the Server.
+        /// The object, for example the Server object.
         node: NodeId,
-        /// Which fields of them.
+        /// The selected fields.
         select: Vec<Select>,
-        /// Only events of this type and its subtypes.
+        /// Restricts the events to this type and its subtypes.
         of_type: Option<NodeId>,
     },
 }
 
-/// How the value of a variable is watched.
+/// A variable and its monitoring parameters.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Sampled {
     /// The variable.
     pub node: NodeId,
-    /// How often the server is to look at it.
+    /// The sampling interval.
     pub interval: Duration,
-    /// How many changes the server keeps between two notifications; of more the oldest go.
+    /// The queue size at the server: most changes between two notifications. The oldest changes are
+    /// discarded.
     pub queue: u32,
-    /// By how much a number may differ without being told; 0 where each change is told.
+    /// The absolute deadband; 0 reports every change.
     pub deadband: f64,
 }
 
@@ -62,17 +63,18 @@ impl Sampled {
     }
 }
 
-/// A field of events.
+/// A field of an event.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Select {
-    /// The type that has the field. With BaseEventType servers look at the path alone.
+    /// The type that defines the field. With BaseEventType servers consider only the path.
     pub type_id: NodeId,
-    /// The path.
+    /// The browse path of the field.
     pub path: Vec<QualifiedName>,
 }
 
 impl Select {
-    /// A field of the core namespace by names joined by `/`, as `ToState/Id`.
+    /// Creates a field of the core namespace by BrowseNames joined by `/`, for example
+    /// `ToState/Id`.
     pub fn new(type_id: impl Into<NodeId>, path: &str) -> Self {
         Self {
             type_id: type_id.into(),
@@ -84,35 +86,36 @@ impl Select {
     }
 }
 
-/// What a subscription tells.
+/// A notification of a subscription.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Notice {
-    /// It is made, for the first time or again: what happened in between was missed. Values follow.
+    /// The subscription was created or restored. Changes before this notice may be missing. Current
+    /// values follow.
     Subscribed,
     /// A value.
     Value {
-        /// Which of the watches.
+        /// The index of the monitored item.
         watch: usize,
         /// The value.
         value: DataValue,
     },
     /// An event.
     Event {
-        /// Which of the watches.
+        /// The index of the monitored item.
         watch: usize,
-        /// The fields in the order they were selected.
+        /// The fields in the order of their selection.
         fields: Vec<Variant>,
     },
-    /// The server does not watch that.
+    /// The server refused a monitored item.
     Refused {
-        /// Which of the watches.
+        /// The index of the monitored item.
         watch: usize,
-        /// Why.
+        /// The status code.
         status: StatusCode,
     },
 }
 
-/// A subscription; the server is told when it is dropped.
+/// A subscription, which the server deletes after this handle is dropped.
 pub struct Subscription {
     id: u64,
     notices: mpsc::Receiver<Notice>,
@@ -121,12 +124,12 @@ pub struct Subscription {
 }
 
 impl Subscription {
-    /// The next notice; `None` when the client is closed.
+    /// Waits for the next notice; `None` when the client is closed.
     pub async fn next(&mut self) -> Option<Notice> {
         self.notices.recv().await
     }
 
-    /// How many notices were thrown away because the queue was full.
+    /// Returns how many notices were discarded because the queue was full.
     #[must_use]
     pub fn dropped(&self) -> u64 {
         self.dropped.load(Ordering::Relaxed)
@@ -142,7 +145,7 @@ impl Drop for Subscription {
     }
 }
 
-/// What there should be.
+/// A requested subscription and its state at the server.
 pub(crate) struct Wanted {
     watches: Arc<[Watch]>,
     interval: Duration,
@@ -155,14 +158,14 @@ pub(crate) struct Wanted {
 enum State {
     Waiting,
     Making,
-    /// The ids of its subscriptions.
+    /// The ids of its subscriptions at the server.
     Made(Vec<u32>),
-    /// The server does not want it.
+    /// The server refused all of its subscriptions.
     Refused,
 }
 
 impl Wanted {
-    /// The connection is gone, and with it what was made.
+    /// Resets the state after the loss of a connection, which ends the subscriptions at the server.
     pub(crate) fn forget(&mut self) {
         self.state = State::Waiting;
     }
@@ -192,10 +195,10 @@ impl Queue {
     }
 }
 
-/// What the library calls with notifications.
+/// The callback of the library for notifications.
 struct Sink(Queue);
 
-/// The client handle of a watch; the library takes 0 for none.
+/// Returns the client handle of a monitored item. Handle 0 is reserved by the library.
 fn handle(watch: usize) -> u32 {
     u32::try_from(watch).map_or(u32::MAX, |watch| watch.saturating_add(1))
 }
@@ -218,8 +221,9 @@ impl OnSubscriptionNotification for Sink {
 }
 
 impl Client {
-    /// Watches values and events, with `interval` between notifications and room for `queue` notices. It is made when
-    /// there is a connection, and again with each.
+    /// Subscribes to values and events with the publishing interval `interval` and a queue of
+    /// `queue` notices. The subscription is created on the current connection and on each later
+    /// connection.
     #[must_use]
     pub fn subscribe(&self, watches: Vec<Watch>, interval: Duration, queue: usize) -> Subscription {
         let (tell, notices) = mpsc::channel(queue.max(1));
@@ -251,10 +255,11 @@ impl Client {
     }
 }
 
-/// Makes what is wanted and takes away what is not.
+/// Creates the requested subscriptions and deletes the dropped subscriptions.
 ///
 /// # Errors
-/// Why the connection is no good any more.
+///
+/// Returns the reason if the connection is not usable.
 pub(crate) async fn renew(shared: &Shared, connected: &Connected) -> Result<(), String> {
     loop {
         let mut gone = None;
@@ -296,7 +301,8 @@ pub(crate) async fn renew(shared: &Shared, connected: &Connected) -> Result<(), 
     }
 }
 
-/// Creates subscriptions for some watches, further ones for watches that a subscription does not take.
+/// Creates a subscription for monitored items, and further subscriptions for the items that do not
+/// fit into it.
 async fn make(
     connected: &Connected,
     watches: &[Watch],
@@ -366,7 +372,7 @@ async fn create(
     created.await
 }
 
-/// Puts watches into a subscription, and returns the watches that do not fit.
+/// Adds monitored items to a subscription, and returns the items that do not fit.
 async fn fill<'w>(
     connected: &Connected,
     (id, interval): (u32, Duration),
@@ -409,7 +415,7 @@ async fn fill<'w>(
     Ok(left)
 }
 
-/// How many intervals there are in `time`.
+/// Returns the number of intervals in `time`, at least 1.
 fn count(time: Duration, interval: Duration) -> u32 {
     let interval = interval.max(Duration::from_millis(1));
     u32::try_from(time.as_millis() / interval.as_millis().max(1)).map_or(u32::MAX, |n| n.max(1))
@@ -457,7 +463,7 @@ fn request(handle: u32, watch: &Watch, interval: Duration) -> MonitoredItemCreat
         monitoring_mode: MonitoringMode::Reporting,
         requested_parameters: MonitoringParameters {
             client_handle: handle,
-            // Events are not sampled.
+            // Events have no sampling interval.
             sampling_interval: match watch {
                 Watch::Value(_) => interval.as_secs_f64() * 1e3,
                 Watch::Sampled(one) => one.interval.as_secs_f64() * 1e3,
@@ -470,13 +476,13 @@ fn request(handle: u32, watch: &Watch, interval: Duration) -> MonitoredItemCreat
     }
 }
 
-/// Most subscriptions for a list of watches.
+/// Most subscriptions for a list of monitored items.
 const MOST_SUBSCRIPTIONS: usize = 100;
-/// How often a subscription says that it lives.
+/// Longest time between two notifications or keep-alives of a subscription.
 const KEEP_ALIVE: Duration = Duration::from_secs(1);
-/// How many keep-alives a server keeps a subscription for nobody.
+/// Lifetime of a subscription without a client, in keep-alive intervals.
 const LIFETIME: u32 = 10;
-/// Values the server keeps between two notifications.
+/// Queue size of a value at the server.
 const VALUES: u32 = 10;
-/// Events the server keeps between two notifications.
+/// Queue size of an event item at the server.
 const EVENTS: u32 = 1_000;

@@ -1,6 +1,6 @@
-//! The life of a connection: find the endpoint, make the session, read what the server is, subscribe, watch, and all
-//! over again. The library can reconnect too, and then hears nothing of its subscriptions with some servers; here each
-//! connection has a new session.
+//! The life of a connection: select the endpoint, create the session, read the properties of the
+//! server, subscribe, supervise, reconnect. The reconnect of the library is not used: with some
+//! servers it receives no notifications afterwards. Each connection has a new session.
 
 use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
@@ -34,14 +34,14 @@ use crate::limits;
 use crate::pki::NO_PKI;
 use crate::pki::{OWN_CERTIFICATE, OWN_KEY, Pki};
 
-/// What the handles and the supervisor have in common.
+/// The state that the handles and the supervisor share.
 pub(crate) struct Shared {
     pub(crate) config: ClientConfig,
     url: String,
     pub(crate) link: watch::Sender<Link>,
     connected: Mutex<Option<Arc<Connected>>>,
     pub(crate) wanted: Mutex<BTreeMap<u64, Wanted>>,
-    /// Something else is wanted, or nothing more.
+    /// Signals a new or dropped subscription.
     pub(crate) changed: Notify,
     closing: watch::Sender<bool>,
     /// How often the certificate of the server was refused.
@@ -51,11 +51,11 @@ pub(crate) struct Shared {
     pub(crate) calls: CallsInFlight,
 }
 
-/// The calls that wait for their results, of all clients of one server.
+/// The calls that wait for their results, of all clients of a server.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct CallsInFlight(Arc<AtomicUsize>);
 
-/// A call that waits for its result, for as long as this is kept.
+/// Counts a call as waiting until this value is dropped.
 #[derive(Debug)]
 pub(crate) struct CallInFlight(Arc<AtomicUsize>);
 
@@ -80,13 +80,13 @@ impl Drop for CallInFlight {
 pub(crate) struct Connected {
     pub(crate) session: Arc<Session>,
     pub(crate) namespaces: Vec<String>,
-    /// OperationLimits of the server.
+    /// The OperationLimits of the server.
     pub(crate) limits: OperationLimits,
-    /// How many connections there have been with this one.
+    /// The number of connections so far, including this connection.
     pub(crate) connects: u64,
-    /// The supertypes that are known.
+    /// The cache of supertypes.
     pub(crate) supertypes: Mutex<HashMap<NodeId, Option<NodeId>>>,
-    /// The loop of the library, without which nothing is sent and nothing heard.
+    /// The event loop of the library, which sends and receives all messages.
     driving: JoinHandle<()>,
 }
 
@@ -112,7 +112,7 @@ impl Shared {
         }
     }
 
-    /// Another client of the same server.
+    /// Creates the state of another client of the same server.
     pub(crate) fn another(&self) -> Self {
         Self {
             calls: self.calls.clone(),
@@ -156,7 +156,7 @@ impl Shared {
     }
 }
 
-/// Connects again and again until the client is closed.
+/// Connects and reconnects until the client is closed.
 pub(crate) async fn run(shared: Arc<Shared>) {
     let mut closing = shared.closing.subscribe();
     {
@@ -169,7 +169,7 @@ pub(crate) async fn run(shared: Arc<Shared>) {
     }
     let last = shared.connected.lock().take();
     if let Some(last) = last {
-        // The server frees the session at once instead of after its timeout.
+        // Makes the server free the session at once instead of after the session timeout.
         let ended = timeout(shared.config.timeout, last.session.disconnect()).await;
         debug!(url = shared.url, ended = ended.is_ok(), "closed a session");
     }
@@ -202,14 +202,14 @@ async fn live(shared: &Shared) {
     }
 }
 
-/// What outlives each connection.
+/// The state that outlives each connection.
 #[derive(Default)]
 struct Life {
     connects: u64,
     started: Option<DateTime>,
 }
 
-/// Has a connection until it is lost, and tells why.
+/// Serves a connection until it is lost, and returns the reason.
 async fn hold(shared: &Shared, life: &mut Life, mut connection: Connection) -> Why {
     life.connects += 1;
     let before = life.started.replace(connection.started);
@@ -230,7 +230,7 @@ async fn hold(shared: &Shared, life: &mut Life, mut connection: Connection) -> W
     });
     let why = watch_over(shared, &mut connection).await;
     *shared.connected.lock() = None;
-    // Who waits for an answer is told at once.
+    // Aborting the event loop fails the pending requests at once.
     connection.connected.driving.abort();
     why
 }
@@ -269,7 +269,7 @@ fn library_client(config: &ClientConfig) -> Result<opcua::client::Client, String
             .max_chunk_count(limits::MOST_CHUNKS)
             .client()
     };
-    // Without certificates the library complains of them though nobody asks for any.
+    // The library logs missing certificates even if the client does not need any.
     let made = if config.pki.is_some() {
         make()
     } else {
@@ -278,31 +278,32 @@ fn library_client(config: &ClientConfig) -> Result<opcua::client::Client, String
     made.map_err(|errors| errors.join(", "))
 }
 
-/// A connection and what ends with it.
+/// A connection, and the state that ends with it.
 struct Connection {
     connected: Arc<Connected>,
     endpoint: EndpointDescription,
-    /// `None` where nothing is secured.
+    /// `None` without security.
     taken: Option<Taken>,
     started: DateTime,
-    /// What happens in the loop of the library.
+    /// The activity of the library's event loop.
     activity: mpsc::Receiver<Activity>,
     ended: oneshot::Receiver<String>,
 }
 
-/// What the watchdogs look at.
+/// An activity that the supervision evaluates.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Activity {
     Connected,
     KeptAlive,
-    /// A keep-alive was not answered.
+    /// A keep-alive timed out.
     Missed,
-    /// A keep-alive was answered by a server that does not run.
+    /// A keep-alive was answered by a server that is not in the state Running.
     NotRunning,
     Published,
 }
 
-/// How long a server keeps a session that it hears nothing of, in milliseconds: longer than it may be busy.
+/// Returns the session timeout in milliseconds, which is longer than the patience with a busy
+/// server.
 fn session_timeout(patience: Duration) -> u32 {
     u32::try_from((SESSION_TIMEOUT + patience).as_millis()).unwrap_or(u32::MAX)
 }
@@ -399,7 +400,7 @@ async fn connect(
     })
 }
 
-/// A task that must not outlive a failure.
+/// A task that is aborted if the connection attempt fails.
 struct AbortOnDrop(Option<JoinHandle<()>>);
 
 impl AbortOnDrop {
@@ -416,7 +417,8 @@ impl Drop for AbortOnDrop {
     }
 }
 
-/// The endpoint of the server that has the security that is wanted, reached as we reach the server.
+/// Selects the endpoint with the required security, and replaces its URL with the URL of the
+/// client.
 async fn endpoint(
     shared: &Shared,
     client: &opcua::client::Client,
@@ -459,16 +461,17 @@ async fn endpoint(
         return Err("a secured session needs a directory for certificates".to_owned());
     }
     let secured = can_secure.then(|| secured_by(wanted)).flatten();
-    // A password is nothing for everybody to hear.
+    // A password must not be sent in clear text.
     let may_be_plain = is_none || is_best && config.user.is_none();
     let chosen = secured.or_else(|| may_be_plain.then(|| has(&is_plain)).flatten());
     let mut chosen = chosen.ok_or_else(|| no_security(shared, &offered))?;
-    // The name a server gives itself may not be known here.
+    // The host name in the server's own URL may not resolve here.
     chosen.endpoint_url = shared.url.as_str().into();
     Ok(chosen)
 }
 
-/// That none of the endpoints will do, with what they are and what was wanted.
+/// Returns the error for a server without a suitable endpoint, with the offered and the required
+/// security.
 fn no_security(shared: &Shared, offered: &[EndpointDescription]) -> String {
     let each = offered.iter().map(|one| {
         let policy = one.security_policy_uri.as_ref().rsplit('#').next();
@@ -533,7 +536,7 @@ async fn what_it_is(
     });
     limits.learn(values.as_slice());
     let namespaces = namespaces.ok_or_else(|| "the server has no NamespaceArray".to_owned())?;
-    // A server that tells no start is never seen to be started again.
+    // Restarts of a server without StartTime are not detected.
     Ok((namespaces, started.unwrap_or_else(DateTime::null)))
 }
 
@@ -550,7 +553,7 @@ fn strings(value: DataValue) -> Option<Vec<String>> {
     each.collect()
 }
 
-/// Makes the subscriptions, and returns with the reason when the connection is no good any more.
+/// Creates the subscriptions, supervises the connection, and returns the reason for its end.
 async fn watch_over(shared: &Shared, connection: &mut Connection) -> Why {
     let mut silence = Silence::new(shared.config.patience, Instant::now());
     let mut reach = Reach::new(&shared.url);
@@ -560,7 +563,7 @@ async fn watch_over(shared: &Shared, connection: &mut Connection) -> Why {
     let mut judged = tokio::time::interval(JUDGED_EVERY);
     judged.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
     loop {
-        // A busy server answers no request: the subscriptions are made when it is free.
+        // A busy server does not answer requests, so the subscriptions are created after the call.
         if !shared.calls.any()
             && let Err(reason) = super::subscription::renew(shared, &connection.connected).await
         {
@@ -572,7 +575,7 @@ async fn watch_over(shared: &Shared, connection: &mut Connection) -> Why {
                 return reason.into();
             }
             activity = connection.activity.recv() => match activity {
-                // Nothing is missed of a server that executes a call.
+                // Missed keep-alives do not count while the server executes a call.
                 Some(Activity::Missed) if shared.calls.any() => {}
                 Some(Activity::Missed) => silence.missed(),
                 Some(Activity::NotRunning) => silence.not_running(),
@@ -612,7 +615,7 @@ async fn watch_over(shared: &Shared, connection: &mut Connection) -> Why {
     }
 }
 
-/// The error of a request that failed.
+/// Converts the error of a failed request.
 pub(crate) fn failed(error: &opcua::types::Error) -> ClientError {
     match error.status() {
         StatusCode::BadTimeout
@@ -627,19 +630,20 @@ pub(crate) fn failed(error: &opcua::types::Error) -> ClientError {
     }
 }
 
-/// Security policies, the one that most servers and their certificates are known to do first.
+/// The security policies in the order of preference: the policy that most servers and certificates
+/// support is first.
 const POLICIES: [&str; 3] = [
     "Basic256Sha256",
     "Aes256_Sha256_RsaPss",
     "Aes128_Sha256_RsaOaep",
 ];
-/// How many endpoints of a server are told of.
+/// Most endpoints in an error message.
 const MOST_TOLD: usize = 12;
-/// How long servers keep the session of a client that is gone.
+/// Session timeout at the server, without the patience.
 const SESSION_TIMEOUT: Duration = Duration::from_secs(30);
-/// How often the certificate of a server is judged while it is connected: it may be revoked, or be over.
+/// Interval of judging the certificate of a connected server, which may be revoked or expire.
 const JUDGED_EVERY: Duration = Duration::from_secs(2);
-/// How often it is looked whether subscriptions live.
+/// Interval of checking the connection and the subscriptions.
 const LOOK: Duration = Duration::from_millis(500);
-/// How long nothing may come of any subscription; each says every second that it lives.
+/// Longest time without a notification; each subscription sends a keep-alive every second.
 const LONGEST_SILENCE: Duration = Duration::from_secs(5);

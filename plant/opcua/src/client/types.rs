@@ -1,4 +1,4 @@
-//! Which types are subtypes of which, as the server has them.
+//! The type hierarchy of a server.
 
 use std::collections::HashSet;
 
@@ -8,7 +8,7 @@ use super::services::Browse;
 use super::{Client, ClientError};
 
 impl Client {
-    /// The supertype of a type, remembered as long as the connection holds.
+    /// Returns the supertype of a type. The result is cached for the connection.
     async fn supertype(&self, type_id: &NodeId) -> Result<Option<NodeId>, ClientError> {
         let connected = self.shared.connected()?;
         if let Some(known) = connected.supertypes.lock().get(type_id) {
@@ -27,15 +27,16 @@ impl Client {
         Ok(above)
     }
 
-    /// The supertypes of a type, nearest first.
+    /// Returns the supertypes of a type, nearest first.
     ///
     /// # Errors
-    /// No answer, or the type is not there.
+    ///
+    /// Returns an error if the request has no response or the type does not exist.
     pub async fn supertypes(&self, type_id: &NodeId) -> Result<Vec<NodeId>, ClientError> {
         let mut found = Vec::new();
         let mut at = type_id.clone();
         while let Some(next) = self.supertype(&at).await? {
-            // A server may have a circle.
+            // The type hierarchy of a faulty server may be cyclic.
             if found.contains(&next) || next == *type_id {
                 break;
             }
@@ -45,10 +46,11 @@ impl Client {
         Ok(found)
     }
 
-    /// Whether a type is another one or a subtype of it.
+    /// Returns whether a type is `base` or a subtype of `base`.
     ///
     /// # Errors
-    /// No answer, or the type is not there.
+    ///
+    /// Returns an error if the request has no response or the type does not exist.
     pub async fn is_subtype_of(
         &self,
         type_id: &NodeId,
@@ -57,10 +59,11 @@ impl Client {
         Ok(type_id == base || self.supertypes(type_id).await?.contains(base))
     }
 
-    /// A type and its subtypes of all levels, at most [`MOST_TYPES`].
+    /// Returns a type and its subtypes of all levels, at most [`MOST_TYPES`].
     ///
     /// # Errors
-    /// No answer, or the type is not there.
+    ///
+    /// Returns an error if the request has no response or the type does not exist.
     pub async fn subtypes(&self, base: &NodeId) -> Result<Vec<NodeId>, ClientError> {
         let mut found = vec![base.clone()];
         let mut seen: HashSet<NodeId> = HashSet::from([base.clone()]);
@@ -82,5 +85,5 @@ impl Client {
     }
 }
 
-/// How many types of a server are looked at.
+/// Most types of a server that are returned or cached.
 pub const MOST_TYPES: usize = 10_000;

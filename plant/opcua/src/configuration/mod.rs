@@ -1,10 +1,13 @@
-//! The certificates of a server as clients manage them: its ServerConfiguration object (OPC 10000-12, 7.10).
+//! The ServerConfiguration object, with which clients manage the certificates of a server (OPC
+//! 10000-12, 7.10).
 //!
-//! An administrator has the server ask for a certificate ([`Configuration`]: CreateSigningRequest), gives it what an authority has
-//! issued (UpdateCertificate), and says whom it is to trust (the trust list, a file). What counts after ApplyChanges only, because
-//! the library reads its pair once, is told to the program around it, which starts the server anew.
+//! An administrator requests a signing request of the server ([`Configuration`]:
+//! CreateSigningRequest), installs the certificate that an authority issued (UpdateCertificate),
+//! and edits the trust list (a file). The library reads its certificate and key only once. Changes
+//! that require a restart are therefore reported to the embedding program, which restarts the
+//! server.
 //!
-//! Reading order: `store` (the trust list in the files of the store), then here.
+//! Reading order: `store` (the trust list in the files of the store), then this module.
 
 mod store;
 
@@ -33,12 +36,12 @@ use crate::pki::{OWN_CERTIFICATE, OWN_KEY};
 use crate::server::{CoreMethod, MethodHandler, MethodRequest, Refusal, method};
 use crate::trust_file::TrustFile;
 
-/// The ServerConfiguration of a server with a certificate store.
+/// The ServerConfiguration object of a server with a certificate store.
 #[derive(Debug)]
 pub struct Configuration {
     root: PathBuf,
     application_uri: String,
-    /// Whether the server that runs lets in whom an authority issued certificates.
+    /// Whether the running server admits clients with certificates of a trusted authority.
     has_door: bool,
     state: Mutex<State>,
     file: TrustFile,
@@ -48,9 +51,9 @@ pub struct Configuration {
 
 #[derive(Default)]
 struct State {
-    /// The key of a signing request that wanted a new one, in the DER of PKCS #8.
+    /// The new private key of a signing request, as DER of PKCS #8.
     next_key: Option<Vec<u8>>,
-    /// A pair that ApplyChanges puts in the place of the server's own.
+    /// The certificate and key that ApplyChanges installs.
     waiting: Option<(Certificate, Option<Vec<u8>>)>,
 }
 
@@ -68,7 +71,8 @@ impl std::fmt::Debug for State {
 type Answer = Result<Vec<Variant>, Refusal>;
 
 impl Configuration {
-    /// That of the server of `application_uri`, whose store is at `root` and has its pair.
+    /// Creates the object of the server `application_uri` with the store at `root`, which contains
+    /// the server's certificate and key.
     #[must_use]
     pub fn new(root: &Path, application_uri: &str) -> Arc<Self> {
         let store = StoreList::new(root);
@@ -83,17 +87,18 @@ impl Configuration {
         })
     }
 
-    /// Ready once changes are to be applied for which the server has to be started anew, with time for the client to be answered.
+    /// Waits until applied changes require a restart of the server. The delay leaves time for the
+    /// response to the client.
     pub async fn applied(&self) {
         self.applied.notified().await;
     }
 
-    /// Has [`applied`](Self::applied) return: the server has another certificate.
+    /// Makes [`applied`](Self::applied) return: the server has a new certificate.
     pub fn restart(&self) {
         self.applied.notify_one();
     }
 
-    /// Each method, for the node manager of the core namespace.
+    /// Returns the methods, for the node manager of the core namespace.
     #[must_use]
     pub fn methods(self: &Arc<Self>) -> Vec<CoreMethod> {
         let mut all = Vec::new();
@@ -148,7 +153,7 @@ impl Configuration {
         all
     }
 
-    /// The nodes of the methods: they are for those who say who may do what.
+    /// Returns the nodes of the methods, which only security administrators may call.
     pub fn nodes() -> impl Iterator<Item = NodeId> {
         let own = METHODS.iter().map(|(id, ..)| *id);
         let file = FILE.iter().map(|(id, ..)| *id);
@@ -158,7 +163,8 @@ impl Configuration {
             .map(NodeId::from)
     }
 
-    /// What its variables show, of a server that is announced by mDNS or not.
+    /// Returns the values of the variables. `is_announced` states whether mDNS announces the
+    /// server.
     #[must_use]
     pub fn values(is_announced: bool) -> Vec<(VariableId, Variant)> {
         let largest = u32::try_from(LARGEST).unwrap_or(u32::MAX);
@@ -205,7 +211,7 @@ impl Configuration {
         match what {
             FileMethod::CloseAndUpdate => {
                 info!(by = ?request.caller.user, "the trust list is another");
-                // The first authority counts when the server is started anew.
+                // The first trusted authority takes effect after a restart of the server.
                 Ok(vec![Variant::Boolean(self.wants_door())])
             }
             FileMethod::Open
@@ -222,7 +228,7 @@ impl Configuration {
         !self.has_door && known::trusts_authorities(&self.root)
     }
 
-    /// UpdateCertificate: answers that ApplyChanges is to follow.
+    /// UpdateCertificate. The result requires ApplyChanges.
     fn update(&self, request: &MethodRequest) -> Answer {
         let [
             Variant::NodeId(group),
@@ -265,7 +271,8 @@ impl Configuration {
         Ok(vec![Variant::Boolean(true)])
     }
 
-    /// The private key of a new certificate: one that was given or made for a request, or, with `None`, that the server has.
+    /// Returns the private key of a new certificate: the given key or the key of the signing
+    /// request. `None` is the server's present key.
     fn key_of(
         &self,
         certificate: &Certificate,
@@ -299,7 +306,7 @@ impl Configuration {
         Ok(der.as_bytes().to_vec())
     }
 
-    /// ApplyChanges: the new pair is that of the server, which is started anew.
+    /// ApplyChanges: installs the new certificate and key, and requests a restart.
     fn apply(self: &Arc<Self>, request: &MethodRequest) -> Answer {
         let waiting = self.state.lock().waiting.take();
         let is_new = waiting.is_some();
@@ -324,7 +331,7 @@ impl Configuration {
         Ok(Vec::new())
     }
 
-    /// GetRejectedList: the certificates that were refused, the latest first, 100 at most.
+    /// GetRejectedList: the rejected certificates, newest first, at most 100.
     fn rejected(&self) -> Vec<Variant> {
         let entries = fs::read_dir(self.root.join("rejected"))
             .into_iter()
@@ -350,7 +357,7 @@ impl Configuration {
     }
 }
 
-/// CreateSigningRequest: for the key there is, or for a new one, which takes some time to make.
+/// CreateSigningRequest for the present key or for a new key, whose generation takes some time.
 struct CreateSigningRequest(Arc<Configuration>);
 
 #[async_trait]
@@ -370,7 +377,8 @@ impl MethodHandler for CreateSigningRequest {
         };
         is_ours(group, wanted)?;
         let key = if *is_anew {
-            // The system has enough that is random; who asks is to have shown what the standard wants (7.10.10).
+            // The nonce is not used, because the system has enough entropy. The standard still
+            // requires it (7.10.10).
             if nonce.value.as_deref().unwrap_or_default().len() < SHORTEST_NONCE {
                 return Err(StatusCode::BadInvalidArgument.into());
             }
@@ -407,7 +415,8 @@ impl MethodHandler for CreateSigningRequest {
 }
 
 /// # Errors
-/// Others could read or change what is said.
+///
+/// Returns an error if the connection is not encrypted.
 fn is_unread(request: &MethodRequest) -> Result<(), StatusCode> {
     match request.caller.encrypted {
         true => Ok(()),
@@ -415,7 +424,8 @@ fn is_unread(request: &MethodRequest) -> Result<(), StatusCode> {
     }
 }
 
-/// Whether a group and a type of certificates are those that there are; null is any.
+/// Checks that the certificate group and the certificate type are supported; a null NodeId means
+/// any.
 fn is_ours(group: &NodeId, wanted: &NodeId) -> Result<(), StatusCode> {
     let own: NodeId =
         ObjectId::ServerConfiguration_CertificateGroups_DefaultApplicationGroup.into();
@@ -428,12 +438,12 @@ fn is_ours(group: &NodeId, wanted: &NodeId) -> Result<(), StatusCode> {
     }
 }
 
-/// RsaSha256ApplicationCertificateType.
+/// Returns RsaSha256ApplicationCertificateType.
 fn kind() -> NodeId {
     ObjectTypeId::RsaSha256ApplicationCertificateType.into()
 }
 
-/// A part of a subject, as `CN=Robot,O=Plant` or `CN=Robot/O=Plant`.
+/// Returns a field of a subject such as `CN=Robot,O=Plant` or `CN=Robot/O=Plant`.
 fn part(subject: &str, wanted: &str) -> Option<String> {
     let each = subject.split([',', '/', ';']);
     let mut pairs = each.filter_map(|one| one.trim().split_once('='));
@@ -443,7 +453,7 @@ fn part(subject: &str, wanted: &str) -> Option<String> {
 
 type CarryOut = fn(&Arc<Configuration>, &MethodRequest) -> Answer;
 
-/// The object's own method, that of its type, its name, and what carries it out.
+/// The methods of the object: method of the instance, method of the type, name, handler.
 const METHODS: [(MethodId, MethodId, &str, CarryOut); 3] = [
     (
         MethodId::ServerConfiguration_UpdateCertificate,
@@ -465,7 +475,7 @@ const METHODS: [(MethodId, MethodId, &str, CarryOut); 3] = [
     ),
 ];
 
-/// The same of the trust list.
+/// The methods of the trust list, in the same form.
 const LIST: [(MethodId, MethodId, &str, CarryOut); 2] = [
     (
         MethodId::ServerConfiguration_CertificateGroups_DefaultApplicationGroup_TrustList_AddCertificate,
@@ -539,5 +549,5 @@ const KEY_BITS: u32 = 2048;
 /// Bytes (OPC 10000-12, 7.10.10).
 const SHORTEST_NONCE: usize = 32;
 const MOST_REJECTED: usize = 100;
-/// What a client was told last is to leave before the server ends.
+/// The time for the last response to reach its client before the server restarts.
 const ANSWER_LEAVES: Duration = Duration::from_millis(500);

@@ -1,4 +1,4 @@
-//! The trust list of a server in the files of its certificate store.
+//! The trust list of a server, stored in the files of its certificate store.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -16,7 +16,7 @@ use crate::known;
 use crate::server::MethodRequest;
 use crate::trust_file::{TrustList, masks};
 
-/// The list of the store at a root.
+/// The trust list of the store at a root.
 #[derive(Debug, Clone)]
 pub(crate) struct StoreList {
     root: PathBuf,
@@ -29,8 +29,8 @@ impl StoreList {
         }
     }
 
-    /// AddCertificate: of an application or an authority that is trusted. Others are of a list that is written as a whole
-    /// (OPC 10000-12, 7.8.2.6).
+    /// AddCertificate: trusts the certificate of an application or of an authority. Issuer
+    /// certificates are changed only by writing the whole list (OPC 10000-12, 7.8.2.6).
     pub(crate) fn add(&self, request: &MethodRequest) -> Answer {
         let [Variant::ByteString(bytes), Variant::Boolean(true)] = request.arguments.as_slice()
         else {
@@ -43,7 +43,7 @@ impl StoreList {
         Ok(Vec::new())
     }
 
-    /// RemoveCertificate: by its thumbprint.
+    /// RemoveCertificate, by thumbprint.
     pub(crate) fn remove(&self, request: &MethodRequest) -> Answer {
         let [Variant::String(thumbprint), Variant::Boolean(is_trusted)] =
             request.arguments.as_slice()
@@ -73,8 +73,9 @@ impl StoreList {
         Ok(Vec::new())
     }
 
-    /// Looks at a new certificate of the server, with the certificates of authorities that come along: the signature of each is
-    /// to be of the one above it. Whom the server trusts says nothing of by whom it is to be known (OPC 10000-12, 7.10.5).
+    /// Judges a new certificate of the server together with its issuer certificates: each signature
+    /// has to be valid. The issuers need not be trusted by the server, because other applications
+    /// verify the certificate (OPC 10000-12, 7.10.5).
     pub(crate) fn judge(
         &self,
         certificate: &Certificate,
@@ -83,21 +84,22 @@ impl StoreList {
         self.judge_among(certificate, &given(issuers)?)
     }
 
-    /// The same with the certificates of authorities read.
+    /// Judges a new certificate of the server with decoded issuer certificates.
     pub(crate) fn judge_among(
         &self,
         certificate: &Certificate,
         issuers: &[Certificate],
     ) -> Result<(), StatusCode> {
         let mut known = known::read(&self.root);
-        // Who may give the server a certificate decides that it is one to be shown.
+        // The issuers count as trusted here: an administrator who may replace the certificate is
+        // responsible for it.
         known.trusted.append(&mut known.issuers);
         known.trusted.extend_from_slice(issuers);
         if certificate.is_self_signed() {
             known.trusted.push(certificate.clone());
         }
         match trust::check(certificate, &[], &known, known::now()) {
-            // Its authority says later what it has revoked.
+            // The authority may publish its revocation lists later.
             Ok(()) | Err(Fault::RevocationUnknown | Fault::IssuerRevocationUnknown) => Ok(()),
             Err(fault) => {
                 warn!(%fault, "a new certificate of the server is refused");
@@ -106,12 +108,12 @@ impl StoreList {
         }
     }
 
-    /// Keeps the certificates of authorities above one, which clients may want to know.
+    /// Stores the issuer certificates of a certificate, which clients may need.
     pub(crate) fn keep_issuers(&self, issuers: &Variant) -> Result<(), StatusCode> {
         self.keep_all(&given(issuers)?)
     }
 
-    /// The same with the certificates read.
+    /// Stores decoded issuer certificates.
     pub(crate) fn keep_all(&self, issuers: &[Certificate]) -> Result<(), StatusCode> {
         for certificate in issuers.iter().filter(|one| one.is_authority()) {
             self.keep(certificate, Standing::Issuer)
@@ -120,7 +122,7 @@ impl StoreList {
         Ok(())
     }
 
-    /// Trusts certificates of a trust list, beside those that are trusted already.
+    /// Trusts the certificates of a trust list, in addition to the trusted certificates.
     pub(crate) fn trust_all(&self, all: &[Certificate]) -> io::Result<()> {
         for certificate in all {
             let known = known::read(&self.root);
@@ -132,7 +134,7 @@ impl StoreList {
         Ok(())
     }
 
-    /// Puts a certificate where the library looks for it; says the name of its file.
+    /// Writes a certificate to the folder that the library reads, and returns the file name.
     fn keep(&self, certificate: &Certificate, standing: Standing) -> io::Result<String> {
         let of_library = X509::from_der(certificate.der())
             .map_err(|error| io::Error::other(error.to_string()))?;
@@ -141,7 +143,7 @@ impl StoreList {
         fs::create_dir_all(&folder)?;
         fs::write(folder.join(&name), certificate.der())?;
         if standing == Standing::Trusted {
-            // Both at once would count as refused.
+            // The library refuses a certificate that is both trusted and rejected.
             match fs::remove_file(self.root.join(Standing::Rejected.name()).join(&name)) {
                 Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
                 Ok(()) | Err(_) => {}
@@ -150,7 +152,7 @@ impl StoreList {
         Ok(name)
     }
 
-    /// Has these certificates alone. The new ones come before the others go.
+    /// Replaces all certificates of a role. New files are written before old files are deleted.
     fn have(&self, all: &[Certificate], standing: Standing) -> io::Result<()> {
         let mut names = BTreeSet::new();
         for one in all {
@@ -165,7 +167,7 @@ impl StoreList {
         Ok(())
     }
 
-    /// Has these lists alone of the authorities that are meant, by whether those are trusted.
+    /// Replaces all revocation lists of trusted authorities, or of the other authorities.
     fn have_lists(&self, all: &[Crl], are_trusted: bool) -> Result<(), StatusCode> {
         let known = known::read(&self.root);
         let folder = self.root.join(known::CRLS);
@@ -223,7 +225,7 @@ impl TrustList for StoreList {
     }
 
     fn replace(&self, list: TrustListDataType) -> Result<bool, StatusCode> {
-        // All is read before anything is written.
+        // The whole list is decoded before any file is changed.
         let certificates = |all: &Option<Vec<ByteString>>| -> Result<Vec<Certificate>, StatusCode> {
             all.iter().flatten().map(read).collect()
         };
@@ -261,7 +263,7 @@ fn is_trusted(list: &Crl, known: &Known) -> bool {
     known.trusted.iter().any(|one| list.is_of(one))
 }
 
-/// The certificates in an argument of a method.
+/// Returns the certificates in a method argument.
 fn given(issuers: &Variant) -> Result<Vec<Certificate>, StatusCode> {
     let Variant::Array(array) = issuers else {
         return Ok(Vec::new());
@@ -280,7 +282,7 @@ fn read(bytes: &ByteString) -> Result<Certificate, StatusCode> {
     Certificate::read(bytes).map_err(|_| StatusCode::BadCertificateInvalid)
 }
 
-/// Tells what went wrong, and what the client is told.
+/// Logs an error of the store, and returns the status code for the client.
 fn told(error: &io::Error) -> StatusCode {
     warn!(%error, "the certificate store cannot be changed");
     StatusCode::BadResourceUnavailable

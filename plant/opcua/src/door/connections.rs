@@ -1,4 +1,5 @@
-//! The open connections of a door, and which of them give way to new ones.
+//! The open connections of a door, and the selection of the connection that a new connection
+//! replaces.
 
 use std::collections::{BTreeMap, HashMap};
 use std::net::IpAddr;
@@ -11,18 +12,18 @@ use tokio::task::AbortHandle;
 #[derive(Debug)]
 struct Connection {
     address: IpAddr,
-    /// Whether the client has shown a certificate that is trusted.
+    /// Whether the client presented a trusted certificate.
     admitted: Arc<AtomicBool>,
     task: AbortHandle,
 }
 
-/// Open connections by their numbers, so the oldest one comes first.
+/// Open connections by number, oldest first.
 #[derive(Debug)]
 pub(super) struct Connections {
     open: BTreeMap<u64, Connection>,
     next: u64,
     most: usize,
-    /// Limit for the connections of an address; 0 is no limit.
+    /// Most connections per address; 0 for no limit.
     most_per_address: usize,
 }
 
@@ -42,7 +43,7 @@ impl Connections {
         self.next
     }
 
-    /// Keeps a connection that was opened.
+    /// Adds an open connection.
     pub(super) fn insert(
         &mut self,
         number: u64,
@@ -57,13 +58,13 @@ impl Connections {
         self.open.insert(number, connection);
     }
 
-    /// Forgets a connection that has ended.
+    /// Removes a closed connection.
     pub(super) fn remove(&mut self, number: u64) {
         self.open.remove(&number);
     }
 
-    /// Makes sure that one more connection of an address can be opened. Connections of admitted clients stay. Returns
-    /// `false` if the new connection must be refused.
+    /// Makes sure that another connection of an address can be opened. Connections of admitted
+    /// clients stay open. Returns `false` if the new connection must be refused.
     pub(super) fn make_room(&mut self, address: IpAddr) -> bool {
         let of_address = self.open.values().filter(|one| one.address == address);
         if self.most_per_address > 0 && of_address.count() >= self.most_per_address {
@@ -72,10 +73,10 @@ impl Connections {
         self.open.len() < self.most || self.give_way(|_| true)
     }
 
-    /// Ends the oldest connection of a client that is not admitted, of the address that has the most of them. Returns
-    /// `false` if all clients are admitted.
+    /// Closes the oldest connection of a client that is not admitted, of the address with the most
+    /// such connections. Returns `false` if all clients are admitted.
     pub(super) fn give_way(&mut self, may_end: impl Fn(IpAddr) -> bool) -> bool {
-        // By address: the number of connections, and the oldest one.
+        // By address: the number of connections, and the number of the oldest connection.
         let mut others: HashMap<IpAddr, (usize, u64)> = HashMap::new();
         for (number, connection) in &self.open {
             if may_end(connection.address) && !connection.admitted.load(Ordering::Relaxed) {
@@ -101,7 +102,8 @@ mod tests {
         [10, 0, 0, last].into()
     }
 
-    /// Connections of these addresses, of which those with these numbers are admitted.
+    /// Returns open connections of these addresses. The connections with the numbers `admitted` are
+    /// admitted.
     fn opened(most: (usize, usize), addresses: &[u8], admitted: &[u64]) -> Connections {
         let mut connections = Connections::new(most.0, most.1);
         for address in addresses {
@@ -121,7 +123,7 @@ mod tests {
     async fn the_oldest_client_that_is_not_admitted_gives_way() {
         let mut connections = opened((4, 0), &[1, 2, 1, 2], &[1]);
         assert!(connections.make_room(ip(3)));
-        // The address 2 had two of them, and the address 1 one.
+        // Address 2 had two connections, and address 1 had one connection.
         assert_eq!(open(&connections), [1, 3, 4]);
         assert!(connections.make_room(ip(3)));
         assert_eq!(open(&connections), [1, 3, 4]);

@@ -1,7 +1,9 @@
-//! An invitation to a plant: where its Global Discovery Server is, by which certificate it is known, and the one-time token that
-//! has the first certificate issued without an administrator.
+//! An invitation to a plant: the URL of its Global Discovery Server, the fingerprint of the
+//! server's certificate, and a one-time token, with which the first certificate is issued without
+//! an administrator.
 //!
-//! It is one text without characters that a shell interprets: `opc.tcp://10.80.0.1:4841,sha256=FINGERPRINT,token=TOKEN`.
+//! An invitation is a text without characters that a shell interprets:
+//! `opc.tcp://10.80.0.1:4841,sha256=FINGERPRINT,token=TOKEN`.
 
 use std::fmt;
 use std::fs;
@@ -31,13 +33,15 @@ impl GdsArguments {
     /// Reads the invitation; `None` without the option.
     ///
     /// # Errors
-    /// The text or the file is not an invitation. The message leaves out the text: it may hold a token.
+    ///
+    /// Returns an error if the text or the file is not an invitation. The message omits the text,
+    /// which may contain a token.
     pub fn invitation(&self) -> Result<Option<Invitation>, InvitationFault> {
         self.gds.as_ref().map(GdsOption::read).transpose()
     }
 }
 
-/// The value of `--gds` as it was given. It may hold a token, so nothing prints it.
+/// The unparsed value of `--gds`. It is never printed, because it may contain a token.
 #[derive(Clone)]
 pub struct GdsOption(String);
 
@@ -73,23 +77,24 @@ fn text_of(file: &Path) -> Result<String, InvitationFault> {
     Ok(text)
 }
 
-/// Where the Global Discovery Server is, and what is known of it.
+/// The URL, the fingerprint and the token of a Global Discovery Server.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Invitation {
-    /// Its endpoint URL.
+    /// The endpoint URL of the server.
     pub url: String,
-    /// The SHA-256 of its certificate, which is trusted without a `trust` command.
+    /// The SHA-256 fingerprint of the server's certificate, which is trusted without a `trust`
+    /// command.
     pub fingerprint: Option<Fingerprint>,
-    /// Has the first certificate issued at once.
+    /// The one-time token, with which the first certificate is issued at once.
     pub token: Option<Token>,
 }
 
-/// A one-time token. [`fmt::Display`] writes it for the invitation; [`fmt::Debug`] does not.
+/// A one-time token. [`fmt::Display`] writes the token for the invitation; [`fmt::Debug`] does not.
 #[derive(Clone, PartialEq, Eq)]
 pub struct Token(String);
 
 impl Token {
-    /// A token of these characters.
+    /// Creates a token from its text.
     #[must_use]
     pub fn of(text: &str) -> Self {
         Self(text.to_owned())
@@ -127,20 +132,20 @@ impl fmt::Display for Invitation {
     }
 }
 
-/// A text that is not an invitation. No part of the text is in the message.
+/// An error in an invitation. The message contains no part of the text.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum InvitationFault {
-    /// The URL cannot be read.
+    /// The URL is invalid.
     #[error(
         "--gds begins with a URL that cannot be read; give opc.tcp://HOST:PORT, or the invitation that `ua-gds invite` printed"
     )]
     Url,
-    /// The fingerprint cannot be read.
+    /// The fingerprint is invalid.
     #[error(
         "--gds has a fingerprint that cannot be read: sha256= is followed by 64 hexadecimal digits"
     )]
     Fingerprint,
-    /// The token cannot be read.
+    /// The token is invalid.
     #[error(
         "--gds has a token that cannot be read: paste the invitation as `ua-gds invite` printed it"
     )]
@@ -148,7 +153,7 @@ pub enum InvitationFault {
     /// An unknown part.
     #[error("--gds has a part that is neither sha256= nor token=; parts are separated by commas")]
     Part,
-    /// A token without fingerprint: any server could take the token.
+    /// The invitation has a token and no fingerprint, so any server could receive the token.
     #[error(
         "--gds has a token and no sha256=: a token is sent only to a server whose certificate is known"
     )]
@@ -198,7 +203,7 @@ impl FromStr for Invitation {
 
 const FINGERPRINT: &str = "sha256";
 const TOKEN: &str = "token";
-/// Bytes of a file with an invitation.
+/// Largest file with an invitation, in bytes.
 const LONGEST: u64 = 4096;
 const LONGEST_TOKEN: usize = 128;
 

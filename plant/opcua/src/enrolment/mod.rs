@@ -1,12 +1,14 @@
-//! Requests and renews the certificate and the trust list of an application at the Global Discovery Server of its plant
-//! (OPC 10000-12, 7.9). One implementation for all programs with an OPC UA certificate.
+//! Requests and renews the certificate and the trust list of an application at the Global Discovery
+//! Server of its plant (OPC 10000-12, 7.9). All programs with an OPC UA certificate use this
+//! implementation.
 //!
-//! The first request goes out at once while the application has made its certificate itself, later ones when four fifths of the
-//! life of the certificate are over. With the one-time token of an [`Invitation`] the first certificate is issued at once;
-//! without it the request waits until an administrator has approved it, and is asked for again until then. The authority in
-//! the trust list is trusted from then on, so that the programs of a plant trust one another.
+//! An application with a self-made certificate sends the first request at once. Later requests
+//! follow after four fifths of the lifetime of the certificate. With the one-time token of an
+//! [`Invitation`] the first certificate is issued at once. Without a token the request waits for
+//! the approval of an administrator, and is polled until then. The authority in the trust list
+//! becomes trusted, so that the programs of a plant trust each other.
 //!
-//! Reading order: `invitation` (the option of a program), then here.
+//! Reading order: `invitation` (the option of a program), then this module.
 
 mod invitation;
 
@@ -29,18 +31,19 @@ use crate::own::{self, Cause};
 use crate::pair;
 use crate::pki::OWN_KEY;
 
-/// An application that wants a certificate.
+/// The application that requests a certificate.
 #[derive(Debug, Clone)]
 pub struct Applicant {
-    /// Its ApplicationUri.
+    /// The ApplicationUri of the application.
     pub application_uri: String,
-    /// Its name for people.
+    /// The application name.
     pub name: String,
-    /// Its ProductUri.
+    /// The ProductUri of the application.
     pub product_uri: String,
-    /// Its DiscoveryUrls. The authority issues certificates for their hosts only.
+    /// The DiscoveryUrls of the application. The authority issues certificates for their hosts
+    /// only.
     pub urls: Vec<String>,
-    /// Its capabilities, such as `DA`.
+    /// The server capabilities, such as `DA`.
     pub capabilities: Vec<String>,
 }
 
@@ -62,8 +65,9 @@ impl Applicant {
         }
     }
 
-    /// Returns the hosts for which a certificate is requested: the hosts of the DiscoveryUrls, and of the current certificate
-    /// all hosts if an authority issued it, otherwise the names of the computer itself.
+    /// Returns the hosts of the requested certificate. These are the hosts of the DiscoveryUrls,
+    /// and hosts of the current certificate: all hosts if an authority issued it, otherwise only
+    /// the loopback names.
     fn hosts(&self, old: &Certificate) -> Vec<String> {
         let urls = self.urls.iter().filter_map(|url| url.parse().ok());
         let registered = urls.flat_map(|url: EndpointUrl| url.hosts());
@@ -80,15 +84,15 @@ impl Applicant {
     }
 }
 
-/// Keeps the certificate and the trust list of an application current.
+/// Keeps the certificate and the trust list of an application up to date.
 #[derive(Debug)]
 pub struct Enrolment {
     root: PathBuf,
     applicant: Applicant,
     gds: Invitation,
-    /// The request that the server has not decided on.
+    /// The pending request, on which the server has not decided.
     pending: Option<Pending>,
-    /// Whether the token was refused: it has expired, or was used by another application.
+    /// Whether the token was refused because it expired or another application used it.
     is_token_refused: bool,
 }
 
@@ -98,22 +102,24 @@ struct Pending {
     number: NodeId,
 }
 
-/// The outcome of a visit.
+/// The outcome of a connection to the Global Discovery Server.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Visit {
-    /// There is a new certificate, or the first authority is trusted: the program has to restart.
+    /// A new certificate was installed, or the first authority is trusted: the program has to
+    /// restart.
     Changed,
-    /// The certificate stays.
+    /// The certificate is unchanged.
     Current,
     /// The request waits for an administrator.
     Waiting,
 }
 
-/// Why a visit failed, for people.
+/// The error message of a failed visit.
 type Why = String;
 
 impl Enrolment {
-    /// The enrolment of the application whose certificate store is at `root` and has its pair.
+    /// Creates the enrolment of an application. The certificate store at `root` contains its
+    /// certificate and key.
     #[must_use]
     pub fn new(root: &Path, applicant: Applicant, gds: Invitation) -> Self {
         Self {
@@ -125,15 +131,15 @@ impl Enrolment {
         }
     }
 
-    /// Keeps the certificate and the trust list current, for as long as it is polled. Calls `changed` when the program has to
-    /// restart for a new certificate.
+    /// Keeps the certificate and the trust list up to date while the future is polled. Calls
+    /// `changed` when the program has to restart with a new certificate.
     pub async fn keep(mut self, changed: impl Fn()) {
         let mut plan: Option<(Certificate, Renewal)> = None;
         let mut lists_at = Instant::now();
         let mut reported: Option<String> = None;
         loop {
             let own = own::read(&self.root);
-            // An administrator may have replaced it.
+            // An administrator may have replaced the certificate.
             let is_same = |(of, _): &(Certificate, Renewal)| Some(of) == own.as_ref();
             plan = plan
                 .filter(is_same)
@@ -168,7 +174,7 @@ impl Enrolment {
         }
     }
 
-    /// Logs an outcome once, until it is another.
+    /// Logs an outcome if it differs from the last outcome.
     fn report(&self, visited: &Result<Visit, Why>, days_left: u64, reported: &mut Option<String>) {
         let message = match visited {
             Ok(Visit::Changed | Visit::Current) => None,
@@ -199,7 +205,8 @@ impl Enrolment {
         );
     }
 
-    /// Connects to the Global Discovery Server, requests a certificate in place of `old`, and fetches the trust list.
+    /// Connects to the Global Discovery Server, requests a certificate to replace `old`, and
+    /// fetches the trust list.
     async fn visit(&mut self, old: Option<&Certificate>) -> Result<Visit, Why> {
         let client = Client::open(
             ClientConfig {
@@ -225,7 +232,7 @@ impl Enrolment {
         let text = |error: DirectoryError| error.to_string();
         let up = client.up(ANSWERS_WITHIN).await;
         up.map_err(|error| error.to_string())?;
-        // Any server could issue a certificate to a client that does not check the server's own.
+        // Without verification of the server's certificate, any server could issue a certificate.
         if !matches!(&*client.link().borrow(), Link::Up { secured: true, .. }) {
             return Err("the server offers no secured channel".to_owned());
         }
@@ -241,7 +248,8 @@ impl Enrolment {
         let application = application.map_err(text)?;
         let lists = directory.trust_lists(&application).await.map_err(text)?;
         let is_first = !known::trusts_authorities(&self.root);
-        // Before the certificate: it is of no use while its authority is not trusted here.
+        // The trust list comes first: the certificate is useless until its authority is trusted
+        // here.
         self.trust(&lists)?;
         if let Some((certificate, above)) = &issued {
             self.take_up(certificate, above)?;
@@ -252,7 +260,8 @@ impl Enrolment {
         }
     }
 
-    /// Returns the certificate that the authority issued, with those of the authorities above; `None` while the request waits.
+    /// Returns the issued certificate and its issuer certificates; `None` while the request is
+    /// pending.
     async fn issued(
         &mut self,
         directory: &Directory,
@@ -277,9 +286,9 @@ impl Enrolment {
                     self.pending = Some(pending);
                     Ok(None)
                 }
-                // The server does not know the request any more: the next visit makes another one.
+                // The server does not know the request; the next visit sends a new request.
                 Some(_) => Err(text(error)),
-                // The answer was lost, and is fetched again.
+                // The response was lost; the next visit polls the request again.
                 None => {
                     self.pending = Some(pending);
                     Err(text(error))
@@ -288,7 +297,7 @@ impl Enrolment {
         }
     }
 
-    /// Requests a certificate: with the token, unless the server has refused it.
+    /// Requests a certificate, with the token unless the server refused the token.
     async fn requested(
         &mut self,
         directory: &Directory,
@@ -325,7 +334,7 @@ impl Enrolment {
         }
     }
 
-    /// Signs a request with the own key, which takes a while.
+    /// Signs a request with the own private key, which takes some time.
     async fn request(&self, old: &Certificate, token: Option<Token>) -> Result<Request, Why> {
         let key = own_key(&self.root)?;
         let (uri, hosts) = (
@@ -341,7 +350,7 @@ impl Enrolment {
         signed.map_err(|why| format!("no certificate can be requested: {why}"))
     }
 
-    /// Trusts the certificates of a trust list, and keeps its revocation lists.
+    /// Trusts the certificates of a trust list, and stores its revocation lists.
     fn trust(&self, lists: &TrustLists) -> Result<(), Why> {
         let store = StoreList::new(&self.root);
         let failed = |error: std::io::Error| format!("the trust list cannot be kept: {error}");
@@ -361,7 +370,8 @@ impl Enrolment {
         Ok(())
     }
 
-    /// Checks an issued certificate by the same rules as UpdateCertificate, and replaces the own certificate by it.
+    /// Checks an issued certificate by the rules of UpdateCertificate, and replaces the own
+    /// certificate.
     fn take_up(&self, certificate: &Certificate, above: &[Certificate]) -> Result<(), Why> {
         if certificate.application_uri().as_deref() != Some(&self.applicant.application_uri) {
             return Err("the issued certificate is for another ApplicationUri".to_owned());
@@ -375,7 +385,7 @@ impl Enrolment {
             Renewal::of(certificate).step(known::now()),
             Step::Wait { .. }
         ) {
-            // The program would restart without end.
+            // Otherwise the program would restart endlessly.
             return Err("the issued certificate is to be renewed at once".to_owned());
         }
         let key = own_key(&self.root)?;
@@ -396,7 +406,7 @@ impl Enrolment {
     }
 }
 
-/// Returns the status that the server answered with; `None` where there was no answer.
+/// Returns the status code of the server's response; `None` without a response.
 fn status_of(error: &DirectoryError) -> Option<StatusCode> {
     match error {
         DirectoryError::Call { error, .. } => match error {
@@ -408,31 +418,34 @@ fn status_of(error: &DirectoryError) -> Option<StatusCode> {
     }
 }
 
-/// Reads the DER of the own private key.
+/// Reads the own private key, and returns its DER encoding.
 ///
 /// # Errors
-/// The file cannot be read, or holds no key.
+///
+/// Returns an error if the file cannot be read or does not contain a key.
 pub fn own_key(root: &Path) -> Result<Vec<u8>, String> {
     let path = root.join(OWN_KEY);
     let read = std::fs::read(&path).map_err(|error| format!("{}: {error}", path.display()))?;
     pair::from_pem(&read).ok_or_else(|| format!("{} holds no private key", path.display()))
 }
 
-/// The names of the computer itself, which every certificate may have.
+/// The loopback names, which every certificate may contain.
 const LOOPBACK: [&str; 3] = ["localhost", "127.0.0.1", "::1"];
 const WAITING: &str = "the certificate is requested and waits for an administrator: `ua-gds requests` lists it, `ua-gds \
     approve NUMBER` has it issued";
-/// How often the store is read: an administrator may have replaced the certificate, and the clock may have been set.
+/// Interval of reading the store: an administrator may have replaced the certificate, or the clock
+/// may have been set.
 const LOOK: Duration = Duration::from_secs(2);
-/// How often the trust list is fetched; an authority signs a new list when half of the time of the last is over.
+/// Interval of fetching the trust list. An authority signs a new revocation list after half of the
+/// validity of the last list.
 const LISTS_EVERY: Duration = Duration::from_secs(3600);
-/// The same after a failure.
+/// Interval of fetching the trust list after a failure.
 const LISTS_AGAIN: Duration = Duration::from_secs(30);
-/// The time of a visit, with all its answers.
+/// Longest duration of a visit.
 const LONGEST_VISIT: Duration = Duration::from_secs(60);
-/// The time of one answer of the Global Discovery Server.
+/// Timeout of a request to the Global Discovery Server.
 const ANSWERS_WITHIN: Duration = Duration::from_secs(10);
-/// Characters of a common name.
+/// Most characters of a common name.
 const LONGEST_NAME: usize = 64;
 
 #[cfg(test)]

@@ -1,4 +1,5 @@
-//! NodeSet2 documents: from the bytes of a file to nodes, with the lines that findings name.
+//! NodeSet2 documents: converts the bytes of a file into nodes, and provides line numbers for
+//! findings.
 
 use std::collections::HashMap;
 use std::fs::File;
@@ -18,16 +19,16 @@ use quick_xml::reader::Reader;
 use super::{CORE, NodeSetError, Source};
 use crate::limits::LARGEST_NODESET;
 
-/// A document, parsed.
+/// A parsed document.
 pub(super) struct Parsed {
-    /// The name of its file.
+    /// The file name.
     pub(super) file: String,
     pub(super) text: Text,
     pub(super) set: UANodeSet,
 }
 
 impl Parsed {
-    /// Reads a document. Its nodes of the core namespace are left out.
+    /// Parses a document, without its nodes of the core namespace.
     pub(super) fn read(source: Source) -> Result<Self, NodeSetError> {
         let (file, text) = match source {
             Source::Text { name, xml } => (name, Text(xml)),
@@ -72,7 +73,7 @@ fn not_a_document(file: &str, reason: String) -> NodeSetError {
     }
 }
 
-/// The bytes of a file, at most [`LARGEST_NODESET`].
+/// Reads a file of at most [`LARGEST_NODESET`] bytes.
 fn bytes(path: &Path, file: &str) -> Result<Vec<u8>, NodeSetError> {
     let mut bytes = Vec::new();
     let read = File::open(path)
@@ -98,7 +99,7 @@ impl Text {
         Ok(Self(text.into_owned()))
     }
 
-    /// Returns the line of a byte, from 1.
+    /// Returns the line of a byte offset, from 1.
     fn line(&self, at: usize) -> usize {
         let before = self.0.as_bytes().get(..at).unwrap_or(self.0.as_bytes());
         before.iter().filter(|byte| **byte == b'\n').count() + 1
@@ -129,7 +130,7 @@ impl Text {
         }
     }
 
-    /// Returns the line of a byte, and the NodeId of the node that the byte belongs to.
+    /// Returns the line of a byte offset, and the NodeId of the node at the offset.
     fn place_at(&self, at: usize) -> (usize, Option<String>) {
         let mut node = None;
         self.each_node(&mut |start, id| {
@@ -142,7 +143,8 @@ impl Text {
         (self.line(at), node)
     }
 
-    /// Returns the lines of nodes, from 1. A NodeId that occurs twice has the line of the last.
+    /// Returns the lines of nodes, from 1. For a duplicate NodeId the line of the last node is
+    /// returned.
     pub(super) fn lines_of(&self, nodes: &[&str]) -> HashMap<String, usize> {
         let mut lines = HashMap::new();
         let (mut line, mut counted) = (1, 0);
@@ -159,10 +161,11 @@ impl Text {
     }
 }
 
-/// The index of the first URI in the table of a document.
+/// Returns the index of the first URI in the namespace table of a document.
 ///
-/// The table begins at index 1 (OPC 10000-6, F.2). Some tools list the core namespace first, as index 0; others list it first
-/// as index 1. In the second case the last index in use is in the table only if counted from 1.
+/// The table starts at index 1 (OPC 10000-6, F.2). Some tools list the core namespace as the first
+/// URI with index 0, other tools list it with index 1. In the second case, the largest namespace
+/// index in use equals the length of the table.
 pub(super) fn offset(set: &UANodeSet) -> usize {
     let uris = uris(set);
     if uris.first().is_none_or(|first| first != CORE) {
@@ -183,11 +186,13 @@ pub(super) fn uris(set: &UANodeSet) -> &[String] {
     set.namespace_uris.as_ref().map_or(&[], |table| &table.uris)
 }
 
-/// Leaves out the nodes of the core namespace, which servers export beside their own. A reference from one of them to a node
-/// of the document is kept at that node.
+/// Removes the nodes of the core namespace, which some servers export together with their own
+/// nodes. References from a removed node to a node of the document are kept at the node of the
+/// document.
 ///
 /// # Errors
-/// [`NodeSetError::Core`] if the document has no other nodes.
+///
+/// Returns [`NodeSetError::Core`] if the document has no other nodes.
 fn leave_out_core(file: &str, set: &mut UANodeSet) -> Result<(), NodeSetError> {
     let (offset, count) = (offset(set), uris(set).len());
     let core_index =

@@ -1,5 +1,5 @@
-//! NodeSets from files that somebody names: everything that is wrong with any of them is told at once, and one that holds
-//! values that cannot be read is used without them.
+//! NodeSets from files that the user names. All faults of all files are reported together. A file
+//! whose values cannot be decoded is used without these values.
 
 use std::collections::hash_map::DefaultHasher;
 use std::collections::{BTreeSet, HashMap};
@@ -23,44 +23,44 @@ use super::structures::{self, Structures};
 use super::{CORE, DEEPEST, Facts, NodeSet, NodeSetError, Source, imported, ordered, parted};
 use crate::limits::{LARGEST_NODESETS, MOST_NODESETS};
 
-/// NodeSets that can be put into an address space.
+/// NodeSets that are ready for import.
 #[derive(Default)]
 pub struct NodeSets {
-    /// Each after those it needs.
+    /// The NodeSets in the order of their dependencies.
     sets: Vec<NodeSet>,
-    /// The namespaces they have nodes of, in the order of the files.
+    /// The namespaces of their nodes, in the order of the files.
     provides: Vec<String>,
     fingerprint: u64,
-    /// What values of structures that the files define are read by.
+    /// Decodes values of the structures that the files define.
     structures: Arc<Structures>,
 }
 
-/// The nodes of NodeSets, by the ids that they have in an address space.
+/// The imported nodes, by their NodeIds in the address space.
 #[derive(Debug, Default)]
 pub struct Imported {
-    /// All of them.
+    /// All imported nodes.
     pub nodes: Vec<NodeId>,
-    /// Those whose values in the files cannot be read.
+    /// The nodes whose values in the files cannot be decoded.
     pub unread: Vec<NodeId>,
 }
 
-/// What is wrong with one of the files.
+/// A fault of a file.
 #[derive(Debug)]
 pub struct FileFault {
-    /// Which of them, from 0.
+    /// The index of the file, from 0.
     pub file: usize,
-    /// What.
+    /// The fault.
     pub error: NodeSetError,
 }
 
 impl NodeSetError {
-    /// Whether the NodeSet cannot be used at all.
+    /// Returns whether the NodeSet is unusable.
     #[must_use]
     pub const fn is_fatal(&self) -> bool {
         !matches!(self, Self::Unread { .. } | Self::MoreUnread { .. })
     }
 
-    /// What to do, for people.
+    /// Returns advice for the user.
     #[must_use]
     pub const fn help(&self) -> &'static str {
         match self {
@@ -91,7 +91,7 @@ impl std::fmt::Debug for NodeSets {
 }
 
 impl NodeSets {
-    /// Reads the files and orders them. Those that are no regular files are not opened.
+    /// Reads and orders the files. Only regular files are opened.
     #[must_use]
     pub fn read(files: &[PathBuf]) -> (Self, Vec<FileFault>) {
         let mut faults = Vec::new();
@@ -164,24 +164,24 @@ impl NodeSets {
         (sets, faults)
     }
 
-    /// Whether there are none.
+    /// Returns whether there are no NodeSets.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.sets.is_empty()
     }
 
-    /// The namespaces they have nodes of, in the order of the files.
+    /// Returns the namespaces of their nodes, in the order of the files.
     pub fn provides(&self) -> impl Iterator<Item = &str> {
         self.provides.iter().map(String::as_str)
     }
 
-    /// Another one when a file is written or replaced.
+    /// Returns a value that changes when a file is written or replaced.
     #[must_use]
     pub const fn fingerprint(&self) -> u64 {
         self.fingerprint
     }
 
-    /// What a node of a namespace is; `None` where no NodeSet has it.
+    /// Returns the kind of a node; `None` if no NodeSet contains the node.
     #[must_use]
     pub fn node(&self, uri: &str, identifier: &Identifier) -> Option<NodeKind> {
         let set = self.of(uri)?;
@@ -201,7 +201,7 @@ impl NodeSets {
             .find(|set| set.facts.provides.contains(uri))
     }
 
-    /// What values of a DataType are, by its supertypes.
+    /// Returns the kind of the values of a DataType, by its supertypes.
     fn value_kind(&self, set: &NodeSet, data_type: &NodeId) -> ValueKind {
         let (mut set, mut id) = (set, data_type.clone());
         for _ in 0..DEEPEST {
@@ -225,10 +225,12 @@ impl NodeSets {
         ValueKind::Any
     }
 
-    /// Puts the nodes into an address space, which owns their namespaces from now on, and gives the ids that they have there.
+    /// Imports the nodes into an address space, to which their namespaces are added. Returns the
+    /// NodeIds in the address space.
     ///
     /// # Errors
-    /// Nodes that are left out.
+    ///
+    /// Returns an error if nodes were left out.
     pub fn import(
         &self,
         address_space: &mut AddressSpace,
@@ -270,13 +272,13 @@ impl NodeSets {
     }
 }
 
-/// A file that is read and sound.
+/// A file that was read and is valid.
 struct Document {
     file: String,
     text: Text,
     facts: Facts,
     types: NodeSet2Import,
-    /// Its nodes beside the types.
+    /// The nodes that are not DataTypes or encodings.
     others: UANodeSet,
 }
 
@@ -294,7 +296,8 @@ impl Document {
         })
     }
 
-    /// The NodeSet without the values in it that cannot be read; and those.
+    /// Returns the NodeSet without the values that cannot be decoded, and the findings for these
+    /// values.
     fn into_set(
         mut self,
         structures: &Arc<Structures>,
@@ -317,7 +320,7 @@ impl Document {
     }
 }
 
-/// The findings for nodes whose values cannot be read.
+/// Returns the findings for nodes with values that cannot be decoded.
 fn unread(file: &str, text: &Text, nodes: &[(String, String)]) -> Vec<NodeSetError> {
     if nodes.is_empty() {
         return Vec::new();
@@ -339,10 +342,10 @@ fn unread(file: &str, text: &Text, nodes: &[(String, String)]) -> Vec<NodeSetErr
     each.chain(more).collect()
 }
 
-/// Number of unreadable values of a file that have a finding each.
+/// Most individual findings for undecodable values of a file.
 const MOST_UNREAD: usize = 10;
 
-/// Has the structures known that the files define. Their namespaces are numbered as in the map.
+/// Registers the structures that the files define. Their namespaces are numbered by the map.
 fn define<'d>(
     documents: impl Iterator<Item = &'d Document>,
     structures: &Structures,
@@ -358,7 +361,8 @@ fn define<'d>(
     structures.define(&items);
 }
 
-/// Takes the values out that cannot be read, and returns the NodeIds of their nodes with the reasons.
+/// Removes the values that cannot be decoded, and returns the NodeIds of their nodes with the
+/// reasons.
 fn without_unread(
     facts: &Facts,
     document: &mut UANodeSet,
@@ -401,7 +405,8 @@ fn without_unread(
     unread
 }
 
-/// What keeps files from being used together. What is missing may be in one that could not be read.
+/// Returns the conflicts between files. Missing namespaces are reported only if all files could be
+/// read, because an unreadable file may contain them.
 fn not_together(read: &[(usize, NodeSet)], is_whole: bool) -> Vec<FileFault> {
     let mut faults = Vec::new();
     let mut owners: HashMap<&str, &NodeSet> = HashMap::new();
@@ -438,7 +443,7 @@ fn not_together(read: &[(usize, NodeSet)], is_whole: bool) -> Vec<FileFault> {
     faults
 }
 
-/// The bytes of a regular file.
+/// Returns the size of a regular file in bytes.
 fn length(path: &Path) -> Result<u64, NodeSetError> {
     let fault = |source| NodeSetError::Read {
         file: path.display().to_string(),
@@ -461,7 +466,7 @@ fn too_large(path: &Path) -> NodeSetError {
     }
 }
 
-/// What changes when one of the files is written or renamed over.
+/// Returns a value that changes when a file is written or replaced by a rename.
 #[must_use]
 pub fn fingerprint(files: &[PathBuf]) -> u64 {
     let mut hasher = DefaultHasher::new();

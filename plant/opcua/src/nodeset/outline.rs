@@ -1,37 +1,37 @@
-//! What the nodes of a NodeSet are, and what values its variables take.
+//! The kinds of the nodes of a NodeSet, and the kinds of the values of its variables.
 
 use std::collections::HashMap;
 
 use opcua::types::{Identifier, NodeId, ReferenceTypeId};
 use opcua::xml::schema::ua_node_set::UANode;
 
-/// What a node is.
+/// The kind of a node.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum NodeKind {
-    /// A Variable, what its values are, and its ValueRank.
+    /// A Variable with the kind of its values and its ValueRank.
     Variable(ValueKind, i32),
     /// A Method.
     Method,
-    /// Anything else.
+    /// Any other NodeClass.
     Other,
 }
 
-/// What the values of a DataType are.
+/// The kind of the values of a DataType.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ValueKind {
-    /// Anything, or not known.
+    /// Any value, or an unknown DataType.
     Any,
-    /// Of the builtin type with this id (OPC 10000-6, 5.1.2).
+    /// The built-in type with this id (OPC 10000-6, 5.1.2).
     Builtin(u8),
-    /// Of any numeric type.
+    /// Any numeric type.
     Number,
-    /// Of any type of whole numbers with a sign.
+    /// Any signed integer type.
     Integer,
-    /// Of any type of whole numbers without a sign.
+    /// Any unsigned integer type.
     UnsignedInteger,
 }
 
-/// The nodes of one NodeSet, by their ids as the file has them.
+/// The nodes of a NodeSet, by their NodeIds in the file.
 #[derive(Default)]
 pub(super) struct Outline(HashMap<NodeId, Entry>);
 
@@ -41,12 +41,12 @@ enum Entry {
         rank: i32,
     },
     Method,
-    /// With its supertype.
+    /// A DataType with its supertype.
     DataType(Option<NodeId>),
     Other,
 }
 
-/// What is known of a node here.
+/// The entry of a node.
 pub(super) enum Found<'o> {
     Variable(&'o NodeId, i32),
     Method,
@@ -54,7 +54,7 @@ pub(super) enum Found<'o> {
 }
 
 impl Outline {
-    /// Takes note of a node; `false` where there is one with that id already.
+    /// Adds a node; returns `false` if the NodeId exists already.
     pub(super) fn insert(
         &mut self,
         id: NodeId,
@@ -101,7 +101,7 @@ impl Outline {
         })
     }
 
-    /// The supertype of a DataType.
+    /// Returns the supertype of a DataType.
     pub(super) fn supertype(&self, id: &NodeId) -> Option<&NodeId> {
         match self.0.get(id)? {
             Entry::DataType(supertype) => supertype.as_ref(),
@@ -110,7 +110,7 @@ impl Outline {
     }
 }
 
-/// What values of a DataType of the core namespace are.
+/// Returns the kind of the values of a DataType of the core namespace.
 pub(super) fn core(id: &NodeId) -> ValueKind {
     match id.identifier {
         Identifier::Numeric(NUMBER) => ValueKind::Number,
@@ -121,11 +121,13 @@ pub(super) fn core(id: &NodeId) -> ValueKind {
     }
 }
 
-/// The id of the builtin type that values of the DataType `i=number` of the core namespace have (OPC 10000-3, 5.8.3; OPC
-/// 10000-6, 5.1.2); `None` for abstract ones and for types this table does not have, whose supertypes may tell.
+/// Returns the id of the built-in type of the DataType `i=number` of the core namespace (OPC
+/// 10000-3, 5.8.3; OPC 10000-6, 5.1.2). Returns `None` for abstract DataTypes and for DataTypes
+/// that this table does not contain; their supertypes may have a built-in type.
 #[must_use]
 pub const fn builtin(number: u32) -> Option<u8> {
-    // Numbers of DataTypes that are builtin types are those of the builtin types; 24 to 29 are abstract.
+    // A DataType that is a built-in type has the number of the built-in type; 24 to 29 are
+    // abstract.
     Some(match number {
         1..=23 | 25 => {
             let [id, ..] = number.to_le_bytes();

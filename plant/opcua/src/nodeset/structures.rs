@@ -1,4 +1,4 @@
-//! Structures that NodeSets define: values of them in the files are read by their definitions.
+//! Structures that NodeSets define: decodes values in the files by these definitions.
 
 use std::collections::HashMap;
 use std::io::{Read, Write};
@@ -21,12 +21,12 @@ use opcua::types::{
 
 use super::{BINARY, DEEPEST};
 
-/// Reads values of the structures, once it is told what these are.
+/// Decodes values of structures after [`define`](Self::define).
 #[derive(Default)]
 pub(super) struct Structures(RwLock<Option<DynamicTypeLoader>>);
 
 impl Structures {
-    /// Takes the definitions of the DataTypes among these nodes, in the place of those before.
+    /// Replaces the definitions by the definitions of the DataTypes among these nodes.
     pub(super) fn define(&self, items: &[ImportedItem]) {
         let own = types(items);
         let loader = (!own.is_empty()).then(|| DynamicTypeLoader::new(Arc::new(tree(own, items))));
@@ -42,7 +42,7 @@ impl TypeLoader for Structures {
         ctx: &Context<'_>,
         name: &str,
     ) -> Option<EncodingResult<Box<dyn DynEncodable>>> {
-        // Of those of the core namespace it knows that they are there, and not their fields.
+        // The loader has the core DataTypes without their fields.
         if node_id.namespace == 0 {
             return None;
         }
@@ -70,15 +70,15 @@ impl TypeLoader for Structures {
     }
 }
 
-/// A structure that says how long it is on the wire: the library says another length of those with arrays of structures in
-/// them, and clients read on from there.
+/// A structure with its exact encoded length. The library computes a wrong length for arrays of
+/// structures in structures, and clients would continue to decode at a wrong offset.
 #[derive(Debug, Clone, PartialEq)]
 struct Exact(DynamicStructure);
 
 impl BinaryEncodable for Exact {
     fn byte_len(&self, ctx: &Context<'_>) -> usize {
         let mut bytes = Vec::new();
-        // What cannot be encoded is told when it is.
+        // The later encoding reports the same error.
         drop(BinaryEncodable::encode(&self.0, &mut bytes, ctx));
         bytes.len()
     }
@@ -130,11 +130,12 @@ impl ExpandedMessageInfo for Exact {
     }
 }
 
-/// Checks that a value can be sent to clients. Structures of unknown types are left as XML, and a file may leave out a field
-/// that its structure needs.
+/// Checks that a value can be encoded. Structures of unknown types remain XML, and a file may omit
+/// a field that the structure requires.
 ///
 /// # Errors
-/// The reason, for people.
+///
+/// Returns the reason.
 pub(super) fn check_sent(value: &Variant, context: &Context<'_>) -> Result<(), String> {
     if !is_known(value) {
         return Err("the type of its structure is not known".to_owned());
@@ -158,13 +159,13 @@ fn is_known(value: &Variant) -> bool {
     is_inner_known && !object.inner_is::<XmlBody>()
 }
 
-/// A DataType.
+/// A DataType and its encodings.
 struct Type<'i> {
     item: &'i ImportedItem,
     encodings: EncodingIds,
 }
 
-/// The DataTypes among nodes, with their encodings.
+/// Returns the DataTypes among nodes, with their encodings.
 fn types(items: &[ImportedItem]) -> Vec<Type<'_>> {
     let mut encodings: HashMap<&NodeId, EncodingIds> = HashMap::new();
     let named: HashMap<&NodeId, &str> = items
@@ -215,10 +216,10 @@ fn as_type(item: &ImportedItem) -> Option<&opcua::nodes::DataType> {
     }
 }
 
-/// Gives each structure the fields that it has from structures of other files (OPC 10000-3, 8.48): the library knows those of
-/// its own file alone. Gives the definitions that are others now.
+/// Adds inherited fields of structures in other files to each structure definition (OPC 10000-3,
+/// 8.48). The library adds inherited fields of the same file only. Returns the changed definitions.
 ///
-/// Structures of the core namespace have no definition here, so their fields are not among them.
+/// Structures of the core namespace have no definition here, so their fields are not added.
 pub(super) fn inherit(items: &mut [ImportedItem]) -> HashMap<NodeId, DataTypeDefinition> {
     let mut known: HashMap<NodeId, StructureDefinition> = HashMap::new();
     for item in items.iter() {
@@ -244,7 +245,8 @@ pub(super) fn inherit(items: &mut [ImportedItem]) -> HashMap<NodeId, DataTypeDef
     others
 }
 
-/// A definition with the fields that it inherits, those of the uppermost first; `None` where it has them already.
+/// Returns a definition with its inherited fields, the fields of the topmost supertype first;
+/// `None` if it already has all fields.
 fn with_inherited(
     id: &NodeId,
     known: &HashMap<NodeId, StructureDefinition>,
@@ -282,7 +284,7 @@ fn with_inherited(
     })
 }
 
-/// What the library needs to read values by.
+/// Returns the type tree with which the library decodes values.
 fn tree(own: Vec<Type<'_>>, items: &[ImportedItem]) -> DataTypeTree {
     let mut parents: HashMap<&NodeId, &NodeId> = HashMap::new();
     parents.extend(CORE_TYPES.iter().map(|one| (&one.id, &one.parent)));
@@ -297,7 +299,7 @@ fn tree(own: Vec<Type<'_>>, items: &[ImportedItem]) -> DataTypeTree {
     }
     let mut known = ParentIds::new();
     for (id, parent) in &parents {
-        // A circle would have no end for the library.
+        // A cyclic type hierarchy would make the library loop forever.
         if (0..DEEPEST)
             .try_fold(*id, |at, _| parents.get(at).copied())
             .is_none()
@@ -326,7 +328,7 @@ fn tree(own: Vec<Type<'_>>, items: &[ImportedItem]) -> DataTypeTree {
             &known,
         );
         match info {
-            // One without an id for its encoding cannot be sent.
+            // A structure without an encoding id cannot be encoded.
             Ok(TypeInfo::Struct(info))
                 if info.encoding_ids.binary_id.is_null() && !info.is_abstract => {}
             Ok(info) => tree.add_type(id.clone(), info),
@@ -346,7 +348,7 @@ struct CoreType {
 }
 
 impl CoreType {
-    /// Says that it is there. The library reads its values by itself.
+    /// Declares the DataType without its fields. The library decodes its values itself.
     fn info(&self) -> TypeInfo {
         TypeInfo::Struct(Arc::new(StructTypeInfo {
             structure_type: StructureType::Structure,

@@ -6,7 +6,7 @@ use opcua::types::{
 
 use super::{Imported, NodeSetError, NodeSets};
 
-/// A NodeSet of one namespace, with the elements from line 3 on.
+/// Returns a NodeSet with a single namespace, with the elements from line 3 on.
 fn document(elements: &str) -> String {
     format!(
         "<UANodeSet xmlns=\"http://opcfoundation.org/UA/2011/03/UANodeSet.xsd\" xmlns:t=\"http://opcfoundation.org/UA/2008/02/Types.xsd\">\
@@ -20,7 +20,7 @@ fn variable(id: u32, data_type: &str, value: &str) -> String {
     )
 }
 
-/// The address space with a document in it, and the findings.
+/// Imports a document, and returns the address space and the findings.
 fn imported(bytes: &[u8]) -> (AddressSpace, Imported, Vec<NodeSetError>) {
     let (sets, faults) = NodeSets::of_document("a.xml", bytes);
     let mut space = AddressSpace::new();
@@ -36,7 +36,7 @@ fn value_of(space: &AddressSpace, id: u32) -> Option<Variant> {
     }
 }
 
-/// The value that a variable with this value in its file has.
+/// Returns the imported value of a variable with this value in its file.
 fn read(value: &str) -> Result<Variant, String> {
     let (space, _, faults) = imported(document(&variable(7, "i=24", value)).as_bytes());
     match faults.first() {
@@ -73,7 +73,7 @@ fn legal_forms_of_values_are_read() {
     ] {
         assert_eq!(read(text), Ok(expected), "{text}");
     }
-    // Times before the first of OPC UA are the first.
+    // Times before the first DateTime of OPC UA become the first DateTime.
     let Ok(Variant::DateTime(time)) = read("<t:DateTime>0001-01-01T00:00:00</t:DateTime>") else {
         panic!("no time");
     };
@@ -106,7 +106,7 @@ fn wrong_values_are_found_with_their_line_and_node() {
             "{}{wrong}",
             variable(1, "i=1", "<t:Boolean>1</t:Boolean>")
         ));
-        // The first variable has the lines 3 to 5.
+        // The first variable is at the lines 3 to 5.
         assert!(told.starts_with("a.xml:8: node ns=1;i=2: "), "{told}");
         assert!(told.contains(what), "{told}");
     }

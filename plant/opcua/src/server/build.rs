@@ -1,4 +1,4 @@
-//! From a configuration to a server that listens.
+//! Creates a listening server from its configuration.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -28,16 +28,16 @@ use crate::nodeset::{self, NodeSet, NodeSetError, Source};
 use crate::pki::{NO_PKI, OWN_CERTIFICATE, OWN_KEY, Pki, PkiError};
 use crate::users::Access;
 
-/// A security policy that clients may choose.
+/// A security policy of a server.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Security {
-    /// Neither signed nor encrypted.
+    /// SecurityPolicy None.
     None,
-    /// Signed, or signed and encrypted.
+    /// Sign and SignAndEncrypt with Basic256Sha256.
     Basic256Sha256,
-    /// Signed, or signed and encrypted with AES of 128 bits.
+    /// Sign and SignAndEncrypt with Aes128_Sha256_RsaOaep.
     Aes128Sha256RsaOaep,
-    /// Signed with RSA-PSS, or signed so and encrypted.
+    /// Sign and SignAndEncrypt with Aes256_Sha256_RsaPss.
     Aes256Sha256RsaPss,
 }
 
@@ -51,7 +51,8 @@ impl Security {
         }
     }
 
-    /// The ways it makes: the URI of the policy, and whether messages are encrypted beside being signed; `None` where neither.
+    /// Returns the endpoints of the policy: the URI of the policy, and whether messages are
+    /// encrypted in addition to signing; `None` for neither.
     pub fn ways(self) -> impl Iterator<Item = (&'static str, Option<bool>)> + use<> {
         let ways: &[Option<bool>] = match self {
             Self::None => &[None],
@@ -63,7 +64,8 @@ impl Security {
         ways.iter().map(move |way| (uri, *way))
     }
 
-    /// The endpoints at that path: one without security, or one that is signed and one that is encrypted too.
+    /// Returns the endpoints at a path: a single endpoint without security, or an endpoint for Sign
+    /// and an endpoint for SignAndEncrypt.
     pub fn endpoints(self, path: &str) -> impl Iterator<Item = (String, ServerEndpoint)> + use<> {
         let modes: &[MessageSecurityMode] = match self {
             Self::None => &[MessageSecurityMode::None],
@@ -74,7 +76,7 @@ impl Security {
         };
         let (policy, path) = (self.policy(), path.to_owned());
         modes.iter().map(move |mode| {
-            // Which users may come is said by who authenticates them; the library has no use for it then.
+            // The authenticator decides on user identities, so the library ignores this list.
             let anonymous = [ANONYMOUS_USER_TOKEN_ID.to_owned()];
             let endpoint = ServerEndpoint::new(&path, policy, *mode, &anonymous);
             (format!("{policy} {mode}"), endpoint)
@@ -82,35 +84,37 @@ impl Security {
     }
 }
 
-/// What a server is, and how clients get in. All users are anonymous, unless [`ServerBuilder::users`] has some.
+/// The identity and the security of a server. All users are anonymous without
+/// [`ServerBuilder::users`].
 #[derive(Debug, Clone)]
 pub struct ServerConfig {
-    /// The ApplicationUri.
+    /// The ApplicationUri of the server.
     pub application_uri: String,
-    /// The name for people.
+    /// The application name.
     pub application_name: String,
-    /// The ProductUri.
+    /// The ProductUri of the server.
     pub product_uri: String,
     /// The version of the program.
     pub software_version: String,
-    /// Where clients connect; port 0 is any free one.
+    /// The endpoint URL; port 0 selects any free port.
     pub endpoint: EndpointUrl,
-    /// What clients may choose from.
+    /// The security policies.
     pub security: Vec<Security>,
-    /// The directory of certificates, which all security but [`Security::None`] needs.
+    /// The directory of the certificate store. Required by all policies except [`Security::None`].
     pub pki: Option<PathBuf>,
-    /// Trusts every client's certificate, and keeps it as trusted. For tests and demonstrations only.
+    /// Trusts every client certificate, and stores it as trusted. For tests and demonstrations
+    /// only.
     pub trust_unknown_clients: bool,
-    /// The rule for clients without a trusted certificate, of a server that trusts an authority.
+    /// The rule for clients without a trusted certificate, if the server trusts an authority.
     pub unknown_clients: UnknownClients,
-    /// How long a session may be silent at most.
+    /// The longest session timeout.
     pub session_timeout: Duration,
-    /// The number of clients.
+    /// The limits of clients.
     pub clients: ClientLimits,
 }
 
 impl ServerConfig {
-    /// A server without security.
+    /// Creates the configuration of a server without security.
     #[must_use]
     pub fn new(application_uri: &str, application_name: &str, endpoint: EndpointUrl) -> Self {
         Self {
@@ -129,33 +133,33 @@ impl ServerConfig {
     }
 }
 
-/// Why there is no server.
+/// An error of creating a server.
 #[derive(Debug, thiserror::Error)]
 pub enum ServerError {
-    /// Nothing listens.
+    /// The listening socket cannot be opened.
     #[error(transparent)]
     Bind(#[from] BindError),
-    /// The certificates cannot be used.
+    /// The certificate store cannot be used.
     #[error(transparent)]
     Pki(#[from] PkiError),
     /// A NodeSet cannot be used.
     #[error(transparent)]
     NodeSet(#[from] NodeSetError),
-    /// The security asked for needs certificates, and there is no directory for them.
+    /// The security policies require certificates, but no directory is configured.
     #[error("security other than None needs a directory for certificates, and none is given")]
     NoPki,
-    /// Clients could choose nothing.
+    /// The server has no security policy.
     #[error("the endpoint has no security policy, not even None")]
     NoSecurity,
-    /// The system.
+    /// An error of the operating system.
     #[error("the listening socket cannot be used: {0}")]
     Io(#[from] io::Error),
-    /// The library refuses the configuration.
+    /// The library refused the configuration.
     #[error("the OPC UA server cannot be configured: {0}")]
     Configuration(String),
 }
 
-/// Collects what a server is made of.
+/// Builds a server.
 pub struct ServerBuilder {
     config: ServerConfig,
     sources: Vec<Source>,
@@ -173,7 +177,7 @@ impl std::fmt::Debug for ServerBuilder {
 }
 
 impl ServerBuilder {
-    /// A server with the core namespace, and an own one with the ApplicationUri.
+    /// Creates a builder with the core namespace and the namespace of the ApplicationUri.
     #[must_use]
     pub fn new(config: ServerConfig) -> Self {
         Self {
@@ -185,21 +189,22 @@ impl ServerBuilder {
         }
     }
 
-    /// Has users, who are looked for anew when their file changes.
+    /// Sets the users, which are read again when their file changes.
     #[must_use]
     pub fn users(mut self, users: Arc<Access>) -> Self {
         self.users = Some(users);
         self
     }
 
-    /// Reads structures of these types in what clients send.
+    /// Registers a type loader for structures that clients send.
     #[must_use]
     pub fn types(mut self, loader: Arc<dyn TypeLoader>) -> Self {
         self.loaders.push(loader);
         self
     }
 
-    /// Loads a NodeSet2 document, which errors call `name`. The order of NodeSets does not matter.
+    /// Adds a NodeSet2 document, with `name` for error messages. The order of NodeSets does not
+    /// matter.
     #[must_use]
     pub fn nodeset_str(mut self, name: &str, xml: &str) -> Self {
         self.sources.push(Source::Text {
@@ -209,24 +214,27 @@ impl ServerBuilder {
         self
     }
 
-    /// Loads a NodeSet2 file. The order of NodeSets does not matter.
+    /// Adds a NodeSet2 file. The order of NodeSets does not matter.
     #[must_use]
     pub fn nodeset_file(mut self, path: impl Into<PathBuf>) -> Self {
         self.sources.push(Source::File(path.into()));
         self
     }
 
-    /// Has one more namespace for instances.
+    /// Adds a namespace for instances.
     #[must_use]
     pub fn namespace(mut self, uri: &str) -> Self {
         self.namespaces.push(uri.to_owned());
         self
     }
 
-    /// Loads the NodeSets and opens the listening socket. Nobody is served until [`Server::start`].
+    /// Loads the NodeSets and opens the listening socket. Clients are served after
+    /// [`Server::start`].
     ///
     /// # Errors
-    /// A NodeSet that cannot be used, a port that cannot be listened on, or certificates that cannot be made.
+    ///
+    /// Returns an error if a NodeSet cannot be used, if listening on the port fails, or if
+    /// certificates cannot be created.
     pub fn build(self) -> Result<Server, ServerError> {
         let sets = nodeset::load(self.sources)?;
         let config = self.config;
@@ -306,7 +314,8 @@ impl ServerBuilder {
     }
 }
 
-/// Builds the server of the library. Without security its complaints about missing certificates are not logged.
+/// Builds the server of the library. Without security, its messages about missing certificates are
+/// not logged.
 fn built(
     builder: opcua::server::ServerBuilder,
     secured: bool,
@@ -365,7 +374,7 @@ fn with(
     builder
 }
 
-/// The node managers, for those who need more of them than the library hands out.
+/// The node managers, for code that needs more than the library's interface provides.
 #[derive(Default)]
 struct Made {
     core: OnceLock<Arc<CoreNodeManager>>,

@@ -1,4 +1,4 @@
-//! Methods of our objects: which handler a call goes to, and what is checked before.
+//! Method calls on instances: selects the handler of a call, and checks the arguments.
 
 use std::collections::HashMap;
 use std::future::Future;
@@ -20,31 +20,32 @@ use super::sessions::{Caller, Presence, Sessions};
 use crate::client::CallResult;
 use crate::limits::LONGEST_REQUEST;
 
-/// A call that has passed the checks of number and types of its arguments.
+/// A method call with arguments of the declared number and types.
 #[derive(Debug, Clone)]
 pub struct MethodRequest {
-    /// Who calls.
+    /// The caller.
     pub caller: Caller,
-    /// Whether its session is still there.
+    /// The state of the caller's session.
     pub presence: Presence,
     /// The object.
     pub object: NodeId,
-    /// The method of the object, also where the client gave that of its type.
+    /// The method of the object, also if the client used the method of the type.
     pub method: NodeId,
     /// The name in the BrowseName of the method.
     pub name: String,
-    /// One for each input argument the method declares.
+    /// The input arguments.
     pub arguments: Vec<Variant>,
 }
 
-/// Why a call is refused.
+/// The refusal of a call.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Refusal {
-    /// With this status.
+    /// Refused with this status code.
     Status(StatusCode),
-    /// With `BadInvalidArgument` and this status for each argument.
+    /// Refused with `BadInvalidArgument` and a status code for each argument.
     Arguments(Vec<StatusCode>),
-    /// The result of a call at another server, which reaches the client unchanged: its status may also be Good or Uncertain.
+    /// The result of a call at another server, which is forwarded unchanged. Its status may also be
+    /// Good or Uncertain.
     PassedOn(Box<CallResult>),
 }
 
@@ -54,18 +55,20 @@ impl From<StatusCode> for Refusal {
     }
 }
 
-/// What carries out the calls of a method. A call that takes longer than [`longest`](Self::longest) is given up.
+/// Executes the calls of a method. A call that takes longer than [`longest`](Self::longest) is
+/// cancelled.
 #[async_trait]
 pub trait MethodHandler: Send + Sync + 'static {
-    /// How long a call may take.
+    /// Returns the timeout of a call.
     fn longest(&self) -> Duration {
         LONGEST_REQUEST
     }
 
-    /// The output arguments.
+    /// Executes a call, and returns the output arguments.
     ///
     /// # Errors
-    /// Why the call is refused.
+    ///
+    /// Returns the refusal of the call.
     async fn call(&self, request: MethodRequest) -> Result<Vec<Variant>, Refusal>;
 }
 
@@ -81,7 +84,7 @@ where
     }
 }
 
-/// A handler that answers at once.
+/// Creates a handler from a function that returns at once.
 pub fn method<F>(function: F) -> Arc<dyn MethodHandler>
 where
     F: Fn(MethodRequest) -> Result<Vec<Variant>, Refusal> + Send + Sync + 'static,
@@ -89,26 +92,27 @@ where
     Arc::new(Function(function))
 }
 
-/// A method of an object.
+/// A method of an object and its handler.
 struct Route {
     name: String,
     handler: Option<Arc<dyn MethodHandler>>,
 }
 
-/// Object and method.
+/// The object and the method.
 type Key = (NodeId, NodeId);
 
 #[derive(Default)]
 pub(crate) struct Calls {
     routes: RwLock<HashMap<Key, Route>>,
-    /// The methods the types of an object declare, and which of its own each is.
+    /// The methods that the types of an object declare, and the method of the object for each
+    /// declaration.
     declared: RwLock<HashMap<Key, NodeId>>,
     pub(crate) sessions: Arc<Sessions>,
     pub(crate) spaces: OnceLock<Arc<Spaces>>,
 }
 
 impl Calls {
-    /// Takes up a method of an object, also under the declarations it was made from.
+    /// Adds a method of an object, and its declarations in the types of the object.
     pub(crate) fn add(&self, object: &NodeId, method: &NodeId, name: &str, declared: &[NodeId]) {
         let route = Route {
             name: name.to_owned(),
@@ -141,7 +145,7 @@ impl Calls {
         route.handler = Some(handler);
     }
 
-    /// Answers the calls of methods of our objects, one after the other, and gives back the rest.
+    /// Executes the calls of methods of instances sequentially, and returns all other calls.
     pub(crate) async fn answer<'a>(
         &self,
         context: &RequestContext,
@@ -178,7 +182,7 @@ impl Calls {
         others
     }
 
-    /// Where a call goes; `None` for objects that are not ours.
+    /// Returns the handler of a call; `None` for objects of other node managers.
     #[expect(
         clippy::type_complexity,
         reason = "said in one place, taken apart in one place"
@@ -202,7 +206,7 @@ impl Calls {
         let route = routes.get(&key)?;
         Some(match &route.handler {
             Some(handler) => Ok((key.1, route.name.clone(), Arc::clone(handler))),
-            // A handler is asked even where Executable is false: it says why it cannot be done now.
+            // A handler is called even if Executable is false, because it returns the reason.
             None if !spaces.executable(&key.1) => Err(StatusCode::BadNotExecutable),
             None => Err(StatusCode::BadNotImplemented),
         })
@@ -223,7 +227,7 @@ impl Calls {
     }
 }
 
-/// Tells a client what became of its call.
+/// Sets the result of a call.
 pub(crate) fn end(call: &mut MethodCall, ended: Result<Vec<Variant>, Refusal>) {
     match ended {
         Ok(outputs) => {
@@ -233,9 +237,9 @@ pub(crate) fn end(call: &mut MethodCall, ended: Result<Vec<Variant>, Refusal>) {
         Err(Refusal::Status(status)) => call.set_status(status),
         Err(Refusal::Arguments(each)) => call.set_argument_error(each),
         Err(Refusal::PassedOn(result)) => {
-            // There is nothing to say of arguments that are all good (OPC 10000-4, 5.12.2.2).
+            // Results of arguments are sent only if an argument is invalid (OPC 10000-4, 5.12.2.2).
             if result.arguments.iter().any(|one| !one.is_good()) {
-                // Also sets the status, which is replaced below.
+                // This also sets the status, which is replaced below.
                 call.set_argument_error(result.arguments);
             }
             call.set_outputs(result.outputs);
@@ -244,10 +248,11 @@ pub(crate) fn end(call: &mut MethodCall, ended: Result<Vec<Variant>, Refusal>) {
     }
 }
 
-/// Whether arguments are as many as are declared, and of their types (OPC 10000-4, 5.12.2).
+/// Checks the number and the types of arguments (OPC 10000-4, 5.12.2).
 ///
 /// # Errors
-/// What is wrong with them.
+///
+/// Returns the faults of the arguments.
 pub(crate) fn check_arguments(
     declared: &[Argument],
     given: &[Variant],
@@ -286,7 +291,8 @@ pub(crate) async fn within<T>(
     }
 }
 
-/// Whether a value may be that of a variable or an argument of this DataType and ValueRank (OPC 10000-3, 5.6.2).
+/// Returns whether a value fits a variable or an argument with this DataType and ValueRank (OPC
+/// 10000-3, 5.6.2).
 pub(crate) fn fits(value: &Variant, data_type: &NodeId, rank: i32, types: &dyn TypeTree) -> bool {
     if matches!(value, Variant::Empty) {
         return *data_type == DataTypeId::BaseDataType;
@@ -310,7 +316,8 @@ pub(crate) fn fits(value: &Variant, data_type: &NodeId, rank: i32, types: &dyn T
     let given = if let Variant::Array(array) = value
         && array.values.is_empty()
     {
-        // The library knows no type of an array without elements; its own says it.
+        // The library does not return a type for an empty array; the element type is in the array
+        // itself.
         Some(NodeId::new(0, array.value_type as u32).into())
     } else {
         value.data_type()
@@ -322,10 +329,10 @@ pub(crate) fn fits(value: &Variant, data_type: &NodeId, rank: i32, types: &dyn T
         return false;
     };
     types.is_subtype_of(&given, data_type)
-        // Enumerations travel as Int32 (OPC 10000-6, 5.2.4).
+        // Enumerations are encoded as Int32 (OPC 10000-6, 5.2.4).
         || (*given == DataTypeId::Int32
             && types.is_subtype_of(data_type, &DataTypeId::Enumeration.into()))
-        // Subtypes of the builtin types travel as those.
+        // Subtypes of a built-in type are encoded as the built-in type.
         || types.is_subtype_of(data_type, &given)
 }
 
@@ -342,7 +349,7 @@ pub(crate) fn arguments(property: &NodeType) -> Option<Vec<Argument>> {
     )))
 }
 
-/// Returns the arguments that an InputArguments or OutputArguments property has for its value.
+/// Returns the arguments in the value of an InputArguments or OutputArguments property.
 #[must_use]
 pub fn arguments_in(value: Option<DataValue>) -> Option<Vec<Argument>> {
     let Variant::Array(array) = value?.value? else {

@@ -1,7 +1,8 @@
-//! The events of state machines: TransitionEventType, ProgramTransitionEventType and what is declared below it.
+//! The events of state machines: TransitionEventType, ProgramTransitionEventType and its subtypes.
 //!
-//! The structs the library generates for them cannot carry the NodeId of a state. This one answers select clauses of
-//! each of the three types of the core namespace and of the declared type.
+//! The generated structs of the library cannot carry the NodeId of a state. The event of this
+//! module supports select clauses of the three types of the core namespace and of the declared
+//! type.
 
 use opcua::nodes::{BaseEventType, Event, EventField};
 use opcua::server::SubscriptionCache;
@@ -13,11 +14,11 @@ use opcua::types::{
 /// A state or a transition of a state machine.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct StateRef {
-    /// The name, as `ReadyToRunning`.
+    /// The name, for example `ReadyToRunning`.
     pub name: String,
     /// The node of the state or transition, in the type of the state machine.
     pub id: NodeId,
-    /// Its number there.
+    /// The number of the state or transition in the type.
     pub number: u32,
 }
 
@@ -26,30 +27,30 @@ pub struct StateRef {
 pub struct TransitionEvent {
     /// The state machine.
     pub source: NodeId,
-    /// Its name.
+    /// The name of the state machine.
     pub source_name: String,
     /// ProgramTransitionEventType or a subtype of it.
     pub event_type: NodeId,
-    /// What has happened, in words.
+    /// The message text.
     pub message: String,
-    /// 1 to 1000.
+    /// The severity, 1 to 1000.
     pub severity: u16,
-    /// Where it was.
+    /// The previous state.
     pub from_state: StateRef,
-    /// Where it is.
+    /// The present state.
     pub to_state: StateRef,
-    /// How it got there.
+    /// The transition between the states.
     pub transition: StateRef,
-    /// The result so far.
+    /// The IntermediateResult of the program.
     pub intermediate_result: Variant,
-    /// What the declared type has beside.
+    /// The further fields of the declared type.
     pub fields: Vec<(QualifiedName, Variant)>,
-    /// When it happened.
+    /// The time of the transition.
     pub time: DateTime,
 }
 
 impl TransitionEvent {
-    /// Makes an event of a state machine that stays in its state, as a BaseEventType.
+    /// Creates a BaseEventType event of a state machine that stays in its state.
     #[must_use]
     pub fn without_transition(
         (source, source_name): (NodeId, &str),
@@ -75,8 +76,8 @@ impl TransitionEvent {
         }
     }
 
-    /// Raises it on its source and on the Server object, as a ProgramTransitionEventType that has no subtype. A server that is
-    /// [`Server`](super::Server) raises events of types of its own, too.
+    /// Raises the event on its source and on the Server object, as a ProgramTransitionEventType
+    /// without subtype. A [`Server`](super::Server) also raises events of its own types.
     pub fn raise(&self, subscriptions: &SubscriptionCache) {
         let types = [
             ObjectTypeId::ProgramTransitionEventType,
@@ -90,7 +91,7 @@ impl TransitionEvent {
     }
 }
 
-/// An event on its way to clients.
+/// A transition event as an OPC UA event.
 pub(crate) struct Raised {
     base: BaseEventType,
     event: TransitionEvent,
@@ -201,7 +202,7 @@ impl EventField for Raised {
     }
 }
 
-/// The types whose select clauses an event of this type answers.
+/// Returns the types whose select clauses apply to events of this type.
 pub(crate) fn answered(event_type: &NodeId, supertypes: Vec<&NodeId>) -> Vec<NodeId> {
     let above = supertypes.into_iter().cloned();
     let mut types: Vec<NodeId> = std::iter::once(event_type.clone()).chain(above).collect();

@@ -1,5 +1,6 @@
-//! Nodes from types (OPC 10000-3, 6.3): the mandatory children of a type and of its supertypes and interfaces, and the
-//! optional ones that are named, each as the most derived type declares it.
+//! Instances of types (OPC 10000-3, 6.3): the mandatory children of a type, of its supertypes and
+//! of its interfaces, and the selected optional children, each as declared by the most derived
+//! type.
 
 use std::collections::BTreeMap;
 
@@ -14,31 +15,32 @@ use super::nodes::plain;
 use super::view::{Declared, View};
 use super::{Server, value_of};
 
-/// What is to be made of a type.
+/// The description of an instance.
 #[derive(Debug, Clone)]
 pub struct InstanceSpec {
     /// The type of the object.
     pub type_id: NodeId,
-    /// The object.
+    /// The NodeId of the object.
     pub node_id: NodeId,
     /// Its BrowseName.
     pub browse_name: QualifiedName,
     /// Its DisplayName.
     pub display_name: LocalizedText,
-    /// What it is below of.
+    /// The parent node.
     pub parent: NodeId,
-    /// How it is below that, as HasComponent.
+    /// The reference type from the parent, for example HasComponent.
     pub reference: NodeId,
-    /// The paths of the optional children it has too, as `ProgramDiagnostic` or `FinalResultData/Force`.
+    /// The paths of optional children, for example `ProgramDiagnostic` or `FinalResultData/Force`.
     pub optional: Vec<String>,
-    /// The interfaces it has beside those of its type.
+    /// The interfaces in addition to the interfaces of the type.
     pub interfaces: Vec<NodeId>,
-    /// Whether clients can subscribe to its events. It is below the Server by HasNotifier then.
+    /// Whether clients can subscribe to its events. The Server object then has a HasNotifier
+    /// reference to it.
     pub event_notifier: bool,
 }
 
 impl InstanceSpec {
-    /// A component of `parent`.
+    /// Creates the description of a component of `parent`.
     #[must_use]
     pub fn new(
         type_id: NodeId,
@@ -60,28 +62,29 @@ impl InstanceSpec {
     }
 }
 
-/// An object that is made of a type.
+/// An instance of a type.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Instance {
-    /// The object.
+    /// The NodeId of the object.
     pub node_id: NodeId,
     nodes: BTreeMap<String, NodeId>,
 }
 
 impl Instance {
-    /// A node below it by its path: BrowseNames joined by `/`, without namespaces.
+    /// Returns a node below the instance by its path: BrowseNames without namespaces, joined by
+    /// `/`.
     #[must_use]
     pub fn node(&self, path: &str) -> Option<&NodeId> {
         self.nodes.get(path)
     }
 
-    /// All nodes below it, by path.
+    /// Returns all nodes below the instance by their paths.
     pub fn nodes(&self) -> impl Iterator<Item = (&str, &NodeId)> {
         self.nodes.iter().map(|(path, id)| (path.as_str(), id))
     }
 }
 
-/// NodeIds with rising numbers.
+/// A range of ascending numeric NodeIds.
 #[derive(Debug, Clone)]
 pub struct IdRange {
     namespace: u16,
@@ -89,7 +92,7 @@ pub struct IdRange {
 }
 
 impl IdRange {
-    /// Begins with `first`.
+    /// Creates a range that starts with `first`.
     #[must_use]
     pub fn new(namespace: u16, first: u32) -> Self {
         Self {
@@ -98,7 +101,7 @@ impl IdRange {
         }
     }
 
-    /// The next one.
+    /// Returns the next NodeId.
     #[expect(clippy::should_implement_trait, reason = "it never ends")]
     pub fn next(&mut self) -> NodeId {
         let id = NodeId::new(self.namespace, self.next);
@@ -107,95 +110,97 @@ impl IdRange {
     }
 }
 
-/// An object without anything below it.
+/// The description of an object without children.
 #[derive(Debug, Clone)]
 pub struct ObjectSpec {
-    /// The object.
+    /// The NodeId of the object.
     pub node_id: NodeId,
     /// Its BrowseName.
     pub browse_name: QualifiedName,
     /// Its DisplayName.
     pub display_name: LocalizedText,
-    /// Its type, as FolderType.
+    /// Its type definition, for example FolderType.
     pub type_definition: NodeId,
-    /// What it is below of.
+    /// The parent node.
     pub parent: NodeId,
-    /// How it is below that.
+    /// The reference type from the parent.
     pub reference: NodeId,
     /// Whether clients can subscribe to its events.
     pub event_notifier: bool,
 }
 
-/// A variable without anything below it.
+/// The description of a variable without children.
 #[derive(Debug, Clone)]
 pub struct VariableSpec {
-    /// The variable.
+    /// The NodeId of the variable.
     pub node_id: NodeId,
     /// Its BrowseName.
     pub browse_name: QualifiedName,
     /// Its DisplayName.
     pub display_name: LocalizedText,
-    /// Its type, as PropertyType.
+    /// Its type definition, for example PropertyType.
     pub type_definition: NodeId,
-    /// What it is below of.
+    /// The parent node.
     pub parent: NodeId,
-    /// How it is below that.
+    /// The reference type from the parent.
     pub reference: NodeId,
     /// Its DataType.
     pub data_type: NodeId,
     /// Its ValueRank.
     pub value_rank: i32,
-    /// What it shows.
+    /// Its initial value.
     pub value: DataValue,
-    /// Whether clients may write it.
+    /// Whether clients may write the value.
     pub writable: bool,
 }
 
-/// Why nodes are not made. None is then.
+/// An error of creating nodes. No node is created in this case.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum InstanceError {
-    /// The type is not there.
+    /// The type does not exist.
     #[error("there is no ObjectType {0}")]
     NoType(NodeId),
-    /// The type has no instances.
+    /// The type is abstract and cannot have instances.
     #[error("{0} is abstract: only its subtypes have instances")]
     Abstract(NodeId),
-    /// An interface is not there.
+    /// The interface does not exist.
     #[error("there is no interface {0}")]
     NoInterface(NodeId),
-    /// The parent is not there.
+    /// The parent does not exist.
     #[error("the parent {0} is not there")]
     NoParent(NodeId),
-    /// The NodeId is not of a namespace of this server's.
+    /// The NodeId is not in a namespace for instances.
     #[error("{0} is not of a namespace for instances")]
     Foreign(NodeId),
-    /// There is a node with the NodeId.
+    /// A node with this NodeId exists already.
     #[error("there is a node {0} already")]
     Taken(NodeId),
-    /// The type is deeper or larger than anything sensible.
+    /// The type is too deep or too large, or contains itself.
     #[error("{0} has more children than a server can have, or is made of itself")]
     TooLarge(NodeId),
-    /// No type declares an optional child that is asked for.
+    /// No type declares a requested optional child.
     #[error("the type has no optional child {0}")]
     NoOptional(String),
 }
 
-/// A node that is going to be made.
+/// A node that is about to be created.
 struct Planned {
     path: String,
     parent: NodeId,
     reference: NodeId,
-    /// The declarations of a method.
+    /// The declarations of the node, under which a method can also be called.
     declared: Vec<NodeId>,
     type_definition: Option<NodeId>,
     node: NodeType,
 }
 
 impl Server {
-    /// Makes an object of a type, with NodeIds that `ids` gives by the path of each child.
+    /// Creates an instance of a type. `ids` returns the NodeId of each child by its path.
     ///
     /// # Errors
-    /// A type without instances, a NodeId that cannot be, or an optional child nobody declares.
+    ///
+    /// Returns an error for a type without instances, an invalid NodeId, or an optional child
+    /// without declaration.
     pub fn instantiate(
         &self,
         spec: &InstanceSpec,
@@ -295,10 +300,11 @@ impl Server {
         }
     }
 
-    /// Makes an object.
+    /// Creates an object.
     ///
     /// # Errors
-    /// A NodeId that cannot be, or a parent that is not there.
+    ///
+    /// Returns an error for an invalid NodeId or a missing parent.
     pub fn add_object(&self, spec: &ObjectSpec) -> Result<(), InstanceError> {
         let object = Object::new(
             &spec.node_id,
@@ -319,10 +325,11 @@ impl Server {
         Ok(())
     }
 
-    /// Makes a variable.
+    /// Creates a variable.
     ///
     /// # Errors
-    /// A NodeId that cannot be, or a parent that is not there.
+    ///
+    /// Returns an error for an invalid NodeId or a missing parent.
     pub fn add_variable(&self, spec: &VariableSpec) -> Result<(), InstanceError> {
         let base = Base::new(
             NodeClass::Variable,
@@ -386,7 +393,8 @@ impl Server {
         Ok(())
     }
 
-    /// Lets a node refer to another, either of which may be of the core namespace. One to itself is not made.
+    /// Adds a reference between two nodes, including nodes of the core namespace. A reference from
+    /// a node to itself is ignored.
     pub fn add_reference(&self, source: &NodeId, reference: &NodeId, target: &NodeId) {
         if source != target {
             let mut own = self.inner.spaces.own().write();
@@ -394,7 +402,8 @@ impl Server {
         }
     }
 
-    /// Removes a node of ours and all below it, with their handlers. Who watches them is told `BadNodeIdUnknown`.
+    /// Removes a node and all nodes below it, with their handlers. Subscribers of the nodes receive
+    /// `BadNodeIdUnknown`.
     pub fn remove(&self, node: &NodeId) {
         let _alone = self.inner.making.lock();
         let spaces = &self.inner.spaces;
@@ -426,7 +435,7 @@ impl Server {
     }
 }
 
-/// Lets clients write a variable or not: both attributes that say so.
+/// Sets whether clients may write a variable, in AccessLevel and UserAccessLevel.
 pub(crate) fn set_writable(variable: &mut Variable, writable: bool) {
     let mut access = variable.access_level();
     access.set(AccessLevel::CURRENT_WRITE, writable);
@@ -522,13 +531,13 @@ impl Plan<'_> {
         match self.view.modelling_rule(child) {
             Some(rule) if *rule == ObjectId::ModellingRule_Mandatory => true,
             Some(rule) if *rule == ObjectId::ModellingRule_Optional => named,
-            // Tools leave the rule out at arguments, which belong to their method.
+            // Some tools omit the modelling rule of arguments, which belong to their method.
             Some(_) | None => arguments,
         }
     }
 }
 
-/// The declaration as a node of an instance.
+/// Copies a declaration to a node of an instance.
 fn copy(node: &NodeType, id: NodeId) -> Option<NodeType> {
     let base = |node: &dyn Node, class| {
         Base::new_full(
@@ -556,7 +565,7 @@ fn copy(node: &NodeType, id: NodeId) -> Option<NodeType> {
                 .as_ref()
                 .is_none_or(|value| *value == Variant::Empty)
             {
-                // The library tells a status only beside a value.
+                // The library returns a status only together with a value.
                 value = DataValue {
                     value: Some(Variant::Empty),
                     status: Some(StatusCode::BadWaitingForInitialData),
@@ -587,7 +596,7 @@ fn copy(node: &NodeType, id: NodeId) -> Option<NodeType> {
     }
 }
 
-/// How deep the children of a type go at most.
+/// Deepest level of children of a type.
 const DEEPEST: usize = 16;
-/// How many nodes an instance has at most.
+/// Most nodes of an instance.
 const MOST_NODES: usize = 10_000;

@@ -1,4 +1,4 @@
-//! Methods that no type declares.
+//! Methods that are not declared in a type.
 
 use std::sync::Arc;
 
@@ -13,28 +13,30 @@ use super::Server;
 use super::calls::MethodHandler;
 use super::instances::{InstanceError, insert};
 
-/// A method of one object, with what it takes and gives.
+/// The description of a method of an object.
 #[derive(Debug, Clone)]
 pub struct MethodSpec {
-    /// The method; the properties with its arguments have the NodeIds that [`arguments`](Self::arguments) says.
+    /// The NodeId of the method. The properties with its arguments have the NodeIds in
+    /// [`arguments`](Self::arguments).
     pub node_id: NodeId,
     /// Its BrowseName.
     pub browse_name: QualifiedName,
-    /// The object it is of.
+    /// The object of the method.
     pub object: NodeId,
     /// The NodeIds of InputArguments and OutputArguments.
     pub arguments: (NodeId, NodeId),
-    /// What it takes.
+    /// The input arguments.
     pub takes: Vec<Argument>,
-    /// What it gives.
+    /// The output arguments.
     pub gives: Vec<Argument>,
 }
 
 impl Server {
-    /// Makes a method of an object, and has a handler carry it out.
+    /// Creates a method of an object, and sets its handler.
     ///
     /// # Errors
-    /// A NodeId that cannot be, or an object that is not there. Nothing is made then.
+    ///
+    /// Returns an error for an invalid NodeId or a missing object. No node is created in this case.
     pub fn add_method(
         &self,
         spec: MethodSpec,

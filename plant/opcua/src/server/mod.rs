@@ -1,8 +1,9 @@
-//! A server whose nodes are instances of the types of NodeSets.
+//! A server with instances of the types of NodeSets.
 //!
-//! Reading order: `build` (from a configuration to a server), `view` (all nodes as one), `instances` (nodes from types), `methods` (without types),
-//! `nodes` (values and writes), `calls` and `routed` (methods), `overlay` (methods of the core namespace), `sessions`,
-//! `events`.
+//! Reading order: `build` (creates a server from its configuration), `view` (the nodes of both node
+//! managers), `instances` (nodes from types), `methods` (methods without declaration in a type),
+//! `nodes` (values and writes), `calls` and `routed` (method calls), `overlay` (methods of the core
+//! namespace), `sessions`, `events`.
 
 mod build;
 mod calls;
@@ -51,20 +52,20 @@ use crate::door::Door;
 use crate::pki::Pki;
 use crate::users::Access;
 
-/// What is known of a variable, or of a variable in a type.
+/// The attributes of a variable, or of a variable declaration in a type.
 #[derive(Debug, Clone)]
 pub struct VariableFacts {
     /// Its DataType.
     pub data_type: NodeId,
     /// Its ValueRank.
     pub value_rank: i32,
-    /// What it shows.
+    /// Its value.
     pub value: DataValue,
     /// Its Description; null without one.
     pub description: LocalizedText,
 }
 
-/// A server. Clones are handles to the same one; it stops when the last is dropped.
+/// A server. Clones share the same server, which stops when the last clone is dropped.
 #[derive(Clone)]
 pub struct Server {
     inner: Arc<Inner>,
@@ -78,19 +79,19 @@ struct Inner {
     application_uri: String,
     url: String,
     port: u16,
-    /// One at a time makes or removes nodes.
+    /// Held while nodes are created or removed.
     making: Mutex<()>,
-    /// Until it is started.
+    /// Set until the server is started.
     waiting: Mutex<Option<Waiting>>,
     running: Mutex<Vec<JoinHandle<()>>>,
 }
 
-/// What serves when it is started.
+/// The parts that serve clients after the start.
 struct Waiting {
     server: opcua::server::Server,
     listener: TcpListener,
     pki: Option<Pki>,
-    /// Where clients come to first, if the server listens for that alone.
+    /// The door and its public listener, if the server listens for the door only.
     door: Option<(Door, TcpListener)>,
     users: Option<Arc<Access>>,
 }
@@ -98,7 +99,7 @@ struct Waiting {
 impl Drop for Inner {
     fn drop(&mut self) {
         self.handle.cancel();
-        // The one that serves ends by itself, and closes its connections.
+        // The serving task ends by itself, and closes its connections.
         for task in self.running.lock().drain(..).skip(1) {
             task.abort();
         }
@@ -106,7 +107,7 @@ impl Drop for Inner {
 }
 
 impl Server {
-    /// Serves clients from now on. The second time does nothing.
+    /// Starts serving clients. A second call has no effect.
     pub fn start(&self) {
         let Some(waiting) = self.inner.waiting.lock().take() else {
             return;
@@ -164,31 +165,31 @@ impl Server {
         }
     }
 
-    /// Where clients connect, as the server tells them.
+    /// Returns the endpoint URL for clients.
     #[must_use]
     pub fn url(&self) -> &str {
         &self.inner.url
     }
 
-    /// The port that is listened on.
+    /// Returns the listening port.
     #[must_use]
     pub fn port(&self) -> u16 {
         self.inner.port
     }
 
-    /// The ApplicationUri, which is the namespace with index 1 too.
+    /// Returns the ApplicationUri, which is also the namespace with index 1.
     #[must_use]
     pub fn application_uri(&self) -> &str {
         &self.inner.application_uri
     }
 
-    /// The index of a namespace.
+    /// Returns the index of a namespace.
     #[must_use]
     pub fn namespace(&self, uri: &str) -> Option<u16> {
         self.inner.handle.get_namespace_index(uri)
     }
 
-    /// The URIs of the namespaces, by their indexes.
+    /// Returns the URIs of the namespaces, by index.
     #[must_use]
     pub fn namespaces(&self) -> Vec<String> {
         let mut all = Vec::new();
@@ -211,14 +212,14 @@ impl Server {
         all
     }
 
-    /// The BrowseName of a node, also of one of the core namespace.
+    /// Returns the BrowseName of a node, including nodes of the core namespace.
     #[must_use]
     pub fn browse_name(&self, node: &NodeId) -> Option<QualifiedName> {
         let spaces = &self.inner.spaces;
         spaces.with(|view| Some(view.node(node)?.as_node().browse_name().clone()))
     }
 
-    /// A type by its namespace and BrowseName.
+    /// Returns a type by its namespace and BrowseName.
     #[must_use]
     pub fn find_type(&self, namespace_uri: &str, browse_name: &str) -> Option<NodeId> {
         let index = self.namespace(namespace_uri)?;
@@ -227,14 +228,14 @@ impl Server {
             .with(|view| view.find_type(index, browse_name))
     }
 
-    /// The supertypes of a type, nearest first, without itself.
+    /// Returns the supertypes of a type, nearest first, without the type itself.
     #[must_use]
     pub fn supertypes(&self, type_id: &NodeId) -> Vec<NodeId> {
         let spaces = &self.inner.spaces;
         spaces.with(|view| view.supertypes(type_id).into_iter().cloned().collect())
     }
 
-    /// Whether a type is another one or a subtype of it.
+    /// Returns whether a type is `base` or a subtype of `base`.
     #[must_use]
     pub fn is_subtype_of(&self, type_id: &NodeId, base: &NodeId) -> bool {
         self.inner
@@ -242,13 +243,13 @@ impl Server {
             .with(|view| view.is_subtype_of(type_id, base))
     }
 
-    /// What is directly below a node, in no order that means anything.
+    /// Returns the direct children of a node, in arbitrary order.
     #[must_use]
     pub fn children(&self, node: &NodeId) -> Vec<Child> {
         self.inner.spaces.with(|view| view.children(node))
     }
 
-    /// What is known of a variable.
+    /// Returns the attributes of a variable.
     #[must_use]
     pub fn variable_facts(&self, node: &NodeId) -> Option<VariableFacts> {
         self.inner.spaces.with(|view| {
@@ -265,41 +266,47 @@ impl Server {
         })
     }
 
-    /// Shows a value with the time now.
+    /// Sets the value of a variable, with the current time.
     ///
     /// # Errors
-    /// The node is no variable of ours.
+    ///
+    /// Returns an error if the node is not a variable of this server's namespaces.
     pub fn show(&self, node: &NodeId, value: impl Into<Variant>) -> Result<(), StatusCode> {
         self.show_value(node, DataValue::new_now(value.into()))
     }
 
-    /// Shows a value; status and times that are missing are Good and now.
+    /// Sets the value of a variable. A missing status becomes Good, and missing timestamps become
+    /// the current time.
     ///
     /// # Errors
-    /// The node is no variable of ours.
+    ///
+    /// Returns an error if the node is not a variable of this server's namespaces.
     pub fn show_value(&self, node: &NodeId, value: DataValue) -> Result<(), StatusCode> {
         self.show_all(vec![(node.clone(), value)])
     }
 
-    /// Shows several values, which clients see either all or none of.
+    /// Sets the values of several variables atomically.
     ///
     /// # Errors
-    /// One of the nodes is no variable of ours; none is shown then.
+    ///
+    /// Returns an error if a node is not a variable of this server's namespaces. No value is set in
+    /// this case.
     pub fn show_all(&self, values: Vec<(NodeId, DataValue)>) -> Result<(), StatusCode> {
         let subscriptions = self.inner.handle.subscriptions();
         nodes::show(self.inner.spaces.own(), subscriptions, values)
     }
 
-    /// What a variable shows.
+    /// Returns the value of a variable.
     #[must_use]
     pub fn value(&self, node: &NodeId) -> Option<DataValue> {
         self.variable_facts(node).map(|facts| facts.value)
     }
 
-    /// Lets clients write a variable or not.
+    /// Sets whether clients may write a variable.
     ///
     /// # Errors
-    /// The node is no variable of ours.
+    ///
+    /// Returns an error if the node is not a variable of this server's namespaces.
     pub fn set_writable(&self, node: &NodeId, writable: bool) -> Result<(), StatusCode> {
         let mut own = self.inner.spaces.own().write();
         match own.find_mut(node) {
@@ -312,10 +319,11 @@ impl Server {
         }
     }
 
-    /// Shows whether a method can be called now. Its handler is asked all the same.
+    /// Sets the Executable attributes of a method. Calls still reach its handler.
     ///
     /// # Errors
-    /// The node is no method of ours.
+    ///
+    /// Returns an error if the node is not a method of this server's namespaces.
     pub fn set_executable(&self, method: &NodeId, executable: bool) -> Result<(), StatusCode> {
         let attributes = [AttributeId::Executable, AttributeId::UserExecutable];
         self.inner.manager.set_attributes(
@@ -326,23 +334,25 @@ impl Server {
         )
     }
 
-    /// Asks a handler before a value is shown that a client writes. Without one what is written is shown.
+    /// Sets the handler that decides on client writes to a variable. Without a handler, written
+    /// values are accepted.
     pub fn on_write(&self, node: &NodeId, handler: Arc<dyn WriteHandler>) {
         self.inner.manager.inner().on_write(node, handler);
     }
 
-    /// Carries out a method of an object. Without a handler it answers `BadNotImplemented`.
+    /// Sets the handler of a method of an object. Without a handler, calls fail with
+    /// `BadNotImplemented`.
     pub fn on_call(&self, object: &NodeId, method: &NodeId, handler: Arc<dyn MethodHandler>) {
         self.inner.calls.handle(object, method, handler);
     }
 
-    /// Tells of each session that has called or written something and is closed now or has expired. It is told from a
-    /// task of the server, which waits for it.
+    /// Registers a callback for the end of sessions that called or wrote something, by closing or
+    /// by timeout. A task of the server runs the callback and waits for it.
     pub fn on_session_closed(&self, told: impl Fn(u32) + Send + Sync + 'static) {
         self.inner.calls.sessions.tell(Arc::new(told));
     }
 
-    /// Tells who watches the Server object which nodes are others than before.
+    /// Sends changes of nodes to the subscribers of the Server object.
     pub fn tell_changes(&self, changes: &[ModelChange]) {
         changes::tell(self.inner.handle.subscriptions(), changes);
     }
@@ -356,13 +366,13 @@ impl Server {
         let id: ByteString = opcua::crypto::random::byte_string(16);
         let raised = events::Raised::new(event, types, id);
         let subscriptions = self.inner.handle.subscriptions();
-        // Who watches the Server object is told by the same.
+        // The notification also reaches the subscribers of the Server object.
         subscriptions
             .notify_events([(&raised as &dyn opcua::nodes::Event, &event.source)].into_iter());
     }
 }
 
-/// What a variable shows, with its times.
+/// Returns the value of a variable with its timestamps.
 #[must_use]
 pub fn value_of(variable: &Variable) -> DataValue {
     variable.value(
@@ -373,7 +383,7 @@ pub fn value_of(variable: &Variable) -> DataValue {
     )
 }
 
-/// How many looks at sessions there are to one at refused certificates and users.
+/// Checks of sessions per check of rejected certificates and users.
 const LOOKS_AT_REJECTED: u64 = 20;
-/// How long stopping may take.
+/// Longest duration of stopping.
 pub const LONGEST_STOP: Duration = Duration::from_secs(2);

@@ -1,4 +1,4 @@
-//! Our nodes: what they show, and what clients write to them.
+//! Nodes of the server's own namespaces: their values, and writes of clients.
 
 use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
@@ -22,24 +22,26 @@ use super::sessions::{Caller, Sessions};
 use super::view::View;
 use crate::limits::LONGEST_REQUEST;
 
-/// A write that has passed the checks of access, DataType and ValueRank.
+/// A write that passed the checks of access, DataType and ValueRank.
 #[derive(Debug, Clone)]
 pub struct WriteRequest {
-    /// Who writes.
+    /// The writing client.
     pub caller: Caller,
     /// The variable.
     pub node: NodeId,
-    /// The whole value the variable would have.
+    /// The complete resulting value of the variable.
     pub value: DataValue,
 }
 
-/// What decides on the values clients write to a variable. It is given up after [`LONGEST_REQUEST`].
+/// Decides on client writes to a variable. A decision that takes longer than [`LONGEST_REQUEST`] is
+/// cancelled.
 #[async_trait]
 pub trait WriteHandler: Send + Sync + 'static {
-    /// Lets the server show the value.
+    /// Accepts a value, which the server then sets.
     ///
     /// # Errors
-    /// Why it is refused.
+    ///
+    /// Returns the status code of the refusal.
     async fn write(&self, request: WriteRequest) -> Result<(), StatusCode>;
 }
 
@@ -55,7 +57,7 @@ where
     }
 }
 
-/// A handler that decides at once.
+/// Creates a handler from a function that returns at once.
 pub fn write<F>(function: F) -> Arc<dyn WriteHandler>
 where
     F: Fn(WriteRequest) -> Result<(), StatusCode> + Send + Sync + 'static,
@@ -86,12 +88,12 @@ impl Spaces {
         &self.own
     }
 
-    /// Whether a node is of one of our namespaces.
+    /// Returns whether a node belongs to the server's own namespaces.
     pub(crate) fn owns(&self, id: &NodeId) -> bool {
         self.indexes.contains(&id.namespace)
     }
 
-    /// Looks at the nodes of both.
+    /// Calls a function with a view of both address spaces.
     pub(crate) fn with<T>(&self, look: impl FnOnce(View<'_>) -> T) -> T {
         let core = self.core.address_space().read();
         let own = self.own.read();
@@ -102,10 +104,11 @@ impl Spaces {
         })
     }
 
-    /// The input arguments of a method of ours; none without the property.
+    /// Returns the input arguments of a method of the own namespaces; empty without the property.
     ///
     /// # Errors
-    /// The value of the property is something else.
+    ///
+    /// Returns an error if the value of the property is not a list of arguments.
     pub(crate) fn input_arguments(&self, method: &NodeId) -> Result<Vec<Argument>, StatusCode> {
         self.with(|view| {
             let properties = view.targets(method, ReferenceTypeId::HasProperty, true);
@@ -127,8 +130,8 @@ impl Spaces {
         }
     }
 
-    /// Lets clients select the fields of the supertypes of an event type by the type itself, and optional fields: the
-    /// library knows those alone that the type declares.
+    /// Registers the inherited fields and the optional fields of event types for select clauses.
+    /// The library registers only the fields that a type itself declares.
     pub(crate) fn inherit_event_fields(&self, types: &mut DefaultTypeTree) {
         self.with(|view| {
             let base: NodeId = ObjectTypeId::BaseEventType.into();
@@ -146,7 +149,7 @@ impl Spaces {
     }
 }
 
-/// The implementation of our node manager.
+/// The implementation of the node manager.
 pub(crate) struct Nodes {
     namespaces: Vec<NamespaceMetadata>,
     writers: RwLock<HashMap<NodeId, Arc<dyn WriteHandler>>>,
@@ -170,7 +173,7 @@ impl Nodes {
         self.writers.write().remove(node);
     }
 
-    /// The value a variable would have, if it may be written.
+    /// Returns the resulting value of a write if the variable may be written.
     fn checked(
         context: &RequestContext,
         address_space: &AddressSpace,
@@ -222,7 +225,7 @@ impl Nodes {
     }
 }
 
-/// The value without picoseconds that say nothing: asyncua takes them for a part of the next timestamp.
+/// Removes picoseconds of 0, which asyncua would decode as a part of the next timestamp.
 pub(crate) fn plain(mut value: DataValue) -> DataValue {
     for picoseconds in [&mut value.source_picoseconds, &mut value.server_picoseconds] {
         picoseconds.take_if(|count| *count == 0);
@@ -230,10 +233,11 @@ pub(crate) fn plain(mut value: DataValue) -> DataValue {
     value
 }
 
-/// Shows values, all or none, and tells who watches their nodes.
+/// Sets values atomically, and notifies subscribers.
 ///
 /// # Errors
-/// A node that is no variable of ours.
+///
+/// Returns an error if a node is not a variable of the own namespaces.
 pub(crate) fn show(
     address_space: &RwLock<AddressSpace>,
     subscriptions: &SubscriptionCache,
@@ -251,7 +255,7 @@ pub(crate) fn show(
     let mut shown = Vec::with_capacity(values.len());
     for (node, value) in values {
         let mut value = plain(value);
-        // The OPC UA library reads a variable that holds no value at all without its status.
+        // The OPC UA library reads a variable without a value without its status.
         value.value.get_or_insert(Variant::Empty);
         value.status.get_or_insert(StatusCode::Good);
         value.source_timestamp.get_or_insert(now);
@@ -261,7 +265,8 @@ pub(crate) fn show(
             shown.push(node);
         }
     }
-    // Until all are told, so that nobody is told in another order.
+    // The lock is held until all notifications are queued, so that their order equals the order of
+    // the changes.
     subscriptions.maybe_notify(
         shown.iter().map(|node| (node, AttributeId::Value)),
         |node, attribute, range, encoding| {
@@ -301,8 +306,9 @@ impl InMemoryNodeManagerImpl for Nodes {
             }
             item.set_initial_value(value);
             item.set_status(StatusCode::Good);
-            // Every change is reported as it comes, as far as the queue of the client holds it: the library would put off what
-            // comes within the sampling interval, and of two changes there only the last would be seen.
+            // Every change is reported at once, as far as the queue of the client permits. With a
+            // sampling interval the library would delay changes, and of two changes within the
+            // interval only the last change would be reported.
             if item.sampling_interval() > 0.0 {
                 item.revise_sampling_interval(AS_IT_COMES_MS);
             }
@@ -351,7 +357,7 @@ impl InMemoryNodeManagerImpl for Nodes {
         _address_space: &RwLock<AddressSpace>,
         methods: &mut [&mut &mut opcua::server::node_manager::MethodCall],
     ) -> Result<(), StatusCode> {
-        // Methods that have no handler, of objects a NodeSet brought.
+        // Methods without handler, of objects in a NodeSet.
         for call in methods {
             call.set_status(StatusCode::BadNotImplemented);
         }
@@ -359,5 +365,5 @@ impl InMemoryNodeManagerImpl for Nodes {
     }
 }
 
-/// Counts as no interval at all, yet is above the 0 that the library takes for "not asked for".
+/// Effectively no interval, but above 0, which the library treats as unspecified.
 const AS_IT_COMES_MS: f64 = 0.000_1;

@@ -1,4 +1,5 @@
-//! Methods of objects of the core namespace: the library has the nodes, and carries out hardly any of them.
+//! Methods of objects of the core namespace. The library has their nodes, but implements few of the
+//! methods.
 
 use std::sync::Arc;
 
@@ -23,18 +24,19 @@ use super::sessions::{Caller, Presence};
 use crate::audit::{Action, Audit};
 use crate::limits::LONGEST_REQUEST;
 
-/// A method of an object of the core namespace, and what carries it out.
+/// A method of an object of the core namespace, and its handler.
 #[derive(Clone)]
 pub struct CoreMethod {
     object: NodeId,
-    /// The node of the object's own method, and that of its type's.
+    /// The method node of the object and the method nodes of its types.
     methods: Vec<NodeId>,
     name: String,
     handler: Arc<dyn MethodHandler>,
 }
 
 impl CoreMethod {
-    /// The method `name` of `object`, under its own node, `methods[0]`, or under those of the types it comes from.
+    /// Creates the method `name` of `object`. `methods[0]` is its own node, the further nodes are
+    /// declarations of its types.
     pub fn new(
         object: impl Into<NodeId>,
         methods: impl IntoIterator<Item = NodeId>,
@@ -54,8 +56,9 @@ impl CoreMethod {
     }
 }
 
-/// The node manager of the core namespace, with these methods carried out, these values of variables, and its nodes `prepared`.
-/// The library has values of its own for some variables, whatever their nodes have; `values` take their places.
+/// Builds the node manager of the core namespace with handlers for methods and with `values` of
+/// variables. `prepared` edits its nodes. The library returns its own values for some variables,
+/// whatever their nodes contain; `values` replace them.
 #[must_use]
 pub fn core_with(
     methods: Vec<CoreMethod>,
@@ -81,7 +84,7 @@ pub fn core_with(
     }
 }
 
-/// The nodes of the core namespace of a server whose methods are carried out so.
+/// Returns the node manager of the core namespace of a server that was built with [`core_with`].
 #[must_use]
 pub fn core_of(handle: &ServerHandle) -> Option<Arc<CoreNodeManager>> {
     let routed = handle.node_managers().get_of_type::<Routed>()?;
@@ -91,7 +94,7 @@ pub fn core_of(handle: &ServerHandle) -> Option<Arc<CoreNodeManager>> {
     }
 }
 
-/// The methods, and where what they take is declared.
+/// The methods, and the address space with their declarations.
 pub(crate) struct Overlay {
     methods: Vec<CoreMethod>,
     values: Vec<(VariableId, Variant)>,
@@ -99,7 +102,7 @@ pub(crate) struct Overlay {
 }
 
 impl Overlay {
-    /// Puts the values that are others than the library's in the place of those.
+    /// Replaces values of the library by the configured values.
     pub(crate) fn correct(&self, nodes: &mut [&mut ReadNode]) {
         for node in nodes {
             let asked = node.node();
@@ -113,7 +116,7 @@ impl Overlay {
         }
     }
 
-    /// Answers the calls of these methods, one after the other, and gives back the rest.
+    /// Executes the calls of these methods sequentially, and returns all other calls.
     pub(crate) async fn answer<'a>(
         &self,
         context: &RequestContext,

@@ -1,8 +1,9 @@
-//! A node manager around another that takes the method calls on our objects out of what it hands on.
+//! A node manager that wraps another node manager, and intercepts method calls on instances.
 //!
-//! The library routes a call by the namespace of the method alone, and then wants the object to have that very method.
-//! Clients may as well give the method of the object's type (OPC 10000-4, 5.12.2.2), which for programs is in the core
-//! namespace. So both node managers, that of the core namespace and ours, stand behind this one.
+//! The library routes a call by the namespace of the method, and requires that the object has
+//! exactly this method. Clients may instead pass the method of the object's type (OPC 10000-4,
+//! 5.12.2.2), which for programs is in the core namespace. Therefore both node managers are
+//! wrapped: the node manager of the core namespace and the node manager of the other namespaces.
 
 use std::sync::Arc;
 
@@ -28,15 +29,15 @@ use super::overlay::Overlay;
 pub(crate) struct Routed {
     pub(crate) inner: Arc<DynNodeManager>,
     pub(crate) front: Front,
-    /// Set for the last node manager, which knows all types there are.
+    /// Set for the last node manager, which is initialized after all types exist.
     pub(crate) last: Option<Arc<Spaces>>,
 }
 
-/// What answers calls before the library does.
+/// The handler of calls before the library.
 pub(crate) enum Front {
-    /// The methods of our objects.
+    /// Handles the methods of instances.
     Calls(Arc<Calls>),
-    /// Those of objects of the core namespace.
+    /// Handles the methods of objects of the core namespace.
     Core(Arc<Overlay>),
 }
 
@@ -239,7 +240,7 @@ impl NodeManager for Routed {
         }
         let ended = self.inner.call(context, &mut others).await;
         if let Err(status) = ended {
-            // Not for those that are answered already.
+            // Calls that have a result already keep it.
             for call in others {
                 call.set_status(status);
             }

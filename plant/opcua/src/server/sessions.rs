@@ -1,4 +1,4 @@
-//! Sessions that have called or written something: who they are, and when they are gone.
+//! Sessions that called or wrote something: their clients, and the detection of their end.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Weak};
@@ -10,25 +10,26 @@ use opcua::types::MessageSecurityMode;
 
 type Told = Arc<dyn Fn(u32) + Send + Sync>;
 
-/// Who calls or writes.
+/// The client and user of a request.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Caller {
-    /// The session, unique while the server runs.
+    /// The session id, unique while the server runs.
     pub session: u32,
-    /// The user, `anonymous` for anonymous ones.
+    /// The user name; `anonymous` for anonymous users.
     pub user: String,
-    /// The ApplicationUri the client gave. Anybody can give any: see `proven`.
+    /// The ApplicationUri that the client sent. It is not verified; see `proven`.
     pub application_uri: String,
-    /// Whether the certificate of the client, which the server trusts, has that ApplicationUri.
+    /// Whether the trusted certificate of the client contains the ApplicationUri.
     pub proven: bool,
-    /// Whether nobody else can read what is said: signed and encrypted.
+    /// Whether the channel is signed and encrypted.
     pub encrypted: bool,
-    /// The DER of the client's certificate, whose key it has; `None` without security.
+    /// The certificate of the client in DER, whose private key the client proved to have; `None`
+    /// without security.
     pub certificate: Option<Arc<[u8]>>,
 }
 
 impl Caller {
-    /// Who is behind a request.
+    /// Returns the client and user of a request.
     #[must_use]
     pub fn of(context: &RequestContext) -> Self {
         let user = match context.token.0.as_str() {
@@ -52,7 +53,7 @@ impl Caller {
     }
 }
 
-/// Whether the session of a request is still there.
+/// Reports whether the session of a request is still active.
 #[derive(Clone)]
 pub struct Presence(Arc<dyn Fn() -> bool + Send + Sync>);
 
@@ -64,7 +65,7 @@ impl std::fmt::Debug for Presence {
 
 impl Presence {
     pub(crate) fn of(context: &RequestContext) -> Self {
-        // The type of the library's sessions has no public name.
+        // The library does not export the type of its sessions.
         let session = Arc::downgrade(&context.session);
         Self::while_(move || Weak::upgrade(&session).is_some_and(|one| one.read().is_activated()))
     }
@@ -73,14 +74,14 @@ impl Presence {
         Self(Arc::new(lasts))
     }
 
-    /// Whether it is there now.
+    /// Returns whether the session is active.
     #[must_use]
     pub fn lasts(&self) -> bool {
         (self.0)()
     }
 }
 
-/// The sessions that are looked after.
+/// The supervised sessions.
 #[derive(Default)]
 pub(crate) struct Sessions {
     watched: Mutex<HashMap<u32, Presence>>,
@@ -88,7 +89,7 @@ pub(crate) struct Sessions {
 }
 
 impl Sessions {
-    /// Who is behind a request, and looks after that session from now on.
+    /// Returns the client and user of a request, and starts to supervise the session.
     pub(crate) fn caller(&self, context: &RequestContext) -> Caller {
         let mut watched = self.watched.lock();
         watched
@@ -102,7 +103,7 @@ impl Sessions {
         self.told.write().push(told);
     }
 
-    /// Tells of the sessions that are gone since the last look.
+    /// Runs the callbacks for sessions that ended since the last call.
     pub(crate) fn look(&self) {
         let mut gone: Vec<u32> = Vec::new();
         self.watched.lock().retain(|session, presence| {
@@ -125,7 +126,7 @@ impl Sessions {
     }
 }
 
-/// The name of users without a name; no other user has it.
+/// The user name of anonymous users; reserved.
 pub(crate) const ANONYMOUS: &str = "anonymous";
-/// How often it is looked.
+/// Interval of checking sessions.
 pub(crate) const LOOK: Duration = Duration::from_millis(50);

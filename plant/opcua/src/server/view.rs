@@ -1,5 +1,5 @@
-//! The nodes of both node managers as one: types of the core namespace beside those of NodeSets, and what instances
-//! of a type are made of.
+//! A view of the nodes of both node managers: types of the core namespace and of NodeSets, and the
+//! declarations that instances copy.
 
 use std::collections::{BTreeMap, HashMap, HashSet};
 
@@ -9,16 +9,17 @@ use opcua::types::{
     BrowseDirection, Identifier, NodeClass, NodeId, QualifiedName, ReferenceTypeId, VariableTypeId,
 };
 
-/// The core namespace and our own namespaces.
+/// The core namespace and the server's own namespaces.
 #[derive(Clone, Copy)]
 pub(crate) struct View<'a> {
     pub(crate) core: &'a AddressSpace,
     pub(crate) own: &'a AddressSpace,
-    /// Nothing here asks for subtypes of references.
+    /// An empty type tree: no query of this module includes subtypes of references.
     pub(crate) no_types: &'a DefaultTypeTree,
 }
 
-/// A child of a type by its BrowseName: its declarations, that of the most derived type first.
+/// A child of a type by its BrowseName, with its declarations. The declaration of the most derived
+/// type is first.
 #[derive(Debug, Clone)]
 pub(crate) struct Declared {
     pub(crate) name: QualifiedName,
@@ -26,14 +27,14 @@ pub(crate) struct Declared {
     pub(crate) nodes: Vec<NodeId>,
 }
 
-/// A node below another.
+/// A child of a node.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Child {
     /// The node.
     pub node_id: NodeId,
     /// Its BrowseName.
     pub browse_name: QualifiedName,
-    /// How it is below the other.
+    /// The reference type from the parent.
     pub reference_type: NodeId,
     /// Its NodeClass.
     pub node_class: NodeClass,
@@ -48,7 +49,8 @@ impl<'a> View<'a> {
         }
     }
 
-    /// The references of a node, wherever they are kept, in an order that stays the same: type and target.
+    /// Returns the references of a node in both address spaces, in a stable order by type and
+    /// target.
     fn references(
         self,
         id: &NodeId,
@@ -63,7 +65,7 @@ impl<'a> View<'a> {
         let mut found: Vec<(&NodeId, &NodeId)> = Vec::new();
         for space in [self.core, self.own] {
             let all = space.find_references(id, None::<(NodeId, bool)>, self.no_types, direction);
-            // Some nodes of the core namespace have thousands.
+            // Some nodes of the core namespace have thousands of references.
             let wanted = all.filter(|one| kinds.iter().any(|kind| *one.reference_type == *kind));
             found.extend(wanted.map(|one| (one.reference_type, one.target_node)));
         }
@@ -72,7 +74,7 @@ impl<'a> View<'a> {
         found
     }
 
-    /// Where the references of one type lead.
+    /// Returns the targets of the references of a type.
     pub(crate) fn targets(
         self,
         id: &NodeId,
@@ -83,7 +85,7 @@ impl<'a> View<'a> {
         references.into_iter().map(|(_, target)| target).collect()
     }
 
-    /// The supertypes, nearest first.
+    /// Returns the supertypes, nearest first.
     pub(crate) fn supertypes(self, type_id: &NodeId) -> Vec<&'a NodeId> {
         let mut found: Vec<&NodeId> = Vec::new();
         let mut at = type_id;
@@ -92,7 +94,7 @@ impl<'a> View<'a> {
             .into_iter()
             .next()
         {
-            // A NodeSet may have a circle.
+            // The type hierarchy of a faulty NodeSet may be cyclic.
             if next == type_id || found.contains(&next) {
                 break;
             }
@@ -102,7 +104,7 @@ impl<'a> View<'a> {
         found
     }
 
-    /// The subtypes of all levels, without the type itself.
+    /// Returns the subtypes of all levels, without the type itself.
     pub(crate) fn subtypes(self, type_id: &NodeId) -> Vec<&'a NodeId> {
         let mut found: Vec<&NodeId> = Vec::new();
         let mut seen: HashSet<&NodeId> = HashSet::new();
@@ -120,7 +122,8 @@ impl<'a> View<'a> {
         type_id == base || self.supertypes(type_id).contains(&base)
     }
 
-    /// The type of an object or variable, if its instances can have children: properties have none.
+    /// Returns the type definition of an object or variable if its instances can have children:
+    /// properties have none.
     pub(crate) fn parental_type(self, id: &NodeId) -> Option<&'a NodeId> {
         self.type_definition(id)
             .filter(|found| **found != VariableTypeId::PropertyType)
@@ -132,7 +135,7 @@ impl<'a> View<'a> {
             .next()
     }
 
-    /// The rule of the first declaration that has one.
+    /// Returns the modelling rule of the first declaration that has a modelling rule.
     pub(crate) fn modelling_rule(self, declared: &Declared) -> Option<&'a NodeId> {
         declared.nodes.iter().find_map(|node| {
             self.targets(node, ReferenceTypeId::HasModellingRule, true)
@@ -141,7 +144,7 @@ impl<'a> View<'a> {
         })
     }
 
-    /// What is below a node, by components, properties, folders and event sources.
+    /// Returns the children of a node: components, properties, organized nodes and event sources.
     pub(crate) fn children(self, id: &NodeId) -> Vec<Child> {
         self.below(id, &HIERARCHICAL)
     }
@@ -162,8 +165,8 @@ impl<'a> View<'a> {
             .collect()
     }
 
-    /// What an instance has by these declarations of it and by its type: declarations come before the type, a type
-    /// before its supertypes and its interfaces.
+    /// Returns the children of an instance by its declarations and its type. Declarations precede
+    /// the type, and a type precedes its supertypes and its interfaces.
     pub(crate) fn declared(
         self,
         declarations: &[NodeId],
@@ -204,7 +207,7 @@ impl<'a> View<'a> {
         found.into_values().collect()
     }
 
-    /// A type by the BrowseName it has in the namespace it is of.
+    /// Returns a type by its BrowseName in its own namespace.
     pub(crate) fn find_type(self, namespace: u16, name: &str) -> Option<NodeId> {
         let roots = [
             ReferenceTypeId::References as u32,
@@ -227,8 +230,8 @@ impl<'a> View<'a> {
         })
     }
 
-    /// The fields of an event type by their path, those of its supertypes too, with the ones that are optional. What
-    /// the types of fields have is kept in `known`: it is the same for each.
+    /// Returns the fields of an event type by their paths, including inherited and optional fields.
+    /// `known` caches the children of the types of fields.
     pub(crate) fn event_fields(
         self,
         event_type: &NodeId,
@@ -265,7 +268,7 @@ impl<'a> View<'a> {
     }
 }
 
-/// Some order of NodeIds.
+/// Returns a sort key of a NodeId.
 fn order(id: &NodeId) -> (u16, u32, String) {
     match &id.identifier {
         Identifier::Numeric(number) => (id.namespace, *number, String::new()),
@@ -275,7 +278,7 @@ fn order(id: &NodeId) -> (u16, u32, String) {
     }
 }
 
-/// What instances of a type have copies of.
+/// The reference types to the children that instances copy.
 const AGGREGATES: [ReferenceTypeId; 4] = [
     ReferenceTypeId::HasComponent,
     ReferenceTypeId::HasProperty,

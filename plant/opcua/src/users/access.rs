@@ -1,4 +1,5 @@
-//! Who comes in, and what each may do: the library asks here for each session and each request.
+//! Authentication and authorization: the library calls this module for each session and each
+//! request.
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
@@ -25,30 +26,30 @@ use super::password::has_hash;
 use super::{Role, Roles};
 use crate::server::{ANONYMOUS, Caller};
 
-/// What a user may do with a node.
+/// A right of a user on a node.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Right {
-    /// Read it and watch it.
+    /// Read and subscribe.
     Read,
-    /// Write it.
+    /// Write.
     Write,
-    /// Call it.
+    /// Call.
     Call,
 }
 
-/// Which roles may do what with a node.
+/// The roles with rights on a node.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Permissions {
-    /// Who reads it.
+    /// The roles that may read the node.
     pub read: Roles,
-    /// Who writes it.
+    /// The roles that may write the node.
     pub write: Roles,
-    /// Who calls it.
+    /// The roles that may call the node.
     pub call: Roles,
 }
 
 impl Default for Permissions {
-    /// Everybody reads; operators and engineers write and call.
+    /// Grants reading to all roles, and writing and calling to operators and engineers.
     fn default() -> Self {
         let runs = Roles::of(&[Role::Operator, Role::Engineer]);
         Self {
@@ -69,59 +70,59 @@ impl Permissions {
     }
 }
 
-/// What a user without a name may do.
+/// The rights of anonymous users.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum Anonymous {
-    /// Observes; and operates a server that only this computer reaches, as long as it has no users.
+    /// The role Observer. Also Operator if the server listens on loopback only and has no users.
     #[default]
     Usual,
-    /// Has those roles.
+    /// The given roles.
     Has(Roles),
-    /// Is not let in.
+    /// Anonymous users are refused.
     Refused,
 }
 
-/// What is told of nodes and of anonymous users.
+/// The configured permissions of nodes and of anonymous users.
 #[derive(Debug, Clone, Default)]
 pub struct Rules {
-    /// What a user without a name may do.
+    /// The rights of anonymous users.
     pub anonymous: Anonymous,
-    /// The nodes that are not as the others.
+    /// The nodes with other permissions than the default.
     pub nodes: HashMap<NodeId, Permissions>,
 }
 
-/// Somebody who wanted in, as the audit tells it.
+/// A login attempt, for audits.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Login {
-    /// The name given; empty for anonymous ones and unknown certificates.
+    /// The given user name; empty for anonymous users and unknown certificates.
     pub user: String,
-    /// How: `anonymous`, `password` or `certificate`.
+    /// The kind of user identity: `anonymous`, `password` or `certificate`.
     pub by: &'static str,
-    /// The policy and mode of the endpoint.
+    /// The security policy and mode of the endpoint.
     pub endpoint: String,
-    /// Why it was refused; `None` where it was let in.
+    /// The reason of a refusal; `None` for a successful login.
     pub fault: Option<LoginFault>,
 }
 
-/// Why somebody is not let in.
+/// The reason of a refused login.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum LoginFault {
     /// Anonymous users are refused.
     #[error("anonymous users are not let in")]
     Anonymous,
-    /// No user of that name, or another password.
+    /// The user does not exist, or the password is wrong.
     #[error("no such user, or another password")]
     Password,
-    /// No user with that certificate.
+    /// No user has the certificate.
     #[error("no user has that certificate (`ua-server user add NAME --certificate FILE`)")]
     Certificate,
-    /// The certificate is not valid now.
+    /// The certificate is not valid at the moment.
     #[error("the user's certificate is not valid now")]
     Expired,
 }
 
 impl LoginFault {
-    /// What the client is told.
+    /// Returns the status code for the client.
     #[must_use]
     pub const fn status(self) -> StatusCode {
         match self {
@@ -134,17 +135,17 @@ impl LoginFault {
 
 type Told = Arc<dyn Fn(&Login) + Send + Sync>;
 
-/// The users of a server and what they may do.
+/// The users of a server and their permissions.
 pub struct Access {
-    /// Where the users are; nowhere for a server without any.
+    /// The folder of the users; `None` for a server without users.
     folder: Option<PathBuf>,
-    /// Whether only this computer reaches the server.
+    /// Whether the server listens on loopback only.
     is_loopback: bool,
     users: RwLock<Users>,
-    /// The file when it was read last.
+    /// The state of the file when it was read last.
     stamp: Mutex<Option<Stamp>>,
     rules: RwLock<Rules>,
-    /// A check of a password takes a core for a while, and memory.
+    /// Limits concurrent password checks: each check uses a CPU core for some time, and memory.
     checking: Arc<Semaphore>,
     told: RwLock<Vec<Told>>,
 }
@@ -155,14 +156,15 @@ impl std::fmt::Debug for Access {
     }
 }
 
-/// Length and time of change of a file.
+/// The length and the modification time of a file.
 type Stamp = (u64, Option<SystemTime>);
 
 impl Access {
-    /// Reads the users of a folder.
+    /// Reads the users in a folder.
     ///
     /// # Errors
-    /// A file that others can read, or that cannot be read as users.
+    ///
+    /// Returns an error if other users can read the file or if its content is invalid.
     pub fn new(folder: Option<PathBuf>, is_loopback: bool) -> Result<Self, UserFault> {
         let users = folder.as_deref().map(Users::read).transpose()?;
         let access = Self {
@@ -177,10 +179,11 @@ impl Access {
         Ok(access)
     }
 
-    /// The users of a certificate store; users without a name have these roles.
+    /// Reads the users of a certificate store. Anonymous users have the roles `anonymous`.
     ///
     /// # Errors
-    /// A file that others can read, or that cannot be read as users.
+    ///
+    /// Returns an error if other users can read the file or if its content is invalid.
     pub fn of_store(pki: Option<&Path>, anonymous: Roles) -> Result<Self, UserFault> {
         let access = Self::new(pki.map(|pki| pki.join(FOLDER)), false)?;
         access.set_rules(Rules {
@@ -190,17 +193,18 @@ impl Access {
         Ok(access)
     }
 
-    /// Has other rules from now on, for open sessions too.
+    /// Replaces the rules, also for open sessions.
     pub fn set_rules(&self, rules: Rules) {
         *self.rules.write() = rules;
     }
 
-    /// Tells of each who wants in.
+    /// Registers a callback for login attempts.
     pub fn on_login(&self, told: impl Fn(&Login) + Send + Sync + 'static) {
         self.told.write().push(Arc::new(told));
     }
 
-    /// Reads the users anew where their file has changed. With a file that cannot be read as users those before stay.
+    /// Reads the users again if their file changed. If the file is invalid, the previous users
+    /// stay.
     pub fn look(&self) {
         let Some(folder) = &self.folder else { return };
         let now = stamp(folder);
@@ -218,7 +222,7 @@ impl Access {
         }
     }
 
-    /// What that user may be: the roles it has now.
+    /// Returns the current roles of a user.
     #[must_use]
     pub fn roles(&self, token: &UserToken) -> Roles {
         if token.is_anonymous() {
@@ -228,7 +232,7 @@ impl Access {
         users.get(&token.0).map_or(Roles::NONE, |user| user.roles)
     }
 
-    /// The roles of the user of a caller.
+    /// Returns the roles of the user of a caller.
     #[must_use]
     pub fn roles_of(&self, caller: &Caller) -> Roles {
         if caller.user == ANONYMOUS {
@@ -240,7 +244,8 @@ impl Access {
             .map_or(Roles::NONE, |user| user.roles)
     }
 
-    /// Whether a user may do that with a node now. What belongs to the standard is for everybody, where nothing else is said.
+    /// Returns whether a user has a right on a node at the moment. Nodes of the core namespace are
+    /// open to all users unless the rules contain them.
     #[must_use]
     pub fn allows(&self, token: &UserToken, node: &NodeId, right: Right) -> bool {
         let rules = self.rules.read();
@@ -253,7 +258,7 @@ impl Access {
         self.roles(token).meets(permissions.of(right))
     }
 
-    /// Whether everybody who is let in may read a node.
+    /// Returns whether all authenticated users may read a node.
     #[must_use]
     pub fn is_public(&self, node: &NodeId) -> bool {
         let rules = self.rules.read();
@@ -261,7 +266,7 @@ impl Access {
         permissions.is_none_or(|permissions| permissions.read == Roles::ALL)
     }
 
-    /// The roles of anonymous users; `None` where they are not let in.
+    /// Returns the roles of anonymous users; `None` if they are refused.
     fn anonymous(&self) -> Option<Roles> {
         match self.rules.read().anonymous {
             Anonymous::Has(roles) => Some(roles),
@@ -280,7 +285,7 @@ impl Access {
         }
     }
 
-    /// Tells of it, and answers the library.
+    /// Reports a login attempt, and returns its result for the library.
     fn answered(&self, login: &Login, token: UserToken) -> Result<UserToken, Error> {
         self.tell(login);
         match login.fault {
@@ -289,7 +294,7 @@ impl Access {
         }
     }
 
-    /// Whether the password is that of the user. Of a name that nobody has it takes as long.
+    /// Checks the password of a user. The check takes the same time if the user does not exist.
     async fn check(&self, name: &str, password: &Password) -> bool {
         let hash = match self.users.read().get(name).map(|user| &user.credential) {
             Some(Credential::Password(hash)) => Some(hash.clone()),
@@ -312,7 +317,7 @@ impl Access {
     }
 }
 
-/// What tells that a file has changed.
+/// Returns a value that changes when the file of users changes.
 fn stamp(folder: &Path) -> Option<Stamp> {
     let about = std::fs::metadata(folder.join(LIST)).ok()?;
     Some((about.len(), about.modified().ok()))
@@ -352,7 +357,7 @@ impl AuthManager for Access {
         let mut login = login("password", &told, endpoint);
         if !self.check(username, password).await {
             login.fault = Some(LoginFault::Password);
-            // Who tries many waits for each; a connection has one at a time.
+            // Delays repeated attempts; a connection has a single attempt at a time.
             tokio::time::sleep(AFTER_A_WRONG_ONE).await;
         }
         self.answered(&login, UserToken(username.to_owned()))
@@ -410,7 +415,7 @@ impl AuthManager for Access {
         self.allows(token, method_id, Right::Call)
     }
 
-    /// A password or a signature is only asked for where nobody else can read or change it.
+    /// Passwords and signatures are requested only on secured endpoints.
     fn user_token_policies(&self, endpoint: &ServerEndpoint) -> Vec<UserTokenPolicy> {
         let policy = |id: UAString, token_type, security: Option<SecurityPolicy>| UserTokenPolicy {
             policy_id: id,
@@ -445,13 +450,13 @@ impl AuthManager for Access {
     }
 }
 
-/// The ids of the library for its policies.
+/// The policy ids of the library.
 const ANONYMOUS_POLICY: &str = "anonymous";
 const X509_POLICY: &str = "x509";
-/// Passwords that are checked at a time.
+/// Most concurrent password checks.
 const MOST_CHECKS: usize = 2;
 const AFTER_A_WRONG_ONE: Duration = Duration::from_secs(1);
-/// A hash that is compared with where there is no user of that name.
+/// The hash that is compared if the user does not exist.
 const NOBODYS: &str = "$argon2id$v=19$m=19456,t=2,p=1$bm9ib2R5LWhhcy1pdC4uLg$AAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAA";
 
 #[cfg(test)]

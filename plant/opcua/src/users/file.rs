@@ -1,8 +1,9 @@
-//! The users of a server, in a folder of its certificate store that only its owner can read.
+//! The users of a server, in a folder of its certificate store that only its owner may read.
 //!
-//! The file `list` has a line for each: the name, the roles with commas between them, and either the argon2 hash of the
-//! password in the PHC format, or `x509:` and the SHA-1 thumbprint of the user's certificate, which stands beside it as
-//! `<thumbprint>.der`. A line that begins with `#` says nothing.
+//! The file `list` has a line for each user: the name, the roles separated by commas, and a
+//! credential. The credential is the argon2 hash of the password in the PHC format, or `x509:` and
+//! the SHA-1 thumbprint of the user's certificate, which is stored in the same folder as
+//! `<thumbprint>.der`. Lines that begin with `#` are comments.
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};
@@ -17,25 +18,26 @@ use opcua::crypto::{CertificateStore, X509};
 use super::{Roles, UnknownRole};
 use crate::synced::replace;
 
-/// A user.
+/// A user and its credential.
 #[derive(Clone, PartialEq, Eq)]
 pub struct User {
-    /// What it may do.
+    /// The roles of the user.
     pub roles: Roles,
-    /// How it shows who it is.
+    /// The credential of the user.
     pub credential: Credential,
 }
 
-/// How a user shows who it is.
+/// The credential of a user.
 #[derive(Clone, PartialEq, Eq)]
 pub enum Credential {
-    /// By a password with this hash.
+    /// The hash of a password.
     Password(String),
-    /// By the key to the certificate with this SHA-1 thumbprint, in hexadecimal of lower case.
+    /// The SHA-1 thumbprint of a certificate in lower-case hexadecimal. The user proves to have its
+    /// private key.
     Certificate(String),
 }
 
-/// A hash is nothing for a log.
+/// Omits the hash, which must not be logged.
 impl std::fmt::Debug for Credential {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
@@ -56,7 +58,7 @@ impl std::fmt::Debug for User {
     }
 }
 
-/// Why there are no users, or no such user.
+/// An error of the users of a server.
 #[derive(Debug, thiserror::Error)]
 pub enum UserFault {
     /// The folder or a file in it cannot be used.
@@ -64,35 +66,35 @@ pub enum UserFault {
     Io {
         /// The file.
         path: PathBuf,
-        /// What the system says.
+        /// The error of the operating system.
         #[source]
         source: io::Error,
     },
-    /// Others can read the hashes.
+    /// Other users can read the hashes.
     #[error("{0} can be read by others than its owner: chmod 600 {0}")]
     Open(PathBuf),
-    /// Too large, or too many.
+    /// The file is too large or contains too many users.
     #[error("{0} is larger than {LARGEST_FILE} bytes, or has more than {MOST_USERS} users")]
     TooMany(PathBuf),
-    /// A line is none of a user. What stands in it is not told: it may be a hash, or a password.
+    /// A line is invalid. The message omits its content, which may be a hash or a password.
     #[error("{path}, line {line}: {why}")]
     Line {
         /// The file.
         path: PathBuf,
-        /// From 1.
+        /// The line number, from 1.
         line: usize,
-        /// What is wrong.
+        /// The reason.
         why: String,
     },
-    /// The name cannot be that of a user.
+    /// The user name is invalid.
     #[error(
         "a user's name has 1 to 64 letters, digits, dots, hyphens, underscores and @, and is not `anonymous`"
     )]
     Name,
-    /// Nobody has that name.
+    /// The user does not exist.
     #[error("there is no user {0}")]
     Unknown(String),
-    /// A user without a role may do nothing.
+    /// A user without a role would have no rights.
     #[error(
         "a user has at least one role: observer, operator, engineer, security_admin, configure_admin"
     )]
@@ -100,7 +102,7 @@ pub enum UserFault {
     /// The role does not exist.
     #[error(transparent)]
     Role(#[from] UnknownRole),
-    /// The password cannot be one.
+    /// The password is too short or too long.
     #[error("a password has 8 to {LARGEST_PASSWORD} bytes")]
     Password,
     /// The certificate cannot be read.
@@ -108,7 +110,7 @@ pub enum UserFault {
     Certificate {
         /// The file.
         path: PathBuf,
-        /// What is wrong.
+        /// The reason.
         why: String,
     },
 }
@@ -120,10 +122,11 @@ pub struct Users {
 }
 
 impl Users {
-    /// Reads those of a folder; without the folder or its file there are none.
+    /// Reads the users in a folder. A missing folder or file contains no users.
     ///
     /// # Errors
-    /// A file that others can read, or a line that is none of a user.
+    ///
+    /// Returns an error if other users can read the file, or if a line is invalid.
     pub fn read(folder: &Path) -> Result<Self, UserFault> {
         let path = folder.join(LIST);
         let io = |source| UserFault::Io {
@@ -172,10 +175,11 @@ impl Users {
         Ok(Self { by_name })
     }
 
-    /// Writes them, in the place of what is there.
+    /// Writes the users, and replaces the previous file.
     ///
     /// # Errors
-    /// The folder or the file cannot be written.
+    ///
+    /// Returns an error if the folder or the file cannot be written.
     pub fn write(&self, folder: &Path) -> Result<(), UserFault> {
         let path = folder.join(LIST);
         let mut text = String::from(HEAD);
@@ -190,24 +194,24 @@ impl Users {
         written.map_err(|source| UserFault::Io { path, source })
     }
 
-    /// Whether there are none.
+    /// Returns whether there are no users.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.by_name.is_empty()
     }
 
-    /// The user of that name.
+    /// Returns a user by name.
     #[must_use]
     pub fn get(&self, name: &str) -> Option<&User> {
         self.by_name.get(name)
     }
 
-    /// The users, by their names.
+    /// Returns the users, ordered by name.
     pub fn iter(&self) -> impl Iterator<Item = (&str, &User)> {
         self.by_name.iter().map(|(name, user)| (&name[..], user))
     }
 
-    /// Whose certificate has that thumbprint.
+    /// Returns the user with the certificate of this thumbprint.
     #[must_use]
     pub fn of_certificate(&self, thumbprint: &str) -> Option<(&str, &User)> {
         self.iter().find(|(_, user)| match &user.credential {
@@ -216,10 +220,11 @@ impl Users {
         })
     }
 
-    /// Has a user, in the place of one of that name.
+    /// Adds a user, or replaces the user with the same name.
     ///
     /// # Errors
-    /// A name that cannot be, no role, or too many users.
+    ///
+    /// Returns an error for an invalid name or if the user has no role.
     pub fn put(&mut self, name: &str, user: User) -> Result<(), UserFault> {
         if !is_name(name) {
             return Err(UserFault::Name);
@@ -231,10 +236,11 @@ impl Users {
         Ok(())
     }
 
-    /// Gives a user other roles.
+    /// Replaces the roles of a user.
     ///
     /// # Errors
-    /// There is none of that name, or no role.
+    ///
+    /// Returns an error if the user does not exist or if no role is given.
     pub fn set_roles(&mut self, name: &str, roles: Roles) -> Result<(), UserFault> {
         if roles == Roles::NONE {
             return Err(UserFault::NoRole);
@@ -245,19 +251,21 @@ impl Users {
         Ok(())
     }
 
-    /// Takes a user away.
+    /// Removes a user.
     ///
     /// # Errors
-    /// There is none of that name.
+    ///
+    /// Returns an error if the user does not exist.
     pub fn remove(&mut self, name: &str) -> Result<User, UserFault> {
         let gone = self.by_name.remove(name);
         gone.ok_or_else(|| UserFault::Unknown(name.to_owned()))
     }
 
-    /// Keeps the certificate of a user beside the list, and gives what the list says of it.
+    /// Stores the certificate of a user in the folder, and returns the credential.
     ///
     /// # Errors
-    /// The file is no certificate, or cannot be kept.
+    ///
+    /// Returns an error if the file is not a certificate or cannot be stored.
     pub fn keep_certificate(folder: &Path, from: &Path) -> Result<Credential, UserFault> {
         let certificate = read_certificate(from)?;
         let thumbprint = certificate.thumbprint().as_hex_string().to_lowercase();
@@ -273,16 +281,17 @@ impl Users {
         Ok(Credential::Certificate(thumbprint))
     }
 
-    /// The certificate that a user shows, as it was kept.
+    /// Returns the stored certificate of a user.
     ///
     /// # Errors
-    /// It is not there, or is no certificate.
+    ///
+    /// Returns an error if the certificate is missing or invalid.
     pub fn certificate(folder: &Path, thumbprint: &str) -> Result<X509, UserFault> {
         read_certificate(&folder.join(format!("{thumbprint}.der")))
     }
 }
 
-/// A certificate in DER or PEM.
+/// Reads a certificate in DER or PEM.
 fn read_certificate(path: &Path) -> Result<X509, UserFault> {
     CertificateStore::read_cert(path).map_err(|why| UserFault::Certificate {
         path: path.to_owned(),
@@ -316,7 +325,7 @@ fn user(line: &str) -> Result<(&str, User), String> {
     Ok((name, User { roles, credential }))
 }
 
-/// A hash that can be checked with bounded effort.
+/// Checks that the cost of verifying a hash is bounded.
 fn sound_hash(text: &str) -> Result<String, String> {
     let hash = PasswordHash::new(text)
         .map_err(|_| "expected an argon2 hash in the PHC format, as $argon2id$..".to_owned())?;
@@ -333,10 +342,11 @@ fn sound_hash(text: &str) -> Result<String, String> {
     Ok(text.to_owned())
 }
 
-/// The argon2id hash of a password, in the PHC format.
+/// Returns the argon2id hash of a password, in the PHC format.
 ///
 /// # Errors
-/// A password that is too short or too long.
+///
+/// Returns an error if the password is too short or too long.
 pub fn hashed(password: &[u8]) -> Result<Credential, UserFault> {
     if !(8..=LARGEST_PASSWORD).contains(&password.len()) {
         return Err(UserFault::Password);
@@ -379,18 +389,18 @@ fn others_read(_about: &fs::Metadata) -> bool {
     false
 }
 
-/// The folder of users, below the root of the certificate store.
+/// The folder of users below the root of the certificate store.
 pub const FOLDER: &str = "users";
-/// The file of users in it.
+/// The file in this folder.
 pub(super) const LIST: &str = "list";
 const HEAD: &str = "# Name, roles, and the argon2 hash of the password or the thumbprint of the certificate. See `ua-server user`.\n";
 const X509_PREFIX: &str = "x509:";
-/// Users of a server.
+/// Most users of a server.
 pub const MOST_USERS: usize = 10_000;
-/// Bytes of a password.
+/// Most bytes of a password.
 pub const LARGEST_PASSWORD: usize = 1_024;
 const LARGEST_FILE: u64 = 4 << 20;
-/// KiB and passes over them that a hash may take.
+/// Most memory in KiB, and most passes, of a hash.
 const MOST_MEMORY: u32 = 256 << 10;
 const MOST_PASSES: u32 = 32;
 

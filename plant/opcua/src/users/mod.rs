@@ -1,10 +1,10 @@
-//! Who may do what: users, the roles they have, and what a role may do with a node.
+//! Users, their roles, and the permissions of roles on nodes.
 //!
-//! A server that takes users keeps them in a folder of its certificate store (`file`). Who comes with a session is asked
-//! there, and for each request of that session what its user may do is asked again (`access`): a user that is taken away,
-//! or has other roles, is that for open sessions too.
+//! A server stores its users in a folder of its certificate store (`file`). Each session is
+//! authenticated against this folder, and each request of a session is authorized again (`access`).
+//! Removed users and changed roles therefore take effect on open sessions too.
 //!
-//! Reading order: the roles here, `file`, `password`, `access`.
+//! Reading order: the roles in this module, `file`, `password`, `access`.
 
 mod access;
 mod file;
@@ -15,18 +15,18 @@ pub use self::file::{
     Credential, FOLDER, LARGEST_PASSWORD, MOST_USERS, User, UserFault, Users, hashed,
 };
 
-/// One of the well-known roles of OPC 10000-18, 4.2.
+/// A well-known role of OPC 10000-18, 4.2.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Role {
-    /// Sees what there is.
+    /// May read.
     Observer,
-    /// Runs the cell: sees, writes and calls.
+    /// Operates the cell: may read, write and call.
     Operator,
-    /// Sets the cell up: may all that an operator may, and what is kept to engineers.
+    /// Sets up the cell: has the rights of an operator, and rights reserved for engineers.
     Engineer,
-    /// Says who may do what: users, certificates, keys, and what the audit tells.
+    /// Manages users, certificates and keys, and receives audit events.
     SecurityAdmin,
-    /// Configures programs: says where in the plant they are.
+    /// Configures programs, for example their location in the plant.
     ConfigureAdmin,
 }
 
@@ -40,7 +40,7 @@ impl Role {
         Self::ConfigureAdmin,
     ];
 
-    /// As it is typed and stands in files.
+    /// Returns the name in commands and files.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -73,7 +73,7 @@ impl std::str::FromStr for Role {
     }
 }
 
-/// A text that names no role.
+/// An unknown role name.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("`{0}` is no role: observer, operator, engineer, security_admin, configure_admin")]
 pub struct UnknownRole(String);
@@ -88,25 +88,25 @@ impl Roles {
     /// Every role.
     pub const ALL: Self = Self(31);
 
-    /// Those roles.
+    /// Returns the set of the given roles.
     #[must_use]
     pub fn of(roles: &[Role]) -> Self {
         roles.iter().copied().collect()
     }
 
-    /// Whether that role is among them.
+    /// Returns whether the set contains a role.
     #[must_use]
     pub const fn contains(self, role: Role) -> bool {
         self.0 & role.bit() != 0
     }
 
-    /// Whether one of the others is among them.
+    /// Returns whether both sets have a role in common.
     #[must_use]
     pub const fn meets(self, others: Self) -> bool {
         self.0 & others.0 != 0
     }
 
-    /// The roles, in their order.
+    /// Returns the roles in their order.
     pub fn iter(self) -> impl Iterator<Item = Role> {
         let all = Role::ALL.iter().copied();
         all.filter(move |role| self.contains(*role))
@@ -119,7 +119,7 @@ impl FromIterator<Role> for Roles {
     }
 }
 
-/// `operator,engineer`
+/// Formats the roles as `operator,engineer`.
 impl std::fmt::Display for Roles {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         for (at, role) in self.iter().enumerate() {

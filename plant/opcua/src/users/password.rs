@@ -8,7 +8,7 @@ pub(super) fn has_hash(password: &[u8], hash: &str) -> bool {
     compared(password, hash).unwrap_or(false)
 }
 
-/// Compares a password with a hash; `None` for a hash that cannot be used.
+/// Compares a password with a hash; `None` for an invalid hash.
 fn compared(password: &[u8], hash: &str) -> Option<bool> {
     let hash = PasswordHash::new(hash).ok()?;
     let (salt, wanted) = (hash.salt.as_ref()?, hash.hash.as_ref()?);
@@ -25,12 +25,13 @@ fn compared(password: &[u8], hash: &str) -> Option<bool> {
     Argon2::new(algorithm, version, params)
         .hash_password_into_with_memory(password, salt, &mut output, memory.as_mut_slice())
         .ok()?;
-    // Outputs are compared in constant time.
+    // The comparison takes constant time.
     Some(Output::new(&output).ok()? == *wanted)
 }
 
-/// The GNU C library returns a freed allocation to the system only above 32 MiB, and keeps smaller allocations in an arena of
-/// each thread. The blocks beyond those of the hash are never touched and take no memory.
+/// The GNU C library returns a freed allocation to the operating system only above 32 MiB. It keeps
+/// smaller allocations in an arena per thread. Blocks beyond the blocks of the hash are never
+/// touched and use no memory.
 const LEAST_BLOCKS: usize = (33 << 20) / Block::SIZE;
 
 #[cfg(test)]
@@ -62,7 +63,7 @@ mod tests {
                     for _ in 0..2 {
                         assert!(has_hash(b"correct horse", &hash));
                     }
-                    // The arenas of these threads exist while the memory is counted.
+                    // The arenas of these threads exist while the memory is measured.
                     barrier.wait();
                     barrier.wait();
                 });

@@ -1,4 +1,4 @@
-//! A server with two NodeSets, and clients of it.
+//! A server with two NodeSets, and its clients.
 
 #![allow(
     dead_code,
@@ -20,7 +20,7 @@ use plant_opcua::server::{
 
 pub(crate) const MACHINES: &str = "urn:test:machines";
 pub(crate) const VENDOR: &str = "urn:test:vendor";
-/// Longer than anything takes on a machine under load.
+/// A timeout that is long enough on a busy machine.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(20);
 
 pub(crate) struct Cell {
@@ -63,7 +63,7 @@ pub(crate) fn config() -> ClientConfig {
     config
 }
 
-/// A press with the NodeIds from `first`.
+/// Creates a press with the NodeIds from `first`.
 pub(crate) fn press(server: &Server, first: u32, optional: &[&str]) -> Instance {
     let type_id = server.find_type(VENDOR, "PressType").unwrap();
     let mut spec = InstanceSpec::new(
@@ -102,7 +102,7 @@ pub(crate) async fn next(subscription: &mut Subscription) -> Notice {
         .expect("the client is closed")
 }
 
-/// The next value.
+/// Waits for the next value.
 pub(crate) async fn next_value(subscription: &mut Subscription) -> (usize, Option<Variant>) {
     loop {
         match next(subscription).await {
@@ -113,7 +113,7 @@ pub(crate) async fn next_value(subscription: &mut Subscription) -> (usize, Optio
     }
 }
 
-/// The status of the next value.
+/// Waits for the status of the next value.
 pub(crate) async fn next_status(subscription: &mut Subscription) -> StatusCode {
     loop {
         if let Notice::Value { value, .. } = next(subscription).await {
@@ -122,7 +122,7 @@ pub(crate) async fn next_status(subscription: &mut Subscription) -> StatusCode {
     }
 }
 
-/// The next event, if one comes.
+/// Waits for the next event, until the timeout.
 pub(crate) async fn next_event(
     subscription: &mut Subscription,
     within: Duration,
