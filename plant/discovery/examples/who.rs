@@ -1,5 +1,5 @@
-//! Both ends of discovery in a terminal: `who announce NAME` is a server that can do nothing but be there, `who watch`
-//! prints who comes and goes, a JSON object a line.
+//! Both ends of discovery in a terminal: `who announce NAME` announces a server without services,
+//! `who watch` prints servers that appear and disappear as JSON objects, each in a line.
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::process::ExitCode;
@@ -67,7 +67,7 @@ struct Presence {
 }
 
 impl Presence {
-    /// The servers to be.
+    /// Returns the servers to announce.
     fn all(&self) -> Vec<Self> {
         let numbered = |number| Self {
             name: format!("{}-{number}", self.name),
@@ -79,7 +79,7 @@ impl Presence {
         }
     }
 
-    /// Is there from now on. Gives what tells of it, and the port.
+    /// Starts to listen and to announce. Returns the announcement and the port.
     async fn begin(self) -> Result<(Announced, u16), Failure> {
         let address = SocketAddr::from((self.address, self.port));
         let listener = TcpListener::bind(address).await.map_err(unavailable)?;

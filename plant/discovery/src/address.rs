@@ -1,4 +1,4 @@
-//! The address under which a server is registered: [`reachable`].
+//! The address under which a server registers: [`reachable`].
 
 use std::net::{IpAddr, SocketAddr};
 use std::time::Duration;
@@ -11,9 +11,10 @@ use mdns::Interface;
 use mdns::Url;
 use mdns::is_own;
 
-/// Returns the server with a URL that others can use. A server that listens on all addresses is known by the name of its host,
-/// which few networks resolve: it is registered with the address of the interface over which the discovery server is reached.
-/// A server whose URL has an address, or a name of its own, is left as it is.
+/// Returns the server with a URL that other hosts can use. The URL of a server that listens on all
+/// addresses has the name of its host, which few networks resolve. Such a server registers with the
+/// address of the interface towards the discovery server. A server whose URL has an address or
+/// another name is not changed.
 pub(crate) async fn reachable(server: Server, lds: &str, interface: Option<&Interface>) -> Server {
     let Some(place) = Url::parse(&server.url) else {
         return server;
@@ -39,20 +40,20 @@ async fn address(place: &Url, lds: &str, interface: Option<&Interface>) -> Optio
         let mut others = addresses.into_iter().filter(|one| !one.is_loopback());
         match others.next() {
             Some(address) => IpAddr::V4(address),
-            // Other hosts may ask this discovery server, too: its loopback address means nothing to them.
+            // Other hosts may query this discovery server, and could not use a loopback address.
             None if place.ip().is_none() && resolves(place).await => return None,
             None => towards,
         }
     } else {
         towards
     };
-    // It may listen on another address of the host alone.
+    // The server may listen on another address of the host only.
     let listens = TcpStream::connect(SocketAddr::new(address, place.port));
     let listens = timeout(LIMIT, listens).await.is_ok_and(|one| one.is_ok());
     listens.then_some(address)
 }
 
-/// The address of this host towards a discovery server. Nothing is sent.
+/// Returns the address of this host towards a discovery server. Sends nothing.
 async fn towards(lds: &str) -> Option<IpAddr> {
     let lds = Url::parse(lds)?;
     let looked_up = timeout(LIMIT, lookup_host((lds.host.as_str(), lds.port))).await;
@@ -92,14 +93,14 @@ mod tests {
             capabilities: Vec::new(),
             number: None,
         };
-        // Towards another address of loopback it is that of loopback.
+        // Towards another loopback address the address is a loopback address too.
         let registered = reachable(server("0.0.0.0"), "opc.tcp://127.0.0.1:4840", None).await;
         assert_eq!(registered.url, format!("opc.tcp://127.0.0.1:{port}/a"));
         for host in ["192.0.2.7", "other-host.example"] {
             let registered = reachable(server(host), "opc.tcp://127.0.0.1:4840", None).await;
             assert_eq!(registered.url, server(host).url);
         }
-        // Nobody listens there under the name of the host.
+        // No server listens under the name of the host.
         drop(listener);
         let named = server(&host_name());
         let registered = reachable(named.clone(), "opc.tcp://127.0.0.1:4840", None).await;

@@ -1,4 +1,4 @@
-//! Telling of a server: [`announce`].
+//! Announcement and registration of a server: [`announce`].
 
 use std::num::NonZeroU16;
 use std::path::PathBuf;
@@ -24,25 +24,27 @@ use mdns::Url;
 use mdns::host_name;
 use mdns::{Aside, Heard, Mdns, MdnsFault, Ours, same_place};
 
-/// A server to tell of.
+/// The description of a server for announcement and registration.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Server {
-    /// Its ApplicationUri.
+    /// The ApplicationUri.
     pub application_uri: String,
-    /// Its ProductUri; may be empty.
+    /// The ProductUri; may be empty.
     pub product_uri: String,
-    /// Its ApplicationName, from which its name on the network is made with host and port behind it.
+    /// The ApplicationName. The mDNS instance name consists of it, the host and the port.
     pub name: String,
-    /// Where it listens, as `opc.tcp://127.0.0.1:43121/`.
+    /// The URL, for example `opc.tcp://127.0.0.1:43121/`.
     pub url: String,
-    /// Codes of OPC 10000-12, Annex D.
+    /// The server capabilities: codes of OPC 10000-12, Annex D.
     pub capabilities: Vec<String>,
-    /// Its number in the space, the namespace of what it produces there; `None` where it produces nothing.
+    /// The number of the server in the space, which is the namespace of its publications; `None` if
+    /// it publishes nothing there.
     pub number: Option<NonZeroU16>,
 }
 
 impl Server {
-    /// Describes the server to a Global Discovery Server, with these DiscoveryUrls beside its own.
+    /// Returns the applicant for a Global Discovery Server, with these DiscoveryUrls in addition to
+    /// the URL of the server.
     #[must_use]
     pub fn applicant(&self, urls: impl IntoIterator<Item = String>) -> Applicant {
         let mut all = vec![self.url.clone()];
@@ -61,23 +63,26 @@ impl Server {
     }
 }
 
-/// To whom a server is told of.
+/// The settings of announcement and registration.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct AnnounceSettings {
-    /// The Local Discovery Server to register with; `None` for none. Its URL, or which of those it is that are heard of by
-    /// mDNS, as a [`Choice`] is written: `any`, `uri=urn:cell:*`, `name=cell-lds`.
+    /// The Local Discovery Server to register with; `None` for no registration. Either its URL, or
+    /// a [`Choice`] among the discovery servers on mDNS: `any`, `uri=urn:cell:*`, `name=cell-lds`.
     pub lds: Option<String>,
-    /// Whether the program is that discovery server itself while nobody else is. To be true with a URL of this host alone.
+    /// Whether the program embeds the discovery server while no other program provides it. Only
+    /// valid with a URL of this host.
     pub embed: bool,
-    /// Where it is announced by mDNS; `None` for nowhere: then the Local Discovery Server is asked to do it.
+    /// The interface for mDNS; `None` for no mDNS announcement by the program. The Local Discovery
+    /// Server is then asked to announce the server.
     pub mdns: Option<Interface>,
-    /// How often the registration is repeated; every ten seconds at least where nothing is heard by mDNS.
+    /// The interval of registrations; at most ten seconds without mDNS.
     pub register_every: Duration,
-    /// The certificate store of the server, with its pair made: it registers over a secured channel where the discovery
-    /// server offers one and is trusted. `None` registers over channels that are not secured, which most discovery servers
-    /// take from their own host at best.
+    /// The certificate store of the server, which contains its certificate and key. The server
+    /// registers over a secured channel if the discovery server offers such a channel and is
+    /// trusted. With `None` the server registers over unsecured channels, which most discovery
+    /// servers accept from their own host at most.
     pub pki: Option<PathBuf>,
-    /// Is told which discovery server the server is registered with.
+    /// Receives the discovery server that the server is registered with.
     pub supervision: Supervision,
 }
 
@@ -95,8 +100,9 @@ impl Default for AnnounceSettings {
 }
 
 impl AnnounceSettings {
-    /// With the discovery server as programs take it by `--lds`: `embed` is that of this host, which the program is itself while
-    /// there is none; `embed=URL` the same at another port or address of this host; all else is as [`lds`](Self::lds) is.
+    /// Returns the settings for the value of `--lds`. `embed` selects the discovery server of this
+    /// host, and embeds it while no other program provides it. `embed=URL` does the same at another
+    /// port or address of this host. All other values have the form of [`lds`](Self::lds).
     #[must_use]
     pub fn registering(written: Option<&str>) -> Self {
         let embedded = match written.and_then(|written| written.strip_prefix("embed")) {
@@ -112,31 +118,31 @@ impl AnnounceSettings {
     }
 }
 
-/// How far the telling has come.
+/// The state of announcement and registration.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct AnnounceState {
-    /// When it was registered, for the first time since it was not.
+    /// The start of the current registration period; `None` while the server is not registered.
     pub registered: Option<SystemTime>,
-    /// When it was announced first.
+    /// The time of the first announcement.
     pub announced: Option<SystemTime>,
-    /// Its name on the network.
+    /// The mDNS instance name.
     pub mdns_name: Option<String>,
-    /// Why it is not registered.
+    /// The reason for a missing registration.
     pub fault: Option<String>,
 }
 
-/// Tells of a server for as long as it is kept.
+/// Announces a server until this value is dropped.
 #[derive(Debug)]
 pub struct Announced {
     server: watch::Sender<Server>,
     state: watch::Receiver<AnnounceState>,
-    /// Closed, it ends the telling.
+    /// Dropping the sender stops the announcement.
     stop: mpsc::Sender<()>,
     task: JoinHandle<()>,
 }
 
 impl Announced {
-    /// The server is another from now on: what has changed is told.
+    /// Replaces the description of the server, and publishes changes.
     pub fn update(&self, server: Server) {
         self.server.send_if_modified(|known| {
             let changed = *known != server;
@@ -145,31 +151,33 @@ impl Announced {
         });
     }
 
-    /// How far it has come.
+    /// Returns the state of announcement and registration.
     #[must_use]
     pub fn state(&self) -> AnnounceState {
         self.state.borrow().clone()
     }
 
-    /// Says goodbye and takes the registration back; waits for that for a second at most. To be called before the server
-    /// ends. Whoever drops it instead has the same done without waiting.
+    /// Withdraws the announcement and the registration; waits for at most one second. To be called
+    /// before the server stops. Dropping this value does the same without waiting.
     pub async fn leave(self) {
         let Self { stop, task, .. } = self;
         drop(stop);
-        // Late or broken off: others find out by themselves.
+        // If this is late or fails, the other programs detect the loss themselves.
         drop(timeout(LEAVE_LIMIT, task).await);
     }
 }
 
-/// Starts to tell of a server. Needs a tokio runtime, and waits for nothing: a discovery server may come later.
+/// Starts to announce and register a server. Requires a tokio runtime. Returns at once, because a
+/// discovery server may become available later.
 ///
 /// # Errors
-/// No mDNS daemon can be started.
+///
+/// Returns an error if the mDNS daemon cannot be started.
 pub fn announce(server: Server, settings: AnnounceSettings) -> Result<Announced, MdnsFault> {
     let mdns = settings.mdns.as_ref().map(Mdns::open).transpose()?;
     let register_every = match mdns {
         Some(_) => settings.register_every,
-        // It does not hear of a discovery server that starts anew.
+        // Without mDNS the restart of a discovery server is not noticed.
         None => settings.register_every.min(MOST_UNHEARD),
     };
     let settings = AnnounceSettings {
@@ -205,10 +213,10 @@ pub fn announce(server: Server, settings: AnnounceSettings) -> Result<Announced,
     })
 }
 
-/// Which discovery server is found, where one is looked for.
+/// The discovery server found by mDNS, if it is selected by a [`Choice`].
 type Looked = Option<watch::Receiver<Option<String>>>;
 
-/// Looks for the discovery server where it is not said by its URL.
+/// Starts to look for the discovery server if it is not given by a URL.
 fn found(settings: AnnounceSettings) -> Result<(AnnounceSettings, Looked), MdnsFault> {
     let choice = settings.lds.as_deref().map(str::parse::<Choice>);
     match (choice, &settings.mdns) {
@@ -220,7 +228,7 @@ fn found(settings: AnnounceSettings) -> Result<(AnnounceSettings, Looked), MdnsF
             };
             Ok((settings, Some(found)))
         }
-        // What is no URL is told when it is tried.
+        // An invalid URL is reported at the attempt to use it.
         _ => Ok((settings, None)),
     }
 }
@@ -228,35 +236,36 @@ fn found(settings: AnnounceSettings) -> Result<(AnnounceSettings, Looked), MdnsF
 struct Telling {
     settings: AnnounceSettings,
     mdns: Option<Mdns>,
-    /// The discovery server, where it is looked for.
+    /// The discovery server found by mDNS, if it is selected by a choice.
     found: Looked,
     server: watch::Receiver<Server>,
     state: watch::Sender<AnnounceState>,
     start_time: i64,
-    /// The name it is announced under.
+    /// The mDNS instance name.
     instance: Option<String>,
-    /// Which run of the discovery server was heard.
+    /// The start time of the discovery server in its last announcement, which identifies its run.
     lds_run: Option<Option<i64>>,
     register_at: Instant,
     wait: Duration,
-    /// The discovery server, where it is embedded.
+    /// The embedded discovery server.
     here: Option<Embedded>,
-    /// Ready when the connection to the discovery server of another program breaks off. The server registers again then, or
-    /// embeds a discovery server.
+    /// Completes when the connection to the discovery server of another program is lost. The server
+    /// then registers again, or embeds a discovery server.
     there: Option<Pin<Box<dyn Future<Output = ()> + Send>>>,
-    /// When a connection to that one may be held next.
+    /// The earliest time of the next connection that watches the discovery server of another
+    /// program.
     look_from: Instant,
-    /// How much later than it broke off.
+    /// The delay of that connection after the loss of the previous connection.
     look_wait: Duration,
 }
 
 type Registering = Pin<Box<dyn Future<Output = Result<Done, AskFault>> + Send>>;
 
-/// What came of a registration.
+/// The outcome of a registration.
 enum Done {
-    /// With this discovery server, where it says who it is.
+    /// The server is registered with this discovery server, if its identity is known.
     Registered(Option<Registrar>),
-    /// Nobody was there: a discovery server is embedded now.
+    /// No discovery server was reachable, so a discovery server was embedded.
     Embedded(Embedded),
 }
 
@@ -334,12 +343,12 @@ impl Telling {
         tokio::join!(goodbye, unregister);
     }
 
-    /// Announces the server by mDNS, in the place of what it was.
+    /// Announces the server by mDNS, and replaces the previous announcement.
     fn put(&mut self) {
         let server = self.server.borrow_and_update().clone();
         let Some(mdns) = &mut self.mdns else { return };
         let instance = match &self.instance {
-            // The name stays while it is still true.
+            // The instance name is kept while it still matches the server.
             Some(known) if known.starts_with(&name(&server)) => known.clone(),
             _ => name(&server),
         };
@@ -377,7 +386,7 @@ impl Telling {
             } => {
                 let lds = self.settings.lds.as_deref();
                 if lds.is_some_and(|lds| same_place(lds, &announcement.url)) {
-                    // One that has just come, or come back, knows nobody yet.
+                    // A discovery server that started or restarted has no registrations yet.
                     let before = self.lds_run.replace(start_time);
                     let is_registered = self.state.borrow().registered.is_some();
                     if !is_registered || before.is_some_and(|before| before != start_time) {
@@ -389,11 +398,11 @@ impl Telling {
         }
     }
 
-    /// The discovery server is another from now on, or none.
+    /// Switches to another discovery server, or to none.
     fn another(&mut self, is_looked_for: bool) {
         self.settings.lds = match &mut self.found {
             Some(found) if is_looked_for => found.borrow_and_update().clone(),
-            // Nobody looks any more: it stays as it is.
+            // The search ended, so the last discovery server stays.
             _ => {
                 self.found = None;
                 return;
@@ -404,17 +413,17 @@ impl Telling {
         self.soon();
     }
 
-    /// The discovery server is not there any more, be it here or there.
+    /// Handles the loss of the embedded or external discovery server.
     fn gone(&mut self) {
         debug!(lds = self.settings.lds, "the discovery server broke off");
         let was_here = self.here.take().is_some();
         self.there = None;
-        // One with too many clients breaks off again and again.
+        // A discovery server with too many clients may close the connection repeatedly.
         self.look_from = Instant::now() + spread(self.look_wait, &self.server.borrow().url);
         self.look_wait = (self.look_wait * 2).min(MOST_WAIT / 2);
         self.soon();
         if was_here {
-            // What ends by itself may do so again.
+            // An embedded discovery server that ended may end again.
             self.register_at += FIRST_WAIT;
         }
     }
@@ -430,7 +439,7 @@ impl Telling {
             return None;
         }
         let server = self.server.borrow().clone();
-        // Whoever announces itself is not announced by another.
+        // The discovery server announces only servers that do not announce themselves.
         let mdns_name = self.mdns.is_none().then(|| name(&server));
         let interface = self.settings.mdns.clone();
         if let Some(here) = &self.here {
@@ -494,7 +503,8 @@ impl Telling {
                     }
                     state.fault = None;
                 });
-                // A discovery server that is killed and restarted has lost its registrations, and its announcement may be lost.
+                // A killed discovery server loses its registrations, and its announcement after the
+                // restart may be lost.
                 if self.here.is_none() && self.there.is_none() {
                     self.there = Some(Box::pin(lost(lds.to_owned(), self.look_from)));
                 }
@@ -502,14 +512,14 @@ impl Telling {
             Err(error) => {
                 self.look_wait = FIRST_WAIT;
                 self.register_at = Instant::now() + spread(self.wait, &self.server.borrow().url);
-                // With its share it is no longer than what may be waited at most.
+                // Including the share of `spread`, the wait stays below its limit.
                 self.wait = (self.wait * 2)
                     .min(MOST_WAIT / 2)
                     .min(self.settings.register_every / 2);
                 let fault = error.to_string();
                 self.state.send_modify(|state| {
                     state.registered = None;
-                    // Once for each reason: it is tried again and again.
+                    // A repeated fault is logged once.
                     if state.fault.as_ref() != Some(&fault) {
                         if matches!(
                             error,
@@ -527,7 +537,7 @@ impl Telling {
     }
 }
 
-/// Ready when the discovery server is gone, in this program or in another.
+/// Completes when the embedded or external discovery server is lost.
 async fn gone(
     here: &mut Option<Embedded>,
     there: &mut Option<Pin<Box<dyn Future<Output = ()> + Send>>>,
@@ -539,19 +549,19 @@ async fn gone(
     }
 }
 
-/// Whether only one of two programs can listen.
+/// Returns whether two URLs have the same host and port, so that only one program can listen.
 fn same_port(one: &str, other: &str) -> bool {
     let place = |url| Url::parse(url).map(|url| (url.host, url.port));
     place(one).is_some_and(|one| place(other) == Some(one))
 }
 
-/// That wait, and a share of it that is another for each URL: of many who come at once not all are answered, and they do not
-/// come at once again.
+/// Returns the wait plus a share that depends on the URL, so that many clients do not retry at the
+/// same time.
 fn spread(wait: Duration, url: &str) -> Duration {
     wait + wait.mul_f64(registry::spread(url))
 }
 
-/// Its name on the network.
+/// Returns the mDNS instance name of a server.
 fn name(server: &Server) -> String {
     let place = Url::parse(&server.url);
     instance_name(

@@ -1,4 +1,4 @@
-//! The discovery server to register with, found on the network: [`find_lds`].
+//! Finds the discovery server to register with by mDNS: [`find_lds`].
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -14,25 +14,27 @@ use crate::watch::{Found, Known, WatchSettings, Watcher};
 use mdns::Interface;
 use mdns::MdnsFault;
 
-/// Looks into the address space of a discovery server, which takes a session.
+/// Looks for marker nodes in the address space of a discovery server, which requires a session.
 #[async_trait]
 pub trait Marks: Send + Sync + 'static {
-    /// Whether the server at `url` has that node, as `nsu=urn:cell;s=Marker`. `false` where it does not answer in time.
+    /// Returns whether the server at `url` has a node such as `nsu=urn:cell;s=Marker`; `false` if
+    /// the server does not answer in time.
     async fn has(&self, url: &str, node: &str) -> bool;
 }
 
-/// Follows which discovery server of a network is the chosen one, for as long as somebody listens. `None` while there is
-/// none, or while several fit and nobody said which: that is told in the log.
+/// Follows the chosen discovery server of a network while the receiver exists. The value is `None`
+/// while no discovery server fits, or while several fit, which is logged.
 ///
 /// # Errors
-/// No mDNS daemon can be started.
+///
+/// Returns an error if the mDNS daemon cannot be started.
 pub fn find_lds(
     choice: Choice,
     interface: &Interface,
     marks: Option<Arc<dyn Marks>>,
 ) -> Result<watch::Receiver<Option<String>>, MdnsFault> {
     if let Choice::At(url) = choice {
-        // There is nothing to find, and what nobody sends any more stays as it is.
+        // The URL is fixed; without a sender the value does not change.
         return Ok(watch::channel(Some(url)).1);
     }
     let watcher = crate::watch(WatchSettings {
@@ -67,7 +69,7 @@ impl Finding {
                     Some(found) => self.take(&found).await,
                     None => return,
                 },
-                // A server may come by its marker later than by its name.
+                // The marker node may appear later than the announcement of the server.
                 _ = again.tick() => self.look_again().await,
                 () = tell.closed() => return,
             }

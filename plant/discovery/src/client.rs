@@ -1,4 +1,4 @@
-//! Asking a server or a Local Discovery Server without a session.
+//! Queries of servers and Local Discovery Servers without a session.
 
 #![expect(
     clippy::wildcard_enum_match_arm,
@@ -32,29 +32,29 @@ use crate::security::Security;
 use crate::wire::{Conversation, Kind, MOST_CHUNK, MOST_CHUNKS, MOST_HEARD, WireFault};
 use mdns::Url;
 
-/// Why there is no answer.
+/// An error of a query.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum AskFault {
-    /// The URL is none of OPC UA over TCP.
+    /// The URL is not an OPC UA URL over TCP.
     #[error("{0} is no URL as opc.tcp://host:port")]
     Url(String),
-    /// Nobody is there.
+    /// The server is not reachable.
     #[error("{0}")]
     Connect(#[from] std::io::Error),
-    /// It did not answer in time.
+    /// The server did not answer in time.
     #[error("no answer in {0:?}")]
     Late(Duration),
-    /// It refuses, with this StatusCode.
+    /// The server refused the request with this StatusCode.
     #[error("refused: {0}")]
     Refused(StatusCode),
-    /// Its certificate is not trusted, or ours cannot be read.
+    /// The certificate of the server is not trusted, or the own certificate cannot be read.
     #[error("{0}")]
     Certificate(String),
-    /// It does not speak OPC UA as it should.
+    /// The server violates the protocol.
     #[error("{0}")]
     Protocol(String),
-    /// Nobody is there, and this program cannot be there itself.
+    /// No discovery server is reachable, and embedding a discovery server failed.
     #[error("no discovery server is there, and none can be embedded: {0}")]
     Embed(String),
 }
@@ -69,47 +69,49 @@ impl From<WireFault> for AskFault {
     }
 }
 
-/// A server that FindServers lists.
+/// A server in the result of FindServers.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Application {
-    /// Its ApplicationUri.
+    /// The ApplicationUri.
     pub application_uri: String,
-    /// Its name.
+    /// The application name.
     pub name: String,
-    /// Whether it is itself a discovery server.
+    /// Whether the server is a discovery server.
     pub is_discovery_server: bool,
-    /// Where its endpoints are asked for.
+    /// The DiscoveryUrls.
     pub discovery_urls: Vec<String>,
 }
 
-/// What a server says of itself.
+/// The self-description of a server.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Described {
-    /// Who it is.
+    /// The application.
     pub application: Application,
-    /// Its ProductUri, which tells what it is an instance of.
+    /// The ProductUri, which identifies the product.
     pub product_uri: String,
-    /// The ways its endpoints may be talked to, each once: `None`, or policy and mode, as `Basic256Sha256/Sign`.
+    /// The security of its endpoints without duplicates: `None`, or policy and mode, for example
+    /// `Basic256Sha256/Sign`.
     pub security: Vec<String>,
 }
 
-/// A server that FindServersOnNetwork lists.
+/// A server in the result of FindServersOnNetwork.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct OnNetwork {
-    /// Its number there.
+    /// The RecordId.
     pub record_id: u32,
-    /// Its mDNS name.
+    /// The mDNS instance name.
     pub name: String,
-    /// Where it is.
+    /// The DiscoveryUrl.
     pub url: String,
-    /// Codes of OPC 10000-12, Annex D.
+    /// The server capabilities: codes of OPC 10000-12, Annex D.
     pub capabilities: Vec<String>,
 }
 
-/// The servers that are registered, with the asked one itself: FindServers.
+/// Returns the servers registered at a server, including the server itself: FindServers.
 ///
 /// # Errors
-/// [`AskFault`], after `limit` at the latest.
+///
+/// Returns [`AskFault`], after `limit` at the latest.
 pub async fn find_servers(url: &str, limit: Duration) -> Result<Vec<Application>, AskFault> {
     let request = FindServersRequest {
         request_header: header(),
@@ -127,10 +129,11 @@ pub async fn find_servers(url: &str, limit: Duration) -> Result<Vec<Application>
     }
 }
 
-/// What the server at `url` says of itself: GetEndpoints (OPC 10000-4, 5.5.4).
+/// Returns the self-description of the server at `url`: GetEndpoints (OPC 10000-4, 5.5.4).
 ///
 /// # Errors
-/// [`AskFault`], after `limit` at the latest.
+///
+/// Returns [`AskFault`], after `limit` at the latest.
 pub async fn describe(url: &str, limit: Duration) -> Result<Described, AskFault> {
     let request = GetEndpointsRequest {
         request_header: header(),
@@ -165,10 +168,11 @@ pub async fn describe(url: &str, limit: Duration) -> Result<Described, AskFault>
     })
 }
 
-/// The servers that are announced on the network: FindServersOnNetwork.
+/// Returns the servers that are announced on the network: FindServersOnNetwork.
 ///
 /// # Errors
-/// [`AskFault`], after `limit` at the latest.
+///
+/// Returns [`AskFault`], after `limit` at the latest.
 pub async fn find_servers_on_network(
     url: &str,
     limit: Duration,
@@ -193,11 +197,12 @@ pub async fn find_servers_on_network(
     }
 }
 
-/// When the program behind an endpoint started, in 100 ns since 1601: the StartTime of its ServerStatus (OPC 10000-5, 12.10),
-/// read in a session without a name, which is closed again.
+/// Returns the start time of the program behind an endpoint, in 100 ns since 1601: the StartTime of
+/// its ServerStatus (OPC 10000-5, 12.10). Reads it in a temporary anonymous session.
 ///
 /// # Errors
-/// [`AskFault`], after `limit` at the latest; a server without such sessions refuses.
+///
+/// Returns [`AskFault`], after `limit` at the latest; a server without anonymous sessions refuses.
 pub(crate) async fn start_time(url: &str, limit: Duration) -> Result<i64, AskFault> {
     match timeout(limit, Box::pin(read_start_time(url))).await {
         Ok(read) => read,
@@ -245,7 +250,7 @@ async fn read_start_time(url: &str) -> Result<i64, AskFault> {
         request_header,
         delete_subscriptions: true,
     };
-    // What was read stays read.
+    // A failure to close the session does not affect the result.
     drop(answer(&mut conversation, 5, &close.into()).await);
     read
 }
@@ -283,18 +288,19 @@ async fn read_in_session(
     }
 }
 
-/// A secured channel to a server, and whose it is.
+/// A secured channel to a server, and the identity of the server.
 #[derive(Debug)]
 struct Way {
     security: Security,
     server: ByteString,
     mode: MessageSecurityMode,
-    /// The ApplicationUri in the certificate of the server.
+    /// The ApplicationUri of the server, which its certificate contains.
     application_uri: String,
 }
 
-/// The best secured channel that a server offers to the application of that certificate store; `None` where it offers
-/// none, and where it runs on this host and is not trusted: what could be forged there could also be done.
+/// Selects the best secured channel between a server and the application of a certificate store.
+/// Returns `None` if the server offers no secured channel. Also returns `None` for an untrusted
+/// server on this host, because a local attacker needs no forged channel.
 async fn way(url: &str, pki: &Path) -> Result<Option<Way>, AskFault> {
     let security = Security::existing(pki).map_err(AskFault::Certificate)?;
     let request = GetEndpointsRequest {
@@ -335,16 +341,17 @@ async fn way(url: &str, pki: &Path) -> Result<Option<Way>, AskFault> {
     };
     let ip = Url::parse(url).and_then(|url| url.ip());
     let is_here = ip.is_some_and(|ip| ip.to_canonical().is_loopback());
-    // What somebody has decided on stays decided here too.
+    // An explicit decision on a certificate also applies on this host.
     match is_here && !refused.may_be_told {
         true => Ok(None),
         false => Err(AskFault::Certificate(refused.to_string())),
     }
 }
 
-/// Registers a server, or takes its registration back: RegisterServer2, and RegisterServer where that is not known. Over
-/// a secured channel where the server has a certificate store and the discovery server such a channel. Returns the discovery
-/// server that the server is registered with, where that is known.
+/// Registers or unregisters a server by RegisterServer2, or by RegisterServer if the discovery
+/// server does not support RegisterServer2. Uses a secured channel if the server has a certificate
+/// store and the discovery server offers such a channel. Returns the discovery server if its
+/// identity is known.
 pub(crate) async fn register(
     lds: &str,
     server: &Server,
@@ -384,7 +391,7 @@ pub(crate) async fn register(
         StatusCode::BadServiceUnsupported,
         StatusCode::BadNotImplemented,
     ];
-    // Asked meanwhile, so that the supervisor is known as soon as it learns of the server.
+    // Both requests run concurrently, so that the supervisor is known when it learns of the server.
     let described = async {
         match way {
             None if is_online => describe(lds, DESCRIBE_LIMIT).await.ok(),
@@ -410,7 +417,7 @@ pub(crate) async fn register(
     }
     let registrar = match way {
         Some(way) => Some((way.application_uri.clone(), true)),
-        // The registration counts even if the discovery server does not describe itself.
+        // The registration is valid even if the discovery server does not describe itself.
         None => described.map(|described| (described.application.application_uri, false)),
     };
     Ok(registrar.map(|(application_uri, proven)| Registrar {
@@ -419,7 +426,7 @@ pub(crate) async fn register(
     }))
 }
 
-/// One question on a channel of its own.
+/// Sends a request on a new channel.
 async fn ask(
     url: &str,
     way: Option<&Way>,
@@ -439,7 +446,7 @@ async fn converse(
 ) -> Result<ResponseMessage, AskFault> {
     let mut conversation = opened(url, way).await?;
     let answered = answer(&mut conversation, 2, &request).await?;
-    // The answer is there; whether the peer hears of the end changes nothing.
+    // A failure to close the channel does not affect the result.
     let close = CloseSecureChannelRequest {
         request_header: header(),
     };
@@ -447,7 +454,7 @@ async fn converse(
     Ok(answered)
 }
 
-/// A channel of its own.
+/// Connects and opens a new channel.
 async fn opened(url: &str, way: Option<&Way>) -> Result<Conversation<TcpStream>, AskFault> {
     let place = Url::parse(url).ok_or_else(|| AskFault::Url(url.to_owned()))?;
     let stream = TcpStream::connect((place.host.as_str(), place.port)).await?;
@@ -466,7 +473,7 @@ async fn opened(url: &str, way: Option<&Way>) -> Result<Conversation<TcpStream>,
     Ok(conversation)
 }
 
-/// Opens the channel.
+/// Opens the secure channel on a connection.
 async fn open(
     conversation: &mut Conversation<TcpStream>,
     way: Option<&Way>,
@@ -513,7 +520,8 @@ async fn answer(
     answer_from(conversation, None, request_id, request).await
 }
 
-/// The answer; of one that opens the channel, from whom it has to come.
+/// Returns the response to a request. The response that opens a channel must be signed by the
+/// expected server.
 async fn answer_from(
     conversation: &mut Conversation<TcpStream>,
     way: Option<&Way>,
@@ -575,10 +583,10 @@ fn texts(all: Option<&[UAString]>) -> Vec<String> {
     all.unwrap_or_default().iter().take(64).map(text).collect()
 }
 
-/// Of more endpoints of a server no security is told.
+/// Most endpoints whose security is returned.
 const MOST_ENDPOINTS: usize = 64;
 const SCHEME: &str = "opc.tcp:";
 const REGISTER_LIMIT: Duration = Duration::from_secs(5);
 const DESCRIBE_LIMIT: Duration = Duration::from_secs(1);
-/// In milliseconds: for one question.
+/// Channel lifetime in milliseconds, for a single request.
 const CHANNEL_LIFETIME: u32 = 60_000;

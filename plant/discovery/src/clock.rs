@@ -1,32 +1,32 @@
-//! The one place that reads the clocks.
+//! The only module that reads the clocks.
 
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
-/// For waiting.
+/// Returns the monotonic time, for waiting.
 #[expect(clippy::disallowed_methods, reason = "the shell's one clock read")]
 pub(crate) fn now() -> Instant {
     Instant::now()
 }
 
-/// For people and for the wire.
+/// Returns the wall-clock time, for messages and protocols.
 #[expect(clippy::disallowed_methods, reason = "the shell's one clock read")]
 pub(crate) fn wall() -> SystemTime {
     SystemTime::now()
 }
 
-/// In 100 ns since 1601, as a DateTime of OPC UA.
+/// Returns a time as an OPC UA DateTime, in 100 ns since 1601.
 pub(crate) fn ticks(at: SystemTime) -> i64 {
     let since = at.duration_since(UNIX_EPOCH).unwrap_or_default() + TO_1970;
     i64::try_from(since.as_nanos() / 100).unwrap_or(i64::MAX)
 }
 
-/// Milliseconds since 1970.
+/// Returns a time in milliseconds since 1970.
 pub(crate) fn millis(at: SystemTime) -> u64 {
     let since = at.duration_since(UNIX_EPOCH).unwrap_or_default();
     u64::try_from(since.as_millis()).unwrap_or(u64::MAX)
 }
 
-/// The time that ticks say.
+/// Returns the time of an OPC UA DateTime.
 pub(crate) fn of_ticks(ticks: i64) -> SystemTime {
     let nanos = u128::try_from(ticks).unwrap_or_default() * 100;
     let since = Duration::from_nanos(u64::try_from(nanos).unwrap_or(u64::MAX));

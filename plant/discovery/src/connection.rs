@@ -1,4 +1,5 @@
-//! One client's connection to the discovery server: HEL, OPN, questions, CLO (OPC 10000-6, 6.7 and 7.1).
+//! A client connection of the discovery server: Hello, OpenSecureChannel, requests,
+//! CloseSecureChannel (OPC 10000-6, 6.7 and 7.1).
 
 #![expect(
     clippy::wildcard_enum_match_arm,
@@ -30,23 +31,23 @@ use crate::wire::{
     Conversation, Kind, MOST_CHUNK, MOST_CHUNKS, MOST_HEARD, Received, WireFault, policy,
 };
 
-/// A question on its way to whoever keeps the registry, with the way back.
+/// A request to the owner of the registry, its channel, and the sender for the response.
 pub(crate) type Asking = (Question, Channel, oneshot::Sender<Answer>);
 
-/// What all connections share.
+/// The state that all connections share.
 #[derive(Debug)]
 pub(crate) struct Shared {
     pub(crate) own: Own,
-    /// `None`: no channel is secured.
+    /// The certificate and key of the server; `None` without secured channels.
     pub(crate) security: Option<Security>,
     pub(crate) ask: mpsc::Sender<Asking>,
     pub(crate) counters: Counters,
-    /// Whether who is on this host may register without a secured channel.
+    /// Whether clients on this host may register over an unsecured channel.
     host_may: bool,
     last_channel: AtomicU32,
 }
 
-/// What was asked, and what was no question.
+/// Counters of requests and faults.
 #[derive(Debug, Default)]
 pub(crate) struct Counters {
     pub(crate) connections: AtomicU64,
@@ -74,7 +75,7 @@ impl Shared {
         }
     }
 
-    /// Takes registrations over secured channels alone.
+    /// Restricts registrations to secured channels.
     pub(crate) fn secured_only(self, secured_only: bool) -> Self {
         Self {
             host_may: !secured_only,
@@ -82,7 +83,7 @@ impl Shared {
         }
     }
 
-    /// Never 0, which is no channel.
+    /// Returns the next SecureChannelId, which is never 0.
     fn next_channel(&self) -> u32 {
         self.last_channel.fetch_add(1, Ordering::Relaxed) % (u32::MAX - 1) + 1
     }
@@ -98,7 +99,7 @@ impl Shared {
     }
 }
 
-/// Answers a client until it goes, says nothing any more, or says what is none of the protocol.
+/// Serves a client until it disconnects, times out, or violates the protocol.
 pub(crate) async fn serve<S>(stream: S, peer: SocketAddr, shared: &Shared)
 where
     S: AsyncRead + AsyncWrite + Unpin,
@@ -140,7 +141,7 @@ struct Connection<'a, S> {
     conversation: Conversation<S>,
     peer: SocketAddr,
     shared: &'a Shared,
-    /// How long nothing may come.
+    /// The timeout without a message.
     lifetime: Duration,
     url: String,
 }
@@ -229,7 +230,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
                     &opening.unwrap_or_else(AsymmetricSecurityHeader::none),
                 );
             }
-            // The channel's own message is opened before anything else is asked on it.
+            // The first message must open the channel.
             _ if self.conversation.channel.secure_channel_id() == 0 => {
                 return Err(WireFault::Bad {
                     status: StatusCode::BadTcpSecureChannelUnknown,
@@ -257,7 +258,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
         Ok(services::response(&request, answer, &self.own()))
     }
 
-    /// Whether who registers is still one to be trusted: its certificate may have been revoked since the channel was opened.
+    /// Checks that the certificate of a registering client is still trusted: it may have been
+    /// revoked after the channel was opened.
     fn stays(&self, question: &Question) -> Result<(), StatusCode> {
         let channel = &self.conversation.channel;
         let is_secured = channel.security_mode() != MessageSecurityMode::None;
@@ -270,7 +272,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
         }
     }
 
-    /// How the question came.
+    /// Returns the properties of the channel of a request.
     fn channel(&self, question: &Question) -> Channel {
         let channel = &self.conversation.channel;
         let is_secured = channel.security_mode() != MessageSecurityMode::None;
@@ -278,12 +280,12 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
         let certificate_uri = match (certificate, question) {
             (Some(certificate), Question::Register { .. }) => {
                 let uri = application_uri(certificate.as_byte_string().as_ref());
-                // One without is nobody's.
+                // A certificate without ApplicationUri matches no server.
                 Some(uri.unwrap_or_default())
             }
             _ => None,
         };
-        // What who is on this host could forge it could also do.
+        // A local attacker needs no forged registration.
         let of_host = self.shared.host_may && self.peer.ip().to_canonical().is_loopback();
         Channel {
             is_secured: is_secured || of_host,
@@ -299,7 +301,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
         }
     }
 
-    /// Issues or renews the token of the channel (OPC 10000-4, 5.5.2).
+    /// Issues or renews the security token of the channel (OPC 10000-4, 5.5.2).
     fn open(
         &mut self,
         request: &OpenSecureChannelRequest,
@@ -362,7 +364,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
             channel.create_random_nonce();
             channel.derive_keys();
         }
-        // A quarter more, as the standard has it for what was on its way.
+        // The standard adds 25 % for messages in transit.
         self.lifetime = lifetime + lifetime / 4;
         let response = OpenSecureChannelResponse {
             response_header: ResponseHeader::new_good(&request.request_header),
@@ -374,7 +376,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
     }
 }
 
-/// Without a certificate there are no channels but those of policy None.
+/// Checks the security policy and the certificate of a client. Without an own certificate only
+/// policy None is admitted.
 fn admit(header: &AsymmetricSecurityHeader, shared: &Shared) -> Result<(), StatusCode> {
     match (policy(header), &shared.security) {
         (Some(SecurityPolicy::None), _) => Ok(()),
@@ -391,7 +394,7 @@ const LATE: WireFault = WireFault::Bad {
     what: "nothing came in time",
 };
 const HELLO_LIMIT: Duration = Duration::from_secs(5);
-/// Until a channel is open.
+/// Timeout until a channel is open.
 const FIRST_IDLE: Duration = Duration::from_secs(5);
 const WRITE_LIMIT: Duration = Duration::from_secs(10);
 const LEAST_LIFETIME: Duration = Duration::from_secs(5);
@@ -412,7 +415,7 @@ mod tests {
     const PEER: SocketAddr =
         SocketAddr::new(std::net::IpAddr::V4(std::net::Ipv4Addr::LOCALHOST), 9);
 
-    /// A discovery server that knows nobody.
+    /// Creates a discovery server without registrations.
     fn shared() -> Arc<Shared> {
         let (ask, mut questions) = mpsc::channel::<Asking>(4);
         tokio::spawn(async move {
@@ -441,7 +444,7 @@ mod tests {
         RequestHeader::new(&NodeId::null(), &DateTime::now(), 7)
     }
 
-    /// A client with an open channel.
+    /// Creates a client with an open channel.
     async fn opened(shared: &Arc<Shared>) -> Conversation<DuplexStream> {
         let mut client = Conversation::new(connect(shared), Role::Client);
         client
@@ -527,7 +530,7 @@ mod tests {
         ));
     }
 
-    /// What a client that writes these bytes is answered with last.
+    /// Returns the status of the last Error message to a client that sends these bytes.
     async fn told(shared: &Arc<Shared>, bytes: &[u8]) -> Option<StatusCode> {
         let mut client = connect(shared);
         client.write_all(bytes).await.unwrap();
@@ -589,7 +592,7 @@ mod tests {
     #[tokio::test]
     async fn no_cut_and_no_flipped_bit_ends_more_than_its_connection() {
         let shared = shared();
-        // What a client says that opens a channel and asks.
+        // The bytes of a client that opens a channel and sends a request.
         let (here, mut there) = duplex(1 << 20);
         let mut client = Conversation::new(here, Role::Client);
         let request = OpenSecureChannelRequest {

@@ -1,6 +1,8 @@
-//! The Local Discovery Server of a host in a program that is another, for as long as no other is there: [`Embedded`].
+//! The Local Discovery Server of a host, embedded in another program while no other discovery
+//! server runs: [`Embedded`].
 //!
-//! Who listens at its port first is it; when that one ends, [`lost`] tells the others, of whom one is it next.
+//! The first program that listens on the port becomes the discovery server. When it ends, [`lost`]
+//! completes in the other programs, and one of them takes over.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -21,21 +23,21 @@ use crate::services::{Answer, Question};
 use mdns::Interface;
 use mdns::Url;
 
-/// What it takes to embed one.
+/// The settings of an embedded discovery server.
 #[derive(Debug)]
 pub(crate) struct Embedding {
-    /// Where it belongs.
+    /// The URL of the discovery server.
     pub(crate) lds: String,
-    /// Where it announces and hears by mDNS.
+    /// The interface for mDNS.
     pub(crate) interface: Interface,
-    /// The certificate store of the program; it has a pair of its own in there.
+    /// The certificate store of the program. The discovery server has a separate store below it.
     pub(crate) pki: Option<PathBuf>,
-    /// What the program is called.
+    /// The name of the program.
     pub(crate) name: String,
 }
 
 impl Embedding {
-    /// Makes the certificate of the discovery server while there is another one, so that it can be replaced at once.
+    /// Creates the certificate of the discovery server in advance, so that a takeover is fast.
     pub(crate) async fn prepare(self) {
         if let Err(error) = self.settings().prepare().await {
             debug!(%error, "the certificate of the embedded discovery server is made later");
@@ -54,16 +56,17 @@ impl Embedding {
         }
     }
 
-    /// Serves a discovery server, where nobody answered because of `absent`.
+    /// Starts the discovery server. `absent` is the error of the connection attempt to another
+    /// discovery server.
     pub(crate) async fn start(self, absent: std::io::Error) -> Result<Embedded, AskFault> {
         let at = self.lds.clone();
         let settings = self.settings();
-        // Before others can connect.
+        // The certificate is created before clients can connect.
         let prepared = settings.prepare().await;
         prepared.map_err(|fault| AskFault::Embed(fault.to_string()))?;
         let listening = match listen(&at).await {
             Ok(listening) => listening,
-            // Another one was faster, and is asked next.
+            // Another program was faster; the next registration goes to its discovery server.
             Err(fault) if fault.is_taken() => return Err(AskFault::Connect(absent)),
             Err(fault) => return Err(AskFault::Embed(format!("cannot listen at {at}: {fault}"))),
         };
@@ -76,7 +79,7 @@ impl Embedding {
         let ask = lds.asking();
         let (stop, stopped) = oneshot::channel::<()>();
         let task = tokio::spawn(async move {
-            // Nobody asks for pages.
+            // An embedded discovery server has no status page.
             let mut pages = mpsc::channel(1).1;
             lds.run(questions, &mut pages, async { drop(stopped.await) })
                 .await;
@@ -88,17 +91,17 @@ impl Embedding {
     }
 }
 
-/// A discovery server in this program. Whoever drops it instead of letting it [leave](Self::leave) has the same done without
+/// A discovery server in this program. Dropping this value is like [`leave`](Self::leave) without
 /// waiting.
 #[derive(Debug)]
 pub(crate) struct Embedded {
     ask: mpsc::Sender<Asking>,
-    /// Closed, it ends the serving.
+    /// Dropping the sender stops the discovery server.
     stop: oneshot::Sender<()>,
     task: JoinHandle<()>,
 }
 
-/// Where the program itself asks the discovery server in it.
+/// Sends requests of the program to its embedded discovery server.
 #[derive(Debug, Clone)]
 pub(crate) struct EmbeddedAsking(mpsc::Sender<Asking>);
 
@@ -107,23 +110,24 @@ impl Embedded {
         EmbeddedAsking(self.ask.clone())
     }
 
-    /// Waits until it has ended by itself. Whoever drops it before loses nothing.
+    /// Waits until the discovery server has ended. Cancel safe.
     pub(crate) async fn ended(&mut self) {
-        // Whether it failed or not: it is not there.
+        // A failure counts as an end too.
         let _ended = (&mut self.task).await;
     }
 
-    /// Lets go of the port, and says goodbye.
+    /// Stops the discovery server: closes the port and withdraws its announcement.
     pub(crate) async fn leave(self) {
         let Self { stop, task, .. } = self;
         drop(stop);
-        // A failure of it has been told.
+        // A failure has been logged.
         let _ended = task.await;
     }
 }
 
 impl EmbeddedAsking {
-    /// Registers the program's own server, or takes that back. It is announced under `mdns_name` where one is given.
+    /// Registers or unregisters the server of the program. With `mdns_name` the discovery server
+    /// announces the server.
     pub(crate) fn register(
         &self,
         server: &Server,
@@ -144,7 +148,7 @@ impl EmbeddedAsking {
                 capabilities: server.capabilities.clone(),
             }),
         };
-        // Nobody from outside can take it back.
+        // No other client can unregister the server.
         let channel = Channel {
             is_secured: true,
             certificate_uri: Some(server.application_uri.clone()),
@@ -175,7 +179,8 @@ impl EmbeddedAsking {
     }
 }
 
-/// Ready when the discovery server of another program does not answer any more; it is looked for from that time on.
+/// Completes when the discovery server of another program no longer answers. Watches it from the
+/// time `from` on.
 pub(crate) async fn lost(lds: String, from: Instant) {
     sleep_until(from).await;
     let Some(place) = Url::parse(&lds) else {
@@ -185,18 +190,19 @@ pub(crate) async fn lost(lds: String, from: Instant) {
         match Line::reach(&lds, &place, true, LIMIT).await {
             Reached::Line(mut line) => {
                 line.broken().await;
-                // A program that ends closes one thing after the other; its listener may be next.
+                // A program that ends closes its sockets one after another; its listener may be
+                // next.
                 sleep(SETTLE).await;
                 return;
             }
             Reached::Refused | Reached::Nobody => return,
-            // Its place is taken, whether or not it says something.
+            // The port is in use, even if the program does not answer.
             Reached::Answers | Reached::Accepts | Reached::Untried => sleep(LOOK_EVERY).await,
         }
     }
 }
 
-/// The folder in the certificate store of a program where the discovery server has its pair.
+/// The folder of the discovery server's store below the certificate store of the program.
 const STORE: &str = "lds";
 const ANSWER_LIMIT: Duration = Duration::from_secs(5);
 const LIMIT: Duration = Duration::from_secs(1);

@@ -1,4 +1,4 @@
-//! The listener of the discovery server: who is let in.
+//! The listener of the discovery server, and its limit of connections.
 
 use std::collections::VecDeque;
 use std::net::{IpAddr, SocketAddr};
@@ -11,13 +11,14 @@ use tracing::debug;
 
 use crate::connection::{Shared, count, serve};
 
-/// Lets clients in for as long as it runs.
+/// Accepts clients until the future is dropped.
 pub(crate) async fn accept(listener: TcpListener, shared: Arc<Shared>) {
     let mut crowd = Crowd::default();
     loop {
         let (stream, peer) = match listener.accept().await {
             Ok(accepted) => accepted,
-            // Out of descriptors, most likely: others may be closed by then.
+            // The process probably has no free file descriptor; connections may be closed by the
+            // next attempt.
             Err(error) => {
                 debug!(%error, "a connection was not accepted");
                 tokio::time::sleep(ACCEPT_AGAIN).await;
@@ -36,13 +37,14 @@ pub(crate) async fn accept(listener: TcpListener, shared: Arc<Shared>) {
     }
 }
 
-/// The open connections in the order in which they came. Who comes is always let in: where there are too many, the oldest
-/// gives way, of the same address if that has its share. A question takes milliseconds, so what is old is idle.
+/// The open connections in the order of their arrival. New connections are always admitted. If a
+/// limit is reached, the oldest connection is closed; if an address has reached its share, the
+/// oldest connection of this address. A request takes milliseconds, so old connections are idle.
 #[derive(Debug, Default)]
 struct Crowd(VecDeque<(IpAddr, AbortHandle)>);
 
 impl Crowd {
-    /// Takes one in. Whether another gave way.
+    /// Adds a connection. Returns whether another connection was closed.
     fn admit(&mut self, peer: SocketAddr, task: AbortHandle) -> bool {
         let address = peer.ip();
         self.0.retain(|(_, task)| !task.is_finished());
@@ -66,7 +68,7 @@ impl Crowd {
 }
 
 impl Drop for Crowd {
-    /// Nobody talks on to a discovery server that has ended.
+    /// Closes all connections of a discovery server that has ended.
     fn drop(&mut self) {
         for (_, task) in &self.0 {
             task.abort();

@@ -1,4 +1,4 @@
-//! What is read of strangers, for the fuzzers of `fuzz/`: nothing else is to use it.
+//! Decoders of untrusted input, for the fuzzers of `fuzz/` only.
 
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::sync::Arc;
@@ -16,8 +16,8 @@ use mdns::Url;
 use crate::clock;
 use mdns::Subnets;
 
-/// What a discovery server that knows nobody answers a client that says these bytes and no more, with how many are
-/// registered afterwards. Needs a tokio runtime.
+/// Returns the response of a discovery server without registrations to a client that sends these
+/// bytes, and the number of registrations afterwards. Requires a tokio runtime.
 pub async fn answered(said: &[u8]) -> (Vec<u8>, usize) {
     let own = Own {
         application_uri: "urn:lds".to_owned(),
@@ -79,13 +79,14 @@ fn answer(
     }
 }
 
-/// The instances that a packet of mDNS takes back.
+/// Returns the instances that an mDNS packet withdraws.
 #[must_use]
 pub fn goodbyes(packet: &[u8]) -> Vec<String> {
     mdns::goodbyes(packet)
 }
 
-/// What is heard of a server by the instance name, the port, and the texts of its TXT record.
+/// Decodes the announcement of a server from its instance name, its port, and the texts of its TXT
+/// record.
 #[must_use]
 pub fn heard(instance: &str, port: u16, path: &[u8], capabilities: &[u8]) -> Option<Announcement> {
     let texts = [("path", path), ("caps", capabilities)];
@@ -104,7 +105,7 @@ pub fn heard(instance: &str, port: u16, path: &[u8], capabilities: &[u8]) -> Opt
     mdns::heard(&service, &subnets).map(|(announcement, _)| announcement)
 }
 
-/// A URL of OPC UA over TCP as it is written again; `None` for any other text.
+/// Parses and formats an OPC UA URL over TCP; `None` for any other text.
 #[must_use]
 pub fn url(text: &str) -> Option<String> {
     Url::parse(text).map(|url| url.to_string())

@@ -1,4 +1,5 @@
-//! One registry with everything around it: what mDNS hears goes in, endpoints are tried, what is to be announced goes out.
+//! A registry with its inputs and outputs: received mDNS announcements, probes of endpoints, own
+//! mDNS announcements.
 
 use std::collections::BTreeMap;
 use std::num::NonZeroU16;
@@ -13,42 +14,43 @@ use crate::clock::now;
 use crate::liveness::{Liveness, Told, Try};
 use mdns::{Aside, Heard, Mdns, Ours, same_place};
 
-/// See the module's page. Drive it by [`step`](Self::step), then take every [`event`](Self::event).
+/// See the module documentation. Call [`step`](Self::step) repeatedly, and take all
+/// [`event`](Self::event)s after each step.
 pub(crate) struct Keeper {
     pub(crate) registry: Registry,
     pub(crate) mdns: Option<Mdns>,
     liveness: Liveness,
-    /// Those that are not under watch any more are let go of then.
+    /// The next time to remove entries of servers that are no longer watched.
     tidy_at: Instant,
-    /// When this program was last seen to run.
+    /// The last time at which this program was known to run.
     awake_at: Instant,
-    /// Where this program itself answers: that is not tried.
+    /// The URL of this program, which is not probed.
     own: Option<String>,
-    /// Lost without a goodbye: mDNS still has their records, and would not tell of them anew when they come back as they
-    /// were.
+    /// Servers that were lost without a goodbye. mDNS still caches their records, and would not
+    /// report an unchanged server that returns.
     asleep: BTreeMap<String, Asleep>,
-    /// When an endpoint answered last.
+    /// The time of the last answer of each endpoint.
     answered: BTreeMap<String, Instant>,
-    /// When the program behind an endpoint started, in 100 ns since 1601, where it tells.
+    /// The start time of the program behind each endpoint, in 100 ns since 1601, if known.
     started: BTreeMap<String, Started>,
-    /// What servers said when they were asked for that, not told of yet.
+    /// Start times that probes returned and that were not yet taken.
     new_starts: Vec<(String, i64)>,
-    /// The numbers in the space of those that tell.
+    /// The numbers in the space of the servers that announce them.
     numbers: BTreeMap<String, NonZeroU16>,
-    /// Servers in the log that cannot be probed.
+    /// Limits the log messages for servers that cannot be probed.
     untried_log: LogLimit,
     most: usize,
 }
 
-/// When a program started, in 100 ns since 1601.
+/// The start time of a program, in 100 ns since 1601.
 #[derive(Debug, Clone, Copy)]
 struct Started {
     at: i64,
-    /// Whether it tells by mDNS. Others are asked.
+    /// Whether the program announces its start time by mDNS. Other programs are queried.
     tells: bool,
 }
 
-/// What a step waits for.
+/// The event that ended a step.
 enum Happened {
     Heard(Heard),
     Told(Told),
@@ -59,14 +61,14 @@ enum Happened {
 struct Asleep {
     announcement: Announcement,
     try_at: Instant,
-    /// The time to the next try, which doubles with each.
+    /// The time to the next probe, which doubles with each probe.
     pause: Duration,
     longest_pause: Duration,
     forget_at: Instant,
 }
 
 impl Keeper {
-    /// With the URL at which the program itself answers, if it does.
+    /// Creates a keeper. `own` is the URL of the program itself.
     pub(crate) fn new(settings: Settings, mdns: Option<Mdns>, own: Option<String>) -> Self {
         Self {
             registry: Registry::new(settings),
@@ -85,7 +87,7 @@ impl Keeper {
         }
     }
 
-    /// Waits until something has happened, and takes it in. Whoever drops it before loses nothing.
+    /// Waits for the next event and processes it. Cancel safe.
     pub(crate) async fn step(&mut self) {
         self.notice_standstill();
         self.try_endpoints();
@@ -116,7 +118,7 @@ impl Keeper {
         }
     }
 
-    /// When there is something to do next; `None` where an answer has to come first.
+    /// Returns the time of the next action; `None` while a probe has to complete first.
     fn due(&self) -> Option<Instant> {
         let due = self.registry.poll_timeout();
         let asleep = self.asleep.values().map(|asleep| asleep.try_at);
@@ -124,7 +126,8 @@ impl Keeper {
         due.filter(|_| self.liveness.has_room())
     }
 
-    /// Whoever stood still, stopped or without processor, has heard no answer, and holds that against nobody.
+    /// Detects that this program was suspended or had no CPU time, so that missing answers are not
+    /// counted.
     fn notice_standstill(&mut self) {
         let at = now();
         let late = self
@@ -136,7 +139,7 @@ impl Keeper {
         self.awake_at = at;
     }
 
-    /// What has happened, oldest first; what concerns mDNS has been done.
+    /// Returns the next event, oldest first. Events for mDNS are processed here.
     pub(crate) fn event(&mut self) -> Option<Event> {
         loop {
             let event = self.registry.poll_event()?;
@@ -144,7 +147,7 @@ impl Keeper {
                 (Event::Announce(announcement), Some(mdns)) => mdns.put(Ours {
                     announcement: announcement.clone(),
                     aside: Aside {
-                        // Listeners expect a server that announces its start to answer during calls.
+                        // An announced start time implies that the server answers during calls.
                         start_time: self
                             .started
                             .get(&announcement.url)
@@ -170,23 +173,23 @@ impl Keeper {
         }
     }
 
-    /// How long an endpoint has not answered, of one that did.
+    /// Returns and clears the time since the last answer of an endpoint.
     pub(crate) fn silent_for(&mut self, url: &str) -> Option<Duration> {
         let answered = self.answered.remove(url)?;
         Some(now().saturating_duration_since(answered))
     }
 
-    /// When the program behind an endpoint started, in 100 ns since 1601, where it tells.
+    /// Returns the start time of the program behind an endpoint, in 100 ns since 1601, if known.
     pub(crate) fn started(&self, url: &str) -> Option<i64> {
         self.started.get(url).map(|known| known.at)
     }
 
-    /// Its number in the space, where it tells.
+    /// Returns the number in the space, if announced.
     pub(crate) fn number(&self, url: &str) -> Option<NonZeroU16> {
         self.numbers.get(url).copied()
     }
 
-    /// Of whom it has become known by asking when they started, and when. To be asked after each step.
+    /// Takes the start times that probes returned. To be called after each step.
     pub(crate) fn take_started(&mut self) -> Vec<(String, i64)> {
         std::mem::take(&mut self.new_starts)
     }
@@ -202,7 +205,7 @@ impl Keeper {
                 let url = announcement.url.clone();
                 match number {
                     Some(number) => keep(&mut self.numbers, self.most, &url, number),
-                    // A discovery server that announces it, too, may not know.
+                    // A discovery server that also announces the server may not know its number.
                     None if start_time.is_none() => {}
                     None => drop(self.numbers.remove(&url)),
                 }
@@ -220,7 +223,7 @@ impl Keeper {
                 }
                 self.registry.announced(announcement, at);
                 if let Some(start_time) = start_time {
-                    // A program of ours, which serves many requests at a time.
+                    // A program of this project, which serves requests concurrently.
                     self.registry.answers_during_calls(&url);
                     self.registry.announced_start(&instance, start_time);
                 }
@@ -252,7 +255,7 @@ impl Keeper {
         }
     }
 
-    /// Tries those whose turn it is.
+    /// Starts the probes that are due.
     fn try_endpoints(&mut self) {
         let at = now();
         self.asleep.retain(|_, asleep| at < asleep.forget_at);
@@ -326,25 +329,26 @@ impl Keeper {
     }
 }
 
-/// Keeps what is known of an endpoint, for no more of them than there may be. Endpoints that nothing is known of any more
-/// are removed every second.
+/// Stores a value of an endpoint, up to a limit of entries. Entries of endpoints that are no longer
+/// watched are removed every second.
 fn keep<T>(map: &mut BTreeMap<String, T>, most: usize, url: &str, value: T) {
     if map.len() < 4 * most || map.contains_key(url) {
         map.insert(url.to_owned(), value);
     }
 }
 
-/// How late a step may come on a machine with much to do.
+/// The delay of a step that counts as a standstill rather than load.
 const LATE: Duration = Duration::from_millis(500);
-/// How much later than its server a program may say that it started, in 100 ns. Another run starts later than that.
+/// The largest difference between the start times of a server and of its program, in 100 ns. A
+/// restart takes longer.
 const SAME_RUN: i64 = 20_000_000;
 const TIDY_EVERY: Duration = Duration::from_secs(1);
-/// A server that cannot be probed is logged once in this time.
+/// Shortest interval between log messages for the same server that cannot be probed.
 const LOG_EVERY: Duration = Duration::from_secs(600);
 const TRY_ASLEEP: Duration = Duration::from_secs(1);
-/// The longest pause between tries of an endpoint that answered before it was lost.
+/// The longest pause between probes of an endpoint that answered before its loss.
 const LONGEST_PAUSE_KNOWN: Duration = Duration::from_secs(2);
-/// The longest pause between tries of an endpoint that never answered.
+/// The longest pause between probes of an endpoint that never answered.
 const LONGEST_PAUSE: Duration = Duration::from_secs(64);
-/// By then mDNS has forgotten them too, and tells of them when they come back.
+/// The caches of mDNS have expired by then, so that mDNS reports a returning server.
 const FORGET_ASLEEP: Duration = Duration::from_secs(150);

@@ -1,4 +1,4 @@
-//! The Local Discovery Server: the registry behind an endpoint of OPC UA, and mDNS on one interface.
+//! The Local Discovery Server: a registry with an OPC UA endpoint, and mDNS on an interface.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::io::ErrorKind;
@@ -34,42 +34,43 @@ use mdns::Url;
 use mdns::host_name;
 use mdns::{Aside, Mdns, Ours};
 
-/// How a discovery server runs.
+/// The settings of a discovery server.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct LdsSettings {
-    /// Its ApplicationUri, where it is part of another application; one of the host's name otherwise.
+    /// The ApplicationUri of the embedding application; `None` for a default with the host name.
     pub application_uri: Option<String>,
-    /// Where it listens, as `opc.tcp://127.0.0.1:4840`.
+    /// The endpoint URL, for example `opc.tcp://127.0.0.1:4840`.
     pub endpoint: String,
-    /// Where it announces and hears by mDNS.
+    /// The interface for mDNS.
     pub interface: Interface,
-    /// Whether servers of other hosts may register over a channel that is not secured.
+    /// Whether servers of other hosts may register over an unsecured channel.
     pub allow_unsecured: bool,
-    /// Whether servers of this host, too, have to register over a secured channel.
+    /// Whether servers of this host must register over a secured channel too.
     pub secured_only: bool,
-    /// How often servers are to register; without semaphore file a registration counts twice as long.
+    /// The registration interval of servers. A registration without a semaphore file expires after
+    /// twice this time.
     pub register_every: Duration,
-    /// The certificate store for secured channels; without it there are none.
+    /// The certificate store; `None` disables secured channels.
     pub pki: Option<PathBuf>,
-    /// The Global Discovery Server that issues its certificate. Needs `pki`.
+    /// The Global Discovery Server that issues the certificate. Requires `pki`.
     pub gds: Option<Invitation>,
-    /// Whether any client certificate will do. For tests only.
+    /// Whether every client certificate is trusted. For tests only.
     pub trust_any: bool,
-    /// The program it runs in, where that is another than `ua-lds`.
+    /// The embedding program; `None` for the program `ua-lds`.
     pub embedded: Option<EmbeddedIn>,
 }
 
-/// The program that a discovery server runs in.
+/// The program that embeds a discovery server.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct EmbeddedIn {
-    /// What it is called.
+    /// The name of the program.
     pub name: String,
-    /// The certificate store that says whom it trusts; its own otherwise.
+    /// The certificate store that decides on trust; `None` for the store of the discovery server.
     pub trusts: Option<PathBuf>,
 }
 
 impl LdsSettings {
-    /// As `ua-lds` runs when nothing is told to it but where: within this host, and without secured channels.
+    /// Returns the defaults of `ua-lds` at an endpoint: mDNS on loopback, and no secured channels.
     #[must_use]
     pub fn at(endpoint: impl Into<String>) -> Self {
         Self {
@@ -86,7 +87,7 @@ impl LdsSettings {
         }
     }
 
-    /// What it is called, for people.
+    /// Returns the application name.
     fn name(&self) -> String {
         match &self.embedded {
             None => NAME.to_owned(),
@@ -94,8 +95,8 @@ impl LdsSettings {
         }
     }
 
-    /// Makes the pair of the certificate store where there is none. A key takes seconds on a small computer, in which a port
-    /// that is listened at already would keep clients waiting.
+    /// Creates a missing certificate and key. Generating a key takes seconds on a small computer,
+    /// during which an open port would keep clients waiting.
     pub(crate) async fn prepare(&self) -> Result<(), Failure> {
         let place = Url::parse(&self.endpoint).map(|place| place.host);
         let host = own_host(place.as_deref().unwrap_or_default(), &self.interface);
@@ -107,7 +108,7 @@ impl LdsSettings {
         given.unwrap_or_else(|| format!("urn:{}:ua-lds", host_name()))
     }
 
-    /// Its certificate store, with its own pair made.
+    /// Opens the certificate store, and creates a missing certificate and key.
     async fn open_security(
         &self,
         application_uri: &str,
@@ -117,7 +118,7 @@ impl LdsSettings {
             return Ok(None);
         };
         let (uri, host, trust_any) = (application_uri.to_owned(), host.to_owned(), self.trust_any);
-        // Making a key takes a while, in which a program around it has other work.
+        // Generating a key takes some time, and must not block the program.
         let open = move || Security::open(&root, &uri, &host, trust_any);
         let opened = spawn_blocking(open).await;
         let opened = opened.map_err(|error| Failure::new(FailureKind::Io, error.to_string()))??;
@@ -129,63 +130,64 @@ impl LdsSettings {
     }
 }
 
-/// A server of another level that is reached through this one (OPC 10000-4, 7.2: GatewayServerUri).
+/// A server of another level that is reached through this server (OPC 10000-4, 7.2:
+/// GatewayServerUri).
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Gated {
-    /// Its ApplicationUri.
+    /// The ApplicationUri.
     pub application_uri: String,
-    /// Its name.
+    /// The application name.
     pub name: String,
-    /// Who passes on what it is asked.
+    /// The ApplicationUri of the gateway, which forwards requests.
     pub gateway_uri: String,
-    /// Where that is asked, on this level.
+    /// The URL of the gateway on this level.
     pub url: String,
 }
 
-/// What a program around the discovery server adds to what it tells.
+/// The information that an embedding program adds to the discovery server.
 #[derive(Debug, Clone, Default)]
 pub struct Added {
-    /// Listed by FindServers.
+    /// Servers to list in FindServers.
     pub gated: Vec<Gated>,
-    /// Shown in `/status` as `level`.
+    /// The value of `level` in `/status`.
     pub status: Option<serde_json::Value>,
 }
 
-/// How a program around the discovery server takes part.
+/// The connection between an embedding program and its discovery server.
 #[derive(Debug)]
 pub struct Around {
-    /// Is told who comes and goes. What does not fit in is lost, and counted as `level_missed_total`: the discovery server
-    /// waits for nobody.
+    /// Receives changes of the servers. Events that do not fit into the channel are dropped, and
+    /// counted as `level_missed_total`: the discovery server never waits.
     pub events: mpsc::Sender<OnLevel>,
-    /// What it adds.
+    /// The added information.
     pub added: watch::Receiver<Added>,
 }
 
-/// Who comes and goes.
+/// A change of the servers.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum OnLevel {
-    /// A source, as an ApplicationUri or an mDNS name, tells of a server.
+    /// A source, which is an ApplicationUri or an mDNS name, reports a server.
     Told {
-        /// Who tells of it.
+        /// The source.
         source: String,
-        /// Where the server is.
+        /// The URL of the server.
         url: String,
-        /// Whether the server registered; others are announced by mDNS only.
+        /// Whether the server is registered; otherwise it is announced by mDNS only.
         registered: bool,
     },
-    /// A source tells of nobody any more.
+    /// A source no longer reports a server.
     Left {
-        /// Who told of it.
+        /// The source.
         source: String,
     },
-    /// The program behind a URL was started anew.
+    /// The program behind a URL restarted.
     Restarted {
-        /// Where it is.
+        /// The URL.
         url: String,
     },
 }
 
-/// What it knows at one moment.
+/// The status of a discovery server.
 #[derive(Debug, Clone, Serialize)]
 pub struct LdsStatus {
     program: &'static str,
@@ -201,7 +203,7 @@ pub struct LdsStatus {
     counters: BTreeMap<&'static str, u64>,
     #[serde(skip_serializing_if = "Option::is_none")]
     level: Option<serde_json::Value>,
-    /// Its own certificate.
+    /// The certificate of the discovery server.
     #[serde(skip_serializing_if = "Option::is_none")]
     certificate: Option<serde_json::Value>,
 }
@@ -223,25 +225,25 @@ struct RecordStatus {
     url: String,
     capabilities: Vec<String>,
     since_ms: u64,
-    /// When its program started, where it tells.
+    /// The start time of its program, if known.
     started_ms: Option<u64>,
 }
 
-/// A server that is gone.
+/// A server that was lost.
 #[derive(Debug, Clone, Serialize)]
 struct LossStatus {
-    /// Its ApplicationUri where it was registered, its name where it was announced.
+    /// The ApplicationUri of a registered server, or the mDNS name of an announced server.
     name: String,
     url: String,
     loss: &'static str,
     at_ms: u64,
-    /// How long it had not answered, where it had before.
+    /// The time since its last answer, if it ever answered.
     silent_ms: Option<u64>,
 }
 
 impl bridge_node::Told for LdsStatus {
     fn json(&self) -> String {
-        // All keys are strings and no number is special, so there is nothing that could fail.
+        // Serialization cannot fail: all keys are strings, and all numbers are finite.
         serde_json::to_string(self).unwrap_or_default()
     }
 
@@ -266,10 +268,11 @@ impl bridge_node::Told for LdsStatus {
     }
 }
 
-/// Runs a discovery server until it is told to stop.
+/// Runs a discovery server until `stop` completes.
 ///
 /// # Errors
-/// The endpoint or the interface cannot be used.
+///
+/// Returns an error if the endpoint or the interface cannot be used.
 pub async fn run(
     settings: LdsSettings,
     pages: Requests<LdsStatus>,
@@ -278,10 +281,11 @@ pub async fn run(
     run_around(settings, None, pages, stop).await
 }
 
-/// The same with a program around it.
+/// Runs a discovery server of an embedding program until `stop` completes.
 ///
 /// # Errors
-/// The endpoint or the interface cannot be used.
+///
+/// Returns an error if the endpoint or the interface cannot be used.
 pub async fn run_around(
     settings: LdsSettings,
     around: Option<Around>,
@@ -298,12 +302,12 @@ pub async fn run_around(
     Ok(())
 }
 
-/// A discovery server that takes clients in, and answers them while it [runs](Self::run).
+/// A discovery server, which serves its clients during [`run`](Self::run).
 pub(crate) struct Lds {
     keeper: Keeper,
     shared: Arc<Shared>,
     interface: Interface,
-    /// Its own name on the network.
+    /// Its own mDNS instance name.
     instance: String,
     started: SystemTime,
     since: BTreeMap<String, SystemTime>,
@@ -312,16 +316,16 @@ pub(crate) struct Lds {
     around: Option<Around>,
     missed: u64,
     register_every: Duration,
-    /// Which registrations were refused, by the URI and why.
+    /// Limits the log messages for refused registrations, by URI and reason.
     refused: LogLimit,
-    /// Lets clients in while it is kept.
+    /// The task that accepts clients.
     accepting: JoinSet<()>,
     /// The certificate store.
     pki: Option<PathBuf>,
 }
 
 impl Lds {
-    /// With what [`listen`] has given.
+    /// Starts a discovery server with the result of [`listen`].
     pub(crate) async fn start(
         settings: &LdsSettings,
         (listener, place): (TcpListener, Url),
@@ -404,7 +408,7 @@ impl Lds {
         Ok((lds, questions))
     }
 
-    /// Announces itself.
+    /// Announces the discovery server by mDNS.
     fn announce(&mut self) {
         if let Some(mdns) = &mut self.keeper.mdns {
             mdns.put(Ours {
@@ -418,12 +422,12 @@ impl Lds {
         }
     }
 
-    /// Where the program around it asks without a connection.
+    /// Returns the sender for requests of the embedding program.
     pub(crate) fn asking(&self) -> mpsc::Sender<Asking> {
         self.shared.ask.clone()
     }
 
-    /// Answers until it is told to stop, and says goodbye.
+    /// Serves requests until `stop` completes, and withdraws the announcement.
     pub(crate) async fn run(
         &mut self,
         mut questions: mpsc::Receiver<Asking>,
@@ -439,7 +443,7 @@ impl Lds {
                 () = self.keeper.step() => {}
                 Some((question, channel, reply)) = questions.recv() => {
                     let answer = self.answer(question, &channel);
-                    // A client that has gone does not wait for it.
+                    // The client may have disconnected.
                     drop(reply.send(answer));
                 }
                 Some(reply) = pages.recv() => drop(reply.send(self.status())),
@@ -638,7 +642,7 @@ impl Lds {
         }
     }
 
-    /// What was counted, each by its name in `/status`.
+    /// Returns the counters, by their names in `/status`.
     pub(crate) fn counters(&self) -> BTreeMap<&'static str, u64> {
         let get = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
         let Counters {
@@ -669,8 +673,8 @@ impl Lds {
         ])
     }
 
-    /// Says goodbye, and closes the listener and the connections. Goodbye comes first: a client
-    /// whose connection ends before takes the discovery server for killed.
+    /// Withdraws the announcement, and then closes the listener and the connections. The order
+    /// matters: clients treat a connection loss without a preceding withdrawal as a crash.
     async fn leave(&mut self) {
         let goodbye = self
             .keeper
@@ -678,7 +682,7 @@ impl Lds {
             .as_mut()
             .and_then(|mdns| mdns.take_back(&self.instance));
         if let Some(goodbye) = goodbye {
-            // Late: others find out by themselves.
+            // After the timeout, other programs detect the loss themselves.
             drop(timeout(LEAVE_LIMIT, goodbye).await);
         }
         self.accepting.shutdown().await;
@@ -686,24 +690,25 @@ impl Lds {
     }
 }
 
-/// Why nothing can listen.
+/// An error of listening.
 #[derive(Debug)]
 pub(crate) enum ListenFault {
-    /// The URL is none of OPC UA over TCP.
+    /// The URL is not an OPC UA URL over TCP.
     Url,
-    /// The system does not let it.
+    /// The error of the operating system.
     Io(std::io::Error),
-    /// Other hosts reach the address, and the OPC UA libraries are as published.
+    /// Other hosts reach the address, and the OPC UA libraries are unpatched.
     AsPublished(OtherHosts),
 }
 
 impl ListenFault {
-    /// Whether somebody else listens there.
+    /// Returns whether another program listens at the address.
     pub(crate) fn is_taken(&self) -> bool {
         matches!(self, Self::Io(error) if error.kind() == ErrorKind::AddrInUse)
     }
 
-    /// As a failure of a program that is a discovery server. Asks whoever has the place who that is.
+    /// Converts the error into a failure of `ua-lds`. Queries the program that uses the address for
+    /// its identity.
     async fn told(self, endpoint: &str) -> Failure {
         let error = match &self {
             Self::Url => {
@@ -746,7 +751,8 @@ impl std::fmt::Display for ListenFault {
     }
 }
 
-/// The host of its own URL: of one that listens at all addresses, that by which the interface is reached.
+/// Returns the host of the own URL. A server on the wildcard address uses the address of the
+/// interface.
 fn own_host(host: &str, interface: &Interface) -> String {
     let address: Option<IpAddr> = host.parse().ok();
     let is_wildcard = address.is_some_and(|address| address.is_unspecified());
@@ -756,7 +762,7 @@ fn own_host(host: &str, interface: &Interface) -> String {
     }
 }
 
-/// Listens at a URL.
+/// Listens at the address of a URL.
 pub(crate) async fn listen(endpoint: &str) -> Result<(TcpListener, Url), ListenFault> {
     let place = Url::parse(endpoint).ok_or(ListenFault::Url)?;
     let addresses = tokio::net::lookup_host((place.host.as_str(), place.port)).await;
@@ -766,7 +772,7 @@ pub(crate) async fn listen(endpoint: &str) -> Result<(TcpListener, Url), ListenF
     Ok((listener.map_err(ListenFault::Io)?, place))
 }
 
-/// The servers of other levels with these URIs, or all of them, as if they had registered.
+/// Returns the servers of other levels with these URIs, or all, in the form of registrations.
 fn gated(around: &Around, uris: &[&str]) -> Vec<Asked> {
     let added = around.added.borrow();
     let wanted = |one: &&Gated| uris.is_empty() || uris.contains(&&*one.application_uri);
@@ -784,13 +790,13 @@ fn gated(around: &Around, uris: &[&str]) -> Vec<Asked> {
     gated.collect()
 }
 
-/// As much of a text from outside as a log line is to hold.
+/// Truncates an external text for the log.
 fn cut(text: &str) -> String {
     text.chars().take(256).collect()
 }
 
 const NAME: &str = "UA bridge discovery server";
-/// As most discovery servers have it.
+/// The default of most discovery servers.
 const REGISTER_EVERY: Duration = Duration::from_secs(600);
 const WHO_LIMIT: Duration = Duration::from_secs(1);
 const MOST_LOSSES: usize = 64;

@@ -1,11 +1,14 @@
-//! Who is there: the registry of [`registry`] with sockets around it.
+//! Discovery of OPC UA servers: [`registry`] with its sockets.
 //!
-//! [`announce`] tells of a server: by mDNS to whoever is on the network, and by registration to the Local Discovery
-//! Server. [`watch`] tells who is there. [`mdns::tell_bridge`] tells of a program that carries a space. [`lds`] is the Local Discovery Server itself, the program `ua-lds`.
+//! [`announce`] announces a server by mDNS, and registers it with the Local Discovery Server.
+//! [`watch`] reports the servers of a network. [`lds`] is the Local Discovery Server itself, the
+//! program `ua-lds`.
 //!
-//! Reading order: `url`, `interface` and `address` (where), `mdns` and `goodbye` (announcements and what is heard of others), `wire` (OPC UA
-//! over TCP), `client` (asking by it), `line` and `liveness` (who still answers), `keeper` (all of that around one registry),
-//! `watch`, `scan`, `chosen`, `announce` and `bridges` (for programs), `endpoint`, `connection`, `security` and `services` (answering by it), `lds`, `embedded` (the same within another program), `presence`.
+//! Reading order: `address` (the registered address), `wire` (OPC UA over TCP), `client` (queries),
+//! `line` and `liveness` (probes of servers), `keeper` (a registry with its inputs and outputs),
+//! `watch`, `scan`, `chosen` and `announce` (the interface for programs), `endpoint`, `connection`,
+//! `security` and `services` (the endpoint of the discovery server), `lds`, `embedded` (the
+//! discovery server within another program), `presence`.
 
 mod address;
 mod announce;
@@ -33,9 +36,9 @@ pub use announce::{AnnounceSettings, AnnounceState, Announced, Server, announce}
 pub use chosen::{Marks, find_lds};
 pub use mdns::{Interface, MdnsFault, host_name};
 pub use presence::be_there;
-/// How it is known that a server is gone.
+/// The detected cause of the loss of a server.
 pub use registry::Loss;
 pub use watch::{Found, Known, WatchSettings, Watcher, watch};
 
-/// Where the Local Discovery Server of a host is (OPC 10000-12, 4.2.2).
+/// The URL of the Local Discovery Server of a host (OPC 10000-12, 4.2.2).
 pub const DEFAULT_LDS: &str = "opc.tcp://127.0.0.1:4840";

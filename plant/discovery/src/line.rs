@@ -1,7 +1,7 @@
-//! A connection to a server that is kept open and asked on again and again: it breaks off in the moment in which the server
-//! ends, and a question on it costs two packets.
+//! A persistent connection to a server, which is probed repeatedly. It closes at the moment the
+//! server ends, and a probe needs two packets.
 //!
-//! Nothing is secured: what is asked is whether somebody answers, and no answer is believed in more than that.
+//! The connection is not secured: a probe only checks whether the server answers.
 
 use std::io::ErrorKind;
 use std::time::Duration;
@@ -20,33 +20,33 @@ use tokio::time::{Instant, timeout, timeout_at};
 use crate::wire::{Conversation, Kind, MOST_CHUNK, MOST_CHUNKS, MOST_HEARD, WireFault};
 use mdns::Url;
 
-/// An open channel.
+/// A connection with an open channel.
 pub(crate) struct Line {
     conversation: Conversation<TcpStream>,
     url: String,
     last_request: u32,
-    /// Its token runs out some time after.
+    /// The time until which the security token is used, some time before its expiry.
     good_until: Instant,
 }
 
-/// How far a connection came.
+/// The progress of a connection attempt.
 pub(crate) enum Reached {
-    /// To a channel.
+    /// A channel is open.
     Line(Box<Line>),
-    /// The server is there, and gives us no channel.
+    /// The server answers, but opens no channel.
     Answers,
-    /// The host takes the connection; the program says nothing.
+    /// The host accepts the connection, but the program does not answer.
     Accepts,
-    /// The host says that nobody listens there.
+    /// The host refuses the connection.
     Refused,
-    /// Nothing came back.
+    /// No answer.
     Nobody,
-    /// It could not be tried.
+    /// The connection cannot be attempted.
     Untried,
 }
 
 impl Line {
-    /// Connects, and opens a channel where `hold` says so.
+    /// Connects, and opens a channel if `hold` is set.
     pub(crate) async fn reach(url: &str, place: &Url, hold: bool, limit: Duration) -> Reached {
         let until = Instant::now() + limit;
         let stream = match connect(place, until).await {
@@ -56,11 +56,12 @@ impl Line {
         let mut conversation = Conversation::new(stream, Role::Client);
         match timeout_at(until, greet(&mut conversation, url)).await {
             Ok(Ok(())) => {}
-            // It says something, or has no room and closes: it is there.
+            // The server sends an Error message, or closes the connection because it is full: it is
+            // running.
             Ok(Err(WireFault::Told(_) | WireFault::Closed | WireFault::Io(_))) => {
                 return Reached::Answers;
             }
-            // Whoever says something else is no server of OPC UA.
+            // Any other answer does not come from an OPC UA server.
             Ok(Err(WireFault::Bad { .. } | WireFault::Unreadable { .. })) | Err(_) => {
                 return Reached::Accepts;
             }
@@ -74,8 +75,8 @@ impl Line {
         }
     }
 
-    /// Asks for something that there is not, which makes the answer short. The line, where it was answered. Whoever drops
-    /// it before has no line any more.
+    /// Probes the server with a query without results, which keeps the response short. Returns the
+    /// line if the server answered. Cancelling the future closes the line.
     pub(crate) async fn ask(mut self) -> Option<Self> {
         self.last_request = self.last_request.wrapping_add(1).max(2);
         let request = FindServersRequest {
@@ -88,18 +89,18 @@ impl Line {
         let conversation = &mut self.conversation;
         conversation.send(self.last_request, &request).await.ok()?;
         match conversation.receive::<ResponseMessage>(|_| Ok(())).await {
-            // Whatever it says.
+            // Any response counts.
             Ok(_) | Err(WireFault::Unreadable { .. }) => Some(self),
             Err(_) => None,
         }
     }
 
-    /// Whether the channel still counts.
+    /// Returns whether the channel is still valid.
     pub(crate) fn is_good(&self) -> bool {
         Instant::now() < self.good_until
     }
 
-    /// Waits until it breaks off; nothing is said on it unasked. Whoever drops it before loses nothing.
+    /// Waits until the connection closes; the server sends nothing unrequested. Cancel safe.
     pub(crate) async fn broken(&mut self) {
         self.conversation.stirred().await;
     }
@@ -122,9 +123,9 @@ async fn connect(place: &Url, until: Instant) -> Result<TcpStream, Reached> {
         },
         Ok(Err(error)) => Err(match error.kind() {
             ErrorKind::ConnectionRefused => Reached::Refused,
-            // Reset is what a server does that has no room: it is there.
+            // A server that has reached its limit of connections resets them: it is running.
             ErrorKind::ConnectionReset => Reached::Answers,
-            // Our own want of descriptors, say, is nothing that the server did.
+            // Any other error, such as a lack of file descriptors, is not caused by the server.
             ErrorKind::HostUnreachable | ErrorKind::NetworkUnreachable | ErrorKind::TimedOut => {
                 Reached::Nobody
             }
@@ -187,8 +188,8 @@ fn header(handle: u32) -> RequestHeader {
     }
 }
 
-/// No server is called so.
+/// The URI that no server has.
 const NOBODY: &str = "urn:ua-bridge:nobody";
-/// In milliseconds. Where it has run out another channel is opened.
+/// Channel lifetime in milliseconds. After its end another channel is opened.
 const LIFETIME: u32 = 3_600_000;
 const OPEN_LIMIT: Duration = Duration::from_secs(1);

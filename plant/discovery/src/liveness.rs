@@ -1,7 +1,7 @@
-//! Who still answers: a task for each endpoint under watch, which holds a [`Line`] to it where the server gives one, and
-//! connects anew where it does not.
+//! Probes of servers: a task for each watched endpoint, which keeps a [`Line`] to it if the server
+//! accepts a channel, and otherwise connects for each probe.
 //!
-//! When to try is the registry's to say. A line that breaks off is told at once.
+//! The registry decides on the times of probes. The loss of a line is reported at once.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -14,23 +14,23 @@ use crate::client;
 use crate::line::{Line, Reached};
 use mdns::Url;
 
-/// What is told of an endpoint.
+/// A report about an endpoint.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum Told {
-    /// What came of a try.
+    /// The outcome of a probe.
     Tried { url: String, outcome: Outcome },
-    /// The connection to it broke off.
+    /// The connection to the endpoint was lost.
     Broken { url: String },
 }
 
-/// A try.
+/// A probe.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Try {
-    /// Whether the server is asked when it started, too, where a channel to it is new.
+    /// Whether a server with a new channel is also queried for its start time.
     pub(crate) ask_start: bool,
 }
 
-/// All endpoints under watch.
+/// All watched endpoints.
 #[derive(Debug)]
 pub(crate) struct Liveness {
     endpoints: BTreeMap<String, Watched>,
@@ -56,12 +56,12 @@ impl Liveness {
         }
     }
 
-    /// Whether more may be tried now.
+    /// Returns whether another probe may start.
     pub(crate) fn has_room(&self) -> bool {
         self.under_way < MOST_TRIES
     }
 
-    /// Has an endpoint tried, unless it is being tried.
+    /// Starts a probe of an endpoint, unless a probe is in progress.
     pub(crate) fn attempt(&mut self, url: &str, attempt: Try) {
         if !self.endpoints.contains_key(url) {
             let may_hold = self.endpoints.len() < MOST_LINES;
@@ -77,17 +77,17 @@ impl Liveness {
         }
     }
 
-    /// What is told next. Whoever drops it before loses nothing.
+    /// Waits for the next report. Cancel safe.
     pub(crate) async fn next(&mut self) -> Told {
         loop {
             let Some(told) = self.told.recv().await else {
-                // Not while we hold an end ourselves.
+                // Cannot happen, because `self` holds a sender.
                 return std::future::pending().await;
             };
             let url = match &told {
                 Told::Tried { url, .. } | Told::Broken { url } => url,
             };
-            // What is not under watch any more is not told of.
+            // Reports of endpoints that are no longer watched are dropped.
             let Some(watched) = self.endpoints.get_mut(url) else {
                 continue;
             };
@@ -99,7 +99,7 @@ impl Liveness {
         }
     }
 
-    /// Lets go of all but these.
+    /// Stops watching all other endpoints.
     pub(crate) fn keep(&mut self, wanted: impl Fn(&str) -> bool) {
         let under_way = &mut self.under_way;
         self.endpoints.retain(|url, watched| {
@@ -113,7 +113,7 @@ impl Liveness {
 }
 
 impl Watched {
-    /// Its task ends when it is dropped.
+    /// Starts the task of an endpoint, which ends when this value is dropped.
     fn start(url: &str, may_hold: bool, tell: mpsc::Sender<Told>) -> Self {
         let (ask, asked) = mpsc::channel(1);
         let endpoint = Endpoint {
@@ -134,7 +134,7 @@ struct Endpoint {
     url: String,
     place: Option<Url>,
     line: Option<Line>,
-    /// How often a channel that broke off may be opened anew: some servers close those without a session.
+    /// How many more channels may be opened: some servers close channels without a session.
     lines_left: u32,
 }
 
@@ -150,7 +150,7 @@ impl Endpoint {
             let told = tokio::select! {
                 attempt = asked.recv() => {
                     let Some(attempt) = attempt else { return };
-                    // Who gives it up while it is tried does not wait for it.
+                    // The task ends at once if the endpoint is no longer watched.
                     let outcome = tokio::select! {
                         outcome = self.attempt(attempt) => outcome,
                         () = closed(&mut asked) => return,
@@ -159,7 +159,8 @@ impl Endpoint {
                 }
                 () = broken => {
                     self.line = None;
-                    // A program that ends closes one thing after the other; its listener may be next.
+                    // A program that ends closes its sockets one after another; its listener may be
+                    // next.
                     sleep(SETTLE).await;
                     Told::Broken { url: self.url.clone() }
                 }
@@ -170,10 +171,11 @@ impl Endpoint {
         }
     }
 
-    /// One try, of a second at most: on the line, and where no answer comes soon, beside it on another connection.
+    /// Probes the endpoint within a second: on the line, and if the answer is delayed, also on
+    /// another connection.
     async fn attempt(&mut self, attempt: Try) -> Outcome {
         let Some(place) = self.place.clone() else {
-            // Another kind of endpoint, such as one of HTTPS.
+            // The endpoint has another transport, for example HTTPS.
             return Outcome::Untried;
         };
         let alive = Outcome::Alive { start_time: None };
@@ -223,19 +225,20 @@ async fn ask(line: Option<Line>) -> Option<Line> {
 }
 
 async fn closed(asked: &mut mpsc::Receiver<Try>) {
-    // One is asked at a time, so the next thing is the end.
+    // No second probe is sent meanwhile, so the channel closes next.
     while asked.recv().await.is_some() {}
 }
 
-/// Tries at one time: more than there are of those that wait for an answer when a cable is cut, but for large plants.
+/// Most concurrent probes: more than the number of waiting probes after a cut cable, except in
+/// large plants.
 const MOST_TRIES: usize = 256;
-/// A process has 1024 descriptors where nobody says otherwise.
+/// Most lines. The default limit of a process is 1024 file descriptors.
 const MOST_LINES: usize = 600;
 const LINES: u32 = 4;
 const SETTLE: Duration = Duration::from_millis(30);
-/// An answer on an open connection comes in milliseconds, or after a packet was lost in some 200 ms.
+/// An answer on an open connection takes milliseconds, or about 200 ms after a lost packet.
 const SOON: Duration = Duration::from_millis(400);
-/// Two tries that wait fit into the time in which a loss is to be told.
+/// Two probes that time out fit into the time for reporting a loss.
 const LIMIT: Duration = Duration::from_secs(1);
 const START_LIMIT: Duration = Duration::from_secs(2);
 
@@ -289,7 +292,7 @@ mod tests {
             capabilities: Vec::new(),
             number: None,
         };
-        // A runtime of its own, which takes all its connections along when it ends.
+        // A separate runtime, which closes all its connections when it ends.
         let runtime = std::thread::spawn(|| {
             tokio::runtime::Builder::new_multi_thread()
                 .worker_threads(1)
@@ -309,7 +312,7 @@ mod tests {
         runtime.shutdown_background();
         let told = timeout(Duration::from_secs(5), liveness.next()).await;
         assert_eq!(told, Ok(Told::Broken { url: url.clone() }));
-        // What it held may be taken down one after the other.
+        // The sockets of the runtime may close one after another.
         let gone = async { while tried(&mut liveness, &url).await != Outcome::Refused {} };
         timeout(Duration::from_secs(5), gone).await.unwrap();
     }

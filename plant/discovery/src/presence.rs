@@ -1,4 +1,4 @@
-//! A server that can do nothing but be there: [`be_there`].
+//! A server without services other than discovery: [`be_there`].
 
 use std::sync::Arc;
 
@@ -11,8 +11,8 @@ use crate::connection::{Asking, Shared};
 use crate::endpoint;
 use crate::services::{Answer, Own, Question};
 
-/// Answers at a listener for a server that has nothing else to say: who it is (FindServers, GetEndpoints), over channels
-/// that are not secured. Sessions and all else it does not support. Ends when it is dropped.
+/// Answers FindServers and GetEndpoints on a listener, over unsecured channels. Sessions and all
+/// other services are not supported. Ends when the future is dropped.
 pub async fn be_there(listener: TcpListener, server: &Server) {
     let own = Own {
         application_uri: server.application_uri.clone(),
@@ -25,13 +25,13 @@ pub async fn be_there(listener: TcpListener, server: &Server) {
     let answers = async {
         while let Some((question, _, reply)) = questions.recv().await {
             let answer = match question {
-                // It adds itself.
+                // The response adds the server itself.
                 Question::FindServers { .. } => Answer::Servers(Vec::new()),
                 Question::FindOnNetwork { .. } | Question::Register { .. } => {
                     Answer::Refused(UNSUPPORTED)
                 }
             };
-            // A client that has gone does not wait for it.
+            // The client may have disconnected.
             drop(reply.send(answer));
         }
     };

@@ -1,7 +1,8 @@
-//! Servers that announce themselves to nobody, found by trying addresses.
+//! Finds servers without announcement by a scan of addresses.
 //!
-//! It connects, asks who is there (GetEndpoints) and leaves: it opens no session and changes nothing. How many addresses are
-//! tried, how many at once and how many a second is bounded. It is never done unless somebody asks for it.
+//! A scan connects, sends GetEndpoints and disconnects: it opens no session and changes nothing.
+//! The number of addresses, of concurrent connections and of connections per second is limited. A
+//! scan runs only on request of the user.
 
 use std::collections::BTreeMap;
 use std::net::{IpAddr, SocketAddr};
@@ -15,16 +16,16 @@ use tokio::time::{MissedTickBehavior, interval, timeout};
 
 use crate::client::{Described, describe};
 
-/// How hard the network is asked.
+/// The limits of a scan.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Pace {
-    /// How many connections are begun in a second at most, from 1 on.
+    /// Most new connections per second, at least 1.
     pub per_second: u32,
-    /// How many are open at once at most, from 1 on.
+    /// Most concurrent connections, at least 1.
     pub at_once: usize,
-    /// How long to wait for a connection.
+    /// The timeout of a connection.
     pub connect: Duration,
-    /// How long to wait for an answer.
+    /// The timeout of a response.
     pub answer: Duration,
 }
 
@@ -39,29 +40,29 @@ impl Default for Pace {
     }
 }
 
-/// A server that was found.
+/// A server that the scan found.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Scanned {
-    /// Where it was reached: the address that was tried, and the path it tells.
+    /// The URL: the scanned address with the path that the server reports.
     pub url: String,
-    /// The other places it was reached at.
+    /// The other URLs of the same server.
     pub also_at: Vec<String>,
-    /// What it says of itself.
+    /// The self-description of the server.
     pub described: Described,
 }
 
-/// What a scan came to.
+/// The result of a scan.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Outcome {
-    /// The servers, one for each ApplicationUri, in the order of their addresses.
+    /// The servers, one per ApplicationUri, ordered by address.
     pub servers: Vec<Scanned>,
-    /// Places where somebody listens who does not answer as an OPC UA server, and why, in the same order.
+    /// Addresses whose listener is not an OPC UA server, with the reason, ordered by address.
     pub others: Vec<(SocketAddr, String)>,
-    /// How many places were tried.
+    /// The number of scanned addresses.
     pub tried: u32,
 }
 
-/// Tries those ports of all those addresses.
+/// Scans these ports of all addresses.
 pub async fn scan(ranges: &[Range], ports: &[u16], pace: Pace) -> Outcome {
     let all = ranges.iter().flat_map(|range| range.addresses());
     let mut places = all.flat_map(|ip| ports.iter().map(move |port| SocketAddr::from((ip, *port))));
@@ -93,10 +94,10 @@ pub async fn scan(ranges: &[Range], ports: &[u16], pace: Pace) -> Outcome {
     outcome
 }
 
-/// What a server says, or why one that listens says nothing.
+/// The self-description of a server, or the reason why a listener did not answer.
 type Tried = Result<Described, String>;
 
-/// `None` where nobody listens.
+/// Scans an address; `None` without a listener.
 async fn try_one(place: SocketAddr, pace: Pace) -> Option<Tried> {
     let connected = timeout(pace.connect, TcpStream::connect(place)).await;
     drop(connected.ok()?.ok()?);
@@ -105,7 +106,7 @@ async fn try_one(place: SocketAddr, pace: Pace) -> Option<Tried> {
     Some(described.map_err(|fault| fault.to_string()))
 }
 
-/// One server for each ApplicationUri.
+/// Merges the results by ApplicationUri.
 fn merged(told: BTreeMap<SocketAddr, Tried>) -> Outcome {
     let mut outcome = Outcome::default();
     for (place, tried) in told {
@@ -133,7 +134,8 @@ fn merged(told: BTreeMap<SocketAddr, Tried>) -> Outcome {
     outcome
 }
 
-/// The place, with the path that the server tells of that port: hosts' names that are announced are not always to be resolved.
+/// Returns the URL of a scanned address, with the path that the server reports for this port.
+/// Reported host names cannot always be resolved.
 fn reached(ip: IpAddr, port: u16, described: &Described) -> String {
     let told = described.application.discovery_urls.iter();
     let mut told = told.filter_map(|url| Url::parse(url));
@@ -176,7 +178,7 @@ mod tests {
                 described("urn:other", "opc.tcp://other:4841/b"),
             ),
             (place(3, 4840), Err("refused".to_owned())),
-            // Who does not say who it is is not the same as another.
+            // Servers without ApplicationUri are not merged.
             (place(20, 4840), described("", "")),
             (place(21, 4840), described("", "")),
         ]));

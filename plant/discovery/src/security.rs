@@ -1,4 +1,5 @@
-//! Whom a secured channel is opened for, and with which certificate of ours (OPC 10000-6, 6.2 and 6.7).
+//! The certificate of the discovery server, and the certificates admitted to its secured channels
+//! (OPC 10000-6, 6.2 and 6.7).
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -19,18 +20,18 @@ use x509_cert::ext::pkix::name::GeneralName;
 
 use crate::clock;
 
-/// The certificate store of a discovery server: `own`, `private` and `trusted` under one directory.
+/// The certificate store of a discovery server, with the folders `own`, `private` and `trusted`.
 #[derive(Debug)]
 pub(crate) struct Security {
     pub(crate) certificate: X509,
     pub(crate) key: PrivateKey,
     judge: Judge,
-    /// Who was turned away, by the certificate and why.
+    /// Limits the log messages for refused certificates, by certificate and reason.
     refused: Mutex<LogLimit>,
 }
 
 impl Security {
-    /// Uses the store under `root`, and makes what is missing of it.
+    /// Opens the store under `root`, and creates missing parts.
     pub(crate) fn open(
         root: &Path,
         application_uri: &str,
@@ -60,7 +61,7 @@ impl Security {
         })
     }
 
-    /// The store of an application that has made its pair already; nothing is made here.
+    /// Opens the store of an application with an existing certificate and key; nothing is created.
     pub(crate) fn existing(root: &Path) -> Result<Self, String> {
         let failed = |error| format!("the certificate store {}: {error}", root.display());
         let (certificate, key) = pair(root);
@@ -72,7 +73,7 @@ impl Security {
         })
     }
 
-    /// The same, but whom it trusts says the store at that root.
+    /// Uses the store at another root to decide on trust.
     pub(crate) fn judging_by(self, root: Option<PathBuf>, trust_any: bool) -> Self {
         Self {
             judge: root.map_or(self.judge, |root| Judge::of(&root, trust_any)),
@@ -80,8 +81,9 @@ impl Security {
         }
     }
 
-    /// Judges the certificate of a server that says it is that application. One that nobody has decided on is kept in `rejected`,
-    /// for whoever does. Which host it is reached at is left open: what it is told there is no secret.
+    /// Judges the certificate of a server with this ApplicationUri. An undecided certificate is
+    /// stored in `rejected`. The host name is not checked, because the registration contains no
+    /// secret.
     pub(crate) fn trusts(&self, der: &[u8], application_uri: &str) -> Result<(), Refused> {
         let names = Names {
             host: None,
@@ -90,7 +92,7 @@ impl Security {
         self.judge.take(der, names).map(drop)
     }
 
-    /// Whether a channel may be opened with this certificate, or may stay.
+    /// Checks that a channel may be opened, or stay open, with this certificate.
     pub(crate) fn admit(&self, der: &[u8]) -> Result<(), StatusCode> {
         let Err(refused) = self.judge.take(der, Names::default()) else {
             return Ok(());
@@ -99,7 +101,7 @@ impl Security {
         if let Some(untold) = self.refused.lock().admit(&told, clock::now()) {
             warn!(untold, "a client is not talked to: {told}");
         }
-        // Not which of the checks it was (OPC 10000-4, 6.1.3).
+        // An untrusted client does not learn which check failed (OPC 10000-4, 6.1.3).
         match refused.may_be_told {
             true => Err(refused.status),
             false => Err(StatusCode::BadSecurityChecksFailed),
@@ -107,8 +109,8 @@ impl Security {
     }
 }
 
-/// The ApplicationUri of a certificate (OPC 10000-6, 6.2.2): the first URI among its alternative names, wherever it stands
-/// there. Some stacks put the names of the host in front of it.
+/// Returns the ApplicationUri of a certificate (OPC 10000-6, 6.2.2): the first URI of its subject
+/// alternative names, at any position. Some stacks put host names first.
 pub(crate) fn application_uri(der: &[u8]) -> Option<String> {
     let certificate = Certificate::from_der(der).ok()?;
     let (_, names) = certificate.tbs_certificate.get::<SubjectAltName>().ok()??;
@@ -124,13 +126,13 @@ pub(crate) fn application_uri(der: &[u8]) -> Option<String> {
     })
 }
 
-/// The own certificate and its key.
+/// Returns the paths of the own certificate and its key.
 fn pair(root: &Path) -> (PathBuf, PathBuf) {
     (root.join("own/cert.der"), root.join("private/private.pem"))
 }
 
-/// The common name of its certificate.
+/// The common name of the certificate.
 const NAME: &str = "UA bridge discovery server";
 
-/// The same client is told of in the log once in this time.
+/// Shortest interval between two log messages for the same client.
 pub(crate) const TOLD_EVERY: Duration = Duration::from_secs(10);

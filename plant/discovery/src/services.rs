@@ -1,4 +1,4 @@
-//! Requests of OPC UA to the registry, and what it says as responses (OPC 10000-4, 5.5).
+//! Conversion between OPC UA services and the registry (OPC 10000-4, 5.5).
 
 #![expect(
     clippy::wildcard_enum_match_arm,
@@ -20,7 +20,7 @@ use registry::{Asked, MdnsConfiguration, NetworkRecord};
 
 use crate::clock;
 
-/// A question to whoever keeps the registry.
+/// A query of the registry.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum Question {
     FindServers {
@@ -37,7 +37,7 @@ pub(crate) enum Question {
     },
 }
 
-/// What it says.
+/// The answer of the registry.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum Answer {
     Servers(Vec<Asked>),
@@ -49,12 +49,12 @@ pub(crate) enum Answer {
     Refused(u32),
 }
 
-/// The one who answers, as it says it itself.
+/// The description of the server that answers.
 #[derive(Debug, Clone)]
 pub(crate) struct Own {
     pub(crate) application_uri: String,
     pub(crate) name: String,
-    /// As clients reach it.
+    /// The URL for clients.
     pub(crate) url: String,
     pub(crate) application_type: ApplicationType,
     /// Null without secured channels.
@@ -72,7 +72,7 @@ impl Own {
         }
     }
 
-    /// GetEndpoints.
+    /// Returns the GetEndpoints response.
     pub(crate) fn endpoints(&self, request: &GetEndpointsRequest) -> ResponseMessage {
         let profiles = request.profile_uris.as_deref().unwrap_or_default();
         let wanted =
@@ -84,7 +84,7 @@ impl Own {
                 server_certificate: self.certificate.clone(),
                 security_mode: mode,
                 security_policy_uri: policy.into(),
-                // None at all: there are no sessions.
+                // An empty list: there are no sessions.
                 user_identity_tokens: Some(Vec::new()),
                 transport_profile_uri: UATCP.into(),
                 security_level: level,
@@ -108,7 +108,7 @@ impl Own {
     }
 }
 
-/// What a request asks of the registry; `None` for a service that is not one of discovery.
+/// Returns the query of a request; `None` if the service is not a discovery service.
 pub(crate) fn question(request: &RequestMessage) -> Option<Question> {
     Some(match request {
         RequestMessage::FindServers(request) => Question::FindServers {
@@ -159,12 +159,12 @@ fn register(server: &RegisteredServer, mdns: Option<MdnsConfiguration>) -> Quest
     }
 }
 
-/// Whether a semaphore file is there; `None` where none is named.
+/// Returns whether the semaphore file exists; `None` without a path.
 pub(crate) fn semaphore(path: &str) -> Option<bool> {
     (!path.is_empty()).then(|| Path::new(path).is_file())
 }
 
-/// The response to a request that was a [`question`].
+/// Returns the response to a request that [`question`] converted.
 pub(crate) fn response(request: &RequestMessage, answer: Answer, own: &Own) -> ResponseMessage {
     let good = || ResponseHeader::new_good(request.request_header());
     match (request, answer) {
@@ -193,7 +193,7 @@ pub(crate) fn response(request: &RequestMessage, answer: Answer, own: &Own) -> R
         }
         .into(),
         (RequestMessage::RegisterServer2(request), Answer::Registered) => {
-            // The first of the kind that is known counts.
+            // Only the first MdnsDiscoveryConfiguration is used.
             let mut taken = false;
             let all = request.discovery_configuration.iter().flatten();
             let results = all.map(|one| {
@@ -215,7 +215,7 @@ pub(crate) fn response(request: &RequestMessage, answer: Answer, own: &Own) -> R
     }
 }
 
-/// A refusal.
+/// Returns a ServiceFault.
 pub(crate) fn fault(request: &RequestMessage, status: StatusCode) -> ResponseMessage {
     ServiceFault::new(request.request_header(), status).into()
 }

@@ -70,14 +70,14 @@ struct UaLds {
     log: LogFormat,
 }
 
-/// Runs `ua-lds` from its command line to its end. `arguments` begin with the name of the program.
+/// Runs `ua-lds` with the command line `arguments`, which begin with the name of the program.
 #[must_use]
 pub fn run(arguments: Vec<OsString>) -> ExitCode {
     run_service::<UaLds>(arguments)
 }
 
 impl Service for UaLds {
-    // The libraries log at level error what a bad client did.
+    // The libraries log faults of clients at level error.
     const QUIET: &'static str = "opcua_core=off,opcua_crypto=off,opcua_types=off,mdns_sd=off";
 
     fn log(&self) -> LogFormat {
@@ -89,7 +89,7 @@ impl Service for UaLds {
         let interface = self.interface.as_deref().map(Interface::parse);
         let gds = self.gds.invitation();
         let gds = gds.map_err(|fault| Failure::new(FailureKind::Usage, fault.to_string()))?;
-        // A certificate of the plant needs a store.
+        // A certificate of the plant requires a store.
         let usual = || gds.as_ref().map(|_| default_named("pki-ua-lds"));
         let settings = LdsSettings {
             interface: interface

@@ -1,4 +1,4 @@
-//! Who is there, for a program: [`watch`].
+//! Reports the servers of a network to a program: [`watch`].
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::num::NonZeroU16;
@@ -15,14 +15,14 @@ use mdns::Interface;
 use mdns::Url;
 use mdns::{Mdns, MdnsFault, same_place};
 
-/// How servers are watched.
+/// The settings of a watcher.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct WatchSettings {
-    /// Where announcements are heard; `None` hears none.
+    /// The interface for mDNS; `None` for no mDNS.
     pub mdns: Option<Interface>,
-    /// How often each endpoint is tried.
+    /// The interval of probes of each endpoint.
     pub probe_every: Duration,
-    /// How long one that gives no answer at all still counts as there.
+    /// The time without any answer after which a server is lost.
     pub lost_after: Duration,
 }
 
@@ -37,27 +37,28 @@ impl Default for WatchSettings {
     }
 }
 
-/// A server that is there.
+/// A server that is present.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Known {
-    /// By which it is told apart from all others, for as long as it is there: its mDNS instance name.
+    /// The mDNS instance name, which is unique while the server is present.
     pub name: String,
-    /// Where it is.
+    /// The URL.
     pub url: String,
-    /// Codes of OPC 10000-12, Annex D.
+    /// The server capabilities: codes of OPC 10000-12, Annex D.
     pub capabilities: Vec<String>,
-    /// Its ApplicationUri as it says itself; `None` where it does not.
+    /// The ApplicationUri that the server reports; `None` if it does not answer.
     pub application_uri: Option<String>,
-    /// Since when it is there.
+    /// The time since which it is present.
     pub since: SystemTime,
-    /// When its program started, where it tells: by mDNS, or as the StartTime of its ServerStatus.
+    /// The start time of its program, if known: from mDNS, or the StartTime of its ServerStatus.
     pub started: Option<SystemTime>,
-    /// Its number in the space, the namespace of what it produces there, where it tells.
+    /// The number of the server in the space, which is the namespace of its publications, if
+    /// announced.
     pub number: Option<NonZeroU16>,
 }
 
 impl Known {
-    /// Whether it is a Local Discovery Server, which has nothing of its own.
+    /// Returns whether the server is a Local Discovery Server, which has no functions of its own.
     #[must_use]
     pub fn is_lds(&self) -> bool {
         self.capabilities
@@ -66,24 +67,24 @@ impl Known {
     }
 }
 
-/// What has happened to a server.
+/// A change of a server.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Found {
-    /// It is there; or it was, and says something else of itself.
+    /// The server appeared, or its description changed.
     Seen(Known),
-    /// It is another run of the program: what was known of its inside is void.
+    /// The program restarted: cached data of the server is invalid.
     Restarted(Known),
-    /// It is no longer there.
+    /// The server was lost.
     Gone {
-        /// What was known of it.
+        /// The last description of the server.
         known: Known,
-        /// How that is known.
+        /// The detected cause of the loss.
         loss: Loss,
     },
 }
 
 impl Found {
-    /// The server.
+    /// Returns the server.
     #[must_use]
     pub fn known(&self) -> &Known {
         match self {
@@ -92,22 +93,23 @@ impl Found {
     }
 }
 
-/// Hears of servers for as long as it is kept.
+/// Receives changes of servers until this value is dropped.
 #[derive(Debug)]
 pub struct Watcher(mpsc::Receiver<Found>);
 
 impl Watcher {
-    /// What has happened next. `None` only when the runtime ends. Whoever is slow misses no server, but is told only what
-    /// it came to at last.
+    /// Waits for the next change. `None` only when the runtime ends. A slow reader receives only
+    /// the last of several changes of a server, and misses no server.
     pub async fn next(&mut self) -> Option<Found> {
         self.0.recv().await
     }
 }
 
-/// Starts to hear of servers. Needs a tokio runtime, and waits for nothing.
+/// Starts to watch servers. Requires a tokio runtime, and returns at once.
 ///
 /// # Errors
-/// No mDNS daemon can be started.
+///
+/// Returns an error if the mDNS daemon cannot be started.
 pub fn watch(settings: WatchSettings) -> Result<Watcher, MdnsFault> {
     let mdns = settings.mdns.as_ref().map(Mdns::open).transpose()?;
     let registry = Settings {
@@ -130,11 +132,12 @@ pub fn watch(settings: WatchSettings) -> Result<Watcher, MdnsFault> {
 struct Watching {
     keeper: Keeper,
     servers: Servers,
-    /// Who is asked for its ApplicationUri.
+    /// The running queries for ApplicationUris.
     asking: JoinSet<(String, Option<String>)>,
-    /// Who is asked next.
+    /// The URLs to query next.
     ask: VecDeque<String>,
-    /// Who is asked once a probe was answered: earlier probes failed, or too many servers appeared at once.
+    /// The URLs to query after an answered probe: earlier probes failed, or too many servers
+    /// appeared at the same time.
     ask_later: BTreeSet<String>,
 }
 
@@ -167,7 +170,7 @@ impl Watching {
             while self.asking.len() < MOST_ASKED
                 && let Some(url) = self.ask.pop_front()
             {
-                // Many forged names appear and go before it is their turn.
+                // Many forged names may appear and disappear before their turn.
                 if self.keeper.registry.watches(&url) {
                     self.asking.spawn(application_uri(url));
                 }
@@ -175,7 +178,7 @@ impl Watching {
         }
     }
 
-    /// Asks a server who it is, now or when it answers probes.
+    /// Queries the ApplicationUri of a server, at once or after an answered probe.
     fn ask(&mut self, url: String) {
         let is_paused = self.keeper.registry.is_paused(&url, clock::now());
         if !is_paused && self.ask.len() < MOST_WAITING {
@@ -225,7 +228,7 @@ impl Watching {
     }
 }
 
-/// What a server says it is, if it says it in time.
+/// Returns the ApplicationUri that a server reports, if it answers in time.
 async fn application_uri(url: String) -> (String, Option<String>) {
     let found = client::find_servers(&url, ASK_LIMIT)
         .await
@@ -248,11 +251,11 @@ const MOST_WAITING: usize = 256;
 const MOST_LATER: usize = 1024;
 const ASK_LIMIT: Duration = Duration::from_millis(500);
 
-/// The servers that are there, and what their reader is still to be told.
+/// The servers that are present, and the pending changes for the reader.
 #[derive(Debug, Default)]
 struct Servers {
     known: BTreeMap<String, Server>,
-    /// Whom the reader believes to be there.
+    /// The names of the servers that are present for the reader.
     told: BTreeSet<String>,
     outbox: VecDeque<Found>,
 }
@@ -260,14 +263,14 @@ struct Servers {
 #[derive(Debug)]
 struct Server {
     known: Known,
-    /// The mDNS instances it is announced as: a discovery server may announce it, too.
+    /// The mDNS instances of the server: a discovery server may announce it too.
     instances: BTreeSet<String>,
-    /// Whether it has been asked who it is.
+    /// Whether the query for the ApplicationUri has completed.
     asked: bool,
 }
 
 impl Servers {
-    /// Takes in a new or changed record. Gives the URL to ask who it is.
+    /// Adds or changes a record. Returns the URL to query for the ApplicationUri.
     fn seen(&mut self, announcement: Announcement, since: SystemTime) -> Option<String> {
         let Announcement {
             instance,
@@ -298,7 +301,7 @@ impl Servers {
             server.instances.insert(instance);
             return None;
         }
-        // Whoever was called so has lost that name since.
+        // A previous server with this name has lost the name.
         self.renamed(&instance);
         let name = match self.known.contains_key(&instance) {
             true => format!("{instance} at {url}"),
@@ -322,7 +325,8 @@ impl Servers {
         Some(url)
     }
 
-    /// A server has lost its name to another that is called so, too: it is there under another of its names from now on.
+    /// Renames a server that lost its name to another server with the same name. It continues under
+    /// another of its names.
     fn renamed(&mut self, name: &str) {
         let Some(mut server) = self.known.remove(name) else {
             return;
@@ -342,7 +346,7 @@ impl Servers {
         }
     }
 
-    /// A server has said who it is, or has not.
+    /// Stores the result of a query for an ApplicationUri.
     fn answered(&mut self, url: &str, application_uri: Option<String>) {
         if let Some((_, server)) = self.of_url(url) {
             server.known.application_uri = application_uri;
@@ -365,7 +369,7 @@ impl Servers {
         }
     }
 
-    /// What number a server has in the space is known, or that it has none.
+    /// Stores the number of a server in the space, or its absence.
     fn numbered(&mut self, url: &str, number: Option<NonZeroU16>) {
         if let Some((_, server)) = self.of_url(url)
             && std::mem::replace(&mut server.known.number, number) != number
@@ -376,7 +380,7 @@ impl Servers {
         }
     }
 
-    /// When a server started is known.
+    /// Stores the start time of a server.
     fn started(&mut self, url: &str, at: SystemTime) {
         if let Some((_, server)) = self.of_url(url)
             && server.known.started.replace(at) != Some(at)
@@ -409,7 +413,7 @@ impl Servers {
         Some((name.clone(), server))
     }
 
-    /// Has the reader told, in the place of what it has not been told yet of the same server.
+    /// Queues a change for the reader, and replaces pending changes of the same server.
     fn push(&mut self, found: Found) {
         let name = found.known().name.clone();
         let of_it = |waiting: &Found| waiting.known().name == name;
@@ -422,7 +426,7 @@ impl Servers {
         let told = self.told.contains(&name);
         match found {
             Found::Gone { .. } if told => self.outbox.push_back(found),
-            // It came and went while nobody looked.
+            // The server appeared and was lost before the reader received it.
             Found::Gone { .. } => {}
             Found::Seen(known) | Found::Restarted(known) if !told || went.is_some() => {
                 self.outbox.extend(went);
@@ -467,7 +471,7 @@ mod tests {
         .collect()
     }
 
-    /// A server that is there and has said who it is.
+    /// Adds a server that has reported its ApplicationUri.
     fn seen(servers: &mut Servers, announcement: Announcement) {
         let url = announcement.url.clone();
         if servers.seen(announcement, SystemTime::UNIX_EPOCH).is_some() {
@@ -509,7 +513,7 @@ mod tests {
     #[test]
     fn a_server_that_gave_its_name_away_is_there_under_the_one_it_took() {
         let mut servers = Servers::default();
-        // Two have one name: what is heard of them is one that moves.
+        // Two servers with the same name look like a single server that moves.
         seen(&mut servers, robot("arm", 2));
         seen(&mut servers, robot("arm (2)", 2));
         assert_eq!(told(&mut servers), ["seen arm"]);

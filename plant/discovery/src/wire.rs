@@ -1,7 +1,9 @@
-//! OPC UA over TCP (OPC 10000-6, 6.7 and 7.1) without sessions: frames, and messages in chunks on a SecureChannel.
+//! OPC UA over TCP (OPC 10000-6, 6.7 and 7.1) without sessions: frames, and messages in chunks on a
+//! SecureChannel.
 //!
-//! Both ends: [`client`](crate::client) opens a conversation, [`connection`](crate::connection) answers in one. What the
-//! peer sends is bounded before it is kept.
+//! Both ends use this module: [`client`](crate::client) opens a conversation,
+//! [`connection`](crate::connection) serves it. The size of received data is limited before it is
+//! stored.
 
 use std::io::{self, Cursor};
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -25,26 +27,26 @@ use opcua::types::{
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 use tracing::subscriber::NoSubscriber;
 
-/// Why a conversation ends.
+/// The reason for the end of a conversation.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum WireFault {
-    /// The connection broke off.
+    /// The connection was lost.
     #[error("the connection broke off: {0}")]
     Io(#[from] io::Error),
     /// The peer closed it.
     #[error("the connection was closed")]
     Closed,
-    /// What came is none of the protocol, or too much.
+    /// Received data violates the protocol or a limit.
     #[error("{what} ({status})")]
     Bad {
-        /// What to tell the peer.
+        /// The status code for the peer.
         status: StatusCode,
         what: &'static str,
     },
-    /// The peer told of an error and closes.
+    /// The peer sent an Error message and closes.
     #[error("the peer says {0}")]
     Told(StatusCode),
-    /// What came was a message that cannot be read; the channel stays as it is.
+    /// A message cannot be decoded; the channel stays open.
     #[error("the message cannot be read: {status}")]
     Unreadable {
         status: StatusCode,
@@ -62,7 +64,7 @@ impl WireFault {
         Self::bad(error.status(), what)
     }
 
-    /// To tell the peer in an ERR message, where there is a peer to tell.
+    /// Returns the status code for an Error message, if the peer is still connected.
     pub(crate) fn status(&self) -> Option<StatusCode> {
         match self {
             Self::Io(_) | Self::Closed | Self::Told(_) => None,
@@ -71,7 +73,7 @@ impl WireFault {
     }
 }
 
-/// The first three letters of a frame.
+/// The MessageType: the first three letters of a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Kind {
     Hello,
@@ -86,27 +88,27 @@ pub(crate) enum Kind {
 #[derive(Debug)]
 pub(crate) struct Frame {
     pub(crate) kind: Kind,
-    /// `F`, `C` or `A`.
+    /// The chunk type: `F`, `C` or `A`.
     last: u8,
     pub(crate) bytes: Bytes,
 }
 
-/// A message and what came with it.
+/// A message and its headers.
 #[derive(Debug)]
 pub(crate) struct Received<M> {
     pub(crate) message: M,
     pub(crate) request_id: u32,
-    /// Of a message that opens the channel, or renews it.
+    /// The security header of an OpenSecureChannel message.
     pub(crate) opening: Option<AsymmetricSecurityHeader>,
 }
 
-/// One connection.
+/// A connection with its channel.
 pub(crate) struct Conversation<S> {
     stream: S,
     pub(crate) channel: SecureChannel,
     sent: SequenceNumberHandle,
     heard: SequenceNumberHandle,
-    /// The largest chunk and message the peer takes.
+    /// The largest chunk and message that the peer accepts.
     most: (usize, usize),
 }
 
@@ -121,7 +123,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Conversation<S> {
         }
     }
 
-    /// What the peer takes, of its HEL or ACK; 0 for any.
+    /// Sets the limits of the peer from its Hello or Acknowledge; 0 for no limit.
     pub(crate) fn limit(&mut self, chunk: u32, message: u32) {
         let size = |size: u32| usize::try_from(size).unwrap_or(usize::MAX);
         self.most.0 = size(chunk).clamp(MIN_CHUNK_SIZE, MOST_CHUNK);
@@ -130,7 +132,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Conversation<S> {
         }
     }
 
-    /// The next frame.
+    /// Receives the next frame.
     pub(crate) async fn frame(&mut self) -> Result<Frame, WireFault> {
         let mut header = [0; HEADER];
         match self.stream.read_exact(&mut header).await {
@@ -177,7 +179,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Conversation<S> {
         Ok(Frame { kind, last, bytes })
     }
 
-    /// The frame as HEL or ACK; of an ERR what it tells.
+    /// Receives Hello or Acknowledge; an Error message becomes an error.
     pub(crate) async fn greeting<T: SimpleBinaryDecodable>(
         &mut self,
         kind: Kind,
@@ -196,7 +198,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Conversation<S> {
             .map_err(|error| WireFault::of(&error, "a greeting that cannot be read"))
     }
 
-    /// Sends HEL, ACK or ERR.
+    /// Sends Hello, Acknowledge or Error.
     pub(crate) async fn greet(
         &mut self,
         greeting: &impl SimpleBinaryEncodable,
@@ -208,22 +210,23 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Conversation<S> {
         Ok(())
     }
 
-    /// Waits until the peer closes, or says something. What it says is lost: for whom it is the end in any case. Whoever
-    /// drops it before loses nothing.
+    /// Waits until the peer closes the connection or sends a byte. The byte is lost, because the
+    /// caller closes the connection in either case. Cancel safe.
     pub(crate) async fn stirred(&mut self) {
         let mut byte = [0];
-        // An error is an end, too.
+        // An error counts as an end too.
         let _ended = self.stream.read(&mut byte).await.is_err();
     }
 
-    /// Tells the peer why the conversation ends.
+    /// Sends an Error message, and closes the connection.
     pub(crate) async fn tell(&mut self, status: StatusCode, why: &str) {
-        // Most likely it is gone.
+        // The peer has probably disconnected.
         drop(self.greet(&ErrorMessage::new(status, why)).await);
         drop(self.stream.shutdown().await);
     }
 
-    /// The next message. `admit` decides on the one that opens the channel before anything of it is decrypted.
+    /// Receives the next message. `admit` decides on an OpenSecureChannel message before it is
+    /// decrypted.
     pub(crate) async fn receive<M: Message>(
         &mut self,
         admit: impl Fn(&AsymmetricSecurityHeader) -> Result<(), StatusCode>,
@@ -277,7 +280,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Conversation<S> {
         }
     }
 
-    /// Sends a message in as many chunks as it takes.
+    /// Sends a message in as many chunks as necessary.
     pub(crate) async fn send<M: Message>(
         &mut self,
         request_id: u32,
@@ -308,7 +311,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Conversation<S> {
         Ok(())
     }
 
-    /// Whether whoever renews the channel is who opened it: nobody takes its security away.
+    /// Checks that a renewal has the sender and the security policy of the open channel, so that
+    /// its security cannot be removed.
     fn check_renewal(&self, header: &AsymmetricSecurityHeader) -> Result<(), WireFault> {
         let channel = &self.channel;
         if channel.secure_channel_id() == 0 || channel.is_client_role() {
@@ -328,7 +332,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Conversation<S> {
         }
     }
 
-    /// Whether a chunk belongs to the channel that is open.
+    /// Checks that a chunk belongs to the open channel.
     fn check_channel(&self, frame: &[u8]) -> Result<(), WireFault> {
         let number = |at: usize| {
             let bytes = frame
@@ -343,7 +347,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Conversation<S> {
                 "no channel of this connection",
             ));
         }
-        // The one before is good until a message comes with the new one (OPC 10000-4, 5.5.2).
+        // The previous token is valid until a message uses the new token (OPC 10000-4, 5.5.2).
         let token = self.channel.token_id();
         match number(MESSAGE_CHUNK_HEADER_SIZE) {
             Some(its) if its == token || its.checked_add(1) == Some(token) => Ok(()),
@@ -354,7 +358,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Conversation<S> {
         }
     }
 
-    /// The chunk as it was before it was signed and encrypted.
+    /// Verifies and decrypts a chunk.
     fn unsecured(&mut self, frame: Bytes) -> Result<MessageChunk, WireFault> {
         let channel = &mut self.channel;
         let signed = match channel.security_mode() {
@@ -367,7 +371,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Conversation<S> {
                 "a chunk without its signature",
             ));
         }
-        // The crate's arithmetic on what a peer encrypted has not been held against every length.
+        // The library may panic on encrypted chunks of unusual length.
         let verified = catch_unwind(AssertUnwindSafe(|| match channel.is_client_role() {
             true => channel.verify_and_remove_security(frame),
             false => channel.verify_and_remove_security_server(frame),
@@ -418,18 +422,19 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Conversation<S> {
     }
 }
 
-/// A channel that is not open yet.
+/// Creates a channel that is not open.
 fn channel(role: Role) -> SecureChannel {
-    // The crate would look for a certificate of ours there; whoever has one sets it.
+    // The library expects a certificate store here; a caller with a certificate sets it on the
+    // channel.
     let store = Arc::new(RwLock::new(CertificateStore::new(Path::new("/dev/null"))));
     let context = ContextOwned::new_default(NamespaceMap::new(), options());
-    // It has an error logged that there is none.
+    // The library logs an error if the own certificate is missing.
     tracing::subscriber::with_default(NoSubscriber::default(), || {
         SecureChannel::new(store, role, Arc::new(RwLock::new(context)))
     })
 }
 
-/// The header that names policy and certificate of a channel to be opened.
+/// Decodes the header with the security policy and the certificate of an OpenSecureChannel message.
 fn opening(frame: &[u8]) -> Result<AsymmetricSecurityHeader, WireFault> {
     let rest = frame.get(MESSAGE_CHUNK_HEADER_SIZE..).unwrap_or_default();
     let header = AsymmetricSecurityHeader::decode(&mut Cursor::new(rest), &options());
@@ -445,7 +450,7 @@ fn told(frame: &Frame) -> WireFault {
     WireFault::Told(message.map_or(StatusCode::BadUnknownResponse, |message| message.error))
 }
 
-/// The policy of the standard's name; `None` for one we do not speak.
+/// Returns the security policy of a header; `None` if it is not supported.
 pub(crate) fn policy(header: &AsymmetricSecurityHeader) -> Option<SecurityPolicy> {
     let policy = SecurityPolicy::from_uri(header.security_policy_uri.as_ref());
     matches!(
@@ -468,12 +473,12 @@ fn options() -> DecodingOptions {
 }
 
 const HEADER: usize = 8;
-/// Headers and the signature of a chunk.
+/// The size of the headers and the signature of a chunk.
 const SIGNED: usize = 12 + 4 + 8 + 32;
-/// The largest chunk that is taken and sent.
+/// The largest chunk that is received or sent.
 pub(crate) const MOST_CHUNK: usize = 65_536;
 pub(crate) const MOST_CHUNKS: usize = 64;
-/// The largest message that is taken.
+/// The largest message that is received.
 pub(crate) const MOST_HEARD: usize = 2 << 20;
-/// The largest message that is sent: a list of a thousand servers has room in it.
+/// The largest message that is sent, enough for a list of a thousand servers.
 const MOST_SENT: usize = 4 << 20;
