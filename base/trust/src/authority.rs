@@ -1,4 +1,5 @@
-//! A small authority: its own certificate and key, and what it signs.
+//! A certificate authority: its own certificate and key, and the certificates and lists that it
+//! signs.
 
 use std::fmt;
 use std::time::Duration;
@@ -32,7 +33,7 @@ use crate::certificate::{
 use crate::crl::{Crl, Revoked};
 use crate::request::{Request, alternatives};
 
-/// One that issues certificates to applications.
+/// An authority that issues certificates to applications.
 pub struct Authority {
     certificate: Certificate,
     signer: SigningKey<Sha256>,
@@ -46,22 +47,23 @@ impl fmt::Debug for Authority {
     }
 }
 
-/// What a certificate is to have besides what is asked for.
+/// The parameters of a certificate in addition to the request.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Issue {
-    /// Its number.
+    /// The serial number.
     pub serial: Serial,
-    /// The first moment of its validity.
+    /// The start of the validity.
     pub from: Duration,
-    /// The last.
+    /// The end of the validity.
     pub until: Duration,
 }
 
 impl Authority {
-    /// Makes one that nobody stands above, with a private key in the DER of PKCS #8.
+    /// Creates a self-signed root authority, with a private key in the DER of PKCS #8.
     ///
     /// # Errors
-    /// A key that is none, or a name that a certificate cannot have.
+    ///
+    /// Returns an error for an invalid key or an invalid name.
     pub fn make(
         key: &[u8],
         (name, organization): (&str, &str),
@@ -74,7 +76,7 @@ impl Authority {
         let mut builder = builder(&signer, issue, (subject.clone(), subject), public.clone())?;
         let id = key_id(public.subject_public_key.raw_bytes());
         add(&mut builder, &SubjectKeyIdentifier(octets(&id)?))?;
-        // It is to stand directly above applications.
+        // The authority issues certificates to applications only.
         let constraints = BasicConstraints {
             ca: true,
             path_len_constraint: Some(0),
@@ -89,10 +91,12 @@ impl Authority {
         })
     }
 
-    /// One that is there already: its certificate, and its private key in the DER of PKCS #8.
+    /// Opens an existing authority: its certificate, and its private key in the DER of PKCS #8.
     ///
     /// # Errors
-    /// A key that is none or another's, or a certificate that is none of an authority.
+    ///
+    /// Returns an error for an invalid or foreign key, or if the certificate does not belong to an
+    /// authority.
     pub fn open(certificate: Certificate, key: &[u8]) -> Result<Self, Unfit> {
         let signer = signer(key)?;
         let public: RsaPublicKey = signer.verifying_key().into();
@@ -105,16 +109,18 @@ impl Authority {
         })
     }
 
-    /// Its certificate.
+    /// Returns its certificate.
     #[must_use]
     pub const fn certificate(&self) -> &Certificate {
         &self.certificate
     }
 
-    /// Issues what a request asks for. It ends no later than the authority does.
+    /// Issues the certificate for a request. Its validity ends with the validity of the authority
+    /// at the latest.
     ///
     /// # Errors
-    /// Names or times that a certificate cannot have.
+    ///
+    /// Returns an error for invalid names or times.
     pub fn issue(&self, request: &Request, issue: &Issue) -> Result<Certificate, Unfit> {
         let (_, last) = self.certificate.validity();
         let issue = Issue {
@@ -132,7 +138,7 @@ impl Authority {
             path_len_constraint: None,
         };
         add(&mut builder, &constraints)?;
-        // OPC 10000-6, 6.2.2.
+        // The usages of OPC 10000-6, 6.2.2.
         let usages = KeyUsages::DigitalSignature
             | KeyUsages::NonRepudiation
             | KeyUsages::KeyEncipherment
@@ -150,10 +156,11 @@ impl Authority {
         Certificate::of(made)
     }
 
-    /// Signs the list of those that are revoked, the `number`th, to be relied on until `until`.
+    /// Signs the revocation list with this number, which is valid until `until`.
     ///
     /// # Errors
-    /// Times that a list cannot have.
+    ///
+    /// Returns an error for invalid times.
     pub fn crl(
         &self,
         revoked: &[Revoked],
@@ -183,7 +190,7 @@ impl Authority {
             issuer: issuer.clone(),
             this_update: time(from)?,
             next_update: Some(time(until)?),
-            // An empty list is left out (RFC 5280, 5.1.2.6).
+            // An empty list is omitted (RFC 5280, 5.1.2.6).
             revoked_certificates: Some(all).filter(|all| !all.is_empty()),
             crl_extensions: Some(extensions.map_err(|_| Unfit::Name)?),
         };
@@ -250,7 +257,8 @@ fn octets(bytes: &[u8]) -> Result<OctetString, Unfit> {
     OctetString::new(bytes).map_err(|_| Unfit::Name)
 }
 
-/// Until 2049 as UTCTime, later as GeneralizedTime (RFC 5280, 4.1.2.5). In whole seconds.
+/// Encodes a time in whole seconds: until 2049 as UTCTime, later as GeneralizedTime (RFC 5280,
+/// 4.1.2.5).
 fn time(since_1970: Duration) -> Result<Time, Unfit> {
     let whole = Duration::from_secs(since_1970.as_secs());
     let short = UtcTime::from_unix_duration(whole).map(Time::UtcTime);

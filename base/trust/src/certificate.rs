@@ -1,4 +1,4 @@
-//! A certificate, and what it says.
+//! X.509 certificates and their fields.
 
 use std::fmt;
 use std::time::Duration;
@@ -19,26 +19,26 @@ use x509_cert::spki::AlgorithmIdentifierOwned;
 
 use crate::{Fingerprint, Unfit};
 
-/// The number that an authority has given a certificate: unlike those of all others of that authority.
+/// The serial number of a certificate, unique for its authority.
 #[derive(Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Serial(Vec<u8>);
 
 impl Serial {
-    /// One of 16 bytes that are random: positive, and never zero.
+    /// Creates a positive serial number from 16 random bytes.
     #[must_use]
     pub fn random(mut bytes: [u8; 16]) -> Self {
         bytes[0] = (bytes[0] & 0x7f) | 0x40;
         Self(bytes.to_vec())
     }
 
-    /// From big-endian bytes.
+    /// Creates a serial number from big-endian bytes.
     #[must_use]
     pub fn of(bytes: &[u8]) -> Self {
         let zeros = bytes.iter().take_while(|byte| **byte == 0).count();
         Self(bytes.get(zeros..).unwrap_or_default().to_vec())
     }
 
-    /// From hexadecimal digits, as [`fmt::Display`] has them.
+    /// Parses hexadecimal digits, in the format of [`fmt::Display`].
     #[must_use]
     pub fn parse(digits: &str) -> Option<Self> {
         if digits.is_empty() || !digits.len().is_multiple_of(2) || digits.len() > 40 {
@@ -68,7 +68,7 @@ impl fmt::Debug for Serial {
     }
 }
 
-/// A certificate of X.509. Equal to one of the same bytes.
+/// An X.509 certificate. Certificates with the same bytes are equal.
 #[derive(Clone)]
 pub struct Certificate {
     pub(crate) inner: x509_cert::Certificate,
@@ -90,10 +90,11 @@ impl fmt::Debug for Certificate {
 }
 
 impl Certificate {
-    /// Reads one in DER, or in PEM.
+    /// Reads a certificate in DER or PEM.
     ///
     /// # Errors
-    /// It is neither.
+    ///
+    /// Returns an error if the bytes are neither.
     pub fn read(bytes: &[u8]) -> Result<Self, Unfit> {
         let inner = if bytes.starts_with(b"-----BEGIN") {
             x509_cert::Certificate::from_pem(bytes)
@@ -103,10 +104,12 @@ impl Certificate {
         Self::of(inner.map_err(|_| Unfit::Unreadable)?)
     }
 
-    /// Reads those of a chain in DER, one behind the other (OPC 10000-6, 6.2.6): the certificate itself, and those of issuers.
+    /// Reads a certificate chain in DER, with the certificates concatenated (OPC 10000-6, 6.2.6):
+    /// the certificate itself, then its issuer certificates.
     ///
     /// # Errors
-    /// There is none, or something else is between or behind them.
+    ///
+    /// Returns an error if the chain is empty or contains other data.
     pub fn read_chain(bytes: &[u8]) -> Result<(Self, Vec<Self>), Unfit> {
         let mut rest = bytes;
         let mut all = Vec::new();
@@ -128,7 +131,7 @@ impl Certificate {
         Ok(Self { inner, der })
     }
 
-    /// Its DER.
+    /// Returns the DER encoding.
     #[must_use]
     pub fn der(&self) -> &[u8] {
         &self.der
@@ -146,41 +149,43 @@ impl Certificate {
         Fingerprint::of_key(&self.inner.tbs_certificate.subject_public_key_info)
     }
 
-    /// Its PEM.
+    /// Returns the PEM encoding.
     #[must_use]
     pub fn pem(&self) -> String {
-        // What was read is written again.
+        // A certificate that was decoded can be encoded.
         self.inner
             .to_pem(x509_cert::der::pem::LineEnding::LF)
             .unwrap_or_default()
     }
 
-    /// The number its issuer gave it.
+    /// Returns the serial number.
     #[must_use]
     pub fn serial(&self) -> Serial {
         Serial::of(self.inner.tbs_certificate.serial_number.as_bytes())
     }
 
-    /// The common name of its subject, which whoever asked for it chose; empty without one.
+    /// Returns the common name of its subject; empty without a common name. The requester of the
+    /// certificate chose it freely.
     #[must_use]
     pub fn name(&self) -> String {
         common_name(&self.inner.tbs_certificate.subject)
     }
 
-    /// The common name of its issuer.
+    /// Returns the common name of its issuer.
     #[must_use]
     pub fn issuer_name(&self) -> String {
         common_name(&self.inner.tbs_certificate.issuer)
     }
 
-    /// The ApplicationUri: the one URI among its alternative names (OPC 10000-6, 6.2.2).
+    /// Returns the ApplicationUri: the first URI of its subject alternative names (OPC 10000-6,
+    /// 6.2.2).
     #[must_use]
     pub fn application_uri(&self) -> Option<String> {
         let (uri, _) = alternative(&self.names()?);
         uri
     }
 
-    /// The hosts among its alternative names: names of DNS, and addresses.
+    /// Returns the hosts of its subject alternative names: DNS names and IP addresses.
     #[must_use]
     pub fn hosts(&self) -> Vec<String> {
         self.names()
@@ -188,11 +193,12 @@ impl Certificate {
             .unwrap_or_default()
     }
 
-    /// Whether it says that its application is reached at that host: by a name of DNS, whatever its case, or an address.
+    /// Returns whether the certificate names this host: a DNS name, ignoring case, or an IP
+    /// address.
     #[must_use]
     pub fn is_for_host(&self, host: &str) -> bool {
         let host = host.trim_matches(['[', ']']).trim_end_matches('.');
-        // An address may be written in several ways.
+        // An IP address has several notations.
         let address = host.parse::<std::net::IpAddr>();
         let host = address.map_or_else(|_| host.to_owned(), |address| address.to_string());
         self.hosts()
@@ -200,7 +206,7 @@ impl Certificate {
             .any(|one| one.eq_ignore_ascii_case(&host))
     }
 
-    /// The first moment and the last of its validity.
+    /// Returns the start and the end of its validity.
     #[must_use]
     pub fn validity(&self) -> (Duration, Duration) {
         let validity = &self.inner.tbs_certificate.validity;
@@ -210,50 +216,50 @@ impl Certificate {
         )
     }
 
-    /// Whether it is valid at that time.
+    /// Returns whether it is valid at this time.
     #[must_use]
     pub fn is_valid_at(&self, now: Duration) -> bool {
         let (from, until) = self.validity();
         (from..=until).contains(&now)
     }
 
-    /// Whether it is one of an authority: it may have issued others.
+    /// Returns whether it belongs to an authority, which may issue certificates.
     #[must_use]
     pub fn is_authority(&self) -> bool {
         self.constraints().is_some_and(|one| one.ca)
     }
 
-    /// Whether it was issued by itself.
+    /// Returns whether it is self-signed.
     #[must_use]
     pub fn is_self_signed(&self) -> bool {
         self.is_named_issuer_of(self) && self.has_signed(self)
     }
 
-    /// Bits of its key; `None` where that is not of RSA.
+    /// Returns the bits of its RSA key; `None` for other keys.
     #[must_use]
     pub fn key_bits(&self) -> Option<usize> {
         Some(self.public_key()?.size() * 8)
     }
 
-    /// Whether both have the same key.
+    /// Returns whether it has this public key.
     #[must_use]
     pub fn has_key_of(&self, key: &RsaPublicKey) -> bool {
         self.public_key().is_some_and(|own| own == *key)
     }
 
-    /// Whether it is of that private key, in the DER of PKCS #8.
+    /// Returns whether it belongs to this private key, in the DER of PKCS #8.
     #[must_use]
     pub fn is_of_private_key(&self, key: &[u8]) -> bool {
         let key = RsaPrivateKey::from_pkcs8_der(key);
         key.is_ok_and(|key| self.has_key_of(&key.to_public_key()))
     }
 
-    /// The names of issuer and subject agree.
+    /// Returns whether its subject is the issuer of `other`.
     pub(crate) fn is_named_issuer_of(&self, other: &Self) -> bool {
         self.inner.tbs_certificate.subject == other.inner.tbs_certificate.issuer
     }
 
-    /// Whether the signature of `other` is of this one's key.
+    /// Returns whether its key signed `other`.
     pub(crate) fn has_signed(&self, other: &Self) -> bool {
         let Ok(signed) = other.inner.tbs_certificate.to_der() else {
             return false;
@@ -265,7 +271,7 @@ impl Certificate {
         )
     }
 
-    /// Whether a signature is of this one's key.
+    /// Returns whether its key made a signature.
     pub(crate) fn verify(
         &self,
         signed: &[u8],
@@ -292,12 +298,13 @@ impl Certificate {
         )
     }
 
-    /// `None` where it does not say.
+    /// Returns the key usage; `None` without this extension.
     pub(crate) fn usage(&self) -> Option<KeyUsage> {
         Some(self.inner.tbs_certificate.get::<KeyUsage>().ok()??.1)
     }
 
-    /// Whether it may be that of an application: where it says whom it is for, that is a client or a server.
+    /// Returns whether it may belong to an application: the extended key usage, if present, permits
+    /// clients or servers.
     pub(crate) fn is_for_applications(&self) -> bool {
         match self.inner.tbs_certificate.get::<ExtendedKeyUsage>() {
             Ok(None) => true,
@@ -308,7 +315,7 @@ impl Certificate {
         }
     }
 
-    /// Whether its signature is of a kind that nobody forges.
+    /// Returns whether its signature algorithm is secure.
     pub(crate) fn has_strong_signature(&self) -> bool {
         [SHA256, SHA384, SHA512].contains(&self.inner.signature_algorithm.oid)
     }
@@ -318,7 +325,7 @@ impl Certificate {
     }
 }
 
-/// Whether a signature is of a key.
+/// Returns whether a key made a signature.
 pub(crate) fn verify(
     key: RsaPublicKey,
     signed: &[u8],
@@ -345,7 +352,7 @@ pub(crate) fn verify(
     }
 }
 
-/// The ApplicationUri and the hosts among alternative names.
+/// Returns the ApplicationUri and the hosts of subject alternative names.
 pub(crate) fn alternative(names: &SubjectAltName) -> (Option<String>, Vec<String>) {
     let mut uri = None;
     let mut hosts = Vec::new();
@@ -374,18 +381,18 @@ fn address(bytes: &[u8]) -> Option<String> {
     Some(std::net::Ipv6Addr::from(sixteen).to_string())
 }
 
-/// The last common name of a name.
+/// Returns the last common name of a distinguished name.
 pub(crate) fn common_name(name: &Name) -> String {
     let each = name.0.iter().flat_map(|part| part.0.iter());
     let mut named = each.filter(|one| one.oid == COMMON_NAME);
-    // Whatever kind of string it is.
+    // All string types are accepted.
     let text = named
         .next_back()
         .map(|one| String::from_utf8_lossy(one.value.value()).into_owned());
     text.unwrap_or_default()
 }
 
-/// A name of these parts, from the most general one on.
+/// Creates a distinguished name from its parts, the most general part first.
 pub(crate) fn name_of(parts: &[(ObjectIdentifier, &str)]) -> Result<Name, Unfit> {
     let mut all = Vec::new();
     for (oid, text) in parts.iter().filter(|(_, text)| !text.is_empty()) {
@@ -400,13 +407,13 @@ pub(crate) fn name_of(parts: &[(ObjectIdentifier, &str)]) -> Result<Name, Unfit>
     Ok(x509_cert::name::RdnSequence(all))
 }
 
-/// The identifier of a key: 160 bits of its hash (RFC 7093, 2, method 1).
+/// Returns the identifier of a key: the first 160 bits of its hash (RFC 7093, 2, method 1).
 pub(crate) fn key_id(key: &[u8]) -> Vec<u8> {
     let hash = Sha256::digest(key);
     hash.iter().take(20).copied().collect()
 }
 
-/// Bytes of the first element of DER.
+/// Returns the length in bytes of the first DER element.
 fn der_length(bytes: &[u8]) -> Option<usize> {
     let (tag, rest) = bytes.split_first()?;
     let (first, rest) = rest.split_first()?;
@@ -434,7 +441,7 @@ pub(crate) const ORGANIZATION: ObjectIdentifier = ObjectIdentifier::new_unwrap("
 pub(crate) const SERVER_AUTH: ObjectIdentifier = ObjectIdentifier::new_unwrap("1.3.6.1.5.5.7.3.1");
 pub(crate) const CLIENT_AUTH: ObjectIdentifier = ObjectIdentifier::new_unwrap("1.3.6.1.5.5.7.3.2");
 const ANY_USAGE: ObjectIdentifier = ObjectIdentifier::new_unwrap("2.5.29.37.0");
-/// Certificates of a chain.
+/// Most certificates of a chain.
 pub(crate) const LONGEST_CHAIN: usize = 10;
-/// Bytes of a part of a name that other stacks read (RFC 5280, appendix A).
+/// Most bytes of a part of a name that other stacks accept (RFC 5280, appendix A).
 const LONGEST_NAME: usize = 64;

@@ -1,4 +1,4 @@
-//! The check of a certificate that somebody shows (OPC 10000-4, 6.1.3).
+//! The validation of certificates (OPC 10000-4, 6.1.3).
 
 use std::time::Duration;
 
@@ -6,19 +6,21 @@ use crate::KEY_BITS;
 use crate::certificate::{Certificate, LONGEST_CHAIN};
 use crate::crl::Crl;
 
-/// What is known of certificates: whom one trusts, who may stand between, and what is revoked.
+/// The trust anchors: trusted certificates, issuer certificates and revocation lists.
 #[derive(Debug, Clone, Default)]
 pub struct Known {
-    /// Those that are trusted: of applications, and of authorities, with all that these have issued.
+    /// Trusted certificates: of applications, and of authorities together with all certificates
+    /// that they issue.
     pub trusted: Vec<Certificate>,
-    /// Authorities that are not trusted themselves, and are needed to reach one that is.
+    /// Issuer certificates, which are not trusted themselves and complete the chain to a trusted
+    /// certificate.
     pub issuers: Vec<Certificate>,
-    /// Revocation lists of any of these.
+    /// The revocation lists of these authorities.
     pub crls: Vec<Crl>,
 }
 
 impl Known {
-    /// Whether an authority is among those that are trusted.
+    /// Returns whether an authority is trusted.
     #[must_use]
     pub fn trusts_authorities(&self) -> bool {
         self.trusted.iter().any(Certificate::is_authority)
@@ -29,57 +31,58 @@ impl Known {
     }
 }
 
-/// Why a certificate is refused, in the order in which it is looked at. Those up to [`Fault::Untrusted`] are nothing that a stranger is told.
+/// The fault of a certificate, in the order of the checks. The faults up to [`Fault::Untrusted`]
+/// must not be revealed to an untrusted peer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, thiserror::Error)]
 pub enum Fault {
-    /// It cannot be read, or its key or signature cannot be used.
+    /// The certificate cannot be decoded, or its key or signature is invalid.
     #[error("the certificate is damaged, or its signature is not of the authority that it names")]
     Invalid,
-    /// The authority that issued it, or one above that, is not known.
+    /// An authority of the chain is missing.
     #[error("an authority above the certificate is not known")]
     Incomplete,
-    /// The key is too short or too long, or the signature is of a kind that can be forged.
+    /// The key is too short or too long, or the signature algorithm is insecure.
     #[error(
         "the key is shorter than 2048 bits or longer than 4096, or the signature is older than SHA-256"
     )]
     Policy,
-    /// Neither it nor an authority above it is trusted.
+    /// Neither the certificate nor an authority of its chain is trusted.
     #[error("neither the certificate nor an authority above it is trusted")]
     Untrusted,
-    /// It is not valid now.
+    /// The certificate is not valid at the moment.
     #[error("the certificate is not valid now")]
     Time,
-    /// An authority above it is not valid now.
+    /// The certificate of an authority of its chain is not valid at the moment.
     #[error("the certificate of the authority is not valid now")]
     IssuerTime,
-    /// It is not for the host that the server is reached at.
+    /// The certificate does not name the host of the server.
     #[error("the certificate is for other hosts than the one that the server is reached at")]
     Host,
-    /// It names another application than the one it is shown for.
+    /// The certificate names another ApplicationUri.
     #[error("the certificate is of another ApplicationUri")]
     Uri,
-    /// It is for something else than OPC UA applications.
+    /// The key usage does not permit OPC UA applications.
     #[error("the certificate is for another use")]
     Use,
-    /// What issued it may not issue certificates.
+    /// An issuer of its chain may not issue certificates.
     #[error("what issued the certificate is no authority")]
     IssuerUse,
-    /// There is no revocation list of its authority that is up to date.
+    /// A current revocation list of its authority is missing.
     #[error("there is no revocation list of the authority that is up to date")]
     RevocationUnknown,
-    /// The same, of an authority above it.
+    /// A current revocation list of a higher authority is missing.
     #[error("there is no revocation list of the authority above the authority that is up to date")]
     IssuerRevocationUnknown,
-    /// It is revoked.
+    /// The certificate is revoked.
     #[error("the certificate is revoked")]
     Revoked,
-    /// An authority above it is revoked.
+    /// An authority of its chain is revoked.
     #[error("the authority is revoked")]
     IssuerRevoked,
 }
 
 impl Fault {
-    /// The StatusCode of OPC UA (OPC 10000-4, table of 6.1.3).
+    /// Returns the OPC UA StatusCode (OPC 10000-4, table of 6.1.3).
     #[must_use]
     pub const fn status(self) -> u32 {
         match self {
@@ -100,28 +103,31 @@ impl Fault {
         }
     }
 
-    /// Whether who shows the certificate may be told what is wrong with it: only one that is trusted otherwise.
+    /// Returns whether the peer may learn the fault: only if the certificate is trusted otherwise.
     #[must_use]
     pub fn may_be_told(self) -> bool {
         self > Self::Untrusted
     }
 }
 
-/// What a certificate has to say of who shows it, where that is known.
+/// The names that a certificate must contain, if known.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Names<'n> {
-    /// The host of the URL that a server is reached at: a name, or an address.
+    /// The host of the server's URL: a DNS name or an IP address.
     pub host: Option<&'n str>,
-    /// The ApplicationUri that it says it has.
+    /// The ApplicationUri that the peer claims.
     pub application_uri: Option<&'n str>,
 }
 
-/// Judges the certificate of an application at that time, with the certificates `sent` along.
+/// Validates the certificate of an application at a point in time. `sent` are the issuer
+/// certificates that the peer sent.
 ///
-/// One that is trusted itself needs no authority that is known; where its authority is known, it counts whether that has revoked it.
+/// The authority of a certificate that is trusted itself may be unknown. If its authority is known,
+/// revocations apply.
 ///
 /// # Errors
-/// The first thing that is wrong with it.
+///
+/// Returns the first fault.
 pub fn check(
     certificate: &Certificate,
     sent: &[Certificate],
@@ -131,10 +137,12 @@ pub fn check(
     check_named(certificate, sent, known, (Names::default(), now))
 }
 
-/// The same of a certificate that is to have these names, as that of a server that a client connects to.
+/// Validates a certificate that must contain these names, such as the certificate of a server that
+/// a client connects to.
 ///
 /// # Errors
-/// The first thing that is wrong with it.
+///
+/// Returns the first fault.
 pub fn check_named(
     certificate: &Certificate,
     sent: &[Certificate],
@@ -172,7 +180,7 @@ pub fn check_named(
     revoked(&chain, known, now)
 }
 
-/// The certificate and those above it, up to one that nobody is above.
+/// Returns the certificate and its issuers up to a self-signed certificate.
 fn chain<'c>(
     certificate: &'c Certificate,
     sent: &'c [Certificate],
@@ -188,7 +196,7 @@ fn chain<'c>(
         let is_named = named.peek().is_some();
         let Some(issuer) = named.find(|one| one.has_signed(last)) else {
             return match () {
-                // Somebody has decided on this very one.
+                // This very certificate is explicitly trusted.
                 () if chain.len() == 1 && known.is_trusted(certificate) && !is_named => Ok(chain),
                 () if is_named => Err(Fault::Invalid),
                 () => Err(Fault::Incomplete),
@@ -203,7 +211,7 @@ fn chain<'c>(
     Ok(chain)
 }
 
-/// Whether each is used for what it is for.
+/// Checks the key usages of the chain.
 fn used(certificate: &Certificate, issuers: &[&Certificate]) -> Result<(), Fault> {
     let signs = certificate
         .usage()
@@ -227,7 +235,8 @@ fn used(certificate: &Certificate, issuers: &[&Certificate]) -> Result<(), Fault
     Ok(())
 }
 
-/// Whether a list of each authority is there, and none has the one below it.
+/// Checks that each authority has a current revocation list, and that no certificate of the chain
+/// is revoked.
 fn revoked(chain: &[&Certificate], known: &Known, now: Duration) -> Result<(), Fault> {
     let mut unknown = None;
     for (place, pair) in chain.windows(2).enumerate() {
@@ -241,7 +250,7 @@ fn revoked(chain: &[&Certificate], known: &Known, now: Duration) -> Result<(), F
             .iter()
             .filter(|crl| crl.is_of(authority))
             .collect();
-        // What was revoked once stays so, also by a list that is out of date.
+        // Revocations in an outdated list stay effective.
         if of_it.iter().any(|crl| crl.revokes(below)) {
             return Err(revoked);
         }

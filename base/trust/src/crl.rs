@@ -1,4 +1,4 @@
-//! The list of certificates that an authority has revoked.
+//! Certificate revocation lists.
 
 use std::time::Duration;
 
@@ -8,12 +8,12 @@ use x509_cert::der::{Decode as _, Encode as _, pem};
 use crate::Unfit;
 use crate::certificate::{Certificate, Serial, common_name};
 
-/// A certificate that is revoked.
+/// A revoked certificate.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Revoked {
-    /// Its number.
+    /// The serial number.
     pub serial: Serial,
-    /// Since when.
+    /// The time of the revocation.
     pub since: Duration,
 }
 
@@ -25,10 +25,11 @@ pub struct Crl {
 }
 
 impl Crl {
-    /// Reads one in DER, or in PEM. Whose it is, is not looked at.
+    /// Reads a list in DER or PEM. Does not check its issuer.
     ///
     /// # Errors
-    /// It is neither.
+    ///
+    /// Returns an error if the bytes are neither.
     pub fn read(bytes: &[u8]) -> Result<Self, Unfit> {
         let inner = if bytes.starts_with(b"-----BEGIN") {
             let (_, der) = pem::decode_vec(bytes).map_err(|_| Unfit::Unreadable)?;
@@ -44,19 +45,19 @@ impl Crl {
         Ok(Self { inner, der })
     }
 
-    /// Its DER.
+    /// Returns the DER encoding.
     #[must_use]
     pub fn der(&self) -> &[u8] {
         &self.der
     }
 
-    /// The common name of its authority.
+    /// Returns the common name of its authority.
     #[must_use]
     pub fn issuer_name(&self) -> String {
         common_name(&self.inner.tbs_cert_list.issuer)
     }
 
-    /// When it was made, and when the next one is to be there at the latest, where it says so.
+    /// Returns the time of its creation, and the latest time of its next update, if present.
     #[must_use]
     pub fn times(&self) -> (Duration, Option<Duration>) {
         let list = &self.inner.tbs_cert_list;
@@ -66,7 +67,7 @@ impl Crl {
         (list.this_update.to_unix_duration(), next)
     }
 
-    /// Those that it has.
+    /// Returns the revoked certificates.
     pub fn revoked(&self) -> impl Iterator<Item = Revoked> + '_ {
         let all = self
             .inner
@@ -80,7 +81,7 @@ impl Crl {
         })
     }
 
-    /// Whether that authority made and signed it.
+    /// Returns whether this authority issued and signed the list.
     #[must_use]
     pub fn is_of(&self, authority: &Certificate) -> bool {
         let list = &self.inner.tbs_cert_list;
@@ -97,14 +98,15 @@ impl Crl {
         )
     }
 
-    /// Whether it can be relied on at that time. A list whose successor is overdue may miss the latest revocations.
+    /// Returns whether the list is current at this time. A list whose successor is overdue may lack
+    /// recent revocations.
     #[must_use]
     pub fn is_current(&self, now: Duration) -> bool {
         let (from, next) = self.times();
         from <= now && next.is_none_or(|next| now <= next)
     }
 
-    /// Whether it has that certificate, which is of the same authority.
+    /// Returns whether the list contains a certificate of its authority.
     #[must_use]
     pub fn revokes(&self, certificate: &Certificate) -> bool {
         let serial = certificate.serial();

@@ -1,4 +1,4 @@
-//! SHA-256 of a certificate, a key or a secret.
+//! SHA-256 fingerprints of certificates, keys and secrets.
 
 use std::fmt;
 use std::str::FromStr;
@@ -7,8 +7,8 @@ use rsa::sha2::{Digest as _, Sha256};
 use x509_cert::der::Encode as _;
 use x509_cert::spki::SubjectPublicKeyInfoOwned;
 
-/// A SHA-256, written as 64 hexadecimal digits. Colons between the digits, as `openssl x509 -fingerprint` prints them, are
-/// read too.
+/// A SHA-256 digest, formatted as 64 hexadecimal digits. Parsing also accepts colons between the
+/// digits, in the format of `openssl x509 -fingerprint`.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Fingerprint([u8; 32]);
 
@@ -20,11 +20,11 @@ impl Fingerprint {
     }
 
     pub(crate) fn of_key(key: &SubjectPublicKeyInfoOwned) -> Self {
-        // A key that was read is written again.
+        // A key that was decoded can be encoded.
         Self::of(&key.to_der().unwrap_or_default())
     }
 
-    /// Compares without a hint, by the time it takes, at the first byte that differs.
+    /// Compares with the digest of a secret, in constant time.
     #[must_use]
     pub fn is_of_secret(&self, secret: &[u8]) -> bool {
         let other = Self::of(secret);
@@ -45,7 +45,7 @@ impl fmt::Debug for Fingerprint {
     }
 }
 
-/// A text that is not a SHA-256.
+/// The text is not a SHA-256 digest.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("a SHA-256 has 64 hexadecimal digits")]
 pub struct NoFingerprint;

@@ -1,38 +1,38 @@
-//! When a certificate is to be asked for anew.
+//! The schedule for the renewal of a certificate.
 
 use std::time::Duration;
 
 use crate::certificate::Certificate;
 
-/// What is to be done about a certificate now.
+/// The next step of a renewal.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Step {
-    /// Nothing before that time.
+    /// Wait until a later time.
     Wait {
-        /// When to look again.
+        /// The time of the next check.
         until: Duration,
     },
-    /// A new one is to be asked for now.
+    /// Request a new certificate.
     Ask,
-    /// The same, and it is over already: others refuse it.
+    /// Request a new certificate; the present certificate has expired, and peers refuse it.
     Late,
 }
 
-/// The plan for the renewal of a certificate: when four fifths of its life are over, or at once if the application has made it
-/// itself. A failed renewal is repeated with growing pauses: from half a minute to an hour, and of a self-made certificate, which
-/// peers do not trust yet, from 2 s to a minute.
+/// The schedule for the renewal of a certificate: after four fifths of its lifetime, or at once for
+/// a self-made certificate. A failed renewal is repeated with growing pauses from 30 s to an hour.
+/// For a self-made certificate, which peers do not trust yet, the pauses grow from 2 s to a minute.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Renewal {
     from: Duration,
     until: Duration,
-    /// Whether no authority has issued it.
+    /// Whether the certificate is self-signed.
     is_self_made: bool,
-    /// When it was asked for last in vain, and how often that was.
+    /// The time of the last failure, and the number of failures.
     failed: Option<(Duration, u32)>,
 }
 
 impl Renewal {
-    /// The plan for a certificate.
+    /// Creates the schedule for a certificate.
     #[must_use]
     pub fn of(certificate: &Certificate) -> Self {
         let (from, until) = certificate.validity();
@@ -44,7 +44,7 @@ impl Renewal {
         }
     }
 
-    /// When it is to be asked for the first time.
+    /// Returns the time of the first request.
     #[must_use]
     pub fn due(&self) -> Duration {
         let life = self.until.saturating_sub(self.from);
@@ -54,19 +54,19 @@ impl Renewal {
         }
     }
 
-    /// The last moment of the certificate.
+    /// Returns the end of the validity.
     #[must_use]
     pub const fn until(&self) -> Duration {
         self.until
     }
 
-    /// What is left of the certificate's life; nothing when it is over.
+    /// Returns the remaining lifetime; zero after the expiry.
     #[must_use]
     pub const fn left(&self, now: Duration) -> Duration {
         self.until.saturating_sub(now)
     }
 
-    /// What is to be done.
+    /// Returns the next step.
     #[must_use]
     pub fn step(&self, now: Duration) -> Step {
         let again = self.failed.map(|(at, times)| at + self.pause(times));
@@ -80,7 +80,7 @@ impl Renewal {
         }
     }
 
-    /// Returns the pause after so many failures: twice as long each time.
+    /// Returns the pause after this number of failures. The pause doubles with each failure.
     fn pause(&self, times: u32) -> Duration {
         let (first, longest) = match self.is_self_made {
             true => SELF_MADE_PAUSES,
@@ -92,15 +92,16 @@ impl Renewal {
             .min(longest)
     }
 
-    /// It was asked for, in vain.
+    /// Records a failed renewal.
     pub fn failed(&mut self, now: Duration) {
         let times = self.failed.map_or(0, |(_, times)| times);
         self.failed = Some((now, times.saturating_add(1)));
     }
 }
 
-/// Returns whether people should replace a certificate that no program renews, such as the certificate of an authority: less
-/// than a fifth of its life is left, or less than a year of a life of more than two years.
+/// Returns whether an operator should replace a certificate that is not renewed automatically, such
+/// as the certificate of an authority. This is the case if less than a fifth of its lifetime is
+/// left, or less than a year of a lifetime of more than two years.
 #[must_use]
 pub fn is_near_end(certificate: &Certificate, now: Duration) -> bool {
     let (from, until) = certificate.validity();
@@ -114,6 +115,6 @@ pub fn is_near_end(certificate: &Certificate, now: Duration) -> bool {
 
 /// The first and the longest pause after a failure.
 const PAUSES: (Duration, Duration) = (Duration::from_secs(30), Duration::from_secs(3600));
-/// The same for a certificate that the application has made itself.
+/// The first and the longest pause for a self-made certificate.
 const SELF_MADE_PAUSES: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs(60));
 const YEAR: Duration = Duration::from_secs(365 * 86_400);

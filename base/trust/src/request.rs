@@ -1,4 +1,4 @@
-//! A request for a certificate (PKCS #10), made by who has the key.
+//! Certificate signing requests (PKCS #10).
 
 use std::fmt;
 use std::net::IpAddr;
@@ -21,7 +21,7 @@ use x509_cert::spki::SubjectPublicKeyInfoOwned;
 use crate::certificate::{COMMON_NAME, ORGANIZATION, alternative, common_name, name_of, verify};
 use crate::{Fingerprint, KEY_BITS, Unfit};
 
-/// A request whose signature is that of the key it is for.
+/// A request that is signed with the key of the requested certificate.
 #[derive(Clone)]
 pub struct Request {
     pub(crate) subject: Name,
@@ -32,7 +32,7 @@ pub struct Request {
     der: Vec<u8>,
 }
 
-/// Without the challengePassword, which is a secret.
+/// Omits the challengePassword, which is a secret.
 impl fmt::Debug for Request {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("Request")
@@ -43,11 +43,12 @@ impl fmt::Debug for Request {
 }
 
 impl Request {
-    /// Asks for a certificate of an application that is called `name` and reached at `hosts`, for a private key in the DER of
-    /// PKCS #8.
+    /// Creates a request for an application with a name and an organization at `hosts`, with a
+    /// private key in the DER of PKCS #8.
     ///
     /// # Errors
-    /// A key that is none, or a name or URI that a certificate cannot have.
+    ///
+    /// Returns an error for an invalid key, name or URI.
     pub fn make(
         key: &[u8],
         application_uri: &str,
@@ -57,10 +58,12 @@ impl Request {
         Self::make_with(key, (application_uri, hosts), names, None)
     }
 
-    /// The same with a challengePassword (RFC 2985, 5.4.1), such as the one-time token of an invitation.
+    /// Creates a request with a challengePassword (RFC 2985, 5.4.1), such as the one-time token of
+    /// an invitation.
     ///
     /// # Errors
-    /// A key that is none, or a name or URI that a certificate cannot have.
+    ///
+    /// Returns an error for an invalid key, name or URI.
     pub fn make_with(
         key: &[u8],
         (application_uri, hosts): (&str, &[String]),
@@ -82,10 +85,12 @@ impl Request {
         Self::of(made)
     }
 
-    /// Reads one in DER, or in PEM.
+    /// Reads a request in DER or PEM.
     ///
     /// # Errors
-    /// It is neither, has no ApplicationUri, or is not signed with the key it is for.
+    ///
+    /// Returns an error if the bytes are neither, if the ApplicationUri is missing, or if the
+    /// signature is invalid.
     pub fn read(bytes: &[u8]) -> Result<Self, Unfit> {
         let read = if bytes.starts_with(b"-----BEGIN") {
             CertReq::from_pem(bytes)
@@ -119,37 +124,38 @@ impl Request {
         })
     }
 
-    /// Its DER.
+    /// Returns the DER encoding.
     #[must_use]
     pub fn der(&self) -> &[u8] {
         &self.der
     }
 
-    /// The common name that is asked for.
+    /// Returns the requested common name.
     #[must_use]
     pub fn name(&self) -> String {
         common_name(&self.subject)
     }
 
-    /// The ApplicationUri that is asked for.
+    /// Returns the requested ApplicationUri.
     #[must_use]
     pub fn application_uri(&self) -> &str {
         &self.application_uri
     }
 
-    /// The hosts that are asked for.
+    /// Returns the requested hosts.
     #[must_use]
     pub fn hosts(&self) -> &[String] {
         &self.hosts
     }
 
-    /// The challengePassword.
+    /// Returns the challengePassword.
     #[must_use]
     pub fn challenge(&self) -> Option<&str> {
         self.challenge.as_deref()
     }
 
-    /// Returns the SHA-256 of the public key, as of [`Certificate::key_fingerprint`](crate::Certificate::key_fingerprint).
+    /// Returns the SHA-256 of the public key, like
+    /// [`Certificate::key_fingerprint`](crate::Certificate::key_fingerprint).
     #[must_use]
     pub fn key_fingerprint(&self) -> Fingerprint {
         Fingerprint::of_key(&self.key)
@@ -182,7 +188,8 @@ fn names(read: &CertReq) -> Option<SubjectAltName> {
     SubjectAltName::from_der(one.extn_value.as_bytes()).ok()
 }
 
-/// The ApplicationUri and hosts as alternative names. What is an address becomes one.
+/// Returns the subject alternative names for an ApplicationUri and hosts. A host that is an IP
+/// address becomes an IP address entry.
 pub(crate) fn alternatives(
     application_uri: &str,
     hosts: &[String],
@@ -203,10 +210,10 @@ pub(crate) fn alternatives(
     Ok(SubjectAltName(names))
 }
 
-/// extensionRequest of PKCS #9.
+/// The OID of extensionRequest (PKCS #9).
 const EXTENSIONS: x509_cert::der::asn1::ObjectIdentifier =
     x509_cert::der::asn1::ObjectIdentifier::new_unwrap("1.2.840.113549.1.9.14");
-/// challengePassword of PKCS #9.
+/// The OID of challengePassword (PKCS #9).
 const CHALLENGE: x509_cert::der::asn1::ObjectIdentifier =
     x509_cert::der::asn1::ObjectIdentifier::new_unwrap("1.2.840.113549.1.9.7");
 const ALTERNATIVE_NAMES: x509_cert::der::asn1::ObjectIdentifier =

@@ -1,5 +1,5 @@
-//! What an authority issues is taken, and what is wrong with a certificate is told by its status. Keys of `tests/keys` are for
-//! nothing else.
+//! Tests of certificate validation: certificates of an authority are accepted, and each fault has
+//! its status code. The keys of `tests/keys` are used by these tests only.
 #![expect(
     clippy::unwrap_used,
     reason = "a test may, also in what its cases share"
@@ -116,7 +116,7 @@ fn each_fault_has_its_status() {
         Err(Fault::Incomplete)
     );
     assert_eq!(check(&device, &[], &known, NOW + DAY * 2), Err(Fault::Time));
-    // The list and the authority are over too; the earlier step tells.
+    // The revocation list and the authority have expired too; the earlier check decides.
     let long = authority
         .issue(&request(), &issue(8, NOW - DAY, NOW + DAY * 100))
         .unwrap();
@@ -135,7 +135,7 @@ fn each_fault_has_its_status() {
     };
     assert_eq!(check(&device, &[], &listed, NOW), Err(Fault::Revoked));
     assert_eq!(check(&long, &[], &listed, NOW), Ok(()), "the others stay");
-    // Somebody else of the same name.
+    // Another authority with the same name.
     let impostor = self::authority(OTHER, "Plant authority");
     let forged = impostor
         .issue(&request(), &issue(7, NOW - DAY, NOW + DAY))
@@ -147,7 +147,7 @@ fn each_fault_has_its_status() {
         Err(Fault::Untrusted),
         "what is sent along is not trusted for it"
     );
-    // A list of another is none.
+    // The revocation list of another authority does not count.
     let list = impostor.crl(&[], 9, (NOW, NOW + DAY)).unwrap();
     let foreign = Known {
         crls: vec![list],
@@ -180,7 +180,7 @@ fn the_certificate_of_a_server_is_for_its_host_and_of_its_application() {
     assert_eq!(named(Some("[0:0::1]"), None, NOW), Ok(()));
     assert_eq!(named(Some("cell-2"), uri, NOW), Err(Fault::Host));
     assert_eq!(named(host, Some("urn:cell:other"), NOW), Err(Fault::Uri));
-    // The earlier step tells.
+    // The earlier check decides.
     assert_eq!(named(Some("cell-2"), uri, NOW + DAY * 2), Err(Fault::Time));
     assert_eq!(Fault::Host.status(), 0x8016_0000);
     assert_eq!(Fault::Uri.status(), 0x8017_0000);
@@ -210,7 +210,7 @@ fn one_that_is_trusted_itself_needs_no_authority_but_is_refused_when_it_is_revok
 #[test]
 fn what_an_application_issued_is_refused() {
     let Cell { device, known, .. } = cell();
-    // With the key of the device, under its name.
+    // A forged authority with the key and the name of the device.
     let fake = Authority::make(
         &key(DEVICE),
         ("Robot", "Plant"),
@@ -240,7 +240,7 @@ fn an_authority_that_is_over_is_told_of() {
     );
     let after = NOW + DAY * 101;
     assert_eq!(check(&device, &[], &known, after), Err(Fault::Time));
-    // One that an authority of shorter life issued, as others do.
+    // A certificate beyond the validity of its authority, as issued by other software.
     let short = Authority::make(
         &key(AUTHORITY),
         ("Plant authority", "Plant"),
