@@ -62,7 +62,6 @@ impl Authority {
     /// Creates a self-signed root authority, with a private key in the DER of PKCS #8.
     ///
     /// # Errors
-    ///
     /// Returns an error for an invalid key or an invalid name.
     pub fn make(
         key: &[u8],
@@ -94,7 +93,6 @@ impl Authority {
     /// Opens an existing authority: its certificate, and its private key in the DER of PKCS #8.
     ///
     /// # Errors
-    ///
     /// Returns an error for an invalid or foreign key, or if the certificate does not belong to an
     /// authority.
     pub fn open(certificate: Certificate, key: &[u8]) -> Result<Self, Unfit> {
@@ -119,7 +117,6 @@ impl Authority {
     /// at the latest.
     ///
     /// # Errors
-    ///
     /// Returns an error for invalid names or times.
     pub fn issue(&self, request: &Request, issue: &Issue) -> Result<Certificate, Unfit> {
         let (_, last) = self.certificate.validity();
@@ -159,7 +156,6 @@ impl Authority {
     /// Signs the revocation list with this number, which is valid until `until`.
     ///
     /// # Errors
-    ///
     /// Returns an error for invalid times.
     pub fn crl(
         &self,

@@ -93,7 +93,6 @@ impl Certificate {
     /// Reads a certificate in DER or PEM.
     ///
     /// # Errors
-    ///
     /// Returns an error if the bytes are neither.
     pub fn read(bytes: &[u8]) -> Result<Self, Unfit> {
         let inner = if bytes.starts_with(b"-----BEGIN") {
@@ -108,7 +107,6 @@ impl Certificate {
     /// the certificate itself, then its issuer certificates.
     ///
     /// # Errors
-    ///
     /// Returns an error if the chain is empty or contains other data.
     pub fn read_chain(bytes: &[u8]) -> Result<(Self, Vec<Self>), Unfit> {
         let mut rest = bytes;
@@ -441,7 +439,7 @@ pub(crate) const ORGANIZATION: ObjectIdentifier = ObjectIdentifier::new_unwrap("
 pub(crate) const SERVER_AUTH: ObjectIdentifier = ObjectIdentifier::new_unwrap("1.3.6.1.5.5.7.3.1");
 pub(crate) const CLIENT_AUTH: ObjectIdentifier = ObjectIdentifier::new_unwrap("1.3.6.1.5.5.7.3.2");
 const ANY_USAGE: ObjectIdentifier = ObjectIdentifier::new_unwrap("2.5.29.37.0");
-/// Most certificates of a chain.
+/// Maximum number of certificates of a chain.
 pub(crate) const LONGEST_CHAIN: usize = 10;
-/// Most bytes of a part of a name that other stacks accept (RFC 5280, appendix A).
+/// Maximum number of bytes of a part of a name that other stacks accept (RFC 5280, appendix A).
 const LONGEST_NAME: usize = 64;

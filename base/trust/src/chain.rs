@@ -6,7 +6,7 @@ use crate::KEY_BITS;
 use crate::certificate::{Certificate, LONGEST_CHAIN};
 use crate::crl::Crl;
 
-/// The trust anchors: trusted certificates, issuer certificates and revocation lists.
+/// The trusted certificates, the issuer certificates and the revocation lists for a validation.
 #[derive(Debug, Clone, Default)]
 pub struct Known {
     /// Trusted certificates: of applications, and of authorities together with all certificates
@@ -32,7 +32,7 @@ impl Known {
 }
 
 /// The fault of a certificate, in the order of the checks. The faults up to [`Fault::Untrusted`]
-/// must not be revealed to an untrusted peer.
+/// are not revealed to the peer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, thiserror::Error)]
 pub enum Fault {
     /// The certificate cannot be decoded, or its key or signature is invalid.
@@ -126,7 +126,6 @@ pub struct Names<'n> {
 /// revocations apply.
 ///
 /// # Errors
-///
 /// Returns the first fault.
 pub fn check(
     certificate: &Certificate,
@@ -141,7 +140,6 @@ pub fn check(
 /// a client connects to.
 ///
 /// # Errors
-///
 /// Returns the first fault.
 pub fn check_named(
     certificate: &Certificate,

@@ -28,7 +28,6 @@ impl Crl {
     /// Reads a list in DER or PEM. Does not check its issuer.
     ///
     /// # Errors
-    ///
     /// Returns an error if the bytes are neither.
     pub fn read(bytes: &[u8]) -> Result<Self, Unfit> {
         let inner = if bytes.starts_with(b"-----BEGIN") {

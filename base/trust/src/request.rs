@@ -47,7 +47,6 @@ impl Request {
     /// private key in the DER of PKCS #8.
     ///
     /// # Errors
-    ///
     /// Returns an error for an invalid key, name or URI.
     pub fn make(
         key: &[u8],
@@ -62,7 +61,6 @@ impl Request {
     /// an invitation.
     ///
     /// # Errors
-    ///
     /// Returns an error for an invalid key, name or URI.
     pub fn make_with(
         key: &[u8],
@@ -88,7 +86,6 @@ impl Request {
     /// Reads a request in DER or PEM.
     ///
     /// # Errors
-    ///
     /// Returns an error if the bytes are neither, if the ApplicationUri is missing, or if the
     /// signature is invalid.
     pub fn read(bytes: &[u8]) -> Result<Self, Unfit> {

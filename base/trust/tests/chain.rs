@@ -116,7 +116,7 @@ fn each_fault_has_its_status() {
         Err(Fault::Incomplete)
     );
     assert_eq!(check(&device, &[], &known, NOW + DAY * 2), Err(Fault::Time));
-    // The revocation list and the authority have expired too; the earlier check decides.
+    // The certificate is still valid, but the revocation list has expired.
     let long = authority
         .issue(&request(), &issue(8, NOW - DAY, NOW + DAY * 100))
         .unwrap();

@@ -171,7 +171,6 @@ impl Announced {
 /// discovery server may become available later.
 ///
 /// # Errors
-///
 /// Returns an error if the mDNS daemon cannot be started.
 pub fn announce(server: Server, settings: AnnounceSettings) -> Result<Announced, MdnsFault> {
     let mdns = settings.mdns.as_ref().map(Mdns::open).transpose()?;

@@ -26,7 +26,6 @@ pub trait Marks: Send + Sync + 'static {
 /// while no discovery server fits, or while several fit, which is logged.
 ///
 /// # Errors
-///
 /// Returns an error if the mDNS daemon cannot be started.
 pub fn find_lds(
     choice: Choice,

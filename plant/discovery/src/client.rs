@@ -110,7 +110,6 @@ pub struct OnNetwork {
 /// Returns the servers registered at a server, including the server itself: FindServers.
 ///
 /// # Errors
-///
 /// Returns [`AskFault`], after `limit` at the latest.
 pub async fn find_servers(url: &str, limit: Duration) -> Result<Vec<Application>, AskFault> {
     let request = FindServersRequest {
@@ -132,7 +131,6 @@ pub async fn find_servers(url: &str, limit: Duration) -> Result<Vec<Application>
 /// Returns the self-description of the server at `url`: GetEndpoints (OPC 10000-4, 5.5.4).
 ///
 /// # Errors
-///
 /// Returns [`AskFault`], after `limit` at the latest.
 pub async fn describe(url: &str, limit: Duration) -> Result<Described, AskFault> {
     let request = GetEndpointsRequest {
@@ -171,7 +169,6 @@ pub async fn describe(url: &str, limit: Duration) -> Result<Described, AskFault>
 /// Returns the servers that are announced on the network: FindServersOnNetwork.
 ///
 /// # Errors
-///
 /// Returns [`AskFault`], after `limit` at the latest.
 pub async fn find_servers_on_network(
     url: &str,
@@ -201,7 +198,6 @@ pub async fn find_servers_on_network(
 /// its ServerStatus (OPC 10000-5, 12.10). Reads it in a temporary anonymous session.
 ///
 /// # Errors
-///
 /// Returns [`AskFault`], after `limit` at the latest; a server without anonymous sessions refuses.
 pub(crate) async fn start_time(url: &str, limit: Duration) -> Result<i64, AskFault> {
     match timeout(limit, Box::pin(read_start_time(url))).await {
@@ -300,7 +296,7 @@ struct Way {
 
 /// Selects the best secured channel between a server and the application of a certificate store.
 /// Returns `None` if the server offers no secured channel. Also returns `None` for an untrusted
-/// server on this host, because a local attacker needs no forged channel.
+/// server on this host: an attacker on this host has the same power without a forged server.
 async fn way(url: &str, pki: &Path) -> Result<Option<Way>, AskFault> {
     let security = Security::existing(pki).map_err(AskFault::Certificate)?;
     let request = GetEndpointsRequest {
@@ -583,7 +579,7 @@ fn texts(all: Option<&[UAString]>) -> Vec<String> {
     all.unwrap_or_default().iter().take(64).map(text).collect()
 }
 
-/// Most endpoints whose security is returned.
+/// Maximum number of endpoints whose security is returned.
 const MOST_ENDPOINTS: usize = 64;
 const SCHEME: &str = "opc.tcp:";
 const REGISTER_LIMIT: Duration = Duration::from_secs(5);

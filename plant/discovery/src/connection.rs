@@ -285,7 +285,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
             }
             _ => None,
         };
-        // A local attacker needs no forged registration.
+        // A client on this host has the same power without a forged identity.
         let of_host = self.shared.host_may && self.peer.ip().to_canonical().is_loopback();
         Channel {
             is_secured: is_secured || of_host,

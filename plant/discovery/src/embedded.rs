@@ -116,7 +116,7 @@ impl Embedded {
         let _ended = (&mut self.task).await;
     }
 
-    /// Stops the discovery server: closes the port and withdraws its announcement.
+    /// Stops the discovery server: withdraws its announcement and closes the port.
     pub(crate) async fn leave(self) {
         let Self { stop, task, .. } = self;
         drop(stop);

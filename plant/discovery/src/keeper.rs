@@ -339,8 +339,8 @@ fn keep<T>(map: &mut BTreeMap<String, T>, most: usize, url: &str, value: T) {
 
 /// The delay of a step that counts as a standstill rather than load.
 const LATE: Duration = Duration::from_millis(500);
-/// The largest difference between the start times of a server and of its program, in 100 ns. A
-/// restart takes longer.
+/// The largest delay of an announced start time after the start time that the server itself
+/// reports, in 100 ns. The start of another run is later.
 const SAME_RUN: i64 = 20_000_000;
 const TIDY_EVERY: Duration = Duration::from_secs(1);
 /// Shortest interval between log messages for the same server that cannot be probed.

@@ -271,7 +271,6 @@ impl bridge_node::Told for LdsStatus {
 /// Runs a discovery server until `stop` completes.
 ///
 /// # Errors
-///
 /// Returns an error if the endpoint or the interface cannot be used.
 pub async fn run(
     settings: LdsSettings,
@@ -284,7 +283,6 @@ pub async fn run(
 /// Runs a discovery server of an embedding program until `stop` completes.
 ///
 /// # Errors
-///
 /// Returns an error if the endpoint or the interface cannot be used.
 pub async fn run_around(
     settings: LdsSettings,

@@ -229,10 +229,10 @@ async fn closed(asked: &mut mpsc::Receiver<Try>) {
     while asked.recv().await.is_some() {}
 }
 
-/// Most concurrent probes: more than the number of waiting probes after a cut cable, except in
-/// large plants.
+/// Maximum number of concurrent probes: more than the number of waiting probes after a cut cable,
+/// except in large plants.
 const MOST_TRIES: usize = 256;
-/// Most lines. The default limit of a process is 1024 file descriptors.
+/// Maximum number of lines. The default limit of a process is 1024 file descriptors.
 const MOST_LINES: usize = 600;
 const LINES: u32 = 4;
 const SETTLE: Duration = Duration::from_millis(30);

@@ -19,9 +19,9 @@ use crate::client::{Described, describe};
 /// The limits of a scan.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Pace {
-    /// Most new connections per second, at least 1.
+    /// Maximum number of new connections per second, at least 1.
     pub per_second: u32,
-    /// Most concurrent connections, at least 1.
+    /// Maximum number of concurrent connections, at least 1.
     pub at_once: usize,
     /// The timeout of a connection.
     pub connect: Duration,

@@ -48,7 +48,7 @@ pub struct Known {
     pub capabilities: Vec<String>,
     /// The ApplicationUri that the server reports; `None` if it does not answer.
     pub application_uri: Option<String>,
-    /// The time since which it is present.
+    /// The time at which it appeared.
     pub since: SystemTime,
     /// The start time of its program, if known: from mDNS, or the StartTime of its ServerStatus.
     pub started: Option<SystemTime>,
@@ -108,7 +108,6 @@ impl Watcher {
 /// Starts to watch servers. Requires a tokio runtime, and returns at once.
 ///
 /// # Errors
-///
 /// Returns an error if the mDNS daemon cannot be started.
 pub fn watch(settings: WatchSettings) -> Result<Watcher, MdnsFault> {
     let mdns = settings.mdns.as_ref().map(Mdns::open).transpose()?;

@@ -99,7 +99,6 @@ pub enum StoreFault {
 /// certificates are skipped.
 ///
 /// # Errors
-///
 /// Returns an error if an existing directory cannot be read.
 pub fn list(root: &Path) -> Result<Vec<Stored>, StoreFault> {
     let mut found: Vec<Stored> = stored(&root.join(OWN), Standing::Own).into_iter().collect();
@@ -129,7 +128,6 @@ pub fn list(root: &Path) -> Result<Vec<Stored>, StoreFault> {
 /// certificate in a DER or PEM file.
 ///
 /// # Errors
-///
 /// Returns an error if no certificate matches or if the store cannot be written.
 pub fn trust(root: &Path, given: &str) -> Result<Stored, StoreFault> {
     let file = Path::new(given);
@@ -150,7 +148,6 @@ pub fn trust(root: &Path, given: &str) -> Result<Stored, StoreFault> {
 /// Its holder is refused from the next connection on.
 ///
 /// # Errors
-///
 /// Returns an error if no certificate matches or if the store cannot be written.
 pub fn reject(root: &Path, given: &str) -> Result<Stored, StoreFault> {
     transfer(root, given, (Standing::Trusted, Standing::Rejected))
@@ -199,7 +196,6 @@ fn remove<'s>(gone: impl Iterator<Item = &'s Stored>) -> Result<(), StoreFault> 
 /// certificates are deleted beyond the limit, because any peer can add certificates.
 ///
 /// # Errors
-///
 /// Returns an error if the library cannot read the certificate or if the store cannot be written.
 pub fn keep_refused(root: &Path, certificate: &trust::Certificate) -> Result<Stored, StoreFault> {
     let folder = root.join(Standing::Rejected.name());
@@ -297,7 +293,6 @@ fn is_authority(certificate: &X509) -> bool {
 /// Stores the certificate of an authority that completes chains, from a DER or PEM file.
 ///
 /// # Errors
-///
 /// Returns an error if the certificate does not belong to an authority or if the store cannot be
 /// written.
 pub fn keep_issuer(root: &Path, file: &Path) -> Result<Stored, StoreFault> {
@@ -328,12 +323,12 @@ pub fn application_uri(certificate: &X509) -> Option<String> {
 
 /// The path of the application's own certificate below the root.
 pub(crate) const OWN: &str = "own/cert.der";
-/// Fewest digits of a thumbprint that identify a certificate.
+/// Minimum number of digits of a thumbprint that identify a certificate.
 const FEWEST_DIGITS: usize = 4;
-/// Most rejected certificates in the store.
+/// Maximum number of rejected certificates in the store.
 pub(crate) const REJECTED_KEPT: usize = 100;
 const LARGEST_CERTIFICATE: u64 = 64 << 10;
-/// Most files of a folder that are read.
+/// Maximum number of files of a folder that are read.
 const MOST_LISTED: usize = 10_000;
 
 #[cfg(test)]

@@ -52,7 +52,7 @@ pub fn tell(subscriptions: &SubscriptionCache, changes: &[ModelChange]) {
     }
 }
 
-/// Most changes in an event; further changes follow in further events.
+/// Maximum number of changes in an event; further changes follow in further events.
 const MOST_TOLD: usize = 500;
 
 /// A list of changes as an OPC UA event.

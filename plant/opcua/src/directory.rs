@@ -133,7 +133,6 @@ impl Directory {
     /// Returns the Directory of a connected client's server.
     ///
     /// # Errors
-    ///
     /// Returns an error if the client is not connected or the server has no Directory.
     pub fn of(client: &Client) -> Result<Self, DirectoryError> {
         client.knows(Arc::new(Types))?;
@@ -158,7 +157,6 @@ impl Directory {
     /// different record is updated.
     ///
     /// # Errors
-    ///
     /// Returns an error if a call fails.
     pub async fn registered(&self, record: &ApplicationRecord) -> Result<NodeId, DirectoryError> {
         let uri = Variant::String(record.application_uri.clone());
@@ -222,7 +220,6 @@ impl Directory {
     /// Returns the certificate that an authority issued for a request, and its issuer certificates.
     ///
     /// # Errors
-    ///
     /// Returns an error if no certificate was issued; BadRequestNotComplete if the decision is
     /// pending.
     pub async fn finished(

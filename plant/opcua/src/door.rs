@@ -5,7 +5,7 @@
 //! forwards the Hello message and checks the certificate in the OpenSecureChannel request
 //! ([`trust::check`]). It then forwards the connection in both directions, or sends an error to the
 //! client. Each admitted certificate is copied into a temporary trust store of the library, and
-//! removed when its connection closes. Changes of the store also apply to open connections.
+//! removed when its last connection closes. Changes of the store also apply to open connections.
 //!
 //! Only a store that trusts an authority has a door, because a door adds a hop to each message.
 
@@ -113,7 +113,6 @@ impl Door {
     /// authority.
     ///
     /// # Errors
-    ///
     /// Returns an error if the store or the address behind the door cannot be used.
     pub fn of(
         root: &Path,
@@ -231,7 +230,7 @@ impl Shared {
         connections.insert(number, peer.ip(), (admitted, task));
     }
 
-    /// Returns the number of messages that were suppressed, if this one should be logged now.
+    /// Returns the number of messages that were suppressed, if this message is to be logged.
     fn another_now(&self, message: &str) -> Option<u64> {
         self.refused.lock().admit(message, Instant::now())
     }
@@ -325,8 +324,8 @@ impl Shared {
         if let Err(fault) = self.judge(shown) {
             let unknown = matches!(fault, Fault::Untrusted | Fault::Incomplete);
             if unknown {
-                // The watcher of the store logs the certificate together with the command that
-                // trusts it.
+                // `Pki::report_rejected` logs the certificate together with the command that trusts
+                // it.
                 if let Err(error) = certificates::keep_refused(&self.root, certificate) {
                     warn!(%error, "a refused certificate is not kept");
                 }

@@ -94,7 +94,6 @@ impl EndpointUrl {
     /// Opens the listening socket, with TCP_NODELAY for the accepted connections.
     ///
     /// # Errors
-    ///
     /// Returns an error if the host has no address or if listening fails on its addresses. With
     /// unpatched libraries, an address that other hosts reach is an error too ([`crate::patches`]).
     pub fn bind(&self) -> Result<TcpListener, BindError> {
@@ -230,7 +229,7 @@ pub enum BindError {
 
 /// The port that IANA assigned to the OPC UA Connection Protocol.
 const DEFAULT_PORT: u16 = 4840;
-/// Most addresses of this computer in a certificate.
+/// Maximum number of addresses of this computer in a certificate.
 const MOST_ADDRESSES: usize = 64;
 
 #[cfg(test)]

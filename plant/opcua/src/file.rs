@@ -83,9 +83,8 @@ impl Handles {
     /// it. Returns the number of the handle.
     ///
     /// # Errors
-    ///
-    /// `BadInvalidState` if the file is open for writing, or if a writer finds the file open;
-    /// `BadTooManyOperations`.
+    /// `BadInvalidState` if the file is open for writing, or, for a writer, if the file is open at
+    /// all; `BadTooManyOperations` if there are too many handles.
     pub fn add(&mut self, request: &MethodRequest, content: Vec<u8>, is_writing: bool) -> Answer {
         self.tidy();
         let is_read = self.all.values().all(|handle| !handle.is_writing);
@@ -114,7 +113,6 @@ impl Handles {
     /// Executes a method of an open handle: Read, Write, Close, GetPosition or SetPosition.
     ///
     /// # Errors
-    ///
     /// Returns the refusal of the method; `BadInvalidArgument` for the other methods.
     pub fn call(&mut self, method: FileMethod, request: &MethodRequest) -> Answer {
         let session = request.caller.session;
@@ -156,7 +154,6 @@ impl Handles {
     /// Closes a handle of a session, and returns the written content.
     ///
     /// # Errors
-    ///
     /// `BadInvalidArgument` if the session has no handle with this number; `BadInvalidState` if the
     /// handle was opened for reading.
     pub fn written(&mut self, session: u32, number: u32) -> Result<Vec<u8>, Refusal> {
@@ -227,7 +224,7 @@ pub const READ: u8 = 1;
 pub const WRITE_ANEW: u8 = 6;
 const MOST_OPEN: usize = 20;
 const MOST_OF_SESSION: usize = 5;
-/// Most bytes of a Read response.
+/// Maximum number of bytes of a Read response.
 const MOST_READ: usize = 1 << 20;
 
 #[cfg(test)]

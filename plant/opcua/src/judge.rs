@@ -134,7 +134,6 @@ impl Judge {
     /// `rejected`.
     ///
     /// # Errors
-    ///
     /// Returns an error if the certificate is refused.
     pub fn take(&self, der: &[u8], names: Names<'_>) -> Result<Shown, Refused> {
         let shown = Certificate::read_chain(der).map_err(|unfit| Refused {
@@ -159,7 +158,6 @@ impl Judge {
     /// Judges a decoded certificate by the current content of the store.
     ///
     /// # Errors
-    ///
     /// Returns an error if the certificate is refused.
     pub fn judge(&self, shown: &Shown, names: Names<'_>) -> Result<(), Refused> {
         let (certificate, sent) = shown;
@@ -280,7 +278,7 @@ pub(crate) const fn help(fault: Fault) -> &'static str {
     }
 }
 
-/// Most pairs of host and certificate that are stored to suppress repeated warnings.
+/// Maximum number of pairs of host and certificate that are stored to suppress repeated warnings.
 const MOST_WARNED: usize = 256;
 /// Digits of a thumbprint in messages.
 const SHOWN_DIGITS: usize = 16;

@@ -64,7 +64,6 @@ pub fn is_crl(file: &Path) -> bool {
 /// Stores the revocation list of an authority, and replaces an older list of the authority.
 ///
 /// # Errors
-///
 /// Returns an error if the file is not a revocation list, if the store does not contain its
 /// authority, or if the store cannot be written.
 pub fn keep_crl(root: &Path, file: &Path) -> Result<PathBuf, StoreFault> {
@@ -82,7 +81,6 @@ pub fn keep_crl(root: &Path, file: &Path) -> Result<PathBuf, StoreFault> {
 /// Stores a decoded revocation list. Returns `None` if the store does not contain its authority.
 ///
 /// # Errors
-///
 /// Returns an error if the store cannot be written.
 pub fn put_crl(root: &Path, list: &Crl) -> Result<Option<PathBuf>, StoreFault> {
     let known = read(root);
@@ -97,8 +95,8 @@ pub fn put_crl(root: &Path, list: &Crl) -> Result<Option<PathBuf>, StoreFault> {
         source,
     };
     fs::create_dir_all(&folder).map_err(failed)?;
-    // Lists of the same authority under other file names are older or identical, unless they are
-    // newer and stay.
+    // Older lists of the same authority are removed. A newer list stays, and the given list is
+    // ignored.
     for other in files(&folder) {
         let of_it = bytes(&other).and_then(|bytes| Crl::read(&bytes).ok());
         let Some(of_it) = of_it.filter(|crl| crl.is_of(authority)) else {

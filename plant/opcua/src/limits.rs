@@ -8,49 +8,53 @@ use opcua::server::{Limits, OperationalLimits, SubscriptionLimits};
 
 /// Largest string, ByteString or message body, in bytes.
 pub const LARGEST_VALUE: usize = 64 << 20;
-/// Most elements of an array. Each element takes at least 24 bytes while a message is decoded.
+/// Maximum number of elements of an array. Each element takes at least 24 bytes while a message is
+/// decoded.
 pub const LARGEST_ARRAY: usize = 4 << 20;
 /// Largest message in bytes, with space for the headers.
 pub const LARGEST_MESSAGE: usize = LARGEST_VALUE + (1 << 20);
-/// Most chunks of a message, with a reserve for peers that send chunks of half the usual size.
+/// Maximum number of chunks of a message, with a reserve for peers that send chunks of half the
+/// usual size.
 pub const MOST_CHUNKS: usize = 2_100;
 /// Interval of processing subscriptions in milliseconds: the largest delay of a notification after
 /// its publishing interval.
 pub const POLL_MS: u64 = 5;
 /// Shortest publishing interval of a server.
 pub const SHORTEST_PUBLISHING: Duration = Duration::from_millis(10);
-/// Most notifications in a response. Many clients refuse arrays of more than 1000 elements, and
-/// then receive no further notifications.
+/// Maximum number of notifications in a response. Many clients refuse arrays of more than 1000
+/// elements, and then receive no further notifications.
 pub const MOST_NOTIFICATIONS: usize = 1_000;
-/// Most nodes or items in a request of a client. Many servers accept 1000.
+/// Maximum number of nodes or items in a request of a client. Many servers accept 1000.
 pub const MOST_PER_REQUEST: usize = 500;
-/// Most sessions of a server.
+/// Maximum number of sessions of a server.
 pub const MOST_SESSIONS: usize = 50;
-/// Most bytes of queued notifications, for all clients of a server.
+/// Maximum number of bytes of queued notifications, for all clients of a server.
 pub const QUEUED_NOTIFICATIONS: usize = 64 << 20;
-/// Most requests of a connection that a server processes at a time, without Publish requests.
+/// Maximum number of requests of a connection that a server processes at a time, without Publish
+/// requests.
 pub const REQUESTS_IN_FLIGHT: usize = 1_000;
 /// Timeout of a method call or a write, after which the client receives `BadTimeout`.
 pub const LONGEST_REQUEST: Duration = Duration::from_secs(10);
 /// Largest NodeSet file in bytes.
 pub const LARGEST_NODESET: u64 = 64 << 20;
-/// Most bytes of all NodeSet files of a server.
+/// Maximum number of bytes of all NodeSet files of a server.
 pub const LARGEST_NODESETS: u64 = 128 << 20;
-/// Most NodeSet files of a server.
+/// Maximum number of NodeSet files of a server.
 pub const MOST_NODESETS: usize = 64;
 
 /// The limits of the clients of a server.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ClientLimits {
-    /// Most sessions.
+    /// Maximum number of sessions.
     pub sessions: usize,
-    /// Most sessions of a client address. The limit applies while less than an eighth of the
-    /// sessions is free; 0 for no limit. SCADA hosts and gateways run many clients at one address.
+    /// Maximum number of sessions of a client address. The limit applies while less than an eighth
+    /// of the sessions is free; 0 for no limit. SCADA hosts and gateways run many clients at one
+    /// address.
     pub sessions_per_address: usize,
-    /// Most connections. A new connection replaces the oldest connection without an activated
-    /// session.
+    /// Maximum number of connections. A new connection replaces the oldest connection without an
+    /// activated session.
     pub connections: usize,
-    /// Most connections of a client address; 0 for no limit.
+    /// Maximum number of connections of a client address; 0 for no limit.
     pub connections_per_address: usize,
 }
 

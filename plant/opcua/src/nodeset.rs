@@ -197,7 +197,6 @@ fn imported(set: UANodeSet) -> NodeSet2Import {
 /// Reads the sources and orders them.
 ///
 /// # Errors
-///
 /// Returns the first error of a source.
 pub(crate) fn load(sources: Vec<Source>) -> Result<Vec<NodeSet>, NodeSetError> {
     let read = sources.into_iter().map(NodeSet::read);
@@ -233,7 +232,6 @@ impl NodeSet {
     /// Imports the nodes into an address space, to which the namespaces are added.
     ///
     /// # Errors
-    ///
     /// Returns an error if nodes were left out.
     pub(crate) fn import(
         &self,
@@ -410,7 +408,7 @@ fn encoded(items: &mut [ImportedItem]) {
 const BINARY: &str = "Default Binary";
 /// The prefix of the BrowseNames of encodings.
 const ENCODING: &str = "Default ";
-/// Most supertypes of a DataType.
+/// Maximum number of supertypes of a DataType.
 const DEEPEST: usize = 64;
 
 /// Checks for faults at which the library would panic or silently leave out nodes.

@@ -109,7 +109,6 @@ pub fn read(root: &Path) -> Option<Certificate> {
 /// Replaces the application's own certificate. The key stays the same.
 ///
 /// # Errors
-///
 /// Returns an error if the certificate cannot be written.
 pub fn replace(root: &Path, certificate: &Certificate, cause: &Cause) -> io::Result<()> {
     crate::pair::write(root, certificate.der(), None)?;

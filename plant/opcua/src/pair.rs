@@ -29,7 +29,6 @@ pub(crate) enum PairFiles {
 /// given.
 ///
 /// # Errors
-///
 /// Returns an error if a file cannot be written. The previous pair is then unchanged.
 pub(crate) fn write(root: &Path, certificate: &[u8], key: Option<&[u8]>) -> io::Result<()> {
     let (path, key_path) = (root.join(OWN_CERTIFICATE), root.join(OWN_KEY));
@@ -59,7 +58,6 @@ pub(crate) fn write(root: &Path, certificate: &[u8], key: Option<&[u8]>) -> io::
 /// Completes or removes the result of an interrupted [`write`], and restricts the key to its owner.
 ///
 /// # Errors
-///
 /// Returns an error if a file cannot be read, renamed or removed.
 pub(crate) fn settle(root: &Path) -> io::Result<PairFiles> {
     let (path, key_path) = (root.join(OWN_CERTIFICATE), root.join(OWN_KEY));

@@ -54,7 +54,6 @@ pub fn version() -> &'static str {
 /// Checks the listening addresses of a server. Logs one warning if the libraries are unpatched.
 ///
 /// # Errors
-///
 /// Returns an error for an address that other hosts reach, if the libraries are unpatched and
 /// [`SERVE_AS_PUBLISHED`] is not set.
 pub fn check(addresses: &[SocketAddr]) -> Result<(), OtherHosts> {

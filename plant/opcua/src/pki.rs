@@ -65,7 +65,6 @@ impl Pki {
     /// Opens the store under `root`, and creates missing directories.
     ///
     /// # Errors
-    ///
     /// Returns an error if a directory cannot be created or read.
     pub fn open(root: PathBuf) -> Result<Self, PkiError> {
         for name in ["own", "private", "trusted", "rejected"] {
@@ -106,7 +105,6 @@ impl Pki {
     /// programs use it. The store may belong to a server.
     ///
     /// # Errors
-    ///
     /// Returns an error if files cannot be read or written, or if only half of a pair exists.
     pub fn ensure_own(&self, application_uri: &str, host: &str) -> Result<(), PkiError> {
         let hosts = [host.to_owned()];
@@ -118,7 +116,6 @@ impl Pki {
     /// ApplicationUri.
     ///
     /// # Errors
-    ///
     /// Returns an error if files cannot be read or written, or if only half of a pair exists.
     pub fn ensure_own_at(&self, application_uri: &str, hosts: &[String]) -> Result<(), PkiError> {
         self.ensure_own_named(application_uri, hosts, NAME)
@@ -128,7 +125,6 @@ impl Pki {
     /// [`ensure_own_at`](Self::ensure_own_at).
     ///
     /// # Errors
-    ///
     /// Returns an error if files cannot be read or written, or if only half of a pair exists.
     pub fn ensure_own_named(
         &self,
@@ -172,7 +168,6 @@ impl Pki {
     /// With `even_issued` a certificate of an authority is replaced too.
     ///
     /// # Errors
-    ///
     /// Returns an error if the store has no certificate, if an authority issued the certificate, or
     /// if files cannot be read or written.
     pub fn renew(&self, even_issued: bool) -> Result<(), PkiError> {

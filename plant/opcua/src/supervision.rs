@@ -71,7 +71,6 @@ impl Supervision {
     /// Checks that a caller with these roles may configure the program.
     ///
     /// # Errors
-    ///
     /// BadUserAccessDenied unless the caller is the supervisor or has the role ConfigureAdmin.
     pub fn admits(&self, caller: &Caller, roles: Roles) -> Result<(), StatusCode> {
         if roles.contains(Role::ConfigureAdmin) {

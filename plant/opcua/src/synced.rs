@@ -9,7 +9,6 @@ use std::path::{Path, PathBuf};
 /// content.
 ///
 /// # Errors
-///
 /// Returns an error if the file cannot be written. The old content is then unchanged.
 pub fn replace(path: &Path, content: &[u8]) -> io::Result<()> {
     let mut beside = path.as_os_str().to_owned();

@@ -37,7 +37,6 @@ pub trait TrustList: Send + Sync + 'static {
     /// Replaces the given parts. Returns whether the change requires ApplyChanges.
     ///
     /// # Errors
-    ///
     /// Returns an error if the list is invalid or cannot be written.
     fn replace(&self, list: TrustListDataType) -> Result<bool, StatusCode>;
 }
@@ -79,7 +78,6 @@ impl TrustFile {
     /// Executes a method. The caller of this function has checked the permissions.
     ///
     /// # Errors
-    ///
     /// Returns the refusal of the method.
     pub fn call(&self, method: FileMethod, request: &MethodRequest) -> Answer {
         match (method, request.arguments.as_slice()) {

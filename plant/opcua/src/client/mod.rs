@@ -241,7 +241,6 @@ impl Client {
     /// Waits until the client is connected.
     ///
     /// # Errors
-    ///
     /// Returns the reason if the client is not connected in time.
     pub async fn up(&self, within: Duration) -> Result<(), ClientError> {
         let mut link = self.link();
@@ -280,7 +279,6 @@ impl Client {
     /// Registers a type loader for structures on the current connection.
     ///
     /// # Errors
-    ///
     /// Returns an error if the client is not connected.
     pub fn knows(&self, types: Arc<dyn TypeLoader>) -> Result<(), ClientError> {
         let connected = self.shared.connected()?;

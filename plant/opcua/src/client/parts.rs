@@ -50,7 +50,7 @@ impl Service {
     }
 }
 
-/// The most operations per request that a server accepts, for each service.
+/// The maximum number of operations per request that a server accepts, for each service.
 #[derive(Debug)]
 pub struct OperationLimits([AtomicUsize; 4]);
 
@@ -117,7 +117,8 @@ pub struct Parts<'l, 'q, Q, A> {
     limits: &'l OperationLimits,
     service: Service,
     rest: &'q [Q],
-    /// The most operations in a part of this request, if smaller than the limit of the connection.
+    /// The maximum number of operations in a part of this request, if smaller than the limit of the
+    /// connection.
     most: usize,
     /// The length of the part that was sent last.
     sent: usize,
@@ -145,7 +146,6 @@ impl<'q, Q, A> Parts<'_, 'q, Q, A> {
     /// in smaller parts.
     ///
     /// # Errors
-    ///
     /// Returns an error if the request failed or if its response has a wrong number of results. The
     /// part is repeated unless [`skip`](Self::skip) is called.
     pub fn answered(&mut self, answer: Result<Vec<A>, Error>) -> Result<(), PartFault> {

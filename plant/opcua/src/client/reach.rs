@@ -126,7 +126,6 @@ impl Reach {
     /// Starts the next probe if the server is busy. To be called every half second.
     ///
     /// # Errors
-    ///
     /// Returns an error if the host has not answered for too long.
     pub(super) fn look(&mut self, is_busy: bool, now: Instant) -> Result<(), String> {
         match self.state.look(is_busy, now) {
@@ -172,12 +171,12 @@ async fn is_reached(url: String) -> bool {
     }
 }
 
-/// Most consecutive keep-alives that may be missed.
+/// Maximum number of consecutive keep-alives that may be missed.
 const MOST_MISSED: u32 = 2;
 /// Longest time without an answer of the host: time for three probes.
 const LOST_AFTER: Duration = Duration::from_millis(1_700);
 const TRY_LIMIT: Duration = Duration::from_secs(1);
-/// Most probes. Servers commonly have an accept queue of 100 connections.
+/// Maximum number of probes. Servers commonly have an accept queue of 100 connections.
 const MOST_TRIES: u32 = 64;
 
 #[cfg(test)]

@@ -94,7 +94,6 @@ impl Client {
     /// Reads the values of nodes. The result has one value per node, including bad values.
     ///
     /// # Errors
-    ///
     /// Returns an error if a request has no response.
     pub async fn read(&self, nodes: &[NodeId]) -> Result<Vec<DataValue>, ClientError> {
         let what: Vec<_> = nodes
@@ -107,7 +106,6 @@ impl Client {
     /// Reads attributes. The result has one value per attribute, including bad values.
     ///
     /// # Errors
-    ///
     /// Returns an error if a request has no response.
     pub async fn read_attributes(
         &self,
@@ -133,7 +131,6 @@ impl Client {
     /// Writes values, and returns a status code for each value.
     ///
     /// # Errors
-    ///
     /// Returns the first error. Other values may have been written;
     /// [`write_each`](Self::write_each) returns the result of each value.
     pub async fn write(
@@ -185,7 +182,6 @@ impl Client {
     /// Returns the references of a node, at most [`MOST_REFERENCES`].
     ///
     /// # Errors
-    ///
     /// Returns an error if the request has no response or the node does not exist.
     pub async fn browse(
         &self,
@@ -231,7 +227,6 @@ impl Client {
     /// Returns the node at a path of BrowseNames along hierarchical references.
     ///
     /// # Errors
-    ///
     /// Returns an error if the request has no response, or `BadNoMatch`.
     pub async fn translate(
         &self,
@@ -273,7 +268,6 @@ impl Client {
     /// Calls a method of an object.
     ///
     /// # Errors
-    ///
     /// Returns an error if the server refuses the call or the call has no response.
     pub async fn call(
         &self,
@@ -292,7 +286,6 @@ impl Client {
     /// (OPC 10000-4, 7.33).
     ///
     /// # Errors
-    ///
     /// Returns an error if the server refuses the call or the call has no response.
     pub async fn call_within(
         &self,
@@ -313,7 +306,6 @@ impl Client {
     /// Calls a method of an object, and returns the result with its status code, Good or not.
     ///
     /// # Errors
-    ///
     /// Returns an error if the call has no result.
     pub async fn call_result(
         &self,
@@ -363,5 +355,5 @@ fn as_many<T>(
     Ok(answer)
 }
 
-/// Most references of a node that are returned.
+/// Maximum number of references of a node that are returned.
 pub const MOST_REFERENCES: usize = 10_000;

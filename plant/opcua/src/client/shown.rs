@@ -47,7 +47,6 @@ impl Servers {
     /// Judges the certificate of an endpoint; `None` for an endpoint without security.
     ///
     /// # Errors
-    ///
     /// Returns an error if the certificate is refused.
     pub(super) fn take(&self, endpoint: &EndpointDescription) -> Result<Option<Taken>, Refused> {
         if endpoint.security_mode == MessageSecurityMode::None {
@@ -73,7 +72,6 @@ impl Servers {
     /// Judges an accepted certificate again, by the current content of the store.
     ///
     /// # Errors
-    ///
     /// Returns an error if the certificate is refused.
     pub(super) fn again(&self, taken: &Taken) -> Result<(), Refused> {
         let names = Names {
@@ -87,7 +85,6 @@ impl Servers {
     /// own certificate and key.
     ///
     /// # Errors
-    ///
     /// Returns an error if the store cannot be written.
     pub(super) fn store(&self, taken: &Taken) -> Result<Arc<RwLock<CertificateStore>>, String> {
         let root = std::path::absolute(self.judge.root()).map_err(|error| error.to_string())?;

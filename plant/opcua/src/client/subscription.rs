@@ -43,8 +43,8 @@ pub struct Sampled {
     pub node: NodeId,
     /// The sampling interval.
     pub interval: Duration,
-    /// The queue size at the server: most changes between two notifications. The oldest changes are
-    /// discarded.
+    /// The queue size at the server: maximum number of changes between two notifications. The
+    /// oldest changes are discarded.
     pub queue: u32,
     /// The absolute deadband; 0 reports every change.
     pub deadband: f64,
@@ -258,7 +258,6 @@ impl Client {
 /// Creates the requested subscriptions and deletes the dropped subscriptions.
 ///
 /// # Errors
-///
 /// Returns the reason if the connection is not usable.
 pub(crate) async fn renew(shared: &Shared, connected: &Connected) -> Result<(), String> {
     loop {
@@ -476,7 +475,7 @@ fn request(handle: u32, watch: &Watch, interval: Duration) -> MonitoredItemCreat
     }
 }
 
-/// Most subscriptions for a list of monitored items.
+/// Maximum number of subscriptions for a list of monitored items.
 const MOST_SUBSCRIPTIONS: usize = 100;
 /// Longest time between two notifications or keep-alives of a subscription.
 const KEEP_ALIVE: Duration = Duration::from_secs(1);

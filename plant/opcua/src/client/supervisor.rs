@@ -637,7 +637,7 @@ const POLICIES: [&str; 3] = [
     "Aes256_Sha256_RsaPss",
     "Aes128_Sha256_RsaOaep",
 ];
-/// Most endpoints in an error message.
+/// Maximum number of endpoints in an error message.
 const MOST_TOLD: usize = 12;
 /// Session timeout at the server, without the patience.
 const SESSION_TIMEOUT: Duration = Duration::from_secs(30);

@@ -30,7 +30,6 @@ impl Client {
     /// Returns the supertypes of a type, nearest first.
     ///
     /// # Errors
-    ///
     /// Returns an error if the request has no response or the type does not exist.
     pub async fn supertypes(&self, type_id: &NodeId) -> Result<Vec<NodeId>, ClientError> {
         let mut found = Vec::new();
@@ -49,7 +48,6 @@ impl Client {
     /// Returns whether a type is `base` or a subtype of `base`.
     ///
     /// # Errors
-    ///
     /// Returns an error if the request has no response or the type does not exist.
     pub async fn is_subtype_of(
         &self,
@@ -62,7 +60,6 @@ impl Client {
     /// Returns a type and its subtypes of all levels, at most [`MOST_TYPES`].
     ///
     /// # Errors
-    ///
     /// Returns an error if the request has no response or the type does not exist.
     pub async fn subtypes(&self, base: &NodeId) -> Result<Vec<NodeId>, ClientError> {
         let mut found = vec![base.clone()];
@@ -85,5 +82,5 @@ impl Client {
     }
 }
 
-/// Most types of a server that are returned or cached.
+/// Maximum number of types of a server that are returned or cached.
 pub const MOST_TYPES: usize = 10_000;

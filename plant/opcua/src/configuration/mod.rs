@@ -415,7 +415,6 @@ impl MethodHandler for CreateSigningRequest {
 }
 
 /// # Errors
-///
 /// Returns an error if the connection is not encrypted.
 fn is_unread(request: &MethodRequest) -> Result<(), StatusCode> {
     match request.caller.encrypted {

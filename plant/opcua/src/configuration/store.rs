@@ -30,7 +30,7 @@ impl StoreList {
     }
 
     /// AddCertificate: trusts the certificate of an application or of an authority. Issuer
-    /// certificates are changed only by writing the whole list (OPC 10000-12, 7.8.2.6).
+    /// certificates are added only by writing the whole list (OPC 10000-12, 7.8.2.6).
     pub(crate) fn add(&self, request: &MethodRequest) -> Answer {
         let [Variant::ByteString(bytes), Variant::Boolean(true)] = request.arguments.as_slice()
         else {

@@ -23,7 +23,7 @@ pub(super) struct Connections {
     open: BTreeMap<u64, Connection>,
     next: u64,
     most: usize,
-    /// Most connections per address; 0 for no limit.
+    /// Maximum number of connections per address; 0 for no limit.
     most_per_address: usize,
 }
 

@@ -33,7 +33,6 @@ impl GdsArguments {
     /// Reads the invitation; `None` without the option.
     ///
     /// # Errors
-    ///
     /// Returns an error if the text or the file is not an invitation. The message omits the text,
     /// which may contain a token.
     pub fn invitation(&self) -> Result<Option<Invitation>, InvitationFault> {

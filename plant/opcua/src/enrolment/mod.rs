@@ -421,7 +421,6 @@ fn status_of(error: &DirectoryError) -> Option<StatusCode> {
 /// Reads the own private key, and returns its DER encoding.
 ///
 /// # Errors
-///
 /// Returns an error if the file cannot be read or does not contain a key.
 pub fn own_key(root: &Path) -> Result<Vec<u8>, String> {
     let path = root.join(OWN_KEY);
@@ -445,7 +444,7 @@ const LISTS_AGAIN: Duration = Duration::from_secs(30);
 const LONGEST_VISIT: Duration = Duration::from_secs(60);
 /// Timeout of a request to the Global Discovery Server.
 const ANSWERS_WITHIN: Duration = Duration::from_secs(10);
-/// Most characters of a common name.
+/// Maximum number of characters of a common name.
 const LONGEST_NAME: usize = 64;
 
 #[cfg(test)]

@@ -191,7 +191,6 @@ pub(super) fn uris(set: &UANodeSet) -> &[String] {
 /// document.
 ///
 /// # Errors
-///
 /// Returns [`NodeSetError::Core`] if the document has no other nodes.
 fn leave_out_core(file: &str, set: &mut UANodeSet) -> Result<(), NodeSetError> {
     let (offset, count) = (offset(set), uris(set).len());

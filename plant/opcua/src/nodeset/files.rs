@@ -229,7 +229,6 @@ impl NodeSets {
     /// NodeIds in the address space.
     ///
     /// # Errors
-    ///
     /// Returns an error if nodes were left out.
     pub fn import(
         &self,
@@ -342,7 +341,7 @@ fn unread(file: &str, text: &Text, nodes: &[(String, String)]) -> Vec<NodeSetErr
     each.chain(more).collect()
 }
 
-/// Most individual findings for undecodable values of a file.
+/// Maximum number of individual findings for undecodable values of a file.
 const MOST_UNREAD: usize = 10;
 
 /// Registers the structures that the files define. Their namespaces are numbered by the map.

@@ -134,7 +134,6 @@ impl ExpandedMessageInfo for Exact {
 /// a field that the structure requires.
 ///
 /// # Errors
-///
 /// Returns the reason.
 pub(super) fn check_sent(value: &Variant, context: &Context<'_>) -> Result<(), String> {
     if !is_known(value) {

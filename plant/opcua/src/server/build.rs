@@ -232,7 +232,6 @@ impl ServerBuilder {
     /// [`Server::start`].
     ///
     /// # Errors
-    ///
     /// Returns an error if a NodeSet cannot be used, if listening on the port fails, or if
     /// certificates cannot be created.
     pub fn build(self) -> Result<Server, ServerError> {

@@ -67,7 +67,6 @@ pub trait MethodHandler: Send + Sync + 'static {
     /// Executes a call, and returns the output arguments.
     ///
     /// # Errors
-    ///
     /// Returns the refusal of the call.
     async fn call(&self, request: MethodRequest) -> Result<Vec<Variant>, Refusal>;
 }
@@ -251,7 +250,6 @@ pub(crate) fn end(call: &mut MethodCall, ended: Result<Vec<Variant>, Refusal>) {
 /// Checks the number and the types of arguments (OPC 10000-4, 5.12.2).
 ///
 /// # Errors
-///
 /// Returns the faults of the arguments.
 pub(crate) fn check_arguments(
     declared: &[Argument],

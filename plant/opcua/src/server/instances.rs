@@ -198,7 +198,6 @@ impl Server {
     /// Creates an instance of a type. `ids` returns the NodeId of each child by its path.
     ///
     /// # Errors
-    ///
     /// Returns an error for a type without instances, an invalid NodeId, or an optional child
     /// without declaration.
     pub fn instantiate(
@@ -303,7 +302,6 @@ impl Server {
     /// Creates an object.
     ///
     /// # Errors
-    ///
     /// Returns an error for an invalid NodeId or a missing parent.
     pub fn add_object(&self, spec: &ObjectSpec) -> Result<(), InstanceError> {
         let object = Object::new(
@@ -328,7 +326,6 @@ impl Server {
     /// Creates a variable.
     ///
     /// # Errors
-    ///
     /// Returns an error for an invalid NodeId or a missing parent.
     pub fn add_variable(&self, spec: &VariableSpec) -> Result<(), InstanceError> {
         let base = Base::new(
@@ -598,5 +595,5 @@ fn copy(node: &NodeType, id: NodeId) -> Option<NodeType> {
 
 /// Deepest level of children of a type.
 const DEEPEST: usize = 16;
-/// Most nodes of an instance.
+/// Maximum number of nodes of an instance.
 const MOST_NODES: usize = 10_000;

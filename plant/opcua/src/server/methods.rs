@@ -35,7 +35,6 @@ impl Server {
     /// Creates a method of an object, and sets its handler.
     ///
     /// # Errors
-    ///
     /// Returns an error for an invalid NodeId or a missing object. No node is created in this case.
     pub fn add_method(
         &self,

@@ -269,7 +269,6 @@ impl Server {
     /// Sets the value of a variable, with the current time.
     ///
     /// # Errors
-    ///
     /// Returns an error if the node is not a variable of this server's namespaces.
     pub fn show(&self, node: &NodeId, value: impl Into<Variant>) -> Result<(), StatusCode> {
         self.show_value(node, DataValue::new_now(value.into()))
@@ -279,7 +278,6 @@ impl Server {
     /// the current time.
     ///
     /// # Errors
-    ///
     /// Returns an error if the node is not a variable of this server's namespaces.
     pub fn show_value(&self, node: &NodeId, value: DataValue) -> Result<(), StatusCode> {
         self.show_all(vec![(node.clone(), value)])
@@ -288,7 +286,6 @@ impl Server {
     /// Sets the values of several variables atomically.
     ///
     /// # Errors
-    ///
     /// Returns an error if a node is not a variable of this server's namespaces. No value is set in
     /// this case.
     pub fn show_all(&self, values: Vec<(NodeId, DataValue)>) -> Result<(), StatusCode> {
@@ -305,7 +302,6 @@ impl Server {
     /// Sets whether clients may write a variable.
     ///
     /// # Errors
-    ///
     /// Returns an error if the node is not a variable of this server's namespaces.
     pub fn set_writable(&self, node: &NodeId, writable: bool) -> Result<(), StatusCode> {
         let mut own = self.inner.spaces.own().write();
@@ -322,7 +318,6 @@ impl Server {
     /// Sets the Executable attributes of a method. Calls still reach its handler.
     ///
     /// # Errors
-    ///
     /// Returns an error if the node is not a method of this server's namespaces.
     pub fn set_executable(&self, method: &NodeId, executable: bool) -> Result<(), StatusCode> {
         let attributes = [AttributeId::Executable, AttributeId::UserExecutable];

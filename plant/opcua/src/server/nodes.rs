@@ -40,7 +40,6 @@ pub trait WriteHandler: Send + Sync + 'static {
     /// Accepts a value, which the server then sets.
     ///
     /// # Errors
-    ///
     /// Returns the status code of the refusal.
     async fn write(&self, request: WriteRequest) -> Result<(), StatusCode>;
 }
@@ -107,7 +106,6 @@ impl Spaces {
     /// Returns the input arguments of a method of the own namespaces; empty without the property.
     ///
     /// # Errors
-    ///
     /// Returns an error if the value of the property is not a list of arguments.
     pub(crate) fn input_arguments(&self, method: &NodeId) -> Result<Vec<Argument>, StatusCode> {
         self.with(|view| {
@@ -236,7 +234,6 @@ pub(crate) fn plain(mut value: DataValue) -> DataValue {
 /// Sets values atomically, and notifies subscribers.
 ///
 /// # Errors
-///
 /// Returns an error if a node is not a variable of the own namespaces.
 pub(crate) fn show(
     address_space: &RwLock<AddressSpace>,

@@ -163,7 +163,6 @@ impl Access {
     /// Reads the users in a folder.
     ///
     /// # Errors
-    ///
     /// Returns an error if other users can read the file or if its content is invalid.
     pub fn new(folder: Option<PathBuf>, is_loopback: bool) -> Result<Self, UserFault> {
         let users = folder.as_deref().map(Users::read).transpose()?;
@@ -182,7 +181,6 @@ impl Access {
     /// Reads the users of a certificate store. Anonymous users have the roles `anonymous`.
     ///
     /// # Errors
-    ///
     /// Returns an error if other users can read the file or if its content is invalid.
     pub fn of_store(pki: Option<&Path>, anonymous: Roles) -> Result<Self, UserFault> {
         let access = Self::new(pki.map(|pki| pki.join(FOLDER)), false)?;
@@ -258,7 +256,7 @@ impl Access {
         self.roles(token).meets(permissions.of(right))
     }
 
-    /// Returns whether all authenticated users may read a node.
+    /// Returns whether all admitted users may read a node.
     #[must_use]
     pub fn is_public(&self, node: &NodeId) -> bool {
         let rules = self.rules.read();
@@ -453,7 +451,7 @@ impl AuthManager for Access {
 /// The policy ids of the library.
 const ANONYMOUS_POLICY: &str = "anonymous";
 const X509_POLICY: &str = "x509";
-/// Most concurrent password checks.
+/// Maximum number of concurrent password checks.
 const MOST_CHECKS: usize = 2;
 const AFTER_A_WRONG_ONE: Duration = Duration::from_secs(1);
 /// The hash that is compared if the user does not exist.

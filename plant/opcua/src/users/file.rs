@@ -125,7 +125,6 @@ impl Users {
     /// Reads the users in a folder. A missing folder or file contains no users.
     ///
     /// # Errors
-    ///
     /// Returns an error if other users can read the file, or if a line is invalid.
     pub fn read(folder: &Path) -> Result<Self, UserFault> {
         let path = folder.join(LIST);
@@ -178,7 +177,6 @@ impl Users {
     /// Writes the users, and replaces the previous file.
     ///
     /// # Errors
-    ///
     /// Returns an error if the folder or the file cannot be written.
     pub fn write(&self, folder: &Path) -> Result<(), UserFault> {
         let path = folder.join(LIST);
@@ -223,7 +221,6 @@ impl Users {
     /// Adds a user, or replaces the user with the same name.
     ///
     /// # Errors
-    ///
     /// Returns an error for an invalid name or if the user has no role.
     pub fn put(&mut self, name: &str, user: User) -> Result<(), UserFault> {
         if !is_name(name) {
@@ -239,7 +236,6 @@ impl Users {
     /// Replaces the roles of a user.
     ///
     /// # Errors
-    ///
     /// Returns an error if the user does not exist or if no role is given.
     pub fn set_roles(&mut self, name: &str, roles: Roles) -> Result<(), UserFault> {
         if roles == Roles::NONE {
@@ -254,7 +250,6 @@ impl Users {
     /// Removes a user.
     ///
     /// # Errors
-    ///
     /// Returns an error if the user does not exist.
     pub fn remove(&mut self, name: &str) -> Result<User, UserFault> {
         let gone = self.by_name.remove(name);
@@ -264,7 +259,6 @@ impl Users {
     /// Stores the certificate of a user in the folder, and returns the credential.
     ///
     /// # Errors
-    ///
     /// Returns an error if the file is not a certificate or cannot be stored.
     pub fn keep_certificate(folder: &Path, from: &Path) -> Result<Credential, UserFault> {
         let certificate = read_certificate(from)?;
@@ -284,7 +278,6 @@ impl Users {
     /// Returns the stored certificate of a user.
     ///
     /// # Errors
-    ///
     /// Returns an error if the certificate is missing or invalid.
     pub fn certificate(folder: &Path, thumbprint: &str) -> Result<X509, UserFault> {
         read_certificate(&folder.join(format!("{thumbprint}.der")))
@@ -345,7 +338,6 @@ fn sound_hash(text: &str) -> Result<String, String> {
 /// Returns the argon2id hash of a password, in the PHC format.
 ///
 /// # Errors
-///
 /// Returns an error if the password is too short or too long.
 pub fn hashed(password: &[u8]) -> Result<Credential, UserFault> {
     if !(8..=LARGEST_PASSWORD).contains(&password.len()) {
@@ -395,12 +387,12 @@ pub const FOLDER: &str = "users";
 pub(super) const LIST: &str = "list";
 const HEAD: &str = "# Name, roles, and the argon2 hash of the password or the thumbprint of the certificate. See `ua-server user`.\n";
 const X509_PREFIX: &str = "x509:";
-/// Most users of a server.
+/// Maximum number of users of a server.
 pub const MOST_USERS: usize = 10_000;
-/// Most bytes of a password.
+/// Maximum number of bytes of a password.
 pub const LARGEST_PASSWORD: usize = 1_024;
 const LARGEST_FILE: u64 = 4 << 20;
-/// Most memory in KiB, and most passes, of a hash.
+/// Maximum memory in KiB, and maximum number of passes, of a hash.
 const MOST_MEMORY: u32 = 256 << 10;
 const MOST_PASSES: u32 = 32;
 
