@@ -554,8 +554,8 @@ fn same_port(one: &str, other: &str) -> bool {
     place(one).is_some_and(|one| place(other) == Some(one))
 }
 
-/// Returns the wait plus a share that depends on the URL, so that many clients do not retry at the
-/// same time.
+/// Returns the wait plus a share that depends on the URL. A discovery server does not answer all of
+/// many simultaneous clients, and the share keeps them from retrying at the same time.
 fn spread(wait: Duration, url: &str) -> Duration {
     wait + wait.mul_f64(registry::spread(url))
 }

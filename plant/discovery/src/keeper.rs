@@ -337,7 +337,8 @@ fn keep<T>(map: &mut BTreeMap<String, T>, most: usize, url: &str, value: T) {
     }
 }
 
-/// The delay of a step that counts as a standstill rather than load.
+/// Largest delay of a step on a busy machine. A longer delay counts as a standstill of this
+/// program.
 const LATE: Duration = Duration::from_millis(500);
 /// The largest delay of an announced start time after the start time that the server itself
 /// reports, in 100 ns. The start of another run is later.
