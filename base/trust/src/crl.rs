@@ -97,8 +97,8 @@ impl Crl {
         )
     }
 
-    /// Returns whether the list is current at this time. A list whose successor is overdue may lack
-    /// recent revocations.
+    /// Returns whether the list is current at this time. A list may lack recent revocations if its
+    /// successor is overdue.
     #[must_use]
     pub fn is_current(&self, now: Duration) -> bool {
         let (from, next) = self.times();

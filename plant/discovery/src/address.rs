@@ -13,8 +13,8 @@ use mdns::is_own;
 
 /// Returns the server with a URL that other hosts can use. The URL of a server that listens on all
 /// addresses has the name of its host, which few networks resolve. Such a server registers with the
-/// address of the interface towards the discovery server. A server whose URL has an address or
-/// another name is not changed.
+/// address of the interface towards the discovery server. A URL with an address or another name is
+/// not changed.
 pub(crate) async fn reachable(server: Server, lds: &str, interface: Option<&Interface>) -> Server {
     let Some(place) = Url::parse(&server.url) else {
         return server;

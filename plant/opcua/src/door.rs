@@ -45,7 +45,7 @@ pub struct Door {
     shared: Arc<Shared>,
 }
 
-/// The rule for clients with a valid certificate that is not trusted and whose authority is not
+/// The rule for clients with a valid certificate if neither the certificate nor its authority is
 /// trusted.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum UnknownClients {

@@ -36,9 +36,10 @@ pub struct Judge {
     read: Mutex<Option<(Stamp, Arc<Known>)>>,
 }
 
-/// The rule for a server whose certificate does not name its host. The rule applies to certificates
-/// that are trusted themselves and have the expected ApplicationUri. A client may suppress this
-/// check (OPC 10000-4, 6.1.3), because DHCP may change the address while the certificate stays.
+/// The rule for a server if its certificate does not name its host. The rule applies to
+/// certificates that are trusted themselves and have the expected ApplicationUri. A client may
+/// suppress this check (OPC 10000-4, 6.1.3), because DHCP may change the address while the
+/// certificate stays.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum HostNames {
     /// The client connects and logs a warning.

@@ -1,4 +1,4 @@
-//! Tests of clients whose servers stop, restart, require certificates, or receive garbage from
+//! Tests of clients with servers that stop, restart, require certificates, or receive garbage from
 //! other peers.
 
 #![expect(

@@ -47,7 +47,7 @@ pub struct ClientConfig {
     /// Accepts a server of a trusted authority without a current revocation list. For connections
     /// to the server that distributes the list.
     pub allow_outdated_lists: bool,
-    /// The rule for a server whose trusted certificate does not name its host.
+    /// The rule for a server if its trusted certificate does not name its host.
     pub host_names: HostNames,
     /// The required security of the endpoint.
     pub security: SecurityChoice,

@@ -1,5 +1,5 @@
 //! NodeSets from files that the user names. All faults of all files are reported together. A file
-//! whose values cannot be decoded is used without these values.
+//! with values that cannot be decoded is used without these values.
 
 use std::collections::hash_map::DefaultHasher;
 use std::collections::{BTreeSet, HashMap};
@@ -40,7 +40,7 @@ pub struct NodeSets {
 pub struct Imported {
     /// All imported nodes.
     pub nodes: Vec<NodeId>,
-    /// The nodes whose values in the files cannot be decoded.
+    /// The nodes with values in the files that cannot be decoded.
     pub unread: Vec<NodeId>,
 }
 

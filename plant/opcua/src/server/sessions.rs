@@ -23,7 +23,7 @@ pub struct Caller {
     pub proven: bool,
     /// Whether the channel is signed and encrypted.
     pub encrypted: bool,
-    /// The certificate of the client in DER, whose private key the client proved to have; `None`
+    /// The certificate of the client in DER. The client proved to have its private key. `None`
     /// without security.
     pub certificate: Option<Arc<[u8]>>,
 }
