@@ -1,4 +1,5 @@
-//! The calls of the mapping: what is executed where, and as what it is asked for elsewhere.
+//! Calls of the mapping: the executor of each call, and the services and actions that offer it
+//! elsewhere.
 
 use std::time::Duration;
 
@@ -9,57 +10,61 @@ use crate::permission::Role;
 use crate::remote::Access;
 use crate::topic::{SpaceId, TopicId};
 
-/// One call of the space: an OPC UA Method, the service or action that executes it, and those that ask for it.
+/// Call of the space: an OPC UA Method, its executor, and the services or actions that offer it in
+/// other spaces.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Call {
-    /// Origin, namespace index, and the node's numeric identifier or alias. Of an action the first of five identifiers, see
-    /// [`CallKind::Action`].
+    /// Origin, namespace index, and the node's numeric identifier or alias. An action takes five
+    /// identifiers and this is the first, see [`CallKind::Action`].
     pub topic: TopicId,
     /// The OPC UA node.
     pub node: NodeIdText,
-    /// Its name for people, with dots between the folders.
+    /// Name for users, with dots between the folders.
     pub name: String,
-    /// What it does, for people; may be empty.
+    /// Description for users; may be empty.
     pub about: String,
-    /// Whether it has an answer at once or takes its time.
+    /// Kind of the call: a service with one response, or an action that takes time.
     pub kind: CallKind,
-    /// Who executes it.
+    /// Executor of the call.
     pub executed: ExecutedBy,
-    /// As what the other spaces ask for it; a space that is not among them has it under its topic.
+    /// Services and actions that offer the call in other spaces. A space without an entry offers
+    /// the call under the name of its topic.
     pub asked: Vec<CallBinding>,
-    /// Whether requests of other hosts are executed too; else only those from a loopback address.
+    /// `true` if requests of other hosts are executed too; `false` if only requests from a loopback
+    /// address are.
     pub open: bool,
-    /// How long the execution of a service may take, and how long who asks waits.
+    /// Longest time that a service may take, and that a caller waits.
     pub timeout: Duration,
-    /// Which roles may call it at the server; `None` where nothing is said.
+    /// Roles that may call it at the server; `None` if the document names none.
     pub callers: Option<Vec<Role>>,
 }
 
-/// Whether a call has an answer at once.
+/// Kind of a call: whether it has a response at once.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum CallKind {
     /// A request has one response.
     Service,
-    /// A goal is accepted, has feedback and, later, a result; it can be cancelled. The identifiers behind that of the goal are
-    /// those of its cancel (+1), its result (+2), its feedback (+3) and its status (+4).
+    /// A goal is accepted, sends feedback and, later, a result; a goal can be cancelled. The
+    /// identifiers after the goal's are the cancel (+1), the result (+2), the feedback (+3) and the
+    /// status (+4).
     Action,
 }
 
-/// Who executes a call.
+/// Executor of a call.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum ExecutedBy {
     /// A service or action in the ROS graph of the call's space.
     Ros(CallTarget),
     /// A Method of an OPC UA server, called by the cell's server.
     OpcUa(MethodTarget),
-    /// Somebody else in the space, such as a component.
+    /// Another executor in the space, such as a component.
     Elsewhere,
 }
 
 /// A service or action of a ROS graph.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct CallTarget {
-    /// With its leading `/`.
+    /// Name with its leading `/`.
     pub name: String,
     /// The type of the service or action.
     pub type_name: TypeName,
@@ -68,65 +73,71 @@ pub struct CallTarget {
 /// A Method of an OPC UA server.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct MethodTarget {
-    /// How the server is reached.
+    /// Endpoint, security and user of the server.
     pub access: Access,
-    /// Its name, if it is one of `servers`.
+    /// Name of the server, if it is an entry of `servers`.
     pub server: Option<String>,
-    /// The Object the Method is called on.
+    /// Object that the Method is called on.
     pub object: ExpandedNodeIdText,
     /// The Method.
     pub method: ExpandedNodeIdText,
 }
 
-/// As what a space asks for a call.
+/// Service or action that offers a call in a space.
 ///
-/// The fields of an action are those of [`messages::ActionCalls`]: `goal.order` of its goal, `result.sequence` of its result,
-/// `feedback.share` of its feedback. What stands beside those messages, as `goal_id`, is in no map and goes by name.
+/// The fields of an action are named as in [`messages::ActionCalls`]: `goal.order` in its goal,
+/// `result.sequence` in its result, `feedback.share` in its feedback. Fields beside these messages,
+/// such as `goal_id`, are in no map: each is made of the field of the same name.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct CallBinding {
-    /// Whose ROS graph the service or action is offered in.
+    /// Space in whose ROS graph the service or action is offered.
     pub space: SpaceId,
-    /// What is offered there.
+    /// Service or action that is offered there.
     pub target: CallTarget,
-    /// What the request of the call, or of its goal, is made of.
+    /// Sources of the fields of the call's request, or of its goal.
     pub request: FieldMap,
-    /// What the response here, or that with the result, is made of.
+    /// Sources of the fields of the offered service's response, or of the response with the
+    /// action's result.
     pub response: FieldMap,
-    /// What the value with the feedback here is made of; of a service it is empty.
+    /// Sources of the fields of the offered action's feedback; empty for a service.
     pub feedback: FieldMap,
 }
 
-/// What the fields of a message are made of. A field that it does not name is made of the field of the same name.
+/// Sources of the fields of a message. A field without an entry is made of the field of the same
+/// name.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct FieldMap(pub Vec<Assignment>);
 
-/// What one field is made of.
+/// Source of one field.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Assignment {
-    /// Path of the field that is written, or of a message with several.
+    /// Path of the field that is written, or of a message with several fields.
     pub target: String,
-    /// Where it comes from.
+    /// Source of the value.
     pub value: Assigned,
 }
 
-/// Where a field comes from.
+/// Source of a field.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Assigned {
-    /// A field of the other side, or a message with fields of the same names.
+    /// A field of the other message, or a message with fields of the same names.
     Field(String),
-    /// Always the same.
+    /// A constant.
     Constant(Literal),
 }
 
 impl FieldMap {
-    /// Whether every field is made of the one of the same name, and there is none without.
+    /// Returns `true` if every field is made of the field of the same name, and no field has
+    /// another source.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.0.is_empty()
     }
 
-    /// What a field is made of; `None` where that of the same name is meant. The longest target that is the field, or a message
-    /// around it, counts. Neither ROS tells large letters from small in names that the other writes so.
+    /// Returns the source of a field, or `None` if the field is made of the field of the same name.
+    /// The longest target counts that equals the field or a message around it. Names are compared
+    /// without regard to case, because ROS 2 writes in lower case some names that ROS 1 writes in
+    /// upper case.
     #[must_use]
     pub fn source(&self, field: &str) -> Option<Assigned> {
         let within = |target: &str| match field.get(..target.len()) {
@@ -149,7 +160,7 @@ impl FieldMap {
 }
 
 impl CallKind {
-    /// What people call it in ROS: `service` or `action`.
+    /// Returns the word of ROS for it: `service` or `action`.
     #[must_use]
     pub const fn word(self) -> &'static str {
         match self {
@@ -158,7 +169,8 @@ impl CallKind {
         }
     }
 
-    /// What the topics of such a call are of, in their order; nothing of the call itself.
+    /// Returns the roles of the topics of such a call, in their order; the call's own topic has an
+    /// empty role.
     pub(crate) const fn parts(self) -> &'static [&'static str] {
         match self {
             Self::Service => &[""],
@@ -166,7 +178,7 @@ impl CallKind {
         }
     }
 
-    /// The topics of such a call; fewer where the numbers end.
+    /// Returns the topics of such a call; fewer at the end of the number range.
     pub(crate) fn topics(self, first: TopicId) -> impl Iterator<Item = TopicId> + use<> {
         let (space, namespace, id) = first.triple();
         let parts = self.parts().iter().zip(0..);
@@ -175,12 +187,12 @@ impl CallKind {
 }
 
 impl Call {
-    /// Every topic the call takes: of an action five.
+    /// Returns every topic that the call takes; an action takes five.
     pub fn topics(&self) -> impl Iterator<Item = TopicId> + use<> {
         self.kind.topics(self.topic)
     }
 
-    /// As what that space asks for it.
+    /// Returns the service or action that offers the call in the space.
     #[must_use]
     pub fn binding(&self, space: SpaceId) -> Option<&CallBinding> {
         self.asked.iter().find(|binding| binding.space == space)

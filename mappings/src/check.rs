@@ -1,4 +1,4 @@
-//! Document -> mapping: what only shows when the parts of a document are seen together.
+//! Document -> mapping: checks that need several parts of a document together.
 
 mod bindings;
 mod calls;
@@ -43,50 +43,51 @@ use crate::tree::Place;
 
 use self::types::Types;
 
-/// What a document comes to.
+/// Result of checking a document.
 #[derive(Clone, Debug)]
 pub struct Checked {
-    /// `None` when one of the findings is an error.
+    /// The mapping; `None` if a finding is an error.
     pub mapping: Option<Mapping>,
-    /// All findings in the order of the text; at most some 200, the last one then tells how many more there are.
+    /// All findings in the order of the text. There are at most about 200; the last finding then
+    /// gives the number of the others.
     pub findings: Vec<Diagnostic>,
-    /// The message types that were looked for, and what was found.
+    /// Message types that the document names, and the origin of each definition.
     pub types: Vec<TypeUse>,
-    /// What was read.
+    /// Texts that were read.
     pub sources: Vec<Source>,
-    /// By whom the errors are minded; nobody stands for everybody.
+    /// Spaces that each error concerns. An empty entry concerns all programs.
     errors: BTreeSet<Vec<SpaceId>>,
-    /// The mapping for those who mind none of them, where there are errors.
+    /// The mapping for programs that none of the errors concerns, if there are errors.
     in_parts: Option<Mapping>,
 }
 
 /// A message, service or action type that a mapping names.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct TypeUse {
-    /// Of which ROS.
+    /// ROS version of the type.
     pub dialect: Dialect,
-    /// Whether it is a message, a service or an action.
+    /// Message, service or action.
     pub kind: TextKind,
-    /// Its name.
+    /// Name of the type.
     pub name: TypeName,
-    /// Where its definition is from.
+    /// Origin of its definition.
     pub source: TypeOrigin,
 }
 
-/// Where a definition is from.
+/// Origin of a definition.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum TypeOrigin {
-    /// It is built in.
+    /// Built in.
     BuiltIn,
     /// A file.
     File(String),
-    /// Nobody knows it yet.
+    /// The definition is not known yet.
     Unknown,
 }
 
 /// Definition files, as [`Surroundings::types`] opens them.
 pub trait TypeFiles: DefinitionTexts {
-    /// What is wrong with the `type_paths`; asked once.
+    /// Returns the faults of the `type_paths`; called once.
     fn faults(&mut self) -> Vec<PathFault>;
 }
 
@@ -96,42 +97,45 @@ impl TypeFiles for NoTexts {
     }
 }
 
-/// Something about one of the `type_paths`.
+/// Fault of one of the `type_paths`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct PathFault {
-    /// Which of them, from 0.
+    /// Index of the path in `type_paths`, from 0.
     pub path: usize,
-    /// What.
+    /// Kind of the fault.
     pub what: PathFaultKind,
 }
 
-/// What can be wrong with one of the `type_paths`.
+/// Kind of a fault of one of the `type_paths`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum PathFaultKind {
-    /// It is not there, cannot be read, or holds no definitions; why, for people.
+    /// The path does not exist, cannot be read, or has no definitions. The text is the reason, for
+    /// users.
     Empty(String),
-    /// A file of it does not count; which line of which file and why, for people.
+    /// A file of the path is ignored. The text gives file, line and reason, for users.
     File(String),
 }
 
 /// A text that was checked.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Source {
-    /// As findings name it.
+    /// Name of the text in findings.
     pub name: Arc<str>,
-    /// As it is in the file.
+    /// Content of the file.
     pub text: String,
 }
 
 impl Checked {
-    /// The mapping, if it can run for somebody: enough to tell which spaces a program serves.
+    /// Returns the mapping if it can run for at least one program: enough to find the spaces that a
+    /// program serves.
     #[must_use]
     pub fn outline(&self) -> Option<&Mapping> {
         self.mapping.as_ref().or(self.in_parts.as_ref())
     }
 
-    /// What it comes to for a program that serves these spaces, and no other. An error in what is known here of the types
-    /// that only others need is a warning, as their definitions may be where they are needed.
+    /// Returns the result for a program that serves these spaces, and no other. If an error lies in
+    /// the definition of a type that only other spaces need, it becomes a warning, because their
+    /// hosts may have another definition.
     #[must_use]
     pub fn for_spaces(mut self, spaces: &[SpaceId]) -> Self {
         let minds = |needed_by: &[SpaceId]| needed_by.iter().all(|space| spaces.contains(space));
@@ -154,7 +158,7 @@ impl Checked {
         }
         if !self.errors.iter().any(|needed_by| minds(needed_by)) {
             self.mapping = self.mapping.take().or_else(|| self.in_parts.take());
-            // What is left tells how many are not shown.
+            // The finding about findings that are not shown remains.
             for found in &mut self.findings {
                 found.severity = Severity::Warning;
             }
@@ -162,14 +166,14 @@ impl Checked {
         self
     }
 
-    /// Every finding with its source line, then how many there are; empty when there is none. `source` is the text that
-    /// was checked, of a document that includes no other.
+    /// Returns every finding with its source line, then the number of findings; empty without
+    /// findings. `source` is the text that was checked, of a document that includes no other file.
     #[must_use]
     pub fn render<'s>(&'s self, source: &'s str) -> String {
         self.render_with(|_| source)
     }
 
-    /// As [`render`](Self::render), with the texts that were read.
+    /// Renders as [`render`](Self::render), with the texts that were read.
     #[must_use]
     pub fn render_all(&self) -> String {
         self.render_with(|found| {
@@ -207,16 +211,16 @@ impl Checked {
 }
 
 impl Mapping {
-    /// Checks the text of a document that stands alone: it includes no other, and no environment variable is set. `file`
-    /// is how the findings name it. Never panics, and takes time and room in proportion to the text, of which at most
-    /// 32 MiB are read.
+    /// Checks the text of a document that stands alone: it includes no other file, and no
+    /// environment variable is set. `file` is its name in the findings. Never panics. Time and
+    /// memory grow in proportion to the text, of which at most 32 MiB are read.
     #[must_use]
     pub fn from_yaml(text: &str, file: &str) -> Checked {
         Self::from_text(text, file, &Alone)
     }
 
-    /// Checks the text of a document and of what it includes. `file` is how the findings name it, and paths within it are
-    /// taken from its folder.
+    /// Checks the text of a document and of the files that it includes. `file` is its name in the
+    /// findings, and paths in the text are relative to its folder.
     #[must_use]
     pub fn from_text(text: &str, file: &str, around: &dyn Surroundings) -> Checked {
         let mut findings = Findings::new(file);
@@ -240,7 +244,7 @@ impl Mapping {
     }
 }
 
-/// Faulty entries are left out; the places are those of the entries that are not.
+/// Returns the sound entries and their positions; faulty entries are left out.
 fn type_paths(
     entries: &Field<Vec<At<String>>>,
     findings: &mut Findings,
@@ -367,7 +371,7 @@ fn compile(
 }
 
 impl Document {
-    /// Whether each entry is there in what the document came to.
+    /// Returns `true` if the mapping contains each entry of the document.
     fn has_all_of(&self, mapping: &Mapping) -> bool {
         fn count<T>(entries: &Field<Vec<T>>) -> usize {
             let entries = entries.as_ref().and_then(|at| at.value.as_ref());
@@ -379,17 +383,18 @@ impl Document {
     }
 }
 
-/// Most entries of `type_paths`.
+/// Maximum number of entries of `type_paths`.
 const MAX_TYPE_PATHS: usize = 256;
 
-/// What a document declares.
+/// Declarations of a document.
 struct Declared<T> {
     known: T,
-    /// Some entry was faulty, so what is missing here may have been meant by it.
+    /// Some entry was faulty, so a name that is missing here may be the name of that entry.
     partial: bool,
 }
 
-/// The value of a key that has no default; notes when it is not there. `owner` is where the map begins.
+/// Returns the value of a key that has no default; notes a missing key. `owner` is the position of
+/// the map's beginning.
 fn required<'d, T>(
     field: &'d Field<T>,
     key: &str,

@@ -1,32 +1,33 @@
-//! The codes of findings.
+//! Codes of findings.
 
 use std::fmt;
 
 macro_rules! codes {
     ($($(#[$doc:meta])* $name:ident = $text:literal, $explanation:literal;)*) => {
-        /// What kind of finding. A code keeps its meaning from release to release; new ones may come.
+        /// Kind of a finding. A code keeps its meaning from release to release; new codes may be
+        /// added.
         #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
         #[non_exhaustive]
         pub enum Code { $(#[doc = concat!($text, ": ", $explanation)] $name,)* }
 
         impl Code {
-            /// Every code, ascending.
+            /// Every code, in ascending order.
             pub const ALL: &'static [Self] = &[$(Self::$name),*];
 
-            /// `M001`
+            /// Returns the text of the code, such as `M001`.
             #[must_use]
             pub const fn as_str(self) -> &'static str {
                 match self { $(Self::$name => $text),* }
             }
 
-            /// What the code means in general and what to do about it.
+            /// Returns the general meaning of the code and the remedy.
             #[must_use]
             pub const fn explanation(self) -> &'static str {
                 match self { $(Self::$name => $explanation),* }
             }
 
-            /// A short document with such a finding, and what is told of it as [`Checked::render`](crate::Checked::render)
-            /// has it.
+            /// Returns a short document with such a finding, and the findings as
+            /// [`Checked::render`](crate::Checked::render) renders them.
             #[must_use]
             pub const fn example(self) -> (&'static str, &'static str) {
                 match self {
@@ -149,8 +150,8 @@ codes! {
 }
 
 impl Code {
-    /// Whether it depends on what is known of a type on this host: on another one its definition may be another, or
-    /// there.
+    /// Returns `true` if the finding depends on the type definitions of this host: another host may
+    /// have the definition, or another version of it.
     pub(crate) const fn lies_in_definitions(self) -> bool {
         matches!(
             self,
@@ -183,7 +184,7 @@ impl fmt::Display for Code {
 impl std::str::FromStr for Code {
     type Err = UnknownCode;
 
-    /// Reads `M001`, in either case.
+    /// Reads a code such as `M001`, in upper or lower case.
     fn from_str(text: &str) -> Result<Self, UnknownCode> {
         let found = Self::ALL
             .iter()
@@ -192,7 +193,7 @@ impl std::str::FromStr for Code {
     }
 }
 
-/// A text that is none of the codes.
+/// Error for a text that is not a code.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("no finding has that code; codes are M001 to M171")]
 pub struct UnknownCode;

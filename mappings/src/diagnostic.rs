@@ -1,4 +1,4 @@
-//! Findings in a document, told as rustc tells them: code, place, the line with a caret, help.
+//! Findings in a document, rendered as rustc does: code, location, the line with a caret, help.
 
 use std::fmt::{self, Write as _};
 use std::sync::Arc;
@@ -8,32 +8,34 @@ use crate::key_text::without_keys;
 use crate::secret::masked;
 use crate::topic::SpaceId;
 
-/// One finding. Its `Display` is one line without the source: `error[M003]: <message> (cell.yaml:14:3)`.
+/// A finding. Its `Display` is one line without the source: `error[M003]: <message>
+/// (cell.yaml:14:3)`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Diagnostic {
-    /// What kind of finding; stable from release to release.
+    /// Kind of the finding; stable from release to release.
     pub code: Code,
-    /// Whether the document can run with it.
+    /// Severity: whether the document can run despite the finding.
     pub severity: Severity,
-    /// The text it is about.
+    /// Location in the document.
     pub at: Span,
-    /// What is wrong, naming the value.
+    /// The fault, with the value in it.
     pub message: String,
-    /// A word beside the caret.
+    /// Label beside the caret.
     pub label: Option<String>,
-    /// What to do about it.
+    /// Remedy.
     pub help: Option<String>,
-    /// Of an error that lies in what is known here of a type: the spaces whose programs need it, all of them together. A
-    /// program that does not serve them all can run with it. Empty where everybody is stopped.
+    /// Spaces whose programs need a type, all of them together, if the error lies in the definition
+    /// of the type on this host. A program that does not serve all of them can run despite the
+    /// error. Empty if the error stops every program.
     pub needed_by: Vec<SpaceId>,
 }
 
-/// Whether a document with the finding can run.
+/// Severity of a finding.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Severity {
-    /// It cannot: there is no [`Mapping`](crate::Mapping).
+    /// The document cannot run: there is no [`Mapping`](crate::Mapping).
     Error,
-    /// It can.
+    /// The document can run.
     Warning,
 }
 
@@ -46,23 +48,24 @@ impl fmt::Display for Severity {
     }
 }
 
-/// A piece of one line of a document.
+/// Part of one line of a document.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Span {
-    /// The name the document was given.
+    /// Name of the document.
     pub file: Arc<str>,
-    /// From 1.
+    /// Line number, from 1.
     pub line: usize,
-    /// From 1, in characters.
+    /// Column in characters, from 1.
     pub column: usize,
-    /// In characters, at least 1.
+    /// Length in characters, at least 1.
     pub len: usize,
 }
 
 impl Diagnostic {
-    /// The finding with its source line, several lines of text that end in a newline. `source` is the text that was
-    /// checked; without that line the finding is told without it. Control characters of the source are replaced, so
-    /// that a document cannot steer the terminal, and passwords in URLs are not shown.
+    /// Renders the finding with its source line: several lines of text that end in a newline.
+    /// `source` is the text that was checked; if it lacks the line, the finding is rendered without
+    /// it. Control characters of the source are replaced, so that a document cannot control the
+    /// terminal. Passwords in URLs are masked.
     #[must_use]
     pub fn render(&self, source: &str) -> String {
         let Span {
@@ -114,10 +117,11 @@ impl fmt::Display for Diagnostic {
     }
 }
 
-/// Widest piece of a line that is shown.
+/// Longest part of a line that is shown.
 const WIDTH: usize = 120;
 
-/// What is shown of a line, where in that the carets begin, and how many there are.
+/// Returns the shown part of a line, the position of the first caret in it, and the number of
+/// carets.
 fn window(text: &str, column: usize, len: usize) -> (String, usize, usize) {
     let text = text.trim_end();
     let total = text.chars().count();

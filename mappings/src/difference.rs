@@ -1,4 +1,4 @@
-//! What another version of a mapping says differently.
+//! Differences between two versions of a mapping.
 
 use std::collections::BTreeMap;
 
@@ -6,21 +6,22 @@ use crate::call::Call;
 use crate::mapping::Mapping;
 use crate::topic::TopicId;
 
-/// The variables, and behind them the calls, that two mappings do not have alike, in the order of their documents.
+/// Variables, and after them calls, that differ between two mappings, in the order of their
+/// documents.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Difference {
-    /// Only in the newer one.
+    /// Topics that only the newer mapping has.
     pub added: Vec<TopicId>,
-    /// In both, with something about them that differs.
+    /// Topics of both mappings with different properties.
     pub changed: Vec<TopicId>,
-    /// Only in the older one.
+    /// Topics that only the older mapping has.
     pub removed: Vec<TopicId>,
-    /// How many are the same in both.
+    /// Number of variables and calls that are equal in both.
     pub same: usize,
 }
 
 impl Mapping {
-    /// How this mapping differs from an older one, variable by variable and call by call.
+    /// Returns the differences from an older mapping, variable by variable and call by call.
     #[must_use]
     pub fn difference(&self, older: &Self) -> Difference {
         let mut difference = Difference::default();

@@ -1,4 +1,5 @@
-//! The document as it is written. The keys, their meaning for a reader of the schema, and nothing checked across them.
+//! The document as it is written: keys and their documentation for the schema. Nothing is checked
+//! across keys.
 
 mod security;
 
@@ -572,7 +573,7 @@ pub(crate) const EXPANDED_NODE_ID: &str = r"^(ns=[0-9]+;|nsu=[^;]+;)?[isgb]=";
 
 pub(crate) const DURATION: &str = r"^[0-9]+(\.[0-9]+)?(ms|s|min|h)$";
 
-/// Index and URI, each at its place.
+/// Index and URI, each with its position.
 pub(crate) type Namespaces = Vec<(At<u16>, At<String>)>;
 
 impl Read for Namespaces {
@@ -603,7 +604,7 @@ impl Read for Namespaces {
     }
 }
 
-/// Value and its text, each at its place.
+/// Value and text, each with its position.
 pub(crate) type EnumTexts = Vec<(At<i64>, At<String>)>;
 
 impl Read for EnumTexts {
@@ -623,7 +624,7 @@ impl Read for EnumTexts {
     }
 }
 
-/// Constants of a request: path of the field, where it is said, and the value.
+/// Constants of a request: path of the field, its position, and the value.
 #[derive(Clone, Debug)]
 pub(crate) struct Request(pub(crate) Vec<(String, Place, Literal)>);
 
@@ -635,7 +636,7 @@ impl Read for Request {
     }
 }
 
-/// `None` after noting what is faulty. Maps nest no deeper than documents do.
+/// Returns `None` for faulty constants, which are noted. Maps nest no deeper than documents do.
 fn constants(
     node: &Node<'_>,
     prefix: &str,
@@ -685,7 +686,7 @@ impl JsonSchema for Request {
     }
 }
 
-/// What is published when the commander of a value is lost.
+/// Reaction to the loss of a value's commander.
 #[derive(Clone, Debug)]
 pub(crate) enum OnLossEntry {
     /// A message of zeros.
@@ -739,14 +740,14 @@ impl JsonSchema for OnLossEntry {
     }
 }
 
-/// What says that a value has arrived.
+/// Confirmation that a value has arrived.
 #[derive(Clone, Debug)]
 pub(crate) enum ConfirmedEntry {
-    /// Nothing.
+    /// No confirmation.
     None,
-    /// The bridges that the value is for.
+    /// Confirmation by the bridges that the value is for.
     Bridge,
-    /// The bridges or a value, as the map says.
+    /// Confirmation by the bridges or by a value, as the map says.
     Map(Box<ConfirmEntry>),
 }
 
@@ -787,7 +788,7 @@ impl JsonSchema for ConfirmedEntry {
     }
 }
 
-/// What fields are made of: path of the field, where it is said, and what.
+/// Sources of fields: path of the field, its position, and the source.
 #[derive(Clone, Debug)]
 pub(crate) struct FieldMapEntry(pub(crate) Vec<(String, Place, Assigned)>);
 
@@ -799,7 +800,7 @@ impl Read for FieldMapEntry {
     }
 }
 
-/// `None` after noting what is faulty. Maps nest no deeper than documents do.
+/// Returns `None` for faulty assignments, which are noted. Maps nest no deeper than documents do.
 fn assignments(
     node: &Node<'_>,
     prefix: &str,
@@ -860,7 +861,7 @@ impl JsonSchema for FieldMapEntry {
     }
 }
 
-/// One service or action of a call, or a list of them.
+/// A service or action of a call, or a list of them.
 #[derive(Clone, Debug)]
 pub(crate) struct CallBindings(pub(crate) Vec<At<CallBindingEntry>>);
 
@@ -895,7 +896,7 @@ impl JsonSchema for CallBindings {
     }
 }
 
-/// A field of a DataSet, by its place or its name.
+/// A field of a DataSet, by its index or its name.
 #[derive(Clone, Debug)]
 pub(crate) struct UaFieldEntry(pub(crate) UaField);
 
@@ -933,10 +934,10 @@ impl JsonSchema for UaFieldEntry {
     }
 }
 
-/// Bytes of the longest name of a field that is kept of what writers announce.
+/// Longest field name, in bytes, that is kept from the metadata of writers.
 const MAX_FIELD_NAME: usize = 255;
 
-/// One path or a list of them.
+/// A path or a list of paths.
 #[derive(Clone, Debug)]
 pub(crate) struct Includes(pub(crate) Vec<At<String>>);
 
@@ -968,7 +969,7 @@ impl JsonSchema for Includes {
     }
 }
 
-/// One role or a list of them.
+/// A role or a list of roles.
 #[derive(Clone, Debug)]
 pub(crate) struct RoleList(pub(crate) Vec<At<RoleEntry>>);
 
@@ -1045,7 +1046,7 @@ impl JsonSchema for FieldList {
     }
 }
 
-/// One binding or a list of them.
+/// A binding or a list of bindings.
 #[derive(Clone, Debug)]
 pub(crate) struct Bindings(pub(crate) Vec<At<BindingEntry>>);
 
@@ -1138,7 +1139,7 @@ fn found(node: &Node<'_>) -> String {
 }
 
 impl Default for Document {
-    /// Without any key.
+    /// Returns a document without any key.
     fn default() -> Self {
         Self {
             include: None,
@@ -1156,10 +1157,10 @@ impl Default for Document {
     }
 }
 
-/// Reads the whole document; an empty one is one without any key.
+/// Reads the whole document; an empty text is a document without any key.
 pub(crate) fn read(root: &Node<'_>, reader: &mut Reader<'_>) -> Option<(Document, Place)> {
     if matches!(root.kind, Kind::Null) {
-        // A file that another includes may be empty.
+        // A file that another file includes may be empty.
         if root.place.file == 0 {
             let message = "the document is empty: it declares no spaces, values or calls";
             let note = reader.findings.error(Code::MissingKey, root.place, message);

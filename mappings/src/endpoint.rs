@@ -1,18 +1,18 @@
-//! Where an OPC UA server is.
+//! Endpoint of an OPC UA server.
 
-/// `opc.tcp://host:port/path`.
+/// URL `opc.tcp://host:port/path`.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
 pub struct Endpoint {
-    /// Host name or address; an IPv6 address without its brackets.
+    /// Host name or address; an IPv6 address is without its brackets.
     pub host: String,
-    /// 1..=65535.
+    /// Port, 1..=65535.
     pub port: u16,
-    /// Empty, or begins with `/`.
+    /// Path; empty, or begins with `/`.
     pub path: String,
 }
 
 impl Endpoint {
-    /// As it is written, with port 4840 where none is said (OPC 10000-6, 7.2). `None` where that is no such URL.
+    /// Reads the URL; the default port is 4840 (OPC 10000-6, 7.2). Returns `None` for another text.
     #[must_use]
     pub fn parse(text: &str) -> Option<Self> {
         let rest = text.strip_prefix("opc.tcp://")?;
@@ -58,7 +58,7 @@ impl Endpoint {
         })
     }
 
-    /// Whether only programs of its own host reach it, as far as its host says.
+    /// Returns `true` if only programs of its own host reach it, judging by its host.
     #[must_use]
     pub fn is_loopback(&self) -> bool {
         match self.host.parse::<std::net::IpAddr>() {
@@ -89,7 +89,7 @@ impl std::fmt::Display for Endpoint {
     }
 }
 
-/// The one registered for OPC UA over TCP.
+/// Port registered for OPC UA over TCP.
 const PORT: u16 = 4840;
 
 #[cfg(test)]

@@ -1,4 +1,5 @@
-//! What is there while a mapping is looked at: the graphs and the server it names, as somebody with sockets saw them.
+//! The running cell while a mapping is checked: ROS graphs and OPC UA servers, as a program with
+//! sockets queried them.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -8,58 +9,60 @@ use crate::call::MethodTarget;
 use crate::node_id::{ExpandedNodeIdText, NodeIdText};
 use crate::topic::SpaceId;
 
-/// What was asked for and found. What is missing here was not asked for, and says nothing.
+/// Results of queries. Names that are missing here were not queried, so nothing is reported about
+/// them.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Environment {
-    /// The ROS graphs, by their spaces.
+    /// ROS graphs, by space.
     pub spaces: BTreeMap<SpaceId, LiveSpace>,
     /// The OPC UA server of the cell.
     pub server: Option<LiveServer>,
-    /// What other OPC UA servers said of Methods of theirs that execute calls: nothing where all is well, else why one cannot
-    /// be called, for people.
+    /// Results for Methods of other OPC UA servers that execute calls: `None` if the Method can be
+    /// called, else the reason, for users.
     pub methods: Vec<(MethodTarget, Option<String>)>,
-    /// What other OPC UA servers said of nodes of theirs that variables come from or go to, by the name of the server and the
-    /// text of the node id.
+    /// Results for nodes of other OPC UA servers that variables come from or are written to, by the
+    /// name of the server and the text of the node id.
     pub remote: BTreeMap<(String, String), LiveRemote>,
 }
 
 impl Environment {
-    /// What a server said of a node; `None` where it was not asked.
+    /// Returns the result for a node of a server; `None` if it was not queried.
     pub(crate) fn remote(&self, server: &str, node: &ExpandedNodeIdText) -> Option<LiveRemote> {
         let key = (server.to_owned(), node.to_string());
         self.remote.get(&key).copied()
     }
 }
 
-/// What another server said of a node.
+/// Result of a query for a node of another server.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum LiveRemote {
-    /// There is no such variable.
+    /// The server has no such variable.
     Away,
     /// A variable.
     Variable {
-        /// Its builtin type and whether it is an array, where the server says so.
+        /// Builtin type, and `true` for an array; `None` if the server does not provide it.
         value: Option<(BuiltinType, bool)>,
-        /// Whether whoever asked may read it.
+        /// `true` if the session of the query may read it.
         readable: bool,
-        /// Whether whoever asked may write it.
+        /// `true` if the session of the query may write it.
         writable: bool,
     },
 }
 
-/// A ROS graph as it was.
+/// State of a ROS graph.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct LiveSpace {
-    /// By their names, with the leading `/`.
+    /// Topics by their names, with the leading `/`.
     pub topics: BTreeMap<String, LiveTopic>,
-    /// Services by their names, with the types they have, as `std_srvs/SetBool`: several where servers disagree, none where
-    /// nobody told. `None` where they were not asked for.
+    /// Services by their names, with their types, such as `std_srvs/SetBool`. There are several
+    /// types if servers disagree, and none if no server announces its type. `None` if services were
+    /// not queried.
     pub services: Option<BTreeMap<String, BTreeSet<String>>>,
 }
 
 impl LiveSpace {
-    /// The actions that somebody serves, by their names, with the types they have, as `nav2_msgs/NavigateToPose`: told by the
-    /// topics of their feedback.
+    /// Returns the actions that have a server, by their names, with their types, such as
+    /// `nav2_msgs/NavigateToPose`. They are found by the topics of their feedback.
     #[must_use]
     pub fn actions(&self) -> BTreeMap<&str, BTreeSet<String>> {
         let mut actions: BTreeMap<&str, BTreeSet<String>> = BTreeMap::new();
@@ -81,37 +84,40 @@ impl LiveSpace {
     }
 }
 
-/// A topic as it was.
+/// State of a topic.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct LiveTopic {
-    /// Its message types, as `std_msgs/Bool`; several where publishers and subscribers disagree, none where nobody told.
+    /// Message types, such as `std_msgs/Bool`; several if publishers and subscribers disagree, none
+    /// if no node announces the type.
     pub types: BTreeSet<String>,
-    /// Somebody publishes it.
+    /// `true` if the topic has a publisher.
     pub published: bool,
-    /// Somebody subscribes to it.
+    /// `true` if the topic has a subscriber.
     pub subscribed: bool,
 }
 
-/// An OPC UA server as it was.
+/// State of an OPC UA server.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct LiveServer {
     /// Its NamespaceArray: the URI of each index.
     pub namespaces: Vec<String>,
-    /// The nodes that were asked for, by the text of their ids.
+    /// Results for the nodes that were queried, by the text of their ids.
     pub nodes: BTreeMap<String, LiveNode>,
 }
 
-/// What a server said of a node it was asked for.
+/// Result of a query for a node of the cell's server.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum LiveNode {
-    /// There is no such variable.
+    /// The server has no such variable.
     Away,
-    /// A variable; its builtin type and whether it is an array, where the server says so.
+    /// A variable, with its builtin type and `true` for an array; `None` if the server does not
+    /// provide the type.
     Variable(Option<(BuiltinType, bool)>),
 }
 
 impl LiveServer {
-    /// Whether the node's namespace index means the URI `uri` here, so that the node can be asked for by its id.
+    /// Returns `true` if the node's namespace index means `uri` at this server, so that the node
+    /// can be queried by its id.
     #[must_use]
     pub fn agrees(&self, node: &NodeIdText, uri: Option<&str>) -> bool {
         let index = usize::from(node.namespace);

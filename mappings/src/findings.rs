@@ -1,4 +1,4 @@
-//! What has been found so far.
+//! Collection of findings.
 
 use std::collections::{BTreeMap, BTreeSet, HashSet};
 use std::sync::Arc;
@@ -11,22 +11,22 @@ use crate::secret;
 use crate::topic::SpaceId;
 use crate::tree::Place;
 
-/// Most findings that are kept; the rest is counted.
+/// Maximum number of findings that are kept; further findings are counted.
 const MAX: usize = 200;
 
 pub(crate) struct Findings {
-    /// By the numbers their places have.
+    /// Names of the files, by the file numbers of positions.
     files: Vec<Arc<str>>,
     found: Vec<(u16, Diagnostic)>,
-    /// An alias brings a node, and what is wrong with it, to several places.
+    /// Findings that exist already: an alias puts a node and its faults into several positions.
     seen: HashSet<(Code, Place, String)>,
-    /// Values that are not there, so that nothing can be said of them.
+    /// Positions of values that are unknown, so that nothing is reported about them.
     unknown: HashSet<Place>,
-    /// Values out of the environment, which are nobody's to read, and what stands for them.
+    /// Values from the environment, which are secret, and the texts that are shown instead.
     secrets: BTreeMap<String, String>,
-    /// The spaces whose part of the document is looked at.
+    /// Spaces of the part of the document that is being checked.
     part: Vec<SpaceId>,
-    /// By whom the errors are minded.
+    /// Spaces that each error concerns.
     errors: BTreeSet<Vec<SpaceId>>,
     left_out: usize,
 }
@@ -45,7 +45,7 @@ impl Findings {
         }
     }
 
-    /// Takes in another file and gives its number; `None` when there are too many.
+    /// Adds a file and returns its number; `None` if there are too many files.
     pub(crate) fn file(&mut self, name: &str) -> Option<u16> {
         let number = u16::try_from(self.files.len()).ok()?;
         self.files.push(name.into());
@@ -59,7 +59,8 @@ impl Findings {
             .unwrap_or_default()
     }
 
-    /// Where something is, told at another place: `line 6`, and of which file if that is another.
+    /// Returns the line of a position, seen from another position: `line 6`, with the file name if
+    /// the files differ.
     pub(crate) fn line(&self, of: Place, at: Place) -> String {
         if of.file == at.file {
             format!("line {}", of.line)
@@ -68,24 +69,24 @@ impl Findings {
         }
     }
 
-    /// Nothing else is said of what stands there.
+    /// Suppresses other findings about the position.
     pub(crate) fn is_unknown(&mut self, place: Place) {
         self.unknown.insert(place);
     }
 
-    /// Does not let `value` be read in what is told: `written` stands for it.
+    /// Hides `value` in all findings: they show `written` instead.
     pub(crate) fn hide(&mut self, value: String, written: String) {
         if value != written && !value.is_empty() {
             self.secrets.entry(value).or_insert(written);
         }
     }
 
-    /// Whether a text is the value of an environment variable.
+    /// Returns `true` if a text is the value of an environment variable.
     pub(crate) fn is_hidden(&self, value: &str) -> bool {
         self.secrets.contains_key(value)
     }
 
-    /// The finding may be given a label and help until the next one comes.
+    /// Adds an error. Label and help may be added to it until the next finding.
     pub(crate) fn error(
         &mut self,
         code: Code,
@@ -148,25 +149,26 @@ impl Findings {
         Note(self.found.last_mut().map(|(_, found)| found))
     }
 
-    /// What is found from now on about types is about those of these spaces, all together: of one host's part of the
-    /// cell. Without any, everybody minds.
+    /// Sets the spaces that the next findings about types concern, all of them together: the spaces
+    /// of one host's part of the cell. Without spaces, the findings concern every program.
     pub(crate) fn of_part(&mut self, spaces: impl IntoIterator<Item = SpaceId>) {
         self.part = spaces.into_iter().collect();
         self.part.sort_unstable();
         self.part.dedup();
     }
 
-    /// The spaces that mind the errors; of those that everybody minds there are none.
+    /// Returns the spaces that each error concerns; an entry without spaces is an error for every
+    /// program.
     pub(crate) const fn errors(&self) -> &BTreeSet<Vec<SpaceId>> {
         &self.errors
     }
 
-    /// In the order of the files and their texts.
+    /// Returns the findings in the order of the files and their texts.
     pub(crate) fn into_sorted(mut self) -> Vec<Diagnostic> {
         self.found
             .sort_by_key(|(file, found)| (*file, found.at.line, found.at.column, found.code));
         let mut all: Vec<Diagnostic> = self.found.into_iter().map(|(_, found)| found).collect();
-        // The longest first, of which another may be a part.
+        // The longest value comes first, because it may contain another.
         let mut secrets: Vec<(String, String)> = self.secrets.into_iter().collect();
         secrets.sort_by_key(|(value, _)| std::cmp::Reverse(value.len()));
         for found in &mut all {
@@ -208,8 +210,8 @@ impl Findings {
     }
 }
 
-/// A text without the values in it. A short one is only taken out where it stands by itself: elsewhere it is a word like
-/// another.
+/// Replaces the values in a text. A short value is replaced only if it stands alone: inside of
+/// other text it may be an ordinary word.
 fn hidden(text: &str, secrets: &[(String, String)]) -> String {
     let mut text = text.to_owned();
     for (value, written) in secrets {
@@ -224,7 +226,7 @@ fn hidden(text: &str, secrets: &[(String, String)]) -> String {
     text
 }
 
-/// A text without beginnings of a value that end where the text around them was cut.
+/// Replaces beginnings of a value at which the text was cut.
 fn without_beginnings(text: &str, value: &str, written: &str) -> String {
     let beginnings = || {
         let ends = value.char_indices().map(|(at, _)| at);
@@ -250,14 +252,14 @@ fn without_beginnings(text: &str, value: &str, written: &str) -> String {
     out
 }
 
-/// What stands where a text was cut.
+/// Mark at the end of a text that was cut.
 const CUT: &str = "...";
-/// More characters than are left of a text that was cut.
+/// Upper bound of the characters that are left of a text that was cut.
 const MOST_CUT: usize = 256;
-/// From so many bytes on a value does not occur in a finding by chance.
+/// Shortest value, in bytes, that does not occur in a finding by chance.
 const TELLING: usize = 8;
 
-/// The finding just made; nothing when it was one too many or known already.
+/// The finding that was just added; `None` if it exceeds the maximum or exists already.
 pub(crate) struct Note<'f>(Option<&'f mut Diagnostic>);
 
 impl Note<'_> {
@@ -268,7 +270,7 @@ impl Note<'_> {
         self
     }
 
-    /// As [`Note::help`], for what takes long to make.
+    /// Sets a help as [`Note::help`] does; the help is created only if it is needed.
     pub(crate) fn help_with(self, help: impl FnOnce() -> String) {
         if self.0.is_some() {
             self.help(help());

@@ -1,4 +1,4 @@
-//! A document and the files it includes, as one.
+//! A document and the files that it includes, as one document.
 
 use crate::check::Source;
 use crate::code::Code;
@@ -13,14 +13,14 @@ pub(crate) struct Loader<'a> {
     pub(crate) around: &'a dyn Surroundings,
     pub(crate) findings: &'a mut Findings,
     pub(crate) sources: Vec<Source>,
-    /// The files that are being read, the outermost first.
+    /// Files that are being read, the outermost first.
     open: Vec<String>,
-    /// Where each file was named.
+    /// Files that have been read, each with the position that names it.
     read: Vec<(String, Place)>,
     bytes: usize,
-    /// Of the values of variables in all files.
+    /// Bytes of the values of variables in all files.
     expanded: usize,
-    /// Some file is missing in the whole.
+    /// A file could not be read, so the document is incomplete.
     partial: bool,
     whole: Document,
 }
@@ -40,14 +40,15 @@ impl<'a> Loader<'a> {
         }
     }
 
-    /// The document of that text with all it includes, and what was read. `None` when the text itself is none.
+    /// Returns the document of the text with all files that it includes, and the texts that were
+    /// read. The document is `None` if the text itself is faulty.
     pub(crate) fn load(mut self, text: &str, name: &str) -> (Option<Document>, Vec<Source>) {
-        // The file may be named as another names it.
+        // An included file may include this file in turn, by its path.
         let path = beside("", name);
         self.read.push((path.clone(), Place::START));
         let read = self.add(text, name, (path, 0));
         if self.partial {
-            // What is not declared may be so in what could not be read.
+            // A declaration that is missing here may be in a file that could not be read.
             self.whole.spaces = Some(missing());
             self.whole.namespaces = Some(missing());
             self.whole.servers = Some(missing());
@@ -99,7 +100,7 @@ impl<'a> Loader<'a> {
                 note.help("a folder with ROS packages in it, or a file, relative to the mapping; a URL brings no types");
                 *value = None;
             }
-            // An empty one stays what it is, for a finding.
+            // An empty text stays empty, so that a finding reports it.
             if let Some(named) = value.as_mut().filter(|named| !named.is_empty()) {
                 *named = beside(&path, named);
                 if named.is_empty() {
@@ -122,7 +123,7 @@ impl<'a> Loader<'a> {
         Some(())
     }
 
-    /// The NodeSets that a document names are beside its file.
+    /// Makes the paths of NodeSets relative to the folder of the file that names them.
     fn nodesets(&mut self, document: &mut Document, path: &str) {
         let server = document.server.as_mut().and_then(|at| at.value.as_mut());
         let files = server.and_then(|server| server.nodesets.as_mut()?.value.as_mut());
@@ -134,14 +135,14 @@ impl<'a> Loader<'a> {
                 );
                 *value = None;
             }
-            // An empty one stays what it is, for a finding.
+            // An empty text stays empty, so that a finding reports it.
             if let Some(named) = value.as_mut().filter(|named| !named.is_empty()) {
                 *named = beside(path, named);
             }
         }
     }
 
-    /// Notes at the first of them that passwords stand in a file.
+    /// Notes passwords in a file, at the first of them.
     fn secrets(&mut self, found: &[Place], path: &str) {
         let Some((place, more)) = found.split_first() else {
             return;
@@ -263,12 +264,12 @@ impl<'a> Loader<'a> {
             return;
         };
         self.read.push((path.clone(), place));
-        // What keeps it from being read has been noted.
+        // The reason that the file cannot be read has been noted.
         let read = self.add(&text, &path.clone(), (path, number));
         self.partial |= read.is_none();
     }
 
-    /// Takes the parts of a file into the whole: lists one behind the other, all else once.
+    /// Merges a file into the whole document: lists are appended, all other keys may occur once.
     fn take(&mut self, other: Document) {
         let Document {
             include: _,
@@ -296,7 +297,8 @@ impl<'a> Loader<'a> {
     }
 }
 
-/// The files with keys that a document names; an empty one stays what it is, for a finding.
+/// Returns the key files that a document names. An empty path is left out, so that a finding
+/// reports it.
 fn key_files(document: &mut Document) -> impl Iterator<Item = &mut String> {
     let groups = document.security.as_mut().and_then(|at| at.value.as_mut());
     let groups = groups.into_iter().flatten();
@@ -305,7 +307,7 @@ fn key_files(document: &mut Document) -> impl Iterator<Item = &mut String> {
     files.filter(|file| !file.is_empty())
 }
 
-/// What a faulty entry comes to.
+/// Returns the value of a faulty entry.
 const fn missing<T>() -> At<T> {
     At {
         place: Place::START,
@@ -319,7 +321,7 @@ fn append<T>(whole: &mut Field<Vec<T>>, part: Field<Vec<T>>) {
         (whole @ None, part) => *whole = part,
         (Some(whole), Some(part)) => match (&mut whole.value, part.value) {
             (Some(all), Some(more)) => all.extend(more),
-            // One of them is faulty, so something is missing in the whole.
+            // One of the lists is faulty, so the whole list is incomplete.
             (value, _) => *value = None,
         },
     }
@@ -339,7 +341,7 @@ fn once<T>(key: &str, whole: &mut Field<T>, part: Field<T>, findings: &mut Findi
     }
 }
 
-/// Not told with the text, which may have a password in it.
+/// Message without the URL, which may contain a password.
 const URL: &str = "a URL stands where a path of a file is wanted";
 const MAX_NESTED: usize = 8;
 const MAX_FILES: usize = 256;

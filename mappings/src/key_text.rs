@@ -1,17 +1,17 @@
-//! Keys that somebody wrote where everybody reads them.
+//! Keys in places that are not secret, such as the document itself.
 
 use std::borrow::Cow;
 
-/// So many hexadecimal digits in a row are taken for a key: 16 bytes.
+/// Number of hexadecimal digits in a row that are taken for a key: 16 bytes.
 const DIGITS: usize = 32;
 
-/// Whether somebody wrote a key there, by itself or as the last part of a path.
+/// Returns `true` if the text is a key, alone or as the last part of a path.
 pub(crate) fn is_key(text: &str) -> bool {
     let text = text.rsplit('/').next().unwrap_or_default();
     text.len() >= DIGITS && text.bytes().all(|byte| byte.is_ascii_hexdigit())
 }
 
-/// A text without what may be keys, as many characters as it had.
+/// Masks possible keys in a text, with as many characters as before.
 pub(crate) fn without_keys(text: Cow<'_, str>) -> Cow<'_, str> {
     let is_digit = |c: char| c.is_ascii_hexdigit();
     if !text.split(|c| !is_digit(c)).any(|run| run.len() >= DIGITS) {

@@ -1,4 +1,4 @@
-//! The names of the space, and the YAML that ties them to ROS topics and OPC UA nodes.
+//! Names of the space, and the YAML document that ties them to ROS topics and OPC UA nodes.
 
 mod call;
 mod check;

@@ -7,19 +7,20 @@ use messages::{Literal, Selected, Selection, TypeName};
 
 use crate::topic::TopicId;
 
-/// What is published once for a value when its commander has ended or timed out.
+/// Message or call that is published once when the commander of a value has ended or timed out.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Loss {
     /// The reaction.
     pub action: LossAction,
-    /// The time after which a value that is not renewed counts as lost; `None`: only the end of its commander counts.
+    /// Time after which a value that is not renewed counts as lost; `None`: only the end of its
+    /// commander counts.
     pub hold: Option<Duration>,
 }
 
 /// A reaction to the loss of a commander.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum LossAction {
-    /// A message with these fields, by their paths in it; all others are zero or empty.
+    /// A message with these fields, by path; all other fields are zero or empty.
     Message(BTreeMap<String, Literal>),
     /// A message in which the bound field has this value.
     Field(Literal),
@@ -28,8 +29,9 @@ pub enum LossAction {
 }
 
 impl LossAction {
-    /// The message for a topic of which the value is `selection`, or the request of a service that is made of the value by it;
-    /// `None` for a call, for one value where several are bound, and for a request that has no value in it.
+    /// Returns the message for a topic whose value is `selection`, or the request that `selection`
+    /// makes of the value. Returns `None` for a call, for one value if several are bound, and for a
+    /// request without a value in it.
     #[must_use]
     pub fn template(&self, selection: &Selection) -> Option<Selection> {
         if let Selection::Template { fields, rest } = selection {
@@ -54,7 +56,7 @@ impl LossAction {
         Some(Selection::Template { fields, rest })
     }
 
-    /// A request of which only `fields` are made of the value.
+    /// Returns a request of which only `fields` come from the value.
     fn request(&self, fields: &[Selected], rest: &BTreeMap<String, Literal>) -> Option<Selection> {
         let mut rest = rest.clone();
         match (self, fields) {
@@ -69,17 +71,17 @@ impl LossAction {
     }
 }
 
-/// How the movement that a command of some message type starts is ended.
+/// Way to stop the movement that a command of a message type starts.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Motion {
-    /// By a message of zeros.
+    /// A message of zeros stops it.
     ByZero,
-    /// Not by zeros, which are a movement, too.
+    /// A message of zeros does not stop it, because zeros are a movement too.
     NotByZero,
 }
 
 impl Motion {
-    /// The motion that messages of a type command; `None` for other types.
+    /// Returns the motion that messages of a type command; `None` for other types.
     #[must_use]
     pub fn of(message_type: &TypeName) -> Option<Self> {
         match (message_type.package(), message_type.name()) {

@@ -1,4 +1,4 @@
-//! What the document says once it is checked: every name resolved, every default filled in.
+//! The checked document: every name resolved, every default filled in.
 
 use std::collections::{BTreeMap, HashMap};
 use std::net::{Ipv4Addr, SocketAddr};
@@ -21,7 +21,7 @@ use crate::security::SecurityGroup;
 use crate::topic::{SpaceId, TopicId};
 use crate::unit::Unit;
 
-/// The checked mapping of one cell. Immutable: a changed file makes a new one.
+/// The checked mapping of one cell. It is immutable: a changed file makes a new mapping.
 ///
 /// `Mapping::default()` is zero configuration: the PubSub defaults, no space declared (each ROS 2 space is then the
 /// DDS domain of its number), no variable.
@@ -68,7 +68,8 @@ impl Mapping {
         }
     }
 
-    /// A mapping without variables, for a program that has no document: what it writes it describes itself.
+    /// Returns a mapping without variables, for a program without a document, which describes its
+    /// own values.
     #[must_use]
     pub fn made(pubsub: PubSub, namespaces: BTreeMap<u16, String>) -> Self {
         Self {
@@ -83,39 +84,39 @@ impl Mapping {
         self
     }
 
-    /// Folders and files whose definitions count before those built in. Those written relative to the mapping are below
-    /// its folder.
+    /// Returns the folders and files whose definitions take precedence over the built-in
+    /// definitions. Paths that are relative to the mapping are below its folder.
     #[must_use]
     pub fn type_paths(&self) -> &[PathBuf] {
         &self.type_paths
     }
 
-    /// The same with those calls, of topics that no variable has.
+    /// Returns the mapping with other calls; no variable may have one of their topics.
     #[must_use]
     pub fn with_calls(mut self, calls: Vec<Call>) -> Self {
         self.calls = calls;
         self
     }
 
-    /// In the order of the document.
+    /// Returns the calls, in the order of the document.
     #[must_use]
     pub fn calls(&self) -> &[Call] {
         &self.calls
     }
 
-    /// The call of a topic, which is of an action that of its goal.
+    /// Returns the call of a topic; for an action it is the topic of its goal.
     #[must_use]
     pub fn call(&self, topic: TopicId) -> Option<&Call> {
         self.calls.iter().find(|call| call.topic == topic)
     }
 
-    /// Every call that is executed in that space.
+    /// Returns every call that is executed in the space.
     pub fn executed_in(&self, space: SpaceId) -> impl Iterator<Item = &Call> {
         let calls = self.calls.iter();
         calls.filter(move |call| call.topic.space == space)
     }
 
-    /// Every call that is asked for in that space under a name of the mapping.
+    /// Returns every call that the space offers under a name of the mapping.
     pub fn asked_in(&self, space: SpaceId) -> impl Iterator<Item = (&Call, &CallBinding)> {
         let calls = self.calls.iter();
         calls.filter_map(move |call| Some((call, call.binding(space)?)))
@@ -126,18 +127,19 @@ impl Mapping {
         self
     }
 
-    /// The rules for topics that are not named, in the order of the document.
+    /// Returns the patterns, in the order of the document.
     #[must_use]
     pub fn patterns(&self) -> &[Pattern] {
         &self.patterns
     }
 
-    /// The variable a ROS topic of a space becomes by the first pattern about it and its type, where that is known. `None` for a topic without a pattern, one
-    /// that a variable is bound to, and the names of the space (`/ua_1_2_10`).
+    /// Returns the variable that a ROS topic of a space becomes by the first pattern that matches
+    /// the topic and, if it is known, its type. Returns `None` for a topic without a pattern, for a
+    /// topic bound to a variable, and for the names of the space (`/ua_1_2_10`).
     ///
     /// # Errors
-    /// The pattern makes no node of it, or one that a variable or call of the mapping has. Two topics that become one node are
-    /// the caller's to tell.
+    /// The pattern makes no valid node, or makes a node that a variable or call of the mapping has.
+    /// The caller has to detect two topics that become the same node.
     #[must_use]
     pub fn matching(
         &self,
@@ -168,7 +170,7 @@ impl Mapping {
         }))
     }
 
-    /// The name of the variable or call that has the topic or the node already.
+    /// Returns the name of the variable or call that has the topic or the node already.
     fn holder(&self, made: &PatternVariable) -> Option<&str> {
         let mut variables = self.variables.iter();
         let variable = variables.find(|v| v.topic == made.topic || v.node == made.node);
@@ -180,25 +182,26 @@ impl Mapping {
         call.map(|call| call.name.as_str())
     }
 
-    /// How NetworkMessages travel.
+    /// Returns the settings for NetworkMessages.
     #[must_use]
     pub const fn pubsub(&self) -> &PubSub {
         &self.pubsub
     }
 
-    /// The declared ROS spaces, ordered by id.
+    /// Returns the declared ROS spaces, ordered by id.
     #[must_use]
     pub fn spaces(&self) -> &[Space] {
         &self.spaces
     }
 
-    /// The declared space of that id.
+    /// Returns the declared space with the id.
     #[must_use]
     pub fn space(&self, id: SpaceId) -> Option<&Space> {
         self.spaces.iter().find(|space| space.id == id)
     }
 
-    /// The DDS domain of a ROS 2 space, declared or not; `None` for the OPC UA side and ROS 1.
+    /// Returns the DDS domain of a ROS 2 space, declared or not; `None` for the OPC UA side and ROS
+    /// 1.
     #[must_use]
     pub fn domain_of(&self, id: SpaceId) -> Option<u16> {
         if !id.is_ros2() {
@@ -208,9 +211,9 @@ impl Mapping {
             .map_or_else(|| Some(id.into()), |space| space.domain)
     }
 
-    /// The ROS 2 space whose values live in that DDS domain: the declared one, else the one of the domain's number.
-    /// `None` for a domain below 2 or above 232 that no space declares, and when the space of that number is
-    /// declared for another domain.
+    /// Returns the ROS 2 space of a DDS domain: the space declared with this domain, else the space
+    /// with the domain's number. Returns `None` for a domain below 2 or above 232 that no space
+    /// declares, and if the space with that number is declared with another domain.
     #[must_use]
     pub fn space_of_domain(&self, domain: u16) -> Option<SpaceId> {
         if let Some(space) = self
@@ -223,13 +226,14 @@ impl Mapping {
         SpaceId::new(domain).filter(|id| id.is_ros2() && self.space(*id).is_none())
     }
 
-    /// Namespace index -> namespace URI. An index is only as good as the URI a server has at it.
+    /// Returns namespace index -> namespace URI. An index is valid only at a server with this URI
+    /// at the index.
     #[must_use]
     pub const fn namespaces(&self) -> &BTreeMap<u16, String> {
         &self.namespaces
     }
 
-    /// The OPC UA server of the cell.
+    /// Returns the OPC UA server of the cell.
     #[must_use]
     pub const fn server(&self) -> &Server {
         &self.server
@@ -240,33 +244,33 @@ impl Mapping {
         self
     }
 
-    /// The OPC UA servers that exist already, in the order of the document.
+    /// Returns the existing OPC UA servers, in the order of the document.
     #[must_use]
     pub fn servers(&self) -> &[RemoteServer] {
         &self.servers
     }
 
-    /// In the order of the document.
+    /// Returns the variables, in the order of the document.
     #[must_use]
     pub fn variables(&self) -> &[Variable] {
         &self.variables
     }
 
-    /// The variable of a topic.
+    /// Returns the variable of a topic.
     #[must_use]
     pub fn variable(&self, topic: TopicId) -> Option<&Variable> {
         self.variables.get(*self.by_topic.get(&topic)?)
     }
 
-    /// Every binding to a ROS topic of one space. A ROS topic occurs more than once only where its fields are read by
-    /// several variables; a topic that is written occurs once.
+    /// Returns every binding to a ROS topic of one space. A ROS topic occurs more than once only if
+    /// several variables read its fields; a topic that is written occurs once.
     pub fn bindings(&self, space: SpaceId) -> impl Iterator<Item = (&Variable, &Binding)> {
         self.variables
             .iter()
             .filter_map(move |v| Some((v, v.binding(space)?)))
     }
 
-    /// Every binding to a service of one space.
+    /// Returns every binding to a service of one space.
     pub fn services(&self, space: SpaceId) -> impl Iterator<Item = (&Variable, &ServiceBinding)> {
         self.variables.iter().filter_map(move |v| {
             let service = v.service.as_deref()?;
@@ -278,13 +282,13 @@ impl Mapping {
 /// A ROS service tied to a variable.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ServiceBinding {
-    /// Whose ROS graph the service is in.
+    /// Space in whose ROS graph the service is.
     pub space: SpaceId,
-    /// What is done with it.
+    /// Role of the service.
     pub role: ServiceRole,
 }
 
-/// How a service and a variable are tied.
+/// Role of a service that is tied to a variable.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum ServiceRole {
     /// Values that arrive from other spaces call the service. `space` is not the variable's origin.
@@ -293,87 +297,92 @@ pub enum ServiceRole {
         service: String,
         /// The type of the service.
         service_type: TypeName,
-        /// The request, always [`Selection::Template`]; without a field in it no value crosses.
+        /// Request, always [`Selection::Template`]; no value crosses if it has no field.
         request: Selection,
-        /// Which values call; [`Trigger::Any`] where the request has the value in it.
+        /// Values that call; [`Trigger::Any`] if the request contains the value.
         when: Trigger,
-        /// How long the service may take.
+        /// Longest time that the service may take.
         timeout: Duration,
     },
-    /// The value is what the service answers to the calls of another variable. `space` is this variable's origin.
+    /// The value is the service's response to the calls of another variable. `space` is this
+    /// variable's origin.
     Answer {
-        /// The variable with the [`ServiceRole::Call`].
+        /// Variable with the [`ServiceRole::Call`].
         of: TopicId,
-        /// What of the response is the value.
+        /// Part of the response that is the value.
         selection: Selection,
     },
-    /// The value is what the service answers when it is asked regularly. `space` is this variable's origin.
+    /// The value is the response of a service that is called at regular intervals. `space` is this
+    /// variable's origin.
     Poll {
         /// Name of the service, with its leading `/`.
         service: String,
         /// The type of the service.
         service_type: TypeName,
-        /// The request, always [`Selection::Template`] without a field.
+        /// Request, always [`Selection::Template`] without a field.
         request: Selection,
-        /// What of the response is the value.
+        /// Part of the response that is the value.
         selection: Selection,
-        /// From call to call.
+        /// Period of the calls.
         every: Duration,
-        /// How long the service may take.
+        /// Longest time that the service may take.
         timeout: Duration,
     },
 }
 
-/// Which values call a service.
+/// Values that call a service.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Trigger {
-    /// Each one.
+    /// Every value.
     Any,
-    /// Those equal to the literal.
+    /// Values equal to the literal.
     Equals(String),
 }
 
-/// How NetworkMessages travel between the spaces.
+/// Settings for NetworkMessages between the spaces.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct PubSub {
-    /// Group or host the NetworkMessages are sent to, and its UDP port.
+    /// Group or host that NetworkMessages are sent to, and its UDP port.
     pub address: SocketAddr,
     /// Name or address of the network interface; `None` lets the operating system choose.
     pub interface: Option<String>,
     /// Hops a multicast datagram may travel; 1 stays on the link.
     pub ttl: u8,
-    /// When a received PublisherId is taken for a space.
+    /// Rule for the PublisherIds of a space.
     pub publisher_id: PublisherIdRule,
     /// A value that does not change is sent again after this time, which heals a lost datagram.
     pub key_frame_period: Duration,
-    /// A writer that has nothing to say says so after this time.
+    /// A writer without a new value sends a keep-alive message after this time.
     pub keep_alive_period: Duration,
-    /// A writer that is silent for this long counts as gone; longer than `keep_alive_period`.
+    /// A writer that is silent for this long is lost; longer than `keep_alive_period`.
     pub receive_timeout: Duration,
-    /// What a writer has in its messages is announced this often, beside when it begins and when it is asked for
-    /// (DataSetMetaData: OPC 10000-14, 7.2.4.6.4).
+    /// Period in which a writer announces the fields of its messages (DataSetMetaData: OPC
+    /// 10000-14, 7.2.4.6.4). It also announces them at its start and on request.
     pub metadata_period: Duration,
-    /// Bytes of the largest NetworkMessage that is sent as one datagram; a larger one goes in chunks of as much
-    /// (OPC 10000-14, 7.2.4.4.4).
+    /// Bytes of the largest NetworkMessage that is sent as one datagram; a larger message is sent
+    /// in chunks of this size (OPC 10000-14, 7.2.4.4.4).
     pub max_datagram: u16,
-    /// Bytes of the largest DataSetMessage that is sent, or put together from chunks.
+    /// Bytes of the largest DataSetMessage that is sent, or reassembled from chunks.
     pub max_message: u32,
-    /// The most DataSetMessages of one WriterGroup that share a NetworkMessage, as far as they are waiting to be sent and fit
-    /// [`max_datagram`](Self::max_datagram) and an Ethernet frame; 1 is each alone.
+    /// Largest number of DataSetMessages of one WriterGroup that share a NetworkMessage, if they
+    /// wait to be sent and fit into [`max_datagram`](Self::max_datagram) and an Ethernet frame; 1
+    /// sends each alone.
     pub messages_per_datagram: u8,
 }
 
 impl PubSub {
     /// The largest UDP payload over IPv4.
     pub const LARGEST_DATAGRAM: u16 = 65_507;
-    /// Room for the headers of a chunk and some of the message.
+    /// Size for the headers of a chunk and a part of the message.
     pub const SMALLEST_DATAGRAM: u16 = 512;
 
-    /// 239.192.0.40:4840. The group is of the IPv4 organization-local scope (RFC 2365, 6.2), so no router
-    /// leaks it to the world; the port is the one registered for OPC UA over UDP (OPC 10000-14, 7.3.2).
+    /// 239.192.0.40:4840. The group is of the IPv4 organization-local scope (RFC 2365, 6.2), so no
+    /// router forwards it to the Internet; the port is registered for OPC UA over UDP (OPC
+    /// 10000-14, 7.3.2).
     pub const ADDRESS: SocketAddr =
         SocketAddr::new(std::net::IpAddr::V4(Ipv4Addr::new(239, 192, 0, 40)), 4840);
-    /// Reads `opc.udp://<group or host by number>:<port>`; the port is 4840 when left out (OPC 10000-14, 7.3.2).
+    /// Reads `opc.udp://<numeric group or host>:<port>`; the default port is 4840 (OPC 10000-14,
+    /// 7.3.2).
     #[must_use]
     pub fn parse_address(url: &str) -> Option<SocketAddr> {
         let rest = url.strip_prefix("opc.udp://")?;
@@ -389,7 +398,7 @@ impl PubSub {
             .or_else(|| Some(SocketAddr::new(alone()?, Self::ADDRESS.port())))
     }
 
-    /// The group OPC 10000-14, 7.3.2.1 keeps for discovery messages: no data belongs there.
+    /// Group that OPC 10000-14, 7.3.2.1 reserves for discovery messages: no data may be sent to it.
     pub const DISCOVERY_GROUP: Ipv4Addr = Ipv4Addr::new(224, 0, 2, 14);
 }
 
@@ -411,7 +420,7 @@ impl Default for PubSub {
     }
 }
 
-/// When a received PublisherId is taken for a space.
+/// Rule for the PublisherIds of a space.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum PublisherIdRule {
     /// Only a UInt16 of the space's number: type and value must be equal (OPC 10000-14, 7.2.4.4.2).
@@ -421,10 +430,10 @@ pub enum PublisherIdRule {
     AnyWidth,
 }
 
-/// A ROS side of the cell.
+/// ROS side of the cell.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Space {
-    /// 1 or above.
+    /// Id of the space, 1 or above.
     pub id: SpaceId,
     /// The DDS domain of a ROS 2 space; `None` for ROS 1.
     pub domain: Option<u16>,
@@ -433,34 +442,37 @@ pub struct Space {
 /// The OPC UA server of the cell.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Server {
-    /// Where clients connect.
+    /// Endpoint for clients.
     pub endpoint: Endpoint,
     /// ApplicationUri of the server.
     pub application_uri: String,
-    /// The security policies it offers, without repetition and not empty; `None` where the document says nothing.
+    /// Security policies that it offers, without repetition and not empty; `None` if the document
+    /// names none.
     pub security: Option<Vec<SecurityPolicy>>,
-    /// What users without a name may be.
+    /// Permission of anonymous users.
     pub anonymous: Anonymous,
-    /// Whether other servers are refused at hosts that their trusted certificates do not name.
+    /// `true` if the server refuses other servers at hosts that their trusted certificates do not
+    /// name.
     pub refuse_other_hosts: bool,
-    /// When uncertain values of other programs are bad, where they do not say it themselves.
+    /// Time after which uncertain values of other programs are bad, if a variable names no other
+    /// time.
     pub bad_after: Option<Duration>,
-    /// How much is kept of what was.
+    /// Size of the history.
     pub history: History,
-    /// How much clients may take up.
+    /// Limits for clients.
     pub limits: ServerLimits,
-    /// Which servers with skills it speaks for when they are found, if any.
+    /// Rule for the servers with skills that it represents when they are found, if any.
     pub find_skills: Option<FindSkills>,
-    /// NodeSet2 files whose nodes it has beside those of the mapping.
+    /// NodeSet2 files whose nodes it has beside the nodes of the mapping.
     pub nodesets: Vec<PathBuf>,
 }
 
-/// How much clients may take up of the server; `None` is left to the server.
+/// Limits for clients of the server; the server chooses for `None`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ServerLimits {
-    /// Sessions at once.
+    /// Sessions at the same time.
     pub sessions: Option<u16>,
-    /// Sessions of one client address, while less than an eighth of the sessions is free.
+    /// Sessions of one client address, enforced while less than an eighth of the sessions is free.
     pub sessions_per_address: Option<u16>,
     /// Connections.
     pub connections: Option<u16>,
@@ -470,13 +482,13 @@ pub struct ServerLimits {
     pub subscriptions: Option<u16>,
     /// Monitored items of a subscription.
     pub items: Option<u16>,
-    /// Nodes that one request reads or writes, or items that it makes.
+    /// Nodes that one request reads or writes, or items that it creates.
     pub operations: Option<u16>,
 }
 
 impl Server {
-    /// The security policies it offers. Where the document says nothing these are all there are, and
-    /// [`SecurityPolicy::None`] only for a server that listens on a loopback address.
+    /// Returns the security policies that it offers. If the document names none, these are all
+    /// policies, and [`SecurityPolicy::None`] only for a server that listens on a loopback address.
     #[must_use]
     pub fn policies(&self, is_loopback: bool) -> Vec<SecurityPolicy> {
         if let Some(told) = &self.security {
@@ -519,7 +531,7 @@ pub enum SecurityPolicy {
 }
 
 impl SecurityPolicy {
-    /// Every policy, the weakest first.
+    /// Every policy, in ascending order of strength.
     pub const ALL: &'static [Self] = &[
         Self::None,
         Self::Aes128Sha256RsaOaep,
@@ -527,7 +539,7 @@ impl SecurityPolicy {
         Self::Aes256Sha256RsaPss,
     ];
 
-    /// The name in the URI's fragment.
+    /// Returns the fragment of the URI.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -539,74 +551,76 @@ impl SecurityPolicy {
     }
 }
 
-/// One value of the space: an OPC UA node, the topic that carries it, and the ROS topics tied to it.
+/// Value of the space: an OPC UA node, the topic that carries it, and the ROS topics tied to it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Variable {
     /// Origin, namespace index, and the node's numeric identifier or alias.
     pub topic: TopicId,
     /// The OPC UA node.
     pub node: NodeIdText,
-    /// BrowseName and DisplayName of the node, behind the folders it stands in, which dots part.
+    /// BrowseName and DisplayName of the node, after the folders that contain it; dots separate
+    /// them.
     pub name: String,
-    /// Builtin type and whether it is an array; `None` when the variable has several fields, or when neither the
-    /// document nor a known ROS type says it.
+    /// Builtin type, and `true` for an array. `None` if the variable has several fields, or if
+    /// neither the document nor a known ROS type provides it.
     pub value_type: Option<(BuiltinType, bool)>,
-    /// One per DataSet field. Empty when nothing is known before a message or a type arrives.
+    /// Fields of the DataSet. Empty if they are not known before a message or a type arrives.
     pub fields: Vec<Leaf>,
-    /// Which field of its DataSet is the value, where its writer is none of the bridges and sends several.
+    /// Field of the DataSet that is the value, if its writer is not a bridge and sends several
+    /// fields.
     pub ua_field: Option<UaField>,
-    /// At most one per space.
+    /// Bindings to ROS topics, at most one per space.
     pub bindings: Vec<Binding>,
-    /// The service tied to it, in a space where no topic is.
+    /// Service tied to it, in a space where no topic is bound.
     pub service: Option<Box<ServiceBinding>>,
-    /// What its queue does when full.
+    /// Reaction of its queue when the queue is full.
     pub overflow: Overflow,
-    /// Whether readers that come late get its last value.
+    /// Whether late subscribers get its last value.
     pub lasting: Lasting,
-    /// Which of its values its origin sends.
+    /// Values that its origin sends.
     pub publish: Publish,
-    /// What its numbers mean.
+    /// Meaning of its numbers.
     pub meaning: Meaning,
-    /// Who may read and write it at the server.
+    /// Roles that may read and write it at the server.
     pub permissions: Permissions,
-    /// How old it may become.
+    /// Maximum ages of its values.
     pub ages: Ages,
-    /// How many past values are kept; `None` as many as of all.
+    /// Number of past values that are kept; `None` for the number of the server's history.
     pub history: Option<u16>,
-    /// What is published when its commander is lost.
+    /// Reaction to the loss of its commander.
     pub loss: Option<Box<Loss>>,
-    /// The value that says that a written value has arrived.
+    /// Value that confirms that a written value has arrived.
     pub confirm: Option<Box<Confirm>>,
-    /// How long a value is sent again until each bridge that it is [for](Self::destinations) has confirmed it; `None` where none
-    /// does.
+    /// Time for which a value is sent again until each bridge of its
+    /// [destinations](Self::destinations) has confirmed it; `None` if bridges do not confirm it.
     pub confirmed_within: Option<Duration>,
-    /// The node of another OPC UA server it comes from; its origin is the OPC UA side then.
+    /// Node of another OPC UA server that it comes from; its origin is then the OPC UA side.
     pub from: Option<Box<NodeSource>>,
-    /// The node of another OPC UA server it is written to.
+    /// Node of another OPC UA server that it is written to.
     pub to: Option<Box<NodeTarget>>,
 }
 
-/// One field of a DataSet (OPC 10000-14, 6.2.3.2.3).
+/// Field of a DataSet (OPC 10000-14, 6.2.3.2.3).
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum UaField {
-    /// By its place in the DataSetMessages, from 0.
+    /// Index in the DataSetMessages, from 0.
     Place(u16),
-    /// By its name in the DataSetMetaData that the writer announces.
+    /// Name in the DataSetMetaData that the writer announces.
     Name(String),
 }
 
-/// What the numbers of a variable mean, as far as it is said.
+/// Meaning of the numbers of a variable, as far as the document names it.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Meaning {
-    /// Their unit of measure.
+    /// Unit of measure.
     pub unit: Option<&'static Unit>,
-    /// The lowest and the highest to be expected, by their bits.
+    /// Lowest and highest expected value, as bits.
     pub(crate) range: Option<(u64, u64)>,
     /// Texts of single values.
     pub texts: BTreeMap<i64, String>,
-    /// What it is, for people.
+    /// Description for users.
     pub description: Option<String>,
-    /// Digits behind the decimal point that are worth showing.
+    /// Number of digits after the decimal point that are worth showing.
     pub precision: Option<u8>,
 }
 
@@ -624,7 +638,7 @@ impl Meaning {
         }
     }
 
-    /// The lowest and the highest value to be expected.
+    /// Returns the lowest and the highest expected value.
     #[must_use]
     pub fn range(&self) -> Option<(f64, f64)> {
         let (low, high) = self.range?;
@@ -632,19 +646,20 @@ impl Meaning {
     }
 }
 
-/// Which values of a variable are sent: by default each.
+/// Values of a variable that are sent; the default is all.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Publish {
-    /// Only those that differ from the one sent last, by more than the deadband.
+    /// `true` if only values are sent that differ from the last sent value, by more than the
+    /// deadband.
     pub on_change: bool,
-    /// By its bits.
+    /// Deadband, as bits.
     deadband: u64,
-    /// At least this long from one to the next; the newest of those in between follows when it is over.
+    /// Shortest time between two values. The newest of the values in between is sent at its end.
     pub period: Duration,
 }
 
 impl Publish {
-    /// `deadband` is 0 or greater.
+    /// Creates the rule; `deadband` is 0 or greater.
     #[must_use]
     pub const fn new(on_change: bool, deadband: f64, period: Duration) -> Self {
         Self {
@@ -654,7 +669,7 @@ impl Publish {
         }
     }
 
-    /// By how much a number may differ from the one sent last without being sent itself.
+    /// Returns the difference up to which a number equals the last sent number and is not sent.
     #[must_use]
     pub const fn deadband(&self) -> f64 {
         f64::from_bits(self.deadband)
@@ -662,13 +677,13 @@ impl Publish {
 }
 
 impl Variable {
-    /// The binding to a ROS topic of that space.
+    /// Returns the binding to a ROS topic of the space.
     #[must_use]
     pub fn binding(&self, space: SpaceId) -> Option<&Binding> {
         self.bindings.iter().find(|binding| binding.space == space)
     }
 
-    /// The other spaces whose topics or services get its values.
+    /// Returns the other spaces whose topics or services get its values.
     pub fn destinations(&self) -> impl Iterator<Item = SpaceId> {
         let called = self.service.as_ref();
         let called = called.filter(|of| matches!(of.role, ServiceRole::Call { .. }));
@@ -678,44 +693,45 @@ impl Variable {
     }
 }
 
-/// A ROS topic tied to a variable: read when `space` is the variable's origin, written otherwise.
+/// Binding of a ROS topic to a variable: read if `space` is the variable's origin, written
+/// otherwise.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Binding {
-    /// Whose ROS graph the topic is in.
+    /// Space in whose ROS graph the topic is.
     pub space: SpaceId,
-    /// With its leading `/`.
+    /// Name of the topic, with its leading `/`.
     pub ros_topic: String,
-    /// The type of the topic.
+    /// Type of the topic.
     pub message_type: TypeName,
-    /// One field of the message, all of them, or the message as it is.
+    /// One field of the message, several or all fields, or the raw message.
     pub selection: Selection,
 }
 
-/// What a queue does when it is full.
+/// Reaction of a queue when it is full.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Overflow {
-    /// One place: a newer value replaces the one that waits. For states.
+    /// A queue of one value: a newer value replaces the waiting value. For states.
     #[default]
     KeepLatest,
-    /// That many places: the oldest goes. For events.
+    /// A queue of this size: the oldest value is dropped. For events.
     DropOldest(NonZeroU16),
 }
 
-/// Whether the last value of a variable is stored for readers that come late.
+/// Whether the last value of a variable is stored for late subscribers.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Lasting {
     /// A state: the last value is repeated while its producer is alive, and latched on the ROS side.
     State,
     /// An event or a command: delivered once, to the subscribers that are present.
     Event,
-    /// A state where the ROS publisher is latched or transient-local, else an event on the ROS side. OPC UA clients see the
-    /// last value in both cases.
+    /// A state if the ROS publisher is latched or transient-local, else an event on the ROS side.
+    /// OPC UA clients see the last value in both cases.
     #[default]
     AsSource,
 }
 
 impl From<Overflow> for Lasting {
-    /// The kind of a value whose queue is declared.
+    /// Returns the kind of a value whose queue is declared.
     fn from(overflow: Overflow) -> Self {
         match overflow {
             Overflow::KeepLatest => Self::State,

@@ -1,4 +1,4 @@
-//! The known name a misspelt one may have meant.
+//! Search for the known name that a misspelt name may mean.
 
 /// Returns the name among `known` that is nearest to `name`, if at most a third of the letters differ.
 pub fn nearest<'k>(name: &str, known: impl IntoIterator<Item = &'k str>) -> Option<&'k str> {
@@ -25,7 +25,8 @@ const LONGEST: usize = 64;
 fn distance(a: &str, b: &str) -> usize {
     let (a, b) = (a.to_lowercase(), b.to_lowercase());
     let mut above: Vec<usize> = (0..=b.chars().count()).collect();
-    // The row of the letter before the last one, in which a swap of both letters continues.
+    // The row of the letter before the last letter: the distance after a swap of both letters
+    // continues from it.
     let mut before: Vec<usize> = Vec::new();
     let mut last = None;
     for (line, x) in a.chars().enumerate() {

@@ -4,18 +4,18 @@ use std::fmt;
 use std::num::NonZeroU16;
 use std::str::FromStr;
 
-/// A NodeId as people write it.
+/// Text form of a NodeId.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
 pub struct NodeIdText {
-    /// Namespace index; 0 is OPC UA's own.
+    /// Namespace index; 0 is the namespace of OPC UA.
     pub namespace: u16,
     /// The identifier in its type.
     pub identifier: Identifier,
 }
 
 impl NodeIdText {
-    /// The identifier when it can be a DataSetWriterId: numeric, 1..=65535, not of namespace 0. Any other node needs
-    /// an alias.
+    /// Returns the identifier if it can be a DataSetWriterId: numeric, 1..=65535, not of namespace
+    /// 0. Any other node needs an alias.
     #[must_use]
     pub fn writer_id(&self) -> Option<NonZeroU16> {
         match self.identifier {
@@ -86,17 +86,17 @@ impl FromStr for NodeIdText {
     }
 }
 
-/// A NodeId of another server, whose namespace is named by its URI or by its index there: `nsu=urn:plc;s=Line` or `ns=3;i=7`
-/// (OPC 10000-6, 5.1.12).
+/// NodeId of another server, whose namespace is given by its URI or by its index there:
+/// `nsu=urn:plc;s=Line` or `ns=3;i=7` (OPC 10000-6, 5.1.12).
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
 pub struct ExpandedNodeIdText {
     /// The namespace.
     pub namespace: NamespaceText,
-    /// The identifier in it.
+    /// Identifier in the namespace.
     pub identifier: Identifier,
 }
 
-/// The namespace of a node of another server.
+/// Namespace of a node of another server.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
 pub enum NamespaceText {
     /// By its index.
@@ -153,7 +153,7 @@ impl FromStr for ExpandedNodeIdText {
     }
 }
 
-/// Why a text is not a NodeId.
+/// Error of a text that is not a NodeId.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum NodeIdError {

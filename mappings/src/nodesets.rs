@@ -1,4 +1,4 @@
-//! What a check asks of the NodeSet2 files that a mapping names. They are read elsewhere.
+//! Interface of a check to the NodeSet2 files of a mapping. Another crate reads the files.
 
 use uadp::BuiltinType;
 
@@ -6,60 +6,60 @@ use crate::node_id::Identifier;
 
 /// NodeSet2 files, as [`Surroundings::nodesets`](crate::Surroundings::nodesets) reads them.
 pub trait NodeSets {
-    /// What is wrong with them; asked once.
+    /// Returns the faults of the files; called once.
     fn faults(&mut self) -> Vec<NodeSetFault>;
 
-    /// Another one when one of the files is.
+    /// Returns a fingerprint that changes when a file changes.
     fn fingerprint(&self) -> u64;
 
-    /// Whether one of them has nodes of a namespace.
+    /// Returns `true` if a file has nodes of the namespace.
     fn has(&self, uri: &str) -> bool;
 
-    /// What a node of a namespace is; `None` where none of them has it.
+    /// Returns the kind of a node of a namespace; `None` if no file has it.
     fn node(&self, uri: &str, node: &Identifier) -> Option<NodeSetNode>;
 }
 
-/// Something about one of the files.
+/// Fault of one of the files.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct NodeSetFault {
-    /// Which of them, from 0.
+    /// Index of the file, from 0.
     pub file: usize,
-    /// Whether it keeps them from being used.
+    /// `true` if the files cannot be used with the fault.
     pub is_fatal: bool,
-    /// What, for people.
+    /// Message for users.
     pub what: String,
-    /// What to do, for people.
+    /// Remedy for users.
     pub help: String,
 }
 
-/// What a node of a NodeSet is.
+/// Kind of a node of a NodeSet.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum NodeSetNode {
-    /// A Variable: what its values are, and its ValueRank (OPC 10000-3, 8.6).
+    /// A Variable: the type of its values, and its ValueRank (OPC 10000-3, 8.6).
     Variable(NodeSetType, i32),
     /// A Method.
     Method,
-    /// Anything else.
+    /// Any other node.
     Other,
 }
 
-/// What the values of a Variable of a NodeSet are.
+/// Type of the values of a Variable of a NodeSet.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum NodeSetType {
-    /// Anything, or not known.
+    /// Any type, or unknown.
     Any,
-    /// Of one builtin type.
+    /// One builtin type.
     Builtin(BuiltinType),
-    /// Of any numeric type.
+    /// Any numeric type.
     Number,
-    /// Of any type of whole numbers with a sign.
+    /// Any type of signed integers.
     Integer,
-    /// Of any type of whole numbers without a sign.
+    /// Any type of unsigned integers.
     UnsignedInteger,
 }
 
 impl NodeSetNode {
-    /// The builtin type of its values and whether they are arrays, where it has one.
+    /// Returns the builtin type of its values and `true` for arrays, if it has one builtin type.
     pub(crate) const fn value_type(self) -> Option<(BuiltinType, bool)> {
         match self {
             Self::Variable(NodeSetType::Builtin(builtin), -1) => Some((builtin, false)),
@@ -68,12 +68,12 @@ impl NodeSetNode {
         }
     }
 
-    /// Whether it is a Variable that takes such values.
+    /// Returns `true` for a Variable that accepts such values.
     pub(crate) fn takes(self, (builtin, array): (BuiltinType, bool)) -> bool {
         let Self::Variable(kind, rank) = self else {
             return false;
         };
-        // -3 is a scalar or one dimension, -2 anything, 0 one dimension or more.
+        // -3 is a scalar or one dimension, -2 any rank, 0 one dimension or more.
         let ranks: &[i32] = if array {
             &[1, 0, -2, -3]
         } else {

@@ -1,4 +1,4 @@
-//! Patterns: which ROS topics become variables without being named, and under which nodes.
+//! Patterns: ROS topics that become variables without being named, and the nodes that they become.
 
 use std::fmt::Write as _;
 use std::num::NonZeroU16;
@@ -8,7 +8,7 @@ use messages::{Selection, TypeName};
 use crate::node_id::NodeIdText;
 use crate::topic::{SpaceId, TopicId};
 
-/// A rule that makes variables of ROS topics as they appear.
+/// Rule that makes variables of ROS topics when they appear.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Pattern {
     pub(crate) topics: Glob,
@@ -21,7 +21,7 @@ pub struct Pattern {
     pub(crate) selection: Selection,
 }
 
-/// The variable a topic becomes.
+/// Variable that a topic becomes.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct PatternVariable {
     /// Origin, namespace index, and the node's numeric identifier or alias.
@@ -30,13 +30,13 @@ pub struct PatternVariable {
     pub node: NodeIdText,
     /// BrowseName and DisplayName of the node.
     pub name: String,
-    /// The type the topic has to have; `None` takes any.
+    /// Type that the topic must have; `None` for any type.
     pub message_type: Option<TypeName>,
-    /// What of the message is the value.
+    /// Part of the message that is the value.
     pub selection: Selection,
 }
 
-/// Why a topic that matches a pattern becomes no variable.
+/// Reason that a topic that matches a pattern becomes no variable.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("`{ros_topic}` matches the pattern `{pattern}`, but {why}")]
 pub struct PatternFault {
@@ -44,46 +44,48 @@ pub struct PatternFault {
     pub ros_topic: String,
     /// The pattern as it is written.
     pub pattern: String,
-    /// What is wrong with the variable it would be.
+    /// Fault of the variable.
     pub why: PatternReason,
 }
 
-/// What is wrong with a variable made of a topic.
+/// Fault of a variable that a pattern makes of a topic.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum PatternReason {
-    /// The text with the captures in it is no node id.
+    /// The text with the captures in it is not a node id.
     #[error("`{0}` is no node id")]
     Node(String),
-    /// The identifier or alias with the captures in it.
+    /// The identifier or alias with the captures in it is not a number from 1 to 65535.
     #[error("`{0}` is no number from 1 to 65535")]
     Number(String),
     /// The name is empty or longer than 512 characters.
     #[error("its name would not have 1 to 512 characters")]
     Name,
-    /// A variable or call of the mapping has that topic of the space or that node.
+    /// A variable or call of the mapping has the same topic of the space or the same node.
     #[error("`{0}` is `{1}` of the mapping already")]
     Taken(TopicId, String),
 }
 
 impl Pattern {
-    /// Whose topics they are.
+    /// Returns the space of the topics.
     #[must_use]
     pub const fn origin(&self) -> SpaceId {
         self.origin
     }
 
-    /// The pattern as it is written.
+    /// Returns the pattern as it is written.
     #[must_use]
     pub fn topics(&self) -> &str {
         &self.topics.text
     }
 
-    /// The variable a topic of the space [`Pattern::origin`] becomes; `None` when the pattern is not about it.
+    /// Returns the variable that a topic of the space [`Pattern::origin`] becomes; `None` if the
+    /// pattern does not match it.
     ///
     /// # Errors
-    /// The texts that matched make no node of the space. Whether another topic has become the same node is the
-    /// caller's to tell; [`Mapping::matching`](crate::Mapping::matching) knows those of the mapping.
+    /// The captured texts make no node of the space. The caller has to detect two topics that
+    /// become the same node; [`Mapping::matching`](crate::Mapping::matching) detects the nodes of
+    /// the mapping.
     #[must_use]
     pub fn matches(&self, ros_topic: &str) -> Option<Result<PatternVariable, PatternFault>> {
         let captures = self.topics.captures(ros_topic)?;
@@ -122,7 +124,7 @@ impl Pattern {
         if name.trim().is_empty() || name.chars().count() > 512 {
             return Err(PatternReason::Name);
         }
-        // Namespace 0 is refused when the pattern is checked.
+        // The check of the pattern refuses namespace 0.
         let namespace = NonZeroU16::new(node.namespace).ok_or(PatternReason::Name)?;
         let topic = TopicId {
             space: self.origin,
@@ -139,23 +141,24 @@ impl Pattern {
     }
 }
 
-/// One spelling per number.
+/// Reads a number; each number has one spelling.
 fn number(text: &str) -> Option<NonZeroU16> {
     let plain = text.bytes().all(|b| b.is_ascii_digit()) && !text.starts_with('0');
     text.parse().ok().filter(|_| plain)
 }
 
-/// A topic name with `*` for one or more characters of a part, and at most one part `**` for any number of parts.
+/// Topic name with `*` for one or more characters of a part, and at most one part `**` for any
+/// number of parts.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Glob {
     text: String,
     before: Vec<Vec<String>>,
-    /// The parts behind `**`, where there is one.
+    /// The parts after `**`, if the pattern contains it.
     after: Option<Vec<Vec<String>>>,
 }
 
 impl Glob {
-    /// `Err` says what is wrong.
+    /// Reads a pattern. `Err` is the fault.
     pub(crate) fn parse(text: &str) -> Result<Self, &'static str> {
         let parts = text.strip_prefix('/').ok_or("it does not begin with `/`")?;
         if text.len() > MAX_TOPIC {
@@ -186,7 +189,7 @@ impl Glob {
         })
     }
 
-    /// How many texts it captures.
+    /// Returns the number of captured texts.
     pub(crate) fn wildcards(&self) -> usize {
         let stars = |parts: &[Vec<String>]| -> usize {
             parts
@@ -197,7 +200,7 @@ impl Glob {
         stars(&self.before) + self.after.as_ref().map_or(0, |after| 1 + stars(after))
     }
 
-    /// What each wildcard stands for, in order.
+    /// Returns the text that each wildcard captures, in order.
     fn captures(&self, topic: &str) -> Option<Vec<String>> {
         let parts: Vec<&str> = topic.strip_prefix('/')?.split('/').collect();
         let (first, rest) = parts.split_at_checked(self.before.len())?;
@@ -225,7 +228,8 @@ fn take_parts(pattern: &[Vec<String>], parts: &[&str], found: &mut Vec<String>) 
         .try_for_each(|(pieces, part)| take_part(pieces, part, found))
 }
 
-/// Each piece at the first place where it can stand, the last one at the end: where any choice fits, this one does.
+/// Matches each piece at the first possible position, and the last piece at the end. If any choice
+/// of positions matches, this choice does.
 fn take_part(pieces: &[String], part: &str, found: &mut Vec<String>) -> Option<()> {
     let (first, others) = pieces.split_first()?;
     let mut rest = part.strip_prefix(first.as_str())?;
@@ -247,19 +251,20 @@ fn take_part(pieces: &[String], part: &str, found: &mut Vec<String>) -> Option<(
     (!captured.is_empty()).then_some(())
 }
 
-/// A text with `{1}`, `{2}`... for what wildcards stand for.
+/// A text with `{1}`, `{2}`... for captured texts.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Template(Vec<Piece>);
 
 #[derive(Clone, Debug, PartialEq, Eq)]
 enum Piece {
     Text(String),
-    /// From 0.
+    /// Index of the capture, from 0.
     Capture(usize),
 }
 
 impl Template {
-    /// `captures`: how many there are. `Err` is the faulty piece of the text.
+    /// Reads a template. `captures` is the number of captures. `Err` is the faulty part of the
+    /// text.
     pub(crate) fn parse(text: &str, captures: usize) -> Result<Self, String> {
         let mut pieces = Vec::new();
         let mut rest = text;
@@ -276,7 +281,7 @@ impl Template {
         Ok(Self(pieces))
     }
 
-    /// Whether it differs from topic to topic.
+    /// Returns `true` if the text differs from topic to topic.
     pub(crate) fn varies(&self) -> bool {
         self.0
             .iter()

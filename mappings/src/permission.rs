@@ -1,20 +1,20 @@
-//! Who may do what with a node of the cell's server.
+//! Permissions on the nodes of the cell's server.
 
-/// What a user may be (OPC 10000-18, 4.2).
+/// Role of a user (OPC 10000-18, 4.2).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Role {
-    /// Sees what there is.
+    /// Reads.
     Observer,
-    /// Runs the cell: sees, writes and calls.
+    /// Runs the cell: reads, writes and calls.
     Operator,
     /// Sets the cell up.
     Engineer,
-    /// Says who may do what.
+    /// Administers permissions.
     SecurityAdmin,
 }
 
 impl Role {
-    /// As it stands in the document.
+    /// Returns the name in the document.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -26,23 +26,24 @@ impl Role {
     }
 }
 
-/// Which roles may do what with a variable. Where nothing is said everybody reads, and operators and engineers write.
+/// Roles that may read and write a variable. By default every user reads, and operators and
+/// engineers write.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Permissions {
-    /// Who may read it.
+    /// Roles that may read it.
     pub read: Option<Vec<Role>>,
-    /// Who may write it.
+    /// Roles that may write it.
     pub write: Option<Vec<Role>>,
 }
 
-/// What users without a name may be.
+/// Permission of anonymous users.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Anonymous {
-    /// They observe; on a server of its own host without users they operate.
+    /// They are observers; at a server of its own host without users they are operators.
     #[default]
     Usual,
-    /// They are not let in.
+    /// They are refused.
     Refused,
-    /// They have that role.
+    /// They have this role.
     Has(Role),
 }

@@ -1,20 +1,22 @@
-//! What the server of the cell is to know of a value: how old it may become, and what confirms it.
+//! Properties of a value at the cell's server: maximum age and confirmation.
 
 use std::time::Duration;
 
 use crate::topic::TopicId;
 
-/// When the cell's server no longer shows a value as good, because no newer one comes.
+/// Times after which the cell's server shows a value as uncertain or bad, because no newer value
+/// comes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Ages {
-    /// It is uncertain when no newer one has come for this long; `None` while its writer is heard.
+    /// The value is uncertain if no newer value has come for this long; `None` as long as its
+    /// writer is not lost.
     pub uncertain_after: Option<Duration>,
-    /// It is bad when it has been uncertain for this long; `None` never.
+    /// The value is bad if it has been uncertain for this long; `None` for never.
     pub bad_after: Option<Duration>,
 }
 
 impl Ages {
-    /// The same, with the default for what is not said.
+    /// Returns the ages, with the default for an age that is not given.
     #[must_use]
     pub fn or(self, bad_after: Option<Duration>) -> Self {
         Self {
@@ -24,32 +26,32 @@ impl Ages {
     }
 }
 
-/// The value of the robot that says that a value which a client wrote has arrived.
+/// Value of the robot that confirms that a value written by a client has arrived.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Confirm {
-    /// The value that answers.
+    /// Topic of the value that confirms.
     pub by: TopicId,
-    /// How long that may take.
+    /// Longest time for the confirmation.
     pub within: Duration,
-    /// Which value of it is an answer.
+    /// Values that are a confirmation.
     pub answer: Answer,
 }
 
-/// Which value confirms what was written.
+/// Values that confirm a written value.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Answer {
-    /// One that equals it.
+    /// A value that equals the written value.
     Same,
-    /// Each that comes.
+    /// Every value that comes.
     Any,
-    /// That one: `true` or `false`, a number, or a text.
+    /// This value: `true` or `false`, a number, or a text.
     Equals(String),
 }
 
-/// How much the server keeps of what was.
+/// Size of the server's history.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct History {
-    /// Values of each variable that says nothing else.
+    /// Number of values of each variable without a number of its own.
     pub values: u16,
     /// Bytes of all of them together.
     pub bytes: usize,

@@ -1,4 +1,4 @@
-//! Tree -> values. Every fault is noted and reading goes on beside it.
+//! Tree -> values. Every fault is noted, and the rest is read.
 
 use std::borrow::Cow;
 use std::collections::HashMap;
@@ -11,24 +11,24 @@ use crate::findings::{Findings, Note};
 use crate::nearest::nearest;
 use crate::tree::{Kind, Node, Place};
 
-/// Most nodes that are read: an alias may lead to one node many times.
+/// Maximum number of nodes that are read: aliases may lead to one node many times.
 const MAX_READ: usize = 4_000_000;
 
-/// Keys of a map that are told apart without a table.
+/// Number of keys of a map up to which duplicates are found without a table.
 const FEW: usize = 16;
 
-/// A value and its place in the text.
+/// A value and its position in the text.
 #[derive(Clone, Debug)]
 pub(crate) struct At<T> {
     pub(crate) place: Place,
-    /// `None` when what stands there is faulty; it has been noted.
+    /// `None` for a faulty value; the fault has been noted.
     pub(crate) value: Option<T>,
 }
 
-/// A key that may be left out.
+/// Value of a key that may be left out.
 pub(crate) type Field<T> = Option<At<T>>;
 
-/// The value of a key, if it is there and sound.
+/// Returns the value of a key, if it is given and sound.
 pub(crate) fn given<T>(field: &Field<T>) -> Option<(&T, Place)> {
     let field = field.as_ref()?;
     Some((field.value.as_ref()?, field.place))
@@ -52,9 +52,9 @@ impl<T: JsonSchema> JsonSchema for At<T> {
     }
 }
 
-/// What can be made of a node.
+/// A value that can be read from a node.
 pub(crate) trait Read: Sized {
-    /// `None` after noting why.
+    /// Returns `None` for a faulty node, which is noted.
     fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self>;
 }
 
@@ -85,7 +85,7 @@ impl<'f> Reader<'f> {
         }
     }
 
-    /// Notes that `wanted` (with its article) should stand there.
+    /// Notes that `wanted` (with its article) is expected instead of the node.
     pub(crate) fn wrong(&mut self, node: &Node<'_>, wanted: &str) {
         let message = format!("expected {wanted}, found {}", node.kind.name());
         self.findings.error(Code::WrongValue, node.place, message);
@@ -99,12 +99,12 @@ impl<'f> Reader<'f> {
         None
     }
 
-    /// The pairs of a map whose keys are texts, each key once.
+    /// Returns the pairs of a map whose keys are texts, each key once.
     pub(crate) fn pairs<'n>(&mut self, node: &'n Node<'n>, wanted: &str) -> Option<Vec<Pair<'n>>> {
         self.pairs_of(node, || wanted.to_owned())
     }
 
-    /// As [`pairs`](Self::pairs), for what takes long to say.
+    /// Returns pairs as [`pairs`](Self::pairs) does; `wanted` is created only for a fault.
     fn pairs_of<'n>(
         &mut self,
         node: &'n Node<'n>,
@@ -115,7 +115,7 @@ impl<'f> Reader<'f> {
             return None;
         };
         let mut found: Vec<Pair<'n>> = Vec::with_capacity(pairs.len());
-        // Of a few keys a look at each is quicker.
+        // A map with few keys is searched faster than a table.
         let mut first: HashMap<&str, Place> = HashMap::new();
         for (key, value) in pairs {
             let Kind::Scalar(text) = &key.kind else {
@@ -149,8 +149,8 @@ impl<'f> Reader<'f> {
         Some(found)
     }
 
-    /// The values of a map in the order of `keys`. Keys that are none of them are noted; a misspelt one is then read as the key
-    /// that it resembles, so that the rest of the document is not held to lack it.
+    /// Returns the values of a map in the order of `keys`. Unknown keys are noted. A misspelt key
+    /// is then read as the key that it resembles, so that no missing key is reported.
     pub(crate) fn keys<'n, const N: usize>(
         &mut self,
         node: &'n Node<'n>,
@@ -186,7 +186,7 @@ impl<'f> Reader<'f> {
         Some(values)
     }
 
-    /// A key without a value counts as left out.
+    /// Returns the value of a key; a key without a value counts as left out.
     pub(crate) fn field<T: Read>(&mut self, node: Option<&Node<'_>>) -> Field<T> {
         let node = node.filter(|node| !matches!(node.kind, Kind::Null))?;
         Some(self.at(node))
@@ -199,7 +199,7 @@ pub(crate) struct Pair<'n> {
     pub(crate) value: &'n Rc<Node<'n>>,
 }
 
-/// `a`, `b`, `c`
+/// Returns `a`, `b`, `c` in backticks.
 pub(crate) fn list(names: &[impl AsRef<str>]) -> String {
     let names: Vec<String> = names
         .iter()
@@ -233,7 +233,7 @@ impl Read for u16 {
 impl Read for f64 {
     fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
         let text = reader.text(node, "a number")?;
-        // `inf` and `nan` are numbers to Rust, and to YAML with a dot before them.
+        // `inf` and `nan` are numbers in Rust, and in YAML with a dot before them.
         let number = text
             .parse()
             .ok()
@@ -271,14 +271,15 @@ impl<T: Read> Read for Vec<At<T>> {
     }
 }
 
-/// Whether a number has zeros in front, which YAML 1.1 reads as octal and YAML 1.2 as decimal.
+/// Returns `true` for a number with leading zeros, which YAML 1.1 reads as octal and YAML 1.2 as
+/// decimal.
 pub(crate) fn is_octal(text: &str) -> bool {
     let digits = text.trim_start_matches(['-', '+']);
     let mut bytes = digits.bytes();
     bytes.next() == Some(b'0') && bytes.next().is_some_and(|b| b.is_ascii_digit())
 }
 
-/// Says of a number with zeros in front how it is written.
+/// Adds a help with the plain spelling of a number with leading zeros.
 pub(crate) fn help_octal(note: Note<'_>, text: &str) {
     if is_octal(text) {
         let plain = text.trim_start_matches('0');
@@ -290,7 +291,7 @@ pub(crate) fn help_octal(note: Note<'_>, text: &str) {
     }
 }
 
-/// At most 64 characters of a text out of a document.
+/// Returns at most 64 characters of a text from a document.
 pub(crate) fn short(text: &str) -> String {
     let mut short: String = text.chars().take(64).collect();
     if short.len() < text.len() {
@@ -299,7 +300,7 @@ pub(crate) fn short(text: &str) -> String {
     short
 }
 
-/// The name of a field that is a word of Rust too.
+/// Returns the name of a field that may be a keyword of Rust too.
 pub(crate) const fn plain(name: &'static str) -> &'static str {
     match name.as_bytes() {
         [b'r', b'#', plain @ ..] => match std::str::from_utf8(plain) {

@@ -1,4 +1,4 @@
-//! OPC UA servers that exist already, and which of their nodes are values of the cell.
+//! Existing OPC UA servers, and their nodes that are values of the cell.
 
 use std::fmt;
 use std::num::NonZeroU16;
@@ -9,50 +9,55 @@ use crate::endpoint::Endpoint;
 use crate::mapping::SecurityPolicy;
 use crate::node_id::ExpandedNodeIdText;
 
-/// An OPC UA server that exists already, such as that of a PLC: an entry of `servers`.
+/// An existing OPC UA server, such as that of a PLC: an entry of `servers`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct RemoteServer {
-    /// What the mapping calls it.
+    /// Name in the mapping.
     pub name: String,
-    /// How it is reached.
+    /// Endpoint, security and user of the server.
     pub access: Access,
-    /// Where its skills are in the space, if they are to be.
+    /// Place of its skills in the space, if they are shown there.
     pub skills: Option<SkillsPlace>,
 }
 
-/// The place in the space that the skills of a server have which knows nothing of it.
+/// Place in the space of the skills of a server that does not know the space.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SkillsPlace {
-    /// Their namespace, which is theirs alone.
+    /// Namespace of the skills, reserved for them.
     pub namespace: u16,
-    /// Whether they are run for other hosts too.
+    /// `true` if other hosts may run the skills too.
     pub open: bool,
 }
 
-/// Which servers with skills, of those that discovery finds, have a place in the space: `server.find_skills`.
+/// Rule for the servers with skills that get a place in the space when discovery finds them:
+/// `server.find_skills`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct FindSkills {
-    /// Their ApplicationUris; with `*` at its end one stands for all that begin so.
+    /// ApplicationUris of the servers; with `*` at its end a URI stands for all URIs with this
+    /// beginning.
     pub uris: Vec<String>,
-    /// The namespace of the first one, 2..=65535.
+    /// Namespace of the first server, 2..=65535.
     pub first: u16,
-    /// How many have a place: their namespaces follow each other, up to 65535. 1..=[`LIMIT`](Self::LIMIT).
+    /// Number of servers that get a place, with consecutive namespaces up to 65535.
+    /// 1..=[`LIMIT`](Self::LIMIT).
     pub most: u16,
-    /// The security policy of the sessions; without one the best that each server offers and both sides know.
+    /// Security policy of the sessions; `None` for the best policy that each server offers and both
+    /// sides know.
     pub security: Option<SecurityPolicy>,
-    /// Whether their skills are run for other hosts too.
+    /// `true` if other hosts may run the skills too.
     pub open: bool,
-    /// IPv4 networks outside the subnets of the interface whose servers are accepted too, as 10.77.0.0/16.
+    /// IPv4 networks outside the subnets of the interface whose servers are accepted too, such as
+    /// 10.77.0.0/16.
     pub networks: Vec<String>,
 }
 
 impl FindSkills {
-    /// How many have a place where nothing is said.
+    /// Default number of servers that get a place.
     pub const MOST: u16 = 8;
-    /// How many may have a place.
+    /// Largest number of servers that get a place.
     pub const LIMIT: u16 = 64;
 
-    /// Whether a server with that ApplicationUri is one of them.
+    /// Returns `true` if the rule accepts a server with the ApplicationUri.
     #[must_use]
     pub fn wants(&self, application_uri: &str) -> bool {
         let mut uris = self.uris.iter();
@@ -62,26 +67,27 @@ impl FindSkills {
         })
     }
 
-    /// The namespaces that they have in the space.
+    /// Returns the namespaces of the servers in the space.
     #[must_use]
     pub const fn namespaces(&self) -> RangeInclusive<u16> {
         self.first..=self.first.saturating_add(self.most.saturating_sub(1))
     }
 }
 
-/// How an OPC UA server is reached, and as whom.
+/// Endpoint of an OPC UA server, and security and user of the session.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
 pub struct Access {
-    /// Where it is.
+    /// Endpoint of the server.
     pub endpoint: Endpoint,
-    /// The security policy of the session; without one the best that the server offers and both sides know.
+    /// Security policy of the session; `None` for the best policy that the server offers and both
+    /// sides know.
     pub security: Option<SecurityPolicy>,
-    /// As whom; anonymous without.
+    /// User of the session; anonymous without a user.
     pub user: Option<User>,
 }
 
 impl Access {
-    /// As anybody, with the best security there is.
+    /// Returns the access of an anonymous user with the best security.
     #[must_use]
     pub const fn anonymous(endpoint: Endpoint) -> Self {
         Self {
@@ -97,11 +103,11 @@ impl Access {
 pub struct User {
     /// The user name.
     pub name: String,
-    /// What proves it.
+    /// Password of the user.
     pub password: Password,
 }
 
-/// A password, which no log shows.
+/// A password; `Debug` does not show it.
 #[derive(Clone, PartialEq, Eq, Hash)]
 pub struct Password(String);
 
@@ -110,7 +116,7 @@ impl Password {
         Self(text)
     }
 
-    /// As the server is told.
+    /// Returns the password in clear, for the server.
     #[must_use]
     pub fn reveal(&self) -> &str {
         &self.0
@@ -123,28 +129,29 @@ impl fmt::Debug for Password {
     }
 }
 
-/// The node of another server that a value comes from.
+/// Node of another server that a value comes from.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct NodeSource {
-    /// The name of the server among `servers`.
+    /// Name of the server in `servers`.
     pub server: String,
-    /// The node there.
+    /// Node at the server.
     pub node: ExpandedNodeIdText,
-    /// How often the server looks at the value (SamplingInterval: OPC 10000-4, 5.13.1.2).
+    /// Period in which the server samples the value (SamplingInterval: OPC 10000-4, 5.13.1.2).
     pub sampling: Duration,
-    /// How many values the server keeps until they are sent; of more the oldest go.
+    /// Number of values that the server queues until they are sent; the oldest values of a full
+    /// queue are dropped.
     pub queue: NonZeroU16,
-    /// By its bits; 0 for none.
+    /// Deadband, as bits; 0 for no deadband.
     deadband: u64,
 }
 
 impl NodeSource {
-    /// The sampling interval where none is said.
+    /// Default sampling interval.
     pub const SAMPLING: Duration = Duration::from_millis(100);
-    /// The queue where none is said.
+    /// Default queue size.
     pub const QUEUE: NonZeroU16 = NonZeroU16::MIN.saturating_add(9);
 
-    /// `deadband` is 0 or greater.
+    /// Creates the source; `deadband` is 0 or greater.
     #[must_use]
     pub const fn new(
         server: String,
@@ -160,19 +167,19 @@ impl NodeSource {
         }
     }
 
-    /// By how much a number may differ from the one told last without being told itself (an absolute deadband:
-    /// OPC 10000-4, 7.22.2); 0 where every change is told.
+    /// Returns the difference up to which a number equals the last reported number and is not
+    /// reported (an absolute deadband: OPC 10000-4, 7.22.2); 0 if every change is reported.
     #[must_use]
     pub const fn deadband(&self) -> f64 {
         f64::from_bits(self.deadband)
     }
 }
 
-/// The node of another server that a value is written to.
+/// Node of another server that a value is written to.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct NodeTarget {
-    /// The name of the server among `servers`.
+    /// Name of the server in `servers`.
     pub server: String,
-    /// The node there.
+    /// Node at the server.
     pub node: ExpandedNodeIdText,
 }

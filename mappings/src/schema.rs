@@ -6,7 +6,8 @@ use serde_json::{Map, Value};
 
 use crate::document::Document;
 
-/// The JSON Schema of the document, for editors: shapes and ranges, without what only checking across keys finds.
+/// Returns the JSON Schema of the document, for editors: structure and ranges, without checks
+/// across keys.
 #[must_use]
 pub fn schema() -> String {
     let mut schema = schemars::schema_for!(Document);
@@ -20,17 +21,17 @@ pub fn schema() -> String {
         });
         defs.insert(NAME.to_owned(), variable.to_value());
     }
-    // Every key is a string, which is all that could fail.
+    // Serialization fails only for keys that are not strings, and every key is a string.
     let mut text = serde_json::to_string_pretty(&schema).unwrap_or_default();
     text.push('\n');
     text
 }
 
-/// A `${NAME}` with no `$` before it, anywhere in a text.
+/// Pattern of a `${NAME}` without a `$` before it, anywhere in a text.
 const VARIABLE: &str = r"(^|[^$])\$\{[A-Za-z_][A-Za-z0-9_]*(:-[^}]*)?\}";
 const NAME: &str = "EnvironmentVariable";
 
-/// The definitions that a single value may be: one of a few words, perhaps.
+/// Returns references to the definitions that allow a single value, such as a keyword.
 fn words(schema: &Schema) -> Vec<String> {
     let defs = schema.get("$defs").and_then(Value::as_object);
     let is_word = |schema: &Value| schema["type"] == "string";
@@ -46,9 +47,9 @@ fn words(schema: &Schema) -> Vec<String> {
     named.map(|(name, _)| format!("#/$defs/{name}")).collect()
 }
 
-/// Lets the environment variable stand wherever a single value does.
+/// Allows an environment variable wherever a single value is allowed.
 struct Variables {
-    /// References to definitions that a single value may be.
+    /// References to definitions that allow a single value.
     words: Vec<String>,
 }
 
@@ -72,7 +73,7 @@ impl Transform for Variables {
 }
 
 impl Variables {
-    /// The schema of a value.
+    /// Adds the environment variable to the schema of a value.
     fn open(&self, value: &mut Value) {
         let Value::Object(schema) = value else { return };
         if let Some(Value::Array(choices)) = schema.get_mut("anyOf") {
@@ -89,7 +90,7 @@ impl Variables {
         }
     }
 
-    /// Whether it is of single values, and not of all texts.
+    /// Returns `true` for a schema of single values that does not allow every text.
     fn is_limited(&self, schema: &Value) -> bool {
         let Value::Object(schema) = schema else {
             return false;

@@ -1,20 +1,21 @@
-//! Passwords in URLs, as `opc.tcp://user:password@host`.
+//! Passwords in URLs, such as `opc.tcp://user:password@host`.
 
 use std::borrow::Cow;
 use std::ops::Range;
 
-/// Whether a text as it stands in a file has a password in it. One that is a variable of the environment is not in it.
+/// Returns `true` if the text of a file contains a password. A password from an environment
+/// variable does not count.
 pub(crate) fn is_written(text: &str) -> bool {
-    // Of most there is none, which is quicker to see by bytes.
+    // Most texts contain none, and a search by bytes is faster.
     text.as_bytes().contains(&b'@') && passwords(text, at_sign).next().is_some()
 }
 
-/// Whether a user name, with a password or without, stands before the host of a URL.
+/// Returns `true` if a user name, with or without a password, precedes the host of a URL.
 pub(crate) fn has_user(url: &str) -> bool {
     users(url, at_sign).next().is_some()
 }
 
-/// A line without its passwords, as many characters as it had.
+/// Masks the passwords of a line, with as many characters as before.
 pub(crate) fn masked(text: &str) -> Cow<'_, str> {
     let of_urls = starred(text, passwords(text, at_sign));
     match key(&of_urls) {
@@ -23,14 +24,15 @@ pub(crate) fn masked(text: &str) -> Cow<'_, str> {
     }
 }
 
-/// Where the value of the key `password` stands in a line, if it stands in the file itself.
+/// Returns the range of the value of the key `password` in a line, if the file itself contains the
+/// value.
 fn key(line: &str) -> Option<Range<usize>> {
     let (before, behind) = line.split_once(KEY)?;
     let value = behind.trim_start();
     let start = before.len() + KEY.len() + (behind.len() - value.len());
     let quoted = value.chars().next().filter(|c| matches!(c, '"' | '\''));
     let length = match quoted {
-        // Up to the end where the quote is not closed in the line.
+        // If the quote is not closed in the line, the value ends with the line.
         Some(quote) => value
             .get(1..)
             .and_then(|rest| rest.find(quote))
@@ -54,7 +56,8 @@ fn key(line: &str) -> Option<Range<usize>> {
 
 const KEY: &str = "password:";
 
-/// A text that may have been cut, without its passwords: before `...` the beginning of one may stand.
+/// Masks the passwords of a text that may have been cut: the beginning of a password may precede
+/// `...`.
 pub(crate) fn masked_where_cut(text: &str) -> Cow<'_, str> {
     let last = |run: &str| run.rfind('@').max(run.rfind("..."));
     starred(text, passwords(text, last))
@@ -76,7 +79,7 @@ fn starred(text: &str, passwords: impl Iterator<Item = Range<usize>>) -> Cow<'_,
     Cow::Owned(out)
 }
 
-/// Where the passwords of the URLs in a text stand. For `last` see [`users`].
+/// Returns the ranges of the passwords in the URLs of a text. For `last` see [`users`].
 fn passwords(
     text: &str,
     last: impl Fn(&str) -> Option<usize>,
@@ -89,8 +92,8 @@ fn passwords(
     })
 }
 
-/// Whether a text is `${NAME}`, or several of them, and nothing else. A default is as readable as what stands there
-/// without a variable.
+/// Returns `true` for a text that is only `${NAME}`, or several of them. A variable with a default
+/// does not count, because the default is in clear.
 fn is_variable(text: &str) -> bool {
     let mut rest = text;
     while let Some((inside, behind)) = rest.strip_prefix("${").and_then(|of| of.split_once('}')) {
@@ -105,8 +108,8 @@ fn is_variable(text: &str) -> bool {
     rest.is_empty() && !text.is_empty()
 }
 
-/// Where users and their passwords stand: between `://` and the `@` before the host. `last` finds the last `@`, or what
-/// may have been one, in a text without spaces and quotes.
+/// Returns the ranges of users and their passwords: between `://` and the `@` before the host.
+/// `last` finds the last `@`, or the end of a cut text, in a text without spaces and quotes.
 fn users(text: &str, last: impl Fn(&str) -> Option<usize>) -> impl Iterator<Item = Range<usize>> {
     let mut from = 0;
     let runs = text.split_inclusive(is_end).map(move |run| {
@@ -119,7 +122,7 @@ fn users(text: &str, last: impl Fn(&str) -> Option<usize>) -> impl Iterator<Item
         let mut next = 0;
         run.match_indices("://").filter_map(move |(at, mark)| {
             let start = at + mark.len();
-            // What stands within one begins no other.
+            // A `://` inside of a range that was found begins no other range.
             if start < next {
                 return None;
             }
@@ -129,8 +132,8 @@ fn users(text: &str, last: impl Fn(&str) -> Option<usize>) -> impl Iterator<Item
     })
 }
 
-/// How many bytes of `rest` are user and password; `None` when it is the beginning of a host with a path. `rest` is what
-/// stands behind `://` and before the last `@`.
+/// Returns the length in bytes of user and password in `rest`; `None` if `rest` is the beginning of
+/// a host with a path. `rest` is the text after `://` and before the last `@`.
 fn user(rest: &str) -> Option<usize> {
     let Some(end) = outside(rest, |c| matches!(c, '/' | '?' | '#')) else {
         return Some(rest.len());
@@ -143,12 +146,13 @@ fn user(rest: &str) -> Option<usize> {
         (_, None) => near,
         (Some(_), Some(password)) if password.is_empty() || is_variable(password) => near,
         (None, Some(port)) if is_port(port) => None,
-        // A password may have a slash in it, written as a URL should not be.
+        // A password may contain a slash, although a URL should not contain it in this form.
         (_, Some(_)) => Some(rest.len()),
     }
 }
 
-/// Where the colon behind the user or the host stands: not that of a default, nor one of an IPv6 address.
+/// Returns the position of the colon after the user or the host; colons of a default and of an IPv6
+/// address do not count.
 fn colon(authority: &str) -> Option<usize> {
     let host = match authority.starts_with('[') {
         true => authority.find(']').unwrap_or(0),
@@ -162,13 +166,13 @@ fn is_port(text: &str) -> bool {
     let default = text
         .strip_prefix("${")
         .and_then(|of| of.strip_suffix('}')?.split_once(":-"));
-    // The URL may be the default of a variable itself.
+    // The URL may itself be the default of a variable.
     digits(text.trim_end_matches('}'))
         || is_variable(text)
         || default.is_some_and(|(_, default)| digits(default))
 }
 
-/// Where the first such character stands that is in no `${NAME:-default}`.
+/// Returns the position of the first such character outside of every `${NAME:-default}`.
 fn outside(text: &str, wanted: impl Fn(char) -> bool) -> Option<usize> {
     let mut inside = 0;
     text.char_indices()
@@ -183,7 +187,7 @@ fn outside(text: &str, wanted: impl Fn(char) -> bool) -> Option<usize> {
         .map(|(at, _)| at)
 }
 
-/// Whether a URL in a text ends before it.
+/// Returns `true` for a character that ends a URL in a text.
 fn is_end(c: char) -> bool {
     matches!(c, '"' | '\'' | '`') || c.is_whitespace()
 }
@@ -192,7 +196,7 @@ fn at_sign(run: &str) -> Option<usize> {
     run.rfind('@')
 }
 
-/// So many bytes of a variable with its default are looked at.
+/// Longest variable with its default, in bytes, that is recognized.
 const LONGEST: usize = 256;
 
 #[cfg(test)]

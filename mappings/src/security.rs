@@ -1,4 +1,4 @@
-//! Who may write and read what is sent, once it is checked.
+//! Permission to write and read the messages of the cell, checked.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -6,36 +6,36 @@ use std::time::Duration;
 use crate::endpoint::Endpoint;
 use crate::mapping::Mapping;
 
-/// A SecurityGroup (OPC 10000-14, 8.2): the programs that have its keys.
+/// SecurityGroup (OPC 10000-14, 8.2): the programs that have its keys.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct SecurityGroup {
-    /// Its SecurityGroupId.
+    /// SecurityGroupId.
     pub id: String,
-    /// What is done to what is sent, and demanded of what is heard.
+    /// Security of the messages that are sent, and required of the messages that are received.
     pub mode: GroupMode,
-    /// The SecurityPolicy of its keys.
+    /// SecurityPolicy of its keys.
     pub policy: GroupPolicy,
-    /// Where the keys come from; `None` with [`GroupMode::None`].
+    /// Source of the keys; `None` with [`GroupMode::None`].
     pub keys: Option<KeySource>,
-    /// The namespaces it has; without any, all that no other group names.
+    /// Namespaces of the group; an empty list means all namespaces that no other group names.
     pub namespaces: Vec<u16>,
-    /// How it is told that a message was there before.
+    /// Detection of repeated messages.
     pub replay: Replay,
 }
 
-/// What is done to the messages of a group.
+/// Security of the messages of a group.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum GroupMode {
-    /// Nothing.
+    /// Neither signed nor encrypted.
     None,
-    /// They are signed.
+    /// Signed.
     Sign,
-    /// They are signed, and all but their headers is encrypted.
+    /// Signed, and encrypted except for the headers.
     #[default]
     SignAndEncrypt,
 }
 
-/// The SecurityPolicy of a group (OPC 10000-7).
+/// SecurityPolicy of a group (OPC 10000-7).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum GroupPolicy {
     /// PubSub-Aes128-CTR.
@@ -45,45 +45,45 @@ pub enum GroupPolicy {
     Aes256,
 }
 
-/// How it is told that a message was there before.
+/// Detection of repeated messages.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Replay {
-    /// By a count for each run of a program.
+    /// By a counter for each run of a program.
     #[default]
     Sender,
-    /// By a count for each PublisherId and WriterGroupId (OPC 10000-14, 7.2.3).
+    /// By a counter for each PublisherId and WriterGroupId (OPC 10000-14, 7.2.3).
     Publisher,
-    /// As `Publisher`, and publishers that do not count are taken.
+    /// As `Publisher`, and messages of publishers without a counter are accepted.
     Uncounted,
 }
 
-/// Where the keys of a group come from.
+/// Source of the keys of a group.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum KeySource {
-    /// A file, below the folder of the mapping where it is relative.
+    /// A file; a relative path is below the folder of the mapping.
     File(PathBuf),
-    /// The name of a file in the directory of credentials that systemd gives the program.
+    /// Name of a file in the credentials directory that systemd provides to the program.
     Credential(String),
-    /// The cell's own server makes them, and hands them out.
+    /// The cell's own server, which makes and distributes the keys.
     Own(Served),
-    /// Another Security Key Service hands them out.
+    /// Another Security Key Service, which distributes the keys.
     Sks(Endpoint),
 }
 
-/// How the cell's own server makes the keys of a group.
+/// Settings for the keys of a group that the cell's own server makes.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Served {
-    /// Where it is.
+    /// Endpoint of the server.
     pub endpoint: Endpoint,
-    /// How long each is used.
+    /// Lifetime of each key.
     pub lifetime: Duration,
-    /// The ApplicationUris of those that get them, where `*` at the end stands for any characters. The cell's
-    /// own server and bridges get them in any case.
+    /// ApplicationUris of the programs that get the keys; `*` at the end stands for any characters.
+    /// The cell's own server and bridges get the keys in any case.
     pub members: Vec<String>,
 }
 
 impl GroupMode {
-    /// As it stands in the document.
+    /// Returns the name in the document.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -95,20 +95,21 @@ impl GroupMode {
 }
 
 impl Mapping {
-    /// The SecurityGroups, in the order of the document. Without any, everything is sent in clear.
+    /// Returns the SecurityGroups, in the order of the document. Without groups, all messages are
+    /// sent in clear.
     #[must_use]
     pub fn security(&self) -> &[SecurityGroup] {
         &self.security
     }
 
-    /// The same with those SecurityGroups.
+    /// Returns the mapping with other SecurityGroups.
     #[must_use]
     pub fn with_security(mut self, groups: Vec<SecurityGroup>) -> Self {
         self.security = groups;
         self
     }
 
-    /// The group that a namespace belongs to, secured or not.
+    /// Returns the group of a namespace, secured or not.
     #[must_use]
     pub fn group_of(&self, namespace: u16) -> Option<&SecurityGroup> {
         let named = |group: &&SecurityGroup| group.namespaces.contains(&namespace);

@@ -1,4 +1,4 @@
-//! `servers` of the document, and what variables say of them.
+//! `servers` of the document, and the keys of variables that refer to them.
 
 use crate::document::{DURATION, EXPANDED_NODE_ID, SecurityEntry};
 use crate::read::{At, document};

@@ -1,4 +1,5 @@
-//! What a document needs beside its text, handed in: this crate opens no file and looks at no environment.
+//! Inputs of a check beside the document's text. The caller provides them: this crate opens no file
+//! and reads no environment.
 
 use std::path::{Component, Path, PathBuf};
 
@@ -8,54 +9,56 @@ use crate::check::TypeFiles;
 use crate::environment::Environment;
 use crate::nodesets::NodeSets;
 
-/// The files beside a document and the variables of its environment.
+/// Files beside a document and the variables of its environment.
 pub trait Surroundings {
-    /// The text of a file, for `include`.
+    /// Returns the text of a file, for `include`.
     ///
     /// # Errors
-    /// Why there is none, for people.
+    /// The reason that the file cannot be read, for users.
     fn read(&self, file: &str) -> Result<String, String>;
 
-    /// The names in a folder, in no order, for an `include` with a wildcard.
+    /// Returns the names in a folder, in no order, for an `include` with a wildcard.
     ///
     /// # Errors
-    /// Why there are none, for people.
+    /// The reason that the folder cannot be read, for users.
     fn list(&self, folder: &str) -> Result<Vec<String>, String>;
 
-    /// The value of an environment variable, for `${NAME}`; `None` when it is not set.
+    /// Returns the value of an environment variable, for `${NAME}`; `None` if it is not set.
     fn variable(&self, name: &str) -> Option<String>;
 
-    /// Who may read a file beside its owner; `None` where that is nobody, or not known.
+    /// Returns the readers of a file beside its owner; `None` if there are no others, or if they
+    /// are not known.
     fn readers(&self, file: &str) -> Option<Readers> {
         let _ = file;
         None
     }
 
-    /// Definition files besides what is built in. `paths` are the `type_paths` of the document, those that are relative
-    /// below the folder of the file they stand in.
+    /// Returns definition files beside the built-in definitions. `paths` are the `type_paths` of
+    /// the document; a relative path is below the folder of the file that contains it.
     fn types(&self, paths: &[PathBuf]) -> Box<dyn TypeFiles> {
         let _ = paths;
         Box::new(NoTexts)
     }
 
-    /// The NodeSet2 files that the document names, read; `None` where nobody reads them here.
+    /// Returns the NodeSet2 files that the document names, read; `None` if this program does not
+    /// read them.
     fn nodesets(&self, files: &[PathBuf]) -> Option<Box<dyn NodeSets>> {
         let _ = files;
         None
     }
 
-    /// What is there in the cell while the document is checked; `None` when nobody asked.
+    /// Returns the state of the running cell; `None` if it was not queried.
     fn environment(&self) -> Option<&Environment> {
         None
     }
 }
 
-/// Who may read a file beside its owner.
+/// Readers of a file beside its owner.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Readers {
-    /// Those of its group.
+    /// Users of its group.
     Group,
-    /// Everybody on the host.
+    /// Every user of the host.
     Everybody,
 }
 
@@ -76,7 +79,7 @@ impl Surroundings for Alone {
     }
 }
 
-/// The path of a file as another one names it, without `.` and without `..` where that can be.
+/// Returns the path of a file that another file names, without `.` and, if possible, without `..`.
 pub(crate) fn beside(file: &str, named: &str) -> String {
     let folder = Path::new(file).parent().unwrap_or_else(|| Path::new(""));
     let mut path = PathBuf::new();
@@ -97,7 +100,7 @@ pub(crate) fn beside(file: &str, named: &str) -> String {
     path.to_string_lossy().into_owned()
 }
 
-/// Whether a name is what a pattern with `*` for any characters says.
+/// Returns `true` if a name matches a pattern with `*` for any characters.
 pub(crate) fn fits(pattern: &str, name: &str) -> bool {
     let mut parts = pattern.split('*');
     let Some(mut rest) = parts.next().and_then(|first| name.strip_prefix(first)) else {

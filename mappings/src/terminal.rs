@@ -1,9 +1,10 @@
-//! Texts of strangers on a terminal.
+//! Foreign texts on a terminal.
 
 use std::fmt::Write as _;
 
-/// Returns whether a terminal obeys a character instead of showing it: control characters of ASCII and of ISO 6429 (U+0080 to
-/// U+009F), and the marks that turn the direction of the text around them.
+/// Returns `true` if a terminal obeys a character instead of showing it: control characters of
+/// ASCII and of ISO 6429 (U+0080 to U+009F), and the marks that change the direction of the text
+/// around them.
 #[must_use]
 pub fn is_obeyed(c: char) -> bool {
     c.is_control()
@@ -17,7 +18,7 @@ pub fn harmless_json(json: &str) -> String {
     let mut escaped = String::with_capacity(json.len());
     for c in json.chars() {
         if is_obeyed(c) && !matches!(c, '\n' | '\r' | '\t') {
-            // A `String` takes everything.
+            // Writing to a `String` cannot fail.
             let _written = write!(escaped, "\\u{:04x}", u32::from(c));
         } else {
             escaped.push(c);

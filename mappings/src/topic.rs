@@ -1,13 +1,13 @@
-//! The names of the space: `ua_<space>_<namespace>_<identifier>`, which is the UADP triple PublisherId,
-//! WriterGroupId, DataSetWriterId (OPC 10000-14, 7.2.4.4.2 and 7.2.4.5.2).
+//! Names of the space: `ua_<space>_<namespace>_<identifier>`, the UADP triple of PublisherId,
+//! WriterGroupId and DataSetWriterId (OPC 10000-14, 7.2.4.4.2 and 7.2.4.5.2).
 
 use std::fmt;
 use std::num::NonZeroU16;
 use std::str::FromStr;
 
-/// Which side a value is produced on: 0 the OPC UA side, 1 ROS 1, 2..=232 a ROS 2 space.
+/// Side that produces a value: 0 the OPC UA side, 1 ROS 1, 2..=232 a ROS 2 space.
 ///
-/// 232 is the highest DDS domain id whose ports fit into UDP's 16 bits.
+/// 232 is the highest DDS domain id whose ports fit into 16 bits.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct SpaceId(u8);
 
@@ -19,20 +19,20 @@ impl SpaceId {
     /// The highest id, 232.
     pub const MAX: Self = Self(232);
 
-    /// `None` above 232.
+    /// Returns `None` above 232.
     #[must_use]
     pub fn new(id: u16) -> Option<Self> {
         let id = u8::try_from(id).ok()?;
         (id <= Self::MAX.0).then_some(Self(id))
     }
 
-    /// The number in the name.
+    /// Returns the number in the name.
     #[must_use]
     pub const fn get(self) -> u8 {
         self.0
     }
 
-    /// Whether this is a ROS 2 space (2..=232).
+    /// Returns `true` for a ROS 2 space (2..=232).
     #[must_use]
     pub const fn is_ros2(self) -> bool {
         self.0 >= 2
@@ -40,7 +40,7 @@ impl SpaceId {
 }
 
 impl From<SpaceId> for u16 {
-    /// The PublisherId of the space's values.
+    /// Returns the PublisherId of the space's values.
     fn from(space: SpaceId) -> Self {
         Self::from(space.0)
     }
@@ -60,12 +60,12 @@ impl fmt::Display for SpaceId {
     }
 }
 
-/// One topic of the space. Its `space` is where the value is produced; every other space reads it.
+/// Topic of the space. Its `space` produces the value; every other space reads it.
 ///
 /// Ordered by space, then namespace, then identifier.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct TopicId {
-    /// Where the value is produced; the PublisherId.
+    /// Space that produces the value; the PublisherId.
     pub space: SpaceId,
     /// Namespace index of the OPC UA node; the WriterGroupId, whose null value is 0.
     pub namespace: NonZeroU16,
@@ -74,7 +74,7 @@ pub struct TopicId {
 }
 
 impl TopicId {
-    /// `None` when the space is above 232 or one of the others is 0.
+    /// Returns `None` if the space is above 232 or another number is 0.
     #[must_use]
     pub fn new(space: u16, namespace: u16, identifier: u16) -> Option<Self> {
         Some(Self {
@@ -84,7 +84,7 @@ impl TopicId {
         })
     }
 
-    /// (PublisherId, WriterGroupId, DataSetWriterId).
+    /// Returns (PublisherId, WriterGroupId, DataSetWriterId).
     #[must_use]
     pub fn triple(self) -> (u16, u16, u16) {
         (
@@ -108,7 +108,8 @@ impl fmt::Display for TopicId {
 impl FromStr for TopicId {
     type Err = TopicError;
 
-    /// Reads exactly what `Display` prints; a leading `/` is the caller's to strip. Never allocates.
+    /// Reads exactly the text that `Display` prints. The caller strips a leading `/`. Never
+    /// allocates.
     fn from_str(text: &str) -> Result<Self, TopicError> {
         let rest = text.strip_prefix("ua_").ok_or(TopicError::Prefix)?;
         let mut parts = rest.split('_');
@@ -128,7 +129,7 @@ impl FromStr for TopicId {
     }
 }
 
-/// One spelling per number: digits only, no sign, no leading zero.
+/// Reads a number; each number has one spelling: digits only, no sign, no leading zero.
 fn decimal(part: Part, text: &str) -> Result<u16, TopicError> {
     let canonical = !text.is_empty()
         && text.bytes().all(|b| b.is_ascii_digit())
@@ -139,25 +140,25 @@ fn decimal(part: Part, text: &str) -> Result<u16, TopicError> {
     text.parse().map_err(|_| TopicError::Range(part))
 }
 
-/// Why a text is not a name of the space.
+/// Error of a text that is not a name of the space.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum TopicError {
-    /// It does not begin with `ua_`.
+    /// The text does not begin with `ua_`.
     #[error("a name of the space begins with `ua_`")]
     Prefix,
-    /// Not three parts after `ua_`.
+    /// There are not three parts after `ua_`.
     #[error("a name of the space is `ua_<space>_<namespace>_<identifier>`")]
     Parts,
-    /// A part that is no plain decimal number.
+    /// A part is not a plain decimal number.
     #[error("the {0} is not a decimal number without sign and leading zeros")]
     Number(Part),
-    /// A number outside its range.
+    /// A number is outside its range.
     #[error("the {0} is outside {range}", range = .0.range())]
     Range(Part),
 }
 
-/// One of the three numbers of a name.
+/// Part of a name: one of its three numbers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Part {
     /// PublisherId.
@@ -169,7 +170,7 @@ pub enum Part {
 }
 
 impl Part {
-    /// The values it takes, as text.
+    /// Returns the range of the number, as text.
     #[must_use]
     pub const fn range(self) -> &'static str {
         match self {

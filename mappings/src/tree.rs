@@ -1,8 +1,9 @@
-//! YAML text -> a tree of nodes that know their place. Says nothing about what the nodes mean.
+//! YAML text -> a tree of nodes with their positions. The meaning of the nodes is not checked here.
 //!
-//! Anchors and aliases are read: an alias shares the node it names, it is never copied, so a document of nested aliases
-//! takes no more room than its text. The pairs of a merge key (`<<`) are shared likewise, and counted. `${NAME}` in a
-//! scalar is the value of an environment variable. Tags are refused.
+//! Anchors and aliases are read: an alias shares the node that it names and is never copied, so a
+//! document of nested aliases needs no more memory than its text. The pairs of a merge key (`<<`)
+//! are shared likewise, and counted. `${NAME}` in a scalar is the value of an environment variable.
+//! Tags are refused.
 
 use std::borrow::Cow;
 use std::cell::Cell;
@@ -16,19 +17,19 @@ use crate::{secret, variables};
 
 /// Largest text, in bytes.
 pub(crate) const MAX_BYTES: usize = 32 << 20;
-/// Most bytes that the values of environment variables come to, each time that one is named.
+/// Maximum number of bytes of the values of environment variables, summed over every reference.
 pub(crate) const MAX_EXPANDED: usize = 4 << 20;
-/// Most nodes a text may hold, with what its merge keys bring.
+/// Maximum number of nodes of a text, including the nodes from merge keys.
 const MAX_NODES: usize = 2_500_000;
-/// Deepest nesting, aliases followed.
+/// Deepest nesting, including aliases.
 const MAX_DEPTH: usize = 24;
-/// So many bytes of a key that a merge key brings count as one node more.
+/// Number of bytes of a key from a merge key that count as one more node.
 const LONG_KEY: usize = 64;
 
-/// Where in the text, counted from 1 in lines and characters, within one line.
+/// Position in the text, within one line; lines and characters are counted from 1.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub(crate) struct Place {
-    /// In the order in which files are read; 0 is the document itself.
+    /// Number of the file, in reading order; 0 is the document itself.
     pub(crate) file: u16,
     pub(crate) line: usize,
     pub(crate) column: usize,
@@ -36,7 +37,7 @@ pub(crate) struct Place {
 }
 
 impl Place {
-    /// The beginning of the text.
+    /// Beginning of the text.
     pub(crate) const START: Self = Self {
         file: 0,
         line: 1,
@@ -45,7 +46,7 @@ impl Place {
     };
 }
 
-/// Scalars without variables are borrowed from the text.
+/// Node of the tree. Scalars without variables are borrowed from the text.
 #[derive(Debug)]
 pub(crate) struct Node<'t> {
     pub(crate) place: Place,
@@ -53,21 +54,21 @@ pub(crate) struct Node<'t> {
     depth: usize,
 }
 
-/// Keys and values.
+/// Keys and values of a map.
 type Pairs<'t> = Vec<(Rc<Node<'t>>, Rc<Node<'t>>)>;
 
 #[derive(Debug)]
 pub(crate) enum Kind<'t> {
-    /// Nothing, `~` or `null`.
+    /// No value, `~` or `null`.
     Null,
     Scalar(Cow<'t, str>),
     List(Vec<Rc<Node<'t>>>),
-    /// In the order of the text, repeated keys included.
+    /// Pairs in the order of the text, repeated keys included.
     Map(Pairs<'t>),
 }
 
 impl Kind<'_> {
-    /// With its article.
+    /// Returns the name with its article.
     pub(crate) const fn name(&self) -> &'static str {
         match self {
             Self::Null => "nothing",
@@ -78,7 +79,7 @@ impl Kind<'_> {
     }
 }
 
-/// Why there is no tree.
+/// Reason that a text makes no tree.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) struct Fault {
     pub(crate) code: Code,
@@ -87,21 +88,22 @@ pub(crate) struct Fault {
     pub(crate) help: Option<&'static str>,
 }
 
-/// A text as a tree.
+/// Tree of a text.
 pub(crate) struct Tree<'t> {
-    /// Null when the text holds comments only.
+    /// Root; null if the text contains only comments.
     pub(crate) root: Rc<Node<'t>>,
-    /// What is wrong with references to variables; the texts they stand in are as written.
+    /// Faults of references to variables; their texts stay as written.
     pub(crate) faults: Vec<Fault>,
-    /// Values of variables, and what stands for them in the text.
+    /// Values of variables, and the references in the text.
     pub(crate) values: BTreeMap<String, String>,
-    /// How many bytes the values of variables come to, each time that one is named.
+    /// Number of bytes of the values of variables, summed over every reference.
     pub(crate) expanded: usize,
-    /// Where values have a password in them, which stands in the text.
+    /// Positions of values with a password that the text contains in clear.
     pub(crate) secrets: Vec<Place>,
 }
 
-/// Reads the text of a file, whose number all places have. `variable` looks up the environment.
+/// Reads the text of a file; all positions have the number `file`. `variable` looks up the
+/// environment.
 pub(crate) fn parse<'t>(
     text: &'t str,
     file: u16,
@@ -195,7 +197,7 @@ struct Builder<'v, 't> {
     variable: &'v dyn Fn(&str) -> Option<String>,
 }
 
-/// A list or map whose end has not come.
+/// A list or map whose end has not been read yet.
 struct Open<'t> {
     anchor: usize,
     place: Place,
@@ -275,7 +277,7 @@ impl<'t> Builder<'_, 't> {
             Event::StreamStart | Event::StreamEnd | Event::DocumentEnd | Event::Anchor(..) => {
                 Ok(())
             }
-            // The enumeration is open: a node this does not know would be missing from the tree.
+            // The enumeration is open: a node of an unknown kind would be missing from the tree.
             other => Err(fault(place, format!("{other:?} is not read here"), None)),
         }
     }
@@ -300,7 +302,7 @@ impl<'t> Builder<'_, 't> {
         self.close(open.anchor, open.place, kind, depth)
     }
 
-    /// Whether the node that begins now is a key.
+    /// Returns `true` if the next node is a key.
     fn is_key(&self) -> bool {
         let open = self.open.last();
         open.is_some_and(|open| open.map && open.children.len().is_multiple_of(2))
@@ -319,7 +321,7 @@ impl<'t> Builder<'_, 't> {
         text
     }
 
-    /// Notes a value that is a variable as a shell writes it, as `$NAME` or `$(NAME)`, outside of quotes.
+    /// Notes an unquoted value that is a variable in shell syntax, such as `$NAME` or `$(NAME)`.
     fn look_for_bare_variable(&mut self, text: &str, style: ScalarStyle, place: Place) {
         let Some(behind) = text
             .strip_prefix('$')
@@ -341,9 +343,9 @@ impl<'t> Builder<'_, 't> {
         }
     }
 
-    /// A scalar with the values of the variables it names.
+    /// Returns a scalar with the values of its variables.
     fn expand(&mut self, text: Cow<'t, str>, place: Place) -> Result<Cow<'t, str>, Fault> {
-        // Of most there is none, which is quicker to see by bytes.
+        // Most scalars contain no variable, and a search by bytes is faster.
         if !text.as_bytes().contains(&b'$') || !text.contains("${") {
             return Ok(text);
         }
@@ -377,8 +379,8 @@ impl<'t> Builder<'_, 't> {
         })
     }
 
-    /// The pairs of a map with those its merge keys bring: of a key that stands in the map itself that value, else that of
-    /// the first map that has it.
+    /// Returns the pairs of a map with the pairs of its merge keys. If several maps have a key, the
+    /// map itself takes precedence, then the first merged map.
     fn merge(&mut self, pairs: Pairs<'t>) -> Result<Pairs<'t>, Fault> {
         let is_merge = |(key, _): &(Rc<Node<'_>>, Rc<Node<'_>>)| matches!(&key.kind, Kind::Scalar(text) if text == "<<");
         if !pairs.iter().any(is_merge) {
@@ -409,7 +411,8 @@ impl<'t> Builder<'_, 't> {
                         self.count(1, merge.place)?;
                         continue;
                     };
-                    // Also those that are there already: looking for them is the work.
+                    // Keys that exist already are counted too, because searching for them takes the
+                    // time.
                     self.count(1 + text.len() / LONG_KEY, merge.place)?;
                     if !known.contains(&**text) {
                         known.insert(text.clone().into_owned());
@@ -421,7 +424,7 @@ impl<'t> Builder<'_, 't> {
         Ok(own)
     }
 
-    /// Takes so many more nodes in, if there is room for them.
+    /// Counts more nodes, up to the maximum.
     fn count(&mut self, nodes: usize, place: Place) -> Result<(), Fault> {
         self.nodes = self.nodes.saturating_add(nodes);
         if self.nodes > MAX_NODES {
@@ -444,7 +447,7 @@ impl<'t> Builder<'_, 't> {
         self.place(node, place)
     }
 
-    /// Puts a finished node where it belongs.
+    /// Adds a finished node to its list or map, or makes it the root.
     fn place(&mut self, node: Rc<Node<'t>>, place: Place) -> Result<(), Fault> {
         self.count(1, place)?;
         if self.open.len() + node.depth > MAX_DEPTH {
@@ -459,7 +462,7 @@ impl<'t> Builder<'_, 't> {
     }
 }
 
-/// That values of variables come to more than they may.
+/// Returns the fault of values of variables that are too long together.
 pub(crate) fn too_expanded(place: Place) -> Fault {
     let message =
         format!("the values of its environment variables have more than {MAX_EXPANDED} bytes");
@@ -530,10 +533,10 @@ fn syntax(text: &str, error: &ScanError) -> Fault {
     fault(place, error.info(), Some(help))
 }
 
-/// How many lines up to a syntax error are searched for its cause.
+/// Number of lines before a syntax error that are searched for its cause.
 const LINES_BEFORE: usize = 3;
 
-/// The first line of what is marked.
+/// Returns the position of the first line of a marked range.
 fn place(text: &str, marks: Marks) -> Place {
     let (start, end) = (marks.start, marks.end);
     let len = if end.line() == start.line() {

@@ -5,19 +5,20 @@ use crate::nearest::nearest;
 /// A unit of measure.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Unit {
-    /// The common code of UN/ECE Recommendation 20, one to three letters and digits: `MTS`.
+    /// Common code of UN/ECE Recommendation 20, one to three letters and digits: `MTS`.
     pub code: &'static str,
-    /// `m/s`
+    /// Symbol, such as `m/s`.
     pub symbol: &'static str,
-    /// `metre per second`
+    /// Name, such as `metre per second`.
     pub name: &'static str,
 }
 
 impl Unit {
-    /// The URI that unit numbers of UNECE codes belong to (OPC 10000-8, 5.6.4.3).
+    /// URI of the units that UNECE codes name (OPC 10000-8, 5.6.4.3).
     pub const NAMESPACE: &'static str = "http://www.opcfoundation.org/UA/units/un/cefact";
 
-    /// The number that stands for the code in OPC UA: its letters as bytes, the last one lowest.
+    /// Returns the UnitId of the code in OPC UA: its letters as bytes, the last letter in the
+    /// lowest byte.
     #[must_use]
     pub fn id(&self) -> i32 {
         self.code
@@ -25,7 +26,7 @@ impl Unit {
             .fold(0, |id, byte| (id << 8) | i32::from(byte))
     }
 
-    /// The unit of a symbol, also spelt without letters beyond ASCII, of a code, or of a name.
+    /// Returns the unit of a symbol, also in its ASCII spelling, of a code, or of a name.
     #[must_use]
     pub fn find(text: &str) -> Option<&'static Self> {
         let spelt = ASCII.iter().find(|(ascii, _)| *ascii == text);
@@ -36,7 +37,7 @@ impl Unit {
             .or_else(|| by(&|unit| unit.name.eq_ignore_ascii_case(text)))
     }
 
-    /// The unit that may be meant by what names none.
+    /// Returns the unit that an unknown text may mean.
     #[must_use]
     pub fn suggest(text: &str) -> Option<&'static Self> {
         let names = UNITS.iter().map(|unit| unit.name);
@@ -147,7 +148,7 @@ const UNITS: &[Unit] = &[
     unit("4L", "Mbyte", "megabyte"),
 ];
 
-/// Symbols on keyboards that have no other letters.
+/// ASCII spellings of symbols with other letters.
 const ASCII: &[(&str, &str)] = &[
     ("um", "µm"),
     ("us", "µs"),

@@ -1,10 +1,10 @@
 //! Environment variables in a scalar.
 
-/// A text with the values of the variables it names, and each value with what stands for it in the text. `lookup` gives
-/// `None` for one that is not set.
+/// Returns a text with the values of its variables, and each value with its reference in the text.
+/// `lookup` returns `None` for a variable that is not set.
 ///
 /// # Errors
-/// What is wrong, and what to do about it.
+/// The fault and its remedy.
 pub(crate) fn expand(text: &str, lookup: &dyn Fn(&str) -> Option<String>) -> Expanded {
     let mut out = String::with_capacity(text.len());
     let mut values = Vec::new();
@@ -68,7 +68,7 @@ pub(crate) fn is_name(name: &str) -> bool {
         && name.bytes().all(|b| b.is_ascii_alphanumeric() || b == b'_')
 }
 
-/// More than any value of a mapping has.
+/// Longest value of a variable, in bytes; no value of a mapping is longer.
 const MOST: usize = 1 << 16;
 
 #[cfg(test)]

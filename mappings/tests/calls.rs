@@ -10,7 +10,7 @@ use messages::{DefinitionText, DefinitionTexts, Dialect, Language, Literal, Text
 
 const HEAD: &str = "spaces: [{id: 1}, {id: 2}]\nnamespaces: {2: 'urn:my-plant:line'}\ncalls:\n";
 
-/// An action of ROS 2 that a file defines.
+/// An action of ROS 2 whose definition is in a file.
 struct Files;
 
 impl DefinitionTexts for Files {
@@ -211,7 +211,7 @@ fn a_constant_is_a_value_of_its_field_whoever_executes() {
         matches!(&fault[..], [one] if one.starts_with("in the response of `std_srvs/Trigger`, ")),
         "{fault:?}"
     );
-    // Of a component nothing is known here but what the response is to be.
+    // Of a component only the assigned response is known.
     assert_eq!(
         told(
             "  - {node: ns=2;i=61, name: Grasp, origin: 0, ros: {space: 2, service: /b, type: std_srvs/Trigger, \

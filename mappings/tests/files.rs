@@ -1,9 +1,9 @@
-//! Documents of several files, with variables of the environment and with what YAML shares within a text.
+//! Documents of several files, with environment variables and with anchors and aliases of YAML.
 use std::collections::BTreeMap;
 
 use mappings::{Checked, Code, Mapping, Readers, Surroundings};
 
-/// Files and variables by their names.
+/// Files and variables, by name.
 #[derive(Default)]
 struct Beside {
     files: BTreeMap<String, String>,
@@ -60,7 +60,7 @@ fn names(checked: &Checked) -> Vec<&str> {
     names.collect()
 }
 
-/// One line per finding: code, file and line, and the label.
+/// Returns one line per finding: code, file and line, and the label.
 fn told(checked: &Checked) -> Vec<String> {
     let findings = checked.findings.iter().map(|found| {
         let label = found.label.clone().unwrap_or_default();
@@ -157,7 +157,7 @@ fn includes_that_lead_nowhere_or_in_circles_are_named() {
         "include: [a.yaml, ./b.yaml, none.yaml, broken.yaml, no/*.yaml]\nvariables:\n  - \
          {node: ns=2;i=1, name: A, type: Double, origin: 1}\n",
     );
-    // Nothing is said of the space and the namespace, which may be declared in what is missing.
+    // No finding concerns the space and the namespace, which may be declared in the missing file.
     assert_eq!(
         told(&checked),
         [
@@ -243,7 +243,7 @@ fn values_of_the_environment_have_no_more_bytes_than_they_may() {
     let checked = beside.check(&many(10));
     let mut codes = checked.findings.iter().map(|one| one.code);
     assert!(!codes.any(|code| code == Code::TooLarge));
-    // Those of all files count together.
+    // The values of all files count together.
     let halves = ["a", "b"].into_iter().fold(Beside::default(), |all, name| {
         all.file(&format!("plant/{name}.yaml"), &many(40))
     });
@@ -269,7 +269,7 @@ fn anchors_aliases_and_merge_keys_share_what_they_name() {
     assert_ne!(variables[2].value_type, variables[0].value_type);
     assert_eq!(variables[1].overflow, variables[0].overflow);
 
-    // What is wrong with what is shared is told once, where it stands.
+    // A fault of a shared node is reported once, at its own position.
     let faulty = text.replace("origin: 1\n", "origin: 3\n");
     assert_eq!(
         told(&Beside::default().check(&faulty)),
@@ -352,7 +352,7 @@ fn a_password_in_a_file_is_told_with_who_can_read_it_and_never_shown() {
     let apart = "rtsp://robot:${SECRET}@camera/hall";
     let beside = beside.file("plant/cameras.yaml", &cameras(apart));
     assert_eq!(told(&beside.check(&text)), [""; 0]);
-    // Also not where a long text is cut, and where another finding tells of it.
+    // Nor is the password shown if a long text is cut, or if another finding shows the text.
     let long = format!("opc.tcp://robot:{}@gateway", "open-sesame".repeat(8));
     let text = format!("{HEAD}server: {{endpoint: \"{long}\"}}\n");
     let checked = beside.check(&text);

@@ -1,4 +1,4 @@
-//! One faulty document per code in tests/bad/, and beside it what people are told about it.
+//! One faulty document per code in tests/bad/, with the expected findings beside it.
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
@@ -31,7 +31,7 @@ fn check(path: &Path) -> (String, Checked) {
     (text.clone(), Mapping::from_text(&text, &name, &around))
 }
 
-/// Definitions in the folder `types`, and perhaps a cell that runs.
+/// Definitions in the folder `types`, and optionally a running cell.
 #[derive(Default)]
 struct Around {
     environment: Option<Environment>,
@@ -63,7 +63,7 @@ impl Surroundings for Around {
     }
 }
 
-/// The NodeSet of a line, in the file line.xml; there is no other.
+/// The NodeSet of a line, in the file line.xml; there is no other file.
 struct Line(Vec<PathBuf>);
 
 impl NodeSets for Line {
@@ -108,7 +108,7 @@ impl NodeSets for Line {
     }
 }
 
-/// The folder `types`, wherever a document names it; there is no other.
+/// The folder `types`, under any path that a document names; there is no other folder.
 struct Folder(Vec<PathBuf>);
 
 impl DefinitionTexts for Folder {
@@ -159,7 +159,7 @@ impl TypeFiles for Folder {
     }
 }
 
-/// What is there for the documents that name what is not.
+/// Returns the running cell for the documents that name missing objects.
 fn environment() -> Environment {
     let topic = |kind: &str, published| LiveTopic {
         types: BTreeSet::from([kind.to_owned()]),

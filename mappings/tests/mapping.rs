@@ -1,4 +1,4 @@
-//! What a document without faults comes to, and that no text is too strange.
+//! Documents without faults, and robustness against arbitrary texts.
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::num::NonZeroU16;
@@ -683,7 +683,7 @@ fn too_many_variables_are_refused_and_the_most_allowed_are_not() {
     let document = |count: u32| {
         let entries: String = (0..count)
             .map(|n| {
-                // A namespace has topics for 65535 of them.
+                // A namespace has topics for 65535 variables.
                 let (namespace, id) = (2 + n / 50_000, 1 + n % 50_000);
                 format!("  - {{node: ns={namespace};i={id}, name: A{n}, origin: 1}}\n")
             })
@@ -830,7 +830,7 @@ calls:
   - {node: ns=2;i=61, name: Reset, origin: 0, opcua: {server: plc, object: 'nsu=urn:plc;s=Line', method: 'nsu=urn:plc;s=Line.Reset'}}
 ";
     let checked = Mapping::from_yaml(text, "cell.yaml");
-    // The password stands in the file.
+    // The file contains the password in clear.
     let codes: Vec<_> = checked.findings.iter().map(|found| found.code).collect();
     assert_eq!(codes, [Code::Secret], "{}", checked.render(text));
     assert!(

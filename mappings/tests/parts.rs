@@ -1,7 +1,7 @@
 //! One mapping on several hosts, each with the definitions of its own robots.
 use mappings::{Checked, Code, Mapping, Severity, SpaceId};
 
-/// No definition of `their_msgs` is here.
+/// The definitions of `their_msgs` are not available here.
 const CELL: &str = "\
 spaces: [{id: 1}, {id: 2}, {id: 3}]
 namespaces: {2: urn:x}

@@ -1,4 +1,4 @@
-//! What is shipped beside the code: the documents, and the schema editors use on them.
+//! Shipped files beside the code: the documents, and their schema for editors.
 use std::path::{Path, PathBuf};
 
 use mappings::{Code, Mapping, Overflow, SpaceId, TopicId};
@@ -12,7 +12,8 @@ fn folder() -> &'static Path {
 fn load(path: &Path) -> Mapping {
     let text = std::fs::read_to_string(path).unwrap();
     let checked = Mapping::from_yaml(&text, &path.display().to_string());
-    // A robot of a make brings types of its own, by its publishers and by files beside the program; so does Nav2.
+    // A vendor's robot brings its own types, by its publishers and by files beside the program; so
+    // does Nav2.
     let expected = |code| {
         path.ends_with("niryo-ned.yaml")
             && matches!(

@@ -1,13 +1,13 @@
-//! The ROS 1 and the ROS 2 version of each type both bundles have, bound to one variable.
+//! The ROS 1 and the ROS 2 version of each type in both bundles, bound to one variable.
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
 
 use mappings::{Code, Mapping};
 use messages::{Dialect, Registry, TypeName};
 
-/// What of the types of both bundles does not cross as it is, and why, as `ua-space check` tells it. All others have the
-/// same fields in the same order: `Header.seq` is left out, times and durations are one field each, and ROS 2 has small
-/// letters.
+/// Types of both bundles that do not cross unchanged, and the reason, as `ua-space check` reports
+/// it. All other types have the same fields in the same order: `Header.seq` is left out, times and
+/// durations are one field each, and ROS 2 has lower-case letters.
 const TOLD: [(&str, &str); 6] = [
     (
         "diagnostic_msgs/DiagnosticStatus",
@@ -36,7 +36,7 @@ fn common() -> Vec<TypeName> {
     let both = ros1
         .names()
         .filter(|name| ros2.names().any(|other| other == *name));
-    // Without fields there is no value.
+    // A type without fields has no value.
     both.filter(|name| !ros1.get(name).unwrap().leaves().is_empty())
         .cloned()
         .collect()

@@ -1,4 +1,4 @@
-//! ROS bindings: topic, type and field of each, and what they do to one another.
+//! ROS bindings: topic, type and field of each binding, and conflicts between bindings.
 
 use std::collections::hash_map::Entry;
 use std::collections::{HashMap, HashSet};
@@ -21,33 +21,33 @@ use crate::read::{At, list, short};
 use crate::topic::{SpaceId, TopicId};
 use crate::tree::Place;
 
-/// Most fields that are told in a help.
+/// Maximum number of fields that a help lists.
 const TOLD: usize = 12;
 
-/// The variable whose bindings are looked at.
+/// The variable whose bindings are checked.
 pub(super) struct Subject {
     pub(super) topic: Option<TopicId>,
     pub(super) origin: Option<SpaceId>,
     pub(super) declared: Option<ValueType>,
-    /// It has a `type`, which is no type.
+    /// The variable has a `type`, which is not a value type.
     pub(super) type_faulty: bool,
 }
 
 pub(super) struct Bound {
     pub(super) bindings: Vec<Binding>,
-    /// `None` when no type of a binding is known.
+    /// `None` if the type of no binding is known.
     pub(super) fields: Option<Vec<Leaf>>,
     pub(super) service: Option<Service>,
 }
 
-/// One binding, as far as it goes.
+/// A binding, with the parts that are known.
 struct Found {
     binding: Binding,
     place: Place,
     fields: Option<Vec<Leaf>>,
 }
 
-/// Where a binding stands.
+/// Position of a binding in the document.
 pub(super) struct Site<'s> {
     pub(super) place: Place,
     pub(super) space: Option<SpaceId>,
@@ -60,7 +60,7 @@ impl Site<'_> {
     }
 }
 
-/// What is done to one ROS topic of one space.
+/// Use of one ROS topic of one space by a variable.
 struct Use {
     place: Place,
     reads: bool,
@@ -72,7 +72,7 @@ pub(super) struct Bindings<'c> {
     types: &'c mut Types,
     calls: Calls,
     uses: HashMap<(SpaceId, String), Vec<Use>>,
-    /// The topics in the order they came, so that findings do.
+    /// Topics in the order of the document, so that findings have this order too.
     order: Vec<(SpaceId, String)>,
 }
 
@@ -91,7 +91,7 @@ impl<'c> Bindings<'c> {
         }
     }
 
-    /// The types that bindings name.
+    /// Returns the types that bindings name.
     pub(super) const fn types(&mut self) -> &mut Types {
         self.types
     }
@@ -146,7 +146,7 @@ impl<'c> Bindings<'c> {
         for one in &found {
             self.note_use(one, subject);
         }
-        // What the writer of the value sends decides its fields.
+        // The binding in the variable's origin decides its fields.
         let own = found
             .iter()
             .filter(|one| Some(one.binding.space) == subject.origin);
@@ -163,7 +163,7 @@ impl<'c> Bindings<'c> {
             Some(_) | None => topics.or(services),
         };
         let mut bindings: Vec<Binding> = found.into_iter().map(|one| one.binding).collect();
-        // Kept as long as the mapping.
+        // The list lives as long as the mapping.
         bindings.shrink_to_fit();
         Bound {
             bindings,
@@ -202,7 +202,8 @@ impl<'c> Bindings<'c> {
         (space, at.place)
     }
 
-    /// `None` when something of it is faulty. Without a space, what does not depend on it is checked.
+    /// Returns `None` if a part of the binding is faulty. Without a space, only parts that need
+    /// none are checked.
     fn binding(
         &mut self,
         entry: &BindingEntry,
@@ -218,7 +219,7 @@ impl<'c> Bindings<'c> {
         let chosen = Chosen::from(entry);
         let place = chosen.place().unwrap_or(place);
         let way = Way {
-            // Where no origin is known, that is the finding.
+            // If no origin is known, that is the finding.
             reads: site.subject.origin.is_none_or(|origin| origin == space),
             declared: site.subject.declared,
             alone: true,
@@ -288,7 +289,7 @@ impl<'c> Bindings<'c> {
         Some((name?, site.place))
     }
 
-    /// `None` when it is not known, which is noted.
+    /// Returns `None` for an unknown type, which is noted.
     fn message_type(
         &mut self,
         name: &TypeName,
@@ -321,7 +322,8 @@ impl<'c> Bindings<'c> {
             | DefinitionError::OtherHash { .. }
             | DefinitionError::Syntax { .. } => error.to_string(),
         };
-        // What is read from a ROS 1 topic brings its definition; an origin that could not be read may be space 1.
+        // Publishers of a ROS 1 topic send its definition, so the bridge gets it when it reads; an
+        // origin that could not be read may be space 1.
         let read = site.subject.origin.is_none_or(|origin| origin == space);
         let (note, why) = if read {
             let why = match dialect {
@@ -352,7 +354,7 @@ impl<'c> Bindings<'c> {
             )
         };
         let types = &mut *self.types;
-        // The one that is not known may be inside of the one that is asked for.
+        // The unknown type may be a field's type, inside of the type of the binding.
         let unknown = match &*error {
             DefinitionError::Unknown { name, .. } => name,
             DefinitionError::Cyclic { .. }
@@ -392,7 +394,7 @@ impl<'c> Bindings<'c> {
         }
     }
 
-    /// What variables do to one another through a topic they share.
+    /// Notes conflicts between variables that share a topic.
     pub(super) fn conflicts(&self, findings: &mut Findings) {
         for key in &self.order {
             let uses = self.uses.get(key).map_or(&[][..], Vec::as_slice);
@@ -461,7 +463,7 @@ fn topic_name(
     Some((text.to_owned(), place))
 }
 
-/// `None` when it is no name of a topic or service, which is noted.
+/// Returns `None` for a text that is not the name of a topic or service, which is noted.
 pub(super) fn ros_name(
     text: &str,
     place: Place,
@@ -544,13 +546,14 @@ pub(super) fn compare(
     }
 }
 
-/// Whether the bytes that are a message of the one are none of the other.
+/// Returns `true` if both bindings bind raw messages and the types or dialects differ, so that the
+/// bytes differ.
 fn differ_as_bytes(a: &Binding, b: &Binding) -> bool {
     let bytes = a.selection == Selection::Bytes && b.selection == Selection::Bytes;
     bytes && (dialect(a.space) != dialect(b.space) || a.message_type != b.message_type)
 }
 
-/// Where the fields of two bindings could not stand for one another.
+/// Notes bindings whose fields cannot stand for each other.
 fn differences(found: &[Found], findings: &mut Findings) {
     let mut known = found
         .iter()
@@ -609,10 +612,10 @@ fn differences(found: &[Found], findings: &mut Findings) {
     }
 }
 
-/// A whole message, whose fields go by their places.
+/// A whole message, whose fields are matched by position.
 type Side<'f> = (&'f Found, &'f [Leaf]);
 
-/// Notes where fields of the same types have names that do not fit.
+/// Notes fields of the same types whose names do not match.
 fn versions(first: Side<'_>, other: Side<'_>, findings: &mut Findings) {
     let whole =
         |(found, fields): Side<'_>| found.binding.selection == Selection::Whole && fields.len() > 1;
@@ -635,8 +638,8 @@ fn versions(first: Side<'_>, other: Side<'_>, findings: &mut Findings) {
         ));
 }
 
-/// What the fields of two sides have not in common, by their names; `None` when nothing. In ROS 2 names are in lower
-/// case with underscores, where in ROS 1 they could be as `D`.
+/// Returns the fields that only one side has, by name; `None` if there are none. ROS 2 names are in
+/// lower case with underscores, while ROS 1 allows names such as `D`.
 fn sides((first, a): Side<'_>, (other, b): Side<'_>) -> Option<String> {
     let plain = |leaf: &Leaf| leaf.path.to_ascii_lowercase().replace('_', "");
     let only = |found: &Found, these: &[Leaf], those: &[Leaf]| {

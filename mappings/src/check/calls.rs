@@ -1,4 +1,4 @@
-//! Calls: node, topic, what executes each and as what it is asked for.
+//! Calls: node and topic, executor, and the services and actions that offer each call.
 
 mod bindings;
 mod fields;
@@ -24,17 +24,17 @@ use crate::read::{At, given, short};
 use crate::topic::{SpaceId, TopicId};
 use crate::tree::Place;
 
-/// Most calls of one document.
+/// Maximum number of calls of one document.
 const MAX_CALLS: usize = 5_000;
-/// How long a call may take where nothing is said.
+/// Timeout of a call without a `timeout`.
 const TIMEOUT: Duration = Duration::from_secs(30);
 
-/// What calls are checked against.
+/// Context that calls are checked against.
 pub(super) struct Known<'k> {
     pub(super) spaces: &'k Spaces,
     pub(super) namespaces: &'k Namespaces,
     pub(super) variables: &'k [Variable],
-    /// Where the cell's own server is.
+    /// Endpoint of the cell's own server.
     pub(super) server: &'k Endpoint,
     pub(super) servers: &'k Servers,
 }
@@ -72,10 +72,10 @@ struct Checker<'c> {
     types: &'c mut Types,
     values: BTreeMap<TopicId, &'c str>,
     nodes: HashMap<&'c NodeIdText, &'c str>,
-    /// Topics and nodes of the calls before, and where they are said.
+    /// Topics and nodes of the calls before, and their positions.
     topics: HashMap<TopicId, Place>,
     call_nodes: HashMap<NodeIdText, Place>,
-    /// Names of services and actions, and where they are said.
+    /// Names of services and actions, and their positions.
     targets: HashMap<(SpaceId, CallKind, String), Place>,
 }
 
@@ -178,7 +178,7 @@ impl Checker<'_> {
         self.free_node(node, place, findings).map(|()| topic)
     }
 
-    /// `None` where something else has the node.
+    /// Returns `None` if another variable or call has the node.
     fn free_node(
         &mut self,
         node: &NodeIdText,
@@ -202,7 +202,7 @@ impl Checker<'_> {
     }
 }
 
-/// Parts who executes a call from those who ask for it, and holds their types against each other.
+/// Separates the executor of a call from the bindings that offer it, and compares their types.
 fn settle(
     origin: SpaceId,
     found: Vec<Found>,

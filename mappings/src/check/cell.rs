@@ -12,7 +12,7 @@ use crate::secret::has_user;
 use crate::topic::SpaceId;
 use crate::tree::Place;
 
-/// A DDS domain whose ports fit into 16 bits (DDSI-RTPS 2.3, 9.6.1.1).
+/// Highest DDS domain whose ports fit into 16 bits (DDSI-RTPS 2.3, 9.6.1.1).
 const MAX_DOMAIN: u16 = 232;
 
 pub(super) fn spaces(
@@ -138,7 +138,7 @@ pub(super) fn namespaces(
     for (index, uri) in entries.value.iter().flatten() {
         let (Some(number), Some(text)) = (index.value, uri.value.as_deref()) else {
             declared.partial = true;
-            // The index is declared, whatever its URI is.
+            // The index is declared even if its URI is faulty.
             declared
                 .known
                 .extend(index.value.map(|number| (number, String::new())));
@@ -180,8 +180,9 @@ pub(super) fn namespaces(
     declared
 }
 
-/// As much of RFC 3986 as tells a URI from a slip: a scheme, a colon, and something without spaces. What everybody gets to
-/// read has no user name or password.
+/// Returns `true` for a URI by the few rules of RFC 3986 that detect mistakes: a scheme, a colon,
+/// and a rest without spaces. A user name or password is refused, because every program can read
+/// the URI.
 pub(super) fn is_uri(text: &str) -> bool {
     let Some((scheme, rest)) = text.split_once(':') else {
         return false;

@@ -1,4 +1,4 @@
-//! The confirmation that a value has arrived.
+//! Confirmation that a value has arrived.
 
 use std::collections::HashMap;
 use std::time::Duration;
@@ -73,7 +73,7 @@ pub(super) fn check<'d>(
     }
 }
 
-/// Whether the values are events of the OPC UA side, or call a service, in another space.
+/// Returns `true` if the values are events of the OPC UA side, or call a service, in another space.
 fn is_command(variable: &Variable) -> bool {
     let called = variable.service.as_ref();
     let calls = called.is_some_and(|of| matches!(of.role, ServiceRole::Call { .. }));
@@ -81,7 +81,8 @@ fn is_command(variable: &Variable) -> bool {
     is_commanded && variable.lasting == Lasting::Event && variable.destinations().next().is_some()
 }
 
-/// How long the bridges may take to confirm; `None` when something is faulty, which is noted.
+/// Returns the time in which the bridges have to confirm; `None` for a faulty entry, which is
+/// noted.
 fn by_bridges(
     entry: Option<&ConfirmEntry>,
     place: Place,
@@ -136,7 +137,7 @@ fn by_bridges(
     Some(within)
 }
 
-/// `None` when something is faulty, which is noted.
+/// Returns `None` for a faulty entry, which is noted.
 fn confirm(
     (entry, place): (&ConfirmEntry, Place),
     written: &Variable,
@@ -242,12 +243,12 @@ fn answer(
     }
 }
 
-/// Whether clients write it.
+/// Returns `true` if clients write the variable.
 fn is_written(variable: &Variable) -> bool {
     variable.topic.space == SpaceId::UA && variable.from.is_none()
 }
 
-/// Of what is not known beforehand nothing is said.
+/// Returns `true` also if the fields are not known beforehand.
 fn are_comparable(written: &Variable, by: &Variable) -> bool {
     if written.fields.is_empty() || by.fields.is_empty() {
         return true;
@@ -262,7 +263,7 @@ fn are_comparable(written: &Variable, by: &Variable) -> bool {
             })
 }
 
-/// Whether the text is one value of the type.
+/// Returns `true` if the text is one value of the type.
 fn is_value(text: &str, value_type: Option<types::ValueType>) -> bool {
     match value_type {
         Some((BuiltinType::Boolean, false)) => matches!(text, "true" | "false"),
@@ -272,9 +273,9 @@ fn is_value(text: &str, value_type: Option<types::ValueType>) -> bool {
     }
 }
 
-/// How long an answer may take where nothing is said.
+/// Default time for an answer.
 const WITHIN: Duration = Duration::from_secs(2);
-/// Likewise the confirmation of a bridge.
+/// Default time for the confirmation of a bridge.
 const CONFIRMED_WITHIN: Duration = Duration::from_secs(1);
-/// How long a value is sent again at most.
+/// Longest time for which a value is sent again.
 const LONGEST: Duration = Duration::from_secs(60);

@@ -1,4 +1,4 @@
-//! Whether what a sound document names is there.
+//! Checks that the names of a sound document exist in the running cell.
 
 mod calls;
 mod remote;
@@ -14,7 +14,8 @@ use crate::read::{given, short};
 use crate::topic::SpaceId;
 use crate::tree::Place;
 
-/// `mapping` is what `document` came to, which has no errors: a variable or call for each entry, in their order.
+/// Checks the environment. `mapping` is made of `document` and has no errors: it has a variable or
+/// call for each entry, in the same order.
 pub(super) fn check(
     document: &Document,
     mapping: &Mapping,
@@ -62,7 +63,7 @@ pub(super) fn check(
     }
 }
 
-/// Where the binding of that space is written.
+/// Returns the entry of the binding of a space.
 fn binding_entry<'d>(
     entry: &'d VariableEntry,
     variable: &Variable,
@@ -263,7 +264,7 @@ fn node(
     let Some((_, place)) = given(&entry.node) else {
         return;
     };
-    // Of a namespace that is another one there, its own finding says enough.
+    // If the namespace differs there, the finding about the namespace is enough.
     if !server.agrees(&variable.node, uri.map(String::as_str)) {
         return;
     }

@@ -16,7 +16,8 @@ use crate::remote::FindSkills;
 use crate::topic::SpaceId;
 use crate::tree::Place;
 
-/// Which servers with skills the cell's server speaks for when they are found. `None` when it is faulty, which is noted.
+/// Returns the rule for the servers with skills that the cell's server represents when they are
+/// found. `None` for a faulty entry, which is noted.
 pub(super) fn check(of: Option<&At<ServerEntry>>, findings: &mut Findings) -> Option<FindSkills> {
     const OF: &str = "`find_skills`";
     let server = of?.value.as_ref()?;
@@ -50,7 +51,8 @@ pub(super) fn check(of: Option<&At<ServerEntry>>, findings: &mut Findings) -> Op
     })
 }
 
-/// IPv4 networks of at most 65536 addresses. `None` when one is faulty, which is noted.
+/// Reads IPv4 networks of at most 65536 addresses. Returns `None` for a faulty network, which is
+/// noted.
 fn networks(entries: &[At<String>], place: Place, findings: &mut Findings) -> Option<Vec<String>> {
     if entries.len() > MOST_NETWORKS {
         let message = format!(
@@ -81,7 +83,7 @@ fn networks(entries: &[At<String>], place: Place, findings: &mut Findings) -> Op
     Some(networks)
 }
 
-/// ApplicationUris, or how they begin. `None` when one is faulty, which is noted.
+/// Reads ApplicationUris, or prefixes of them. Returns `None` for a faulty entry, which is noted.
 fn application_uris(
     entries: &[At<String>],
     place: Place,
@@ -117,7 +119,8 @@ fn application_uris(
     Some(uris)
 }
 
-/// Nothing else may be in the namespaces of servers that are found.
+/// Notes variables, calls and servers in the namespaces that are reserved for servers that are
+/// found.
 pub(super) fn alone(
     (entry, found): (Option<&At<ServerEntry>>, Option<&FindSkills>),
     servers: &Servers,
@@ -163,7 +166,7 @@ pub(super) fn alone(
     }
 }
 
-/// Most entries of `networks`.
+/// Maximum number of entries of `networks`.
 const MOST_NETWORKS: usize = 64;
-/// Most entries of `uris`.
+/// Maximum number of entries of `uris`.
 const MOST_URIS: usize = 64;

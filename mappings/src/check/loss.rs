@@ -1,4 +1,4 @@
-//! What is published when the commander of a value is lost.
+//! Reaction to the loss of a value's commander.
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
@@ -17,7 +17,8 @@ use crate::read::short;
 use crate::topic::{SpaceId, TopicId};
 use crate::tree::Place;
 
-/// Reads `on_loss` and `hold`, and warns of commands that move a robot without an end. What is faulty is noted.
+/// Reads `on_loss` and `hold`, and warns of commands that move a robot without an end. Faults are
+/// noted.
 pub(super) fn check<'d>(
     entries: impl Iterator<Item = (TopicId, &'d VariableEntry)>,
     variables: &mut [Variable],
@@ -42,7 +43,7 @@ pub(super) fn check<'d>(
     }
 }
 
-/// `None` without `on_loss`, or when something is faulty, which is noted.
+/// Returns `None` without `on_loss`, or for a faulty entry, which is noted.
 fn loss(
     entry: &VariableEntry,
     variable: &Variable,
@@ -95,7 +96,7 @@ fn loss(
     Some(Loss { action, hold })
 }
 
-/// The variable whose service stops the robot.
+/// Returns the variable whose service stops the robot.
 fn stop_call(
     call: &crate::document::StopCallEntry,
     place: Place,
@@ -114,7 +115,7 @@ fn stop_call(
     found.copied()
 }
 
-/// Whether the message can be made; a type that is not known here is looked at by the host that has it.
+/// Checks that the message can be made; an unknown type is checked by the host that has it.
 fn fits(
     binding: &Binding,
     action: &LossAction,
@@ -148,7 +149,7 @@ fn fits(
     can_be_made(&message, &template, (binding.space, place), findings)
 }
 
-/// As [`fits`], for the request of a service.
+/// Checks the request of a service, as [`fits`] does a message.
 fn fits_request(
     (space, service_type, request): (SpaceId, &TypeName, &Selection),
     action: &LossAction,
@@ -194,7 +195,8 @@ fn can_be_made(
     }
 }
 
-/// The service in another space that the values of a variable call: its space and type, and the request.
+/// Returns the service in another space that the values of a variable call: its space and type, and
+/// the request.
 fn called(variable: &Variable) -> Option<(SpaceId, &TypeName, &Selection)> {
     let service = variable.service.as_ref()?;
     let ServiceRole::Call {
@@ -208,14 +210,14 @@ fn called(variable: &Variable) -> Option<(SpaceId, &TypeName, &Selection)> {
     (service.space != variable.topic.space).then_some((service.space, service_type, request))
 }
 
-/// The topics that the values of a variable command.
+/// Returns the topics that the values of a variable command.
 fn commanded(variable: &Variable) -> impl Iterator<Item = &Binding> {
     let origin = variable.topic.space;
     let bindings = variable.bindings.iter();
     bindings.filter(move |binding| binding.space != origin)
 }
 
-/// Whether the values of a variable call a service with the same request each time.
+/// Returns `true` if the values of a variable call a service with the same request each time.
 fn is_stop_call(variable: &Variable) -> bool {
     variable.service.as_ref().is_some_and(|service| {
         matches!(
@@ -225,7 +227,8 @@ fn is_stop_call(variable: &Variable) -> bool {
     })
 }
 
-/// Warns of a motion that goes on when its commander is lost, and of one that is stored for late subscribers.
+/// Warns of a motion that continues after the loss of its commander, and of a motion that is stored
+/// for late subscribers.
 fn warn(entry: &VariableEntry, variable: &Variable, findings: &mut Findings) {
     let Some(place) = entry.ros.as_ref().map(|at| at.place) else {
         return;

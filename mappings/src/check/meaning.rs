@@ -1,4 +1,4 @@
-//! What the numbers of a variable mean: their unit, range, and texts.
+//! Meaning of the numbers of a variable: unit, range, and texts.
 
 use std::collections::BTreeMap;
 
@@ -13,10 +13,11 @@ use crate::read::{At, given, short};
 use crate::tree::Place;
 use crate::unit::Unit;
 
-/// Most texts of one variable.
+/// Maximum number of texts of one variable.
 const MAX_TEXTS: usize = 1000;
 
-/// `None` when something is faulty, which is noted. The value type is that in OPC UA, where the value is one.
+/// Returns `None` for a faulty entry, which is noted. `value` has the OPC UA value type, if the
+/// variable is one value.
 pub(super) fn check(
     entry: &VariableEntry,
     value: (Option<ValueType>, bool),
@@ -93,7 +94,7 @@ pub(super) fn check(
     })
 }
 
-/// `None` when it is faulty, which is noted.
+/// Returns `None` for a faulty precision, which is noted.
 fn precision(
     entry: &VariableEntry,
     value: (Option<ValueType>, bool),
@@ -113,7 +114,7 @@ fn precision(
     precision.map(Some)
 }
 
-/// `None` when it is faulty, which is noted.
+/// Returns `None` for a faulty description, which is noted.
 fn description(entry: &VariableEntry, findings: &mut Findings) -> Option<Option<String>> {
     let Some((text, place)) = given(&entry.description) else {
         return Some(None);
@@ -126,7 +127,7 @@ fn description(entry: &VariableEntry, findings: &mut Findings) -> Option<Option<
     Some(Some(text.clone()))
 }
 
-/// Notes that a value is none that such a key goes with.
+/// Notes a value that is not a number, for a key that needs one.
 fn numbers(
     value: (Option<ValueType>, bool),
     (key, code, place): (&str, Code, Place),

@@ -2,10 +2,10 @@
 
 use messages::Dialect;
 
-/// Longest absolute topic name ROS 2 takes (`rmw_validate_full_topic_name`); ROS 1 has no limit of its own.
+/// Longest absolute topic name of ROS 2 (`rmw_validate_full_topic_name`); ROS 1 has no limit.
 const MAX_TOPIC: usize = 247;
 
-/// Why a text is no absolute topic name, if it is none.
+/// Returns why a text is not an absolute topic name, or `None` if it is one.
 pub(super) fn topic_fault(topic: &str, dialect: Dialect) -> Option<String> {
     let Some(parts) = topic.strip_prefix('/') else {
         return Some("it does not begin with `/`".to_owned());
@@ -43,7 +43,7 @@ pub(super) fn topic_fault(topic: &str, dialect: Dialect) -> Option<String> {
     }
 }
 
-/// The nearest legal name, when a slip is plain.
+/// Returns the nearest legal name, if the mistake is obvious.
 pub(super) fn mended(topic: &str, dialect: Dialect) -> Option<String> {
     let parts: Vec<&str> = topic
         .split('/')

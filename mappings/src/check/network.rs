@@ -1,4 +1,4 @@
-//! Where datagrams go, when, and where the server listens.
+//! Addresses and periods of PubSub, and the endpoint of the server.
 
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::ops::RangeInclusive;
@@ -116,7 +116,7 @@ fn timing(entry: &PubSubEntry, pubsub: &PubSub, findings: &mut Findings) {
     ));
 }
 
-/// `opc.udp://host:port`, port 4840 when left out (OPC 10000-14, 7.3.2).
+/// Reads `opc.udp://host:port`; the default port is 4840 (OPC 10000-14, 7.3.2).
 fn address(text: &str, place: Place, findings: &mut Findings) -> Option<SocketAddr> {
     let Some(address) = PubSub::parse_address(text) else {
         let message = format!("`{}` is no PubSub address", short(text));
@@ -165,7 +165,7 @@ fn address(text: &str, place: Place, findings: &mut Findings) -> Option<SocketAd
     Some(address)
 }
 
-/// Linux takes 15 bytes.
+/// Longest name of a network interface of Linux.
 const MAX_INTERFACE: usize = 15;
 
 fn interface(text: &str, place: Place, findings: &mut Findings) -> Option<String> {
@@ -199,7 +199,7 @@ pub(super) fn duration(field: &Field<String>, findings: &mut Findings) -> Option
     duration
 }
 
-/// `None` also outside 10 ms to 1 h.
+/// Reads a duration. Returns `None` also outside 10 ms to 1 h.
 fn parse_duration(text: &str) -> Option<Duration> {
     let unit = text.find(|c: char| c.is_ascii_alphabetic())?;
     let (number, unit) = text.split_at_checked(unit)?;
@@ -309,7 +309,7 @@ fn limits(field: &Field<LimitsEntry>, findings: &mut Findings) -> ServerLimits {
     }
 }
 
-/// Where another server is. `None` when it is faulty, which is noted.
+/// Reads the endpoint of another server. Returns `None` for a faulty endpoint, which is noted.
 pub(super) fn remote_endpoint(
     text: &str,
     place: Place,
@@ -327,7 +327,7 @@ pub(super) fn remote_endpoint(
     endpoint
 }
 
-/// Whether an endpoint is that of the cell's own server.
+/// Returns `true` for the endpoint of the cell's own server.
 pub(super) fn is_own(endpoint: &Endpoint, own: &Endpoint) -> bool {
     endpoint.host.eq_ignore_ascii_case(&own.host) && endpoint.port == own.port
 }

@@ -1,4 +1,4 @@
-//! The NodeSet2 files that the server loads, and what of them is mapped.
+//! NodeSet2 files that the server loads, and their nodes in the mapping.
 
 use std::path::PathBuf;
 
@@ -13,7 +13,7 @@ use crate::surroundings::Surroundings;
 use crate::topic::SpaceId;
 use crate::tree::Place;
 
-/// The files, and where each is named. Faulty entries are left out.
+/// Returns the files and their positions. Faulty entries are left out.
 pub(super) fn files(
     entry: Option<&At<ServerEntry>>,
     findings: &mut Findings,
@@ -39,7 +39,8 @@ pub(super) fn files(
         .unzip()
 }
 
-/// Reads them where somebody does so here, and looks at what the mapping has of them. They are needed by the server alone.
+/// Reads the files if this program can read them, and compares their nodes with the mapping. Only
+/// the server needs the files.
 pub(super) fn check(
     document: &Document,
     mapping: &Mapping,
@@ -74,7 +75,7 @@ pub(super) fn check(
     findings.of_part(None);
 }
 
-/// The server's own namespace has its own nodes.
+/// Notes a file with nodes of the server's own namespace, which is reserved for the server.
 fn own_namespace(
     mapping: &Mapping,
     places: &[Place],
@@ -94,7 +95,7 @@ fn own_namespace(
     }
 }
 
-/// What the mapping has of their nodes. Nothing is said where an entry was faulty.
+/// Compares the mapping's nodes with the nodes of the files. Checks nothing if an entry is faulty.
 fn nodes(document: &Document, mapping: &Mapping, sets: &dyn NodeSets, findings: &mut Findings) {
     if !document.has_all_of(mapping) {
         return;
@@ -201,5 +202,5 @@ fn variable(
     }
 }
 
-/// Most files.
+/// Maximum number of files.
 const MOST: usize = 64;

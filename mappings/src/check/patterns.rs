@@ -1,4 +1,4 @@
-//! Patterns: topics that become variables as they appear.
+//! Patterns: topics that become variables when they appear.
 
 use std::collections::BTreeMap;
 
@@ -18,7 +18,7 @@ use crate::read::{At, given, short};
 use crate::topic::SpaceId;
 use crate::tree::Place;
 
-/// Most patterns of one document: each is tried on every topic.
+/// Maximum number of patterns of one document: each pattern is matched with every topic.
 const MAX_PATTERNS: usize = 1000;
 
 pub(super) fn check(
@@ -178,7 +178,7 @@ fn template(
     }
 }
 
-/// A text that is to tell topics apart.
+/// Reads a text that has to differ from topic to topic.
 fn numbered(
     text: &str,
     place: Place,
@@ -235,7 +235,7 @@ fn node(
     Some(template)
 }
 
-/// Type and selection.
+/// Returns type and selection.
 fn kind(
     (entry, owner): (&PatternEntry, Place),
     origin: Option<SpaceId>,
@@ -244,7 +244,7 @@ fn kind(
 ) -> Option<(Option<TypeName>, Selection)> {
     let chosen = Chosen::from(entry);
     let chosen_at = |or: Place| chosen.place().unwrap_or(or);
-    // What a pattern makes are values of its space, of no declared type.
+    // A pattern makes values of its own space, without a declared type.
     let way = Way {
         reads: true,
         declared: None,

@@ -1,4 +1,4 @@
-//! Who may do what with the nodes of the server.
+//! Permissions on the nodes of the server.
 
 use crate::code::Code;
 use crate::document::{
@@ -11,7 +11,7 @@ use crate::permission::{Anonymous, Permissions, Role};
 use crate::read::{Field, given};
 use crate::topic::SpaceId;
 
-/// `None` when something is faulty, which is noted.
+/// Returns `None` for a faulty entry, which is noted.
 pub(super) fn of_variable(
     field: &Field<PermissionsEntry>,
     origin: Option<SpaceId>,
@@ -34,7 +34,7 @@ pub(super) fn of_variable(
     Some(Permissions { read, write })
 }
 
-/// Who may call; the outer `None` when something is faulty.
+/// Returns the roles that may call; the outer `None` marks a faulty entry.
 pub(super) fn of_call(
     field: &Field<CallPermissionsEntry>,
     findings: &mut Findings,
@@ -43,7 +43,7 @@ pub(super) fn of_call(
     roles(&at.value.as_ref()?.call, findings)
 }
 
-/// The outer `None` when something is faulty, the inner where nothing is said.
+/// Returns the roles; the outer `None` marks a faulty entry, the inner an entry that is left out.
 fn roles(field: &Field<RoleList>, findings: &mut Findings) -> Option<Option<Vec<Role>>> {
     let Some(at) = field else { return Some(None) };
     let RoleList(entries) = at.value.as_ref()?;
@@ -77,7 +77,7 @@ const fn role(entry: RoleEntry) -> Role {
     }
 }
 
-/// What users without a name may be.
+/// Returns the permission of anonymous users.
 pub(super) fn anonymous(entry: &ServerEntry) -> Anonymous {
     match given(&entry.anonymous) {
         None => Anonymous::Usual,
@@ -88,7 +88,7 @@ pub(super) fn anonymous(entry: &ServerEntry) -> Anonymous {
     }
 }
 
-/// What of a server that others reach is open to them.
+/// Reports permissions that are open to other hosts that reach the server.
 pub(super) fn left_open(entry: &ServerEntry, server: &Server, findings: &mut Findings) {
     if server.endpoint.is_loopback() {
         return;

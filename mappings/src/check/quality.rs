@@ -1,4 +1,4 @@
-//! How old values may become.
+//! Maximum ages of values.
 
 use super::network;
 use crate::code::Code;
@@ -9,7 +9,7 @@ use crate::quality::Ages;
 use crate::read::given;
 use crate::topic::SpaceId;
 
-/// `None` when something is faulty, which is noted.
+/// Returns `None` for a faulty entry, which is noted.
 pub(super) fn check(
     entry: &VariableEntry,
     origin: Option<SpaceId>,

@@ -10,21 +10,21 @@ use crate::read::given;
 use crate::remote::{NodeSource, NodeTarget};
 use crate::topic::SpaceId;
 
-/// What of a variable is at other servers.
+/// Source and target of a variable at other servers.
 pub(super) type Remote = (Option<Box<NodeSource>>, Option<Box<NodeTarget>>);
 
-/// What is known of the variable.
+/// Properties of the variable that are known.
 pub(super) struct Subject<'s> {
     pub(super) origin: Option<SpaceId>,
     pub(super) node: Option<&'s NodeIdText>,
-    /// Whether it is one value; of a variable whose fields are not known it may be.
+    /// `true` for a variable with one value, and for a variable whose fields are not known.
     pub(super) single: bool,
     pub(super) value_type: Option<ValueType>,
-    /// Whether ROS or a service makes its values.
+    /// `true` if ROS or a service produces its values.
     pub(super) produced: bool,
 }
 
-/// `None` when something of it is faulty, which is noted.
+/// Returns `None` for a faulty entry, which is noted.
 pub(super) fn check(
     entry: &VariableEntry,
     subject: &Subject<'_>,
@@ -72,7 +72,7 @@ pub(super) fn check(
     Some((from.map(Box::new), to.map(Box::new)))
 }
 
-/// Whether its values can come from another server.
+/// Returns `true` if its values can come from another server.
 fn may_come(entry: &VariableEntry, subject: &Subject<'_>, findings: &mut Findings) -> bool {
     let Some(place) = entry.from.as_ref().map(|at| at.place) else {
         return true;

@@ -1,4 +1,4 @@
-//! SecurityGroups: what each is, and what is left open beside them.
+//! SecurityGroups, and the messages that are not secured beside them.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -19,14 +19,14 @@ use crate::read::{At, given, short};
 use crate::security::{GroupMode, GroupPolicy, KeySource, Replay, SecurityGroup, Served};
 use crate::tree::Place;
 
-/// Most groups of a document.
+/// Maximum number of groups of a document.
 const MAX_GROUPS: usize = 64;
-/// How long a key is used where nothing is said.
+/// Default lifetime of a key.
 const LIFETIME: Duration = Duration::from_secs(3600);
-/// Shorter than programs need to hear of the next one.
+/// Shortest lifetime of a key: programs need time to get the next one.
 const LEAST_LIFETIME: Duration = Duration::from_secs(2);
 
-/// `server` is the endpoint of the cell's own server.
+/// Checks the groups. `server` is the endpoint of the cell's own server.
 pub(super) fn check(
     entries: &[At<GroupEntry>],
     server: &Endpoint,
@@ -60,7 +60,7 @@ pub(super) fn check(
     groups
 }
 
-/// Notes namespaces that two groups have.
+/// Notes namespaces that two groups claim.
 fn claim(
     entry: &GroupEntry,
     owner: Place,
@@ -269,7 +269,7 @@ fn service(
     Some(KeySource::Sks(endpoint))
 }
 
-/// What of a cell that is secured in part is not.
+/// Reports the parts of a partly secured cell that are not secured.
 pub(super) fn left_open(mapping: &Mapping, document: &Document, findings: &mut Findings) {
     own_service(mapping, document, findings);
     let secured = |group: &SecurityGroup| group.mode != GroupMode::None;
@@ -308,7 +308,7 @@ pub(super) fn left_open(mapping: &Mapping, document: &Document, findings: &mut F
     }
 }
 
-/// What keeps programs from fetching the keys that the cell's own server makes.
+/// Reports a configuration that keeps programs from getting the keys of the cell's own server.
 fn own_service(mapping: &Mapping, document: &Document, findings: &mut Findings) {
     let own = |group: &&SecurityGroup| matches!(group.keys, Some(KeySource::Own(_)));
     let (Some(at), Some(group)) = (&document.security, mapping.security().iter().find(own)) else {
@@ -346,7 +346,7 @@ fn own_service(mapping: &Mapping, document: &Document, findings: &mut Findings) 
     }
 }
 
-/// Reports a group without `members`, whose keys are for the programs of the cell alone.
+/// Reports a group without `members`, whose keys only programs of the cell get.
 fn without_members(place: Place, group: &SecurityGroup, server: &Server, findings: &mut Findings) {
     let Some(KeySource::Own(served)) = &group.keys else {
         return;
@@ -368,7 +368,7 @@ fn without_members(place: Place, group: &SecurityGroup, server: &Server, finding
         .help(help);
 }
 
-/// Where a call stands.
+/// Returns the position of a call.
 fn place_of(document: &Document, call: &Call) -> Option<Place> {
     let entries = document.calls.as_ref()?.value.as_deref()?;
     let mut named = entries

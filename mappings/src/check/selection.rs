@@ -1,4 +1,5 @@
-//! Which fields of a message cross: what `field`, `fields`, `as` and the keys that convert say together.
+//! Fields of a message that cross: `field`, `fields`, `as` and the keys that convert, taken
+//! together.
 
 use std::sync::Arc;
 
@@ -14,7 +15,7 @@ use crate::nearest::nearest;
 use crate::read::{Field, given, short};
 use crate::tree::Place;
 
-/// What a binding or a pattern says of the fields.
+/// Keys of a binding or a pattern that select fields.
 #[derive(Clone, Copy)]
 pub(super) struct Chosen<'e> {
     pub(super) field: &'e Field<String>,
@@ -46,7 +47,7 @@ impl<'e> From<&'e PatternEntry> for Chosen<'e> {
 }
 
 impl Chosen<'_> {
-    /// Where the fields are named, or else how they cross.
+    /// Returns the position of `field` or `fields`, or else of `as`.
     pub(super) fn place(&self) -> Option<Place> {
         let field = self.field.as_ref().map(|at| at.place);
         let fields = self.fields.as_ref().map(|at| at.place);
@@ -54,17 +55,17 @@ impl Chosen<'_> {
         field.or(fields).or(r#as)
     }
 
-    /// Whether fields are named.
+    /// Returns `true` if fields are named.
     pub(super) const fn names_fields(&self) -> bool {
         self.field.is_some() || self.fields.is_some()
     }
 
-    /// Notes that something converts where no value is.
+    /// Notes a conversion key if there is no value to convert.
     pub(super) fn converts_nothing(&self, findings: &mut Findings) -> Option<()> {
         shaping::shaping(self.keys, findings)?.of_nothing(findings)
     }
 
-    /// `None` when it is faulty, which is noted.
+    /// Returns `None` for a faulty selection, which is noted.
     pub(super) fn selection(
         self,
         message_type: Option<&MessageType>,
@@ -102,7 +103,7 @@ impl Chosen<'_> {
                 Some(Selection::Bytes)
             }
             (None, AsEntry::Fields) => {
-                // Of a type with one field that one is meant.
+                // A type with one field means this field.
                 let Some([only]) = message_type.map(MessageType::leaves) else {
                     shaping.of_several(findings)?;
                     return Some(Selection::Whole);
@@ -116,7 +117,7 @@ impl Chosen<'_> {
     }
 }
 
-/// The values of a selection; `None` when the type has it not, which is noted.
+/// Returns the values of a selection; `None` if the type lacks a field, which is noted.
 pub(super) fn leaves(
     message_type: &Arc<MessageType>,
     selection: &Selection,
@@ -139,7 +140,8 @@ pub(super) fn leaves(
     }
 }
 
-/// A field, or those of a message in the message; `None` when the type has it not, which is noted.
+/// Returns a field, or the fields of a message inside of the message; `None` if the type lacks the
+/// path, which is noted.
 pub(super) fn field(
     message_type: &MessageType,
     path: &str,

@@ -1,4 +1,4 @@
-//! `servers`, and the variables that come from them or go to them.
+//! `servers`, and the variables that come from them or are written to them.
 
 use std::collections::HashMap;
 use std::num::NonZeroU16;
@@ -18,12 +18,12 @@ use crate::server_entries::{FromEntry, RemoteServerEntry, ToEntry};
 use crate::topic::SpaceId;
 use crate::tree::Place;
 
-/// Most entries of `servers`.
+/// Maximum number of entries of `servers`.
 const MAX_SERVERS: usize = 256;
 
 pub(super) type Servers = Declared<Vec<RemoteServer>>;
 
-/// The servers; `own` is where the cell's own server is.
+/// Checks the servers; `own` is the endpoint of the cell's own server.
 pub(super) fn check(
     entries: Option<&At<Vec<At<RemoteServerEntry>>>>,
     (own, namespaces): (&Endpoint, &Namespaces),
@@ -102,7 +102,7 @@ fn server(
     Some((server, place))
 }
 
-/// The place of its skills. `None` when it is faulty, which is noted.
+/// Returns the namespace of the server's skills. `None` for a faulty entry, which is noted.
 #[expect(clippy::option_option, reason = "faulty, left out, or there")]
 fn skills(
     entry: &RemoteServerEntry,
@@ -144,7 +144,8 @@ fn skills(
     Some(Some(SkillsPlace { namespace, open }))
 }
 
-/// Nothing else may be where skills are: what is there has its identifiers from the skills.
+/// Notes variables and calls in the namespaces of skills, which are reserved: the skills determine
+/// the identifiers there.
 pub(super) fn alone(
     servers: &Servers,
     variables: &[Variable],
@@ -193,7 +194,7 @@ fn name_of(name: &str, place: Place, findings: &mut Findings) -> Option<String> 
     None
 }
 
-/// An endpoint that is not that of the cell's own server.
+/// Reads an endpoint that differs from the endpoint of the cell's own server.
 fn other_endpoint(
     (text, place): (&str, Place),
     own: &Endpoint,
@@ -209,7 +210,7 @@ fn other_endpoint(
     Some(endpoint)
 }
 
-/// `None` when it is faulty, which is noted.
+/// Returns `None` for a faulty entry, which is noted.
 #[expect(clippy::option_option, reason = "faulty, left out, or there")]
 fn user(entry: &RemoteServerEntry, findings: &mut Findings) -> Option<Option<User>> {
     match (&entry.user, &entry.password) {
@@ -222,7 +223,7 @@ fn user(entry: &RemoteServerEntry, findings: &mut Findings) -> Option<Option<Use
                     .help("1 to 256 bytes; without `user` the session is anonymous");
                 return None;
             }
-            // Empty where the environment of another program has it.
+            // The password is empty here if only the environment of another program has it.
             if !text.is_empty() && !findings.is_hidden(text) {
                 findings
                     .warning(Code::Secret, password.place, "a password stands here in plain text")
@@ -248,7 +249,7 @@ fn user(entry: &RemoteServerEntry, findings: &mut Findings) -> Option<Option<Use
     }
 }
 
-/// One of the servers by its name. `None` when there is none, which is noted.
+/// Returns the server of that name. `None` if no server has it, which is noted.
 pub(super) fn named<'s>(
     name: &str,
     place: Place,
@@ -256,7 +257,7 @@ pub(super) fn named<'s>(
     findings: &mut Findings,
 ) -> Option<&'s RemoteServer> {
     let found = servers.known.iter().find(|server| server.name == name);
-    // What is missing may have been meant by an entry that is faulty.
+    // A faulty entry may have had the missing name.
     if found.is_none() && !servers.partial {
         let message = format!("no server is named `{}`", short(name));
         let note = findings.error(Code::RemoteNode, place, message);
@@ -272,7 +273,7 @@ pub(super) fn named<'s>(
     found
 }
 
-/// A node of another server. `None` when it is faulty, which is noted.
+/// Reads a node of another server. Returns `None` for a faulty node, which is noted.
 pub(super) fn node(
     field: &Field<String>,
     (key, of): (&str, &str),
@@ -292,7 +293,7 @@ pub(super) fn node(
     }
 }
 
-/// `from` of a variable. `None` when it is faulty, which is noted.
+/// Reads `from` of a variable. Returns `None` for a faulty entry, which is noted.
 pub(super) fn source(
     at: &At<FromEntry>,
     servers: &Servers,
@@ -340,7 +341,7 @@ pub(super) fn source(
     Some(NodeSource::new(name, node?, (sampling?, queue?, deadband?)))
 }
 
-/// `to` of a variable. `None` when it is faulty, which is noted.
+/// Reads `to` of a variable. Returns `None` for a faulty entry, which is noted.
 pub(super) fn target(
     at: &At<ToEntry>,
     servers: &Servers,

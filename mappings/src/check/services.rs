@@ -1,4 +1,4 @@
-//! Service bindings: what is called, with which request, and what of the answer is a value.
+//! Service bindings: the service, its request, and the part of the response that is a value.
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
@@ -29,7 +29,7 @@ use crate::tree::Place;
 const TIMEOUT: Duration = Duration::from_secs(5);
 const EVERY: Duration = Duration::from_secs(1);
 
-/// What a binding is.
+/// Kind of a binding.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Kind {
     Topic,
@@ -49,10 +49,10 @@ impl Kind {
     }
 }
 
-/// A service binding, as far as it goes.
+/// A service binding, with the parts that are known.
 pub(super) struct Service {
     pub(super) binding: ServiceBinding,
-    /// `None` when the type of the service is not known or no value crosses.
+    /// `None` if the type of the service is not known or no value crosses.
     pub(super) fields: Option<Vec<Leaf>>,
     place: Place,
     /// The literal of `when`.
@@ -60,7 +60,7 @@ pub(super) struct Service {
 }
 
 impl Service {
-    /// Notes when the values of the variable's topics are none of the service.
+    /// Notes values of the variable's topics that differ in type from the values of the service.
     pub(super) fn compare(&self, topics: &[Leaf], own: &[Leaf], findings: &mut Findings) {
         let shape =
             |fields: &[Leaf]| -> Vec<ValueType> { fields.iter().map(types::value_type).collect() };
@@ -81,7 +81,7 @@ impl Service {
             .help("bind fields of one type on both sides");
     }
 
-    /// With the trigger of a call settled, now that the type of the value is known.
+    /// Returns the binding with the trigger of its call, which depends on the type of the value.
     pub(super) fn settled(
         mut self,
         value_type: Option<ValueType>,
@@ -111,7 +111,8 @@ impl Service {
     }
 }
 
-/// The value that calls is compared as the std_msgs type of the variable's: the text has to be a value of it.
+/// Checks `when`. The value is compared with the text as the std_msgs type of the variable's
+/// `type`, so the text has to be a value of this type.
 fn check_when(
     text: &str,
     value_type: ValueType,
@@ -137,11 +138,11 @@ fn check_when(
     }
 }
 
-/// The calls of a document by the node of their variable.
+/// Calls of a document, by the node of their variable.
 pub(super) struct Calls(HashMap<NodeIdText, Call>);
 
 struct Call {
-    /// `None` when something of the variable is faulty.
+    /// `None` if a part of the variable is faulty.
     topic: Option<TopicId>,
     service_type: Option<TypeName>,
 }
@@ -168,18 +169,19 @@ impl Calls {
     }
 }
 
-/// What bindings are checked against.
+/// Context that bindings are checked against.
 pub(super) struct Known<'k> {
     pub(super) types: &'k mut Types,
     pub(super) calls: &'k Calls,
 }
 
-/// `package/srv/Name` is the same name.
+/// Reads a type name. `package/srv/Name` is another spelling of `package/Name`.
 pub(super) fn type_name(text: &str) -> Option<TypeName> {
     text.replacen("/srv/", "/", 1).parse().ok()
 }
 
-/// `None` when the binding is not exactly one of the kinds, which is noted. Keys of other kinds are noted too.
+/// Returns `None` if the binding is not exactly one of the kinds, which is noted. Keys of other
+/// kinds are noted too.
 pub(super) fn kind(entry: &BindingEntry, owner: Place, findings: &mut Findings) -> Option<Kind> {
     let keys = [
         (Kind::Topic, &entry.topic),
@@ -228,7 +230,7 @@ pub(super) fn kind(entry: &BindingEntry, owner: Place, findings: &mut Findings) 
     sound
 }
 
-/// `None` when something of it is faulty.
+/// Returns `None` for a faulty binding.
 pub(super) fn check(
     kind: Kind,
     entry: &BindingEntry,
@@ -255,7 +257,7 @@ pub(super) fn check(
 
 type Checked = (ServiceRole, Option<Vec<Leaf>>, Option<(String, Place)>);
 
-/// The space of the service, when one can be bound there.
+/// Returns the space of the service, if a service can be bound there.
 fn space_of(kind: Kind, site: &Site<'_>, findings: &mut Findings) -> Option<SpaceId> {
     let (space, origin) = (site.space?, site.subject.origin);
     let (message, help) = if kind == Kind::Call && origin == Some(space) {
@@ -309,7 +311,7 @@ fn answer(
     Some((ServiceRole::Answer { of, selection }, fields, None))
 }
 
-/// A call or a poll.
+/// Checks a call or a poll.
 fn asked(
     kind: Kind,
     entry: &BindingEntry,
@@ -407,7 +409,7 @@ fn service_type(
     Some((name?, at.place))
 }
 
-/// `None` when it is not built in, which is noted.
+/// Returns the service type; `None` for an unknown type, which is noted.
 pub(super) fn built_in(
     name: &TypeName,
     (dialect, place): (Dialect, Place),
@@ -449,7 +451,7 @@ pub(super) const fn wire(dialect: Dialect) -> Wire {
     }
 }
 
-/// What of the response is the value, and its fields where the type is known.
+/// Returns the part of the response that is the value, and its fields if the type is known.
 fn response_field(
     entry: &BindingEntry,
     response: Option<&Arc<MessageType>>,
@@ -479,13 +481,13 @@ fn response_field(
     Some((selection, Some(fields)))
 }
 
-/// Whether the value in `field` is that of `path` too: its own, or that of the message it is in.
+/// Returns `true` if `path` is the field `field`, or a field of the message `field`.
 fn takes(field: &str, path: &str) -> bool {
     path.strip_prefix(field)
         .is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
 }
 
-/// The request with its constants, each checked where its type is known.
+/// Returns the request with its constants, each checked if its type is known.
 fn template(
     entry: &BindingEntry,
     fields: Vec<Selected>,
@@ -525,7 +527,7 @@ fn template(
     sound.then_some(Selection::Template { fields, rest })
 }
 
-/// Message and help.
+/// Returns message and help.
 fn told_fault(path: &str, error: PlanError) -> (String, Option<String>) {
     match error {
         PlanError::UnknownField { name, known, .. } => {

@@ -15,7 +15,7 @@ use crate::mapping::Binding;
 use crate::read::{At, given, short};
 use crate::tree::Place;
 
-/// The fields of a binding; `None` when something is faulty, which is noted.
+/// Returns the fields of a binding; `None` for a faulty entry, which is noted.
 pub(super) fn fields(
     chosen: Chosen<'_>,
     at: &At<FieldList>,
@@ -62,7 +62,7 @@ pub(super) fn fields(
         };
         let field = shaping::part(text, place, findings)?;
         let shaping = shaping::shaping(entry.into(), findings)?;
-        // The variable has no one type that all would be converted to.
+        // The variable has several values, so there is no single type to convert them to.
         let way = Way {
             declared: None,
             alone: false,
@@ -80,7 +80,7 @@ pub(super) fn fields(
     Some(Selection::Fields(all))
 }
 
-/// The fields of a selection that names them; `None` of one that names none.
+/// Returns the fields of a selection that names them; `None` for other selections.
 pub(super) fn selected(selection: Selection) -> Option<Vec<Selected>> {
     match selection {
         Selection::Field(field) => Some(vec![Selected::whole(&field)]),
@@ -101,7 +101,7 @@ pub(super) fn selected(selection: Selection) -> Option<Vec<Selected>> {
     }
 }
 
-/// The values of several fields; `None` when the type has one of them not, which is noted.
+/// Returns the values of several fields; `None` if the type lacks one of them, which is noted.
 pub(super) fn leaves(
     message_type: &Arc<MessageType>,
     selected: &[Selected],
@@ -153,7 +153,7 @@ pub(super) fn leaves(
     Some(all)
 }
 
-/// The one value of a structure; `None` where no message is, which is noted.
+/// Returns the one value of a structure; `None` if the path is not a message, which is noted.
 pub(super) fn structure(
     message_type: &MessageType,
     path: &str,
@@ -175,7 +175,7 @@ pub(super) fn structure(
     None
 }
 
-/// Structures are of one type on both sides.
+/// Notes structures of different types on both sides.
 pub(super) fn compare(a: &Binding, b: &Binding, place: Place, findings: &mut Findings) {
     if let (Selection::Structure(None), Selection::Structure(None)) = (&a.selection, &b.selection)
         && a.message_type != b.message_type
@@ -190,5 +190,5 @@ pub(super) fn compare(a: &Binding, b: &Binding, place: Place, findings: &mut Fin
     }
 }
 
-/// As many as a DataSet with a component for each can reasonably have.
+/// Largest number of fields for which a DataSet with a component for each is reasonable.
 const MOST_FIELDS: usize = 1_000;

@@ -1,4 +1,5 @@
-//! Parts of arrays, and values that are converted: what stands in `field`, `scale`, `offset`, `invert` and `out_of_range`.
+//! Parts of arrays, and conversion of values: `field`, `scale`, `offset`, `invert` and
+//! `out_of_range`.
 
 use messages::{
     Conversion, Leaf, MessageType, Part, Plan, PlanError, Selection, Wire, is_lossless, is_number,
@@ -12,17 +13,17 @@ use crate::findings::Findings;
 use crate::read::{Field, given, short};
 use crate::tree::Place;
 
-/// What a binding says about its one value beside its field.
+/// Conversion keys of a binding with one value.
 pub(super) struct Shaping {
     conversion: Conversion,
-    /// Of the first key that converts.
+    /// Position of the first conversion key.
     place: Option<Place>,
     scaled: bool,
-    /// What becomes of values that do not fit is said.
+    /// `out_of_range` is given.
     said: bool,
 }
 
-/// The keys that convert a value.
+/// Keys that convert a value.
 #[derive(Clone, Copy)]
 pub(super) struct Keys<'k> {
     scale: &'k Field<f64>,
@@ -64,16 +65,16 @@ impl<'k> From<&'k FieldEntry> for Keys<'k> {
     }
 }
 
-/// Which way the value goes, and what it is in OPC UA.
+/// Direction of the value, and its type in OPC UA.
 #[derive(Clone, Copy)]
 pub(super) struct Way {
     pub(super) reads: bool,
     pub(super) declared: Option<ValueType>,
-    /// It is the one value of a variable, whose `type` may be given.
+    /// The value is the only value of a variable, whose `type` may be given.
     pub(super) alone: bool,
 }
 
-/// The field and the part of it; `None` when that is faulty, which is noted.
+/// Returns the field and its part; `None` for a faulty text, which is noted.
 pub(super) fn part(
     text: &str,
     place: Place,
@@ -89,7 +90,7 @@ pub(super) fn part(
     split.map(|(field, part)| (field.to_owned(), part))
 }
 
-/// `None` when something is faulty, which is noted.
+/// Returns `None` for a faulty key, which is noted.
 pub(super) fn shaping(keys: Keys<'_>, findings: &mut Findings) -> Option<Shaping> {
     let mut sound = Some(());
     let mut conversion = Conversion::default();
@@ -162,8 +163,8 @@ pub(super) fn shaping(keys: Keys<'_>, findings: &mut Findings) -> Option<Shaping
 }
 
 impl Shaping {
-    /// Selection of a field with what is said about it, checked against the type where that is known. `None` when
-    /// something is faulty, which is noted.
+    /// Returns the selection of a field with its conversion, checked against the type if it is
+    /// known. Returns `None` for a fault, which is noted.
     pub(super) fn select(
         self,
         (field, part): (String, Option<Part>),
@@ -182,7 +183,7 @@ impl Shaping {
         }
         let leaf = message_type.and_then(|message| message.leaf(&field));
         let element = match &part {
-            // The type of a field inside is known by the type of the messages.
+            // The type of a field inside of messages follows from the type of the messages.
             Some(inside @ Part::Inside { .. }) => message_type
                 .and_then(|message| inner(message, &field, inside))
                 .map(|leaf| leaf.builtin),
@@ -199,7 +200,7 @@ impl Shaping {
         })
     }
 
-    /// What converts stands with one of several fields.
+    /// Notes a conversion key beside `fields`: it belongs to one of the fields.
     pub(super) fn of_fields(&self, findings: &mut Findings) -> Option<()> {
         let Some(place) = self.place else {
             return Some(());
@@ -210,7 +211,7 @@ impl Shaping {
         None
     }
 
-    /// Where no value crosses none is converted.
+    /// Notes a conversion key if no value crosses.
     pub(super) fn of_nothing(&self, findings: &mut Findings) -> Option<()> {
         let Some(place) = self.place else {
             return Some(());
@@ -225,7 +226,7 @@ impl Shaping {
         None
     }
 
-    /// Of a whole message nothing is converted.
+    /// Notes a conversion key if a whole message crosses.
     pub(super) fn of_several(&self, findings: &mut Findings) -> Option<()> {
         let Some(place) = self.place else {
             return Some(());
@@ -296,7 +297,7 @@ impl Shaping {
     }
 }
 
-/// The field of one message of an array.
+/// Returns the field of one message of an array.
 fn inner(message_type: &MessageType, array: &str, part: &Part) -> Option<Leaf> {
     let Part::Inside { field, .. } = part else {
         return None;
@@ -304,7 +305,7 @@ fn inner(message_type: &MessageType, array: &str, part: &Part) -> Option<Leaf> {
     message_type.leaf_inside(array, field)
 }
 
-/// The builtin type of one value of that.
+/// Returns the builtin type of one element, or of the whole field.
 fn element(leaf: &Leaf, part: Option<&Part>) -> BuiltinType {
     match (leaf.builtin, part) {
         (BuiltinType::ByteString, Some(Part::Element(_) | Part::Named { .. })) => BuiltinType::Byte,
@@ -312,7 +313,8 @@ fn element(leaf: &Leaf, part: Option<&Part>) -> BuiltinType {
     }
 }
 
-/// The fields of a selection with a part or conversion; `None` when the type has it not, which is noted.
+/// Returns the fields of a selection with a part or conversion; `None` if the type lacks a field,
+/// which is noted.
 pub(super) fn leaves(
     message_type: &std::sync::Arc<MessageType>,
     selection: &Selection,

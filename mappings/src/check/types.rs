@@ -17,10 +17,10 @@ use crate::nearest::nearest;
 use crate::topic::SpaceId;
 use crate::tree::Place;
 
-/// Builtin type and whether it is an array.
+/// Builtin type, and `true` for an array.
 pub(super) type ValueType = (BuiltinType, bool);
 
-/// `Double`, `Double[]`
+/// Reads `Double` or `Double[]`.
 pub(super) fn parse_value_type(text: &str) -> Option<ValueType> {
     let (name, array) = text
         .strip_suffix("[]")
@@ -36,7 +36,8 @@ pub(super) fn value_type(leaf: &Leaf) -> ValueType {
     (leaf.builtin, matches!(leaf.rank, Rank::Array { .. }))
 }
 
-/// What may be meant by a name that is no builtin type: a misspelt one, or a word of another language.
+/// Returns the builtin type that an unknown name may mean: a misspelt name, or the word of another
+/// language.
 pub(super) fn suggest_value_type(text: &str) -> Option<&'static str> {
     const ELSEWHERE: [(&str, &str); 20] = [
         ("bool", "Boolean"),
@@ -82,10 +83,10 @@ pub(super) const fn dialect(space: SpaceId) -> Dialect {
 
 type Answer = Result<Arc<MessageType>, Box<DefinitionError>>;
 
-/// The message types that are built in or in files.
+/// Message types that are built in or in files.
 pub(super) struct Types {
     files: Box<dyn TypeFiles>,
-    /// Of ROS 1 and of ROS 2, once something of it was asked for.
+    /// Libraries of ROS 1 and of ROS 2, created with the first query.
     libraries: [Option<Library>; 2],
     asked: HashMap<(Dialect, TypeName), Answer>,
     services: HashMap<(Dialect, TypeName), Option<Arc<ServiceType>>>,
@@ -108,7 +109,7 @@ impl Types {
         }
     }
 
-    /// What is built in.
+    /// Returns the built-in definitions.
     pub(super) fn registry(dialect: Dialect) -> &'static Registry {
         match dialect {
             Dialect::Ros1 => &ROS1,
@@ -129,7 +130,7 @@ impl Types {
         (library, &mut self.files, &mut self.used)
     }
 
-    /// A service that is known; notes what is wrong with its file.
+    /// Returns a known service type; notes faults of its file.
     pub(super) fn service(
         &mut self,
         (dialect, place): (Dialect, Place),
@@ -152,7 +153,7 @@ impl Types {
         found
     }
 
-    /// An action that is known, as calls and values; notes what is wrong with its files.
+    /// Returns a known action type as calls and values; notes faults of its files.
     pub(super) fn action(
         &mut self,
         (dialect, place): (Dialect, Place),
@@ -176,7 +177,7 @@ impl Types {
         found
     }
 
-    /// A message type; notes what is wrong with its files.
+    /// Returns a message type; notes faults of its files.
     pub(super) fn get(
         &mut self,
         (dialect, place): (Dialect, Place),
@@ -199,7 +200,7 @@ impl Types {
         found
     }
 
-    /// What may be meant by a name that is not known.
+    /// Returns the known name that an unknown name may mean.
     pub(super) fn suggest(
         &mut self,
         dialect: Dialect,
@@ -210,7 +211,7 @@ impl Types {
         library.suggest(kind, name, files.as_mut())
     }
 
-    /// `; looked in a, b`, or nothing where only what is built in is known.
+    /// Returns `; looked in a, b`, or an empty text if there are only built-in types.
     pub(super) fn looked(&self, dialect: Dialect) -> String {
         let places = self.files.places(dialect);
         if places.is_empty() {
@@ -220,7 +221,7 @@ impl Types {
         format!("; looked in {}", told(&places))
     }
 
-    /// The types that were asked for.
+    /// Returns the types that were queried.
     pub(super) fn used(self) -> Vec<TypeUse> {
         self.used
     }

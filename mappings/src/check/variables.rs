@@ -23,16 +23,17 @@ use crate::read::{At, given, short};
 use crate::topic::{SpaceId, TopicId};
 use crate::tree::Place;
 
-/// Most variables of one document.
+/// Maximum number of variables of one document.
 const MAX_VARIABLES: usize = 100_000;
 
-/// The WriterGroupId of nodes of namespace 0, whose own index is the null value: the highest, which no server reaches.
+/// WriterGroupId of nodes of namespace 0, whose own index is the null value: the highest number,
+/// which no server uses as an index.
 pub(super) const NAMESPACE_ZERO: NonZeroU16 = NonZeroU16::MAX;
 
 pub(super) type Namespaces = Declared<BTreeMap<u16, String>>;
 pub(super) type Spaces = Declared<Vec<Space>>;
 
-/// What could be read of an entry that is a map.
+/// Parts of an entry that could be read; the entry is a map.
 struct Draft<'d> {
     entry: &'d VariableEntry,
     place: Place,
@@ -100,7 +101,7 @@ pub(super) fn check(
         .filter_map(|draft| Some((draft.topic()?, draft.entry)));
     confirm::check(entries.clone(), &mut variables, findings);
     loss::check(entries, &mut variables, bindings.types(), findings);
-    // Kept as long as the mapping.
+    // The list lives as long as the mapping.
     variables.shrink_to_fit();
     bindings.conflicts(findings);
     variables
@@ -134,7 +135,7 @@ fn draft<'d>(
     }
 }
 
-/// How a finding calls a variable of which something is missing.
+/// Returns the name that findings use for a variable that lacks keys.
 fn title(entry: &VariableEntry) -> String {
     match given(&entry.name).or_else(|| given(&entry.node)) {
         Some((text, _)) => format!("the variable `{}`", short(text)),
@@ -172,7 +173,7 @@ pub(super) fn node_id(
     Some((node, place))
 }
 
-/// A space that is the OPC UA side or declared.
+/// Returns the OPC UA side, or a declared space.
 pub(super) fn space(
     number: u16,
     place: Place,
@@ -210,7 +211,7 @@ pub(super) fn space(
 
 fn aliases(drafts: &[Draft<'_>], findings: &mut Findings) {
     let used: HashSet<TopicId> = drafts.iter().filter_map(Draft::topic).collect();
-    // The numbers not yet proposed.
+    // The numbers that have not been proposed yet.
     let mut next: HashMap<(SpaceId, NonZeroU16), RangeInclusive<u16>> = HashMap::new();
     for draft in drafts {
         let Some((node, place)) = &draft.node else {
@@ -255,7 +256,7 @@ fn aliases(drafts: &[Draft<'_>], findings: &mut Findings) {
     }
 }
 
-/// Why the identifier of a node is none of a topic.
+/// Returns why the identifier of a node cannot be the identifier of a topic.
 fn why_alias(node: &NodeIdText) -> &'static str {
     match node.identifier {
         Identifier::Numeric(_) if node.namespace == 0 => "a node of namespace 0",
@@ -288,7 +289,7 @@ fn unique(drafts: &[Draft<'_>], findings: &mut Findings) {
             let note = findings.warning(Code::NameTwice, place, message);
             note.label(format!("first at {line}"));
         }
-        // Two variables of one node have one topic too, where the origin is the same: one finding is enough.
+        // Two variables of one node and one origin also share a topic: one finding is enough.
         if let Some(first) = nodes.insert(node, *place) {
             let line = findings.line(first, *place);
             let note = findings.error(
@@ -413,7 +414,8 @@ fn variable(
     })
 }
 
-/// The field of a foreign publisher that is the value. `None` when it is faulty, which is noted.
+/// Returns the field that is the value in the DataSet of a publisher that is not a bridge. `None`
+/// for a fault, which is noted.
 fn ua_field(
     draft: &Draft<'_>,
     bindings: &[Binding],
@@ -447,7 +449,7 @@ fn ua_field(
     Some(Some(field.clone()))
 }
 
-/// `None` when it is faulty, which is noted.
+/// Returns `None` for a faulty entry, which is noted.
 fn publish(
     entry: &VariableEntry,
     (value_type, fields): (Option<ValueType>, &[Leaf]),
@@ -502,7 +504,7 @@ fn publish(
     sound.map(|()| Publish::new(on_change, deadband, period))
 }
 
-/// The time between two of so many in a second: `10 Hz`.
+/// Reads a rate such as `10 Hz` and returns its period.
 fn rate(text: &str) -> Option<Duration> {
     let number = text.strip_suffix("Hz")?.trim_end();
     let rate: f64 = number.parse().ok()?;
@@ -511,7 +513,7 @@ fn rate(text: &str) -> Option<Duration> {
         .then(|| Duration::from_secs_f64(1.0 / rate))
 }
 
-/// As the std_msgs type of a value has it.
+/// Returns the field of the std_msgs type of a value.
 fn only_field((builtin, array): ValueType) -> Leaf {
     let rank = if array {
         Rank::Array { fixed: None }

@@ -1,4 +1,4 @@
-//! Who may write and read what is sent: the part of the document about SecurityGroups.
+//! SecurityGroups in the document: permission to write and read the messages.
 
 use crate::read::{At, choice, document};
 

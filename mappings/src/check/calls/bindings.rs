@@ -18,43 +18,44 @@ use crate::read::{Field, given, short};
 use crate::topic::SpaceId;
 use crate::tree::Place;
 
-/// A service or action under `ros`, as far as it goes.
+/// A service or action under `ros`, with the parts that are known.
 pub(super) struct Found {
     pub(super) space: SpaceId,
     pub(super) place: Place,
     pub(super) kind: CallKind,
     pub(super) target: CallTarget,
-    /// `None` where the type is not known.
+    /// `None` if the type is not known.
     pub(super) definition: Option<Definition>,
     pub(super) maps: Maps,
 }
 
-/// What a type is made of.
+/// Definition of a service or action type.
 #[derive(Clone)]
 pub(super) enum Definition {
     Service(Arc<ServiceType>),
     Action(Arc<ActionCalls>),
 }
 
-/// The maps of a binding, each with its place.
+/// The maps of a binding, each with its position.
 #[derive(Default)]
 pub(super) struct Maps {
-    /// Of the request, or the goal.
+    /// Map of the request, or of the goal.
     pub(super) request: Option<(FieldMap, Place)>,
-    /// Of the response, or the result.
+    /// Map of the response, or of the result.
     pub(super) response: Option<(FieldMap, Place)>,
     pub(super) feedback: Option<(FieldMap, Place)>,
 }
 
 impl Maps {
-    /// Where the first of them is.
+    /// Returns the position of the first map.
     pub(super) fn place(&self) -> Option<Place> {
         let maps = [&self.request, &self.response, &self.feedback];
         maps.into_iter().flatten().map(|(_, place)| *place).next()
     }
 }
 
-/// What a call is by its bindings. `None` where they are of both kinds, which is noted, or faulty.
+/// Returns the kind of a call by its bindings; `None` if they are faulty, or of both kinds, which
+/// is noted.
 pub(super) fn kind_of(
     found: Option<&[Found]>,
     entry: &CallEntry,
@@ -79,7 +80,7 @@ pub(super) fn kind_of(
 }
 
 impl Checker<'_> {
-    /// `None` where one of them is faulty.
+    /// Returns the bindings of a call; `None` if a binding is faulty.
     pub(super) fn bindings(
         &mut self,
         entry: &CallEntry,
@@ -108,7 +109,7 @@ impl Checker<'_> {
                 _ => all = None,
             }
         }
-        // What is wrong as a whole is wrong with each.
+        // A fault of the whole entry makes all bindings faulty.
         entry
             .ros
             .as_ref()
@@ -199,7 +200,8 @@ impl Checker<'_> {
     }
 }
 
-/// `None` when the binding is not exactly one of the kinds, or has keys of the other, which is noted.
+/// Returns `None` if the binding is not exactly one of the kinds, or has keys of the other kind.
+/// Both are noted.
 fn kind(entry: &CallBindingEntry, owner: Place, findings: &mut Findings) -> Option<CallKind> {
     let place = |at: &Field<FieldMapEntry>| at.as_ref().map(|at| at.place);
     let maps = [
@@ -260,7 +262,8 @@ fn name(
     Some((text.clone(), place))
 }
 
-/// `package/srv/Name` and `package/action/Name` are the same names.
+/// Reads a type name. `package/srv/Name` and `package/action/Name` are other spellings of
+/// `package/Name`.
 fn type_name(
     text: &str,
     kind: CallKind,
@@ -283,7 +286,7 @@ fn type_name(
     Some((name?, place))
 }
 
-/// `None` when it is not known, which is noted.
+/// Returns `None` for an unknown action type, which is noted.
 fn action(
     name: &TypeName,
     (dialect, place): (Dialect, Place),
@@ -313,7 +316,7 @@ fn action(
     known
 }
 
-/// `within` is the message of the call that the fields are in.
+/// Reads a field map. `within` is the message of the call that contains the fields.
 fn field_map(entry: &Field<FieldMapEntry>, within: &str) -> Option<(FieldMap, Place)> {
     let (entry, place) = given(entry)?;
     let assigned = entry.0.iter().map(|(target, _, value)| Assignment {

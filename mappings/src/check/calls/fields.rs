@@ -1,4 +1,4 @@
-//! Whether requests, responses and feedback can be made of each other.
+//! Checks that requests, responses and feedback can be made of each other.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -14,8 +14,8 @@ use crate::findings::Findings;
 use crate::read::short;
 use crate::tree::Place;
 
-/// Notes where a field of the request that is executed, or of the response where it is asked for, is made of nothing, and
-/// what is wrong with the maps as far as the types are known.
+/// Notes each field without a source, in the request of the executor and in the response of the
+/// offered service. Notes faults of the maps as far as the types are known.
 pub(super) fn compare(executes: Option<&Found>, asks: &Found, findings: &mut Findings) {
     let there = executes.and_then(|one| one.definition.as_ref());
     let here = asks.definition.as_ref();
@@ -64,7 +64,7 @@ pub(super) fn compare(executes: Option<&Found>, asks: &Found, findings: &mut Fin
 }
 
 impl Definition {
-    /// What is asked with: the request of a service or goal.
+    /// Returns the request of a service, or of an action's goal.
     fn request(&self) -> &Arc<MessageType> {
         match self {
             Self::Service(service) => service.request(),
@@ -72,7 +72,7 @@ impl Definition {
         }
     }
 
-    /// What comes back: the response of a service, or that with the result.
+    /// Returns the response of a service, or the response with an action's result.
     fn response(&self) -> &Arc<MessageType> {
         match self {
             Self::Service(service) => service.response(),
@@ -88,20 +88,21 @@ impl Definition {
     }
 }
 
-/// Two messages, one of which is made of the other.
+/// Two messages: a target that is made of a source.
 struct Part<'p> {
-    /// Of its map, and what paths of an action have in front of those of the mapping.
+    /// Key of the map in the document, and the prefix of an action's paths that the document leaves
+    /// out.
     key: (&'static str, &'static str),
     map: Option<&'p (FieldMap, Place)>,
-    /// `None` where its type is not known.
+    /// `None` if the type of the target is not known.
     target: Option<(&'p Found, &'p Arc<MessageType>)>,
     source: Option<(&'p Found, Option<&'p Arc<MessageType>>)>,
-    /// It goes from who asks to who executes.
+    /// The message goes from the caller to the executor.
     asked: bool,
 }
 
 impl Part<'_> {
-    /// What is wrong with it, for people.
+    /// Returns the fault of this pair of messages, for users.
     fn fault(&self) -> Option<String> {
         let (target, message) = self.target?;
         let (key, name) = (self.key.0, &target.target.type_name);
@@ -121,7 +122,7 @@ impl Part<'_> {
         let given = given?;
         let mut leaves = message.leaves().iter();
         let fault = leaves.find_map(|leaf| self.made(map, leaf, given));
-        // Who answers may say more than is wanted.
+        // An executor may return more fields than the caller wants.
         let whole = map.is_empty() || message.leaves().is_empty();
         let fault = fault.or_else(|| {
             let lost = self.asked && whole;
@@ -133,7 +134,7 @@ impl Part<'_> {
         ))
     }
 
-    /// Why a field cannot have the constant it is made of.
+    /// Returns why the constant does not fit the field.
     fn constant(
         &self,
         map: &FieldMap,
@@ -145,7 +146,7 @@ impl Part<'_> {
             Assigned::Field(_) => return None,
         };
         let told = self.told(&leaf.path);
-        // What goes out is made of fields, which know no names of constants.
+        // The request of the executor is made of fields, which know no names of constants.
         if self.asked {
             let fits = is_value(leaf, &literal);
             let kind = types::print(types::value_type(leaf));
@@ -180,7 +181,7 @@ impl Part<'_> {
         }
     }
 
-    /// Which field of who asks nothing is made of, where nothing says that it is left out.
+    /// Returns the fault if a field of the caller is used nowhere and no map leaves it out.
     fn lost(&self, message: &MessageType, given: &MessageType) -> Option<String> {
         let lost = given.leaves().iter().find(|source| {
             let mut targets = message.leaves().iter();
@@ -189,13 +190,13 @@ impl Part<'_> {
         Some(format!("nothing is made of `{}`", self.told(&lost.path)))
     }
 
-    /// A path as the mapping has it.
+    /// Returns a path as the mapping writes it.
     fn told<'f>(&self, path: &'f str) -> &'f str {
         path.strip_prefix(self.key.1).unwrap_or(path)
     }
 }
 
-/// Whether that is a field, or a message with fields in it.
+/// Returns `true` if the target is a field, or a message with fields in it.
 fn has_target(message: &MessageType, target: &str) -> bool {
     let mut leaves = message.leaves().iter();
     leaves.any(|leaf| {
@@ -204,7 +205,7 @@ fn has_target(message: &MessageType, target: &str) -> bool {
     })
 }
 
-/// Whether the constant is a value of a field in a request.
+/// Returns `true` if the constant is a value of a field in a request.
 fn is_value(leaf: &Leaf, literal: &Literal) -> bool {
     let fits = |text: &String| is_scalar(leaf.builtin, text);
     match (literal, leaf.rank) {
@@ -235,7 +236,7 @@ fn is_scalar(builtin: BuiltinType, text: &str) -> bool {
         BuiltinType::Float => text.parse::<f32>().is_ok(),
         BuiltinType::Double => text.parse::<f64>().is_ok(),
         BuiltinType::String => true,
-        // No time is always the same but that of nothing.
+        // The zero time is the only constant of a DateTime.
         BuiltinType::DateTime => text == "0",
         BuiltinType::Guid
         | BuiltinType::ByteString

@@ -14,11 +14,11 @@ use crate::remote::Access;
 use crate::topic::SpaceId;
 use crate::tree::Place;
 
-/// Something of it is faulty, which is noted.
+/// A part of the entry is faulty, which is noted.
 pub(super) struct Faulty;
 
 impl Checker<'_> {
-    /// The Method that executes a call, if one does.
+    /// Returns the Method that executes a call, if `opcua` names one.
     pub(super) fn method(
         &self,
         entry: &CallEntry,
@@ -75,7 +75,7 @@ impl Checker<'_> {
         })
     }
 
-    /// How its server is reached, and its name if it has one.
+    /// Returns the access to the server, and its name if it has one.
     fn reached(
         &self,
         entry: &MethodEntry,

@@ -1,4 +1,4 @@
-//! Whether what executes a call is there, and the names it is asked for by are free.
+//! Checks that the executor of a call exists, and that the names that offer the call are free.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -59,7 +59,8 @@ pub(super) fn check(
     }
 }
 
-/// What somebody offers of that kind, with the types it has; `None` where nobody asked.
+/// Returns the services or actions that the graph offers, with their types; `None` if the graph was
+/// not queried.
 fn offered(live: &LiveSpace, kind: CallKind) -> Option<BTreeMap<&str, BTreeSet<String>>> {
     match kind {
         CallKind::Service => {
@@ -104,7 +105,7 @@ fn executed(
     }
 }
 
-/// Where the name of the service or action of that space is written.
+/// Returns the position of the name of the service or action of a space.
 fn name_place(entry: &CallEntry, call: &Call, space: SpaceId) -> Option<Place> {
     let (bindings, _) = given(&entry.ros)?;
     let of_space = |binding: &&CallBindingEntry| match given(&binding.space) {

@@ -1,4 +1,4 @@
-//! Whether the nodes of other servers that variables come from and go to are there.
+//! Checks that the nodes of other servers exist that variables come from or are written to.
 
 use crate::code::Code;
 use crate::document::VariableEntry;
@@ -42,7 +42,7 @@ pub(super) fn check(
     }
 }
 
-/// Which node of which server, and what is done with it.
+/// A node of a server, and whether it is written.
 struct About<'a> {
     server: &'a str,
     node: String,
