@@ -23,8 +23,8 @@ use crate::unit::Unit;
 
 /// The checked mapping of one cell. It is immutable: a changed file makes a new mapping.
 ///
-/// `Mapping::default()` is zero configuration: the PubSub defaults, no space declared (each ROS 2 space is then the
-/// DDS domain of its number), no variable.
+/// `Mapping::default()` is zero configuration: the PubSub defaults, no declared space (each ROS 2
+/// space is then the DDS domain of its number), no variable.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Mapping {
     pubsub: PubSub,
@@ -720,7 +720,8 @@ pub enum Overflow {
 /// Whether the last value of a variable is stored for late subscribers.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Lasting {
-    /// A state: the last value is repeated while its producer is alive, and latched on the ROS side.
+    /// A state: the last value is repeated while its producer is alive, and latched on the ROS
+    /// side.
     State,
     /// An event or a command: delivered once, to the subscribers that are present.
     Event,

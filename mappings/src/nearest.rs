@@ -1,6 +1,7 @@
 //! Search for the known name that a misspelt name may mean.
 
-/// Returns the name among `known` that is nearest to `name`, if at most a third of the letters differ.
+/// Returns the name among `known` that is nearest to `name`, if at most a third of the letters
+/// differ.
 pub fn nearest<'k>(name: &str, known: impl IntoIterator<Item = &'k str>) -> Option<&'k str> {
     if name.chars().count() > LONGEST {
         return None;
@@ -20,8 +21,8 @@ pub fn nearest<'k>(name: &str, known: impl IntoIterator<Item = &'k str>) -> Opti
 
 const LONGEST: usize = 64;
 
-/// Counts the letters to insert, delete, change or swap with their neighbour, case apart (the optimal string alignment
-/// distance).
+/// Counts the letters to insert, delete, change or swap with their neighbour, case apart (the
+/// optimal string alignment distance).
 fn distance(a: &str, b: &str) -> usize {
     let (a, b) = (a.to_lowercase(), b.to_lowercase());
     let mut above: Vec<usize> = (0..=b.chars().count()).collect();

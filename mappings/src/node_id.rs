@@ -1,4 +1,5 @@
-//! The text of a NodeId: `ns=2;i=10`, `ns=2;s=Line.Running`, `ns=2;g=...`, `ns=2;b=...` (OPC 10000-6, 5.1.12).
+//! The text of a NodeId: `ns=2;i=10`, `ns=2;s=Line.Running`, `ns=2;g=...`, `ns=2;b=...` (OPC
+//! 10000-6, 5.1.12).
 
 use std::fmt;
 use std::num::NonZeroU16;

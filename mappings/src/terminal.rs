@@ -11,8 +11,8 @@ pub fn is_obeyed(c: char) -> bool {
         || matches!(c, '\u{61c}' | '\u{200e}'..='\u{200f}' | '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}')
 }
 
-/// Escapes the characters of a JSON document that a terminal obeys (`\u009b`). Line breaks stay. The document means the same,
-/// because such characters occur only inside its strings.
+/// Escapes the characters of a JSON document that a terminal obeys (`\u009b`). Line breaks stay.
+/// The document means the same, because such characters occur only inside its strings.
 #[must_use]
 pub fn harmless_json(json: &str) -> String {
     let mut escaped = String::with_capacity(json.len());

@@ -1,4 +1,5 @@
-//! Units of measure by their UNECE code (UN/ECE Recommendation 20), as OPC UA names them (OPC 10000-8, 5.6.4.3).
+//! Units of measure by their UNECE code (UN/ECE Recommendation 20), as OPC UA names them (OPC
+//! 10000-8, 5.6.4.3).
 
 use crate::nearest::nearest;
 

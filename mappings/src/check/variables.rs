@@ -319,7 +319,7 @@ fn unique(drafts: &[Draft<'_>], findings: &mut Findings) {
     }
 }
 
-/// Returns what the queue of a variable does when it is full, and for how long a value counts. Commands are events.
+/// Returns the reaction of a full queue, and how long a value is kept. Commands are events.
 fn queue(entry: &VariableEntry, is_command: bool) -> Option<(Overflow, Lasting)> {
     let given = match given(&entry.queue) {
         Some((Queue::DropOldest(size), _)) => Overflow::DropOldest(NonZeroU16::new(*size)?),
