@@ -1,6 +1,7 @@
-"""The ROS 1 side of the assembly line as its graph shows it: a Niryo Ned, its conveyor and storage.
+"""Simulates the ROS 1 side of the assembly line: a Niryo Ned, its conveyor and storage.
 
-With --more the graph also has what such a robot has beside: logs, an action, transforms, a camera, a type of its own.
+With --more the graph also has the usual further parts of such a robot: logs, an action, transforms,
+a camera, and a message type of its own.
 """
 
 import argparse

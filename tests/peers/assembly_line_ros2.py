@@ -1,4 +1,4 @@
-"""The ROS 2 side of the assembly line as its DDS domain shows it: a TurtleBot3 that parks and carries a bucket."""
+"""Simulates the ROS 2 side of the assembly line: a TurtleBot3 that parks and carries a bucket."""
 
 import argparse
 import time
@@ -22,7 +22,7 @@ TAKES = {
     "/conveyor/covers": UInt32,
     "/turtlebot3/covers": UInt32,
 }
-# What the ROS 1 side has under the same name: both produce it, each for itself.
+# The ROS 1 side has the same topic: each side produces its own.
 MORE = {"/joint_states": JointState()}
 QOS = Qos(
     Policy.Reliability.Reliable(duration(seconds=10)),

@@ -1,6 +1,8 @@
-"""Judges simulators of devices by their makers' tables: registers by pymodbus, process data by plain HTTP.
+"""Checks simulators of devices by their makers' tables: registers by pymodbus, process data by
+plain HTTP.
 
-One JSON line per thing that was seen. Nothing of the bridge's own codecs is used."""
+Each observation is one JSON line. The codecs of the bridge are not used.
+"""
 
 import argparse
 import json
@@ -25,7 +27,8 @@ def client_of(line):
 
 
 def robotiq(line):
-    """Chapter 4.3 to 4.5 of the 2F-85 manual: outputs from 1000 on, inputs from 2000 on, bytes high first."""
+    """Reads and writes registers by chapters 4.3 to 4.5 of the 2F-85 manual: outputs from 1000,
+    inputs from 2000, high byte first."""
     with client_of(line) as client:
 
         def status():
@@ -77,12 +80,12 @@ def converter(line):
         while (millivolts := client.read_input_registers(0, count=1, device_id=1).registers[0]) == 0:
             assert time.monotonic() < end
             time.sleep(0.05)
-        # Behind a divider of 10k and 1.5k.
+        # The voltage is measured behind a divider of 10k and 1.5k.
         lifetime.say(what="volts", volts=round(millivolts / 1000 * 11.5 / 1.5, 1))
 
 
 def schmalz(url):
-    """IO-Link JSON interface: process data of 4 bytes in, 2 bytes out."""
+    """Uses the IO-Link JSON interface: 4 bytes of process data in, 2 bytes out."""
     base = f"{url}/iolink/v1/devices/master1port1"
 
     def ask(path, body=None):

@@ -1,9 +1,9 @@
-"""Asks questions of a graph with rdflib, which shares no code with the store of the plant.
+"""Queries a graph with rdflib, which shares no code with the store of the plant.
 
     knowledge_judge.py GRAPH.nq QUESTION.rq ...
 
-The default graph is the merge of all named ones. Each question gets a JSON line with its columns and rows, the values as plain
-JSON has them.
+The default graph is the merge of all named graphs. Each query gets a JSON line with its columns and
+rows, with values as plain JSON.
 """
 
 import json
@@ -16,7 +16,7 @@ import lifetime
 
 
 def plain(term):
-    """A number, a truth value or a text."""
+    """Returns a number, a truth value or a text."""
     if term is None:
         return None
     if isinstance(term, rdflib.Literal):
@@ -30,7 +30,7 @@ def plain(term):
 
 def main():
     lifetime.bound(60.0)
-    # STR() is of a literal as it is written, which rdflib would write anew.
+    # STR() returns a literal as it is written; rdflib would normalize it by default.
     rdflib.NORMALIZE_LITERALS = False
     known = rdflib.Dataset(default_union=True)
     known.parse(sys.argv[1], format="nquads")

@@ -1,5 +1,6 @@
-"""Holds a lease on a file: whoever opens it waits in the kernel until a line comes on standard input. Says so of the
-first who does. The kernel ends a lease by itself after 45 s (/proc/sys/fs/lease-break-time)."""
+"""Holds a lease on a file: an open of the file waits in the kernel until a line comes on standard
+input. Reports the first open. The kernel ends a lease by itself after 45 s
+(/proc/sys/fs/lease-break-time)."""
 
 import argparse
 import fcntl

@@ -1,4 +1,4 @@
-"""What every peer shares: it ends on SIGTERM, and by itself when nobody ends it."""
+"""Provides functions for all peers: a peer ends on SIGTERM, and by itself after a time limit."""
 
 import json
 import os
@@ -8,7 +8,7 @@ import threading
 
 
 def bound(seconds):
-    """Ends the process on SIGTERM and SIGINT, and after `seconds` whatever it is doing."""
+    """Ends the process on SIGTERM and SIGINT, and unconditionally after `seconds`."""
 
     def leave(*_):
         sys.stdout.flush()
@@ -20,7 +20,7 @@ def bound(seconds):
 
 
 def limit(seconds):
-    """Ends the process after `seconds`; signals stay as they are."""
+    """Ends the process after `seconds`; signal handlers stay as they are."""
 
     def too_late():
         sys.stderr.write(f"peer: its {seconds} s are over\n")
@@ -33,13 +33,13 @@ def limit(seconds):
 
 
 def say(**fields):
-    """One JSON object on one line of standard output, at once."""
+    """Prints one JSON object as one line of standard output, and flushes it."""
     sys.stdout.write(json.dumps(fields) + "\n")
     sys.stdout.flush()
 
 
 def told():
-    """An event that is set when a line comes on standard input."""
+    """Returns an event that is set when a line comes on standard input."""
     event = threading.Event()
 
     def read():
@@ -51,7 +51,7 @@ def told():
 
 
 def values_of(arguments):
-    """The values to send: those of --value, or else the lines of standard input."""
+    """Returns the values to send: the values of --value, or else the lines of standard input."""
     if arguments.value:
         return [json.loads(text) for text in arguments.value]
     return [json.loads(line) for line in sys.stdin if line.strip()]

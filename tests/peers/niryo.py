@@ -1,6 +1,8 @@
-"""A Niryo Ned as its ROS graph shows it: the topics, services and actions of ned_ros under their names, with little behind them.
+"""Simulates the ROS graph of a Niryo Ned: topics, services and actions of ned_ros by name, with
+little behavior.
 
-The definitions are read from a folder at run time. Every call of a service is one JSON line on standard output.
+The definitions are read from a folder at run time. Every call of a service is one JSON line on
+standard output.
 """
 
 import argparse
@@ -116,7 +118,7 @@ class Niryo:
             self.servers.append((name, server))
             server.start()
 
-    # What it does.
+    # Services.
 
     def set_conveyor(self, request):
         if request.cmd == 1:
@@ -159,7 +161,7 @@ class Niryo:
     def done(self, _request):
         return {"status": SUCCESS, "message": ""}
 
-    # What it shows.
+    # Topics.
 
     def joints(self):
         angle = math.sin(rospy.get_time())

@@ -1,11 +1,16 @@
-"""Who is let into an OPC UA server, and what each may do there: a JSON line for each try.
+"""Checks the access to an OPC UA server and the permissions there: a JSON line for each try.
 
-`pairs FOLDER` makes the keys and certificates that the tries use: of a client (`client`), of one whose time is over
-(`expired`), of a user (`user`), and of a server that the peers can be (`server`). `issued FOLDER` makes authorities and what they issue, with their
-revocation lists. `servers FOLDER` makes those of servers, of which one alone is as it should be. `tries URL FOLDER NODE TYPE VALUE USER PASSWORD` tries each security policy and mode with
-each kind of user, reading and writing the node. `endpoints URL` says which
-policies a server offers. `audit URL` tells of the events of the Server object. `crowd URL COUNT` opens that many sessions at once and
-says how many came in; with `--vanish` each has a subscription, and its connection breaks off as that of a client that is killed.
+- `pairs FOLDER` makes the keys and certificates for the tries: of a client (`client`), of a client
+  with an expired certificate (`expired`), of a user (`user`), and of a server that the peers can be
+  (`server`).
+- `issued FOLDER` makes authorities, certificates that they issue, and their revocation lists.
+- `servers FOLDER` makes certificates of servers, of which exactly one is valid.
+- `tries URL FOLDER NODE TYPE VALUE USER PASSWORD` tries each security policy and mode with each
+  kind of user, and reads and writes the node.
+- `endpoints URL` prints the policies that a server offers.
+- `audit URL` prints the events of the Server object.
+- `crowd URL COUNT` opens COUNT sessions at once and prints how many succeed. With `--vanish` each
+  session has a subscription, and its connection breaks off like the connection of a killed client.
 """
 
 import argparse
@@ -31,7 +36,8 @@ DAY = datetime.timedelta(days=1)
 
 
 def make(folder, name, uri, begin, end, above=None, purpose=ExtendedKeyUsageOID.CLIENT_AUTH, host="127.0.0.1"):
-    """A key and a certificate of an application, valid from the one day to the other from now: self-signed, or by an authority."""
+    """Makes a key and a certificate of an application, valid between two days relative to today:
+    self-signed, or issued by an authority."""
     key = rsa.generate_private_key(public_exponent=65537, key_size=2048)
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
     now = datetime.datetime.now(datetime.timezone.utc)
@@ -68,7 +74,7 @@ def make(folder, name, uri, begin, end, above=None, purpose=ExtendedKeyUsageOID.
 
 
 def authority(folder, name, above=None, end=365):
-    """The key and the certificate of an authority, which another one may have issued."""
+    """Makes the key and the certificate of an authority, which another authority may issue."""
     key = rsa.generate_private_key(public_exponent=65537, key_size=2048)
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
     issuer, signs = (above[1].subject, above[0]) if above else (subject, key)
@@ -95,7 +101,7 @@ def authority(folder, name, above=None, end=365):
 
 
 def revocations(folder, name, of, revoked, end=30):
-    """The revocation list of an authority."""
+    """Makes the revocation list of an authority."""
     now = datetime.datetime.now(datetime.timezone.utc)
     builder = (
         x509.CertificateRevocationListBuilder()
@@ -161,7 +167,7 @@ def aged(folder, uri):
 
 
 def status_of(error):
-    """The name of the status in an error, however it is wrapped."""
+    """Returns the name of the status in an error, however it is wrapped."""
     while error is not None:
         if isinstance(error, UaStatusCodeError):
             return ua.StatusCode(error.code).name
@@ -170,7 +176,7 @@ def status_of(error):
 
 
 class Refusals(logging.Handler):
-    """The error that ends a connection: the client logs it, and raises another one."""
+    """Keeps the error that ends a connection: the client logs it and raises another error."""
 
     def __init__(self):
         super().__init__()
@@ -184,7 +190,7 @@ class Refusals(logging.Handler):
 
 
 async def tried(args, client, about):
-    """Connects, reads and writes, and says how each ended."""
+    """Connects, reads and writes, and prints the status of each."""
     said = dict(about)
     refusals = Refusals()
     try:
@@ -200,7 +206,7 @@ async def tried(args, client, about):
             except UaStatusCodeError as refused:
                 said.setdefault("read", status_of(refused))
                 said.setdefault("write", status_of(refused))
-    except Exception as error:  # whatever it is, it is the outcome
+    except Exception as error:  # any failure is the outcome
         if "connected" not in said:
             said["connected"] = refusals.last or status_of(error) or repr(error)
     lifetime.say(**said)
@@ -249,7 +255,7 @@ async def endpoints(url):
 
 
 def issuer(der):
-    """The common name of who issued a certificate."""
+    """Returns the common name of the issuer of a certificate."""
     names = x509.load_der_x509_certificate(der).issuer.get_attributes_for_oid(NameOID.COMMON_NAME)
     return names[0].value if names else None
 
@@ -293,7 +299,7 @@ class Nobody:
 
 
 async def crowd(args):
-    """How many of the clients came in, and what the others were told."""
+    """Prints how many clients connected, and the errors of the others."""
 
     async def come():
         client = Client(args.endpoint, timeout=20)
@@ -301,7 +307,7 @@ async def crowd(args):
         try:
             await client.connect()
             return client, "Good"
-        except Exception as error:  # whatever it is, it is the outcome
+        except Exception as error:  # any failure is the outcome
             return client, status_of(error) or repr(error)
 
     came = await asyncio.gather(*(come() for _ in range(args.count)))
@@ -322,7 +328,7 @@ async def crowd(args):
 
 
 async def hold(args):
-    """Stays until the connection is cut off."""
+    """Holds a session until the connection is cut off."""
     security, mode = args.with_security[0]
     client = await secured(args, args.client, security, mode)
     await client.connect()
@@ -331,13 +337,13 @@ async def hold(args):
         while True:
             await client.get_node(ua.NodeId(ua.ObjectIds.Server_ServerStatus_CurrentTime)).read_value()
             await asyncio.sleep(0.2)
-    except Exception as error:  # whatever it is, the connection is gone
+    except Exception as error:  # any failure is the loss of the connection
         lifetime.say(cut_off=repr(error))
         os._exit(0)
 
 
 def ways(text):
-    """`None,Basic256Sha256/Sign`"""
+    """Reads pairs of policy and mode, such as `None,Basic256Sha256/Sign`."""
     for one in text.split(","):
         security, _, mode = one.partition("/")
         yield security, mode or "None"

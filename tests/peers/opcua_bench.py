@@ -1,6 +1,10 @@
-"""An asyncua server that is measured beside others: COUNT variables with the NodeIds ns=2;i=10 and on, a variable ns=2;i=5 that
-clients write, and a Method ns=2;i=6 of the object ns=2;i=7 that answers at once. A JSON line `{"change": true}` on standard input has it
-give all variables a new value each 103 ms, which is when that was, in microseconds of the machine's monotonic clock; `false` ends that."""
+"""Runs an asyncua server for benchmarks.
+
+It has COUNT variables with the NodeIds from ns=2;i=10, a variable ns=2;i=5 that clients write, and
+a Method ns=2;i=6 of the object ns=2;i=7 that returns at once. After a JSON line `{"change": true}`
+on standard input it sets all variables every 103 ms to the time of the change, in microseconds of
+the machine's monotonic clock; `false` ends the changes.
+"""
 
 import argparse
 import asyncio

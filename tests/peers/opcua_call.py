@@ -1,7 +1,11 @@
-"""An asyncua client that finds a Method of the server by its path below Objects, waits for it, says what it takes and gives,
-and calls it once for each --value, a JSON list of arguments. An argument is a value of the type the Method takes (a
-ByteString in hexadecimal digits, a DateTime as ISO 8601 has it), or an object with the name of another type and the value;
-with --structures that of a structure, by the definitions the server has. A JSON line for each answer, or its status."""
+"""Calls a Method by asyncua.
+
+The client finds the Method by its path below Objects, waits for it, prints its arguments, and calls
+it once for each --value, a JSON list of arguments. An argument is a value of the type of the Method
+(a ByteString in hexadecimal digits, a DateTime in ISO 8601), or an object with the name of another
+type and the value; with --structures it may be the value of a structure, by the definitions of the
+server. It prints a JSON line for each response, or its status.
+"""
 
 import argparse
 import asyncio
@@ -18,7 +22,8 @@ import opcua_session
 
 
 async def found(client, path, seconds):
-    """The object with the Method, and the Method; None when it is not there within the time."""
+    """Returns the object with the Method, and the Method; None if it does not appear within the
+    time."""
     end = time.monotonic() + seconds
     while True:
         try:
@@ -76,14 +81,14 @@ def argument(value, kind):
 
 
 async def builtin(client, kind):
-    # A DataType like Duration travels as what it is derived from.
+    # A DataType such as Duration is encoded as its base type.
     if not isinstance(kind, int) or kind <= 25:
         return kind
     return (await data_type_to_variant_type(client.get_node(ua.NodeId(kind, 0)))).value
 
 
 async def called(client, object_, method, given):
-    # As it is on the wire: asyncua's own call_method raises where an argument is wrong.
+    # The request is sent unchecked: asyncua's own call_method raises for a wrong argument.
     request = ua.CallMethodRequest()
     request.ObjectId, request.MethodId = object_.nodeid, method.nodeid
     request.InputArguments = given

@@ -1,4 +1,5 @@
-"""Watches the Server object of an OPC UA server for GeneralModelChangeEvents: a JSON line for each, with the nodes and their verbs."""
+"""Watches the Server object of an OPC UA server for GeneralModelChangeEvents: a JSON line for each,
+with the nodes and their verbs."""
 
 import argparse
 import asyncio

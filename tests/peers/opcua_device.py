@@ -1,7 +1,12 @@
-"""A device by asyncua: a server with methods, one of them to be configured by, registered with the discovery server of its
-level. It says each place that it is told. Hold takes as many seconds as it is told, in which the device answers nothing else.
-Judge is answered with the StatusCode that it is told, beside an InputArgumentResult and an output. With `--pairs`, the folder of `opcua_access.py servers`, all of it is signed and encrypted: the
-server has the pair `--pair`, and registers with `--registers-with`."""
+"""Simulates a device by asyncua: a server with Methods that registers with the discovery server of
+its level.
+
+Configure sets the place of the device, and each call is printed. Hold blocks the device for the
+given number of seconds, in which it answers no other request. Judge returns the given StatusCode,
+with an InputArgumentResult and an output. With `--pairs`, the folder of `opcua_access.py servers`,
+all connections are signed and encrypted: the server uses the pair `--pair`, and registers with
+`--registers-with`.
+"""
 
 import argparse
 import asyncio
@@ -26,7 +31,7 @@ def configure(parent, place, supervisor, discovery):
 
 @uamethod
 async def hold(parent, seconds):
-    # Not of asyncio: the loop serves nothing meanwhile.
+    # time.sleep blocks the loop, so that it serves no other request meanwhile.
     lifetime.say(holds=seconds)
     time.sleep(seconds)
     lifetime.say(held=seconds)

@@ -1,4 +1,5 @@
-"""Asks a discovery server without a session, or registers a server with it: one JSON line an answer."""
+"""Queries a discovery server without a session, or registers a server with it: one JSON line for
+each response."""
 
 import argparse
 import asyncio
@@ -88,7 +89,7 @@ async def run(args):
         client = await opcua_session.client_of(args)
         await client.connect_sessionless()
     except (ua.UaError, OSError, asyncio.TimeoutError) as error:
-        # What ends the connection is told nobody else.
+        # Only the client's log has the error that ends the connection.
         said = described(error)
         lifetime.say(**said | {"status": refusals.last or said["status"]})
         return

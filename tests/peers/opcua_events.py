@@ -1,5 +1,5 @@
-"""Watches a node of an OPC UA server for events of some types, as asyncua asks for them: a JSON line for each event, and for each data
-change that it is told of an item that monitors events, which is none."""
+"""Watches a node of an OPC UA server for events of some types, as asyncua requests them: a JSON
+line for each event, and for each data change of an item that monitors events, which is a fault."""
 
 import argparse
 import asyncio

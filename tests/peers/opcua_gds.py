@@ -1,5 +1,8 @@
 #!/usr/bin/env python3
-"""asyncua as a client of a Global Discovery Server: registers applications and has certificates issued, as a user or as itself."""
+"""Runs asyncua as a client of a Global Discovery Server.
+
+It registers applications and has certificates issued, as a user or as an application.
+"""
 
 import argparse
 import asyncio
@@ -26,7 +29,7 @@ DIRECTORY, GROUP, TRUST_LIST = 141, 615, 616
 
 
 class Gds:
-    """The Directory, by the ids of its NodeSet."""
+    """Accesses the Directory by the ids of its NodeSet."""
 
     def __init__(self, client, index):
         self.client, self.index = client, index
@@ -39,7 +42,7 @@ class Gds:
         return await self.directory.call_method(ua.NodeId(number, self.index), *arguments)
 
     async def read_list(self, node, masks=None):
-        """The TrustListDataType of a trust list, read as a file."""
+        """Returns the TrustListDataType of a trust list, read as a file."""
         node = self.client.get_node(node)
         if masks is None:
             handle = await node.call_method(ua.NodeId(622, self.index), ua.Variant(1, ua.VariantType.Byte))
@@ -57,7 +60,7 @@ class Gds:
 
 
 def record(uri=URI, name="Robot", number=None, capabilities=("DA",)):
-    """What a client tells of an application, with the class that asyncua made of the server's DataType."""
+    """Returns an application record, of the class that asyncua made of the server's DataType."""
     told = ua.ApplicationRecordDataType()
     if number is not None:
         told.ApplicationId = number
@@ -84,7 +87,7 @@ def signing_request(uri=URI, key=None, hosts=("robot.cell",), token=None):
 
 
 async def outcome(awaited):
-    """How a call ends: what it answers, or the name of its status."""
+    """Returns the result of a call, or the name of its status."""
     try:
         return await awaited
     except UaStatusCodeError as refused:
@@ -150,7 +153,8 @@ async def directory(gds, said):
 
 
 async def certificates(gds, said, folder):
-    """Has a certificate issued for a registered application, looks at it with another library, has it revoked."""
+    """Has a certificate issued for a registered application, checks it with another library, and
+    has it revoked."""
     number = await gds.call(146, record())
     groups = await gds.call(508, number)
     said["groups"] = [str(group) for group in groups]
@@ -216,7 +220,7 @@ async def certificates(gds, said, folder):
 
 
 async def itself(gds, said):
-    """An application that came with its certificate: it may do for itself, and for nobody else."""
+    """Checks an application with its own certificate: it may act for itself only."""
     found = await gds.call(143, URI)
     number = found[0].ApplicationId
     _, wanted = signing_request()
@@ -231,7 +235,7 @@ async def itself(gds, said):
 
 
 async def stranger(gds, said):
-    """Somebody who may read, and nothing else."""
+    """Checks a user that may only read."""
     said["register"] = await outcome(gds.call(146, record("urn:stranger")))
     said["found"] = await outcome(gds.call(143, "urn:nobody"))
     said["start"] = await outcome(
@@ -242,7 +246,7 @@ async def stranger(gds, said):
 
 
 async def applies(gds, said, args, folder):
-    """An application that nobody trusts requests its first certificate, with a token or without."""
+    """Requests the first certificate of an untrusted application, with a token or without."""
     uri = args.application_uri
     null = ua.NodeId()
     number = await outcome(gds.call(146, record(uri)))
@@ -295,7 +299,7 @@ async def main():
     client = await connected(args)
     try:
         await client.connect()
-    except Exception as refused:  # whatever it is, it is the outcome
+    except Exception as refused:  # any failure is the outcome
         lifetime.say(connected=opcua_access.status_of(refused) or repr(refused))
         return
     async with client:

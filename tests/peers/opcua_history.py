@@ -1,5 +1,8 @@
-"""Reads the history of nodes of an OPC UA server: a JSON list of questions, a JSON line for each answer, which is read to its end.
-Times are milliseconds since 2023-11-14T22:13:20Z, statuses of values the whole StatusCode."""
+"""Reads the history of nodes of an OPC UA server.
+
+It takes a JSON list of queries and prints a JSON line for each, after all continuation points.
+Times are milliseconds since 2023-11-14T22:13:20Z, statuses of values are the whole StatusCode.
+"""
 
 import argparse
 import asyncio
@@ -60,7 +63,7 @@ async def asked(client, question):
     parameters = ua.HistoryReadParameters()
     parameters.HistoryReadDetails = details_of(question)
     parameters.TimestampsToReturn = ua.TimestampsToReturn.Both
-    # Else it releases them alone.
+    # With True the server would only release the continuation points.
     parameters.ReleaseContinuationPoints = False
     values, answers, point = [], 0, None
     while True:

@@ -1,5 +1,5 @@
-"""Loads NodeSet files one after the other into a server of its own, and says which object types they bring, and the
-values of their variables.
+"""Loads NodeSet files one after the other into its own server, and prints their object types and
+the values of their variables.
 
 opcua_import.py FILE...
 """
@@ -22,7 +22,8 @@ class Complaints(logging.Handler):
 
 
 async def type_of(node):
-    """The name of the object type that has the node, at whatever depth: two types may have variables of one name."""
+    """Returns the name of the object type that contains the node at any depth: two types may have
+    variables of the same name."""
     while node is not None and await node.read_node_class() != ua.NodeClass.ObjectType:
         node = await node.get_parent()
     return None if node is None else (await node.read_browse_name()).Name

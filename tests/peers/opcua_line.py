@@ -1,6 +1,7 @@
-"""An assembly line's OPC UA server by asyncua: nodes with numbers, texts and GUIDs, in a namespace of its own.
+"""Runs the OPC UA server of an assembly line by asyncua: nodes with numbers, texts and GUIDs, in
+its own namespace.
 
-With --export it writes its nodes as a NodeSet, too.
+With --export it also writes its nodes as a NodeSet.
 """
 
 import argparse

@@ -1,5 +1,5 @@
-"""An asyncua server with Methods, which says each call it gets as a JSON line. `--before N` puts N namespaces in front of its
-own."""
+"""Runs an asyncua server with Methods that prints each call as a JSON line. `--before N` puts N
+namespaces before its own namespace."""
 
 import argparse
 import asyncio
@@ -66,7 +66,7 @@ async def run(args):
         node, name = ua.NodeId(f"Line.{name}", space), ua.QualifiedName(name, space)
         await place.add_method(node, name, function, takes, gives)
 
-    # Duration and LocaleId are a Double and a String by another name.
+    # Duration and LocaleId are subtypes of Double and String.
     takes = [argument("TargetPosition", 11), argument("speeds", 10, 1)]
     await method("Move", line.move, takes, [argument("Reached", 290), argument("Remark", 295)])
     await method("Wait", line.wait, [argument("seconds", 11)], [argument("waited", 11)])

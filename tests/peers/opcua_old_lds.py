@@ -1,4 +1,5 @@
-"""A discovery server that knows RegisterServer and not RegisterServer2, as those before OPC UA 1.03: asyncua's server."""
+"""Runs asyncua's discovery server without RegisterServer2, like discovery servers before OPC UA
+1.03, which only have RegisterServer."""
 
 import argparse
 import asyncio

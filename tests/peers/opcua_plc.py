@@ -1,7 +1,11 @@
-"""An asyncua server as a PLC that knows nothing of the space: variables that are set by JSON lines on standard input, as
-{"set": "Speed", "value": 1.5, "status": "UncertainLastUsableValue", "age": 60}, and one that clients write, which is said.
-`--before N` puts N namespaces in front of its own; `--user NAME PASSWORD` has it refuse all others. With `--only POLICY`, and the folder
-of `opcua_access.py pairs`, it takes nobody without that security policy."""
+"""Runs an asyncua server as a PLC that does not know the space.
+
+Its variables are set by JSON lines on standard input, such as {"set": "Speed", "value": 1.5,
+"status": "UncertainLastUsableValue", "age": 60}. Clients write another variable, and each write is
+printed. `--before N` puts N namespaces before its own; with `--user NAME PASSWORD` it refuses all
+other users. With `--only POLICY`, and the folder of `opcua_access.py pairs`, it refuses all clients
+without that security policy.
+"""
 
 import argparse
 import asyncio

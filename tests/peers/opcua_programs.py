@@ -1,13 +1,19 @@
-"""An asyncua server as a machine that knows Programs of OPC 10000-10 and nothing of the space, and says what is called there.
+"""Runs an asyncua server as a machine that knows Programs of OPC 10000-10 and not the space, and
+prints the calls.
 
 Its object `machine` has
-- Stamp, a Program with a parameter and a result that takes `--seconds` for a run, and fails where Force is above 90;
-- Blink, a Program without parameters whose run is over before its Start answers;
-- Grasp, of the type of an earlier system (https://fortiss.org/UA/Device/ GraspGripperSkillType), whose state has no Id;
-- a second one that is called Stamp, with parameters of structures: a frame, ranges, and one that is no numbers; what it was told
-  of the frame it says as a vector at its end;
-- Odd, a Program that says nobody in what state it is.
-The Start of all of them takes any state, as that of an earlier system does: who calls must look."""
+- Stamp, a Program with a parameter and a result whose run takes `--seconds`, and fails if Force is
+  above 90;
+- Blink, a Program without parameters whose run ends before its Start returns;
+- Grasp, of the type of an earlier system (https://fortiss.org/UA/Device/ GraspGripperSkillType),
+  whose state has no Id;
+- a second Program with the name Stamp, with parameters of structures: a frame, ranges, and a
+  structure without numbers; at its end it returns the frame as a vector;
+- Odd, a Program that does not show its state.
+
+The Start of all of them is accepted in any state, like in an earlier system: the caller has to
+check the state.
+"""
 
 import argparse
 import asyncio
@@ -27,7 +33,7 @@ def core(name):
 
 
 async def bare(parent, node, name, of_type):
-    """An object of a type without the children that the type says."""
+    """Adds an object of a type without the children of the type."""
     item = ua.AddNodesItem()
     item.RequestedNewNodeId, item.BrowseName, item.ParentNodeId = node, name, parent.nodeid
     item.ReferenceTypeId = ua.NodeId(ua.ObjectIds.HasComponent)

@@ -1,7 +1,15 @@
-"""An asyncua client at the PubSub configuration of a server. It does what it is told, a line each: `walk` looks at every attribute
-of all that is below the object PublishSubscribe, `read PATH` reads the value of a node below it, `call PATH` calls a method, `file PATH`
-reads and decodes a file, `open PATH MODE` opens it and leaves it so, `leave` closes the session. A JSON line for each answer, with the
-number of the order."""
+"""Runs an asyncua client at the PubSub configuration of a server, with an order in each line of
+standard input.
+
+- `walk` reads every attribute of all nodes below the object PublishSubscribe.
+- `read PATH` reads the value of a node below it.
+- `call PATH` calls a Method.
+- `file PATH` reads and decodes a file.
+- `open PATH MODE` opens a file and leaves it open.
+- `leave` closes the session.
+
+Each response is a JSON line with the number of the order.
+"""
 
 import argparse
 import asyncio
@@ -17,7 +25,8 @@ import lifetime
 import opcua_session
 
 ROOT = "i=14443"
-# What each class of nodes has to have (OPC 10000-3, 5); those it may have are asked for by no client without need.
+# Mandatory attributes of each class of nodes (OPC 10000-3, 5); clients rarely read the optional
+# attributes.
 ALL = ["NodeId", "NodeClass", "BrowseName", "DisplayName"]
 MORE = {
     ua.NodeClass.Object: ["EventNotifier"],
@@ -70,7 +79,7 @@ async def found(client, path):
 
 
 async def in_file(node):
-    """What a file is, as far as it says, and what it holds."""
+    """Returns the properties of a file, and its content."""
     async with UaFile(node, "r") as file:
         content, size = await file.read(), await file.get_size()
     decoded = extensionobject_from_binary(Buffer(content))

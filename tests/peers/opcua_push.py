@@ -1,5 +1,9 @@
 #!/usr/bin/env python3
-"""asyncua as the administrator of a server's certificates: has it ask for one, issues that with an authority of its own, and gives it to the server."""
+"""Runs asyncua as the administrator of a server's certificates.
+
+It has the server create a signing request, issues the certificate with its own authority, and
+updates the certificate of the server.
+"""
 
 import argparse
 import asyncio
@@ -26,7 +30,7 @@ def node_id(name):
 
 
 class Server:
-    """Its ServerConfiguration."""
+    """Accesses the ServerConfiguration of a server."""
 
     def __init__(self, client):
         self.configuration = client.get_node(node_id("ServerConfiguration"))
@@ -67,7 +71,7 @@ async def outcome(awaited):
 
 
 def certificate_for(request, authority, uri=None):
-    """What an authority makes of a signing request."""
+    """Returns the certificate that an authority issues for a signing request."""
     names = request.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     if uri:
         names = x509.SubjectAlternativeName([x509.UniformResourceIdentifier(uri)])
@@ -179,7 +183,8 @@ async def main():
     lifetime.bound(120.0)
     folder = pathlib.Path(args.folder)
     if args.verb == "shown":
-        # What the server shows to everybody, and whether whoever the authority issued a certificate is let in.
+        # Check the certificate that the server shows to every client, and that a client with a
+        # certificate of the authority is accepted.
         endpoints = await client_of(args).connect_and_get_server_endpoints()
         shown = next(one.ServerCertificate for one in endpoints if one.ServerCertificate)
         said = {"new": shown == (folder / "server.der").read_bytes()}

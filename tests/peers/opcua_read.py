@@ -1,4 +1,5 @@
-"""Reads nodes of an OPC UA server: one JSON line per node, status and timestamps included; or the nodes below."""
+"""Reads nodes of an OPC UA server: one JSON line per node, with status and timestamps; or the nodes
+below."""
 
 import argparse
 import asyncio

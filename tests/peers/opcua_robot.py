@@ -1,7 +1,7 @@
-"""Looks at robots as a client of OPC 40010-1 does, which knows no skills, and says what it sees as JSON lines.
+"""Reads robots like a client of OPC 40010-1, which does not know skills, and prints JSON lines.
 
-First each motion device system of the DeviceSet, then each value of its first task control while skill 1 of the server's own
-namespace runs once.
+It reads each motion device system of the DeviceSet, then each value of its first task control while
+skill 1 of the server's own namespace runs once.
 """
 
 import argparse
@@ -44,7 +44,7 @@ async def values(node, *wanted):
 
 
 async def only(node, folder):
-    """The one device in a folder, whose type says so."""
+    """Returns the only device in a folder, with its type."""
     found = await names((await names(node))[folder])
     (name,) = found
     kind = await found[name].read_type_definition()

@@ -1,5 +1,8 @@
-"""Exports the nodes of one namespace of a server by asyncua's exporter, and loads them by its importer into a server of its own that has the given NodeSets: one JSON
-line with how many there were, and which are others there than here."""
+"""Exports the nodes of one namespace by asyncua's exporter, and imports them into its own server
+with the given NodeSets.
+
+It prints one JSON line with the number of nodes, and the nodes that differ after the import.
+"""
 
 import argparse
 import asyncio
@@ -15,7 +18,7 @@ import opcua_session
 
 
 async def below(client, index):
-    """The nodes of the namespace that hierarchical references lead to."""
+    """Returns the nodes of the namespace that hierarchical references lead to."""
     found, waiting = {}, [client.nodes.root]
     seen = {client.nodes.root.nodeid}
     while waiting:
@@ -42,7 +45,7 @@ async def described(node, namespaces):
         told["type"] = [namespaces[data_type.NamespaceIndex], str(data_type.Identifier)]
         told["rank"] = int(await node.read_value_rank())
         value = await node.read_data_value(raise_on_bad_status=False)
-        # How many bytes a NodeId took on its way is no part of it.
+        # The encoding of a NodeId is not part of its value.
         told["value"] = re.sub(r", NodeIdType=<[^>]*>", "", repr(value.Value.Value)) if value.Value else None
     return told
 

@@ -1,4 +1,4 @@
-"""A small OPC UA server by asyncua: the harness tries its own clients on it."""
+"""Runs a small OPC UA server by asyncua: the harness tests its own clients with it."""
 
 import argparse
 import asyncio

@@ -1,4 +1,4 @@
-"""How the OPC UA peers connect, and how they write down what they see."""
+"""Provides the connections of the OPC UA peers, and the JSON form of values."""
 
 import base64
 import datetime
@@ -37,7 +37,7 @@ def add_arguments(parser):
 
 
 async def pair_of(folder, name, uri):
-    """The key and the certificate in a folder, made where they are not there."""
+    """Returns the key and the certificate in a folder, and makes them if they do not exist."""
     folder = pathlib.Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     key, certificate = folder / f"{name}_key.pem", folder / f"{name}_certificate.der"
@@ -53,7 +53,7 @@ async def pair_of(folder, name, uri):
 
 
 async def client_of(args):
-    """A client that is not connected yet: `async with await client_of(args) as client`."""
+    """Returns a client that is not connected yet: `async with await client_of(args) as client`."""
     client = Client(args.endpoint, timeout=args.patience)
     if args.user:
         client.set_user(args.user)
@@ -76,8 +76,8 @@ async def client_of(args):
 
 
 async def secure(server, folder, only=None, pair="server", uri=SERVER_URI):
-    """Has a server offer no security and each policy we know, or one policy only, with a pair that `opcua_access.py` made in
-    the folder."""
+    """Makes a server offer no security and each known policy, or only one policy, with a pair of
+    `opcua_access.py` in the folder."""
     folder = pathlib.Path(folder)
     await server.load_certificate(str(folder / f"{pair}_certificate.der"))
     await server.load_private_key(str(folder / f"{pair}_key.pem"))
@@ -101,9 +101,10 @@ def plain(value):
 
 
 def described(node, data):
-    """What a DataValue says, as a JSON object."""
+    """Returns a DataValue as a JSON object."""
     variant = data.Value
-    # The lower half has bits about the value's way, such as that of a queue that overflowed, and is no part of the name.
+    # The lower half has bits about the transport of the value, such as an overflow of a queue, and
+    # is not part of the name.
     code = data.StatusCode.value & 0xFFFF0000 if data.StatusCode is not None else 0
     return {
         "node": node,

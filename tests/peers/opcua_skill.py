@@ -1,15 +1,20 @@
-"""Calls skills as a client does that knows Programs of OPC 10000-10 only, and says what it sees as JSON lines.
+"""Calls skills like a client that knows only Programs of OPC 10000-10, and prints JSON lines.
 
-opcua_skill.py ENDPOINT walk       all states and methods of skill 1, which does not end by itself, then a run of skill 2, which does
-opcua_skill.py ENDPOINT refused    what skill 3 says to a Start without a parameter, with wrong ones, and with good ones
-opcua_skill.py ENDPOINT execute    Execute and ReadOutcome of skills 1 and 2, from two sessions, and the lock of OPC 10000-100
-opcua_skill.py ENDPOINT begin      makes skill 1 run, says its number and ends
-opcua_skill.py ENDPOINT after:RUN  how skill 1 is, what is known of that run, and what number the next one has
-opcua_skill.py ENDPOINT idle       how long the second of two sessions waits for the lease of the first, which does nothing
-opcua_skill.py ENDPOINT quick      the states that a subscription with a queue shows of ten runs of skill 2
-opcua_skill.py ENDPOINT race       twenty times two sessions begin skill 2 at once
-opcua_skill.py ENDPOINT uses       what skill 1 of the server's own namespace refers to with UsesSkill
-opcua_skill.py ENDPOINT find:TYPE  the objects whose type is that one of urn:ua-bridge:skills or a subtype
+opcua_skill.py ENDPOINT walk       all states and methods of skill 1, which does not end by itself,
+                                   then a run of skill 2, which ends
+opcua_skill.py ENDPOINT refused    responses of skill 3 to a Start without a parameter, with wrong
+                                   parameters, and with good parameters
+opcua_skill.py ENDPOINT execute    Execute and ReadOutcome of skills 1 and 2, from two sessions, and
+                                   the lock of OPC 10000-100
+opcua_skill.py ENDPOINT begin      starts skill 1, prints the number of the run and ends
+opcua_skill.py ENDPOINT after:RUN  state of skill 1, outcome of that run, number of the next run
+opcua_skill.py ENDPOINT idle       how long the second of two sessions waits for the lease of the
+                                   first, which is idle
+opcua_skill.py ENDPOINT quick      states that a subscription with a queue shows of ten runs of
+                                   skill 2
+opcua_skill.py ENDPOINT race       two sessions start skill 2 at once, twenty times
+opcua_skill.py ENDPOINT uses       targets of UsesSkill of skill 1 of the server's own namespace
+opcua_skill.py ENDPOINT find:TYPE  objects of that type of urn:ua-bridge:skills or of a subtype
 """
 
 import argparse
@@ -62,7 +67,7 @@ class Skill:
     async def shown(self):
         values = [await self.state()]
         for path in [("CurrentState",), ("CurrentState", "Number"), ("RunId",), ("LastTransition",)]:
-            # There is no last transition before the first.
+            # Before the first transition LastTransition has a bad status.
             shown = await (await self.child(*path)).read_data_value(raise_on_bad_status=False)
             value = shown.Value.Value if shown.Value else None
             values.append(value.Text if isinstance(value, ua.LocalizedText) else plain(value))
@@ -96,7 +101,7 @@ class Skill:
 
 
 class Events:
-    """The transition events of skills."""
+    """Collects the transition events of skills."""
 
     def __init__(self):
         self.seen = []
@@ -183,7 +188,7 @@ async def refused(client, ns):
 
 
 async def asked(of, method, *arguments):
-    """The status of a call, and what it gave."""
+    """Returns the status of a call, and its output."""
     try:
         given = await of.node.call_method(await of.child(method), *arguments)
         return "Good", [plain(value) for value in given] if isinstance(given, list) else plain(given)
@@ -255,7 +260,7 @@ async def race(client, ns, other):
 
         await until(ended)
         winner = [status for status, _ in both].index("Good")
-        # Its session has the lease until it gives that back.
+        # The session of the winner holds the lease until it releases it.
         await locks[winner].call_method(f"{di}:InitLock", "")
         await locks[winner].call_method(f"{di}:ExitLock")
 
@@ -331,7 +336,7 @@ async def execute(client, ns, other):
 
 
 async def find(client, name):
-    """By the references of types alone: no name but that of the wanted type."""
+    """Finds objects by the references of types; the only name is the name of the wanted type."""
     ns = await client.get_namespace_index("urn:ua-bridge:skills")
     path = ["0:Types", "0:ObjectTypes", "0:BaseObjectType"]
     types, wanted = [await client.nodes.root.get_child(path)], None

@@ -1,4 +1,5 @@
-"""Reads nodes of an OPC UA server by the DataTypeDefinitions it has: one JSON line per node, with what it is and what is in it."""
+"""Reads nodes of an OPC UA server by its DataTypeDefinitions: one JSON line per node, with the type
+and the content."""
 
 import argparse
 import asyncio
@@ -19,7 +20,7 @@ def opened(value):
 
 
 async def encodings(client, data_type):
-    """The BrowseNames of a DataType's encodings, with their NodeIds."""
+    """Returns the BrowseNames of a DataType's encodings, with their NodeIds."""
     found = await client.get_node(data_type).get_references(ua.ObjectIds.HasEncoding)
     return {one.BrowseName.Name: one.NodeId.to_string() for one in found}
 
@@ -29,7 +30,7 @@ async def run(args):
         await client.load_data_type_definitions()
         for text in args.node:
             node = client.get_node(text)
-            # Whose writer may be silent by now.
+            # The writer of the value may be silent by now.
             value = (await node.read_data_value(raise_on_bad_status=False)).Value.Value
             first = value[0] if isinstance(value, list) else value
             data_type = await node.read_data_type()

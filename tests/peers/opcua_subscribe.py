@@ -1,5 +1,5 @@
-"""Subscribes to nodes of an OPC UA server: one JSON line per notification. With --events to the events of the nodes, of which those
-fields are told."""
+"""Subscribes to nodes of an OPC UA server: one JSON line per notification. With --events it
+subscribes to the events of the nodes, and prints the given fields."""
 
 import argparse
 import asyncio

@@ -1,7 +1,9 @@
-"""Reads the attributes that every node of a server has to have: one JSON line for each that a client cannot use, and one with what was read.
+"""Reads the mandatory attributes of every node of a server.
 
-With --server one line says what the server tells of itself, and no tree is read. With --export the nodes of all namespaces but that of OPC UA are written by asyncua's exporter and loaded by its importer into a server of its
-own; a line says which of them are others there than here.
+It prints one JSON line for each attribute that a client cannot use, and one line with the counts.
+With --server it prints one line with the server's description of itself, and reads no tree. With
+--export asyncua's exporter writes the nodes of all namespaces except the namespace of OPC UA, and
+its importer loads them into its own server; a line lists the nodes that differ after the import.
 """
 
 import argparse
@@ -18,7 +20,7 @@ import opcua_session
 
 A = ua.AttributeIds
 EVERY = [A.NodeId, A.NodeClass, A.BrowseName, A.DisplayName]
-# What a node of a class has in any case: OPC 10000-3, tables 2 to 23.
+# Mandatory attributes of each class of nodes: OPC 10000-3, tables 2 to 23.
 OF_CLASS = {
     ua.NodeClass.Object: [A.EventNotifier],
     ua.NodeClass.Variable: [A.Value, A.DataType, A.ValueRank, A.AccessLevel, A.UserAccessLevel, A.Historizing],
@@ -33,7 +35,7 @@ AT_ONCE = 40
 
 
 async def browsed(client):
-    """Every node that hierarchical references lead to, with its class."""
+    """Returns every node that hierarchical references lead to, with its class."""
     root = client.nodes.root.nodeid
     found, waiting = {root: ua.NodeClass.Object}, [root]
     while waiting:
@@ -104,7 +106,8 @@ async def described(node):
 
 
 def without_instances(file):
-    """Takes out what types say of those that are of them: asyncua's importer has it for the type of the type."""
+    """Removes the references of types to their instances: asyncua's importer takes them for the
+    type of the type."""
     document = ElementTree.parse(file)
     for references in document.iterfind(".//{*}References"):
         for one in references.findall("{*}Reference"):

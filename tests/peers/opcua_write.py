@@ -1,5 +1,5 @@
-"""Writes one value into a node of an OPC UA server and says with which status the server answered. With --many it writes 1, 2, 3 ... until
-the server is gone, and says which ones it confirmed."""
+"""Writes one value into a node of an OPC UA server and prints the status of the response. With
+--many it writes 1, 2, 3 ... until the connection is lost, and prints the confirmed values."""
 
 import argparse
 import asyncio
@@ -23,14 +23,14 @@ async def many(args):
             count += 1
             await node.write_value(ua.DataValue(ua.Variant(float(count), ua.VariantType[args.type])))
             lifetime.say(confirmed=count)
-    except Exception as gone:  # whichever way it is gone
+    except Exception as gone:  # any failure is the loss of the connection
         lifetime.say(gone=type(gone).__name__, at=count)
 
 
 async def run(args):
     if args.many:
         await many(args)
-        # What is left of the client waits for the server.
+        # An orderly end of the client would wait for the server.
         os._exit(0)
     async with await opcua_session.client_of(args) as client:
         value = bytes(args.zeros) if args.zeros else json.loads(args.value)

@@ -1,5 +1,6 @@
-"""An actionlib client. Lines of standard input tell it what to do: `send N` sends the goal N and calls it by the count
-of goals so far, `cancel COUNT` cancels that goal, `cancel_all` all. It prints what it hears of its goals."""
+"""Runs an actionlib client, controlled by lines of standard input: `send N` sends the goal N and
+numbers it by the count of goals so far, `cancel COUNT` cancels that goal, `cancel_all` cancels all
+goals. It prints the events of its goals."""
 
 import argparse
 import sys
@@ -12,7 +13,7 @@ from ros1_actions import TestAction, TestGoal, start, status_name
 
 
 class Many:
-    """ActionClient: goals side by side."""
+    """Sends goals side by side, by ActionClient."""
 
     def __init__(self, name):
         self.client = actionlib.ActionClient(name, TestAction)
@@ -46,7 +47,7 @@ class Many:
 
 
 class Simple:
-    """SimpleActionClient: follows the last goal only."""
+    """Follows the last goal only, by SimpleActionClient."""
 
     def __init__(self, name):
         self.client = actionlib.SimpleActionClient(name, TestAction)
@@ -60,7 +61,8 @@ class Simple:
             text = self.client.get_goal_status_text()
             lifetime.say(count=count, end=status_name(status), text=text, result=result.result)
 
-        # The client knows the goal as its own only once it is sent, and loses what is answered before.
+        # The client knows the goal as its own only after the call returns, and would lose an
+        # earlier response.
         with self.client.action_client.manager.list_mutex:
             self.client.send_goal(
                 TestGoal(goal=number),

@@ -1,5 +1,12 @@
-"""An actionlib server. What it does depends on the goal's number:
--2 is rejected, -1 aborted, 100 and more report one more and last until they are cancelled, others succeed doubled."""
+"""Runs an actionlib server. The number of the goal selects the reaction.
+
+- -2: the goal is rejected.
+- -1: the goal is aborted.
+- 100 and more: the goal sends the number plus one as feedback and runs until it is cancelled.
+- Others: the goal succeeds with twice the number.
+
+With --simple no goal is rejected or aborted, and there is no feedback.
+"""
 
 import argparse
 
@@ -11,7 +18,7 @@ from ros1_actions import TestAction, TestFeedback, TestResult, start
 
 
 class Many:
-    """ActionServer: goals side by side."""
+    """Executes goals side by side, by ActionServer."""
 
     def __init__(self, name):
         self.held = {}
@@ -39,7 +46,7 @@ class Many:
 
 
 class Simple:
-    """SimpleActionServer: a newer goal takes the place of the older."""
+    """Replaces the older goal with a newer goal, by SimpleActionServer."""
 
     def __init__(self, name):
         self.server = actionlib.SimpleActionServer(name, TestAction, self.work, auto_start=False)

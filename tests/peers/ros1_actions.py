@@ -1,4 +1,4 @@
-"""What the actionlib peers share: the action, and a clock that is wrong."""
+"""Provides the common parts of the actionlib peers: the action, and a clock that is wrong."""
 
 import time
 

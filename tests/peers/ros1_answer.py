@@ -1,4 +1,5 @@
-"""A rospy server of a service that is defined in a folder: answers each request with --answer, and says it on a line."""
+"""Runs a rospy server of a service that a folder defines: it answers each request with --answer and
+prints a line."""
 
 import argparse
 import json

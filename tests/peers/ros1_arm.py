@@ -1,4 +1,5 @@
-"""A robot of rospy: it moves to the setpoints it is given, and tells where it is. Those above 100 it does not reach."""
+"""Simulates a robot by rospy: it moves to setpoints and publishes its position. It does not reach
+setpoints above 100."""
 
 import argparse
 

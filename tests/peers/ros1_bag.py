@@ -1,4 +1,5 @@
-"""What stands in a bag: one JSON line per connection, then one per message, read by the definitions in the bag."""
+"""Prints the content of a bag: one JSON line per connection, then one per message, read by the
+definitions in the bag."""
 
 import sys
 

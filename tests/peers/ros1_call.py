@@ -1,4 +1,5 @@
-"""A rospy client: calls a service once for each --value and prints the answer or the error as a JSON line."""
+"""Runs a rospy client: it calls a service once for each --value and prints the response or the
+error as a JSON line."""
 
 import argparse
 import json

@@ -1,4 +1,5 @@
-"""The other side of a crowd: subscribes /crowd/out_*, and publishes /crowd/in_* to whoever comes."""
+"""Runs the peer of a crowd: it subscribes to /crowd/out_* and publishes /crowd/in_* to all
+subscribers."""
 
 import argparse
 import time

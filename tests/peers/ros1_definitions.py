@@ -1,7 +1,8 @@
-"""ROS 1 message, service and action classes made from definition files at run time, by genmsg and genpy.
+"""Makes ROS 1 message, service and action classes of definition files at run time, by genmsg and
+genpy.
 
-A folder is searched for `<package>/msg/<Name>.msg`, `srv/<Name>.srv` and `action/<Name>.action`; what it does not
-have is taken from the Python packages installed.
+A folder is searched for `<package>/msg/<Name>.msg`, `srv/<Name>.srv` and `action/<Name>.action`;
+definitions that are not in the folder are taken from the installed Python packages.
 """
 
 import os
@@ -31,7 +32,7 @@ class Definitions:
                         self.texts[f"{package}/{name}", kind] = text.read()
 
     def message(self, name):
-        """The class of a message, such as `niryo_robot_msgs/RobotState`."""
+        """Returns the class of a message, such as `niryo_robot_msgs/RobotState`."""
         if (name, "msg") not in self.texts:
             installed = roslib.message.get_message_class(name)
             if installed is not None:
@@ -39,7 +40,7 @@ class Definitions:
         return self._class(name, self._load(name))
 
     def service(self, name):
-        """The class of a service, as rospy.Service and rospy.ServiceProxy take it."""
+        """Returns the class of a service, for rospy.Service and rospy.ServiceProxy."""
         spec = genmsg.msg_loader.load_srv_from_string(self.context, self.texts[name, "srv"], name)
         self._load_parts(spec.request)
         self._load_parts(spec.response)
@@ -52,7 +53,7 @@ class Definitions:
         return type(name.rpartition("/")[2], (), parts)
 
     def action(self, name):
-        """The class of an action, as actionlib.SimpleActionServer takes it."""
+        """Returns the class of an action, for actionlib.SimpleActionServer."""
         goal, result, feedback = self.texts[name, "action"].split("---")
         header = "Header header\n"
         status = "actionlib_msgs/GoalStatus status\n"

@@ -1,6 +1,8 @@
-"""A rospy node that sends every topic of the space back onto itself: what a bridge must not fall for.
+"""Runs a rospy node that sends every topic of the space back onto itself: the bridge must not make
+a loop of it.
 
-It hears its own publications as well and leaves those alone; otherwise it would need no bridge to make a loop.
+The node also receives its own publications and ignores them; otherwise it would make a loop without
+a bridge.
 """
 
 import argparse

@@ -1,4 +1,5 @@
-"""rospy and large images: `pub` sends numbered ones, `sub` says of each that came whether its bytes are the right ones.
+"""Publishes or checks large images by rospy: `pub` sends numbered images, `sub` checks the bytes of
+each received image.
 
 The number is the height of the image; byte k of image n is (n + k) % 251.
 """
@@ -41,7 +42,7 @@ def subscribe(args):
         right = image.data == pattern(image.height, args.size)
         lifetime.say(number=image.height, right=right)
 
-    # A large buffer: rospy otherwise reads ten megabytes in many small pieces.
+    # With a small buffer, rospy reads ten megabytes in many small pieces.
     subscriber = rospy.Subscriber(
         args.topic, Image, heard, queue_size=None, buff_size=1 << 24, tcp_nodelay=True
     )

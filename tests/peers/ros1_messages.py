@@ -1,4 +1,4 @@
-"""ROS 1 messages to and from plain JSON values."""
+"""Converts ROS 1 messages from and to plain JSON values."""
 
 import base64
 
@@ -14,7 +14,8 @@ def message_class(type_name):
 
 
 def build(kind, value):
-    """A message of class `kind`. A value that is no object is that of the field `data`."""
+    """Returns a message of class `kind`. A value that is not an object is the value of the field
+    `data`."""
     message = kind()
     fields = value if isinstance(value, dict) else {"data": value}
     genpy.message.fill_message_args(message, [fields])
@@ -22,7 +23,7 @@ def build(kind, value):
 
 
 def plain(value):
-    """The JSON form: messages are objects, bytes are base64 text, times are secs and nsecs."""
+    """Returns the JSON form: messages are objects, bytes base64 text, times secs and nsecs."""
     if isinstance(value, genpy.Message):
         return {name: plain(getattr(value, name)) for name in value.__slots__}
     if isinstance(value, genpy.rostime.TVal):

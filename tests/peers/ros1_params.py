@@ -1,6 +1,8 @@
-"""A rospy node that sets parameters and a clock as it is told, one JSON object per line of standard input.
+"""Runs a rospy node that sets parameters and a clock by JSON objects, one per line of standard
+input.
 
-{"set": name, "value": value}, {"delete": name}, {"get": name}, {"search": name}, {"clock": [secs, nsecs]}
+{"set": name, "value": value}, {"delete": name}, {"get": name}, {"search": name},
+{"clock": [secs, nsecs]}
 """
 
 import argparse

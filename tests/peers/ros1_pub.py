@@ -1,4 +1,5 @@
-"""A rospy publisher. Values come as JSON from --value or standard input; --numbered makes "0", "1", ..."""
+"""Runs a rospy publisher. Values come as JSON from --value or standard input; --numbered makes "0",
+"1", ..."""
 
 import argparse
 import json
@@ -29,7 +30,7 @@ def arguments():
 
 
 def paced(values, rate, repeat):
-    """Yields each value when it is due. A late one does not move the ones after it."""
+    """Yields each value when it is due. A late value does not delay the values after it."""
     start = time.monotonic()
     sent = 0
     turn = 0

@@ -1,4 +1,4 @@
-"""A rospy node that repeats a topic of any type under another name."""
+"""Runs a rospy node that repeats a topic of any type under another name."""
 
 import argparse
 
@@ -18,7 +18,7 @@ def main():
     args = parser.parse_args()
     lifetime.limit(args.limit)
     rospy.init_node(args.node, disable_rosout=True)
-    # The bytes go on as they came; only who subscribes is told a type.
+    # The bytes are forwarded unchanged; only subscribers see a type, which is std_msgs/String.
     publisher = rospy.Publisher(args.output, String, queue_size=1000, tcp_nodelay=True)
     rospy.Subscriber(args.input, AnyMsg, publisher.publish, queue_size=None, tcp_nodelay=True)
     lifetime.say(ready=args.output)

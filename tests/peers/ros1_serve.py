@@ -1,4 +1,5 @@
-"""A rospy server of std_srvs/SetBool: true is done, false raises. One JSON line per request."""
+"""Runs a rospy server of std_srvs/SetBool: true succeeds, false raises. It prints one JSON line per
+request."""
 
 import argparse
 

@@ -1,4 +1,4 @@
-"""A rospy subscriber: one JSON line per message, with the name of the node that sent it."""
+"""Runs a rospy subscriber: one JSON line per message, with the name of the publishing node."""
 
 import argparse
 

@@ -1,4 +1,5 @@
-"""A rospy subscriber that only counts: one JSON line with the count whenever it has changed, and rospy's errors."""
+"""Runs a rospy subscriber that only counts: one JSON line with the count after each change, and
+rospy's errors."""
 
 import argparse
 import logging

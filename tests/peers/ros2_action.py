@@ -1,11 +1,12 @@
-"""A Cyclone DDS server or client of the Fibonacci action, as rmw_cyclonedds and rcl_action make them.
+"""Runs a Cyclone DDS server or client of the Fibonacci action, as rmw_cyclonedds and rcl_action do.
 
-`serve` accepts orders of 0 and more. It sends as feedback the numbers 1 up to the order and succeeds with them; of an
-order of 100 and more it sends those up to 3 and waits to be cancelled, which it agrees to unless the order is odd. Order
--1 is rejected, -2 aborted.
+`serve` accepts orders of 0 and more. It sends the numbers 1 up to the order as feedback and
+succeeds with them. For an order of 100 and more it sends the numbers up to 3 and waits for a cancel
+request, which it refuses if the order is odd. Order -1 is rejected, -2 is aborted.
 
-`call` does what lines of standard input say: `send ORDER`, `cancel N`, `cancel_all`, `cancel_unknown`, `cancel_until N`,
-`result N`, `result_unknown` and `repeat N`, with N counting goals from 0; by itself it asks for no result unless told --results.
+`call` executes lines of standard input: `send ORDER`, `cancel N`, `cancel_all`, `cancel_unknown`,
+`cancel_until N`, `result N`, `result_unknown` and `repeat N`, with N counting goals from 0. It
+requests results by itself only with --results.
 """
 
 import argparse
@@ -52,7 +53,7 @@ def nanos(time_):
 
 
 def valid(reader):
-    """What a reader has, without the word that a writer has left."""
+    """Returns the samples of a reader, without notifications that a writer has left."""
     return [sample for sample in reader.take(N=1000) if sample.sample_info.valid_data]
 
 
@@ -104,7 +105,8 @@ class ActionServer:
         accepted = request.order != -1 and bytes(request.goal_id.uuid) not in self.goals
         lifetime.say(goal=request.order, accepted=accepted)
         goal = Goal(request.goal_id, request.order)
-        # Feedback and a status before the answer, as threads of a server may happen to send them.
+        # Send feedback and a status before the response, which can happen with the threads of a
+        # server.
         if self.args.hasty and accepted:
             self.goals[bytes(goal.id.uuid)] = goal
             self.step(goal)
@@ -187,7 +189,7 @@ def serve(args, participant):
 
 
 def lines():
-    """The lines of standard input as they come."""
+    """Returns a queue with the lines of standard input."""
     waiting = queue.Queue()
 
     def read():
@@ -215,7 +217,7 @@ class ActionClient:
         self.pending = {}
 
     def wait(self, seconds):
-        """Until a server has matched all, as `rcl_action_server_is_available` says it; no longer."""
+        """Waits until a server has matched all endpoints, like `rcl_action_server_is_available`."""
         end = time.monotonic() + seconds
         services = (self.send, self.cancel, self.result)
         endpoints = [self.feedback, self.status]
@@ -311,7 +313,7 @@ def call(args, participant):
 
 
 def status(args, participant):
-    """One line a status, from one that comes late."""
+    """Prints one line for each status, as a late subscriber."""
     topic = topics(participant, args.action)[1]
     reader = DataReader(participant, topic, qos=STATUS_QOS)
     lifetime.say(ready=args.action)
@@ -322,7 +324,8 @@ def status(args, participant):
 
 
 def garbage(args, participant):
-    """Requests of the right types' names that end too early, and feedback and a status likewise."""
+    """Sends requests with the right type names that end too early, and feedback and a status of the
+    same form."""
     base = args.action.lstrip("/") + "/_action"
     short = types.HEADER + [("data", types.uint8, 7)]
     writers = []

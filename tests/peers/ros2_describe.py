@@ -1,8 +1,8 @@
-"""A node of ROS 2 Iron and later, through Cyclone DDS, with a type of its own: it publishes or reads it, announces the
-type's hash, and tells what the type is when it is asked.
+"""Runs a node of ROS 2 Iron and later through Cyclone DDS, with its own type.
 
-The type is `type_description_interfaces/msg/FieldType`, whose hash is the one ROS 2 publishes; with --short HASH another of
-that name, of its first two fields.
+It publishes or reads the type, announces the type's hash, and describes the type on request. The
+type is `type_description_interfaces/msg/FieldType`, with the hash that ROS 2 publishes; with
+--short HASH it is another type of this name, with the first two fields.
 """
 
 import argparse
@@ -75,7 +75,7 @@ def announced(args):
 
 
 def tell_node(participant, name, readers, writers):
-    """The list of nodes, with the endpoints as the node's."""
+    """Publishes the list of nodes, with the endpoints as the node's endpoints."""
     import ros2_graph
 
     gid, entities, kind = ros2_graph.KINDS[16]
@@ -96,7 +96,8 @@ def answers(args, server):
 
 
 def use(args, participant):
-    """Publishes a value (`serve`) or says those it reads (`read`), and answers who asks for the type."""
+    """Publishes a value (`serve`) or prints the received values (`read`), and describes the type on
+    request."""
     server = None
     if not args.no_service:
         server = ros2_service.Server(participant, f"/{args.name}/get_type_description", GET)
@@ -121,7 +122,7 @@ def use(args, participant):
 
 
 def ask(args, participant):
-    """Asks the node --node what a type is."""
+    """Requests the description of a type from the node --node."""
     client = ros2_service.Client(participant, f"{args.node}/get_type_description", GET)
     lifetime.say(ready=args.node)
     client.wait(10.0)

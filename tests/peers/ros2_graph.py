@@ -1,7 +1,9 @@
-"""What a ROS 2 node sees of the graph, through Cyclone DDS: nodes, readers, writers and what they announce.
+"""Prints the graph as a ROS 2 node sees it, through Cyclone DDS: nodes, readers, writers and their
+announcements.
 
-It hears `ros_discovery_info` with Gids of 16 bytes (from Iron on) or of 24 (up to Humble), and Cyclone's built-in topics,
-and prints all it knows as one JSON line whenever that changes. Given --node it is a node itself, with as many Gids.
+It receives `ros_discovery_info` with Gids of 16 bytes (from Iron on) or of 24 bytes (up to Humble),
+and Cyclone's built-in topics, and prints its knowledge as one JSON line after each change. Each
+--node announces a node of that name, in its own participant and with Gids of the same length.
 """
 
 import argparse
@@ -93,7 +95,7 @@ def policy(policies, kind):
 
 
 def milliseconds(policies):
-    """The deadline, None when there is none."""
+    """Returns the deadline; None without a deadline."""
     found = policies[Policy.Deadline].deadline if Policy.Deadline in policies else None
     return None if found is None or found > 2**60 else found // 1_000_000
 
@@ -119,11 +121,11 @@ def endpoints(reader):
 
 
 def hear(reader, known):
-    """Takes the lists of nodes; what does not fit the length of this peer's Gids is counted."""
+    """Takes the lists of nodes, and counts samples with Gids of another length."""
     while True:
         try:
             samples = reader.take(N=1)
-        except Exception:  # the decoder of the package raises whatever it stumbles over
+        except Exception:  # the decoder raises many kinds of exceptions
             known["unreadable"] += 1
             continue
         if not samples:

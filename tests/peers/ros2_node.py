@@ -1,20 +1,28 @@
-"""A ROS 2 node of rclpy that does and tells what it is asked, one JSON object on a line of standard input each.
+"""Runs a ROS 2 node of rclpy that executes JSON objects, one per line of standard input.
 
-An answer has the `id` of what was asked.
+A response has the `id` of its request.
 
 {"nodes": 1}                      the names of all nodes, as `ros2 node list`
-{"info": "/node"}                 what `ros2 node info` prints of a node
+{"info": "/node"}                 a node, as `ros2 node info`
 {"topics": 1}                     names and types, as `ros2 topic list -t`
 {"topic": "/t"}                   the endpoints of a topic, as `ros2 topic info -v`
-{"subscribe": "/t", "type": "std_msgs/msg/String", "qos": {...}}   says {"heard": "/t", "value": ...} from then on,
-                                  with "checksum": 1 that of the message's `data` as value
-{"publish": "/t", "type": ..., "qos": {...}, "value": {...}}       once; without a value the publisher is only made
-{"publish": "/t", "type": ..., "seed": 7}                          something in every field, which is the answer
-{"publish": "/t", "bytes": 1000000, "seed": 7}     a std_msgs/msg/UInt8MultiArray; the answer is the checksum
-{"call": "/s", "type": "std_srvs/srv/Trigger", "value": {...}}     answers with {"reply": ...}
-{"serve": "/s", "type": ..., "value": {...}}                       replies that to all, says {"asked": "/s", "value": ...}
-{"parameters": "/node"}           its parameters with values and descriptors, as `ros2 param dump` and `describe`
-{"set": "/node", "name": ..., "value": ...}                        answers with what the node said of it
+{"subscribe": "/t", "type": "std_msgs/msg/String", "qos": {...}}
+                                  prints {"heard": "/t", "value": ...} from then on,
+                                  with "checksum": 1 the checksum of the message's `data`
+{"publish": "/t", "type": ..., "qos": {...}, "value": {...}}
+                                  publishes once; without a value it only creates the publisher
+{"publish": "/t", "type": ..., "seed": 7}
+                                  random values in every field, which are the response
+{"publish": "/t", "bytes": 1000000, "seed": 7}
+                                  a std_msgs/msg/UInt8MultiArray; the response is the checksum
+{"call": "/s", "type": "std_srvs/srv/Trigger", "value": {...}}
+                                  responds with {"reply": ...}
+{"serve": "/s", "type": ..., "value": {...}}
+                                  replies with the value, prints {"asked": "/s", "value": ...}
+{"parameters": "/node"}           its parameters with values and descriptors,
+                                  as `ros2 param dump` and `describe`
+{"set": "/node", "name": ..., "value": ...}
+                                  responds with the result of the node
 """
 
 import argparse
@@ -58,7 +66,7 @@ def qos(asked):
 
 
 def plain(value):
-    """A message as JSON has it."""
+    """Returns the JSON form of a message."""
     if hasattr(value, "get_fields_and_field_types"):
         return {name: plain(getattr(value, name)) for name in value.get_fields_and_field_types()}
     if isinstance(value, bytes):
@@ -69,7 +77,7 @@ def plain(value):
 
 
 def filled(message, values):
-    """A message with these fields set, the rest as they are."""
+    """Returns the message with these fields set; the other fields stay as they are."""
     for name, value in values.items():
         there = getattr(message, name)
         if hasattr(there, "get_fields_and_field_types"):
@@ -85,7 +93,8 @@ INTEGERS = {f"{sign}int{size}": (size, sign == "") for sign in ("", "u") for siz
 
 
 def anything(kind, random):
-    """A value of that type, of `rosidl_parser.definition`, unlike the default one; floats that are exact with 32 bits."""
+    """Returns a value of a type of `rosidl_parser.definition` that differs from the default; floats
+    are exact with 32 bits."""
     if isinstance(kind, definition.NamespacedType):
         return any_message(type_of("/".join(kind.namespaced_name())), random)
     if isinstance(kind, definition.AbstractNestedType):
@@ -111,7 +120,7 @@ def anything(kind, random):
 def any_message(kind, random):
     message = kind()
     if kind.__module__.startswith("builtin_interfaces"):
-        # As exact as the times of OPC UA: ticks of 100 ns, and a Duration is a Double.
+        # Use the precision of OPC UA: ticks of 100 ns, and a Duration is a Double.
         bits = 31 if kind.__name__ == "Time" else 20
         message.sec, message.nanosec = random.getrandbits(bits), random.randrange(10**7) * 100
         return message
@@ -255,7 +264,7 @@ class Judge(Node):
 
 
 def done(future):
-    """The result of what the executor's thread completes."""
+    """Returns the result of a future that the executor's thread completes."""
     event = threading.Event()
     future.add_done_callback(lambda _: event.set())
     if not event.wait(WAIT):
@@ -287,7 +296,7 @@ def main():
         asked = json.loads(line)
         try:
             answer = {"answer": node.do(asked)}
-        except Exception as error:  # told to the test, which fails of it
+        except Exception as error:  # reported to the test, which then fails
             answer = {"error": repr(error)}
         lifetime.say(id=asked.get("id"), **answer)
     rclpy.shutdown()

@@ -1,4 +1,4 @@
-"""A Cyclone DDS writer with ROS 2 names. Values come as JSON from --value or standard input.
+"""Runs a Cyclone DDS writer with ROS 2 names. Values come as JSON from --value or standard input.
 
 It stays after the last value; a line on standard input then makes it leave in order.
 """

@@ -1,15 +1,20 @@
-"""An action of `test_msgs/Fibonacci` with rclpy itself: what rcl_action does, and what its graph says of others.
+"""Runs an action of `test_msgs/Fibonacci` with rclpy itself: the behavior of rcl_action, and its
+view of the graph.
 
-`serve` decides about goals by their order: -1 is rejected and -2 aborted. Others get the numbers one by one as feedback and succeed,
-but from 100 on, of which three are told, and which go on until they are cancelled. Odd ones refuse to be. One of 110 succeeds
-although it was cancelled, and one of 112 is aborted. With `--decides-after` it decides so many seconds late.
+`serve` decides about goals by their order: -1 is rejected and -2 is aborted. Other goals get the
+numbers one by one as feedback and succeed. Goals from 100 on get three numbers and run until they
+are cancelled; odd orders refuse a cancel. Order 110 succeeds although it was cancelled, and order
+112 is aborted. With `--decides-after` the server decides this number of seconds late.
 
-`call` does what lines of standard input say: `send ORDER`, `cancel N`, `cancel_all`, `cancel_unknown`, `cancel_until N`, `result N`,
-`result_unknown`, and `back` and `gone`, which wait for a server or none, with N counting goals from 0; by itself it asks for no result unless told --results.
-`accepts N` sends N goals of 0, each when the one before was accepted, and tells how long that took.
+`call` executes lines of standard input: `send ORDER`, `cancel N`, `cancel_all`, `cancel_unknown`,
+`cancel_until N`, `result N`, `result_unknown`, and `back` and `gone`, which wait for a server or
+its loss, with N counting goals from 0. It requests results by itself only with --results. `accepts
+N` sends N goals of order 0, each after the previous goal was accepted, and prints how long each
+acceptance took.
 
-Both tell when asked: `node NAME`, the actions of a node; `action NAME`, the endpoints of an action; `participants`,
-how many processes there are; `watch`, the statuses, one line each, as one hears them who comes now; `leave`, which ends it as rclpy ends.
+Both roles also execute `node NAME`, which prints the actions of a node; `action NAME`, the
+endpoints of an action; `participants`, the number of processes; `watch`, which prints each status
+as a late subscriber receives it; `leave`, which ends the process like rclpy.
 """
 
 import argparse
@@ -48,7 +53,7 @@ TURN = 0.005
 
 
 def lines():
-    """The lines of standard input as they come."""
+    """Returns a queue with the lines of standard input."""
     waiting = queue.Queue()
 
     def read():
@@ -114,7 +119,7 @@ class Client:
     def __init__(self, node, args):
         self.args = args
         self.end = ActionClient(node, Fibonacci, args.action)
-        # What an action client has no words for, `ros2 service call` may ask.
+        # These requests are possible by `ros2 service call`, but not by an action client.
         self.cancel = node.create_client(CancelGoal, f"{args.action}/_action/cancel_goal")
         self.result = node.create_client(Fibonacci.Impl.GetResultService, f"{args.action}/_action/get_result")
         self.ids, self.handles, self.said, self.asked, self.waits = [], {}, {}, [], []
@@ -164,7 +169,7 @@ class Client:
     def cancelled(self, answer):
         ids = [list(one.uuid) for one in self.ids]
         told = [list(info.goal_id.uuid) for info in answer.goals_canceling]
-        # Those of other clients are not counted here.
+        # Goals of other clients are not counted here.
         goals = [ids.index(one) if one in ids else None for one in told]
         lifetime.say(cancel=CODES[answer.return_code], goals=goals)
 
@@ -214,7 +219,7 @@ class Client:
 
 
 def say_node(node, name):
-    """What `ros2 node info` says of a node's actions."""
+    """Prints a node's actions like `ros2 node info`."""
     actions = {}
     for role, ask in (
         ("servers", get_action_server_names_and_types_by_node),
@@ -228,7 +233,8 @@ def say_node(node, name):
 
 
 def say_action(node, action):
-    """What is known of each endpoint of an action, its services' by the names that DDS has."""
+    """Prints the properties of each endpoint of an action; the endpoints of its services have the
+    names of DDS."""
     base, seen = f"{action}/_action", []
     topics = [(f"{base}/feedback", False), (f"{base}/status", False)]
     for part in ("send_goal", "cancel_goal", "get_result"):
@@ -275,7 +281,7 @@ def main():
     executor = MultiThreadedExecutor(num_threads=16) if args.role == "serve" else SingleThreadedExecutor()
     executor.add_node(node)
     if args.nested:
-        # For its endpoints alone.
+        # Only its endpoints are needed.
         ActionServer(node, NestedMessage, args.nested, lambda goal: NestedMessage.Result())
     end = time.monotonic() + args.wait
     while args.role == "call" and not part.ready():

@@ -1,7 +1,8 @@
-"""A Cyclone DDS server or client of a ROS 2 service, as rmw_cyclonedds makes them: two topics, and a header of 16
-bytes in front of each body.
+"""Runs a Cyclone DDS server or client of a ROS 2 service, as rmw_cyclonedds does: two topics, and a
+header of 16 bytes before each body.
 
-`serve` answers each request with --answer, `call` asks with each --value and says what is answered.
+`serve` answers each request with --answer, `call` sends each --value as a request and prints the
+replies.
 """
 
 import argparse
@@ -20,7 +21,7 @@ import ros2_types
 
 
 def body(sample):
-    """The JSON form of a request or reply without its header."""
+    """Returns the JSON form of a request or reply without its header."""
     plain = ros2_types.plain(sample)
     for name in ("client", "count", "structure_needs_at_least_one_member"):
         plain.pop(name, None)
@@ -46,8 +47,8 @@ class Server(Ends):
         self.reader = DataReader(participant, self.request, qos=self.qos)
 
     def answer(self, request, reply):
-        # As rmw_cyclonedds does: a request may come before the reader of its client is matched, and a reply before that is
-        # lost. A client has one of each.
+        # As in rmw_cyclonedds: a request may arrive before the reader of its client is matched, and
+        # an earlier reply would be lost. A client has one writer and one reader.
         end = time.monotonic() + 1.0
         while ros2_types.matched(self.writer) < ros2_types.matched(self.reader) and time.monotonic() < end:
             time.sleep(0.001)
@@ -66,7 +67,7 @@ class Client(Ends):
         self.strange = 0
 
     def wait(self, seconds):
-        """Until a server has matched both topics."""
+        """Waits until a server has matched both topics."""
         end = time.monotonic() + seconds
         while not (ros2_types.matched(self.writer) and ros2_types.matched(self.reader)):
             if time.monotonic() > end:
@@ -80,7 +81,7 @@ class Client(Ends):
         return self.count
 
     def replies(self):
-        """Number and reply of those that are for us."""
+        """Yields number and reply of the replies for this client."""
         for reply in self.reader.take(N=1000):
             if not hasattr(reply, "count"):
                 continue
@@ -125,7 +126,7 @@ def call(args, participant, kinds):
     client = Client(participant, args.service, kinds)
     lifetime.say(ready=args.service)
     client.wait(args.wait)
-    # The server may learn of us later than we of it.
+    # The server may match this client later than this client matches the server.
     time.sleep(args.settle)
     values = [json.loads(value) for value in args.value]
     if args.at_once:
@@ -148,7 +149,8 @@ def call(args, participant, kinds):
 
 
 def garbage(args, participant, kinds):
-    """Samples of the requests' type name that end within the header, or have a body of another form."""
+    """Sends samples with the type name of the requests that end within the header, or have a body
+    of another form."""
     name = kinds[0].__idl_typename__.replace("::", ".").rsplit(".", 1)[1].rstrip("_")
     package, kind = kinds[0].__idl_typename__.replace("::", ".").split(".")[:2]
     fields = {

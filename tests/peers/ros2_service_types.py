@@ -1,5 +1,5 @@
-"""The ROS 2 services and actions the tests speak, as rmw_cyclonedds has them on the wire: each request and reply
-begins with 8 bytes that name the client and a number that counts its requests."""
+"""Defines the ROS 2 services and actions of the tests with the wire format of rmw_cyclonedds: each
+request and reply begins with 8 bytes that name the client and a number that counts its requests."""
 
 from dataclasses import dataclass, field
 from types import new_class
@@ -27,7 +27,7 @@ from ros2_types import Time
 
 
 def struct(name, fields):
-    """A class for the ROS name `package/kind/Name` with (name, type, default) fields."""
+    """Returns a class for the ROS name `package/kind/Name` with (name, type, default) fields."""
     package, kind, short = name.split("/")
 
     def fill(namespace):
@@ -45,7 +45,7 @@ NOTHING = [("structure_needs_at_least_one_member", uint8, 0)]
 
 
 def service(name, request, reply):
-    """Request and reply of `package/kind/Name`."""
+    """Returns request and reply of `package/kind/Name`."""
     return (
         struct(f"{name}_Request", HEADER + (request or NOTHING)),
         struct(f"{name}_Response", HEADER + (reply or NOTHING)),
@@ -109,7 +109,7 @@ ParameterEvent = struct(
         ("deleted_parameters", sequence[Parameter], list),
     ],
 )
-# Messages that nothing but the services of parameters brings about.
+# Messages that only the services of parameters cause.
 MESSAGES = {"rcl_interfaces/ParameterEvent": ParameterEvent}
 
 BASIC = [
@@ -169,13 +169,13 @@ SERVICES = {
     "lifecycle_msgs/GetAvailableStates": service(
         "lifecycle_msgs/srv/GetAvailableStates", [], [("available_states", sequence[State], list)]
     ),
-    # As tests/tests/shaped.rs defines it.
+    # The same definition as in tests/tests/shaped.rs.
     "robot_msgs/Move": service(
         "robot_msgs/srv/Move",
         [("speed", float32, 0.0), ("dry", bool, False), ("mode", str, "")],
         [("refused", bool, False), ("codes", sequence[int32], list), ("took", float64, 0.0)],
     ),
-    # The Fibonacci of the ROS tutorials under a package of its own.
+    # The Fibonacci action of the ROS tutorials, in its own package.
     "demo_msgs/Fibonacci_SendGoal": service(
         "demo_msgs/action/Fibonacci_SendGoal",
         [("goal_id", UUID, UUID), ("order", int32, 0)],

@@ -1,4 +1,4 @@
-"""A Cyclone DDS reader with ROS 2 names: one JSON line per sample."""
+"""Runs a Cyclone DDS reader with ROS 2 names: one JSON line per sample."""
 
 import argparse
 

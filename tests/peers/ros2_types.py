@@ -1,4 +1,4 @@
-"""The ROS 2 interfaces the tests speak, under the names ROS 2 gives them on DDS."""
+"""Defines the ROS 2 interfaces of the tests, with the names that ROS 2 gives them on DDS."""
 
 import base64
 from dataclasses import dataclass, field, fields, is_dataclass
@@ -123,7 +123,7 @@ class Log(IdlStruct, typename="rcl_interfaces.msg.dds_.Log_"):
 @dataclass
 @final
 class Unheard(IdlStruct, typename="nobody_msgs.msg.dds_.Unheard_"):
-    """A type no bridge has a definition of."""
+    """A type without a definition at any bridge."""
 
     data: uint8 = 0
 
@@ -144,10 +144,10 @@ TYPES = {
 
 
 def matched(endpoint):
-    """How many readers a writer has matched, or writers a reader.
+    """Returns how many readers a writer has matched, or writers a reader.
 
-    The wheel asks for the number, makes room for so many handles and asks again. It raises IndexError when one more has
-    been matched in between, so that is asked once more.
+    The Python package queries the number, allocates as many handles and queries again. It raises
+    IndexError if an endpoint was matched in between, so the query is repeated.
     """
     while True:
         try:
@@ -166,7 +166,8 @@ def kind_of(type_name):
 
 
 def build(kind, value):
-    """A sample of class `kind`. A value that is no object is that of the field `data`."""
+    """Returns a sample of class `kind`. A value that is not an object is the value of the field
+    `data`."""
     wanted = value if isinstance(value, dict) else {"data": value}
     sample = kind()
     for one in fields(kind):
@@ -178,7 +179,7 @@ def build(kind, value):
 
 
 def plain(value):
-    """The JSON form of a sample."""
+    """Returns the JSON form of a sample."""
     if is_dataclass(value):
         return {one.name: plain(getattr(value, one.name)) for one in fields(value)}
     if isinstance(value, (bytes, bytearray)):

@@ -1,6 +1,8 @@
-"""Judges mappings by a JSON Schema: jsonschema and ruamel.yaml, neither of which shares code with the bridges.
+"""Validates mappings with a JSON Schema: jsonschema and ruamel.yaml, which share no code with the
+bridges.
 
-A file that holds entries alone is judged as those of `variables` or `patterns`. Each file gets a JSON line with its faults.
+A file with a list of entries is validated as the entries of `variables` or `patterns`. Each file
+gets a JSON line with its faults.
 """
 
 import json
@@ -18,14 +20,14 @@ def document(text):
     yaml = YAML(typ="safe", pure=True)
     found = yaml.load(text)
     if isinstance(found, list):
-        # Entries alone: those of `patterns` have topics.
+        # Entries with `topics` are entries of `patterns`.
         key = "patterns" if "topics" in found[0] else "variables"
         return {key: found}
     return found
 
 
 def plain(value):
-    """As JSON has it: the keys of a map are strings."""
+    """Returns the JSON form: the keys of a map are strings."""
     if isinstance(value, dict):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list):

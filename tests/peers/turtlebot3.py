@@ -1,6 +1,7 @@
-"""A TurtleBot3 as its domain shows it: the topics of turtlebot3_node and of its lidar, with their types, rates and qualities.
+"""Simulates a TurtleBot3: the topics of turtlebot3_node and of its lidar, with their types, rates
+and QoS.
 
-Every velocity it is told is one JSON line on standard output.
+Every velocity that it receives is one JSON line on standard output.
 """
 
 import argparse
@@ -148,7 +149,7 @@ class TurtleBot3:
         self.joint_states = self.writer("/joint_states", JointState)
         self.imu = self.writer("/imu", Imu)
         self.battery_state = self.writer("/battery_state", BatteryState)
-        # As sensor data is published: what is lost is lost.
+        # Sensor data is published best effort: lost samples are not repeated.
         self.scan = self.writer("/scan", LaserScan, Policy.Reliability.BestEffort)
         kind = TwistStamped if stamped else Twist
         topic = Topic(self.participant, "rt/cmd_vel", kind, qos=self.qos())

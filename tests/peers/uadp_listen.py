@@ -1,4 +1,4 @@
-"""asyncua's PubSub as a listener on a UADP group: one JSON line per DataSetMessage."""
+"""Runs asyncua's PubSub as a listener on a UADP group: one JSON line per DataSetMessage."""
 
 import argparse
 import asyncio

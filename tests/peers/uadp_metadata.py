@@ -1,7 +1,9 @@
-"""asyncua as the judge of DataSetMetaData: one JSON line per announcement in a UADP group, and per structure in its data.
+"""Checks DataSetMetaData by asyncua: one JSON line per announcement in a UADP group, and per
+structure in its data.
 
-The headers of NetworkMessages are read here as far as bridges write them; what stands in announcements, and the values,
-are decoded by asyncua, structures by the classes it makes of the StructureDescriptions that were announced before.
+The headers of NetworkMessages are read here as far as bridges write them. asyncua decodes the
+announcements and the values; structures are decoded by the classes that it makes of
+StructureDescriptions announced before.
 """
 
 import argparse
@@ -37,7 +39,7 @@ def announcement(datagram):
     assert (flags, token, nonce) == (0, 0, 0)
     kind, sequence, writer = struct.unpack_from("<BHH", datagram, 11)
     if kind != DATA_SET_META_DATA:
-        # Programs announce their application, too.
+        # Programs also announce their application.
         return
     rest = Buffer(datagram[16:])
     meta = struct_from_binary(ua.DataSetMetaDataType, rest)
@@ -82,7 +84,7 @@ def property_of(value):
 
 
 def learn(described):
-    """Has asyncua make a class of a StructureDescription."""
+    """Makes asyncua create a class of a StructureDescription."""
     if described.DataTypeId in ua.extension_objects_by_datatype:
         return
     name = described.Name.Name.replace("/", "_")
@@ -94,7 +96,7 @@ def learn(described):
 
 
 def data(datagram):
-    """A key frame as bridges write it: its fields that are structures."""
+    """Reads a key frame as bridges write it, and prints its fields that are structures."""
     publisher, _, group, count, writer = struct.unpack_from("<HBHBH", datagram, 2)
     at = 2 + 8 + 10
     flags = datagram[at]
@@ -127,7 +129,7 @@ def main():
             try:
                 data(datagram)
             except ua.UaError:
-                # Of a type that is announced a moment later.
+                # The type of the structure is announced later.
                 continue
 
 

@@ -1,4 +1,5 @@
-"""asyncua's PubSub as a publisher: three groups of DataSetWriters, of values that tests/asyncua_pubsub.rs knows."""
+"""Runs asyncua's PubSub as a publisher: three groups of DataSetWriters, with the values of
+tests/asyncua_pubsub.rs."""
 
 import argparse
 import asyncio

@@ -1,4 +1,5 @@
-"""asyncua's PubSub as a subscriber: DataSetReaders that print one JSON line per DataSetMessage they take."""
+"""Runs asyncua's PubSub as a subscriber: DataSetReaders that print one JSON line per received
+DataSetMessage."""
 
 import argparse
 import asyncio
@@ -18,7 +19,7 @@ import opcua_session
 
 
 class Heard:
-    """What a DataSetReader gives its values to."""
+    """Receives the values of a DataSetReader."""
 
     def __init__(self, writer):
         self.writer = writer
@@ -47,7 +48,7 @@ def described(field):
 def reader(args, writer):
     meta = DataSetMeta.Create("fields")
     for index in range(args.fields):
-        # The messages say the types.
+        # The messages contain the types.
         meta.add_scalar(f"field {index}", ua.VariantType.Variant)
     return DataSetReader.new(
         ua.Variant(ua.UInt16(args.publisher)),

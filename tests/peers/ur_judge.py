@@ -1,4 +1,5 @@
-"""Judges the simulator of a robot: RTDE by ur_rtde, the client of another maker; the secondary interface by the maker's table."""
+"""Checks the simulator of a robot: RTDE by ur_rtde, a client of another maker; the secondary
+interface by the maker's table."""
 
 import argparse
 import math
@@ -13,7 +14,7 @@ import lifetime
 
 
 def state_of(stream):
-    """The next robot state message of the secondary interface: mode and position."""
+    """Returns the next robot state message of the secondary interface: mode and position."""
 
     def exactly(count):
         data = b""
@@ -70,7 +71,7 @@ def main():
     lifetime.say(what="moved", pose=[round(part, 4) for part in heard.getActualTCPPose()], fastest=round(fastest, 3),
                  seconds=round(time.monotonic() - began, 3))
 
-    # At half the speed it takes twice as long.
+    # At half the speed the motion takes twice as long.
     told.setSpeedSlider(0.5)
     end = time.monotonic() + 5
     while abs(heard.getSpeedScaling() - 0.5) > 1e-6:

@@ -1,7 +1,14 @@
-"""An actionlib client. Lines of standard input tell it what to do: {"send": GOAL}, {"cancel": N} with N counting goals from 0,
-{"cancel_all": true}, and with --plain {"accepts": N}, which sends N empty goals, each when the one before was accepted, and tells how long that
-took. It prints what it hears of its goals. With --plain several goals go on side by side, else a newer goal
-ends the interest in an older one."""
+"""Runs an actionlib client, controlled by JSON lines on standard input.
+
+- {"send": GOAL} sends a goal.
+- {"cancel": N} cancels a goal, with N counting goals from 0.
+- {"cancel_all": true} cancels all goals.
+- {"accepts": N}, only with --plain, sends N empty goals, each after the previous goal was accepted,
+  and prints how long each acceptance took.
+
+It prints the events of its goals. With --plain several goals run side by side, else a newer goal
+replaces the older goal.
+"""
 
 import argparse
 import json
@@ -26,7 +33,7 @@ def status_name(code):
 
 
 class Plain:
-    """ActionClient: goals side by side."""
+    """Sends goals side by side, by ActionClient."""
 
     def __init__(self, name, kind):
         self.client = actionlib.ActionClient(name, kind)
@@ -59,7 +66,7 @@ class Plain:
                     accepted.set()
 
             start = time.monotonic_ns()
-            # Who has no handle of a goal hears nothing of it.
+            # A client without a handle of a goal gets no events of it.
             handle = self.client.send_goal(goal, transition)
             accepted.wait()
             took.append(time.monotonic_ns() - start)
@@ -68,7 +75,7 @@ class Plain:
 
 
 class Simple:
-    """SimpleActionClient: follows the last goal only."""
+    """Follows the last goal only, by SimpleActionClient."""
 
     def __init__(self, name, kind):
         self.client = actionlib.SimpleActionClient(name, kind)
@@ -76,7 +83,8 @@ class Simple:
         self.over = False
 
     def send(self, goal):
-        # The client takes note of an end only after it has told of it, and would take it for that of the next goal.
+        # The client registers an end only after its callback, and would take a late end for the end
+        # of the next goal.
         while self.over and self.client.simple_state != actionlib.SimpleGoalState.DONE:
             time.sleep(0.001)
         count = self.count
@@ -87,7 +95,8 @@ class Simple:
             self.over = True
             ended(count, status, self.client.get_goal_status_text(), result)
 
-        # The client knows the goal as its own only once it is sent, and loses what is answered before.
+        # The client knows the goal as its own only after the call returns, and would lose an
+        # earlier response.
         with self.client.action_client.manager.list_mutex:
             self.client.send_goal(
                 goal,

@@ -1,5 +1,10 @@
-"""An actionlib server. A number in the goal says what it does: of -1 it is rejected (with --simple it cannot be), of -2 it is
-aborted after some feedback, of 100 and more it reports and goes on until it is cancelled, others are reported and succeed."""
+"""Runs an actionlib server. A number in the goal selects the reaction.
+
+- -1: the goal is rejected; with --simple it is aborted after some feedback.
+- -2: the goal is aborted after some feedback.
+- 100 and more: the goal sends feedback until it is cancelled.
+- Others: the goal sends feedback and succeeds.
+"""
 
 import argparse
 import sys
@@ -82,7 +87,7 @@ class Common:
 
 
 class Many(Common):
-    """ActionServer: goals side by side."""
+    """Executes goals side by side, by ActionServer."""
 
     def __init__(self, name, kind, work):
         super().__init__(name, kind, work)
@@ -118,7 +123,7 @@ class Many(Common):
 
 
 class Simple(Common):
-    """SimpleActionServer: a newer goal takes the place of the older."""
+    """Replaces the older goal with a newer goal, by SimpleActionServer."""
 
     def __init__(self, name, kind, work):
         super().__init__(name, kind, work)

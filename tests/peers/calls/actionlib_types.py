@@ -1,4 +1,4 @@
-"""Action classes of ROS 1: those that are installed, and others that genpy makes of their definition."""
+"""Provides action classes of ROS 1: installed classes, and classes made of definitions by genpy."""
 
 import importlib
 
@@ -33,14 +33,14 @@ MESSAGES = {
     "trajectory_msgs/JointTrajectoryPoint": "float64[] positions\nfloat64[] velocities\nfloat64[] accelerations\n"
     "float64[] effort\nduration time_from_start",
 }
-# The actions of skills, as they are shipped.
+# The actions of skills, in the shipped definitions.
 SKILLS = Path(__file__).resolve().parents[3] / "ros/ua_msgs/action"
 TEXTS |= {f"ua_msgs/{file.stem}": file.read_text() for file in SKILLS.glob("*.action")}
 BASIC = "bool byte char int8 uint8 int16 uint16 int32 uint32 int64 uint64 float32 float64 string time duration".split()
 
 
 def parts(name, text):
-    """The seven messages of an action, by http://wiki.ros.org/actionlib/DetailedDescription."""
+    """Returns the messages of an action (http://wiki.ros.org/actionlib/DetailedDescription)."""
     goal, result, feedback = text.split("\n---\n")
     status = "std_msgs/Header header\nactionlib_msgs/GoalStatus status\n"
     return {
@@ -63,7 +63,7 @@ def text_of(name, own):
 
 
 def needed(name, own, found):
-    """The texts of a message and of those it needs, full names in them."""
+    """Collects the texts of a message and of the messages that it needs, with full type names."""
     rows = []
     for row in text_of(name, own).splitlines():
         words = row.split("#")[0].split()
@@ -81,7 +81,7 @@ def needed(name, own, found):
 
 
 def action_class(name):
-    """The class `XAction` of an action."""
+    """Returns the class `XAction` of an action."""
     package, short = name.split("/")
     if name not in TEXTS:
         return getattr(importlib.import_module(f"{package}.msg"), f"{short}Action")
@@ -92,7 +92,7 @@ def action_class(name):
 
 
 def told(value):
-    """A message as JSON has it."""
+    """Returns the JSON form of a message."""
     if isinstance(value, genpy.Message):
         return {slot: told(getattr(value, slot)) for slot in value.__slots__}
     if isinstance(value, genpy.rostime.TVal):

@@ -1,14 +1,15 @@
-"""What is asked and answered in the tests of calls, the same for peers of ROS 1 and of ROS 2.
+"""Defines the requests and responses in the tests of calls, the same for peers of ROS 1 and of ROS
+2.
 
-A case says how the request with a number is filled in, what it is answered with, and whether an answer is the one of
-that number.
+A case fills the request with a number, makes its response, and checks that a response belongs to
+the number.
 """
 
 BIG = 1_000_000
 
 
 class Bundled:
-    """Built in: std_srvs/SetBool."""
+    """A built-in type: std_srvs/SetBool."""
 
     type = "std_srvs/SetBool"
     takes = {"data": False}
@@ -33,7 +34,7 @@ class Bundled:
 
 
 class Files:
-    """Known from files only: test_msgs/BasicTypes."""
+    """A type that only files define: test_msgs/BasicTypes."""
 
     type = "test_msgs/BasicTypes"
     takes = {
@@ -140,7 +141,7 @@ class Messages(Empty):
 
 
 class Switch(Bundled):
-    """std_srvs/SetBool of whoever answers with what was asked."""
+    """std_srvs/SetBool with a server that returns the value of the request."""
 
     @staticmethod
     def right(response, number):
@@ -148,7 +149,7 @@ class Switch(Bundled):
 
 
 class Skill(Empty):
-    """A Method of a component's skill, where its state allows it."""
+    """A Method of a component's skill, called when the state of the skill allows it."""
 
     @staticmethod
     def right(response, number):
@@ -156,7 +157,8 @@ class Skill(Empty):
 
 
 class Grasp(Files):
-    """The Start of a skill with a parameter, where the mapping asks for it by a type known from files only."""
+    """The Start of a skill with a parameter; the mapping offers it with a type that only files
+    define."""
 
     takes = {"Force": 0.0}
 
@@ -171,7 +173,7 @@ class Grasp(Files):
 
 
 class Loggers(Empty):
-    """What every node of roscpp has: `~get_loggers`."""
+    """A service of every node of roscpp: `~get_loggers`."""
 
     type = "roscpp/GetLoggers"
 
@@ -181,7 +183,7 @@ class Loggers(Empty):
 
 
 class Level(Empty):
-    """What every node of roscpp has: `~set_logger_level`."""
+    """A service of every node of roscpp: `~set_logger_level`."""
 
     type = "roscpp/SetLoggerLevel"
 

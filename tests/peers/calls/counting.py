@@ -1,4 +1,5 @@
-"""What peers that execute have in common: how often each request was executed, and for how long each takes."""
+"""Counts for executing peers how often each request was executed, and sets how long each execution
+takes."""
 
 import collections
 import json
@@ -7,7 +8,8 @@ import threading
 
 
 class Counted:
-    """Requests by case and number, told on a line of standard input. The line `end` ends all delays."""
+    """Counts requests by case and number, and reports the counts for a line of standard input. The
+    line `end` ends all delays."""
 
     def __init__(self, say, delay):
         self.say = say
@@ -31,7 +33,8 @@ class Counted:
         return response
 
     def tell(self):
-        """`executed` requests, of which `twice` were executed more often than once, and `most` at a time."""
+        """Reports the number of `executed` requests, the requests that were executed more than once
+        (`twice`), and the largest number of requests at the same time (`most`)."""
         with self.lock:
             self.say(
                 executed=sum(self.times.values()),
@@ -49,7 +52,7 @@ class Counted:
 
 
 class Asked:
-    """Answers as they come: right, wrong, or none with the reason."""
+    """Collects responses: right, wrong, or failed with the reason."""
 
     def __init__(self):
         self.lock = threading.Lock()

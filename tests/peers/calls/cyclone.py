@@ -1,5 +1,7 @@
-"""A Cyclone DDS server or client of services of ROS 2: `serve CASE=/name ..` as ros2_executor.py is, `ask` as ros2_asker.py
-is, of which one call is under way at a time."""
+"""Runs a Cyclone DDS server or client of services of ROS 2.
+
+`serve CASE=/name ..` works as ros2_executor.py, and `ask` as ros2_asker.py with one call at a time.
+"""
 
 import argparse
 import json
@@ -58,7 +60,7 @@ def asked(participant, clients, order):
         if time.monotonic() > end:
             return {"absent": True}
         time.sleep(0.005)
-    # The server may learn of us later than we of it.
+    # The server may match this client later than this client matches the server.
     time.sleep(0.2)
     told = Asked()
     first = order.get("first", 0)

@@ -1,5 +1,5 @@
-"""An asyncua client that asks for calls of the space as Methods: the orders of ros1_asker.py, where `service` is the path of a
-Method below Objects."""
+"""Runs an asyncua client that calls Methods of the space: the orders of ros1_asker.py, with the
+path of a Method below Objects as `service`."""
 
 import argparse
 import asyncio
@@ -19,7 +19,7 @@ from calls.counting import Asked, lines
 
 
 async def method_of(client, path):
-    """The object with the Method, the Method, and its arguments; None while it is not there."""
+    """Returns the object with the Method, the Method, and its arguments; None if there is none."""
     object_ = node = client.nodes.objects
     for name in path.split("/"):
         children = await node.get_children()

@@ -1,5 +1,5 @@
-"""An asyncua server whose object `Line` has a Method of each CASE, named as the case. A line on standard input makes it tell
-what it executed."""
+"""Runs an asyncua server whose object `Line` has a Method for each CASE, named as the case. For a
+line on standard input it reports its executions."""
 
 import argparse
 import asyncio

@@ -1,4 +1,5 @@
-"""A rospy client: {"case": "bundled", "service": "/s", "first": 0, "count": 10, "at_once": 4} on standard input."""
+"""Runs a rospy client with orders on standard input, such as {"case": "bundled", "service": "/s",
+"first": 0, "count": 10, "at_once": 4}."""
 
 import argparse
 import sys

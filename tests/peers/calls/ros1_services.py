@@ -1,11 +1,11 @@
-"""Service classes of ROS 1: those that are installed, and others made from their definition."""
+"""Provides service classes of ROS 1: installed classes, and classes made of their definition."""
 
 import hashlib
 
 import genpy.dynamic
 import roslib.message
 
-# What ROS 2 calls a byte is an int8 under that name in ROS 1.
+# A `byte` of ROS 2 is a uint8; ROS 1 has a type `byte` too, which is an int8.
 BASIC = """bool bool_value
 uint8 byte_value
 char char_value
@@ -33,7 +33,8 @@ TEXTS = {
 
 
 def md5_text(text, others):
-    """As ROS 1 has it: in the place of a type that is a message stands its MD5 sum."""
+    """Returns the text for the MD5 sum of ROS 1, in which the MD5 sum of a message replaces its
+    type."""
     rows = []
     for row in text.splitlines():
         kind, name = row.split()

@@ -1,6 +1,7 @@
-"""An rclpy client: {"case": "bundled", "service": "/s", "first": 0, "count": 10, "at_once": 4} on standard input.
+"""Runs an rclpy client with orders on standard input, such as {"case": "bundled", "service": "/s",
+"first": 0, "count": 10, "at_once": 4}.
 
-`patience` is how many seconds a call may take before it counts as failed.
+`patience` is the time in seconds after which a call counts as failed.
 """
 
 import argparse

@@ -1,4 +1,5 @@
-"""An rclpy server of services, each `CASE=/name`. A line on standard input makes it tell what it executed."""
+"""Runs an rclpy server of services, each `CASE=/name`. For a line on standard input it reports its
+executions."""
 
 import argparse
 import sys

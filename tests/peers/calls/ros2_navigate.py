@@ -1,7 +1,8 @@
-"""A Cyclone DDS server of `nav2_msgs/NavigateToPose`, as rmw_cyclonedds and rcl_action make one.
+"""Runs a Cyclone DDS server of `nav2_msgs/NavigateToPose`, as rmw_cyclonedds and rcl_action do.
 
-The x of a goal's pose says what it does: of -1 it is rejected, of -2 aborted, of 100 and more it goes on until it is cancelled;
-it reports the goal's pose as its own, and what is left of the way."""
+The x of a goal's pose selects the reaction: -1 is rejected, -2 is aborted, 100 and more runs until
+it is cancelled. Feedback has the goal's pose as the current pose, and the distance that is left.
+"""
 
 import argparse
 import sys

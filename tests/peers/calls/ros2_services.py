@@ -1,4 +1,4 @@
-"""What the rclpy peers of calls have in common."""
+"""Provides the common parts of the rclpy peers of calls."""
 
 import importlib
 import threading
@@ -6,7 +6,7 @@ import threading
 from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.qos import QoSProfile
 
-# The usual 10 lose requests and replies where many come at once.
+# The default depth of 10 loses requests and replies if many arrive at the same time.
 DEEP = QoSProfile(depth=1000)
 
 
@@ -16,7 +16,7 @@ def service_class(name):
 
 
 def spinning(node, threads):
-    """Spins the node in a thread of its own."""
+    """Spins the node in its own thread."""
     executor = MultiThreadedExecutor(threads)
     executor.add_node(node)
 

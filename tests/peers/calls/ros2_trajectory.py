@@ -1,6 +1,9 @@
-"""A Cyclone DDS client of `control_msgs/FollowJointTrajectory`, as rmw_cyclonedds and rcl_action make one of ROS 2 Humble.
+"""Runs a Cyclone DDS client of `control_msgs/FollowJointTrajectory`, as rmw_cyclonedds and
+rcl_action of ROS 2 Humble do.
 
-A line of standard input is the first position of a goal with two points; it says what its server does (actionlib_server.py)."""
+A line of standard input is the first position of a goal with two points, which selects the reaction
+of the server (actionlib_server.py).
+"""
 
 import argparse
 import sys

@@ -1,4 +1,5 @@
-"""Asks by `ua-space call`, whose path is given: the orders of ros1_asker.py, where `service` is a topic or the name of a call."""
+"""Calls by `ua-space call`, whose path is an argument: the orders of ros1_asker.py, with a topic or
+the name of a call as `service`."""
 
 import argparse
 import json
