@@ -1,6 +1,10 @@
-"""What serializers in Python take for the messages that `messages-bench dump` prints: python3 serializers.py genpy|rosbags
+"""Measures Python serializers with the messages that `messages-bench dump` prints.
 
-To read is from the bytes to the library's object, to write is back. Neither makes UADP of it."""
+    python3 serializers.py genpy|rosbags
+
+Reading converts the bytes to the library's object, writing converts it back. Neither makes UADP of
+it.
+"""
 import io
 import sys
 import timeit

@@ -1,5 +1,8 @@
-"""Made-up values of messages, and the fields a bridge is to make of them: the rules of the crate's documentation, written
-a second time. `schema` and `made` are those of serializers.py."""
+"""Makes random values of messages, and the fields that a bridge has to make of them.
+
+The rules of the crate's documentation are implemented here a second time. `schema` and `made` are
+defined in serializers.py.
+"""
 import struct
 from fractions import Fraction
 
@@ -12,7 +15,7 @@ WORDS = ["", "a", "map", "base_link", "Grüße", "odometry/filtered", "日本"]
 
 
 def value(kind, rng):
-    """Values that print alike everywhere."""
+    """Returns a value that all implementations print alike."""
     if kind == "bool":
         return rng.random() < 0.5
     if kind in ("float32", "float64"):
@@ -23,7 +26,7 @@ def value(kind, rng):
         return (rng.randrange(0, 2**31), rng.randrange(0, 10**7) * 100)
     if kind == "duration":
         return (rng.randrange(-1000, 1000), rng.randrange(0, 10**9))
-    if kind == "byte":  # of ROS 2; rosbags takes it for signed
+    if kind == "byte":  # of ROS 2; rosbags reads it as signed
         return rng.randrange(0, 128)
     bits = int(kind.lstrip("uint"))
     return rng.randrange(0, 2**bits) if kind[0] == "u" else rng.randrange(-(2 ** (bits - 1)), 2 ** (bits - 1))
@@ -38,7 +41,7 @@ def make(schema, name, rng, value=value, count=few):
     for field, kind, length in schema[name]:
         one = (lambda: make(schema, kind, rng, value, count)) if kind in schema else (lambda: value(kind, rng))
         if (name, field) == ("std_msgs/Header", "seq"):
-            made[field] = 0  # not carried, so no other value comes back
+            made[field] = 0  # not transported, so no other value returns
         elif length is None:
             made[field] = one()
         else:
@@ -48,7 +51,7 @@ def make(schema, name, rng, value=value, count=few):
 
 
 def walk(schema, name, made, inside=False):
-    """What a bridge hands over, in order: (what, kind or type, value or number)."""
+    """Yields the output of a bridge, in order: (event, kind or type, value or number)."""
     for field, kind, length in schema[name]:
         v = made[field]
         if (name, field) == ("std_msgs/Header", "seq"):
@@ -79,7 +82,7 @@ def walk(schema, name, made, inside=False):
 
 
 def ticks(time):
-    """Of 100 ns since 1601."""
+    """Returns ticks of 100 ns since 1601."""
     return (time[0] + 11644473600) * 10**7 + time[1] // 100
 
 
@@ -96,7 +99,7 @@ def show(kind, v):
 
 
 def events(schema, name, made):
-    """One line each."""
+    """Yields one line for each event."""
     for what, kind, v in walk(schema, name, made):
         if what in ("scalar", "element"):
             yield f"{what} {BUILTIN[kind]} {show(kind, v)}"
@@ -120,7 +123,7 @@ def one(kind, v):
     if kind in ("string", "wstring"):
         text = v.encode()
         return struct.pack("<I", len(text)) + text
-    if kind == "byte":  # which rosbags reads as signed
+    if kind == "byte":  # rosbags reads it as signed
         return struct.pack("B", v % 256)
     if kind == "time":
         return struct.pack("<q", ticks(v))
@@ -128,7 +131,8 @@ def one(kind, v):
 
 
 def packed(schema, name, made):
-    """The same for a machine: of each a letter, then the value little endian, or the number as 4 bytes."""
+    """Returns the events in binary form: a letter, then the value in little endian, or the number
+    as 4 bytes."""
     out = []
     for what, kind, v in walk(schema, name, made):
         if what in ("scalar", "element"):

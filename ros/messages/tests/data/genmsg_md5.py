@@ -1,8 +1,10 @@
-"""Prints name and md5 of each .srv and of the seven messages of each .action below a folder, as genmsg computes them.
+"""Prints name and MD5 of each .srv and of the seven messages of each .action below a folder, as
+genmsg computes them.
 
-    python3 genmsg_md5.py <folder>    needs Debian's python3-genmsg and the message packages the folder uses
+    python3 genmsg_md5.py <folder>
 
-A line `? name: why` is a type that cannot be resolved here.
+It needs Debian's python3-genmsg and the message packages that the folder uses. A line
+`? name: why` is a type that cannot be resolved here.
 """
 import importlib
 import os
@@ -28,7 +30,8 @@ def below(folder):
 
 
 def action(name, text):
-    """By http://wiki.ros.org/actionlib/DetailedDescription, and yields the names."""
+    """Adds the messages of an action (http://wiki.ros.org/actionlib/DetailedDescription) and yields
+    their names."""
     pieces = [[]]
     for line in text.split("\n"):
         if line.startswith("---"):

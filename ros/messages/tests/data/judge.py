@@ -1,14 +1,18 @@
-"""A foreign serializer that `tests/foreign.rs` asks: python3 judge.py genpy|rosbags1|rosbags2|cyclone
+"""Runs a foreign serializer for `tests/foreign.rs`.
 
-On stdin and stdout frames: 4 bytes length, little endian, then as much. First comes JSON, [[name, definition text]] of all
-types; the answer is JSON, {name: md5} with the md5 where the library knows one. Then each question is JSON:
+    python3 judge.py genpy|rosbags1|rosbags2|cyclone
 
-    {"make": name, "seed": text, "count": n}    answer: n made-up messages
-    {"read": name, "count": n}                  then a frame of n times 4 bytes length and message; answer: what was read
-                                                of each and its bytes when written again
+Stdin and stdout carry frames: 4 bytes length, little endian, then the content. The first frame is
+JSON, [[name, definition text]] of all types; the response is JSON, {name: md5}, with the MD5 if the
+library knows it. Then each request is JSON:
 
-An answer is one frame: for each message the bytes the library writes and its fields as fields.py packs them, each after
-4 bytes of length.
+    {"make": name, "seed": text, "count": n}    response: n random messages
+    {"read": name, "count": n}                  then a frame of n times 4 bytes length and message;
+                                                response: the fields that were read of each, and its
+                                                bytes when written again
+
+A response is one frame: for each message the bytes that the library writes, and its fields as
+fields.py packs them, each after 4 bytes of length.
 """
 import json
 import math
@@ -26,10 +30,10 @@ BITS = {"int8": "b", "uint8": "B", "byte": "B", "int16": "h", "uint16": "H", "in
 
 
 def value_of(lib, name):
-    """Any value the type has, and often one at an edge."""
+    """Returns a function for random values of a type, often with values at the limits."""
     early = 0 if lib.dialect == 1 else -(2**31)
-    late = 2**32 if name == "genpy" else 2**31  # rosbags takes a time of ROS 1 for signed
-    signed = name.startswith("rosbags")  # which takes a `byte` of ROS 2 for signed
+    late = 2**32 if name == "genpy" else 2**31  # rosbags reads a time of ROS 1 as signed
+    signed = name.startswith("rosbags")  # rosbags reads a `byte` of ROS 2 as signed
 
     def value(kind, rng):
         if kind == "bool":
@@ -98,7 +102,7 @@ def main(name):
     for each, _ in texts:
         if each in lib.schema:
             md5[each] = lib.classes[each]._md5sum if name == "genpy" else None
-    if name == "genpy":  # where Debian has the package, what its own file says counts
+    if name == "genpy":  # a package of Debian takes precedence over the definition
         for package in {each.split("/")[0] for each in md5}:
             try:
                 own = Genpy.installed([package])

@@ -1,29 +1,31 @@
-"""Makes the tables beside it: what other implementations say about the common interfaces.
+"""Makes the tables beside this file: results of other implementations for the common interfaces.
 
-    python3 make.py rosbags   needs the package rosbags (0.11.9) -> ros1_md5.txt, ros2_fields.txt, rosbags.json
+    python3 make.py rosbags   needs the package rosbags (0.11.9)
+                              -> ros1_md5.txt, ros2_fields.txt, rosbags.json
     python3 make.py cyclone   needs rosbags and cyclonedds (11.0.1) -> cyclone.json
-    python3 make.py genpy     needs Debian's python3-std-msgs, -geometry-msgs, -sensor-msgs, -tf2-msgs,
-                              -rosgraph-msgs, -actionlib-msgs -> genpy.json
-    python3 make.py services  needs Debian's python3-std-srvs, -nav-msgs, -sensor-msgs, -tf2-msgs, -diagnostic-msgs,
-                              -roscpp-msg, -move-base-msgs -> ros1_services.txt
+    python3 make.py genpy     needs Debian's python3-std-msgs, -geometry-msgs, -sensor-msgs,
+                              -tf2-msgs, -rosgraph-msgs, -actionlib-msgs -> genpy.json
+    python3 make.py services  needs Debian's python3-std-srvs, -nav-msgs, -sensor-msgs, -tf2-msgs,
+                              -diagnostic-msgs, -roscpp-msg, -move-base-msgs -> ros1_services.txt
     python3 make.py actions   needs Debian's python3-actionlib, -move-base-msgs -> ros1_actions.txt
     python3 make.py hashes    needs rosbags -> ros2_type_hashes.txt
     python3 make.py idl       needs rosbags -> rosbags_idl.json
 
-ua_msgs of this project (../../../ros/ua_msgs) is read from its files into each of the stores of rosbags.
+The files of ua_msgs of this project (../../../ros/ua_msgs) are added to each store of rosbags.
 
-ros1_md5.txt    name and md5 of each ROS 1 type: rosbags' store ROS1_NOETIC
-ros1_services.txt name and md5 of each service of those packages, of roscpp/Logger, and of the messages genaction made
-                of two actions: the classes genpy made
-ros1_actions.txt name and md5 of each message genaction made of the actions of actionlib and move_base_msgs: the classes
-                genpy made; and those genpy makes of the Fibonacci of other packages and
-                of the actions of ua_msgs here
-ros2_fields.txt name and fields of each ROS 2 type: rosbags' store ROS2_JAZZY
-ros2_type_hashes.txt for each of rosbags' stores from Humble to Lyrical a line `# store`, then type hash, name and fields of
-                each type that the store before has not or has otherwise
-rosbags_idl.json messages of ROS2_JAZZY in IDL, as rosbags reads them again, and their type hashes
-*.json          (others) messages with made-up values: their bytes as that implementation writes them, and the fields a bridge
-                is to make of them, one line each, by the rules of the crate's documentation (written here a second time)
+ros1_md5.txt          name and MD5 of each ROS 1 type: rosbags' store ROS1_NOETIC
+ros1_services.txt     name and MD5 of each service of these packages, of roscpp/Logger, and of the
+                      messages of two actions by genaction: the classes of genpy
+ros1_actions.txt      name and MD5 of each message of the actions of actionlib and move_base_msgs by
+                      genaction: the classes of genpy; also the classes that genpy makes of the
+                      Fibonacci actions of other packages and of the actions of ua_msgs here
+ros2_fields.txt       name and fields of each ROS 2 type: rosbags' store ROS2_JAZZY
+ros2_type_hashes.txt  for each of rosbags' stores from Humble to Lyrical a line `# store`, then type
+                      hash, name and fields of each type that is new or changed in the store
+rosbags_idl.json      messages of ROS2_JAZZY in IDL, which rosbags reads back, and their type hashes
+*.json                (others) random messages: their bytes as the implementation writes them, and
+                      the fields that a bridge has to make of them, one line each, by the rules of
+                      the crate's documentation (implemented here a second time)
 """
 import json
 import pathlib
@@ -200,7 +202,7 @@ IDL_WORDS = {"bool": "boolean", "byte": "octet", "char": "uint8", "float32": "fl
 
 
 def idl_text(store, full_name):
-    """A message as rosidl_adapter writes it in IDL."""
+    """Returns a message in IDL, as rosidl_adapter writes it."""
     from rosbags.interfaces import Nodetype
 
     package, _, name = full_name.split("/")
@@ -259,7 +261,7 @@ def idl():
     for name in IDL_SAMPLES:
         text = idl_text(store, full(name))
         read = get_typestore(Stores.ROS2_JAZZY)
-        # Its parser does not know `#include`.
+        # The parser of rosbags does not support `#include`.
         plain = "".join(line for line in text.splitlines(True) if not line.startswith("#"))
         read.fielddefs.update(get_types_from_idl(plain))
         assert read.fielddefs[full(name)] == store.fielddefs[full(name)], name

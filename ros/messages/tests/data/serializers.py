@@ -1,11 +1,14 @@
-"""ROS serializers of others, behind one face: `make.py` and `judge.py` use them.
+"""Provides foreign ROS serializers with a common interface for `make.py` and `judge.py`.
 
-Each has
+Each serializer has
+
     dialect               1 or 2
-    schema                name -> [(field, kind, length)]; length None single, -1 - bound a sequence, else fixed. Kinds are
-                          those of ROS 1, with `time` and `duration` for builtin_interfaces too, or names of messages
-    build(name, made)     its message of a dict of field -> value, nested; a time is (seconds, nanoseconds)
-    made(name, message)   the dict again
+    schema                name -> [(field, kind, length)]; length None is single, -1 - bound a
+                          sequence, else fixed. Kinds are the kinds of ROS 1, with `time` and
+                          `duration` for builtin_interfaces too, or names of messages
+    build(name, made)     its message of a nested dict of field -> value; a time is
+                          (seconds, nanoseconds)
+    made(name, message)   the dict of a message
     write(name, message)  the bytes
     read(name, bytes)     the message
 """
@@ -13,9 +16,9 @@ import io
 import re
 
 CLOCKS = {"builtin_interfaces/msg/Time": "time", "builtin_interfaces/msg/Duration": "duration"}
-# What Python's rosbags and Cyclone give an empty message; it is none.
+# rosbags and Cyclone of Python give an empty message this field; it is not a field of the type.
 HIDDEN = "structure_needs_at_least_one_member"
-# Kinds for which a library has a class or form of its own: its `convert` makes it, its `parts` takes it apart.
+# Kinds with a class or form of the library: its `convert` makes it, its `parts` takes it apart.
 CONVERTED = ("time", "duration", "wstring")
 
 
@@ -66,7 +69,7 @@ class Serializer:
 
 
 class Rosbags(Serializer):
-    """Of PyPI, 0.11.9."""
+    """rosbags 0.11.9 of PyPI."""
 
     def __init__(self, dialect, extra=()):
         import numpy
@@ -121,7 +124,7 @@ class Rosbags(Serializer):
 
 
 class Cyclone(Serializer):
-    """Bytes by cyclonedds (11.0.1) of PyPI, types by rosbags' description."""
+    """Bytes by cyclonedds 11.0.1 of PyPI, types by the descriptions of rosbags."""
 
     dialect = 2
 
@@ -133,7 +136,7 @@ class Cyclone(Serializer):
                 self.define(name)
 
     def define(self, name):
-        """Class of the type; its bases first."""
+        """Returns the class of a type, after defining the classes of its fields."""
         from dataclasses import dataclass
 
         from cyclonedds.idl import IdlStruct, types
@@ -148,13 +151,13 @@ class Cyclone(Serializer):
             if node in (Nodetype.ARRAY, Nodetype.SEQUENCE):
                 (node, what), count = what
                 length = count if desc[0] == Nodetype.ARRAY else -1 - count
-            if node == Nodetype.NAME and what.endswith("/wstring"):  # which rosbags takes for the name of a message
+            if node == Nodetype.NAME and what.endswith("/wstring"):  # for rosbags a message
                 node, what = Nodetype.BASE, ("wstring", 0)
             if node == Nodetype.NAME:
                 base, kind = self.define(what), CLOCKS.get(what) or short(what)
             else:
                 kind = {"char": "uint8"}.get(what[0], what[0])
-                # As rmw_cyclonedds has it: a word per UTF-16 unit.
+                # rmw_cyclonedds has a word for each UTF-16 unit.
                 wide = types.sequence[types.uint32]
                 base = {"string": str, "bool": bool, "wstring": wide}.get(kind)
                 base = base or getattr(types, {"octet": "byte"}.get(kind, kind))
@@ -192,7 +195,7 @@ class Cyclone(Serializer):
 
 
 class Genpy(Serializer):
-    """Debian's python3-genpy. `classes`: name -> class of all types, those used by others too."""
+    """Debian's python3-genpy. `classes`: name -> class of all types, including types of fields."""
 
     dialect = 1
 
@@ -210,7 +213,7 @@ class Genpy(Serializer):
 
     @staticmethod
     def installed(packages):
-        """The classes Debian made of the .msg files of those packages."""
+        """Returns the classes that Debian made of the .msg files of the packages."""
         import importlib
 
         classes = {}
@@ -222,12 +225,13 @@ class Genpy(Serializer):
 
     @staticmethod
     def defined(texts):
-        """The classes genpy makes of definition texts with all they need, as in a connection header."""
+        """Returns the classes that genpy makes of definition texts with all dependencies, as in a
+        connection header."""
         from genpy.dynamic import generate_dynamic
 
         classes = {}
         for name, text in texts:
-            # Each is of its own module, with its own classes of what it needs.
+            # Each class is in its own module, with its own classes of its dependencies.
             made = generate_dynamic(name, text)
             classes[name] = made[name]
         return classes
