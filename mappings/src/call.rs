@@ -90,7 +90,7 @@ pub struct MethodTarget {
 /// such as `goal_id`, are in no map: each is made of the field of the same name.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct CallBinding {
-    /// Space in whose ROS graph the service or action is offered.
+    /// Space of the ROS graph that offers the service or action.
     pub space: SpaceId,
     /// Service or action that is offered there.
     pub target: CallTarget,

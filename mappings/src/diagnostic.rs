@@ -14,7 +14,7 @@ use crate::topic::SpaceId;
 pub struct Diagnostic {
     /// Kind of the finding; stable from release to release.
     pub code: Code,
-    /// Severity: whether the document can run despite the finding.
+    /// Severity: error or warning.
     pub severity: Severity,
     /// Location in the document.
     pub at: Span,

@@ -84,7 +84,7 @@ impl Mapping {
         self
     }
 
-    /// Returns the folders and files whose definitions take precedence over the built-in
+    /// Returns the folders and files with definitions that take precedence over the built-in
     /// definitions. Paths that are relative to the mapping are below its folder.
     #[must_use]
     pub fn type_paths(&self) -> &[PathBuf] {
@@ -282,7 +282,7 @@ impl Mapping {
 /// A ROS service tied to a variable.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ServiceBinding {
-    /// Space in whose ROS graph the service is.
+    /// Space of the ROS graph with the service.
     pub space: SpaceId,
     /// Role of the service.
     pub role: ServiceRole,
@@ -463,7 +463,7 @@ pub struct Server {
     pub limits: ServerLimits,
     /// Rule for the servers with skills that it represents when they are found, if any.
     pub find_skills: Option<FindSkills>,
-    /// NodeSet2 files whose nodes it has beside the nodes of the mapping.
+    /// NodeSet2 files of nodes that it has beside the nodes of the mapping.
     pub nodesets: Vec<PathBuf>,
 }
 
@@ -683,7 +683,7 @@ impl Variable {
         self.bindings.iter().find(|binding| binding.space == space)
     }
 
-    /// Returns the other spaces whose topics or services get its values.
+    /// Returns the other spaces with topics or services that get its values.
     pub fn destinations(&self) -> impl Iterator<Item = SpaceId> {
         let called = self.service.as_ref();
         let called = called.filter(|of| matches!(of.role, ServiceRole::Call { .. }));
@@ -697,7 +697,7 @@ impl Variable {
 /// otherwise.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Binding {
-    /// Space in whose ROS graph the topic is.
+    /// Space of the ROS graph with the topic.
     pub space: SpaceId,
     /// Name of the topic, with its leading `/`.
     pub ros_topic: String,
@@ -732,7 +732,7 @@ pub enum Lasting {
 }
 
 impl From<Overflow> for Lasting {
-    /// Returns the kind of a value whose queue is declared.
+    /// Returns the kind of a value with a declared queue.
     fn from(overflow: Overflow) -> Self {
         match overflow {
             Overflow::KeepLatest => Self::State,

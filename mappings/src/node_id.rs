@@ -87,7 +87,7 @@ impl FromStr for NodeIdText {
     }
 }
 
-/// NodeId of another server, whose namespace is given by its URI or by its index there:
+/// NodeId of another server, with the URI of its namespace or the index there:
 /// `nsu=urn:plc;s=Line` or `ns=3;i=7` (OPC 10000-6, 5.1.12).
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
 pub struct ExpandedNodeIdText {

@@ -99,7 +99,7 @@ impl<'f> Reader<'f> {
         None
     }
 
-    /// Returns the pairs of a map whose keys are texts, each key once.
+    /// Returns the pairs of a map with texts as keys, each key once.
     pub(crate) fn pairs<'n>(&mut self, node: &'n Node<'n>, wanted: &str) -> Option<Vec<Pair<'n>>> {
         self.pairs_of(node, || wanted.to_owned())
     }

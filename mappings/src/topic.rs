@@ -7,7 +7,7 @@ use std::str::FromStr;
 
 /// Side that produces a value: 0 the OPC UA side, 1 ROS 1, 2..=232 a ROS 2 space.
 ///
-/// 232 is the highest DDS domain id whose ports fit into 16 bits.
+/// 232 is the highest DDS domain id with ports that fit into 16 bits.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct SpaceId(u8);
 
@@ -67,9 +67,9 @@ impl fmt::Display for SpaceId {
 pub struct TopicId {
     /// Space that produces the value; the PublisherId.
     pub space: SpaceId,
-    /// Namespace index of the OPC UA node; the WriterGroupId, whose null value is 0.
+    /// Namespace index of the OPC UA node; the WriterGroupId, with the null value 0.
     pub namespace: NonZeroU16,
-    /// Numeric identifier of the node or its alias; the DataSetWriterId, whose null value is 0.
+    /// Numeric identifier of the node or its alias; the DataSetWriterId, with the null value 0.
     pub identifier: NonZeroU16,
 }
 

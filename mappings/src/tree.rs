@@ -197,7 +197,7 @@ struct Builder<'v, 't> {
     variable: &'v dyn Fn(&str) -> Option<String>,
 }
 
-/// A list or map whose end has not been read yet.
+/// A list or map that has not been read to its end yet.
 struct Open<'t> {
     anchor: usize,
     place: Place,

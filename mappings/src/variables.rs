@@ -68,7 +68,7 @@ pub(crate) fn is_name(name: &str) -> bool {
         && name.bytes().all(|b| b.is_ascii_alphanumeric() || b == b'_')
 }
 
-/// Longest value of a variable, in bytes; no value of a mapping is longer.
+/// Maximum length of an expanded text, in bytes; no value of a mapping is that long.
 const MOST: usize = 1 << 16;
 
 #[cfg(test)]

@@ -24,7 +24,7 @@ use crate::tree::Place;
 /// Maximum number of fields that a help lists.
 const TOLD: usize = 12;
 
-/// The variable whose bindings are checked.
+/// Variable of the bindings that are checked.
 pub(super) struct Subject {
     pub(super) topic: Option<TopicId>,
     pub(super) origin: Option<SpaceId>,
@@ -322,8 +322,8 @@ impl<'c> Bindings<'c> {
             | DefinitionError::OtherHash { .. }
             | DefinitionError::Syntax { .. } => error.to_string(),
         };
-        // Publishers of a ROS 1 topic send its definition, so the bridge gets it when it reads; an
-        // origin that could not be read may be space 1.
+        // The publisher of a topic that is read can provide the definition. If the origin is not
+        // known, the topic may be one that is read.
         let read = site.subject.origin.is_none_or(|origin| origin == space);
         let (note, why) = if read {
             let why = match dialect {
@@ -553,7 +553,7 @@ fn differ_as_bytes(a: &Binding, b: &Binding) -> bool {
     bytes && (dialect(a.space) != dialect(b.space) || a.message_type != b.message_type)
 }
 
-/// Notes bindings whose fields cannot stand for each other.
+/// Notes bindings with fields that cannot stand for each other.
 fn differences(found: &[Found], findings: &mut Findings) {
     let mut known = found
         .iter()
@@ -612,10 +612,10 @@ fn differences(found: &[Found], findings: &mut Findings) {
     }
 }
 
-/// A whole message, whose fields are matched by position.
+/// A whole message with its fields, which are matched by position.
 type Side<'f> = (&'f Found, &'f [Leaf]);
 
-/// Notes fields of the same types whose names do not match.
+/// Notes fields of the same types with names that do not match.
 fn versions(first: Side<'_>, other: Side<'_>, findings: &mut Findings) {
     let whole =
         |(found, fields): Side<'_>| found.binding.selection == Selection::Whole && fields.len() > 1;

@@ -12,7 +12,7 @@ use crate::secret::has_user;
 use crate::topic::SpaceId;
 use crate::tree::Place;
 
-/// Highest DDS domain whose ports fit into 16 bits (DDSI-RTPS 2.3, 9.6.1.1).
+/// Highest DDS domain with ports that fit into 16 bits (DDSI-RTPS 2.3, 9.6.1.1).
 const MAX_DOMAIN: u16 = 232;
 
 pub(super) fn spaces(

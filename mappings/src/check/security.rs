@@ -346,7 +346,7 @@ fn own_service(mapping: &Mapping, document: &Document, findings: &mut Findings) 
     }
 }
 
-/// Reports a group without `members`, whose keys only programs of the cell get.
+/// Reports a group without `members`: only programs of the cell get its keys.
 fn without_members(place: Place, group: &SecurityGroup, server: &Server, findings: &mut Findings) {
     let Some(KeySource::Own(served)) = &group.keys else {
         return;

@@ -102,7 +102,8 @@ fn server(
     Some((server, place))
 }
 
-/// Returns the namespace of the server's skills. `None` for a faulty entry, which is noted.
+/// Returns the place of the server's skills in the space. `None` for a faulty entry, which is
+/// noted.
 #[expect(clippy::option_option, reason = "faulty, left out, or there")]
 fn skills(
     entry: &RemoteServerEntry,

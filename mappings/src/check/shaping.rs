@@ -70,7 +70,7 @@ impl<'k> From<&'k FieldEntry> for Keys<'k> {
 pub(super) struct Way {
     pub(super) reads: bool,
     pub(super) declared: Option<ValueType>,
-    /// The value is the only value of a variable, whose `type` may be given.
+    /// The value is the only value of its variable, so the variable may have a `type`.
     pub(super) alone: bool,
 }
 

@@ -26,7 +26,7 @@ use crate::tree::Place;
 /// Maximum number of variables of one document.
 const MAX_VARIABLES: usize = 100_000;
 
-/// WriterGroupId of nodes of namespace 0, whose own index is the null value: the highest number,
+/// WriterGroupId of nodes of namespace 0, because index 0 is the null value: the highest number,
 /// which no server uses as an index.
 pub(super) const NAMESPACE_ZERO: NonZeroU16 = NonZeroU16::MAX;
 
