@@ -8,8 +8,8 @@ use crate::key_text::without_keys;
 use crate::secret::masked;
 use crate::topic::SpaceId;
 
-/// A finding. Its `Display` is one line without the source: `error[M003]: <message>
-/// (cell.yaml:14:3)`.
+/// A finding. Its `Display` is a line without the source:
+/// `error[M003]: <message> (cell.yaml:14:3)`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Diagnostic {
     /// Kind of the finding; stable from release to release.

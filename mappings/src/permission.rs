@@ -7,7 +7,7 @@ pub enum Role {
     Observer,
     /// Runs the cell: reads, writes and calls.
     Operator,
-    /// Sets the cell up.
+    /// Configures the cell.
     Engineer,
     /// Administers permissions.
     SecurityAdmin,

@@ -53,7 +53,7 @@ pub enum Answer {
 pub struct History {
     /// Number of values of each variable without a number of its own.
     pub values: u16,
-    /// Bytes of all of them together.
+    /// Bytes of all values together.
     pub bytes: usize,
 }
 

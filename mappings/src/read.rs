@@ -330,7 +330,7 @@ macro_rules! document {
     )*};
 }
 
-/// One of a few words.
+/// An enumeration of keywords.
 macro_rules! choice {
     ($($(#[$meta:meta])* enum $name:ident { $($(#[$variant_meta:meta])* $variant:ident = $word:literal,)* })*) => {$(
         #[derive(Clone, Copy, Debug, PartialEq, Eq, schemars::JsonSchema)]

@@ -8,9 +8,9 @@ are cancelled; odd orders refuse a cancel. Order 110 succeeds although it was ca
 
 `call` executes lines of standard input: `send ORDER`, `cancel N`, `cancel_all`, `cancel_unknown`,
 `cancel_until N`, `result N`, `result_unknown`, and `back` and `gone`, which wait for a server or
-its loss, with N counting goals from 0. It requests results by itself only with --results. `accepts
-N` sends N goals of order 0, each after the previous goal was accepted, and prints how long each
-acceptance took.
+its loss, with N counting goals from 0. It requests results by itself only with --results.
+`accepts N` sends N goals of order 0, each after the previous goal was accepted, and prints how long
+each acceptance took.
 
 Both roles also execute `node NAME`, which prints the actions of a node; `action NAME`, the
 endpoints of an action; `participants`, the number of processes; `watch`, which prints each status
