@@ -1,5 +1,4 @@
-"""Defines the requests and responses in the tests of calls, the same for peers of ROS 1 and of ROS
-2.
+"""Defines the requests and responses in the tests of calls, for peers of ROS 1 and of ROS 2.
 
 A case fills the request with a number, makes its response, and checks that a response belongs to
 the number.

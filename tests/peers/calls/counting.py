@@ -1,5 +1,4 @@
-"""Counts for executing peers how often each request was executed, and sets how long each execution
-takes."""
+"""Counts how often a peer executes each request, and delays each execution."""
 
 import collections
 import json
