@@ -1,15 +1,16 @@
-//! A DDS participant that does nothing but announce itself, and hears what it is asked for: what peers drop can be seen.
+//! A DDS participant that only announces itself and records the ACKNACKs sent to it, so that tests
+//! see which peers drop it.
 
 use std::net::UdpSocket;
 use std::time::{Duration, Instant};
 
-/// A participant of domain 2 on this host, which counts as gone after a second of silence.
+/// A participant of domain 2 on this host with a lease of one second.
 pub struct Announcer {
     socket: UdpSocket,
 }
 
 impl Announcer {
-    /// Opens its socket.
+    /// Opens the participant's socket.
     ///
     /// # Panics
     /// When that fails.
@@ -40,9 +41,9 @@ impl Announcer {
             (0x50, &guid),
             (0x32, &locator),
             (0x31, &locator),
-            // The lease: seconds and a fraction.
+            // The lease duration: seconds and a fraction.
             (0x02, &[1, 0, 0, 0, 0, 0, 0, 0]),
-            // It has readers and writers of announcements.
+            // The available builtin endpoints: readers and writers of announcements.
             (0x58, &[0x3f, 0, 0, 0]),
         ];
         let mut payload = vec![0, 3, 0, 0];
@@ -64,7 +65,8 @@ impl Announcer {
         self.socket.send_to(&datagram, FIRST_OF_DOMAIN_2).unwrap();
     }
 
-    /// The counts of the ACKNACKs by which its writers are asked for, as they come, until `enough` says so or the time is over.
+    /// Returns the counts of the ACKNACKs sent to this participant's writers, in their order, until
+    /// `enough` accepts them or `time` is over.
     ///
     /// # Panics
     /// When the socket fails.
@@ -81,7 +83,7 @@ impl Announcer {
     }
 }
 
-/// The counts of the ACKNACKs for the writer of announcements of writers (RTPS 2.5, 9.4.5.3).
+/// Returns the counts of the ACKNACKs for the writer of publications (RTPS 2.5, 9.4.5.3).
 fn acknacks(datagram: &[u8]) -> Vec<i32> {
     const ACKNACK: u8 = 0x06;
     const PUBLICATIONS_WRITER: &[u8] = &[0, 0, 3, 0xc2];
@@ -100,6 +102,7 @@ fn acknacks(datagram: &[u8]) -> Vec<i32> {
 }
 
 const PREFIX: &[u8; 12] = b"\x01\x0fannouncer.";
-/// Where the first participant on a host hears announcements to it alone (RTPS 2.5, 9.6.2.3).
+/// The unicast address at which the first participant on a host receives announcements (RTPS 2.5,
+/// 9.6.2.3).
 const FIRST_OF_DOMAIN_2: &str = "127.0.0.1:7910";
 const POLL: Duration = Duration::from_millis(20);

@@ -1,8 +1,9 @@
-//! Who may not know what: the dependency rules of the workspace, read from `cargo tree`.
+//! The dependency rules of the workspace, checked with `cargo tree`.
 
 use std::process::Command;
 
-/// The crates `package` reaches through normal dependencies, its own name included, as `cargo tree` prints them.
+/// Returns the crates that `package` reaches through normal dependencies, its own name included, as
+/// `cargo tree` prints them.
 ///
 /// # Panics
 /// When cargo does not answer.
@@ -22,8 +23,8 @@ pub fn tree(package: &str) -> String {
     String::from_utf8(output.stdout).unwrap()
 }
 
-/// The crates of `tree` that stand in `banned`, each once and sorted. A banned name ending in `*` stands for all
-/// crates that begin so.
+/// Returns the crates of `tree` that are in `banned`, each once and sorted. A banned name ending in
+/// `*` stands for all crates with this prefix.
 #[must_use]
 pub fn forbidden(tree: &str, banned: &[&str]) -> Vec<String> {
     let mut found: Vec<String> = tree

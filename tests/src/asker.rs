@@ -1,4 +1,4 @@
-//! Peers that ask for calls many times, or execute them and count.
+//! Peers that call services and methods many times, and peers that execute calls and count them.
 
 use std::time::Duration;
 
@@ -7,19 +7,19 @@ use serde_json::{Value, json};
 use crate::cell::{ROSCPP, compiled};
 use crate::{Cell, Child, Distribution, SERVER_ENDPOINT, Started, program};
 
-/// More than the longest order of a test takes.
+/// The timeout of an order, longer than the longest order of a test takes.
 const PATIENCE: Duration = Duration::from_secs(90);
 
-/// `peers/calls/ros1_asker.py` or another that takes the same orders.
+/// A caller: `peers/calls/ros1_asker.py` or another script that takes the same orders.
 pub struct Asker {
     peer: Child,
     asked: u64,
 }
 
-/// `peers/calls/ros1_executor.py` or another that answers as it does.
+/// An executor that counts: `peers/calls/ros1_executor.py` or another script with the same answers.
 pub struct Counting(Child);
 
-/// Who asks for calls, of those in `peers/calls`.
+/// The kinds of callers in `peers/calls`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Asking {
     /// A rospy client.
@@ -38,7 +38,7 @@ pub enum Asking {
     UaSpace,
 }
 
-/// A type that programs know from files only.
+/// A type that programs know from files only, as its request and its response.
 const BASIC_TYPES: &str = "\
 bool bool_value
 byte byte_value
@@ -55,7 +55,7 @@ int64 int64_value
 uint64 uint64_value
 string string_value
 ";
-/// The same, with an array of messages in its response.
+/// A service type that programs know from files only, with an array of messages in its response.
 const STATES: [(&str, &str); 2] = [
     (
         "srv/GetAvailableStates.srv",
@@ -65,8 +65,8 @@ const STATES: [(&str, &str); 2] = [
 ];
 
 impl Cell {
-    /// A mapping for the bridge of `space`, 1 or 2, that has nothing but the definitions of the cases `files` and `messages`, and
-    /// `more`. Gives its path.
+    /// Writes a mapping for the bridge of `space`, 1 or 2, with the definitions of the cases
+    /// `files` and `messages` and the text `more`. Returns its path.
     ///
     /// # Panics
     /// When it cannot be written.
@@ -79,14 +79,15 @@ impl Cell {
         path.to_str().unwrap().to_owned()
     }
 
-    /// The definitions of those cases as the ROS of `space`, 1 or 2, has them; the name of their folder.
+    /// Writes the definitions of the cases `files` and `messages` for the ROS of `space`, 1 or 2.
+    /// Returns the name of their folder.
     ///
     /// # Panics
     /// When they cannot be written.
     #[must_use]
     pub fn call_types(&self, space: u16) -> &'static str {
         let (name, basic) = if space == 1 {
-            // What ROS 2 calls a byte is an int8 under that name in ROS 1.
+            // The type `byte` of ROS 2 is a uint8; in ROS 1, `byte` is an alias of int8.
             ("ros1", BASIC_TYPES.replace("byte ", "uint8 "))
         } else {
             ("ros2", BASIC_TYPES.to_owned())
@@ -102,7 +103,7 @@ impl Cell {
         name
     }
 
-    /// Those who ask, which start beside each other.
+    /// Starts these callers in parallel.
     #[must_use]
     pub fn askers(&self, askers: &[Asking]) -> Vec<Asker> {
         let started = askers.iter().map(|of| self.asker_started(*of).told());
@@ -129,14 +130,14 @@ impl Cell {
         }
     }
 
-    /// The roscpp peer, not started yet.
+    /// Returns the roscpp peer, not started yet.
     #[must_use]
     pub fn roscpp_started(&self, args: &[&str]) -> Started {
         self.with_ros1(Started::new(ROSCPP, &compiled(ROSCPP)))
             .args(args)
     }
 
-    /// A rospy client of the cases in `peers/calls/cases.py`.
+    /// Starts a rospy client of the cases in `peers/calls/cases.py`.
     #[must_use]
     pub fn rospy_asker(&self) -> Asker {
         Asker::of(
@@ -146,21 +147,21 @@ impl Cell {
         )
     }
 
-    /// An rclpy client of the same cases.
+    /// Starts an rclpy client of the cases in `peers/calls/cases.py`.
     #[must_use]
     pub fn rclpy_asker(&self, distribution: Distribution) -> Asker {
         let peer = self.rclpy_started(distribution, "calls/ros2_asker.py", &[]);
         Asker::of(peer.told().start())
     }
 
-    /// A rospy server of services, each `CASE=/name`, with options.
+    /// Starts a rospy server of services, each `CASE=/name`, with options.
     #[must_use]
     pub fn rospy_executor(&self, args: &[&str]) -> Counting {
         let peer = self.rospy_started("calls/ros1_executor.py", args);
         Counting(peer.told().start().ready(PATIENCE))
     }
 
-    /// Peers that execute, which start beside each other.
+    /// Starts these executors in parallel.
     #[must_use]
     pub fn executors(&self, started: impl IntoIterator<Item = Started>) -> Vec<Counting> {
         let started = started.into_iter().map(|started| started.told().start());
@@ -169,7 +170,7 @@ impl Cell {
         ready.map(Counting).collect()
     }
 
-    /// An rclpy server of services, each `CASE=/name`, with options.
+    /// Starts an rclpy server of services, each `CASE=/name`, with options.
     #[must_use]
     pub fn rclpy_executor(&self, distribution: Distribution, args: &[&str]) -> Counting {
         let peer = self.rclpy_started(distribution, "calls/ros2_executor.py", args);
@@ -202,14 +203,15 @@ impl Asker {
         }
     }
 
-    /// Begins to ask, see `peers/calls/ros2_asker.py`, for [`Self::told`].
+    /// Sends an order to the caller, see `peers/calls/ros2_asker.py`. [`Self::told`] returns its
+    /// result.
     pub fn begin(&mut self, mut order: Value) {
         self.asked += 1;
         order["id"] = json!(self.asked);
         self.peer.tell(&order.to_string());
     }
 
-    /// What became of the order begun last: `right`, `wrongs` and `failures` are numbers of calls.
+    /// Returns the result of the last order: `right`, `wrongs` and `failures` are numbers of calls.
     ///
     /// # Panics
     /// When it does not end in time.
@@ -221,7 +223,7 @@ impl Asker {
             })
     }
 
-    /// Both of these.
+    /// Sends an order and returns its result.
     ///
     /// # Panics
     /// As [`Self::told`].
@@ -230,14 +232,15 @@ impl Asker {
         self.told()
     }
 
-    /// The process.
+    /// Returns the process.
     pub const fn child(&mut self) -> &mut Child {
         &mut self.peer
     }
 }
 
 impl Counting {
-    /// What it has executed: `executed`, how many `different` requests, which `twice`, `most` and `running` at a time.
+    /// Returns the executor's counts: `executed`, the number of `different` requests, the requests
+    /// executed `twice`, and the `most` and `running` calls at a time.
     ///
     /// # Panics
     /// When it does not say so in time.
@@ -245,7 +248,7 @@ impl Counting {
         self.0.ask("counts", PATIENCE)
     }
 
-    /// Has all that it executes end at once.
+    /// Ends all running calls at once.
     ///
     /// # Panics
     /// As [`Self::counts`].
@@ -253,7 +256,7 @@ impl Counting {
         self.0.ask("end", PATIENCE);
     }
 
-    /// The process.
+    /// Returns the process.
     pub const fn child(&mut self) -> &mut Child {
         &mut self.0
     }

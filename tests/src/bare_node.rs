@@ -1,4 +1,5 @@
-//! The ends of ROS 1 paths by hand, with blocking sockets: no library, of ours or others', in what is measured.
+//! The ends of ROS 1 paths with blocking sockets, without any ROS library that would count in a
+//! measurement.
 
 use std::{
     collections::HashMap,
@@ -18,7 +19,7 @@ pub struct BareNode {
 }
 
 impl BareNode {
-    /// Opens the node's two ports. The name is resolved, such as `/bench`.
+    /// Opens the node's two ports. `name` is a resolved name, such as `/bench`.
     ///
     /// # Panics
     /// When no port can be opened.
@@ -30,7 +31,8 @@ impl BareNode {
         let node = name.to_owned();
         std::thread::spawn(move || {
             while let Ok((stream, _)) = data.accept() {
-                // A peer that has gone again comes back by itself; and nobody may be waiting any more.
+                // A peer that closed its connection reconnects by itself. The receiver of the
+                // channel may have been dropped.
                 if let Ok(subscriber) = welcome(stream, &node)
                     && found.send(subscriber).is_err()
                 {
@@ -45,7 +47,8 @@ impl BareNode {
         }
     }
 
-    /// Registers the topics, waits until each has a subscriber, and gives their connections in the same order.
+    /// Registers the topics, waits until each has a subscriber, and returns their connections in
+    /// the same order.
     ///
     /// # Panics
     /// When a topic has none in time.
@@ -70,7 +73,8 @@ impl BareNode {
         in_order.collect()
     }
 
-    /// Connects to the first publisher of a topic, or `None` while the master knows of none.
+    /// Connects to the first publisher of a topic. Returns `None` while the master knows no
+    /// publisher.
     pub fn subscribe(&self, topic: &str) -> Option<BareSubscription> {
         let reply = self.register("registerSubscriber", topic)?;
         let (_, uri) = reply.split_once("http://")?;
@@ -123,7 +127,7 @@ impl BareSubscription {
         this
     }
 
-    /// Changes how long `receive` waits.
+    /// Sets the timeout of `receive`.
     ///
     /// # Panics
     /// When the system does not take it.
@@ -142,7 +146,7 @@ impl BareSubscription {
         self.stream.get_ref().set_read_timeout(None).unwrap();
     }
 
-    /// The next message: a frame without its length.
+    /// Returns the next message: a frame without its length.
     ///
     /// # Errors
     /// When none comes in time, and when the connection has ended.
@@ -150,7 +154,7 @@ impl BareSubscription {
         self.receive_frame().map(|frame| &frame[4..])
     }
 
-    /// The next frame as it came, its length first.
+    /// Returns the next frame as received, its length first.
     ///
     /// # Errors
     /// As [`Self::receive`].
@@ -168,7 +172,7 @@ impl BareSubscription {
     }
 }
 
-/// One frame with a `std_msgs/String` in it.
+/// Returns a frame with a `std_msgs/String`.
 ///
 /// # Panics
 /// When the text is longer than 4 GiB.
@@ -181,7 +185,7 @@ pub fn string_frame(text: &str) -> Vec<u8> {
     frame
 }
 
-/// Shakes hands with a subscriber, which may ask for any type.
+/// Does the TCPROS handshake with a subscriber, which may ask for any type.
 fn welcome(mut stream: TcpStream, node: &str) -> io::Result<(String, TcpStream)> {
     stream.set_nodelay(true)?;
     stream.set_read_timeout(Some(PATIENCE))?;
@@ -212,7 +216,7 @@ fn connection_header(fields: &[(&str, &str)]) -> Vec<u8> {
     [&length(&header)[..], &header].concat()
 }
 
-/// The value of one field of a connection header.
+/// Returns the value of a field of a connection header.
 fn field<'a>(mut header: &'a [u8], name: &str) -> Option<&'a str> {
     while let Some((length, rest)) = header.split_first_chunk::<4>() {
         let length = usize::try_from(u32::from_le_bytes(*length)).ok()?;
@@ -225,7 +229,7 @@ fn field<'a>(mut header: &'a [u8], name: &str) -> Option<&'a str> {
     None
 }
 
-/// Answers the calls a node gets: where its data is, and yes to all else.
+/// Serves the node's slave API: `requestTopic` returns the data port, and all other calls succeed.
 fn serve_slave_api(data_port: u16) -> String {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let uri = format!("http://{}/", listener.local_addr().unwrap());
@@ -249,7 +253,7 @@ fn serve_slave_api(data_port: u16) -> String {
                 "HTTP/1.1 200 OK\r\nContent-Type: text/xml\r\nConnection: close\r\nContent-Length: {}\r\n\r\n{body}",
                 body.len()
             );
-            // A caller that has gone will call again.
+            // A caller that closed its connection calls again.
             drop(stream.write_all(answer.as_bytes()));
         }
     });
@@ -278,9 +282,9 @@ fn integers(xml: &str) -> impl Iterator<Item = u16> + '_ {
         .filter_map(|part| part.trim().parse().ok())
 }
 
-/// A message that takes longer is lost.
+/// The timeout of connections. A message that takes longer is lost.
 pub const PATIENCE: Duration = Duration::from_secs(2);
-/// Python and a ROS graph on a busy machine need seconds to come up.
+/// The time that Python and a ROS graph need to start on a busy machine.
 const START: Duration = Duration::from_secs(30);
-/// A read takes what is there, up to here; what a longer message still lacks is read in place, without a copy.
+/// The size of the read buffer. The rest of a longer message is read in place, without a copy.
 const READ_AT_ONCE: usize = 4 * 1024;

@@ -1,4 +1,5 @@
-//! Captures of UADP datagrams, and what Wireshark shows of them with the dissector of this project.
+//! Captures of UADP datagrams, and their dissection by Wireshark with the dissector of this
+//! project.
 
 use std::{fmt::Write as _, fs, process::Command};
 
@@ -8,23 +9,24 @@ use crate::{Cell, GROUP, cell::TSHARK};
 
 const DISSECTOR: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/wireshark/uadp.lua");
 
-/// A capture file in the classic pcap format: IPv4 packets, one UDP datagram each, a millisecond apart.
+/// A capture file in the classic pcap format: IPv4 packets with a UDP datagram each, a millisecond
+/// apart.
 #[derive(Debug, Clone)]
 pub struct Capture {
     port: u16,
-    /// Each with how many of its bytes were captured.
+    /// The datagrams, each with the number of its captured bytes.
     datagrams: Vec<(Vec<u8>, usize)>,
 }
 
 impl Capture {
-    /// A capture of these datagrams, sent to [`GROUP`].
+    /// Returns a capture of these datagrams, sent to [`GROUP`].
     #[must_use]
     pub fn of<D: Into<Vec<u8>>>(datagrams: impl IntoIterator<Item = D>) -> Self {
         Self::cut(datagrams.into_iter().map(|datagram| (datagram, usize::MAX)))
     }
 
-    /// A capture of these datagrams, sent to [`GROUP`], with so many bytes of each and the rest cut off by whoever
-    /// captured.
+    /// Returns a capture of these datagrams, sent to [`GROUP`], each cut off after the given number
+    /// of bytes.
     #[must_use]
     pub fn cut<D: Into<Vec<u8>>>(datagrams: impl IntoIterator<Item = (D, usize)>) -> Self {
         Self {
@@ -36,7 +38,7 @@ impl Capture {
         }
     }
 
-    /// The same, sent to another port.
+    /// Changes the destination port of the datagrams.
     #[must_use]
     pub fn to_port(mut self, port: u16) -> Self {
         self.port = port;
@@ -62,7 +64,7 @@ impl Capture {
         out
     }
 
-    /// IPv4 and UDP headers, without checksums, and the datagram.
+    /// Returns the IPv4 and UDP headers, without checksums, and the datagram.
     fn packet(&self, datagram: &[u8]) -> Vec<u8> {
         let length = |headers: usize| u16::try_from(datagram.len() + headers).unwrap();
         let mut packet = vec![0x45, 0];
@@ -78,15 +80,15 @@ impl Capture {
     }
 }
 
-/// Packets that start with their IP header.
+/// The link type of packets that start with their IP header.
 const LINKTYPE_RAW: u32 = 101;
 const HEADERS: usize = 28;
-/// Seconds since 1970 of the first packet.
+/// Time of the first packet, in seconds since 1970.
 const FIRST: u32 = 1_800_000_000;
 
 impl Cell {
-    /// What tshark shows of each datagram of a capture: the tree under `uadp`, empty where it took it for something
-    /// else. `args` come after those that are always needed.
+    /// Returns tshark's view of each datagram of a capture: the tree under `uadp`, which is empty
+    /// where tshark chose another dissector. `args` follow the arguments that are always needed.
     ///
     /// # Panics
     /// When tshark fails or says anything about Lua, which it does when the dissector has an error.
@@ -102,7 +104,8 @@ impl Cell {
             .collect()
     }
 
-    /// The Protocol and Info columns of each datagram of a capture, with a space between.
+    /// Returns the Protocol and Info columns of each datagram of a capture, with a space between
+    /// them.
     ///
     /// # Panics
     /// As for [`dissect`](Self::dissect).
@@ -114,7 +117,8 @@ impl Cell {
         output.lines().map(str::to_owned).collect()
     }
 
-    /// These fields of each datagram of a capture, with a tab between; several of one field with a comma.
+    /// Returns these fields of each datagram of a capture, separated by tabs; several values of a
+    /// field are separated by commas.
     ///
     /// # Panics
     /// As for [`dissect`](Self::dissect).
@@ -136,7 +140,7 @@ impl Cell {
             .arg(&path)
             .args(["-X", &format!("lua_script:{DISSECTOR}")])
             .args(args)
-            // Nothing that this machine's user has set up or installed takes part.
+            // The configuration of the machine's user and its plugins must not take part.
             .env("WIRESHARK_CONFIG_DIR", self.folder())
             .env("LC_ALL", "C.UTF-8")
             .env("TZ", "UTC")
@@ -151,19 +155,19 @@ impl Cell {
     }
 }
 
-/// What tshark shows of a datagram, or of a part of one.
+/// tshark's view of a datagram or of a part of it.
 #[derive(Debug, Clone)]
 pub struct Dissected(Value);
 
 impl Dissected {
-    /// The item of that name directly below this one.
+    /// Returns the item with this name directly below this item.
     #[must_use]
     pub fn child(&self, name: &str) -> Option<Self> {
         self.0.get(name).cloned().map(Self)
     }
 
-    /// The values of all fields of that name at any depth, in their order, as Wireshark writes them; an item that has
-    /// only others below it is an empty text.
+    /// Returns the values of all fields with this name at any depth, in order, as Wireshark writes
+    /// them. An item that has only child items is an empty text.
     #[must_use]
     pub fn all(&self, name: &str) -> Vec<String> {
         let text = |value: &Value| match value {
@@ -174,7 +178,7 @@ impl Dissected {
         found(&self.0, name).into_iter().map(text).collect()
     }
 
-    /// The value of the field of that name, `None` without one.
+    /// Returns the value of the field with this name, or `None` without such a field.
     ///
     /// # Panics
     /// When there are several.
@@ -185,19 +189,19 @@ impl Dissected {
         all.pop()
     }
 
-    /// Whether a field of that name is there.
+    /// Returns whether there is a field with this name.
     #[must_use]
     pub fn has(&self, name: &str) -> bool {
         !found(&self.0, name).is_empty()
     }
 
-    /// Whether the one field of that name is there and a Boolean that is true.
+    /// Returns whether there is a single field with this name, a Boolean that is true.
     #[must_use]
     pub fn is_set(&self, name: &str) -> bool {
         self.one(name).is_some_and(|value| is_true(&value))
     }
 
-    /// The items of that name, each with what stands below it.
+    /// Returns the items with this name, each with its child items.
     #[must_use]
     pub fn parts(&self, name: &str) -> Vec<Self> {
         found(&self.0, name)
@@ -206,20 +210,20 @@ impl Dissected {
             .collect()
     }
 
-    /// What the dissector found wrong, each as "At byte 12: why".
+    /// Returns the errors that the dissector reports, each as "At byte 12: why".
     #[must_use]
     pub fn expert_infos(&self) -> Vec<String> {
         self.all("_ws.expert.message")
     }
 }
 
-/// Wireshark writes a Boolean in different ways from version to version.
+/// Returns whether a Boolean is true; its form differs between versions of Wireshark.
 #[must_use]
 pub fn is_true(value: &str) -> bool {
     matches!(value, "1" | "true" | "True")
 }
 
-/// Bytes as Wireshark writes them.
+/// Returns bytes as Wireshark writes them.
 #[must_use]
 pub fn hex(bytes: &[u8]) -> String {
     let mut out = String::new();

@@ -1,4 +1,4 @@
-//! A network of its own for each test.
+//! A separate network for each test.
 
 use std::{
     env, fs,
@@ -16,7 +16,7 @@ use nix::{
     sched::{CloneFlags, unshare},
 };
 
-/// Software of other makers that a test needs.
+/// Third-party software that a test needs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Peer {
     /// rosmaster, rospy and roscpp's `topic_tools`, from Debian or Ubuntu.
@@ -29,7 +29,8 @@ pub enum Peer {
     CycloneC,
     /// roscpp from Debian or Ubuntu, in a program that `cargo xtask test` compiles.
     Roscpp,
-    /// rclpy over Fast DDS, of each [`Distribution`], in the Python environments that `cargo xtask test` makes.
+    /// rclpy over Fast DDS, of each [`Distribution`], in Python environments that `cargo xtask
+    /// test` makes.
     Ros2,
     /// node-opcua, which `cargo xtask test` installs from npm.
     NodeOpcua,
@@ -39,7 +40,7 @@ pub enum Peer {
     Tshark,
 }
 
-/// A distribution of ROS 2 that is there as a peer.
+/// A distribution of ROS 2 that is available as a peer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Distribution {
     /// Jazzy Jalisco, over Fast DDS 2.14.
@@ -49,16 +50,16 @@ pub enum Distribution {
 }
 
 impl Distribution {
-    /// All of them.
+    /// All distributions.
     pub const ALL: [Self; 2] = [Self::Jazzy, Self::Kilted];
 
-    /// Where the files of a package are, such as its definitions.
+    /// Returns the folder with the files of a package, such as its definitions.
     #[must_use]
     pub fn share(self, package: &str) -> PathBuf {
         self.prefix().join("share").join(package)
     }
 
-    /// Its Python interpreter, with rclpy.
+    /// Returns the Python interpreter with rclpy.
     #[must_use]
     pub fn python(self) -> PathBuf {
         self.prefix().join("bin/python")
@@ -72,10 +73,12 @@ impl Distribution {
     }
 }
 
-/// A network namespace with nothing in it but a loopback that carries multicast, and a folder for files.
+/// A network namespace with only a loopback interface that carries multicast, and a folder for
+/// files.
 ///
-/// Processes have to be started from the thread that made it: the namespace is the thread's. There is one at a time,
-/// since peers that start side by side on a small machine take each other's time.
+/// Processes have to be started from the thread that made the cell, because the namespace belongs
+/// to the thread. Only a single cell exists at a time: peers that start in parallel on a small
+/// machine slow each other down.
 pub struct Cell {
     folder: PathBuf,
     pub(crate) python: PathBuf,
@@ -93,7 +96,7 @@ pub(crate) const CLOCK: &str = "clock-shift.so";
 pub(crate) const NODE_OPCUA: &str = "node-opcua";
 
 impl Cell {
-    /// Puts this thread into a new network, or says why the test is skipped and gives `None`.
+    /// Puts this thread into a new network, or logs why the test is skipped and returns `None`.
     ///
     /// # Panics
     /// When a peer is missing and `CI=true`, and when this process may not make network namespaces.
@@ -123,7 +126,8 @@ impl Cell {
 
     fn enter(python: PathBuf) -> Self {
         static COUNT: AtomicU32 = AtomicU32::new(0);
-        // A test that failed with the lock has left nothing behind that the next one could trip over.
+        // A test that failed while it held the lock leaves nothing behind that disturbs the next
+        // test.
         let only = ONLY.lock().unwrap_or_else(PoisonError::into_inner);
         let parts = CloneFlags::CLONE_NEWNET | CloneFlags::CLONE_NEWNS;
         if let Err(error) = unshare(parts).and_then(|()| own_shared_memory()) {
@@ -149,13 +153,13 @@ impl Cell {
         }
     }
 
-    /// A folder of this test, removed when it passes.
+    /// Returns the folder of this test, which is removed when the test passes.
     #[must_use]
     pub fn folder(&self) -> &Path {
         &self.folder
     }
 
-    /// Writes a file into the folder and gives its path.
+    /// Writes a file into the folder and returns its path.
     ///
     /// # Panics
     /// When that fails.
@@ -177,8 +181,8 @@ impl Drop for Cell {
     }
 }
 
-/// Fast DDS passes samples through files there, whose names are those of its ports: tests that run beside each other
-/// would hear one another.
+/// Mounts a separate `/dev/shm`. Fast DDS passes samples through files there that are named after
+/// its ports, so tests that run in parallel would receive each other's samples.
 fn own_shared_memory() -> nix::Result<()> {
     const NOTHING: Option<&str> = None;
     mount(
@@ -217,7 +221,7 @@ fn python() -> PathBuf {
     )
 }
 
-/// Where the peers are that `cargo xtask test` compiles, or installs beside them.
+/// Returns the path of a peer that `cargo xtask test` compiles or installs.
 pub(crate) fn compiled(name: &str) -> PathBuf {
     env::var_os("UA_PEERS")
         .map_or_else(

@@ -1,4 +1,4 @@
-//! Processes a test starts, what they print, and their end.
+//! Processes that a test starts, their output, and their end.
 
 use std::{
     fmt,
@@ -18,10 +18,11 @@ use serde_json::Value;
 
 use crate::{Cable, Host, Site};
 
-/// How long a process has between the signal that asks it to end and the one that makes it. A bridge
-/// waits 5 s for pending cancellations; the rest is for a loaded machine.
+/// Time between the signal that asks a process to end and SIGKILL. A bridge waits 5 s for pending
+/// cancellations; the rest is for a loaded machine.
 const GRACE: Duration = Duration::from_secs(10);
-/// Lines kept per process. What comes after them is read and counted, so that the process never blocks on its pipe.
+/// Lines kept per process. Later lines are read and counted only, so that the process never blocks
+/// on its pipe.
 const KEPT: usize = 200_000;
 /// Lines shown when a test fails.
 const SHOWN: usize = 60;
@@ -35,10 +36,11 @@ pub struct Started {
 }
 
 impl Started {
-    /// `program` under the name the messages of a failing test call it by.
+    /// Creates a process that runs `program`; `name` is its name in messages of a failing test.
     #[must_use]
     pub fn new(name: &str, program: &Path) -> Self {
-        // The kernel ends the process with the thread that started it: a test that is killed leaves nothing behind.
+        // The kernel ends the process together with the thread that started it, so a killed test
+        // leaves no processes behind.
         let mut command = Command::new("setpriv");
         command.args(["--pdeathsig", "KILL", "--"]).arg(program);
         Self {
@@ -49,54 +51,55 @@ impl Started {
         }
     }
 
-    /// More arguments.
+    /// Adds arguments.
     #[must_use]
     pub fn args<S: AsRef<std::ffi::OsStr>>(mut self, args: impl IntoIterator<Item = S>) -> Self {
         self.command.args(args);
         self
     }
 
-    /// One variable of the process's environment.
+    /// Sets a variable of the process's environment.
     #[must_use]
     pub fn env(mut self, key: &str, value: impl AsRef<std::ffi::OsStr>) -> Self {
         self.command.env(key, value);
         self
     }
 
-    /// The process works in that folder.
+    /// Sets the working folder of the process.
     #[must_use]
     pub fn in_folder(mut self, folder: &Path) -> Self {
         self.command.current_dir(folder);
         self
     }
 
-    /// The signal that ends the process in order, where that is not SIGTERM.
+    /// Sets the signal that ends the process in order, if it is not SIGTERM.
     #[must_use]
     pub fn ends_on(mut self, signal: Signal) -> Self {
         self.ends_on = signal;
         self
     }
 
-    /// The process runs on that host instead of the cell's.
+    /// Runs the process on `host` instead of the cell's host.
     #[must_use]
     pub fn on(self, host: &Host) -> Self {
         self.in_network(&host.path())
     }
 
-    /// The process runs at the far end of that cable instead of on the cell's host.
+    /// Runs the process at the far end of `cable` instead of on the cell's host.
     #[must_use]
     pub fn beyond(self, cable: &Cable) -> Self {
         self.in_network(&cable.path())
     }
 
-    /// The process runs at that site instead of the cell's.
+    /// Runs the process at `site` instead of on the cell's host.
     #[must_use]
     pub fn at(self, site: &Site) -> Self {
         self.in_network(&site.path())
     }
 
     fn in_network(mut self, path: &Path) -> Self {
-        // It becomes setpriv, which becomes the program: one process, with one id.
+        // nsenter replaces itself with setpriv, and setpriv with the program: a single process with
+        // the same id.
         let mut command = Command::new("nsenter");
         command
             .arg(format!("--net={}", path.display()))
@@ -112,7 +115,7 @@ impl Started {
         self
     }
 
-    /// The process has a standard input, for [`Child::tell`].
+    /// Gives the process a standard input, for [`Child::tell`].
     #[must_use]
     pub fn told(mut self) -> Self {
         self.told = true;
@@ -152,7 +155,8 @@ impl Started {
     }
 }
 
-/// A process of this test. Dropping it ends it; if the test is failing, its last lines are shown.
+/// A process of this test. Dropping it ends the process; if the test is failing, the last lines are
+/// printed.
 pub struct Child {
     name: String,
     process: std::process::Child,
@@ -162,7 +166,8 @@ pub struct Child {
 }
 
 impl Child {
-    /// The first line, of both streams, that contains `pattern`, whether printed before or after the call.
+    /// Returns the first line, of both streams, that contains `pattern`, whether printed before or
+    /// after the call.
     ///
     /// # Panics
     /// After `deadline`, or when the process ends without having printed one.
@@ -172,7 +177,7 @@ impl Child {
         })
     }
 
-    /// What `pick` makes of the first JSON line of standard output it does not answer `None` to.
+    /// Returns the first result of `pick` for the JSON lines of standard output that is not `None`.
     ///
     /// # Panics
     /// As [`Self::wait_for_line`].
@@ -187,7 +192,7 @@ impl Child {
         })
     }
 
-    /// Waits until the peer has said that it is ready.
+    /// Waits until the peer has reported that it is ready.
     ///
     /// # Panics
     /// As [`Self::wait_for_line`].
@@ -199,7 +204,8 @@ impl Child {
         self
     }
 
-    /// Tells the process a line and gives the JSON line it answers with, the first after those that are there.
+    /// Writes a line to the process and returns its answer: the first JSON line after the present
+    /// lines.
     ///
     /// # Panics
     /// As [`Self::wait_for_line`].
@@ -232,7 +238,8 @@ impl Child {
     ) -> T {
         let start = Instant::now();
         loop {
-            // Asked before the lines are read, so that the last lines of a process that has ended are seen.
+            // Checked before the lines are read, so that the last lines of an ended process are
+            // seen.
             let ended = self.process.try_wait().unwrap();
             if ended.is_some() {
                 self.join_readers();
@@ -266,21 +273,21 @@ impl Child {
         writeln!(input, "{line}").unwrap();
     }
 
-    /// All lines so far, of both streams.
+    /// Returns all lines so far, of both streams.
     #[must_use]
     pub fn lines(&self) -> Vec<String> {
         let lines = self.output.lines.lock().unwrap();
         lines.kept.iter().map(|line| line.text.clone()).collect()
     }
 
-    /// The JSON objects printed to standard output so far.
+    /// Returns the JSON objects printed to standard output so far.
     #[must_use]
     pub fn json_lines(&self) -> Vec<Value> {
         let lines = self.output.lines.lock().unwrap();
         lines.kept.iter().filter_map(Line::json).collect()
     }
 
-    /// The `value`s among the JSON lines so far: what a subscriber has heard.
+    /// Returns the `value`s of the JSON lines so far: the values that a subscriber received.
     #[must_use]
     pub fn values(&self) -> Vec<Value> {
         self.json_lines()
@@ -289,19 +296,19 @@ impl Child {
             .collect()
     }
 
-    /// Its process id.
+    /// Returns the process id.
     #[must_use]
     pub fn id(&self) -> u32 {
         self.process.id()
     }
 
-    /// Whether it still runs.
+    /// Returns whether the process is running.
     #[must_use]
     pub fn runs(&mut self) -> bool {
         self.process.try_wait().unwrap().is_none()
     }
 
-    /// Sends it a signal.
+    /// Sends the process a signal.
     ///
     /// # Panics
     /// When the process is gone.
@@ -309,7 +316,7 @@ impl Child {
         kill(self.pid(), signal).unwrap();
     }
 
-    /// Waits for its end.
+    /// Waits for the end of the process.
     ///
     /// # Panics
     /// After `deadline`.
@@ -322,7 +329,7 @@ impl Child {
         status
     }
 
-    /// Asks it to end as a user would and waits for that.
+    /// Ends the process with the signal a user would send, and waits for its end.
     ///
     /// # Panics
     /// When it has not ended in ten seconds.
@@ -341,7 +348,7 @@ impl Child {
         }
     }
 
-    /// Ends it without ever panicking: this runs while a test may be failing already.
+    /// Ends the process without a panic, because this also runs while a test is failing.
     fn put_away(&mut self) {
         let Ok(None) = self.process.try_wait() else {
             return;

@@ -1,4 +1,4 @@
-//! The wall clock of programs, which a test sets.
+//! The wall clock of programs, set by a test.
 
 use std::fs::File;
 use std::os::unix::fs::FileExt as _;
@@ -7,7 +7,7 @@ use std::path::PathBuf;
 use crate::cell::{CLOCK, Cell, compiled};
 use crate::child::Started;
 
-/// A wall clock that goes as the machine's, so much ahead of it or behind.
+/// A wall clock that runs at the speed of the machine's clock with an offset.
 #[derive(Debug)]
 pub struct WallClock {
     path: PathBuf,
@@ -15,7 +15,7 @@ pub struct WallClock {
 }
 
 impl Cell {
-    /// A clock that is right. Needs [`Peer::Clock`](crate::Peer::Clock).
+    /// Creates a clock without offset. Needs [`Peer::Clock`](crate::Peer::Clock).
     #[must_use]
     pub fn wall_clock(&self) -> WallClock {
         let path = self.file("clock", "\0\0\0\0\0\0\0\0");
@@ -25,7 +25,7 @@ impl Cell {
 }
 
 impl WallClock {
-    /// It jumps: so many seconds ahead from now on.
+    /// Sets the offset to `ahead` seconds; the clock jumps.
     pub fn set(&self, ahead: i64) {
         let shift = (ahead * 1_000_000_000).to_ne_bytes();
         self.file.write_all_at(&shift, 0).unwrap();
@@ -33,7 +33,7 @@ impl WallClock {
 }
 
 impl Started {
-    /// The process lives by that clock.
+    /// Runs the process with that clock.
     #[must_use]
     pub fn by(self, clock: &WallClock) -> Self {
         self.env("LD_PRELOAD", compiled(CLOCK))

@@ -1,4 +1,4 @@
-//! Somebody in the space who asks for a call, by the codec alone.
+//! A requestor of calls in a space, built on the codec alone.
 
 use std::net::{Ipv4Addr, SocketAddr, UdpSocket};
 use std::time::{Duration, Instant};
@@ -12,26 +12,27 @@ use uadp::{Extras, NetworkHeader, NetworkMessage, OwnedPublisherId};
 
 use crate::{GROUP, Triple, UadpSocket};
 
-/// Asks in the name of a space.
+/// A requestor with the PublisherId of a space.
 pub struct CodecAsker {
     socket: UadpSocket,
     requestor: Requestor,
     start: Instant,
 }
 
-/// How a call ended.
+/// The end of a call.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Ended {
-    /// Executed; the bytes of its fields.
+    /// Executed; the bytes of the response fields.
     Answered(Vec<u8>),
-    /// Not executed.
+    /// Refused without execution.
     Refused,
-    /// Nobody knows.
+    /// Unknown whether the call was executed.
     Unknown,
 }
 
 impl CodecAsker {
-    /// In the name of `space`. Those with the same `instance` send the same CorrelationData.
+    /// Creates a requestor for `space`. Requestors with the same `instance` send the same
+    /// CorrelationData.
     #[must_use]
     pub fn new(space: u16, instance: u8) -> Self {
         let id = OwnedPublisherId::UInt16(space);
@@ -42,7 +43,7 @@ impl CodecAsker {
         }
     }
 
-    /// Begins a call with fields as Variants, their count in front.
+    /// Starts a call with fields as Variants, preceded by their count.
     ///
     /// # Panics
     /// When it is not taken.
@@ -66,7 +67,7 @@ impl CodecAsker {
         self.requestor.call(request, self.start.elapsed()).unwrap()
     }
 
-    /// Sends and hears for one turn of 5 ms at most, and gives what has ended.
+    /// Sends and receives for a turn of at most 5 ms, and returns the calls that have ended.
     ///
     /// # Panics
     /// When the group cannot be used.
@@ -90,7 +91,7 @@ impl CodecAsker {
         ended
     }
 
-    /// Responses that were nobody's, or came too late.
+    /// Returns the number of dropped responses: unknown or late.
     #[must_use]
     pub const fn dropped(&self) -> u64 {
         self.requestor.counters().dropped
@@ -121,7 +122,8 @@ impl CodecAsker {
     }
 }
 
-/// Sends a datagram to the group from another loopback address than everybody else.
+/// Sends a datagram to the group from a loopback address that differs from the address of all other
+/// senders.
 ///
 /// # Panics
 /// When it does not leave.
@@ -133,5 +135,5 @@ pub fn send_from(address: Ipv4Addr, datagram: &[u8]) {
     socket.send_to(datagram, GROUP).unwrap();
 }
 
-/// How long it listens before it looks what is due.
+/// Time of listening between two checks for due work.
 const TURN: Duration = Duration::from_millis(5);

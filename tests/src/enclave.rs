@@ -1,4 +1,5 @@
-//! DDS Security: keystores as `ros2 security` lays them out, peers that are secured by them, and what is on the wire.
+//! DDS Security: keystores as `ros2 security` lays them out, secured peers, and the traffic on the
+//! wire.
 
 use std::{
     fs,
@@ -13,36 +14,38 @@ use socket2::{Domain, Protocol, Socket, Type};
 
 use crate::{Cell, GROUP, Host, Peer, Started, WIRE, peers::cyclone_uri, program};
 
-/// A keystore with one certificate authority for everything, and the enclaves `/bridge` and `/peer`, in which all may
+/// A keystore with a single certificate authority and the enclaves `/bridge` and `/peer`, which may
 /// read and write all topics of all domains.
 pub struct Keystore(PathBuf);
 
 const ENCLAVES: [&str; 2] = ["bridge", "peer"];
 
-/// How a domain is governed: kinds of protection as DDS Security names them, `NONE`, `SIGN`, `ENCRYPT` and, but for
-/// `data`, the last two with `_WITH_ORIGIN_AUTHENTICATION`.
+/// The governance of a domain. The kinds of protection have the names of DDS Security: `NONE`,
+/// `SIGN`, `ENCRYPT` and, except for `data`, the last two with `_WITH_ORIGIN_AUTHENTICATION`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Governance {
-    /// What tells of topics; `NONE` also leaves the topics' own out of the protected builtin ones.
+    /// Discovery of endpoints. With `NONE`, topics are also not announced by the protected builtin
+    /// endpoints.
     pub discovery: &'static str,
-    /// What tells that participants live; `NONE` as with `discovery`.
+    /// Liveliness of participants. `NONE` as with `discovery`.
     pub liveliness: &'static str,
-    /// Datagrams as a whole.
+    /// RTPS messages as a whole.
     pub rtps: &'static str,
     /// Submessages of the topics.
     pub metadata: &'static str,
-    /// What is in samples.
+    /// Payload of samples.
     pub data: &'static str,
 }
 
 impl Governance {
-    /// As by `ros2 security create_keystore`: all is encrypted, discovery too, and datagrams are signed as a whole.
+    /// The governance of `ros2 security create_keystore`: everything including discovery is
+    /// encrypted, and RTPS messages are signed as a whole.
     pub const SROS2: Self = Self {
         rtps: "SIGN",
         ..Self::all("ENCRYPT")
     };
 
-    /// One kind for everything.
+    /// Returns a governance with the same kind for everything.
     #[must_use]
     pub const fn all(kind: &'static str) -> Self {
         Self {
@@ -73,7 +76,7 @@ impl Governance {
 }
 
 impl Keystore {
-    /// Makes one in the cell's folder, its domain governed by [`Governance::SROS2`].
+    /// Creates a keystore in the cell's folder, with the domain governed by [`Governance::SROS2`].
     ///
     /// # Panics
     /// When `openssl` does not do it.
@@ -82,7 +85,8 @@ impl Keystore {
         let keystore = Self(cell.folder().join(name));
         fs::create_dir_all(&keystore.0).unwrap();
         keystore.key("ca.key.pem");
-        // As sros2 names it; two keystores have authorities of the same name and of different keys.
+        // The name that sros2 uses; the authorities of two keystores have the same name and
+        // different keys.
         keystore.openssl(
             "req -x509 -new -key ca.key.pem -sha256 -days 3650 -subj /CN=sros2CA \
              -addext basicConstraints=critical,CA:TRUE,pathlen:1 -out ca.cert.pem",
@@ -94,7 +98,7 @@ impl Keystore {
         keystore
     }
 
-    /// Governs the domain anew, for programs that start from now on.
+    /// Replaces the governance of the domain, for programs that start later.
     ///
     /// # Panics
     /// When `openssl` does not do it.
@@ -124,7 +128,7 @@ impl Keystore {
         }
     }
 
-    /// Makes the certificate of an enclave anew, for so many days from now.
+    /// Renews the certificate of an enclave, valid for `days` days from the present.
     ///
     /// # Panics
     /// When `openssl` does not do it.
@@ -135,19 +139,19 @@ impl Keystore {
         ));
     }
 
-    /// What `ROS_SECURITY_KEYSTORE` is set to.
+    /// Returns the value of `ROS_SECURITY_KEYSTORE`.
     #[must_use]
     pub fn path(&self) -> &Path {
         &self.0
     }
 
-    /// The folder of an enclave, given without the slash.
+    /// Returns the folder of an enclave; `name` has no leading slash.
     #[must_use]
     pub fn enclave(&self, name: &str) -> PathBuf {
         self.0.join("enclaves").join(name)
     }
 
-    /// A key as `ros2 security` makes them, which only its owner reads.
+    /// Creates a key as `ros2 security` does, readable by its owner only.
     fn key(&self, file: &str) {
         self.openssl(&format!(
             "genpkey -algorithm EC -pkeyopt ec_paramgen_curve:P-256 -out {file}"
@@ -176,7 +180,7 @@ impl Keystore {
     }
 }
 
-/// Whether bridge-ros2 was built with DDS Security.
+/// Returns whether bridge-ros2 was built with DDS Security.
 ///
 /// # Panics
 /// When it does not say so.
@@ -193,7 +197,8 @@ pub fn has_security() -> bool {
 }
 
 impl Cell {
-    /// As [`Self::with`], where bridge-ros2 was built with DDS Security.
+    /// Creates a cell as [`Self::with`], or skips the test if bridge-ros2 was built without DDS
+    /// Security.
     #[must_use]
     pub fn secured(peers: &[Peer]) -> Option<Self> {
         if !has_security() {
@@ -203,7 +208,8 @@ impl Cell {
         Self::with(peers)
     }
 
-    /// bridge-ros2 in domain 2 as the enclave `/bridge`, or not at all. Not started yet.
+    /// Returns bridge-ros2 in domain 2, which starts only as the enclave `/bridge`. Not started
+    /// yet.
     #[must_use]
     pub fn secured_bridge(&self, keystore: &Keystore, args: &[&str]) -> Started {
         self.bridge_ros2_started(args)
@@ -213,21 +219,21 @@ impl Cell {
             .env("ROS_SECURITY_KEYSTORE", keystore.path())
     }
 
-    /// The Cyclone DDS peer in C as the enclave `/peer`, not started yet.
+    /// Returns the Cyclone DDS peer in C as the enclave `/peer`, not started yet.
     #[must_use]
     pub fn secured_cyclone(&self, keystore: &Keystore, args: &[&str]) -> Started {
         let started = self.cyclone_c_started(args);
         Self::as_peer(started, keystore, &cyclone_uri("lo", ""))
     }
 
-    /// The same on another host.
+    /// Returns the Cyclone DDS peer in C as the enclave `/peer` on another host, not started yet.
     #[must_use]
     pub fn secured_cyclone_on(&self, host: &Host, keystore: &Keystore, args: &[&str]) -> Started {
         let started = host.cyclone_c_started(self, args);
         Self::as_peer(started, keystore, &cyclone_uri(WIRE, ""))
     }
 
-    /// With the enclave in the configuration.
+    /// Adds the enclave to the configuration.
     fn as_peer(started: Started, keystore: &Keystore, configuration: &str) -> Started {
         let folder = keystore.enclave("peer");
         let file = |name: &str| format!("file:{}", folder.join(name).display());
@@ -258,7 +264,7 @@ impl Cell {
         )
     }
 
-    /// The Fast DDS peer as the enclave `/peer`, not started yet.
+    /// Returns the Fast DDS peer as the enclave `/peer`, not started yet.
     #[must_use]
     pub fn secured_fastdds(&self, keystore: &Keystore, args: &[&str]) -> Started {
         self.fastdds_started(args)
@@ -266,7 +272,8 @@ impl Cell {
     }
 }
 
-/// Where Debian and Ubuntu put a plugin of Cyclone DDS, which its loader does not look into; else its bare name.
+/// Returns the path of a plugin of Cyclone DDS in the folder of Debian and Ubuntu, which the loader
+/// does not search; the bare name if there is no such file.
 fn plugin(name: &str) -> String {
     let folders = fs::read_dir("/usr/lib").into_iter().flatten().flatten();
     folders
@@ -275,11 +282,11 @@ fn plugin(name: &str) -> String {
         .map_or_else(|| name.to_owned(), |path| path.display().to_string())
 }
 
-/// Hears every UDP datagram of a cell but those of the UADP group.
+/// Captures every UDP datagram of a cell except the datagrams of the UADP group.
 pub struct Wiretap(Socket);
 
 impl Wiretap {
-    /// From now on.
+    /// Starts the capture.
     ///
     /// # Panics
     /// When the socket cannot be made.
@@ -293,7 +300,7 @@ impl Wiretap {
         Self(socket)
     }
 
-    /// What came since the last call: IPv4 packets.
+    /// Returns the IPv4 packets captured after the last call.
     ///
     /// # Panics
     /// When reading fails.

@@ -1,4 +1,4 @@
-//! Somebody in the space who executes a call, by the codec alone.
+//! A responder that executes a call in a space, built on the codec alone.
 
 use std::net::Ipv4Addr;
 use std::sync::Arc;
@@ -20,7 +20,8 @@ use uadp::{
 
 use crate::{Triple, UadpSocket};
 
-/// Announces a call that needs nothing and answers `success`, `message` and `run`, and executes it.
+/// Announces a call without inputs and with the outputs `success`, `message` and `run`, and
+/// executes it.
 pub struct Executor {
     stop: Arc<AtomicBool>,
     executed: Arc<AtomicU32>,
@@ -28,12 +29,13 @@ pub struct Executor {
     thread: Option<JoinHandle<()>>,
 }
 
-/// What an [`Executor`] makes of requests.
+/// The ways in which an [`Executor`] executes requests.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Executes {
-    /// Each is answered at once, its `message` being the name of the call and `run` how many there were.
+    /// Answers each request at once: `message` is the name of the call, and `run` the number of
+    /// requests so far.
     AtOnce,
-    /// None has an end.
+    /// Never ends an execution.
     Forever,
 }
 
@@ -43,7 +45,7 @@ struct Work {
     socket: UadpSocket,
     responder: Responder<()>,
     executes: Executes,
-    /// How often each datagram is heard and sent.
+    /// Number of times that each datagram is received and sent.
     copies: usize,
     executed: Arc<AtomicU32>,
     abandoned: Arc<AtomicU32>,
@@ -51,8 +53,8 @@ struct Work {
 }
 
 impl Executor {
-    /// Announces the call at once and every `ANNOUNCED_EVERY`, as long as this lives. With `copies` above 1 the network
-    /// doubles every datagram to it and of it.
+    /// Announces the call at once and every `ANNOUNCED_EVERY`, until this is dropped. With `copies`
+    /// above 1, every datagram in both directions is duplicated.
     #[must_use]
     pub fn start(triple: Triple, name: &str, executes: Executes, copies: usize) -> Self {
         let stop = Arc::<AtomicBool>::default();
@@ -78,19 +80,19 @@ impl Executor {
         }
     }
 
-    /// How many requests were executed, or begun.
+    /// Returns the number of requests that were executed or started.
     #[must_use]
     pub fn executed(&self) -> u32 {
         self.executed.load(Ordering::Relaxed)
     }
 
-    /// How many that were begun nobody wants any longer.
+    /// Returns the number of started requests that were abandoned by their requestors.
     #[must_use]
     pub fn abandoned(&self) -> u32 {
         self.abandoned.load(Ordering::Relaxed)
     }
 
-    /// Ends it in the middle of what it does, as a process that is killed: nothing of it is heard any more.
+    /// Stops the executor in the middle of its work, as a killed process: it sends nothing more.
     pub fn kill(self) {
         drop(self);
     }
@@ -142,7 +144,7 @@ impl Work {
             if !ours {
                 continue;
             }
-            // What it does not take, such as a response of its own, is none of its business.
+            // Messages that the responder does not take, such as its own responses, are ignored.
             match self.responder.handle_request(&request, (), now) {
                 Ok(Requested::Execute(execution)) => self.execute(execution, now),
                 Ok(Requested::Abandoned(_)) => {
@@ -226,7 +228,7 @@ impl Work {
     }
 }
 
-/// Between two announcements.
+/// Interval between two announcements.
 const ANNOUNCED_EVERY: Duration = Duration::from_millis(500);
-/// How long it listens before it looks what is due.
+/// Time of listening between two checks for due work.
 const TURN: Duration = Duration::from_millis(5);

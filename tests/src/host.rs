@@ -1,4 +1,5 @@
-//! A second host: a network of its own, joined to the cell's by a wire that can lose and delay.
+//! A second host: a separate network, joined to the cell's network by a wire that can lose and
+//! delay frames.
 
 mod wire;
 
@@ -18,14 +19,14 @@ pub use wire::Wire;
 
 use crate::{Cell, Started, UaSide, UadpSocket};
 
-/// The cell's end of the wire.
+/// The address of the cell's end of the wire.
 pub const HERE: &str = "10.77.0.1";
-/// The other host's end.
+/// The address of the other host's end.
 pub const THERE: &str = "10.77.0.2";
-/// What both ends are called.
+/// The interface name of both ends.
 pub const WIRE: &str = "wire0";
 
-/// The other host. Programs are started on it by [`Started::on`].
+/// The other host. [`Started::on`] starts programs on it.
 pub struct Host {
     namespace: Namespace,
     orders: Arc<Orders>,
@@ -33,7 +34,8 @@ pub struct Host {
 }
 
 impl Cell {
-    /// A second host at the end of a wire of MTU 1500 that carries multicast. The cell keeps its loopback beside it.
+    /// Creates a second host at the end of a wire with an MTU of 1500 that carries multicast. The
+    /// cell keeps its loopback.
     ///
     /// # Panics
     /// When the network cannot be made.
@@ -63,14 +65,15 @@ impl Cell {
     }
 }
 
-/// A second host at the end of a plain cable. Pulling it takes the interfaces of both ends away.
+/// A second host at the end of a plain cable. Pulling the cable removes the interfaces of both
+/// ends.
 pub struct Cable {
     here: Namespace,
     there: Namespace,
 }
 
 impl Cell {
-    /// A second host, with no cable to it yet.
+    /// Creates a second host without a cable to it.
     #[must_use]
     pub fn cable(&self) -> Cable {
         Cable {
@@ -81,7 +84,7 @@ impl Cell {
 }
 
 impl Cable {
-    /// Makes [`WIRE`] here, with that address, and its end there, with [`THERE`].
+    /// Creates [`WIRE`] on this host with `address`, and its end on the other host with [`THERE`].
     ///
     /// # Panics
     /// When it is there already.
@@ -105,7 +108,7 @@ impl Cable {
         self.here.ip(&["link", "delete", WIRE]);
     }
 
-    /// Takes the link down at its far end: nothing crosses, and the addresses stay.
+    /// Sets the link down at its far end: no frames pass, and the addresses stay.
     ///
     /// # Panics
     /// When there is no cable.
@@ -121,12 +124,12 @@ impl Cable {
         self.there.ip(&["link", "set", WIRE, "up"]);
     }
 
-    /// The other host's namespace, for programs that are to run in it.
+    /// Returns the path of the other host's namespace, for programs that run in it.
     pub(crate) fn path(&self) -> PathBuf {
         self.there.path()
     }
 
-    /// Has multicast without a named interface leave the cell by the cable, and no longer by loopback.
+    /// Routes multicast without a named interface through the cable instead of loopback.
     ///
     /// # Panics
     /// When there is no cable.
@@ -135,7 +138,7 @@ impl Cable {
         self.here.ip(&["route", "replace", group, "dev", WIRE]);
     }
 
-    /// A member of the UADP group on the other host, for as long as the cable lies.
+    /// Creates a member of the UADP group on the other host, which works while the cable lies.
     ///
     /// # Panics
     /// When there is no cable.
@@ -152,7 +155,7 @@ impl Cable {
 }
 
 impl Host {
-    /// Cuts the wire: every frame is lost until it is mended.
+    /// Cuts the wire: every frame is lost until [`mend`](Self::mend).
     pub fn cut(&self) {
         self.orders.cut.store(true, Ordering::Relaxed);
     }
@@ -162,12 +165,12 @@ impl Host {
         self.orders.cut.store(false, Ordering::Relaxed);
     }
 
-    /// The namespace, for programs that are to run in it.
+    /// Returns the path of the namespace, for programs that run in it.
     pub(crate) fn path(&self) -> PathBuf {
         self.namespace.path()
     }
 
-    /// The Fast DDS peer on this host, in domain 2, not started yet.
+    /// Returns the Fast DDS peer on this host, in domain 2, not started yet.
     #[must_use]
     pub fn fastdds_started(&self, cell: &Cell, args: &[&str]) -> Started {
         cell.fastdds_started(args)
@@ -175,13 +178,14 @@ impl Host {
             .on(self)
     }
 
-    /// The Cyclone DDS peer in C on this host, in domain 2, not started yet.
+    /// Returns the Cyclone DDS peer in C on this host, in domain 2, not started yet.
     #[must_use]
     pub fn cyclone_c_started(&self, cell: &Cell, args: &[&str]) -> Started {
         self.cyclone_c_with(cell, "", args)
     }
 
-    /// The same with more elements of XML in the section `Discovery` of its configuration.
+    /// Returns the Cyclone DDS peer in C with more XML elements in the section `Discovery` of its
+    /// configuration.
     #[must_use]
     pub fn cyclone_c_with(&self, cell: &Cell, discovery: &str, args: &[&str]) -> Started {
         cell.cyclone_c_started(args)
@@ -201,7 +205,7 @@ impl Drop for Host {
     }
 }
 
-/// A network namespace, which lives as long as this.
+/// A network namespace, which exists until this is dropped.
 pub(crate) struct Namespace(File);
 
 impl Namespace {
@@ -227,7 +231,7 @@ impl Namespace {
         ))
     }
 
-    /// Does something in it, on a thread of its own.
+    /// Runs a function in the namespace, on a separate thread.
     pub(crate) fn within<T: Send>(&self, what: impl FnOnce() -> T + Send) -> T {
         std::thread::scope(|scope| {
             let done = scope.spawn(|| {
@@ -238,7 +242,7 @@ impl Namespace {
         })
     }
 
-    /// Lays a wire from here to `other`, where its end is called `name`.
+    /// Creates a wire from this namespace to `other`, where its end has the name `name`.
     fn join(&self, name: &str, other: &Self, address: &str) {
         self.ip(&["link", "add", WIRE, "type", "veth", "peer", "name", name]);
         let path = other.path();

@@ -1,4 +1,4 @@
-//! A node of ROS 2 itself that tells what it sees.
+//! An rclpy node that reports the ROS 2 graph as it sees it.
 
 use std::time::Duration;
 
@@ -6,17 +6,18 @@ use serde_json::{Value, json};
 
 use crate::{Cell, Child, Distribution};
 
-/// More than the 15 s after which the node itself gives up.
+/// Longer than the 15 s after which the node itself gives up.
 const PATIENCE: Duration = Duration::from_secs(30);
 
-/// `peers/ros2_node.py`: what `ros2` on the command line asks, asked through rclpy.
+/// `peers/ros2_node.py`: the commands of the `ros2` command line through rclpy.
 pub struct Judge {
     node: Child,
     asked: u64,
 }
 
 impl Cell {
-    /// An rclpy node `/judge/NAME` in domain 2, for the first of `args`, which may be followed by options.
+    /// Starts an rclpy node `/judge/NAME` in domain 2. `NAME` is the first of `args`; options may
+    /// follow it.
     #[must_use]
     pub fn judge(&self, distribution: Distribution, args: &[&str]) -> Judge {
         let node = self.rclpy_started(distribution, "ros2_node.py", args);
@@ -25,7 +26,7 @@ impl Cell {
 }
 
 impl Judge {
-    /// Of a process that runs `ros2_node.py` and can be told lines.
+    /// Wraps a process that runs `ros2_node.py` and has a standard input.
     #[must_use]
     pub fn of(process: Child) -> Self {
         Self {
@@ -34,7 +35,7 @@ impl Judge {
         }
     }
 
-    /// The node's answer to a command, see `peers/ros2_node.py`.
+    /// Returns the node's answer to a command, see `peers/ros2_node.py`.
     ///
     /// # Panics
     /// When there is none in time, or the command failed.
@@ -55,7 +56,7 @@ impl Judge {
         line["answer"].clone()
     }
 
-    /// What `pick` makes of the node's answer, asked again until it is not `None`.
+    /// Repeats a command until `pick` returns a value for the answer, and returns this value.
     ///
     /// # Panics
     /// When that takes too long.
@@ -67,13 +68,14 @@ impl Judge {
             if let Some(found) = pick(&last) {
                 return found;
             }
-            // The graph changes by what comes over the network.
+            // The graph changes when messages arrive from the network.
             std::thread::park_timeout(Duration::from_millis(50));
         }
         panic!("{command}: at last {last}");
     }
 
-    /// The first value heard on a topic that `pick` does not answer `None` to, from now or before.
+    /// Returns the first result of `pick`, other than `None`, for the values received on a topic,
+    /// before or after the call.
     ///
     /// # Panics
     /// When none comes in time.
@@ -86,7 +88,7 @@ impl Judge {
         })
     }
 
-    /// The process.
+    /// Returns the process.
     pub const fn child(&mut self) -> &mut Child {
         &mut self.node
     }

@@ -1,12 +1,14 @@
-//! What the system tests stand on: a network of their own, the peers of other makers, and the programs under test.
+//! The base of the system tests: a separate network, third-party peers, and the programs under
+//! test.
 //!
-//! A test starts with [`Cell::with`], which puts its thread into a new network namespace. Everything it starts from
-//! there lives in that network and nowhere else, so ports, multicast groups and DDS domains of two tests never meet,
-//! and fixed port numbers are free.
+//! A test starts with [`Cell::with`], which puts its thread into a new network namespace. All
+//! processes that it starts from there live in that network only, so ports, multicast groups and
+//! DDS domains of two tests never meet, and fixed port numbers are free.
 //!
 //! `cells/` has the mappings of the tests' cells.
 //!
-//! A peer that this machine does not have skips the test with the reason; with `CI=true` that is a failure.
+//! A test whose peer is missing on this machine is skipped with the reason; with `CI=true` it
+//! fails.
 
 mod announcer;
 mod arrows;

@@ -1,4 +1,4 @@
-//! Bytes of the tests' own: the UADP group, HTTP, XML-RPC.
+//! Raw bytes on the network: the UADP group, HTTP, XML-RPC.
 
 use std::{
     io::{Read, Write},
@@ -10,12 +10,12 @@ use std::{
 use serde_json::Value;
 use socket2::{Domain, Protocol, SockRef, Socket, Type};
 
-/// The group and port programs use that are told nothing else.
+/// The default group and port of the programs.
 pub const GROUP: SocketAddrV4 = SocketAddrV4::new(Ipv4Addr::new(239, 192, 0, 40), 4840);
 
 const PATIENCE: Duration = Duration::from_secs(5);
 
-/// A member of the UADP group on loopback, which sees and sends raw datagrams.
+/// A member of the UADP group on loopback, which receives and sends raw datagrams.
 pub struct UadpSocket(UdpSocket);
 
 impl UadpSocket {
@@ -28,7 +28,7 @@ impl UadpSocket {
         Self::join_on(Ipv4Addr::LOCALHOST)
     }
 
-    /// Joins [`GROUP`] on the interface with that address.
+    /// Joins [`GROUP`] on the interface with this address.
     ///
     /// # Panics
     /// When the socket cannot be made.
@@ -41,7 +41,7 @@ impl UadpSocket {
         Self(socket)
     }
 
-    /// Sends one datagram to the group.
+    /// Sends a datagram to the group.
     ///
     /// # Panics
     /// When it does not leave.
@@ -50,7 +50,8 @@ impl UadpSocket {
         assert_eq!(sent, datagram.len());
     }
 
-    /// The next datagram of anyone in the group, this socket's own included; `None` after `deadline`.
+    /// Returns the next datagram of any member of the group, including this socket; `None` after
+    /// `deadline`.
     ///
     /// # Panics
     /// When reading fails.
@@ -70,7 +71,7 @@ impl UadpSocket {
         }
     }
 
-    /// The datagrams that arrive within `window`, those waiting already included.
+    /// Returns the datagrams that arrive within `window`, and the datagrams already waiting.
     #[must_use]
     pub fn receive_for(&self, window: Duration) -> Vec<Vec<u8>> {
         let start = Instant::now();
@@ -81,13 +82,13 @@ impl UadpSocket {
         all
     }
 
-    /// Reads away what is waiting.
+    /// Discards the waiting datagrams.
     pub fn drain(&self) {
         while self.receive(Duration::from_millis(1)).is_some() {}
     }
 }
 
-/// A socket that hears a group on loopback, with room for bursts.
+/// Opens a socket that receives a group on loopback, with a buffer for bursts.
 ///
 /// # Panics
 /// When the socket cannot be made.
@@ -105,7 +106,8 @@ fn member(group: SocketAddrV4, interface: Ipv4Addr) -> UdpSocket {
     socket.into()
 }
 
-/// The datagrams the kernel dropped because this socket was full: no loss of whoever sent them.
+/// Returns the number of datagrams that the kernel dropped because this socket's buffer was full.
+/// This is no loss by their sender.
 #[must_use]
 pub fn overflowed(socket: &UdpSocket) -> Option<u64> {
     let link = std::fs::read_link(format!("/proc/self/fd/{}", socket.as_raw_fd())).ok()?;
@@ -115,13 +117,14 @@ pub fn overflowed(socket: &UdpSocket) -> Option<u64> {
         .find_map(|(of, dropped)| (of == inode).then_some(dropped))
 }
 
-/// The same of all UDP sockets of this thread's network together.
+/// Returns the number of datagrams dropped because of full buffers, summed over all UDP sockets of
+/// this thread's network.
 #[must_use]
 pub fn all_overflowed() -> Option<u64> {
     Some(udp_sockets()?.into_iter().map(|(_, dropped)| dropped).sum())
 }
 
-/// Inode and drops of each, the columns 10 and 13 of Linux' `/proc/net/udp`.
+/// Returns inode and drops of each socket: columns 10 and 13 of `/proc/net/udp` of Linux.
 fn udp_sockets() -> Option<Vec<(String, u64)>> {
     let table = std::fs::read_to_string("/proc/thread-self/net/udp").ok()?;
     let rows = table.lines().skip(1).map(|row| {
@@ -131,27 +134,28 @@ fn udp_sockets() -> Option<Vec<(String, u64)>> {
     rows.collect()
 }
 
-/// What a program says about itself at `/status`, or `None` while it does not answer.
+/// Returns the `/status` of a program, or `None` while it does not answer.
 #[must_use]
 pub fn metrics(address: &str) -> Option<Value> {
     serde_json::from_str(&http_get(address, "/status")?).ok()
 }
 
-/// The body of a successful answer to an HTTP GET, or `None`.
+/// Returns the body of a successful answer to an HTTP GET, or `None`.
 #[must_use]
 pub fn http_get(address: &str, path: &str) -> Option<String> {
     let request = format!("GET {path} HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n");
     exchange(address, &request)
 }
 
-/// The code and the body of any answer to an HTTP GET, or `None` where there is none.
+/// Returns the status code and the body of any answer to an HTTP GET, or `None` without an answer.
 #[must_use]
 pub fn http_answer(address: &str, path: &str) -> Option<(u16, String)> {
     let request = format!("GET {path} HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n");
     answer(address, &request)
 }
 
-/// The body of the answer to an XML-RPC call, or `None` while nobody answers. An argument is text, or XML of a value.
+/// Returns the body of the answer to an XML-RPC call, or `None` without an answer. An argument is
+/// text, or XML of a value.
 #[must_use]
 pub fn xml_rpc(address: &str, method: &str, arguments: &[&str]) -> Option<String> {
     let params: String = arguments

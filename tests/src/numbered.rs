@@ -1,9 +1,9 @@
-//! Texts that carry their number and a checksum, as the DDS peers send them and check them.
+//! Texts with a number and a checksum, as the DDS peers send and check them.
 
 use std::collections::BTreeSet;
 
-/// The text of `size` characters that carries `number`: its eight decimal digits, the FNV-1a of number and filler in
-/// hexadecimal, filler.
+/// Returns the text of `size` characters for `number`: its eight decimal digits, the FNV-1a hash of
+/// number and filler in hexadecimal, and filler.
 ///
 /// # Panics
 /// When `size` is below 18 or `number` has more digits.
@@ -16,18 +16,18 @@ pub fn numbered(number: u32, size: usize) -> String {
     format!("{number:08} {:08x} {filler}", sum(number, &filler))
 }
 
-/// Which numbered texts were heard.
+/// The set of numbered texts that were received.
 #[derive(Debug, Default)]
 pub struct Numbered {
     heard: BTreeSet<u32>,
-    /// Texts that were heard before.
+    /// Number of texts received more than once.
     pub repeated: usize,
-    /// Texts that are not as they were sent.
+    /// Number of texts that differ from the text that was sent.
     pub bad: usize,
 }
 
 impl Numbered {
-    /// Takes a text; one without a number is none of these.
+    /// Adds a text. A text without a number is ignored.
     pub fn add(&mut self, text: &str) {
         let number = text.get(..8).and_then(|number| number.parse().ok());
         let Some(number) = number.filter(|_| text.len() >= HEAD) else {
@@ -40,19 +40,19 @@ impl Numbered {
         }
     }
 
-    /// How many different ones were heard, whole.
+    /// Returns the number of different intact texts received.
     #[must_use]
     pub fn len(&self) -> usize {
         self.heard.len()
     }
 
-    /// Whether none was.
+    /// Returns whether no intact text was received.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.heard.is_empty()
     }
 
-    /// Those below `count` that were not.
+    /// Returns the numbers below `count` that were not received.
     #[must_use]
     pub fn missing(&self, count: u32) -> Vec<u32> {
         (0..count)
@@ -76,7 +76,7 @@ mod tests {
 
     #[test]
     fn a_text_is_as_the_peers_in_c_make_it() {
-        // What `cyclone-peer pub --size 24 --first 7` sends.
+        // The text that `cyclone-peer pub --size 24 --first 7` sends.
         assert_eq!(numbered(7, 24), "00000007 b8cfe161 hovcjq");
     }
 

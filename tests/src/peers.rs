@@ -1,5 +1,5 @@
-//! The peers: ROS 1, Fast DDS and Cyclone DDS from Debian, Cyclone DDS and asyncua from PyPI, node-opcua from npm,
-//! rosrust.
+//! The peers: ROS 1, Fast DDS and Cyclone DDS from Debian, Cyclone DDS and asyncua from PyPI,
+//! node-opcua from npm, and rosrust.
 
 use std::{
     path::{Path, PathBuf},
@@ -14,13 +14,14 @@ use crate::{
     eventually, program, xml_rpc,
 };
 
-/// Where the ROS 1 master of a cell is.
+/// The address of the ROS 1 master of a cell.
 pub const MASTER: &str = "127.0.0.1:11311";
 
-/// Python and a ROS graph on a busy machine need seconds to come up.
+/// The time that Python and a ROS graph need to start on a busy machine.
 const START: Duration = Duration::from_secs(30);
 
-/// Cyclone's configuration, which keeps to one interface, with more elements in its section `Discovery`.
+/// Returns a Cyclone DDS configuration that is bound to an interface, with more elements in its
+/// section `Discovery`.
 pub(crate) fn cyclone_uri(interface: &str, discovery: &str) -> String {
     format!(
         "<CycloneDDS><Domain id=\"any\">\
@@ -45,7 +46,7 @@ float32 distance_remaining
 ";
 
 impl Cell {
-    /// A running ROS 1 master: it has answered `getPid`.
+    /// Starts a ROS 1 master and waits until it answers `getPid`.
     #[must_use]
     pub fn roscore(&self) -> Child {
         let master = self.roscore_unwatched();
@@ -63,13 +64,13 @@ impl Cell {
             .start()
     }
 
-    /// A rospy script of `peers/` that has said it is ready.
+    /// Starts a rospy script of `peers/` and waits until it is ready.
     #[must_use]
     pub fn rospy(&self, script: &str, args: &[&str]) -> Child {
         self.rospy_started(script, args).start().ready(START)
     }
 
-    /// A rospy script of `peers/`, not started yet.
+    /// Returns a rospy script of `peers/`, not started yet.
     #[must_use]
     pub fn rospy_started(&self, script: &str, args: &[&str]) -> Started {
         self.with_ros1(Started::new(script, Path::new("/usr/bin/python3")))
@@ -77,7 +78,8 @@ impl Cell {
             .args(args)
     }
 
-    /// A program of ROS 1 under `/usr`, such as `bin/rostopic` or `lib/topic_tools/throttle`, not started yet.
+    /// Returns a program of ROS 1 under `/usr`, such as `bin/rostopic` or
+    /// `lib/topic_tools/throttle`, not started yet.
     #[must_use]
     pub fn ros1_started(&self, program: &str, args: &[&str]) -> Started {
         let name = program.rsplit('/').next().unwrap_or(program);
@@ -86,7 +88,8 @@ impl Cell {
             .ends_on(Signal::SIGINT)
     }
 
-    /// A command line tool of ROS 1 that ends by itself, such as `rosservice`; the lines it printed.
+    /// Runs a command line tool of ROS 1 that ends by itself, such as `rosservice`, and returns its
+    /// lines.
     ///
     /// # Panics
     /// When it fails.
@@ -99,10 +102,10 @@ impl Cell {
         tool.lines()
     }
 
-    /// roscpp's `topic_tools relay` from one topic to another. It says nothing when it is ready.
+    /// Starts roscpp's `topic_tools relay` between two topics. It does not report when it is ready.
     #[must_use]
     pub fn topic_tools_relay(&self, from: &str, to: &str) -> Child {
-        // roscpp leaves its registrations in the master on SIGTERM.
+        // On SIGTERM, roscpp leaves its registrations in the master.
         self.with_ros1(Started::new(
             "relay",
             Path::new("/usr/lib/topic_tools/relay"),
@@ -112,7 +115,7 @@ impl Cell {
         .start()
     }
 
-    /// rosrust publishing or subscribing `std_msgs/String`; it has said that it is ready.
+    /// Starts a rosrust publisher or subscriber of `std_msgs/String` and waits until it is ready.
     #[must_use]
     pub fn rosrust(&self, args: &[&str]) -> Child {
         self.with_ros1(Started::new("rosrust-peer", &program("rosrust-peer")))
@@ -121,26 +124,27 @@ impl Cell {
             .ready(START)
     }
 
-    /// A Cyclone DDS script of `peers/` that has said it is ready.
+    /// Starts a Cyclone DDS script of `peers/` and waits until it is ready.
     #[must_use]
     pub fn cyclone(&self, script: &str, args: &[&str]) -> Child {
         self.cyclone_started(script, args).start().ready(START)
     }
 
-    /// A Cyclone DDS script of `peers/`, not started yet.
+    /// Returns a Cyclone DDS script of `peers/`, not started yet.
     #[must_use]
     pub fn cyclone_started(&self, script: &str, args: &[&str]) -> Started {
         self.python(script, args)
             .env("CYCLONEDDS_URI", cyclone_uri("lo", ""))
     }
 
-    /// The Fast DDS peer, whose commands `peers/dds/README.md` lists, in domain 2; it has said that it is ready.
+    /// Starts the Fast DDS peer in domain 2 and waits until it is ready. `peers/dds/README.md`
+    /// lists its commands.
     #[must_use]
     pub fn fastdds(&self, args: &[&str]) -> Child {
         self.fastdds_started(args).start().ready(START)
     }
 
-    /// The Fast DDS peer in domain 2, not started yet.
+    /// Returns the Fast DDS peer in domain 2, not started yet.
     #[must_use]
     pub fn fastdds_started(&self, args: &[&str]) -> Started {
         Started::new("fastdds-peer", &compiled(FASTDDS))
@@ -149,14 +153,14 @@ impl Cell {
             .told()
     }
 
-    /// The Cyclone DDS peer in C, whose commands `peers/dds/README.md` lists, in domain 2; it has said that it is
-    /// ready.
+    /// Starts the Cyclone DDS peer in C in domain 2 and waits until it is ready.
+    /// `peers/dds/README.md` lists its commands.
     #[must_use]
     pub fn cyclone_c(&self, args: &[&str]) -> Child {
         self.cyclone_c_started(args).start().ready(START)
     }
 
-    /// The Cyclone DDS peer in C in domain 2, not started yet.
+    /// Returns the Cyclone DDS peer in C in domain 2, not started yet.
     #[must_use]
     pub fn cyclone_c_started(&self, args: &[&str]) -> Started {
         Started::new("cyclone-peer", &compiled(CYCLONE))
@@ -166,7 +170,7 @@ impl Cell {
             .told()
     }
 
-    /// An rclpy script of `peers/` in domain 2 that has said it is ready.
+    /// Starts an rclpy script of `peers/` in domain 2 and waits until it is ready.
     #[must_use]
     pub fn rclpy(&self, distribution: Distribution, script: &str, args: &[&str]) -> Child {
         self.rclpy_started(distribution, script, args)
@@ -174,7 +178,7 @@ impl Cell {
             .ready(START)
     }
 
-    /// An rclpy script of `peers/` in domain 2, not started yet.
+    /// Returns an rclpy script of `peers/` in domain 2, not started yet.
     #[must_use]
     pub fn rclpy_started(
         &self,
@@ -191,19 +195,19 @@ impl Cell {
             .args(args)
     }
 
-    /// An asyncua script of `peers/` that stays and has said it is ready.
+    /// Starts an asyncua script of `peers/` that keeps running, and waits until it is ready.
     #[must_use]
     pub fn asyncua(&self, script: &str, args: &[&str]) -> Child {
         self.asyncua_started(script, args).start().ready(START)
     }
 
-    /// An asyncua script of `peers/`, not started yet.
+    /// Returns an asyncua script of `peers/`, not started yet.
     #[must_use]
     pub fn asyncua_started(&self, script: &str, args: &[&str]) -> Started {
         self.python(script, args)
     }
 
-    /// An asyncua script of `peers/` that ends by itself; the JSON lines it printed.
+    /// Runs an asyncua script of `peers/` that ends by itself, and returns its JSON lines.
     ///
     /// # Panics
     /// When it fails.
@@ -215,7 +219,8 @@ impl Cell {
         child.json_lines()
     }
 
-    /// Like [`Self::asyncua_once`], `None` when the script fails: for a server that may not be there yet.
+    /// Runs a script like [`Self::asyncua_once`]. Returns `None` if it fails, for a server that may
+    /// not be running yet.
     #[must_use]
     pub fn asyncua_try(&self, script: &str, args: &[&str]) -> Option<Vec<serde_json::Value>> {
         let mut child = self.python(script, args).start();
@@ -223,13 +228,15 @@ impl Cell {
         status.success().then(|| child.json_lines())
     }
 
-    /// A node-opcua script of `peers/node-opcua` that stays and has said it is ready.
+    /// Starts a node-opcua script of `peers/node-opcua` that keeps running, and waits until it is
+    /// ready.
     #[must_use]
     pub fn node_opcua(&self, script: &str, args: &[&str]) -> Child {
         self.node_opcua_started(script, args).start().ready(START)
     }
 
-    /// A node-opcua script of `peers/node-opcua` that ends by itself; the JSON lines it printed.
+    /// Runs a node-opcua script of `peers/node-opcua` that ends by itself, and returns its JSON
+    /// lines.
     ///
     /// # Panics
     /// When it fails.
@@ -241,31 +248,33 @@ impl Cell {
         child.json_lines()
     }
 
-    /// A node-opcua script of `peers/node-opcua`, not started yet.
+    /// Returns a node-opcua script of `peers/node-opcua`, not started yet.
     #[must_use]
     pub fn node_opcua_started(&self, script: &str, args: &[&str]) -> Started {
         let modules = compiled(NODE_OPCUA).join("node_modules");
         Started::new(script, Path::new("node"))
             .env("NODE_PATH", modules)
-            // node-opcua warns of what it has seen in its own surroundings, and keeps its certificates below HOME.
+            // node-opcua prints warnings about its environment, and keeps its certificates below
+            // HOME.
             .env("HOME", self.folder())
             .args([peer_script("node-opcua").join(script)])
             .args(args)
     }
 
-    /// asyncua's PubSub listening on the UADP group.
+    /// Starts a PubSub listener of asyncua on the UADP group.
     #[must_use]
     pub fn uadp_listener(&self) -> Child {
         self.asyncua("uadp_listen.py", &[&format!("opc.udp://{GROUP}")])
     }
 
-    /// The Python that has asyncua.
+    /// Returns the Python interpreter that has asyncua.
     #[must_use]
     pub fn asyncua_python(&self) -> &Path {
         &self.python
     }
 
-    /// What `AMENT_PREFIX_PATH` names where Nav2's action of a pose is installed: a folder of this cell with that.
+    /// Creates a folder for `AMENT_PREFIX_PATH` with Nav2's action NavigateToPose, and returns its
+    /// path.
     ///
     /// # Panics
     /// When it cannot be written.
@@ -285,7 +294,8 @@ impl Cell {
             .args(args)
     }
 
-    /// Where the ROS 1 node `name` serves its slave API, as `127.0.0.1:40001`; `None` while the master does not know it.
+    /// Returns the address of the slave API of the ROS 1 node `name`, such as `127.0.0.1:40001`;
+    /// `None` while the master does not know the node.
     #[must_use]
     pub fn slave_api(&self, name: &str) -> Option<String> {
         let answer = xml_rpc(MASTER, "lookupNode", &["/system_tests", name])?;
@@ -293,7 +303,8 @@ impl Cell {
         Some(rest.split(['/', '<']).next()?.to_owned())
     }
 
-    /// Where the ROS 1 node `name` serves the topic by TCPROS; `None` while it does not publish it.
+    /// Returns the TCPROS address at which the ROS 1 node `name` serves the topic; `None` while the
+    /// node does not publish it.
     #[must_use]
     pub fn tcpros_port(&self, name: &str, topic: &str) -> Option<String> {
         let tcpros = "<array><data><value><array><data><value><string>TCPROS</string></value></data></array></value>\
@@ -310,7 +321,7 @@ impl Cell {
         Some(format!("127.0.0.1:{port}"))
     }
 
-    /// The environment of a ROS 1 program in this cell.
+    /// Adds the environment of a ROS 1 program in this cell.
     #[must_use]
     pub fn with_ros1(&self, started: Started) -> Started {
         started

@@ -5,20 +5,20 @@ use std::path::PathBuf;
 use crate::Cell;
 use crate::host::Namespace;
 
-/// A host with no network but those it is plugged into, and its own loopback.
+/// A host with its own loopback, and otherwise only the networks it is plugged into.
 pub struct Site(Namespace);
 
 /// A network of level 2: a bridge.
 pub struct Segment(Namespace);
 
 impl Cell {
-    /// A host.
+    /// Creates a host.
     #[must_use]
     pub fn site(&self) -> Site {
         Site(Namespace::fresh())
     }
 
-    /// A network without hosts.
+    /// Creates a network without hosts.
     #[must_use]
     pub fn segment(&self) -> Segment {
         let segment = Namespace::fresh();
@@ -37,13 +37,14 @@ impl Cell {
 }
 
 impl Segment {
-    /// Gives a host an interface here, with an address of a network of 24 bits.
+    /// Connects a host with an interface of the name `interface` and an address of a 24-bit
+    /// network.
     ///
     /// # Panics
     /// When it has one of that name.
     pub fn plug(&self, site: &Site, interface: &str, address: &str) {
         let Self(here) = self;
-        // Names are at most 15 letters, and have to differ here.
+        // Interface names are at most 15 characters and have to be unique in this namespace.
         let end = format!("p{}", address.replace('.', "-"));
         let path = site.path();
         let path = path.to_string_lossy();
@@ -60,7 +61,7 @@ impl Segment {
         }
     }
 
-    /// Pulls the cable of the host with an address, and takes the interface away.
+    /// Pulls the cable of the host with this address, which removes the interface.
     ///
     /// # Panics
     /// When nobody is plugged in there.
@@ -75,7 +76,7 @@ impl Site {
         self.0.path()
     }
 
-    /// Does something there.
+    /// Runs a function on this host.
     pub fn within<T: Send>(&self, what: impl FnOnce() -> T + Send) -> T {
         self.0.within(what)
     }

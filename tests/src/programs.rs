@@ -1,4 +1,4 @@
-//! The programs under test, found and started as users start them.
+//! The programs under test, located and started as users start them.
 
 use std::{
     env, fs,
@@ -10,11 +10,11 @@ use serde_json::Value;
 
 use crate::{Cell, Child, Started, eventually, metrics};
 
-/// Where a cell's bridge-ros1 answers about itself.
+/// The metrics address of a cell's bridge-ros1.
 pub const METRICS_ROS1: &str = "127.0.0.1:9101";
-/// Where a cell's bridge-ros2 answers about itself.
+/// The metrics address of a cell's bridge-ros2.
 pub const METRICS_ROS2: &str = "127.0.0.1:9102";
-/// Where a cell's ua-server answers about itself.
+/// The metrics address of a cell's ua-server.
 pub const METRICS_SERVER: &str = "127.0.0.1:9103";
 /// The endpoint of a cell's ua-server.
 pub const SERVER_ENDPOINT: &str = "opc.tcp://127.0.0.1:4840";
@@ -22,7 +22,8 @@ pub const SERVER_ENDPOINT: &str = "opc.tcp://127.0.0.1:4840";
 const START: Duration = Duration::from_secs(20);
 
 impl Cell {
-    /// bridge-ros1 as it answers, with `args` after those every cell needs.
+    /// Starts bridge-ros1 and waits until it answers. `args` follow the arguments that every cell
+    /// needs.
     #[must_use]
     pub fn bridge_ros1(&self, args: &[&str]) -> Child {
         let child = self.bridge_ros1_started(args).start();
@@ -30,13 +31,13 @@ impl Cell {
         child
     }
 
-    /// bridge-ros1, not started yet.
+    /// Returns bridge-ros1, not started yet.
     #[must_use]
     pub fn bridge_ros1_started(&self, args: &[&str]) -> Started {
         self.bridge_ros1_at(args, METRICS_ROS1)
     }
 
-    /// bridge-ros1 that answers about itself at another address, not started yet.
+    /// Returns bridge-ros1 with another metrics address, not started yet.
     #[must_use]
     pub fn bridge_ros1_at(&self, args: &[&str], metrics: &str) -> Started {
         self.with_ros1(Started::new("bridge-ros1", &program("bridge-ros1")))
@@ -44,7 +45,8 @@ impl Cell {
             .args(["--interface", "lo", "--metrics", metrics])
     }
 
-    /// The example of tcpros that repeats the first topic of each pair as the second. It says nothing when it is ready.
+    /// Starts the example of tcpros that republishes the first topic of each pair as the second
+    /// topic. It does not report when it is ready.
     #[must_use]
     pub fn tcpros_relay(&self, node: &str, pairs: &[(String, String)]) -> Child {
         self.with_ros1(Started::new("relay", &program("examples/relay")))
@@ -53,7 +55,8 @@ impl Cell {
             .start()
     }
 
-    /// bridge-ros2 in domain 2 as it answers, with `args` after those every cell needs.
+    /// Starts bridge-ros2 in domain 2 and waits until it answers. `args` follow the arguments that
+    /// every cell needs.
     #[must_use]
     pub fn bridge_ros2(&self, args: &[&str]) -> Child {
         let child = self.bridge_ros2_started(args).start();
@@ -61,13 +64,13 @@ impl Cell {
         child
     }
 
-    /// bridge-ros2 in domain 2, not started yet.
+    /// Returns bridge-ros2 in domain 2, not started yet.
     #[must_use]
     pub fn bridge_ros2_started(&self, args: &[&str]) -> Started {
         self.bridge_ros2_alone(args).args(["--domain", "2"])
     }
 
-    /// bridge-ros2 in the domain that `args` or the mapping say, not started yet.
+    /// Returns bridge-ros2 in the domain of `args` or of the mapping, not started yet.
     #[must_use]
     pub fn bridge_ros2_alone(&self, args: &[&str]) -> Started {
         Started::new("bridge-ros2", &program("bridge-ros2"))
@@ -75,13 +78,15 @@ impl Cell {
             .args(["--interface", "lo", "--metrics", METRICS_ROS2])
     }
 
-    /// The example of bridge-ros2 that repeats one topic of domain 2 as another, not started yet.
+    /// Returns the example of bridge-ros2 that republishes a topic of domain 2 as another topic,
+    /// not started yet.
     #[must_use]
     pub fn ros2_relay_started(&self, from: &str, to: &str) -> Started {
         Started::new("relay", &program("examples/ros2_relay")).args([from, to, "2"])
     }
 
-    /// ua-server as it answers, with `args` after those every cell needs.
+    /// Starts ua-server and waits until it answers. `args` follow the arguments that every cell
+    /// needs.
     #[must_use]
     pub fn ua_server(&self, args: &[&str]) -> Child {
         let child = self.ua_server_started(args).start();
@@ -89,7 +94,7 @@ impl Cell {
         child
     }
 
-    /// ua-server, not started yet.
+    /// Returns ua-server, not started yet.
     #[must_use]
     pub fn ua_server_started(&self, args: &[&str]) -> Started {
         Started::new("ua-server", &program("ua-server"))
@@ -107,7 +112,8 @@ fn answers(name: &str, address: &str) {
     );
 }
 
-/// The sum of all numbers under keys called `key`, at any depth: a status may count per topic or as a whole.
+/// Returns the sum of all numbers with the key `key`, at any depth: a status may count per topic or
+/// in total.
 #[must_use]
 pub fn number(status: &Value, key: &str) -> u64 {
     match status {
@@ -123,7 +129,7 @@ pub fn number(status: &Value, key: &str) -> u64 {
     }
 }
 
-/// The samples and datagrams a program has dropped, for whatever reason.
+/// Returns the number of samples and datagrams that a program dropped, for any reason.
 #[must_use]
 pub fn drops(status: &Value) -> u64 {
     match status {
@@ -141,10 +147,11 @@ pub fn drops(status: &Value) -> u64 {
     }
 }
 
-/// The path of a program of this workspace.
+/// Returns the path of a program of this workspace.
 ///
 /// # Panics
-/// When the program has not been built, or a program with the name of a link to `ua-bridge` is left from another build.
+/// If the program has not been built, or if a program with the name of a link to `ua-bridge` is
+/// left from another build.
 #[must_use]
 pub fn program(name: &str) -> PathBuf {
     let given = env::var_os("UA_BIN_DIR").map(PathBuf::from);

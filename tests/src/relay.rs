@@ -1,7 +1,7 @@
-//! A relay between two multicast groups that loses, doubles and delays datagrams.
+//! A relay between two multicast groups that loses, duplicates and delays datagrams.
 //!
-//! `tc netem` would do the same where the kernel has it. Programs of both groups stay on loopback, where calls are
-//! executed without being opened.
+//! `tc netem` does the same on kernels that have it. Programs of both groups stay on loopback,
+//! where calls are executed without being opened.
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
@@ -18,20 +18,20 @@ use crate::{GROUP, group_member};
 /// The group on the other side of a [`Relay`].
 pub const OTHER_GROUP: SocketAddrV4 = SocketAddrV4::new(Ipv4Addr::new(239, 192, 0, 41), 4840);
 
-/// What a relay does to datagrams, in each direction. Shares are 0 to 1.
+/// The effect of a relay on datagrams, in each direction. Shares are 0 to 1.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Weather {
-    /// Never arrive.
+    /// Share of datagrams that never arrive.
     pub lost: f64,
-    /// Arrive twice, the second time late.
+    /// Share of datagrams that arrive twice, the second time late.
     pub doubled: f64,
-    /// Arrive late, behind others.
+    /// Share of datagrams that arrive late, behind later datagrams.
     pub late: f64,
-    /// How late, at most.
+    /// The maximum delay.
     pub delay: Duration,
 }
 
-/// Carries datagrams between [`GROUP`] and [`OTHER_GROUP`] for as long as it lives.
+/// Carries datagrams between [`GROUP`] and [`OTHER_GROUP`] until it is dropped.
 pub struct Relay {
     stop: Arc<AtomicBool>,
     silent: Arc<AtomicBool>,
@@ -43,17 +43,17 @@ struct Direction {
     from: UdpSocket,
     to: UdpSocket,
     group: SocketAddrV4,
-    /// Where this relay itself sends from.
+    /// The addresses this relay itself sends from.
     own: [SocketAddr; 2],
     weather: Weather,
-    /// Nothing arrives.
+    /// If set, no datagram arrives.
     silent: Arc<AtomicBool>,
     random: u64,
     under_way: BinaryHeap<Reverse<(Instant, Vec<u8>)>>,
 }
 
 impl Weather {
-    /// All arrives at once.
+    /// Every datagram arrives at once.
     pub const FAIR: Self = Self {
         lost: 0.0,
         doubled: 0.0,
@@ -63,7 +63,7 @@ impl Weather {
 }
 
 impl Relay {
-    /// Begins to carry.
+    /// Starts the relay.
     ///
     /// # Panics
     /// When the sockets cannot be made.
@@ -100,12 +100,12 @@ impl Relay {
         }
     }
 
-    /// Whether all that [`GROUP`] says is lost on its way to [`OTHER_GROUP`] from now on.
+    /// Sets whether all datagrams of [`GROUP`] are lost on their way to [`OTHER_GROUP`].
     pub fn hush(&self, silent: bool) {
         self.silent.store(silent, Ordering::Relaxed);
     }
 
-    /// How many datagrams were lost, doubled or late.
+    /// Returns the number of datagrams that were lost, duplicated or delayed.
     #[must_use]
     pub fn disturbed(&self) -> u32 {
         self.bad.load(Ordering::Relaxed)
@@ -181,7 +181,7 @@ impl Direction {
         self.under_way.extend(arrivals);
     }
 
-    /// 0 to 1, by xorshift64.
+    /// Returns a number from 0 to 1, by xorshift64.
     fn chance(&mut self) -> f64 {
         self.random ^= self.random << 13;
         self.random ^= self.random >> 7;
@@ -190,5 +190,5 @@ impl Direction {
     }
 }
 
-/// How long a direction looks away from its orders.
+/// Interval in which a direction checks its orders.
 const LOOK_UP: Duration = Duration::from_millis(20);

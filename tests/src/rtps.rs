@@ -1,18 +1,18 @@
-//! RTPS datagrams nobody would send: real ones, changed.
+//! Mutated RTPS datagrams, made from real datagrams.
 
 use std::{fs, net::UdpSocket, path::Path};
 
-/// The GUID prefix of the participant the corpus was sent to, as the files have it.
+/// The GUID prefix of the participant that the corpus was sent to, as stored in the files.
 const RECEIVER: &[u8; 12] = b"\x01\x12the-bridge";
 
-/// Real datagrams of all kinds, and what makes others of them. The same seed makes the same ones.
+/// Mutates real datagrams of all kinds. The same seed makes the same datagrams.
 pub struct Mutator {
     corpus: Vec<Vec<u8>>,
     random: u64,
 }
 
 impl Mutator {
-    /// Datagrams for the participant of that GUID prefix.
+    /// Creates datagrams for the participant with this GUID prefix.
     ///
     /// # Panics
     /// When the corpus in `fuzz/corpus/rtps` cannot be read.
@@ -34,13 +34,13 @@ impl Mutator {
         }
     }
 
-    /// The datagrams as they were.
+    /// Returns the original datagrams.
     #[must_use]
     pub fn corpus(&self) -> &[Vec<u8>] {
         &self.corpus
     }
 
-    /// The next datagram.
+    /// Returns the next datagram.
     #[must_use]
     pub fn datagram(&mut self) -> Vec<u8> {
         let chosen = self.below(self.corpus.len());
@@ -66,7 +66,8 @@ impl Mutator {
             5 => self.splice(datagram),
             6 => self.repeat(datagram),
             7 => self.put_entity(datagram),
-            // Another participant of the same maker: one of few, as many there are without any mutation.
+            // Another participant of the same vendor, chosen from 64 to limit the number of
+            // participants.
             8 => datagram[19] = self.below(64) as u8,
             9 => self.turn_endianness(datagram),
             _ => {
@@ -78,7 +79,7 @@ impl Mutator {
         }
     }
 
-    /// An integer that breaks arithmetic, at a place where integers are.
+    /// Writes an integer that breaks arithmetic at a position of integers.
     fn put_number(&mut self, datagram: &mut [u8]) {
         const NUMBERS: [u32; 10] = [
             0,
@@ -101,7 +102,7 @@ impl Mutator {
         put(datagram, self.below(datagram.len()) & !3, &bytes);
     }
 
-    /// A length of a submessage or of a parameter.
+    /// Writes a length of a submessage or of a parameter.
     fn put_length(&mut self, datagram: &mut [u8]) {
         const LENGTHS: [u16; 9] = [0, 1, 3, 4, 8, 0x7fff, 0x8000, 0xfffc, 0xffff];
         let length = LENGTHS[self.below(LENGTHS.len())];
@@ -132,7 +133,7 @@ impl Mutator {
         }
     }
 
-    /// The id of a builtin endpoint, where ids of endpoints are.
+    /// Writes the id of a builtin endpoint at a position of EntityIds.
     fn put_entity(&mut self, datagram: &mut [u8]) {
         const ENTITIES: [[u8; 4]; 8] = [
             [0, 1, 0, 0xc2],
@@ -174,17 +175,18 @@ impl Mutator {
     }
 }
 
-/// Whether a datagram claims more than RustDDS 0.15.1 can bear, which then reads no more for long, or ever: a HEARTBEAT or
-/// GAP of more than a hundred thousand samples, which it goes through one by one (`rtps_writer_proxy.rs`,
-/// `missing_seqnums` and `irrelevant_changes_range`), or a DATA_FRAG of a sample of more than 64 MB, for which it fills
-/// as much memory at the first fragment (`fragment_assembler.rs`, `AssemblyBuffer::new`).
+/// Returns whether a datagram claims more than RustDDS 0.15.1 can bear. After such a datagram,
+/// RustDDS stops reading for long, or forever. It is a HEARTBEAT or GAP of more than a hundred
+/// thousand samples, through which RustDDS iterates (`rtps_writer_proxy.rs`, `missing_seqnums` and
+/// `irrelevant_changes_range`), or a DATA_FRAG of a sample of more than 64 MB, for which RustDDS
+/// fills as much memory at the first fragment (`fragment_assembler.rs`, `AssemblyBuffer::new`).
 #[must_use]
 pub fn claims_too_much(datagram: &[u8]) -> bool {
     const SAMPLES: i64 = 100_000;
     const SAMPLE: u32 = 64 << 20;
     submessages(datagram).into_iter().any(|at| {
         let little_endian = datagram[at + 1] & 1 == 1;
-        // Either has two ids of endpoints, then two sequence numbers.
+        // Both submessages have two EntityIds, then two sequence numbers.
         let number = |from: usize| {
             let bytes: [u8; 8] = datagram.get(from..from + 8)?.try_into().ok()?;
             Some(sequence_number(bytes, little_endian))
@@ -209,7 +211,7 @@ pub fn claims_too_much(datagram: &[u8]) -> bool {
 /// The length of the header of a message (RTPS 2.5, 9.4.4).
 const HEADER: usize = 20;
 
-/// Where submessages begin.
+/// Returns the positions of the submessages.
 fn submessages(datagram: &[u8]) -> Vec<usize> {
     let mut all = Vec::new();
     let mut at = HEADER;
@@ -220,7 +222,7 @@ fn submessages(datagram: &[u8]) -> Vec<usize> {
         } else {
             u16::from_be_bytes([low, high])
         };
-        // Zero is the rest of the message, but for PAD and INFO_TS (RTPS 2.5, 9.4.5.1.3).
+        // Zero means the rest of the message, except for PAD and INFO_TS (RTPS 2.5, 9.4.5.1.3).
         if length == 0 && !matches!(kind, 0x01 | 0x09) {
             break;
         }
@@ -229,7 +231,7 @@ fn submessages(datagram: &[u8]) -> Vec<usize> {
     all
 }
 
-/// The high half comes first in either endianness (RTPS 2.5, 9.3.2).
+/// Decodes a sequence number. The high half comes first in either endianness (RTPS 2.5, 9.3.2).
 fn sequence_number([a, b, c, d, e, f, g, h]: [u8; 8], little_endian: bool) -> i64 {
     let (high, low) = if little_endian {
         (
@@ -263,7 +265,7 @@ fn addressed(mut datagram: Vec<u8>, receiver: [u8; 12]) -> Vec<u8> {
     datagram
 }
 
-/// The GUID prefix in an announcement of a participant to the multicast group of the domain.
+/// Returns the GUID prefix of a participant's announcement to the multicast group of the domain.
 ///
 /// # Panics
 /// When the group cannot be read.
@@ -275,7 +277,8 @@ pub fn announced(group: &UdpSocket) -> Option<[u8; 12]> {
     (datagram.starts_with(b"RTPS")).then(|| prefix.try_into().unwrap())
 }
 
-/// Bytes that wait in the UDP sockets bound to these ports in this thread's network, and datagrams they had no room for.
+/// Returns the bytes that wait in the UDP sockets bound to these ports in this thread's network,
+/// and the number of datagrams dropped because of full buffers.
 ///
 /// # Panics
 /// When the system does not tell.

@@ -1,22 +1,23 @@
-//! What a text ends with: 8 digits of a topic, 12 of a number, and 16 of when it was sent, as the peers in C++ write it.
+//! The stamp at the end of a text, as the peers in C++ write it: 8 digits of a topic, 12 of a
+//! number, and 16 of the time of sending.
 
 use std::time::Duration;
 
 use nix::time::{ClockId, clock_gettime};
 
-/// Which text it is, and when it was sent.
+/// The topic, the number and the time of sending of a text.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Stamp {
-    /// The number of its topic among those of its sender, from 0.
+    /// The index of the topic among the topics of its sender, from 0.
     pub topic: usize,
-    /// Counted by its sender.
+    /// The number, counted by the sender.
     pub number: u64,
-    /// On the machine's monotonic clock.
+    /// The time of sending on the machine's monotonic clock.
     pub sent: Duration,
 }
 
 impl Stamp {
-    /// A text of `size` characters with a stamp of now.
+    /// Returns a text of `size` characters with a stamp of the current time.
     #[must_use]
     pub fn text(topic: usize, number: u64, size: usize) -> String {
         let padding = size.saturating_sub(LENGTH);
@@ -24,7 +25,7 @@ impl Stamp {
         format!("{:.<padding$}{topic:08}{number:012}{sent:016}", "")
     }
 
-    /// That of a text's end, if it has one.
+    /// Reads the stamp at the end of a text, if there is a stamp.
     #[must_use]
     pub fn of(text: &[u8]) -> Option<Self> {
         let (_, stamp) = text.split_last_chunk::<LENGTH>()?;
@@ -37,7 +38,7 @@ impl Stamp {
     }
 }
 
-/// The machine's monotonic clock, which all processes share.
+/// Returns the machine's monotonic clock, which all processes share.
 ///
 /// # Panics
 /// When there is none.

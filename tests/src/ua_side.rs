@@ -1,4 +1,4 @@
-//! The OPC UA side of a cell, by the codec alone.
+//! The OPC UA side of a cell, built on the codec alone.
 
 use std::time::{Duration, Instant};
 
@@ -12,10 +12,10 @@ use crate::UadpSocket;
 /// PublisherId, WriterGroupId and DataSetWriterId of a value.
 pub type Triple = (u16, u16, u16);
 
-/// Peers in Python on a busy machine need seconds.
+/// The time that Python peers need on a busy machine.
 const PATIENCE: Duration = Duration::from_secs(30);
 
-/// Hears all values of a cell and writes those of other spaces.
+/// Receives all values of a cell and writes values of other spaces.
 pub struct UaSide {
     socket: UadpSocket,
     sequence: u16,
@@ -31,7 +31,7 @@ impl UaSide {
         Self::on(UadpSocket::join())
     }
 
-    /// By that socket.
+    /// Creates the side on this socket.
     #[must_use]
     pub const fn on(socket: UadpSocket) -> Self {
         Self {
@@ -40,7 +40,7 @@ impl UaSide {
         }
     }
 
-    /// What `pick` makes of the first value of the triple it does not answer `None` to.
+    /// Returns the first result of `pick`, other than `None`, for the values of the triple.
     ///
     /// # Panics
     /// When none comes in time, with `what` in the message.
@@ -67,7 +67,7 @@ impl UaSide {
         panic!("{triple:?} was not heard: {what}");
     }
 
-    /// Waits for a value of one field.
+    /// Waits for a value with a single field.
     ///
     /// # Panics
     /// When it does not come in time.
@@ -77,7 +77,7 @@ impl UaSide {
         });
     }
 
-    /// Writes one value of one field.
+    /// Writes a value with a single field.
     ///
     /// # Panics
     /// When it cannot be sent.
@@ -85,7 +85,7 @@ impl UaSide {
         self.write_fields(triple, &[value]);
     }
 
-    /// Writes one value of several fields.
+    /// Writes a value with several fields.
     ///
     /// # Panics
     /// When it cannot be sent.
@@ -114,12 +114,12 @@ impl UaSide {
         self.socket.send(&datagram);
     }
 
-    /// Reads away what is waiting.
+    /// Discards the waiting datagrams.
     pub fn drain(&self) {
         self.socket.drain();
     }
 
-    /// The triples of all values heard within `window`.
+    /// Returns the triples of all values received within `window`.
     #[must_use]
     pub fn triples_for(&self, window: Duration) -> Vec<Triple> {
         let datagrams = self.socket.receive_for(window);
@@ -135,7 +135,7 @@ impl UaSide {
     }
 }
 
-/// The values a NetworkMessage brings; without fields where it is a keep-alive.
+/// Returns the values of a NetworkMessage; a keep-alive has no fields.
 fn values<'a>(message: &NetworkMessage<'a>) -> Vec<(Triple, Vec<Variant<'a>>)> {
     let header = message.header();
     let group = header.group.and_then(|group| group.writer_group_id);

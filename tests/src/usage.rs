@@ -1,11 +1,11 @@
-//! What a process takes of the machine, from `/proc`.
+//! The resources that a process uses, from `/proc`.
 
 use std::{
     fs,
     time::{Duration, Instant},
 };
 
-/// Threads of a process.
+/// Returns the number of threads of a process.
 ///
 /// # Panics
 /// When it is gone.
@@ -14,7 +14,7 @@ pub fn threads(process: u32) -> u64 {
     status(process, "Threads:")
 }
 
-/// Memory of a process that is in RAM, in bytes.
+/// Returns the resident memory of a process, in bytes.
 ///
 /// # Panics
 /// When it is gone.
@@ -23,7 +23,8 @@ pub fn resident(process: u32) -> u64 {
     status(process, "VmRSS:") * 1024
 }
 
-/// The memory of a process in RAM that is its own, without the pages of its program file, in bytes.
+/// Returns the resident memory that belongs to a process alone, without the pages of its program
+/// file, in bytes.
 ///
 /// # Panics
 /// When it is gone.
@@ -32,7 +33,7 @@ pub fn anonymous(process: u32) -> u64 {
     status(process, "RssAnon:") * 1024
 }
 
-/// The most memory of a process that was ever in RAM, in bytes.
+/// Returns the peak resident memory of a process, in bytes.
 ///
 /// # Panics
 /// When it is gone.
@@ -41,7 +42,7 @@ pub fn peak(process: u32) -> u64 {
     status(process, "VmHWM:") * 1024
 }
 
-/// The share of one processor that a process takes within `window`.
+/// Returns the share of a processor that a process uses within `window`.
 ///
 /// # Panics
 /// When it is gone.
@@ -60,7 +61,8 @@ fn status(process: u32, field: &str) -> u64 {
 }
 
 fn cpu_time(process: u32) -> Duration {
-    // The name may contain spaces; after it, user and system time are the 12th and 13th field, in 1/100 s.
+    // The name may contain spaces. After it, user and system time are the 12th and 13th field, in
+    // 1/100 s.
     let text = fs::read_to_string(format!("/proc/{process}/stat")).unwrap();
     let (_, fields) = text.rsplit_once(')').unwrap();
     let fields: Vec<&str> = fields.split_whitespace().collect();

@@ -1,10 +1,10 @@
-//! Waiting for a condition, with an end.
+//! Waits for conditions, with a timeout.
 
 use std::time::{Duration, Instant};
 
 const POLL: Duration = Duration::from_millis(5);
 
-/// Asks `condition` until it answers, and gives the answer.
+/// Polls `condition` until it returns a value, and returns this value.
 ///
 /// # Panics
 /// After `deadline`, with `what` in the message.
@@ -26,7 +26,8 @@ pub fn eventually<T>(
     }
 }
 
-/// Watches a condition that has to stay true for the whole of `window`: the one way to see that nothing happens.
+/// Checks that a condition stays true for the whole of `window`, which is the only way to see that
+/// nothing happens.
 ///
 /// # Panics
 /// As soon as `condition` is false, with `what` in the message.

@@ -1,7 +1,7 @@
-//! The wire between two hosts: frames go in at one end and come out at the other, later, or never.
+//! The wire between two hosts: frames enter at an end and leave at the other end, later or never.
 //!
-//! `tc netem` would do the same where the kernel has it; this needs nothing but packet sockets, and loses the same
-//! frames of a sequence each time.
+//! `tc netem` does the same on kernels that have it. This module needs only packet sockets, and
+//! loses the same frames of a sequence each time.
 
 use std::{
     collections::VecDeque,
@@ -23,29 +23,29 @@ use nix::{
     },
 };
 
-/// What a wire does to frames, in each direction.
+/// The effect of a wire on frames, in each direction.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Wire {
-    /// The share of frames that is lost, 0 to 1.
+    /// The share of lost frames, 0 to 1.
     pub loss: f64,
-    /// How long a frame takes.
+    /// The delay of a frame.
     pub delay: Duration,
 }
 
-/// What a wire is told while it carries.
+/// Orders to a wire that carries frames.
 #[derive(Debug, Default)]
 pub(super) struct Orders {
     pub(super) end: AtomicBool,
     pub(super) cut: AtomicBool,
 }
 
-/// How long a direction looks away from its orders.
+/// Interval in which a direction checks its orders.
 const LOOK_UP: Duration = Duration::from_millis(50);
-/// Room of a packet socket, for bursts.
+/// Buffer size of a packet socket, for bursts.
 const ROOM: usize = 64 << 20;
 
 impl Wire {
-    /// Carries frames between two interfaces of this thread's network until it is asked to end.
+    /// Carries frames between two interfaces of this thread's network until the orders end it.
     pub(super) fn carry(self, ends: [&str; 2], orders: &Orders) {
         let sockets = ends.map(packet_socket);
         let mut directions = [
@@ -114,7 +114,8 @@ impl Direction {
                 return;
             };
             match send(socket.as_raw_fd(), &frame, MsgFlags::empty()) {
-                // The other host is leaving, or its queue is full: as on any wire, the frame is gone.
+                // The other host is leaving, or its queue is full: as on any wire, the frame is
+                // lost.
                 Ok(_) | Err(Errno::ENETDOWN | Errno::ENOBUFS | Errno::ENXIO) => {}
                 Err(error) => panic!("a frame of {} bytes: {error}", frame.len()),
             }
@@ -122,14 +123,14 @@ impl Direction {
     }
 }
 
-/// Takes the checksum out of a UDP datagram over IPv4, which may go without. The sender's kernel left it to the network
-/// card, which a pair of veth does not have, and here the frame has left the kernel that would know.
+/// Clears the checksum of a UDP datagram over IPv4, where it is optional. The sender's kernel
+/// leaves the checksum to the network card, which a pair of veth does not have.
 fn forget_checksum(frame: &mut [u8]) {
     const ETHERNET: usize = 14;
     let udp_over_ipv4 = frame.len() > ETHERNET + 20
         && frame[12..14] == [0x08, 0x00]
         && frame[ETHERNET + 9] == 17
-        // The first fragment has the header of UDP.
+        // Only the first fragment has the UDP header.
         && u16::from_be_bytes([frame[ETHERNET + 6], frame[ETHERNET + 7]]) & 0x1fff == 0;
     if udp_over_ipv4 {
         let header = ETHERNET + usize::from(frame[ETHERNET] & 0x0f) * 4;
@@ -139,7 +140,7 @@ fn forget_checksum(frame: &mut [u8]) {
     }
 }
 
-/// A socket that sees all frames that reach the interface, and sends frames out of it.
+/// Opens a socket that receives all frames of the interface and sends frames through it.
 fn packet_socket(interface: &str) -> OwnedFd {
     let made = socket(
         AddressFamily::Packet,
@@ -204,7 +205,7 @@ mod tests {
         forget_checksum(&mut frame);
         assert_eq!(frame, expected);
 
-        // A later fragment has data there.
+        // A later fragment has data at this position.
         frame[20..22].copy_from_slice(&[0x20, 0xb9]);
         frame[40..42].copy_from_slice(&[7, 7]);
         let later = frame.clone();
