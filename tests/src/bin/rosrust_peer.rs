@@ -1,10 +1,11 @@
-//! rosrust as an independent ROS 1 implementation: publishes, subscribes or repeats `std_msgs/String`, calls or serves
-//! `std_srvs/SetBool`.
+//! rosrust as an independent ROS 1 implementation: publishes, subscribes or relays
+//! `std_msgs/String`, calls or serves `std_srvs/SetBool`.
 //!
-//! `rosrust-peer pub TOPIC VALUE..` sends the values ten times a second; `rosrust-peer sub TOPIC` prints one
-//! JSON line per message; `rosrust-peer relay IN OUT` sends on the bytes of each message; `rosrust-peer serve SERVICE`
-//! answers `done` to true and fails at false. All four end on SIGTERM, and by themselves after two minutes, the relay
-//! after thirty. `rosrust-peer call SERVICE` calls with true and with false, prints one JSON line each, and ends.
+//! `rosrust-peer pub TOPIC VALUE..` sends the values ten times a second; `rosrust-peer sub TOPIC`
+//! prints a JSON line per message; `rosrust-peer relay IN OUT` forwards the bytes of each message;
+//! `rosrust-peer serve SERVICE` answers `done` to true and fails at false. All four end on SIGTERM,
+//! and by themselves after two minutes, the relay after thirty. `rosrust-peer call SERVICE` calls
+//! with true and with false, prints a JSON line for each, and ends.
 
 use std::{
     io::Write,
@@ -104,7 +105,7 @@ fn call(service: &str) {
     }
 }
 
-/// `std_srvs/SetBool` with its answer as bytes.
+/// `std_srvs/SetBool` with its response as bytes.
 #[derive(Clone, Debug, Default, PartialEq)]
 struct SetBool;
 

@@ -1,4 +1,4 @@
-//! The DDS end of a path: a raw reliable reader; nothing is decoded but the text's end.
+//! The DDS end of a path: a raw reliable reader that decodes only the text.
 
 use std::net::{IpAddr, Ipv4Addr};
 use std::time::Duration;
@@ -9,9 +9,9 @@ use bridge_ros2::raw::Reader as RawReader;
 use futures_util::StreamExt;
 use tokio::runtime::Runtime;
 
-/// A reader of one topic of std_msgs/String in domain 2.
+/// A reader of a topic of std_msgs/String in domain 2.
 pub(crate) struct Reader {
-    // Before the domain it lives in, which is dropped last.
+    // Declared before its domain, which is dropped last.
     reader: RawReader,
     runtime: Runtime,
     _domain: Domain,
@@ -45,7 +45,7 @@ impl Reader {
         }
     }
 
-    /// Takes samples until one holds the text; false when none did in time.
+    /// Takes samples until a sample has the text. Returns false after `patience`.
     pub(crate) fn wait_for(&self, text: &str, patience: Duration) -> bool {
         let mut samples = std::pin::pin!(self.reader.as_async_stream());
         self.runtime.block_on(async {

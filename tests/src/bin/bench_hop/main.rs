@@ -1,8 +1,10 @@
-//! `cargo xtask bench hop`: how long one hop through each bridge takes, beside a raw relay and roscpp's.
+//! `cargo xtask bench hop`: the duration of a hop through each bridge, compared with a raw relay
+//! and roscpp's relay.
 //!
-//! One process sends a message into a path and waits for it at the other end, one at a time, the paths in turn, so
-//! that all of them see the same machine. The floor is a program that reads frames from a TCP connection and sends
-//! each as a UDP multicast datagram with blocking calls, which is all that has to happen between ROS 1 and UADP.
+//! A single process sends a message into a path and waits for it at the other end, one at a time,
+//! with the paths in turn, so that all of them see the same machine. The lower bound is a program
+//! that reads frames from a TCP connection and sends each as a UDP multicast datagram with blocking
+//! calls, which is the minimum between ROS 1 and UADP.
 
 mod dds;
 mod ros1;
@@ -32,7 +34,7 @@ fn main() -> ExitCode {
     }
 }
 
-/// The floor: frames in, datagrams out.
+/// Runs the lower bound: frames in, datagrams out.
 fn relay(args: &[String]) -> ExitCode {
     let group: SocketAddrV4 = args[0].parse().unwrap();
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
@@ -50,10 +52,10 @@ fn relay(args: &[String]) -> ExitCode {
     ExitCode::SUCCESS
 }
 
-/// One way a message can take, from this process and back to it.
+/// A path of a message from this process and back to it.
 trait Path {
     fn name(&self) -> &'static str;
-    /// Sends the text and waits until it comes out. The number is in the text.
+    /// Sends the text and waits until it arrives. The number is in the text.
     fn pass(&mut self, text: &str);
 }
 
@@ -262,7 +264,7 @@ impl Path for Bridge2 {
     }
 }
 
-/// Reads datagrams until one ends with the text.
+/// Reads datagrams until a datagram ends with the text.
 fn until(receiver: &UdpSocket, buffer: &mut [u8], text: &str) {
     loop {
         let length = receiver

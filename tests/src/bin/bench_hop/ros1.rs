@@ -19,7 +19,7 @@ impl Relay {
         let child = cell.topic_tools_relay("/bench_in", "/bench_out");
         let node = BareNode::start("/bench_relay");
         let mut publisher = node.publish(&["/bench_in".to_owned()]).remove(0);
-        // The relay advertises its output when it has seen a message.
+        // The relay advertises its output when it has received a message.
         let subscription = eventually("the relay advertises", Duration::from_secs(20), || {
             publisher.write_all(&string_frame("are you there")).unwrap();
             node.subscribe("/bench_out")

@@ -7,7 +7,8 @@ use system_tests::{Cell, Times, per_message};
 
 use crate::servers::{START, Server, config, connected};
 
-/// From nothing to a session in which something was read; the endpoints are asked for over a connection of their own.
+/// Measures from the start to a session in which a value was read. The endpoints are requested over
+/// a separate connection.
 pub(crate) async fn measure(cell: &Cell, servers: &[Server], connects: usize) {
     println!("\n{connects} connections of each kind, in turns; milliseconds:\n");
     println!("| security | server | p50 | p99 | p50 / asyncua | CPU of the server |");
@@ -20,7 +21,7 @@ pub(crate) async fn measure(cell: &Cell, servers: &[Server], connects: usize) {
     ] {
         let mut rows = Vec::new();
         for server in servers {
-            // Certificates are made and kept as trusted the first time.
+            // The first connection creates certificates and stores them as trusted.
             let first = connected(cell, server.endpoint, security).await;
             first.close().await;
             rows.push((server, Times::default(), server.used()));

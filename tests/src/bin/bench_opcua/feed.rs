@@ -11,7 +11,7 @@ use uadp::{DataSetHeader, GroupHeader, NetworkHeader, NetworkMessageEncoder, Pub
 
 use crate::servers::{FIRST, SPACE};
 
-/// Sends values.
+/// A publisher of values.
 pub(crate) struct Sender {
     socket: UdpSocket,
     datagram: Vec<u8>,
@@ -20,13 +20,13 @@ pub(crate) struct Sender {
 impl Sender {
     pub(crate) fn new() -> Self {
         Self {
-            // It joins nothing: what comes from the group is not for it.
+            // The socket joins no group, because it receives nothing.
             socket: UdpSocket::bind("127.0.0.1:0").unwrap(),
             datagram: Vec::new(),
         }
     }
 
-    /// One value each for the variables of these numbers, in one datagram.
+    /// Sends a value for each of the variables with these numbers, in a single datagram.
     pub(crate) fn send(&mut self, numbers: &[usize], sequence: u16, value: f64) {
         let header = NetworkHeader {
             publisher_id: Some(PublisherId::UInt16(2)),
@@ -58,8 +58,8 @@ impl Sender {
     }
 }
 
-/// Has all variables change each [`PERIOD`], while it is told to: the value is when that was, in microseconds of the machine's
-/// monotonic clock.
+/// Changes all variables each [`PERIOD`] while it is running. The value is the time of the change,
+/// in microseconds of the machine's monotonic clock.
 pub(crate) struct Feed {
     variables: usize,
     sequence: u16,
@@ -111,7 +111,8 @@ fn change(stopped: &AtomicBool, variables: usize, mut sequence: u16) -> u16 {
     sequence
 }
 
-/// Between two changes: out of step with what is published each 100 ms, so that a change waits for any part of that.
+/// Interval of changes: out of step with the publishing interval of 100 ms, so that a change waits
+/// for any part of it.
 pub(crate) const PERIOD: Duration = Duration::from_millis(103);
-/// Values in one datagram at most.
+/// Maximum number of values in a datagram.
 const A_DATAGRAM: usize = 25;

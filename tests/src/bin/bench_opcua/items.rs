@@ -1,4 +1,5 @@
-//! A thousand monitored items that change about as often as their subscription is published, each 100 ms.
+//! A thousand monitored items that change about as often as their subscription is published, each
+//! 100 ms.
 
 use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
@@ -39,7 +40,7 @@ fn row(runtime: &Runtime, server: &mut Server, seconds: u64) {
         let (from, used) = (now(), server.used());
         let mut seen = watch(&mut values, seconds).await;
         let (to, used) = (now(), server.used() - used);
-        // What changed before the end may be on its way.
+        // Changes before the end may still be in transit.
         seen.extend(watch(&mut values, SETTLING).await);
         Seen::within(seen, micros(from), micros(to), used)
     });
@@ -69,14 +70,14 @@ fn row(runtime: &Runtime, server: &mut Server, seconds: u64) {
     runtime.block_on(client.close());
 }
 
-/// A subscription whose items have all told their first value.
+/// Creates a subscription and waits until all its items have reported their first value.
 async fn subscribed(endpoint: &str) -> (Client, Subscription) {
     let client = Client::open(plain(), endpoint);
     client.up(START).await.unwrap();
     let watches = (0..ITEMS).map(|number| {
         Watch::Sampled(Sampled {
             node: variable(number),
-            // Each change, as it comes.
+            // Each change, as it occurs.
             interval: Duration::ZERO,
             queue: 10,
             deadband: 0.0,
@@ -97,7 +98,7 @@ async fn subscribed(endpoint: &str) -> (Client, Subscription) {
     (client, values)
 }
 
-/// Item, time of its change, and when that was told.
+/// An item, the time of its change, and the time of the notification.
 type Told = (usize, f64, f64);
 
 async fn watch(values: &mut Subscription, during: Duration) -> Vec<Told> {
@@ -113,11 +114,11 @@ async fn watch(values: &mut Subscription, during: Duration) -> Vec<Told> {
     seen
 }
 
-/// What was told of the changes of a time.
+/// The notifications about the changes in a time span.
 struct Seen {
-    /// How often all changed.
+    /// Number of changes of all variables.
     ticks: usize,
-    /// How many different changes were told.
+    /// Number of distinct changes that were reported.
     distinct: usize,
     delays: Times,
     late: usize,
@@ -135,7 +136,7 @@ impl Seen {
         };
         let (mut ticks, mut distinct) = (BTreeSet::new(), BTreeSet::new());
         for (item, changed, at) in told {
-            // All times here are positive, and their bits in the order of the numbers.
+            // All times here are positive, so their bits have the order of the numbers.
             if changed < from || changed >= to || !distinct.insert((changed.to_bits(), item)) {
                 continue;
             }
@@ -150,8 +151,8 @@ impl Seen {
 }
 
 const PUBLISHING: Duration = Duration::from_millis(100);
-/// A change waits for the next publishing, 100 ms at most, and may miss one.
+/// A change waits for the next publishing, 100 ms at most, and may miss a publishing.
 const LATE: Duration = Duration::from_millis(200);
-/// Notices that may wait in the client.
+/// Number of notifications that may wait in the client.
 const ROOM: usize = 200_000;
 const SETTLING: Duration = Duration::from_secs(2);

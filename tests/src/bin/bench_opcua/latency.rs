@@ -42,7 +42,7 @@ async fn row(endpoint: &str, publishing: Duration, values: usize) -> Times {
     let mut told = client.subscribe(vec![watch], publishing, 1000);
     while !matches!(told.next().await.unwrap(), Notice::Value { .. }) {}
     let (mut sender, mut delays) = (Sender::new(), Times::default());
-    // Out of step with the publishing.
+    // Out of step with the publishing interval.
     let period = publishing * 23 / 20;
     for number in 0..values {
         let sent = micros(now());
@@ -61,7 +61,7 @@ async fn row(endpoint: &str, publishing: Duration, values: usize) -> Times {
 }
 
 fn took(notice: Option<Notice>, delays: &mut Times) {
-    // That of a silent writer is Uncertain.
+    // The value of a silent writer is Uncertain.
     if let Some(Notice::Value { value, .. }) = notice
         && value.status.is_none_or(|status| status.is_good())
         && let Some(Variant::Double(sent)) = value.value

@@ -1,5 +1,5 @@
-//! `cargo xtask bench opcua`: ua-server beside servers of other makers, with one client for all, and what comes from the
-//! space to clients.
+//! `cargo xtask bench opcua`: ua-server compared with third-party servers, with the same client for
+//! all, and the delivery of values of the space to clients.
 
 mod connect;
 mod feed;
@@ -27,7 +27,7 @@ fn main() -> ExitCode {
     let Some(cell) = Cell::with(&[Peer::Python, Peer::NodeOpcua]) else {
         return ExitCode::FAILURE;
     };
-    // Its threads are of the network of this one.
+    // The runtime's threads are in the network of this thread.
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(2)
         .enable_all()
@@ -57,23 +57,23 @@ fn main() -> ExitCode {
     ExitCode::SUCCESS
 }
 
-/// How much of what.
+/// The benchmarks to run and their sizes.
 struct Plan {
     help: bool,
-    /// Those to run; all when empty.
+    /// The parts to run; all parts if empty.
     parts: Vec<String>,
-    /// Of each kind to each server.
+    /// Requests of each kind to each server.
     requests: usize,
-    /// With each policy to each server.
+    /// Connections with each policy to each server.
     connects: usize,
-    /// Of values that change, and of fifty topics.
+    /// Duration of changing values and of fifty topics.
     seconds: u64,
-    /// In the largest address space.
+    /// Nodes in the largest address space.
     nodes: usize,
 }
 
 impl Plan {
-    /// `None` when the arguments make no sense.
+    /// Returns the plan, or `None` if the arguments are invalid.
     fn of(args: &[String]) -> Option<Self> {
         let mut plan = Self {
             help: false,
@@ -116,7 +116,7 @@ fn positive(arg: Option<&String>) -> Option<usize> {
     arg?.parse().ok().filter(|number| *number > 0)
 }
 
-/// What needs all servers.
+/// Parts that need all servers.
 const BESIDE: [&str; 3] = ["services", "connect", "items"];
 const PARTS: [&str; 6] = ["services", "connect", "items", "latency", "rate", "nodes"];
 

@@ -1,4 +1,4 @@
-//! Large address spaces: how soon they are served, and what they take.
+//! Large address spaces: the time until they are served, and the resources they use.
 
 use std::fmt::Write as _;
 use std::net::TcpStream;
@@ -19,7 +19,7 @@ pub(crate) fn measure(cell: &Cell, runtime: &Runtime, most: usize) {
     println!("|---|---|---|---|---|");
     for count in [1000, most / 10, most] {
         ours(cell, runtime, count);
-        // asyncua takes minutes for ten thousand.
+        // asyncua takes minutes for ten thousand nodes.
         for (start, most) in [(asyncua as Start, 1000), (node_opcua, 10_000)] {
             if count > most {
                 continue;
@@ -38,7 +38,7 @@ fn ours(cell: &Cell, runtime: &Runtime, count: usize) {
     let mapping = cell.file("nodes.yaml", &mapping(count));
     let began = Instant::now();
     let path = mapping.to_string_lossy();
-    // Its page of metrics has to answer soon, and its endpoint is another thing.
+    // `ua_server` expects the metrics page soon; this measurement waits for the endpoint.
     let mut child = cell.ua_server_started(&[&path]).start();
     let listens = || TcpStream::connect(SERVER_ENDPOINT.trim_start_matches("opc.tcp://")).is_ok();
     let serves = eventually("the server listens or ends", LONGEST, || {
@@ -70,7 +70,7 @@ fn shown(count: usize, name: &str, took: Duration, process: u32) {
     );
 }
 
-/// The status of a variable, as soon as somebody answers.
+/// Returns the status of a variable as soon as the server answers.
 async fn answers(endpoint: &str, node: NodeId) -> StatusCode {
     let mut config = plain();
     config.backoff = (Duration::from_millis(10), Duration::from_millis(50));
@@ -88,7 +88,8 @@ async fn answers(endpoint: &str, node: NodeId) -> StatusCode {
     }
 }
 
-/// Variables of space 2 in folders of a thousand, in as many namespaces as their numbers need.
+/// Writes a mapping of variables of space 2 in folders of a thousand, in as many namespaces as
+/// their numbers need.
 fn mapping(count: usize) -> String {
     let mut text = "spaces: [{id: 2}]\nnamespaces:\n".to_owned();
     for index in 2..=namespace(count - 1) {
@@ -114,7 +115,7 @@ fn id(number: usize) -> u32 {
     1 + u32::try_from(number % A_NAMESPACE).unwrap()
 }
 
-/// The number of a DataSetWriter has 16 bits.
+/// A DataSetWriterId has 16 bits.
 const A_NAMESPACE: usize = 50_000;
 type Start = fn(&Cell, usize, &str) -> Server;
 

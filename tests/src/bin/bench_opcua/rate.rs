@@ -26,7 +26,7 @@ pub(crate) fn measure(cell: &Cell, runtime: &Runtime, seconds: u64) {
     }
 }
 
-/// What a client wants of the values, which is published each 100 ms.
+/// The subscription of a client to the values, published each 100 ms.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Hears {
     Nobody,
@@ -81,7 +81,7 @@ fn row(server: &Server, runtime: &Runtime, (a_datagram, hears): (usize, Hears), 
     );
 }
 
-/// A count that no longer grows.
+/// Waits until a count stops growing, and returns it.
 fn settled(count: impl Fn() -> Option<u64>) -> u64 {
     let mut last = None;
     eventually("the server has taken all", START, || {
@@ -92,7 +92,7 @@ fn settled(count: impl Fn() -> Option<u64>) -> u64 {
     })
 }
 
-/// Every topic once in each millisecond, at absolute times.
+/// Sends every topic once in each millisecond, at absolute times.
 fn send(sender: &mut Sender, a_datagram: usize, ticks: u64) {
     let numbers: Vec<usize> = (0..TOPICS).collect();
     let mut due = Instant::now();
@@ -126,7 +126,7 @@ async fn subscribed(server: &Server, hears: Hears) -> (Client, Subscription) {
     (client, values)
 }
 
-/// How many values a client is told until it is done and nothing more comes.
+/// Counts the values that a client receives until it is done and no more values arrive.
 fn counted_by(
     runtime: &Runtime,
     (client, mut values): (Client, Subscription),
@@ -150,6 +150,6 @@ fn counted_by(
 }
 
 const TOPICS: usize = 50;
-/// Notices that may wait in the client.
+/// Number of notifications that may wait in the client.
 const ROOM: usize = 200_000;
 const SILENCE: Duration = Duration::from_millis(500);

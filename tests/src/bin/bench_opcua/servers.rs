@@ -10,17 +10,17 @@ use system_tests::{Cell, Child, Executes, Executor, SERVER_ENDPOINT, processor_t
 
 use crate::feed::Feed;
 
-/// A server that runs.
+/// A running server.
 pub(crate) struct Server {
     pub(crate) name: &'static str,
     pub(crate) endpoint: &'static str,
     child: Child,
-    /// Those of ours are changed and called in the space.
+    /// The space of our own server, in which its variables are changed and its method is called.
     space: Option<(Feed, Executor)>,
 }
 
 impl Server {
-    /// The processor time it has had.
+    /// Returns the processor time of the server so far.
     pub(crate) fn used(&self) -> Duration {
         processor_time(self.child.id())
     }
@@ -29,7 +29,7 @@ impl Server {
         self.child.id()
     }
 
-    /// Has all its variables change from now on, or no longer.
+    /// Starts or stops changes of all its variables.
     pub(crate) fn change(&mut self, on: bool) {
         match &mut self.space {
             Some((feed, _)) => feed.change(on),
@@ -40,7 +40,7 @@ impl Server {
     }
 }
 
-/// All of them, with so many variables that change.
+/// Starts all servers, with this number of changing variables.
 pub(crate) fn all(cell: &Cell, variables: usize) -> Vec<Server> {
     let pairs = pairs(cell);
     vec![
@@ -50,7 +50,7 @@ pub(crate) fn all(cell: &Cell, variables: usize) -> Vec<Server> {
     ]
 }
 
-/// The keys and certificates of the others, made where they are not there yet.
+/// Creates the keys and certificates of the other servers, if they are missing.
 pub(crate) fn pairs(cell: &Cell) -> String {
     let pairs = cell.folder().join("pairs").to_string_lossy().into_owned();
     if !cell.folder().join("pairs").is_dir() {
@@ -99,7 +99,8 @@ pub(crate) fn node_opcua(cell: &Cell, variables: usize, pairs: &str) -> Server {
     }
 }
 
-/// A variable that clients write, those that change in space 2, and a call that the space executes.
+/// Returns a mapping with a variable that clients write, variables that change in space 2, and a
+/// call that the space executes.
 fn mapping(variables: usize) -> String {
     let mut text = format!(
         "namespaces: {{2: '{NAMESPACE}'}}\nspaces: [{{id: 1}}, {{id: 2}}]\n\
@@ -109,7 +110,7 @@ fn mapping(variables: usize) -> String {
     );
     for number in 0..variables {
         let node = FIRST as usize + number;
-        // Every change is told, as it is by the others.
+        // Every change is reported, as by the other servers.
         writeln!(
             text,
             "  - {{node: ns=2;i={node}, name: v{number}, type: Double, origin: 2, queue: {{drop_oldest: 100}}}}"
@@ -119,14 +120,14 @@ fn mapping(variables: usize) -> String {
     text
 }
 
-/// A client that has connected.
+/// Returns a connected client.
 pub(crate) async fn connected(cell: &Cell, endpoint: &str, security: SecurityChoice) -> Client {
     let client = Client::open(config(cell, security), endpoint);
     client.up(START).await.unwrap();
     client
 }
 
-/// A client of any server.
+/// Returns the configuration of a client of any server.
 pub(crate) fn config(cell: &Cell, security: SecurityChoice) -> ClientConfig {
     ClientConfig {
         pki: (security != SecurityChoice::None).then(|| store(cell)),
@@ -136,12 +137,12 @@ pub(crate) fn config(cell: &Cell, security: SecurityChoice) -> ClientConfig {
     }
 }
 
-/// A client without security.
+/// Returns the configuration of a client without security.
 pub(crate) fn plain() -> ClientConfig {
     ClientConfig {
         security: SecurityChoice::None,
         timeout: START,
-        // Of no weight beside what is measured.
+        // Insignificant for the measurement.
         keep_alive: Duration::from_secs(5),
         ..ClientConfig::new("urn:ua-bridge:bench:client", "bench")
     }
@@ -151,7 +152,7 @@ fn store(cell: &Cell) -> PathBuf {
     cell.folder().join("client")
 }
 
-/// One of the variables that change.
+/// Returns the NodeId of a changing variable.
 pub(crate) fn variable(number: usize) -> NodeId {
     NodeId::new(SPACE, FIRST + u32::try_from(number).unwrap())
 }
@@ -161,9 +162,9 @@ pub(crate) const NAMESPACE: &str = "urn:ua-bridge:bench";
 pub(crate) const SPACE: u16 = 2;
 pub(crate) const WRITTEN: u32 = 5;
 pub(crate) const METHOD: u16 = 6;
-/// The first of the variables that change.
+/// The first number of the changing variables.
 pub(crate) const FIRST: u32 = 10;
-/// Variables that change.
+/// Number of changing variables.
 pub(crate) const ITEMS: usize = 1000;
 /// asyncua makes a thousand variables in three seconds.
 pub(crate) const START: Duration = Duration::from_secs(180);

@@ -31,9 +31,9 @@ pub(crate) async fn measure(cell: &Cell, servers: &[Server], requests: usize) {
     }
 }
 
-/// One kind of request, to all servers.
+/// Measures a kind of request with all servers.
 async fn kind(asked: &mut [Asked<'_>], what: What, security: &str, requests: usize) {
-    // The first of a kind is another thing: it may have to be looked up.
+    // The first request of a kind is not measured: the server may have to look the node up.
     for one in &mut *asked {
         one.ask(what, 0).await;
     }
@@ -99,7 +99,7 @@ impl<'a> Asked<'a> {
         let parents = Browse::of(ReferenceTypeId::HasComponent).inverse();
         let until = Instant::now() + METHOD_THERE;
         let object = loop {
-            // That of a call of the space comes with the announcement of who executes it.
+            // The object of a call of the space appears with the announcement of its executor.
             let found = client.browse(&method(), parents.clone()).await;
             match found.unwrap_or_default().first() {
                 Some(parent) => break parent.node_id.node_id.clone(),
@@ -144,8 +144,8 @@ fn method() -> NodeId {
     NodeId::new(SPACE, u32::from(METHOD))
 }
 
-/// Requests to one server, then to the next.
+/// Number of requests to a server before the next server's turn.
 const TURN: usize = 50;
-/// Values of a large Read.
+/// Number of values of a large Read.
 const MANY: usize = 100;
 const METHOD_THERE: Duration = Duration::from_secs(10);

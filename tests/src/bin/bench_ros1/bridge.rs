@@ -64,7 +64,7 @@ fn shown(count: Option<u64>) -> String {
     count.map_or_else(|| "unknown".to_owned(), |count| count.to_string())
 }
 
-/// Events, of which none may give way.
+/// Returns a mapping of events, none of which may be replaced.
 fn mapping(shared: u8) -> String {
     let mut text = format!(
         "spaces:\n  - id: 1\nnamespaces:\n  2: urn:ua-bridge:bench\n\
@@ -102,7 +102,7 @@ fn carries_all(topics: &mut [TcpStream], listener: &UdpSocket) {
     });
 }
 
-/// Every topic once in each millisecond, at absolute times.
+/// Sends every topic once in each millisecond, at absolute times.
 fn send(topics: &mut [TcpStream], ticks: u64) {
     let mut due = Instant::now();
     for tick in 0..ticks {
@@ -114,7 +114,7 @@ fn send(topics: &mut [TcpStream], ticks: u64) {
     }
 }
 
-/// How many different numbers came, over all topics.
+/// Counts the distinct numbers that arrive, over all topics.
 fn receive(listener: &UdpSocket, done: &AtomicBool) -> u64 {
     let mut seen: Vec<Vec<bool>> = vec![Vec::new(); TOPICS];
     let mut count = 0;
@@ -141,15 +141,15 @@ fn receive(listener: &UdpSocket, done: &AtomicBool) -> u64 {
     }
 }
 
-/// A text that ends with its topic and number, nine digits each.
+/// Returns a text that ends with its topic and number, nine digits each.
 fn message(topic: usize, number: u64) -> Vec<u8> {
     string_frame(&format!("{:PADDING$}{topic:09}{number:09}", ""))
 }
 
-/// Topic and number of each text of a datagram.
+/// Returns topic and number of each text of a datagram.
 fn parsed(datagram: &[u8]) -> Vec<(usize, u64)> {
     let message = NetworkMessage::decode(datagram).unwrap();
-    // An announcement has none. A message ends with its last field.
+    // An announcement has no messages. A message ends with its last field.
     let messages = message.messages().flatten();
     messages
         .filter_map(|message| {
@@ -166,8 +166,8 @@ const TOPICS: usize = 50;
 const FIRST: usize = 10;
 const SIZE: usize = 64;
 const PADDING: usize = SIZE - 18;
-/// The number of what is sent until the whole path stands.
+/// The number of texts that are sent until the whole path is established.
 const HELLO: u64 = 999_999_999;
 const START: Duration = Duration::from_secs(30);
-/// Nothing more comes after this long without a datagram.
+/// Silence after which no more datagrams are expected.
 const SILENCE: Duration = Duration::from_millis(500);

@@ -1,4 +1,4 @@
-//! 500 messages of 1 KiB in one piece, as a node sends them that had to wait for its data.
+//! 500 messages of 1 KiB in a burst, as sent by a node that had to wait for its data.
 
 use crate::path::Path;
 use system_tests::Times;

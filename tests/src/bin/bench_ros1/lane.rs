@@ -1,4 +1,4 @@
-//! One topic's way into a relay and out of it again.
+//! The path of a topic into a relay and out of it.
 
 use std::io::Write;
 use std::net::TcpStream;
@@ -6,11 +6,12 @@ use std::time::{Duration, Instant};
 
 use system_tests::{BareNode, BareSubscription, PATIENCE, Times, eventually, string_frame};
 
-/// The two ends of a way.
+/// The two ends of a path.
 pub(crate) struct Lane {
     input: TcpStream,
     output: BareSubscription,
-    /// Of the next message: late ones of an earlier measurement are told apart by it.
+    /// The number of the next message, which distinguishes it from late messages of an earlier
+    /// measurement.
     number: u64,
     start: Instant,
 }
@@ -25,17 +26,18 @@ impl Lane {
         }
     }
 
-    /// The lanes through a relay that repeats the first topic of each pair as the second, once they stand.
+    /// Returns the established lanes through a relay that republishes the first topic of each pair
+    /// as the second.
     pub(crate) fn through(node: &BareNode, pairs: &[(String, String)]) -> Vec<Self> {
         let inputs: Vec<String> = pairs.iter().map(|(input, _)| input.clone()).collect();
         let inputs = node.publish(&inputs).into_iter();
         let lanes = inputs.zip(pairs).map(|(mut input, (_, output))| {
-            // Some relays advertise their output only when they have seen a message.
+            // Some relays advertise their output only when they have received a message.
             let mut output = eventually("the relay advertises", START, || {
                 input.write_all(&string_frame("are you there")).unwrap();
                 node.subscribe(output)
             });
-            // Others take a subscriber in only after they have shaken hands with it.
+            // Other relays send to a subscriber only after the handshake with it.
             output.wait_at_most(Duration::from_millis(200));
             eventually("the relay carries a message", START, || {
                 input.write_all(&string_frame("are you there")).unwrap();
@@ -43,14 +45,14 @@ impl Lane {
             });
             output.wait_at_most(PATIENCE);
             let mut lane = Self::of(input, output);
-            // What is left of the beginning is read away.
+            // Discards the messages of the start.
             lane.pass(&string_frame("now"));
             lane
         });
         lanes.collect()
     }
 
-    /// Sends a frame, waits until it comes out, and says how long that took.
+    /// Sends a frame, waits until it arrives, and returns the elapsed time.
     pub(crate) fn pass(&mut self, frame: &[u8]) -> Duration {
         let start = Instant::now();
         self.input.write_all(frame).unwrap();
@@ -66,8 +68,8 @@ impl Lane {
         }
     }
 
-    /// Sends numbered messages in a thread of their own, at a pace or all in one piece, and gives the times of those
-    /// that come out before all is silent for `silence`.
+    /// Sends numbered messages on a separate thread, at a pace or all at once. Returns the times of
+    /// the messages that arrive before a silence of `SILENCE`.
     pub(crate) fn stream(&mut self, count: u64, size: usize, pace: Option<Duration>) -> Times {
         let first = self.number;
         self.number += count;
@@ -103,7 +105,8 @@ impl Lane {
     }
 }
 
-/// Sends at absolute times. A message's time begins when it is sent, so that the sender's own lateness does not count.
+/// Sends at absolute times. A message's time starts when it is sent, so that the sender's own delay
+/// does not count.
 fn paced(
     mut input: &TcpStream,
     numbers: std::ops::Range<u64>,
@@ -120,7 +123,7 @@ fn paced(
     }
 }
 
-/// A text of `size` characters that ends with its number and when it was sent.
+/// Returns a text of `size` characters that ends with its number and the time of sending.
 fn stamped(number: u64, sent: Duration, size: usize) -> Vec<u8> {
     let sent = sent.as_nanos();
     let padding = size.saturating_sub(2 * DIGITS);
@@ -134,8 +137,8 @@ fn stamp(frame: &[u8]) -> Option<(u64, Duration)> {
     Some((digits(number)?, Duration::from_nanos(digits(sent)?)))
 }
 
-/// Of a number at the end of a text.
+/// Digits of a number at the end of a text.
 pub(crate) const DIGITS: usize = 16;
-/// Nothing more comes after this long without a message.
+/// Silence after which no more messages are expected.
 const SILENCE: Duration = Duration::from_millis(700);
 const START: Duration = Duration::from_secs(30);

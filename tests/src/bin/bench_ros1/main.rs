@@ -1,8 +1,10 @@
-//! `cargo xtask bench ros1`: relays of ROS 1 messages beside a raw TCP echo, and `bridge-ros1` under many topics.
+//! `cargo xtask bench ros1`: relays of ROS 1 messages compared with a raw TCP echo, and
+//! `bridge-ros1` under many topics.
 //!
-//! One process plays both ends of every path, with blocking sockets. What is compared takes turns, so that all of it
-//! sees the same machine. The echo is a program that reads whole frames from one TCP connection and writes each to
-//! another with blocking calls: the least that a relay has to do.
+//! A single process plays both ends of every path, with blocking sockets. The compared paths take
+//! turns, so that all of them see the same machine. The echo is a program that reads whole frames
+//! from a TCP connection and writes each to another with blocking calls: the minimum work of a
+//! relay.
 
 mod bridge;
 mod bursts;
@@ -63,14 +65,14 @@ fn main() -> ExitCode {
     ExitCode::SUCCESS
 }
 
-/// How much of what.
+/// The benchmarks to run and their sizes.
 struct Plan {
     help: bool,
-    /// Those to run; all when empty.
+    /// The parts to run; all parts if empty.
     parts: Vec<String>,
-    /// Of each size, one at a time, through each path.
+    /// Messages of each size, one at a time, through each path.
     messages: u64,
-    /// Open loop, through each path.
+    /// Seconds of open loop through each path.
     seconds: u64,
     bursts: u64,
     bridge_seconds: u64,
@@ -79,7 +81,7 @@ struct Plan {
 }
 
 impl Plan {
-    /// `None` when the arguments make no sense.
+    /// Returns the plan, or `None` if the arguments are invalid.
     fn of(args: &[String]) -> Option<Self> {
         let mut plan = Self {
             help: false,
@@ -123,7 +125,8 @@ impl Plan {
     }
 }
 
-/// A thousand topics in and out are 2000 connections, here and in a relay; many systems give a process 1024.
+/// Raises the limit of open files: a thousand topics in and out are 2000 connections, here and in a
+/// relay, and many systems allow a process 1024.
 fn allow_open_files() {
     let maximum = getrlimit(Resource::Nofile).maximum;
     let current = maximum;

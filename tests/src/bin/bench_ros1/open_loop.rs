@@ -1,4 +1,4 @@
-//! 1 KiB a thousand times a second, whether the last one has come or not: what a sensor does.
+//! 1 KiB a thousand times a second, whether the last message has arrived or not, as a sensor sends.
 
 use std::time::Duration;
 
@@ -37,6 +37,6 @@ pub(crate) fn measure(paths: &mut [Path], seconds: u64) {
     }
 }
 
-/// Seconds, so that all paths see the same machine and none the others' messages.
+/// Seconds of a turn, so that all paths see the same machine and not the messages of other paths.
 const TURN: u64 = 10;
 const PERIOD: Duration = Duration::from_millis(1);

@@ -1,4 +1,4 @@
-//! What repeats messages: the echo, `tcpros`, roscpp, rospy, rosrust.
+//! The relays: the echo, `tcpros`, roscpp, rospy, rosrust.
 
 use std::io::{Read, Write};
 use std::net::{TcpListener, TcpStream};
@@ -10,7 +10,7 @@ use system_tests::{BareNode, BareSubscription, Cell, Child, Started, processor_t
 
 use crate::lane::Lane;
 
-/// One relay with both ends of its one lane.
+/// A relay with both ends of its only lane.
 pub(crate) struct Path {
     pub(crate) name: &'static str,
     pub(crate) lane: Lane,
@@ -18,7 +18,7 @@ pub(crate) struct Path {
 }
 
 impl Path {
-    /// All of them, the echo first.
+    /// Starts all relays, the echo first.
     pub(crate) fn all(cell: &Cell) -> Vec<Self> {
         let node = BareNode::start("/bench");
         vec![
@@ -69,8 +69,8 @@ impl Path {
     }
 }
 
-/// An echo of many lanes: what comes in on one connection goes out on the next, as a readiness queue shows it. Connections
-/// are taken in pairs, input first.
+/// Runs an echo of many lanes: frames of a connection are sent to the next connection, in the order
+/// of a readiness queue. Connections are taken in pairs, input first.
 pub(crate) fn echo_many(lanes: usize) -> ExitCode {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     println!("{}", listener.local_addr().unwrap());
@@ -104,14 +104,15 @@ pub(crate) fn echo_many(lanes: usize) -> ExitCode {
     ExitCode::SUCCESS
 }
 
-/// The echo: frames in from the first connection, out to the second, with as few calls as can be.
+/// Runs the echo: frames in from the first connection, out to the second, with as few calls as
+/// possible.
 pub(crate) fn echo() -> ExitCode {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     println!("{}", listener.local_addr().unwrap());
     let (input, _) = listener.accept().unwrap();
     let (mut output, _) = listener.accept().unwrap();
     output.set_nodelay(true).unwrap();
-    // Waits as long as the other end stays.
+    // Waits as long as the other end stays connected.
     let mut frames = BareSubscription::of(input);
     frames.wait_without_end();
     while let Ok(frame) = frames.receive_frame() {

@@ -1,4 +1,4 @@
-//! One message at a time through every path, the paths in turn.
+//! Messages one at a time through every path, the paths in turn.
 
 use std::time::Duration;
 
@@ -28,7 +28,8 @@ pub(crate) fn measure(paths: &mut [Path], messages: u64) {
     }
 }
 
-/// A turn's first messages pass untimed: the path before may still be at work, as threads go on after a message.
+/// The first messages of a turn are not timed: the previous path may still be working, because
+/// threads continue after a message.
 fn pass(paths: &mut [Path], size: usize, messages: u64) -> Vec<Times> {
     let padding = " ".repeat(size - DIGITS);
     let mut all: Vec<Times> = paths.iter().map(|_| Times::default()).collect();
@@ -46,6 +47,6 @@ fn pass(paths: &mut [Path], size: usize, messages: u64) -> Vec<Times> {
     all
 }
 
-/// Messages through one path before it is the next one's turn.
+/// Messages through a path before the next path's turn.
 const TURN: usize = 50;
 const UNTIMED: u64 = 10;

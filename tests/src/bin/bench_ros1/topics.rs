@@ -1,5 +1,5 @@
-//! What a message costs a relay that carries few topics or many, at the same rate over all of them, and what it costs
-//! an echo of as many connections that does nothing else.
+//! The cost of a message in a relay that carries few topics or many, at the same total rate, and in
+//! an echo with as many connections that does nothing else.
 
 use std::net::TcpStream;
 use std::time::Duration;
@@ -11,7 +11,7 @@ use system_tests::{
 
 use crate::lane::{DIGITS, Lane};
 
-/// A relay of so many topics, with both ends of each.
+/// A relay of many topics, with both ends of each topic.
 struct Crowd {
     name: &'static str,
     relay: Child,
@@ -63,7 +63,8 @@ impl Crowd {
         }
     }
 
-    /// One message at a time, each through the next topic, so that none is read or written together with another.
+    /// Sends messages one at a time, each through the next topic, so that no two messages are read
+    /// or written together.
     fn turn(&mut self, first: u64) {
         let before = processor_time(self.relay.id());
         let lanes = self.lanes.len() as u64;
@@ -109,5 +110,5 @@ pub(crate) fn measure(cell: &Cell, blocks: usize) {
     }
 }
 
-/// Messages of one turn: every topic of the most gets its own.
+/// Messages of a turn: with the highest number of topics, each topic gets a message.
 const BLOCK: u64 = 1000;

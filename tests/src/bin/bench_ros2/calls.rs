@@ -1,4 +1,4 @@
-//! Services asked for through both bridges, beside those of one ROS that nothing stands between.
+//! Service calls through both bridges, compared with direct calls within a ROS.
 
 use std::time::Duration;
 
@@ -37,7 +37,7 @@ pub(crate) fn measure(cell: &Cell, calls: u64) {
     }
 }
 
-/// What became of the calls of one way.
+/// The results of the calls of a way.
 #[derive(Default)]
 struct Sum {
     times: Times,
@@ -67,7 +67,7 @@ struct Ways {
     direct: Child,
     through: Child,
     bridges: [Child; 2],
-    /// Whom they ask.
+    /// The servers of the calls.
     _servers: [Child; 2],
 }
 
@@ -75,7 +75,7 @@ impl Ways {
     fn stand(cell: &Cell) -> Self {
         let mapping = cell.file("calls.yaml", MAPPING);
         let mapping = mapping.to_string_lossy();
-        // Any node of roscpp has the service.
+        // Every node of roscpp has the service.
         let node = ["/nothing", "/nowhere", "__name:=roscpp"];
         let servers = [
             cell.ros1_started("lib/topic_tools/relay", &node).start(),
@@ -104,7 +104,7 @@ impl Ways {
         ways
     }
 
-    /// Asks [`TURN`] times on a way of [`NAMES`].
+    /// Calls [`TURN`] times on a way of [`NAMES`].
     fn ask(&mut self, way: usize, window: u64) -> Value {
         let order = format!("{TURN} {window}");
         let by_rospy = |case: &str, service: &str| {
@@ -161,5 +161,5 @@ calls:
       - {space: 1, service: /switch, type: std_srvs/SetBool}
 ";
 
-/// Calls of one way before the next has its turn.
+/// Calls of a way before the next way's turn.
 const TURN: u64 = 100;

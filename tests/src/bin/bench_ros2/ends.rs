@@ -1,4 +1,4 @@
-//! The ends of the paths: Cyclone DDS in C told what to do by lines, ROS 1 by a blocking socket.
+//! The ends of the paths: Cyclone DDS in C, controlled by lines, and ROS 1 with a blocking socket.
 
 use std::collections::HashSet;
 use std::io::Write as _;
@@ -10,10 +10,10 @@ use system_tests::{
     BareNode, BareSubscription, Cell, Child, Stamp, Times, eventually, now, string_frame,
 };
 
-/// Sends stamped texts on topics of DDS.
+/// A sender of stamped texts on topics of DDS.
 pub(crate) struct Pacer(Child);
 
-/// When to send: ticks of `period`, with a pause after each `burst` of them.
+/// The times of sending: ticks of `period`, with a pause after each `burst` of ticks.
 #[derive(Clone, Copy)]
 pub(crate) struct Pace {
     pub(crate) ticks: u64,
@@ -24,7 +24,7 @@ pub(crate) struct Pace {
 }
 
 impl Pace {
-    /// 1 kHz without a pause.
+    /// Returns a pace of 1 kHz without a pause.
     pub(crate) const fn kilohertz(seconds: u64, size: usize) -> Self {
         Self {
             ticks: seconds * 1000,
@@ -48,7 +48,7 @@ impl Pacer {
         Self(cell.cyclone_c(&[&args, more].concat()))
     }
 
-    /// Sends, and says how many samples were refused.
+    /// Sends at a pace, and returns the number of refused samples.
     pub(crate) fn send(&mut self, pace: Pace) -> u64 {
         let (period, pause) = (pace.period.as_nanos(), pace.pause.as_nanos());
         let line = format!(
@@ -60,10 +60,10 @@ impl Pacer {
     }
 }
 
-/// Hears stamped texts on topics of DDS.
+/// A receiver of stamped texts on topics of DDS.
 pub(crate) struct Meter(Child);
 
-/// What a [`Meter`] or a [`Listener`] has heard.
+/// The results of a [`Meter`] or a [`Listener`].
 #[derive(Debug, Default)]
 pub(crate) struct Report {
     pub(crate) distinct: u64,
@@ -87,7 +87,7 @@ impl Meter {
         Self(cell.cyclone_c(&[&args, more].concat()))
     }
 
-    /// Waits for so many samples, or until none comes any more, and begins anew.
+    /// Waits for this many samples, or for silence, and resets the results.
     pub(crate) fn report(&mut self, expected: u64) -> Report {
         let answer = self.0.ask(&format!("{expected} {SILENCE_MS}"), PATIENCE);
         Report {
@@ -115,7 +115,7 @@ pub(crate) fn times(answer: &Value) -> Times {
     times
 }
 
-/// Sends stamped texts on one topic of ROS 1.
+/// A sender of stamped texts on a topic of ROS 1.
 pub(crate) struct Talker {
     stream: TcpStream,
     number: u64,
@@ -139,7 +139,7 @@ impl Talker {
         }
     }
 
-    /// One text, which measurements count too.
+    /// Sends a text, which measurements count, too.
     pub(crate) fn say(&mut self, size: usize) {
         let text = Stamp::text(0, self.number, size);
         self.number += 1;
@@ -147,7 +147,7 @@ impl Talker {
     }
 }
 
-/// Hears stamped texts on one topic of ROS 1.
+/// A receiver of stamped texts on a topic of ROS 1.
 pub(crate) struct Listener {
     subscription: BareSubscription,
     heard: HashSet<u64>,
@@ -155,7 +155,7 @@ pub(crate) struct Listener {
 }
 
 impl Listener {
-    /// Waits until somebody publishes the topic.
+    /// Waits until the topic is published, and subscribes to it.
     pub(crate) fn of(node: &BareNode, topic: &str) -> Self {
         let what = format!("{topic} is published");
         Self {
@@ -165,7 +165,7 @@ impl Listener {
         }
     }
 
-    /// Hears so many texts, or until none comes any more.
+    /// Receives this many texts, or until silence.
     pub(crate) fn report(&mut self, expected: u64) -> Report {
         self.subscription
             .wait_at_most(Duration::from_millis(SILENCE_MS));
@@ -189,11 +189,11 @@ impl Listener {
     }
 }
 
-/// How long peers may live: longer than any measurement.
+/// The maximum lifetime of peers in seconds: longer than any measurement.
 pub(crate) const LIMIT: &str = "1800";
-/// A path needs seconds to stand.
+/// A path needs seconds to be established.
 pub(crate) const START: Duration = Duration::from_secs(30);
-/// For an answer that needs no time.
+/// The timeout of an answer that is given at once.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(30);
-/// Nothing more comes after so long without anything.
+/// Silence after which no more samples are expected.
 pub(crate) const SILENCE_MS: u64 = 1000;

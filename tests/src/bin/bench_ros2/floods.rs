@@ -1,4 +1,4 @@
-//! More than both bridges can carry.
+//! Higher rates than both bridges can carry.
 
 use std::time::Duration;
 
@@ -34,7 +34,7 @@ fn flood(ways: &mut Ways, way: usize, floods: u64) {
             let mut report = ways.send(way, pace);
             let mut took = now().saturating_sub(start);
             if report.distinct < ticks {
-                // It was waited for what did not come.
+                // The time that was spent waiting for missing samples.
                 took = took.saturating_sub(Duration::from_millis(SILENCE_MS));
             }
             #[expect(clippy::cast_precision_loss, reason = "a rate for people")]
@@ -51,7 +51,7 @@ fn flood(ways: &mut Ways, way: usize, floods: u64) {
     }
 }
 
-/// The samples that both bridges have counted as dropped.
+/// Returns the number of samples that both bridges have dropped.
 pub(crate) fn bridges_dropped() -> u64 {
     let bridges = [METRICS_ROS1, METRICS_ROS2];
     let statuses = bridges.into_iter().filter_map(metrics);

@@ -1,4 +1,5 @@
-//! How long a goal takes to be accepted through both bridges, beside those of one ROS that nothing stands between.
+//! The time until a goal is accepted through both bridges, compared with a direct goal within a
+//! ROS.
 
 use std::time::Duration;
 
@@ -27,10 +28,10 @@ pub(crate) fn measure(cell: &Cell, goals: u64) {
     }
 }
 
-/// A client of each way, in the order of [`NAMES`].
+/// A client for each way, in the order of [`NAMES`].
 struct Ways {
     clients: [Child; 4],
-    /// Those who carry, and whom they ask.
+    /// The bridges, and the servers of the goals.
     _others: [Child; 4],
 }
 
@@ -50,7 +51,7 @@ impl Ways {
         let [of_ros1, of_ros2] = servers.map(|server| server.told().start().ready(START));
         let bridges = [cell.bridge_ros1(&[]), cell.bridge_ros2(&[])];
         let by_actionlib = |action: &str| {
-            // Of two nodes of one name the master ends the first.
+            // Of two nodes with the same name, the master shuts the first down.
             let node = action.trim_start_matches('/');
             let args = [action, TYPE, "--plain", "--limit", LIMIT, "--node", node];
             cell.rospy_started("calls/actionlib_client.py", &args)
@@ -70,7 +71,7 @@ impl Ways {
             clients: clients.map(|client| client.told().start().ready(START)),
             _others: [of_ros1, of_ros2, one, two],
         };
-        // What is slow the first time is no measure.
+        // The first goals are slow and not measured.
         for way in 0..NAMES.len() {
             drop(ways.ask(way));
         }
@@ -100,5 +101,5 @@ const RCLPY: &str = "ros2_rclpy_action.py";
 const TYPE: &str = "test_msgs/Fibonacci";
 const OF_ROS1: &str = "/ua_1_2_70";
 const OF_ROS2: &str = "/ua_2_2_70";
-/// Goals of one way before the next has its turn.
+/// Goals of a way before the next way's turn.
 const TURN: u64 = 25;

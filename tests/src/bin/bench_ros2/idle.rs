@@ -1,4 +1,4 @@
-//! What `bridge-ros2` takes of the machine while nothing happens.
+//! The resources of an idle `bridge-ros2`.
 
 use std::time::Duration;
 
@@ -24,7 +24,7 @@ pub(crate) fn measure(cell: &Cell, seconds: u64) {
             let many = ["--topics", &topics, "--first", &first, "--limit", "1800"];
             ["meter", "pace"].map(|role| cell.cyclone_c(&[&[role, "/ua_2_2_"], &many[..]].concat()))
         });
-        // Endpoints settle.
+        // Time in which endpoints settle.
         std::thread::sleep(Duration::from_secs(5));
         let before = processor_time(bridge.id());
         std::thread::sleep(Duration::from_secs(seconds));

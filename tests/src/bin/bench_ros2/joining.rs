@@ -1,4 +1,4 @@
-//! From a program's start to the first sample that it repeats.
+//! From the start of a program to the first sample that it relays.
 
 use std::time::{Duration, Instant};
 

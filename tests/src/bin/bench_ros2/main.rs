@@ -1,7 +1,8 @@
-//! `cargo xtask bench ros2`: relays of DDS samples beside a UDP echo, and both bridges between ROS 1 and ROS 2.
+//! `cargo xtask bench ros2`: relays of DDS samples compared with a UDP echo, and both bridges
+//! between ROS 1 and ROS 2.
 //!
-//! The DDS ends of every path are Cyclone DDS in C, the ROS 1 and UADP ends blocking sockets without any library. What
-//! is compared takes turns, so that all of it sees the same machine.
+//! The DDS ends of every path are Cyclone DDS in C, the ROS 1 and UADP ends blocking sockets
+//! without any library. The compared paths take turns, so that all of them see the same machine.
 
 mod bursts;
 mod calls;
@@ -74,25 +75,26 @@ fn main() -> ExitCode {
     ExitCode::SUCCESS
 }
 
-/// How much of what.
+/// The benchmarks to run and their sizes.
 struct Plan {
     help: bool,
-    /// Those to run; all when empty.
+    /// The parts to run; all parts if empty.
     parts: Vec<String>,
-    /// Of each size, one at a time, through each relay; a tenth of it where samples are large.
+    /// Messages of each size, one at a time, through each relay; a tenth of this number for large
+    /// samples.
     messages: u64,
-    /// Of these at a time through one relay, then through the next.
+    /// Messages through a relay before the next relay's turn.
     turn: u64,
-    /// At 1 kHz, and of doing nothing.
+    /// Seconds at 1 kHz, and seconds of idling.
     seconds: u64,
-    /// Of what happens a few times only.
+    /// Repetitions of events that happen a few times only.
     turns: u64,
-    /// Of a service, one at a time and many at a time.
+    /// Calls of a service, one at a time and many at a time.
     calls: u64,
 }
 
 impl Plan {
-    /// `None` when the arguments make no sense.
+    /// Returns the plan, or `None` if the arguments are invalid.
     fn of(args: &[String]) -> Option<Self> {
         let mut plan = Self {
             help: false,
@@ -130,7 +132,7 @@ impl Plan {
     }
 }
 
-/// Each takes seconds.
+/// Each flood takes seconds.
 const FLOODS: u64 = 3;
 const PARTS: [&str; 11] = [
     "round-trip",

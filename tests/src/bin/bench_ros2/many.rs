@@ -45,7 +45,7 @@ fn to_dds(cell: &Cell, seconds: u64) {
         tick(number);
         number += 1;
         let heard = meter.report(TOPICS as u64).distinct;
-        // Twice in a row: what settles has settled.
+        // Twice in succession, so that all endpoints have settled.
         whole = if heard == TOPICS as u64 { whole + 1 } else { 0 };
         (whole == 2).then_some(())
     });
@@ -63,7 +63,7 @@ fn to_dds(cell: &Cell, seconds: u64) {
     let sent = seconds * 1000 * TOPICS as u64;
     let report = meter.report(sent);
     let used = processor_time(bridge.id()) - before;
-    // The receiver's socket is Cyclone's own, and what it loses is repaired.
+    // The receiver's socket belongs to Cyclone DDS, which repairs its losses.
     let dropped = Dropped::so_far(0).since(&dropped);
     row(
         "UADP -> DDS",
@@ -91,7 +91,7 @@ fn to_uadp(cell: &Cell, way: &str, pubsub: &str, seconds: u64) {
         pacer.send(Pace::kilohertz(1, SIZE));
         let mut crossed = HashSet::new();
         let start = now();
-        // Keep-alives come for ever.
+        // Keep-alives never end.
         while now() - start < SETTLES
             && let Ok(length) = listener.recv(&mut buffer)
         {
@@ -134,7 +134,7 @@ fn to_uadp(cell: &Cell, way: &str, pubsub: &str, seconds: u64) {
     );
 }
 
-/// Where samples and datagrams were dropped.
+/// The number of dropped samples and datagrams, by location.
 struct Dropped {
     by_bridge: u64,
     in_receiver: u64,
@@ -160,7 +160,7 @@ impl Dropped {
     }
 }
 
-/// What came of one way.
+/// The results of a way.
 struct Ran {
     sent: u64,
     report: Report,
@@ -190,7 +190,7 @@ fn row(way: &str, ran: Ran) {
     );
 }
 
-/// What a member of the group hears of stamped texts.
+/// The stamped texts that a member of the group has received.
 #[derive(Default)]
 struct Heard {
     seen: HashSet<(usize, u64)>,
@@ -198,7 +198,7 @@ struct Heard {
 }
 
 impl Heard {
-    /// The topics of the datagram's texts that were not heard before.
+    /// Adds a datagram. Returns the topics of its texts that were not received before.
     fn add(&mut self, datagram: &[u8]) -> Vec<usize> {
         let mut topics = Vec::new();
         let Ok(message) = NetworkMessage::decode(datagram) else {
@@ -222,7 +222,7 @@ impl Heard {
     }
 }
 
-/// Events, of which none may give way.
+/// Returns a mapping of events, none of which may be replaced.
 pub(crate) fn mapping(origin: u16) -> String {
     let mut text =
         "spaces:\n  - id: 1\n  - id: 2\nnamespaces:\n  2: urn:ua-bridge:bench\nvariables:\n"
@@ -245,9 +245,9 @@ fn id(topic: usize) -> u16 {
 pub(crate) const TOPICS: usize = 50;
 pub(crate) const FIRST: usize = 10;
 const SIZE: usize = 64;
-/// DataSetMessages of one datagram, where they share one; some ten of these texts fit.
+/// DataSetMessages of a shared datagram; some ten of these texts fit.
 const SHARED: u8 = 32;
-/// What was sent in a second is there after this long.
+/// Time after which all samples of a second have arrived.
 const SETTLES: Duration = Duration::from_secs(2);
-/// Nothing more comes after this long without a new text.
+/// Silence, without a new text, after which no more texts are expected.
 const SILENCE: Duration = Duration::from_millis(500);

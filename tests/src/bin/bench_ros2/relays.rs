@@ -1,4 +1,5 @@
-//! Samples there and back through relays of three makers, and datagrams through an echo.
+//! Round trips of samples through relays on three DDS implementations, and of datagrams through an
+//! echo.
 
 use std::net::UdpSocket;
 use std::process::ExitCode;
@@ -121,7 +122,7 @@ fn print(size: &str, paths: &[Path], passed: Vec<Option<Passed>>) {
     }
 }
 
-/// Sends through all paths in turns. `None` for a path that does not carry so much at once.
+/// Sends through all paths in turns. The result is `None` for a path that cannot carry this load.
 fn pass(paths: &mut [Path], pinger: &mut Pinger, turn: u64, load: Load) -> Vec<Option<Passed>> {
     let mut all: Vec<Option<Passed>> = paths
         .iter()
@@ -136,7 +137,7 @@ fn pass(paths: &mut [Path], pinger: &mut Pinger, turn: u64, load: Load) -> Vec<O
             let Some(all) = all else { continue };
             let before = processor_time(path.relay.id());
             let passed = path.pass(pinger, Load { samples, ..load });
-            // Less than before when a thread has ended.
+            // Lower than before if a thread has ended.
             all.used += processor_time(path.relay.id()).saturating_sub(before);
             all.times.extend(passed.times);
             all.lost += passed.lost;
@@ -146,7 +147,7 @@ fn pass(paths: &mut [Path], pinger: &mut Pinger, turn: u64, load: Load) -> Vec<O
     all
 }
 
-/// So many samples of a size, of which `window` may be on the way.
+/// A number of samples of a size, of which `window` may be in transit.
 #[derive(Clone, Copy)]
 struct Load {
     samples: u64,
@@ -154,7 +155,7 @@ struct Load {
     window: u64,
 }
 
-/// What has gone through one path.
+/// The results of a path.
 #[derive(Default)]
 struct Passed {
     times: Times,
@@ -163,10 +164,10 @@ struct Passed {
     used: Duration,
 }
 
-/// One relay.
+/// A relay.
 struct Path {
     name: &'static str,
-    /// Of the pinger; the echo has a socket instead.
+    /// The index in the pinger; the echo has a socket instead.
     lane: Option<usize>,
     socket: Option<UdpSocket>,
     relay: Child,
@@ -202,7 +203,8 @@ impl Path {
         self.socket.is_none() || (load.size <= LARGE && load.window == 1)
     }
 
-    /// Passes samples until a whole turn of them comes back: endpoints that have just met may miss some.
+    /// Passes samples until a whole turn of them returns, because endpoints that have just matched
+    /// may miss some.
     fn begin(&self, pinger: &mut Pinger) {
         let Some(lane) = self.lane else { return };
         let start = Instant::now();
@@ -242,7 +244,7 @@ fn datagrams(socket: &UdpSocket, Load { samples, size, .. }: Load) -> Passed {
     passed
 }
 
-/// Datagrams in, the same out.
+/// Runs the echo: returns each datagram.
 pub(crate) fn echo() -> ExitCode {
     let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
     println!("{}", socket.local_addr().unwrap());
@@ -290,12 +292,12 @@ fn topics(lane: usize) -> (String, String) {
 }
 
 const LANES: usize = 3;
-/// Characters of a text, and what is said of it. Its length and the NUL add 5 bytes.
+/// Characters of a text, and the name of its size. Length and NUL add 5 bytes.
 const SIZES: [(usize, &str); 4] = [
     (11, "16 B"),
     (1024, "1 KiB"),
     (LARGE, "64 kB"),
     (1 << 20, "1 MiB"),
 ];
-/// The most that fits a datagram with its headers.
+/// The largest text that fits into a datagram with its headers.
 const LARGE: usize = 65_000;

@@ -1,4 +1,5 @@
-//! What signing and encrypting costs: the whole way through both bridges of a secured group beside that of an open one.
+//! The cost of signing and encryption: the whole way through both bridges in a secured group,
+//! compared with an open group.
 
 use std::process::Command;
 use std::time::Duration;
@@ -51,7 +52,7 @@ pub(crate) fn measure(cell: &Cell, seconds: u64) {
     }
 }
 
-/// Of each group, the open one first.
+/// Prints the rows of all groups, the open group first.
 fn rows_of<'a>((size, way): (&str, &str), sums: impl Iterator<Item = &'a mut Sum>) {
     let mut open = None;
     for ((group, _), sum) in GROUPS.iter().zip(sums) {
@@ -76,7 +77,7 @@ struct Sum {
     used: Duration,
 }
 
-/// Each with what its mapping has beside the values.
+/// The groups, each with the additions to its mapping.
 const GROUPS: [(&str, &str); 3] = [
     ("open", ""),
     (
@@ -89,5 +90,5 @@ const GROUPS: [(&str, &str); 3] = [
     ),
 ];
 const SIZES: [(usize, &str); 2] = [(64, "64 B"), (1024, "1 KiB")];
-/// Seconds.
+/// Seconds of a turn.
 const TURN: u64 = 5;

@@ -1,4 +1,4 @@
-//! The whole way between ROS 1 and ROS 2, through both bridges, beside roscpp's relay.
+//! The whole way between ROS 1 and ROS 2 through both bridges, compared with roscpp's relay.
 
 use std::time::Duration;
 
@@ -53,12 +53,13 @@ pub(crate) struct Ways {
 }
 
 impl Ways {
-    /// Starts all, with topics in whose queues so many may wait, and waits until each way carries.
+    /// Starts all programs, with queues of `waiting` samples, and waits until each way carries
+    /// samples.
     pub(crate) fn stand(cell: &Cell, waiting: u32) -> Self {
         Self::secured(cell, waiting, "")
     }
 
-    /// The same with what else the mapping of both bridges has.
+    /// Starts all programs, with `security` added to the mapping of both bridges.
     pub(crate) fn secured(cell: &Cell, waiting: u32, security: &str) -> Self {
         let mapping = MAPPING.replace("WAITING", &waiting.to_string()) + security;
         let mapping = cell.file("through.yaml", &mapping);
@@ -96,7 +97,7 @@ impl Ways {
             from_ros2.send(hello);
             (in_ros1.report(hello.ticks).distinct >= hello.ticks).then_some(())
         });
-        // What was sent before the way stood may still come.
+        // Samples that were sent before the way was established may still arrive.
         in_ros1.report(u64::MAX);
         Self {
             to_relay,
@@ -110,7 +111,7 @@ impl Ways {
         }
     }
 
-    /// Sends on a way of [`NAMES`] and hears what comes out.
+    /// Sends on a way of [`NAMES`] and returns the results of its receiver.
     pub(crate) fn send(&mut self, way: usize, pace: Pace) -> Report {
         let expected = pace.ticks;
         if way == 1 {
@@ -151,7 +152,7 @@ pub(crate) const NAMES: [&str; 3] = [
     "both bridges, ROS 2 -> UADP -> ROS 1",
 ];
 
-/// Samples that may wait, unless a measurement wants more.
+/// Queue length in samples, unless a measurement needs more.
 pub(crate) const WAITING: u32 = 2000;
 
 const MAPPING: &str = "\
@@ -172,5 +173,5 @@ struct Sum {
     used: Duration,
 }
 
-/// Seconds.
+/// Seconds of a turn.
 const TURN: u64 = 5;

@@ -1,5 +1,5 @@
-//! `cargo xtask bench skills finding`: how soon a server that is plugged in is found, how soon its method is called from
-//! another workstation, and what many servers cost.
+//! `cargo xtask bench skills finding`: the time until a new server is discovered, the time until
+//! its method is called from another workstation, and the cost of many servers.
 
 use std::net::{Ipv4Addr, SocketAddrV4};
 use std::time::{Duration, Instant};
@@ -18,7 +18,7 @@ use system_tests::{
 use tokio::net::TcpListener;
 use tokio::runtime::Runtime;
 
-/// Measures all of it; gives up with the reason where a peer is missing.
+/// Runs all measurements; stops with the reason if a peer is missing.
 pub(crate) fn all(runs: usize, servers: usize) -> Option<()> {
     seen(runs)?;
     called(runs)?;
@@ -26,7 +26,7 @@ pub(crate) fn all(runs: usize, servers: usize) -> Option<()> {
 }
 
 fn runtime() -> Runtime {
-    // Its threads are of the network of this one.
+    // The runtime's threads are in the network of this thread.
     tokio::runtime::Builder::new_multi_thread()
         .worker_threads(2)
         .enable_all()
@@ -34,7 +34,7 @@ fn runtime() -> Runtime {
         .unwrap()
 }
 
-/// A server that can do nothing but be there.
+/// Announces a server that has no other function.
 async fn plugged(name: &str, at: Ipv4Addr, lds: Option<&str>) -> Announced {
     let listener = TcpListener::bind((at, 0)).await.unwrap();
     let port = listener.local_addr().unwrap().port();
@@ -56,7 +56,7 @@ async fn plugged(name: &str, at: Ipv4Addr, lds: Option<&str>) -> Announced {
     announced
 }
 
-/// From the call that announces a server to those who hear of it.
+/// Measures from the announcement of a server to its discovery by watchers.
 fn seen(runs: usize) -> Option<()> {
     let cell = Cell::with(&[Peer::NodeOpcua])?;
     let host = cell.host(Wire::default());
@@ -134,7 +134,7 @@ async fn until_seen(watcher: &mut Watcher, name: &str) {
     tokio::time::timeout(SOON, seen).await.unwrap();
 }
 
-/// When node-opcua listed it, to the millisecond.
+/// Returns the time at which node-opcua listed the server, in milliseconds.
 fn listed_by(other: &mut Child, name: &str) -> Duration {
     other.wait_for_json(&format!("{name} is listed"), SOON, |line| {
         let mut network = line["network"].as_array()?.iter();
@@ -167,7 +167,8 @@ async fn until_listed(url: &str, name: &str) {
     }
 }
 
-/// From the start of a component to the answer of its method, which is called at another workstation.
+/// Measures from the start of a component to the answer of its method, called at another
+/// workstation.
 fn called(runs: usize) -> Option<()> {
     let cell = Cell::with(&[Peer::NodeOpcua])?;
     let bus = cell.segment();
@@ -190,7 +191,7 @@ fn called(runs: usize) -> Option<()> {
     let url = "opc.tcp://10.80.1.1:4840".to_owned();
     let mut times = Times::default();
     let mut known = None;
-    // The first finds out where the method is.
+    // The first run finds the location of the method.
     for _ in 0..=runs {
         let began = Instant::now();
         let component = second.component();
@@ -215,7 +216,7 @@ fn called(runs: usize) -> Option<()> {
     Some(())
 }
 
-/// The same by a client of node-opcua, which runs all the time.
+/// Measures the same with a client of node-opcua that runs all the time.
 fn other_client(
     cell: &Cell,
     at: &Level,
@@ -294,7 +295,7 @@ fn station(at: &Site, name: &str, address: &str, more: &[&str]) -> Child {
         .start()
 }
 
-/// The client of the other workstation, in the network of this thread.
+/// Runs a client of the other workstation in the network of this thread.
 fn asking<T>(url: &str, what: impl AsyncFnOnce(&Client) -> T) -> T {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
@@ -313,7 +314,7 @@ fn asking<T>(url: &str, what: impl AsyncFnOnce(&Client) -> T) -> T {
     })
 }
 
-/// Where the other workstation is, as the discovery server of this one says.
+/// Returns the URL of the other workstation from the discovery server of this workstation.
 async fn neighbour(lds: &str) -> String {
     let end = Instant::now() + SOON;
     loop {
@@ -329,7 +330,7 @@ async fn neighbour(lds: &str) -> String {
     }
 }
 
-/// Calls the method until it answers. Gives the names on the way to it.
+/// Calls the method until it answers, and returns the names of its path.
 fn answered(url: &str, known: Option<&[String]>) -> Vec<String> {
     asking(url, async |client| {
         let end = Instant::now() + SOON;
@@ -353,7 +354,7 @@ fn answered(url: &str, known: Option<&[String]>) -> Vec<String> {
     })
 }
 
-/// Waits until the component is missed: a workstation without methods is not listed.
+/// Waits until the loss of the component is detected: a workstation without methods is not listed.
 fn gone(lds: &str) {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
@@ -368,7 +369,7 @@ fn gone(lds: &str) {
     });
 }
 
-/// The nodes of a path of names below Objects.
+/// Returns the nodes of a path of names below Objects.
 async fn nodes(client: &Client, path: &[String]) -> Option<Vec<NodeId>> {
     let mut nodes = vec![NodeId::from(ObjectId::ObjectsFolder)];
     for name in path {
@@ -382,7 +383,7 @@ async fn nodes(client: &Client, path: &[String]) -> Option<Vec<NodeId>> {
     Some(nodes)
 }
 
-/// Where the method is, below the component.
+/// Returns the path of the method below the component.
 async fn search(client: &Client) -> Option<Vec<String>> {
     let path = DEVICE.map(str::to_owned).to_vec();
     let mut left = vec![(nodes(client, &path).await?.pop()?, path)];
@@ -403,7 +404,7 @@ async fn search(client: &Client) -> Option<Vec<String>> {
     None
 }
 
-/// Many servers that register: until all are listed, and what they cost when nothing happens.
+/// Measures many registering servers: the time until all are listed, and their cost when idle.
 fn many(servers: usize) -> Option<()> {
     let _cell = Cell::with(&[])?;
     let lds = lds(&[]);
@@ -480,7 +481,7 @@ fn lds(args: &[&str]) -> Child {
 }
 
 const LDS: &str = "opc.tcp://127.0.0.1:4840";
-/// Where the component is at the other workstation.
+/// The path of the component at the other workstation.
 const DEVICE: [&str; 4] = ["Neighbours", "station-2", "Devices", "parallel-gripper"];
 const MDNS: SocketAddrV4 = SocketAddrV4::new(Ipv4Addr::new(224, 0, 0, 251), 5353);
 const SOON: Duration = Duration::from_secs(20);

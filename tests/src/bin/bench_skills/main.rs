@@ -1,5 +1,5 @@
-//! `cargo xtask bench skills`: what a client waits for, what a skill's methods take beside a plain one, and many skills in
-//! one server.
+//! `cargo xtask bench skills`: the delays of a client, the duration of a skill's methods compared
+//! with a plain method, and many skills in a server.
 
 mod finding;
 
@@ -42,7 +42,7 @@ fn main() -> ExitCode {
     let Some(cell) = Cell::with(&[]) else {
         return ExitCode::FAILURE;
     };
-    // Its threads are of the network of this one.
+    // The runtime's threads are in the network of this thread.
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(2)
         .enable_all()
@@ -65,7 +65,7 @@ cargo xtask bench skills finding [--runs N] [--servers N]
   --servers N  servers that register with one discovery server (500)
 ";
 
-/// A component with so many grippers, all done at once.
+/// Starts a component with this number of grippers, whose actions complete at once.
 fn component(cell: &Cell, pairs: usize, ready: &mut Times) -> Child {
     let mut yaml =
         "component: bench\napplication_uri: urn:ua-bridge:bench\nnamespace: 9\nskills:\n"
@@ -103,7 +103,8 @@ fn node(id: u32) -> NodeId {
     NodeId::new(1, id)
 }
 
-/// From a Start to its answer, and to the event that says Running, and from that to the end of the run.
+/// Measures from a Start to its answer and to the event for Running, and from this event to the end
+/// of the run.
 async fn events(runs: usize) {
     let client = client().await;
     let select = ["Transition/Number"];
@@ -121,7 +122,7 @@ async fn events(runs: usize) {
         while events.next().await != Some(Notice::Subscribed) {}
         let (mut answered, mut running, mut ended) =
             (Times::default(), Times::default(), Times::default());
-        // Good or not: it may be Ready already.
+        // The result may be bad, because the skill may be Ready already.
         let _reset = client.call(&node(100), &node(109), Vec::new()).await;
         for _ in 0..runs {
             let began = Instant::now();
@@ -154,7 +155,7 @@ async fn events(runs: usize) {
     client.close().await;
 }
 
-/// Waits for the transition of a number.
+/// Waits for the transition with this number.
 async fn until(events: &mut plant_opcua::client::Subscription, number: u32) {
     loop {
         if let Some(Notice::Event { fields, .. }) = events.next().await
@@ -165,7 +166,7 @@ async fn until(events: &mut plant_opcua::client::Subscription, number: u32) {
     }
 }
 
-/// A method that has nothing done beside those of a skill.
+/// Measures a method without effect, compared with the methods of a skill.
 async fn methods(runs: usize) {
     let client = client().await;
     let none = |value_type| {
@@ -184,7 +185,7 @@ async fn methods(runs: usize) {
     };
     let outcome = || vec![Variant::UInt32(0)];
     let skill = node(100);
-    // The lease of the client before ends a moment after its session.
+    // The lease of the previous client ends a moment after its session.
     let until = Instant::now() + Duration::from_secs(5);
     while let Err(error) = client.call(&skill, &node(120), execute()).await {
         assert!(Instant::now() < until, "{error}");
@@ -230,7 +231,8 @@ async fn methods(runs: usize) {
     client.close().await;
 }
 
-/// Many skills in one server: how long it takes to start and to be listed, and what it takes while nothing happens.
+/// Measures many skills in a server: the time to start and to be listed, and the resources when
+/// idle.
 fn many(cell: &Cell, runtime: &Runtime, skills: usize) {
     println!(
         "\n| skills | serves after | listed in | in RAM | of a processor, idle |\n|---|---|---|---|---|"
