@@ -1,5 +1,6 @@
-//! Data for tests. The project's own data is in this folder: manifests of modules, NodeSets and definitions of a robot that do not
-//! exist elsewhere. Data of others is a peer: it has licences of its own, is no part of the project, and may be missing.
+//! Data for tests. The project's own data is in this folder: manifests of modules, NodeSets and
+//! definitions of a robot that exist only here. Third-party data is a peer: it has its own
+//! licences, is no part of the project, and may be missing.
 #![expect(
     clippy::panic,
     clippy::print_stderr,
@@ -11,7 +12,7 @@ use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::{env, fs, thread};
 
-/// Data of others that tests read, by the folder that it is in.
+/// Third-party data that tests read, by its folder.
 pub const FOREIGN: &[(&str, &str)] = &[
     ("mtp", "manifests of eight modules (MIT, ISC)"),
     ("nodesets", "NodeSets of the OPC Foundation (MIT 1.00)"),
@@ -19,7 +20,7 @@ pub const FOREIGN: &[(&str, &str)] = &[
     ("ros1-niryo", "ROS definitions of ned_ros (GPL-3.0)"),
 ];
 
-/// Returns the path of a file of the project's own data, as `mtp/stage.aml`.
+/// Returns the path of a file of the project's own data, such as `mtp/stage.aml`.
 #[must_use]
 pub fn own(file: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join(file)
@@ -34,8 +35,9 @@ pub fn read_own(file: &str) -> String {
     read(&own(file))
 }
 
-/// Returns the path of data of others, as `nodesets/Opc.Ua.Di.NodeSet2.xml`. Where it is missing the test is reported as left
-/// out. The folder is the one that `UA_DATA` names, or `shared/data` beside the repository.
+/// Returns the path of third-party data, such as `nodesets/Opc.Ua.Di.NodeSet2.xml`. If it is
+/// missing, the test is reported as left out. The folder is `UA_DATA`, or `shared/data` beside the
+/// repository.
 ///
 /// # Panics
 /// The data is missing and `CI=true`, or [`FOREIGN`] does not declare its folder.
@@ -56,7 +58,7 @@ pub fn foreign(file: &str) -> Option<PathBuf> {
     None
 }
 
-/// Reads a file of others.
+/// Reads a file of third-party data.
 ///
 /// # Panics
 /// As [`foreign`], and where the file cannot be read.
@@ -65,8 +67,8 @@ pub fn read_foreign(file: &str) -> Option<String> {
     foreign(file).map(|path| read(&path))
 }
 
-/// Reports a test that is left out. The runner of the tests captures what a passing test prints, so the reason also goes into
-/// the file that `UA_SKIPPED` names, which `cargo xtask test` shows at the end.
+/// Reports a test that is left out. The test runner captures the output of a passing test, so the
+/// reason is also written to the file `UA_SKIPPED`, which `cargo xtask test` shows at the end.
 ///
 /// # Panics
 /// `CI=true`, where no test is left out.
@@ -78,7 +80,7 @@ pub fn skip(reason: &str) {
     leave_out(reason);
 }
 
-/// Reports a test that is left out, also with `CI=true`: it has nothing to test in this build.
+/// Reports a test that is left out, also with `CI=true`, because this build has nothing to test.
 pub fn leave_out(reason: &str) {
     let thread = thread::current();
     let test = thread.name().unwrap_or("a test");
