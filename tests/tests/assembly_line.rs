@@ -1,5 +1,5 @@
-//! The demo of the assembly line, with the programs that people run: all of it is done by skills (mappings/line-by-skills.yaml), or
-//! by topics, with a conveyor that is switched by a call.
+//! The demo of the assembly line with the programs that users run. The work is done by skills
+//! (mappings/line-by-skills.yaml), or by topics with a conveyor that is switched by a call.
 
 use std::time::Duration;
 
@@ -15,7 +15,7 @@ fn the_conveyor_is_switched_by_a_call_and_the_line_goes_on_without_it() {
     let report = demo.json_lines().pop().unwrap_or_default();
     assert!(ended.success(), "{report}");
     assert_eq!(report["finished"], true, "{report}");
-    // Some went by the conveyor before it was switched off, and the others without it.
+    // Some covers went by the conveyor before it was switched off, the others without it.
     let by = ["by_conveyor", "by_turtlebot"].map(|by| report[by].as_u64().unwrap_or_default());
     assert!(by.iter().all(|covers| *covers > 0), "{report}");
     assert_eq!(by.iter().sum::<u64>(), 4, "{report}");
@@ -35,7 +35,7 @@ fn a_line_of_skills_takes_back_what_a_dead_conveyor_was_to_carry_and_goes_on_wit
     let report = demo.json_lines().pop().unwrap_or_default();
     assert!(ended.success(), "{report}");
     assert_eq!(report["finished"], true, "{report}");
-    // Two came before the conveyor died, with the third on its way to it.
+    // Two covers arrived before the conveyor died; the third was on its way to the conveyor.
     let counts = ["by_conveyor", "by_turtlebot", "taken_back"].map(|of| report[of].as_u64());
     assert_eq!(counts, [Some(2), Some(2), Some(1)], "{report}");
     let told = report["told_lost_ms"].as_f64();

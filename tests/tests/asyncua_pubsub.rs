@@ -1,4 +1,4 @@
-//! asyncua's PubSub and our codec in one multicast group, both ways.
+//! asyncua's PubSub and our codec in a single multicast group, in both directions.
 
 use std::future::Future;
 use std::time::{Duration, SystemTime};
@@ -16,9 +16,9 @@ use uadp::{
 const SOON: Duration = Duration::from_secs(20);
 const PUBLISHER: u16 = 2;
 
-/// 2026-05-17 12:34:56.789012 UTC, the time `uadp_publish.py` gives its values.
+/// 2026-05-17 12:34:56.789012 UTC, the timestamp of the values of `uadp_publish.py`.
 const TIME: DateTime = DateTime(134_234_948_967_890_120);
-/// A microsecond later.
+/// A microsecond after `TIME`.
 const LATER: DateTime = DateTime(TIME.0 + 10);
 const GUID: Guid = Guid::from_fields(
     0x7296_2B91,
@@ -44,7 +44,7 @@ fn run<T>(future: impl Future<Output = T>) -> T {
     runtime.block_on(async { tokio::time::timeout(SOON, future).await.unwrap() })
 }
 
-/// The next datagrams of one WriterGroup of the publisher.
+/// Returns the next `count` datagrams of a WriterGroup of the publisher.
 fn published(cell: &Cell, writer_group: u16, count: usize) -> Vec<Vec<u8>> {
     run(async {
         let group = group();
@@ -70,7 +70,7 @@ fn messages<'a>(message: &NetworkMessage<'a>) -> Vec<DataSetMessage<'a>> {
     message.messages().map(Result::unwrap).collect()
 }
 
-/// A value with the elements of an array one by one.
+/// A value, with the elements of arrays read one by one.
 #[derive(Debug, PartialEq)]
 enum Read<'a> {
     Scalar(Scalar<'a>),
@@ -272,7 +272,7 @@ fn raw_data_of_asyncua_is_left_as_its_bytes() {
     assert!(raw.values().is_err());
 }
 
-/// asyncua's DataSetReaders of the writers 10 and 11 of our publisher's group 5.
+/// Starts asyncua's DataSetReaders of the writers 10 and 11 of our publisher's group 5.
 fn subscriber(cell: &Cell) -> Child {
     let url = format!("opc.udp://{GROUP}");
     let publisher = PUBLISHER.to_string();
@@ -306,7 +306,7 @@ fn header() -> NetworkHeader<'static> {
     }
 }
 
-/// With a time that asyncua gives its fields as that of the server.
+/// A header with a timestamp, which asyncua uses as the server timestamp of the fields.
 fn data_set_header() -> DataSetHeader {
     DataSetHeader {
         sequence_number: Some(1),
@@ -315,7 +315,8 @@ fn data_set_header() -> DataSetHeader {
     }
 }
 
-/// The fields of the first DataSetMessage that the reader of the writer has taken, without those named `left_out`.
+/// Returns the fields of the first DataSetMessage that the reader of the writer received, without
+/// the fields named `left_out`.
 fn taken(subscriber: &mut Child, writer: u16, left_out: &[&str]) -> Value {
     let what = format!("a DataSetMessage of {writer}");
     let mut fields = subscriber.wait_for_json(&what, SOON, |line| {
@@ -340,7 +341,7 @@ fn asyncua_reads_every_type_from_several_data_set_messages_of_ours() {
         for scalar in &every_scalar()[..16] {
             scalars.scalar(*scalar)?;
         }
-        // Cut to microseconds by asyncua.
+        // asyncua truncates the time to microseconds.
         scalars.scalar(Scalar::DateTime(DateTime(TIME.0 + 9)))?;
         scalars.finish()?;
         let mut arrays = message.key_frame(&data_set_header())?;
@@ -521,7 +522,7 @@ fn asyncua_takes_our_messages_by_publisher_group_and_writer() {
     byte(ours, 6, 10, 4);
     byte(ours, 5, 12, 5);
     byte(ours, 5, 10, 6);
-    // What is sent last is heard last: nothing else was taken before it.
+    // The last sent message is received last, so no message before it was accepted.
     let fields = taken(&mut subscriber, 10, &["name", "status", "server"]);
     assert_eq!(fields, json!([{"type": "Byte", "value": 6}]));
     let lines = subscriber.json_lines();

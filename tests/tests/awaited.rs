@@ -12,7 +12,7 @@ spaces: [{id: 1}, {id: 2}]
 namespaces: {2: urn:cell}
 ";
 
-/// Writes a mapping with the head that all have.
+/// Writes a mapping with the common head.
 fn mapping(cell: &Cell, name: &str, text: &str) -> String {
     let file = cell.file(name, &format!("{HEAD}{text}"));
     file.to_str().unwrap().to_owned()
@@ -74,7 +74,7 @@ variables:
   - {node: ns=2;i=10, name: Lamp, origin: 0, ros: {space: 1, topic: /lamp, type: std_msgs/Bool}}
 ";
     let file = mapping(&cell, "lamp.yaml", text);
-    // An address of no interface: packets to it go nowhere.
+    // An address that no interface has: packets to it are lost.
     let bridge = cell.bridge_ros1_started(&[&file]);
     let mut bridge = bridge
         .env("ROS_HOSTNAME", "")
@@ -110,7 +110,7 @@ variables:
         line.contains("nodes in DDS domain 2 (no participant"),
         "{line}"
     );
-    // The bridge is there, although it has no value.
+    // The bridge is present, although it has no value.
     server.wait_for_line("no longer waiting for: space 2", SOON);
     assert_eq!(
         metrics(METRICS_SERVER).unwrap()["waiting_for"]

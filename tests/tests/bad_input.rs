@@ -1,4 +1,5 @@
-//! Bad bytes, missing peers, wrong configuration: a clear message or a counted drop, and the others' traffic goes on.
+//! Bad bytes, missing peers, wrong configuration: each leads to a clear message or a counted drop,
+//! and other traffic continues.
 
 use std::{
     io::Write,
@@ -17,7 +18,7 @@ const SOON: Duration = Duration::from_secs(30);
 const BOTH: &[Peer] = &[Peer::Ros1, Peer::Python];
 const TEN_FAULTS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/cells/ten_faults.yaml");
 
-/// A fixed sequence of bytes that look random (xorshift): a failure can be run again.
+/// A fixed sequence of pseudo-random bytes (xorshift), so that a failure can be reproduced.
 struct Noise(u64);
 
 impl Noise {
@@ -33,7 +34,7 @@ impl Noise {
     }
 }
 
-/// Values that were not there when this was called arrive.
+/// Waits until more values arrive than at the start of the call.
 fn goes_on(heard: &Child) {
     let before = heard.values().len();
     eventually("traffic goes on", SOON, || {
@@ -93,7 +94,8 @@ fn random_and_truncated_datagrams_are_counted_and_stop_nobody() {
         group.send(&noise.bytes(round % 97 + 1));
         bad += 1;
         if round % 50 == 0 {
-            // Not faster than a program on a busy machine reads: this is about bad bytes, not about floods.
+            // Sent no faster than a program on a busy machine reads: the test is about bad bytes,
+            // not about floods.
             goes_on_a_little(&heard);
         }
     }
@@ -156,7 +158,7 @@ fn garbage_at_the_tcpros_and_slave_ports_stops_nobody() {
         (&tcpros, b"\x04\0\0\0\0\0\0\0".to_vec()), // a header of one empty field
         (&tcpros, b"\x10\0\0\0\xff\xff\xff\x7fcallerid=/x".to_vec()), // a field longer than its header
         (&tcpros, b"GET / HTTP/1.1\r\n\r\n".to_vec()),
-        (&tcpros, Vec::new()), // a peer that says nothing
+        (&tcpros, Vec::new()), // a peer that sends nothing
         (&slave, noise.bytes(4096)),
         (
             &slave,
@@ -226,7 +228,7 @@ fn a_bridge_withdraws_its_registrations_when_told_to_end() {
             "\"on\"",
         ],
     );
-    // Questions for calls are heard before.
+    // Probes for calls are received before.
     eventually("the topic crosses", SOON, || {
         let datagram = group.receive(Duration::from_millis(100))?;
         let message = uadp::NetworkMessage::decode(&datagram).unwrap();

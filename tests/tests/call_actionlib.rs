@@ -1,4 +1,5 @@
-//! Actions of ROS 1 and of ROS 2 by each other: actionlib itself at one end, rclpy or Cyclone DDS at the other.
+//! Actions of ROS 1 used from ROS 2 and the reverse: actionlib itself at an end, rclpy or Cyclone
+//! DDS at the other.
 
 use std::time::Duration;
 
@@ -6,7 +7,7 @@ use nix::sys::signal::Signal;
 use serde_json::{Value, json};
 use system_tests::{Cell, Child, Distribution, Peer, Started, eventually, program};
 
-/// rospy and rclpy need seconds to start on a busy machine.
+/// The time that rospy and rclpy need to start on a busy machine.
 const SOON: Duration = Duration::from_secs(60);
 const OF_ROS1: &str = "/ua_1_2_70";
 const OF_ROS2: &str = "/ua_2_2_70";
@@ -15,7 +16,7 @@ const SERVER: &str = "calls/actionlib_server.py";
 const CLIENT: &str = "calls/actionlib_client.py";
 const RCLPY: &str = "ros2_rclpy_action.py";
 
-/// An actionlib client, which takes orders once it has found its server.
+/// Starts an actionlib client, which takes orders once it has found its server.
 fn actionlib_client(cell: &Cell, args: &[&str]) -> Child {
     let started = cell.rospy_started(CLIENT, args).told();
     started.start().ready(SOON)
@@ -25,7 +26,7 @@ fn send(client: &mut Child, goal: &Value) {
     client.tell(&json!({"send": goal}).to_string());
 }
 
-/// How a goal of an actionlib client ended.
+/// Returns the end of a goal of an actionlib client: status, text and result.
 fn end(client: &mut Child, goal: u64) -> Value {
     client.wait_for_json(&format!("the end of goal {goal}"), SOON, |line| {
         (line.get("goal")? == goal && line.get("end").is_some())
@@ -33,7 +34,7 @@ fn end(client: &mut Child, goal: u64) -> Value {
     })
 }
 
-/// The feedback that an actionlib client has of a goal.
+/// Returns the feedback that an actionlib client received for a goal.
 fn feedback(client: &Child, goal: u64) -> Vec<Value> {
     let lines = client.json_lines();
     let told = lines.iter().filter(|line| line["goal"] == goal);
@@ -55,7 +56,7 @@ fn rclpy_server(cell: &Cell, action: &str) -> Child {
     started.start().ready(SOON)
 }
 
-/// Waits for a line in which `key` is `value`, and gives what it has under another key.
+/// Waits for a line in which `key` is `value`, and returns its value of the key `wanted`.
 fn line(child: &mut Child, key: &str, value: &Value, wanted: &str) -> Value {
     child.wait_for_json(&format!("{key} {value} with {wanted}"), SOON, |line| {
         (line.get(key)? == value).then(|| line.get(wanted).cloned())?
@@ -78,7 +79,7 @@ fn a_simple_action_client_drives_an_action_server_of_rclpy() {
     send(&mut client, &json!({"order": 5}));
     let reached = json!(["SUCCEEDED", "", sequence(&[1, 1, 2, 3, 5])]);
     assert_eq!(end(&mut client, 0), reached);
-    // In ROS 1 a result may overtake the last feedback.
+    // In ROS 1, a result may overtake the last feedback.
     let told = feedback(&client, 0);
     assert_eq!(told.first(), Some(&sequence(&[1])), "{told:?}");
     assert_eq!(line(&mut server, "goal", &json!(5), "accepted"), true);
@@ -192,7 +193,7 @@ fn a_goal_goes_on_without_its_client_and_ends_without_its_server() {
     assert_eq!(line(&mut other, "goal", &json!(0), "accepted"), true);
     let ended = |line: &Value| line.get("cancel").or_else(|| line.get("done")).is_some();
     assert!(!server.json_lines().iter().any(ended), "the first goes on");
-    // Another client can end it.
+    // Another client can cancel the goals.
     other.tell("cancel_all");
     for order in [100, 102] {
         line(&mut server, "cancel", &json!(order), "cancel");
@@ -202,7 +203,7 @@ fn a_goal_goes_on_without_its_client_and_ends_without_its_server() {
     assert_eq!(line(&mut other, "goal", &json!(1), "accepted"), true);
     server.signal(Signal::SIGKILL);
     assert_eq!(line(&mut other, "result", &json!(1), "status"), "ABORTED");
-    // The master goes on to name it.
+    // The master still lists the killed server.
     other.tell("send 3");
     assert_eq!(line(&mut other, "goal", &json!(2), "accepted"), false);
     let _again = cell.rospy(SERVER, &[OF_ROS1, FIBONACCI]);
@@ -212,7 +213,7 @@ fn a_goal_goes_on_without_its_client_and_ends_without_its_server() {
     assert_eq!(reached, json!([1, 1, 2, 3]));
 }
 
-/// `ua-space call` of an action, with JSON for each thing it tells.
+/// Starts `ua-space call` of an action, with its events as JSON.
 fn ask(words: &[&str]) -> Child {
     Started::new("ua-space", &program("ua-space"))
         .args(
@@ -227,7 +228,7 @@ fn ask(words: &[&str]) -> Child {
         .start()
 }
 
-/// How it ended: its exit code, how the goal did, and what came out.
+/// Waits for the end of a call. Returns the exit code, the status, the result and the lines.
 fn asked(mut asking: Child) -> (i32, Value, Value, Vec<Value>) {
     let code = asking.wait_for_end(SOON).code().unwrap();
     let lines = asking.json_lines();
@@ -294,7 +295,7 @@ fn who_looks_into_the_space_sends_goals_sees_their_feedback_and_cancels_them() {
     line(&mut server, "cancel", &json!(100), "cancel");
     let cancelled = asked(ask(&["ua_1_2_70", "order=102", "--run-timeout", "1"]));
     assert_eq!((cancelled.0, &cancelled.1), (1, &json!("CANCELED")));
-    // What is not set in a goal is what a message has; what it has not is said.
+    // Unset fields of a goal get the defaults of the message; unknown fields are reported.
     let nothing = asked(ask(&["ua_1_2_70"]));
     assert_eq!(
         (nothing.0, &nothing.2),
@@ -357,7 +358,7 @@ fn a_client_of_move_base_drives_a_base_of_ros_2() {
     assert_eq!(end(&mut client, 3)[0], "REJECTED");
 }
 
-/// The types of a trajectory in ROS 1, and the richer ones in ROS 2.
+/// Writes the types of a trajectory in ROS 1, and the richer types in ROS 2.
 fn trajectory_types(cell: &Cell) -> [String; 2] {
     const POINTS: &str = "trajectory_msgs/JointTrajectoryPoint desired\n\
         trajectory_msgs/JointTrajectoryPoint actual\n\
@@ -402,7 +403,7 @@ fn trajectory_types(cell: &Cell) -> [String; 2] {
     })
 }
 
-/// An arm of ROS 1 that clients of ROS 2 move with goals of a type that has more.
+/// A mapping for an arm of ROS 1 that clients of ROS 2 move with goals of a richer type.
 fn arm([one, two]: &[String; 2]) -> String {
     format!(
         "
@@ -497,7 +498,8 @@ fn a_client_of_ros_2_moves_an_arm_of_ros_1_along_a_trajectory() {
     );
 }
 
-/// A skill that goes on until it is halted, one that is done at once, and one that must be told where to.
+/// A component with a skill that runs until it is halted, a skill that completes at once, and a
+/// skill with a target parameter.
 const COMPONENT: &str = "
 component: bench
 application_uri: urn:ua-bridge:system-tests:component
@@ -508,7 +510,7 @@ skills:
   - {name: Move, type: PtpMoveSkillType, driver: {simulated: {time_scale: 100}}}
 ";
 
-/// The one line for who has an action type of their own.
+/// The single entry of a mapping for clients with an action type of their own.
 const HOLD: &str = "
 spaces: [{id: 1}, {id: 2, domain: 2}]
 namespaces: {9: 'urn:ua-bridge:system-tests:component'}
@@ -520,7 +522,7 @@ calls:
       - {space: 2, action: /hold, type: test_msgs/Fibonacci, goal: {force: 12.5}, feedback: {sequence: [1]}, result: {sequence: [2]}}
 ";
 
-/// A component that serves at that address.
+/// Starts a component that serves at this address.
 fn skills(cell: &Cell, url: &str) -> Child {
     component(cell, COMPONENT, url)
 }
@@ -537,7 +539,8 @@ fn component(cell: &Cell, yaml: &str, url: &str) -> Child {
     child
 }
 
-/// Waits until a client of OPC UA reads that state. A subscription may leave out one that follows another at once.
+/// Waits until an OPC UA client reads this state. A subscription may skip a state that is replaced
+/// at once.
 fn stands(cell: &Cell, url: &str, state: &str) {
     eventually(state, SOON, || {
         let read = cell.asyncua_try("opcua_read.py", &[url, "ns=1;i=101"])?;
@@ -560,7 +563,8 @@ fn goals_of_either_ros_run_skills_and_are_refused_with_the_reason_of_the_compone
     let _bridges = (cell.bridge_ros1(&[path]), cell.bridge_ros2(&[path]));
     stands(&cell, url, "Halted");
 
-    // Without a mapping, by its type of ua_msgs. It is not ready, and becomes it.
+    // Without a mapping, the action has its type of ua_msgs. The skill is not ready at first and
+    // becomes ready.
     let mut hold = actionlib_client(&cell, &["/ua_0_9_110", "ua_msgs/Grasp"]);
     send(&mut hold, &json!({}));
     let told = hold.wait_for_json("feedback", SOON, |line| {
@@ -569,7 +573,7 @@ fn goals_of_either_ros_run_skills_and_are_refused_with_the_reason_of_the_compone
     assert_eq!(told["state"], "Running");
     assert!(told["run"].as_u64() > Some(0), "{told}");
     stands(&cell, url, "Running");
-    // A component does one thing at a time.
+    // A component executes a single skill at a time.
     let mut moves = actionlib_client(
         &cell,
         &["/ua_0_9_310", "ua_msgs/PtpMove", "--node", "mover"],
@@ -594,7 +598,7 @@ fn goals_of_either_ros_run_skills_and_are_refused_with_the_reason_of_the_compone
     );
     stands(&cell, url, "Halted");
 
-    // A wrong parameter moves nothing; of a right goal the result comes.
+    // A wrong parameter moves nothing; a valid goal returns its result.
     send(
         &mut moves,
         &json!({"target_position": target, "max_velocity": 99.0}),
@@ -611,7 +615,7 @@ fn goals_of_either_ros_run_skills_and_are_refused_with_the_reason_of_the_compone
     let off = position.iter().zip(target.as_array().unwrap()).map(near);
     assert!(off.fold(0.0, f64::max) < 1e-3, "{position:?}");
 
-    // The same from the command line.
+    // The same call from the command line.
     let goal = [
         "bench.Move.Goal",
         "{target_position: [0.2, 0, 0.3, 0, 0, 0]}",
@@ -623,7 +627,7 @@ fn goals_of_either_ros_run_skills_and_are_refused_with_the_reason_of_the_compone
     let unsaid = asked(ask(&["bench.Move.Goal"]));
     assert_eq!(unsaid.0, 64, "where to is not made up: {:?}", unsaid.3);
 
-    // By the one line of the mapping, for who knows another type.
+    // Through the entry of the mapping, for clients with another type.
     let mut rclpy = rclpy_client(&cell, "/hold");
     rclpy.tell("send 7");
     assert_eq!(line(&mut rclpy, "goal", &json!(0), "accepted"), true);
@@ -639,7 +643,7 @@ fn goals_of_either_ros_run_skills_and_are_refused_with_the_reason_of_the_compone
         json!([2])
     );
 
-    // A component that dies takes its goals along; the next one runs others.
+    // A component that dies aborts its goals; the next component runs new goals.
     rclpy.tell("send 8");
     assert_eq!(line(&mut rclpy, "goal", &json!(1), "accepted"), true);
     component.signal(Signal::SIGKILL);
@@ -653,7 +657,8 @@ fn goals_of_either_ros_run_skills_and_are_refused_with_the_reason_of_the_compone
         number += 1;
         (answer == true).then_some(())
     });
-    // The reason is told where that ROS has a word for it, soon after receive_timeout, which is 3 s.
+    // The reason is reported, where this ROS has a field for it, soon after receive_timeout, which
+    // is 3 s.
     rclpy.tell(&format!("cancel {}", number - 1));
     line(&mut rclpy, "result", &json!(number - 1), "status");
     send(&mut hold, &json!({}));
@@ -669,7 +674,7 @@ fn goals_of_either_ros_run_skills_and_are_refused_with_the_reason_of_the_compone
     assert!(why.contains("who executes the action is gone"), "{why}");
 }
 
-/// A base of ROS 2 and a belt of ROS 1, which do the work of skills.
+/// A component whose skills are executed by a base of ROS 2 and a belt of ROS 1.
 const LINE: &str = "
 component: line
 application_uri: urn:ua-bridge:system-tests:line
@@ -692,7 +697,7 @@ skills:
     driver: {call: {name: ua_1_2_61, request: {data: {parameter: On}}}}
 ";
 
-/// The result of a skill that was started with those words, and how `ua-space` ended.
+/// Runs a skill with these arguments. Returns the exit code of `ua-space` and the result.
 fn run(words: &[&str]) -> (i32, Value) {
     let (code, .., lines) = asked(ask(words));
     let result = lines.iter().find(|line| line["event"] == "result");
@@ -726,7 +731,7 @@ fn skills_have_their_work_done_by_an_action_of_ros_2_and_a_service_of_ros_1() {
     assert_eq!(met["orientation"], json!(turned));
     assert_eq!((&met["frame"], &met["tree"]), (&json!("map"), &json!("")));
 
-    // What the base does not do is no success, with the reason.
+    // A goal that the base rejects or aborts is no success; the result has the reason.
     for (x, why) in [("-1", "rejected"), ("-2", "aborted")] {
         let (code, result) = run(&["line.Go", &format!("Goal={x},0,0")]);
         let message = result["message"].to_string();
@@ -745,7 +750,7 @@ fn skills_have_their_work_done_by_an_action_of_ros_2_and_a_service_of_ros_1() {
         (line.get("cancel")? == &json!([100])).then_some(())
     });
 
-    // A client of OPC UA runs the belt.
+    // An OPC UA client runs the belt.
     for method in ["Reset", "Start"] {
         let path = format!("line/Skills/Belt/{method}");
         let told = cell.asyncua_once("opcua_call.py", &[url, &path, "--value", "[]"]);
@@ -754,7 +759,7 @@ fn skills_have_their_work_done_by_an_action_of_ros_2_and_a_service_of_ros_1() {
     assert_eq!(line(&mut belt, "value", &json!(true), "value"), true);
     let (code, result) = run(&["line.Belt", "On=false"]);
     assert_eq!(code, 1, "the service failed: {result}");
-    // As an action of ROS 1, of which the work is one of ROS 2.
+    // Called as an action of ROS 1 whose work is done by an action of ROS 2.
     let mut client = actionlib_client(&cell, &["/ua_0_9_110", "ua_msgs/NavigateTo"]);
     send(&mut client, &json!({"goal": [3.0, 0.0, 0.0]}));
     let reached = end(&mut client, 0);

@@ -1,4 +1,5 @@
-//! Actions of ROS 2 asked for across the space: clients of rclpy in one domain, servers of rclpy in another, and a bridge in each.
+//! Actions of ROS 2 across the space: clients of rclpy in a domain, servers of rclpy in another,
+//! and a bridge in each domain.
 
 use std::time::Duration;
 
@@ -6,14 +7,14 @@ use nix::sys::signal::Signal;
 use serde_json::{Value, json};
 use system_tests::{Cell, Child, Distribution, Judge, Peer, Started, eventually, metrics, program};
 
-/// Programs of ROS need seconds to start on a busy machine.
+/// The time that programs of ROS need to start on a busy machine.
 const SOON: Duration = Duration::from_secs(60);
 const SCRIPT: &str = "ros2_rclpy_action.py";
 const OF_TWO: &str = "/ua_2_2_70";
-/// As `ros2 action` prints it.
+/// The type name as `ros2 action` prints it.
 const FIBONACCI: &str = "test_msgs/action/Fibonacci";
 
-/// A bridge of its own of a space, in a domain.
+/// Starts the bridge of a space in a domain.
 fn bridge(space: u16, domain: u16, args: &[&str]) -> Child {
     let name = format!("bridge_of_{space}");
     let address = format!("127.0.0.1:{}", 9200 + space);
@@ -34,13 +35,13 @@ fn rclpy(cell: &Cell, distribution: Distribution, domain: &str, args: &[&str]) -
         .told()
 }
 
-/// A server in domain 2.
+/// Starts a server in domain 2.
 fn server(cell: &Cell, distribution: Distribution, action: &str) -> Child {
     let server = rclpy(cell, distribution, "2", &["serve", action]);
     server.start().ready(SOON)
 }
 
-/// A server in domain 2 that counts as gone when nothing is heard of it for three seconds.
+/// Starts a server in domain 2 with a lease of three seconds.
 fn mortal(cell: &Cell, action: &str) -> Child {
     let profile = cell.file(
         "lease.xml",
@@ -59,13 +60,13 @@ fn mortal(cell: &Cell, action: &str) -> Child {
         .ready(SOON)
 }
 
-/// A client in domain 3, which has found a server.
+/// Starts a client in domain 3 and waits until it has found a server.
 fn client(cell: &Cell, distribution: Distribution, action: &str) -> Child {
     let args = ["call", action, "--results", "--wait", "50"];
     rclpy(cell, distribution, "3", &args).start().ready(SOON)
 }
 
-/// The first line of a peer with that under a key, also one before.
+/// Returns the first line of a peer, printed before or after the call, with this value of `key`.
 fn says(peer: &mut Child, key: &str, wanted: &Value) -> Value {
     let what = format!("{key} {wanted}");
     peer.wait_for_json(&what, SOON, |line| {
@@ -73,7 +74,7 @@ fn says(peer: &mut Child, key: &str, wanted: &Value) -> Value {
     })
 }
 
-/// What a client is told of a request to cancel, which is the first after `before` of them.
+/// Sends a cancel request and returns the client's report about it: the first new `cancel` line.
 fn cancels(client: &mut Child, line: &str) -> Value {
     let told = |client: &Child| -> Vec<Value> {
         let lines = client.json_lines().into_iter();
@@ -84,7 +85,7 @@ fn cancels(client: &mut Child, line: &str) -> Value {
     eventually(line, SOON, || told(client).get(before).cloned())
 }
 
-/// Sends goal `number`, and waits for its third report of progress.
+/// Sends goal `number`, and waits for its third feedback.
 fn runs(client: &mut Child, number: usize, order: i32) {
     client.tell(&format!("send {order}"));
     assert_eq!(says(client, "goal", &json!(number))["accepted"], true);
@@ -93,7 +94,7 @@ fn runs(client: &mut Child, number: usize, order: i32) {
     });
 }
 
-/// How goal `number` ended, and with which numbers.
+/// Returns the status and the sequence of the result of goal `number`.
 fn ended(client: &mut Child, number: usize) -> (String, Value) {
     let told = says(client, "result", &json!(number));
     let status = told["status"].as_str().unwrap().to_owned();
@@ -120,7 +121,7 @@ fn goals_end_in_every_way(serving: Distribution, asking: Distribution) {
     assert_eq!(says(&mut client, "goal", &json!(1))["accepted"], false);
     client.tell("send -2");
     assert_eq!(ended(&mut client, 2), ("ABORTED".to_owned(), json!([])));
-    // It is the server that says how a goal ends that was cancelled.
+    // The server decides how a cancelled goal ends.
     for (number, order, end) in [
         (3, 100, "CANCELED"),
         (4, 110, "SUCCEEDED"),
@@ -140,14 +141,15 @@ fn goals_end_in_every_way(serving: Distribution, asking: Distribution) {
         let again = cancels(&mut client, &format!("cancel {number}"));
         assert_eq!(again["cancel"], "GOAL_TERMINATED");
     }
-    // A client of rclpy drops what it has not read when the result comes, so that only of those that ran on it has all.
+    // A client of rclpy drops unread feedback when the result arrives, so only the goals that kept
+    // running have all feedback.
     let progress = [json!([1]), json!([1, 1]), json!([1, 1, 2])];
     for number in [3, 4, 5] {
         assert_eq!(feedback_of(&client, number), progress);
     }
     let unknown = cancels(&mut client, "cancel_unknown");
     assert_eq!(unknown["cancel"], "UNKNOWN_GOAL_ID");
-    // One that will not be cancelled, and two that will.
+    // A goal that refuses cancellation, and two goals that accept it.
     for (number, order) in [(6, 101), (7, 102), (8, 104)] {
         runs(&mut client, number, order);
     }
@@ -172,7 +174,8 @@ fn goals_end_in_every_way(serving: Distribution, asking: Distribution) {
         .filter(|line| line.get("goal").is_some())
         .collect();
     assert_eq!(goals.len(), 9, "each goal is sent once: {goals:?}");
-    // One that leaves as rclpy leaves takes its goals and its action along, and the next one is served again.
+    // A server that leaves as rclpy does removes its goals and its action; the next server is
+    // served again.
     server.tell("leave");
     assert_eq!(ended(&mut client, 6).0, "ABORTED");
     client.tell("gone");
@@ -271,7 +274,8 @@ fn of_two_bridges_in_one_domain_one_serves_an_action_and_a_goal_is_sent_once() {
     assert_eq!(goals.count(), 5);
 }
 
-/// Count, executed as `/count` in space 2, and served in space 3 as the mapping says.
+/// A mapping of the action Count, executed as `/count` in space 2 and served in space 3 according
+/// to `asked`.
 fn count(asked: &str) -> String {
     format!(
         "
@@ -293,7 +297,7 @@ fn a_mapping_names_an_action_on_both_sides_and_what_its_goals_say() {
     let Some(cell) = Cell::with(&[Peer::Ros2]) else {
         return;
     };
-    // Whatever is asked for, three numbers are wanted.
+    // The mapping requests three numbers, whatever the goal of the client.
     let three = "{space: 3, action: /three, type: test_msgs/Fibonacci, goal: {order: 3}}";
     let file = cell.file("cell.yaml", &count(three));
     let path = file.to_str().unwrap();
@@ -304,7 +308,8 @@ fn a_mapping_names_an_action_on_both_sides_and_what_its_goals_say() {
     let three = json!([1, 1, 2]);
     assert_eq!(ended(&mut mapped, 0), ("SUCCEEDED".to_owned(), three));
     says(&mut server, "goal", &json!(3));
-    // The mapping is read again: the action has another name, and its goals are what clients say.
+    // The mapping is reloaded: the action has another name, and its goals are the goals of the
+    // clients.
     let any = "{space: 3, action: /any, type: test_msgs/Fibonacci}";
     let beside = file.with_extension("new");
     std::fs::write(&beside, count(any)).unwrap();

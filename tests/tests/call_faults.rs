@@ -1,4 +1,5 @@
-//! Calls while datagrams are lost, doubled and late, while programs are killed, and while somebody lies.
+//! Calls while datagrams are lost, duplicated and delayed, while programs are killed, and while an
+//! attacker forges messages.
 
 use std::net::Ipv4Addr;
 use std::time::{Duration, Instant};
@@ -16,13 +17,13 @@ use uadp::action::{
 use uadp::{Extras, NetworkHeader, NetworkMessage};
 
 const SOON: Duration = Duration::from_secs(40);
-/// Within that a caller is told that the one who executes is gone.
+/// Time within which a caller learns that the executor is lost.
 const BOUND: Duration = Duration::from_secs(8);
 const BOTH: &[Peer] = &[Peer::Ros1, Peer::Ros2];
 const SERVICE: &str = "/ua_1_2_61";
 const SERVICE_ID: (u16, u16, u16) = (1, 2, 61);
 
-/// Calls of one service, by number.
+/// Returns an order for calls of a service, numbered from `first`.
 fn order(case: &str, first: u32, count: u32, at_once: u32) -> Value {
     json!({"case": case, "service": SERVICE, "first": first, "count": count, "at_once": at_once})
 }
@@ -92,7 +93,7 @@ fn a_service_that_is_killed_while_it_executes_is_told_and_what_was_before_and_co
         "{told}"
     );
     drop(executor);
-    // The next one of that name executes nothing that was asked of the one before.
+    // The next executor with this name executes no request that was sent to the previous executor.
     let mut executor = cell.rospy_executor(&[&format!("empty={SERVICE}")]);
     let told = asker.ask(order("empty", 0, 3, 1));
     assert_eq!(told["right"], 3, "{told}");
@@ -109,7 +110,7 @@ fn a_bridge_that_is_killed_while_it_executes_is_told_and_the_next_one_executes_n
     let Some(cell) = Cell::with(BOTH) else {
         return;
     };
-    // A call is given up when it was not announced for three periods.
+    // A call is lost when it was not announced for three periods.
     let [one, two] = [1, 2].map(|of| cell.call_mapping(of, "pubsub: {metadata_period: 1s}\n"));
     let _core = cell.roscore();
     let mut executor = cell.rospy_executor(&[&format!("files={SERVICE}"), "--delay", "1"]);
@@ -117,7 +118,8 @@ fn a_bridge_that_is_killed_while_it_executes_is_told_and_the_next_one_executes_n
     let _requestor = cell.bridge_ros2(&[&two]);
     let mut asker = cell.rclpy_asker(Distribution::Kilted);
     one_right(&mut asker, 0);
-    // While: the service goes on, but nobody learns of it. Its type has no word for that in ROS 2.
+    // During the loss, the service continues, but its response is lost. Its type has no field for
+    // that in ROS 2.
     let before = failed_calls();
     let mut slow = order("files", 1, 1, 1);
     slow["patience"] = json!(6);
@@ -131,7 +133,8 @@ fn a_bridge_that_is_killed_while_it_executes_is_told_and_the_next_one_executes_n
     let told = asker.told();
     assert_eq!(told["failures"], 1, "{told}");
     each_once(&mut executor, 2);
-    // After: what was asked of the one before is not executed by the next one, which is asked as soon as it is believed.
+    // After the loss, requests to the previous bridge are not executed by the next bridge, which
+    // receives new requests as soon as it is trusted.
     let _responder = cell.bridge_ros1(&[&one]);
     let mut number = 2;
     eventually("a call of the next bridge is answered", SOON, || {
@@ -148,23 +151,24 @@ fn a_bridge_that_is_killed_while_it_executes_is_told_and_the_next_one_executes_n
     );
 }
 
-/// When a bridge is killed that executes a call.
+/// The time at which a bridge that executes a call is killed.
 #[derive(Clone, Copy, PartialEq)]
 enum Killed {
-    /// It has the request in its socket.
+    /// The request is in the bridge's socket.
     Before,
-    /// It has executed it, and its answer is lost.
+    /// The bridge has executed the request, and its response is lost.
     After,
 }
 
-/// The next bridge hears the request, which is still repeated, and who asks is told that nothing is known of it.
+/// Checks that the next bridge receives the request, which is still repeated, and that the caller
+/// is informed that the result is unknown.
 fn a_killed_bridge_and_the_next_one_execute_once(killed: Killed) {
     let Some(cell) = Cell::with(BOTH) else {
         return;
     };
     let relay = Relay::start(Weather::FAIR);
     let one = cell.call_mapping(1, "");
-    // A request goes on for as long as that.
+    // A request is repeated for this time.
     let two = format!("pubsub: {{address: \"opc.udp://{OTHER_GROUP}\", receive_timeout: 40s}}\n");
     let two = cell.call_mapping(2, &two);
     let _core = cell.roscore();
@@ -210,7 +214,8 @@ fn a_killed_bridge_and_the_next_one_execute_once(killed: Killed) {
         "{why}"
     );
     each_executed(&mut executor, executed);
-    // What the next bridge said of itself was lost, too. It is asked for, long before it is said again.
+    // The announcement of the next bridge was lost, too. It is requested long before it is
+    // repeated.
     let wait = Duration::from_secs(5);
     eventually("the next bridge executes", wait, || {
         (asker.ask(order("empty", 0, 1, 1))["right"] == 1).then_some(())
@@ -230,7 +235,7 @@ fn a_bridge_that_is_killed_before_its_answer_arrives_leaves_nothing_to_the_next_
     a_killed_bridge_and_the_next_one_execute_once(Killed::After);
 }
 
-/// `call_failed` of bridge-ros2, wherever it counts.
+/// Returns the sum of `call_failed` in the status of bridge-ros2.
 fn failed_calls() -> u64 {
     metrics(METRICS_ROS2).map_or(0, |status| system_tests::number(&status, "call_failed"))
 }
@@ -257,14 +262,15 @@ fn a_requestor_that_is_killed_has_its_calls_executed_once_and_the_next_one_is_no
     each_once(&mut executor, 20);
     let _requestor = cell.bridge_ros2(&[&two]);
     assert_eq!(asker.told()["failures"], 20);
-    // DDS takes a killed participant for alive for a while: who saw it would still ask it.
+    // DDS considers a killed participant alive for a while, and clients that discovered it would
+    // still send requests to it.
     let mut asker = cell.rclpy_asker(Distribution::Jazzy);
     let told = asker.ask(order("files", 100, 5, 5));
     assert_eq!(told["right"], 5, "{told}");
     each_once(&mut executor, 25);
 }
 
-/// What becomes of the calls of all of them.
+/// Waits until each requestor has `count` ended calls, and returns the ends.
 fn ended(askers: &mut [CodecAsker], count: usize) -> Vec<Vec<Ended>> {
     let mut all = vec![Vec::new(); askers.len()];
     eventually("all calls end", SOON, || {
@@ -281,7 +287,7 @@ fn announced(cell: &Cell, service: &str) {
         let status = metrics(METRICS_ROS1)?;
         status.to_string().contains(&service[1..]).then_some(())
     });
-    // The folder is not needed; the cell has to live as long as what is asked in it.
+    // The folder is not needed, but the cell has to live as long as the calls in it.
     assert!(cell.folder().exists());
 }
 
@@ -325,7 +331,7 @@ fn an_answer_after_its_deadline_is_dropped_and_counted_and_answers_no_other_call
     each_executed(&mut executor, 2);
 }
 
-/// The response that a request would get from who executes it, with `success` and `message`.
+/// Forges the response of the executor to a request, with `success` and `message`.
 fn forged(datagram: &[u8], id: (u16, u16, u16)) -> Option<Vec<u8>> {
     let message = NetworkMessage::decode(datagram).ok()?;
     let requests = message.actions(ActionDialect::Standard).ok()?;
@@ -397,7 +403,8 @@ fn slow_calls_do_not_delay_values_at_1_khz() {
         return;
     };
     let _core = cell.roscore();
-    // They go on until they are told to end, which takes its time on a loaded machine.
+    // The calls run until the executor is ordered to end them, which takes time on a loaded
+    // machine.
     let mut executor = cell.rospy_executor(&["empty=/slow", "--delay", "1000"]);
     let plant = include_str!("../cells/plant.yaml");
     let slow = "
@@ -436,7 +443,7 @@ calls:
     running(&mut executor, AT_ONCE);
     sends.tell("go");
     sends.wait_for_line("\"sent\"", SOON);
-    // They have been under way for the whole time.
+    // The calls have been running the whole time.
     assert_eq!(executor.counts()["running"], AT_ONCE);
     judge.hears(topic, |value| (value["data"] == "3999").then_some(()));
     let mut heard = judge.child().json_lines();
@@ -452,7 +459,7 @@ calls:
     assert_eq!(executor.counts()["executed"], AT_ONCE);
 }
 
-/// Slow calls of one service.
+/// Number of slow calls of a service.
 const AT_ONCE: u64 = 200;
-/// No fields.
+/// An empty list of fields.
 const NOTHING: &[u8] = &[0, 0];

@@ -1,4 +1,5 @@
-//! Every kind of executor asked by every kind of asker, with requests and responses of every kind.
+//! Every kind of executor called by every kind of caller, with requests and responses of every
+//! kind.
 //!
 //! The tables of `docs/calls.md` hold the results of these tests.
 
@@ -7,7 +8,7 @@ mod actions;
 use serde_json::{Value, json};
 use system_tests::{Asker, Asking, Cell, Child, Distribution, Peer, Started, program};
 
-/// The letter of each case in the table of the page, and its name.
+/// The letter of each case in the table of the page, and its name in `peers/calls/cases.py`.
 const CASES: [(char, &str); 5] = [
     ('B', "bundled"),
     ('F', "files"),
@@ -15,7 +16,7 @@ const CASES: [(char, &str); 5] = [
     ('L', "megabyte"),
     ('M', "messages"),
 ];
-/// Calls of each who asks, of each case of each who executes.
+/// Number of calls of each caller, for each case of each executor.
 const COUNT: u64 = 2;
 const ASKING: [Asking; 8] = [
     Asking::Rospy,
@@ -32,17 +33,17 @@ const PLC: &str = "opc.tcp://127.0.0.1:4841";
 const METHOD: &str = "Method (asyncua)";
 const SKILL: &str = "skill of a component";
 
-/// One call, under all its names.
+/// A call with all its names.
 struct Call {
     letter: char,
-    /// Of `peers/calls/cases.py`.
+    /// The case in `peers/calls/cases.py`.
     case: &'static str,
     service: String,
     method: String,
     topic: String,
 }
 
-/// Somebody who executes, and what.
+/// An executor and its calls.
 struct Executing {
     name: &'static str,
     space: u16,
@@ -50,7 +51,7 @@ struct Executing {
 }
 
 impl Executing {
-    /// Services of ROS with the numbers from `first` on, for which nothing is mapped.
+    /// Services of ROS with the numbers from `first` on, without a mapping.
     fn services(name: &'static str, space: u16, first: usize) -> Self {
         let calls = CASES.iter().zip(first..).map(|((letter, case), number)| {
             let topic = format!("ua_{space}_2_{number}");
@@ -69,7 +70,7 @@ impl Executing {
         }
     }
 
-    /// Methods of another server. That of the type from files has a type in ROS by the mapping.
+    /// Methods of another server. For the case of a type from files, the mapping sets the ROS type.
     fn methods() -> Self {
         let mut methods = Self::services(METHOD, 0, 60);
         methods.calls.pop();
@@ -84,7 +85,8 @@ impl Executing {
         methods
     }
 
-    /// Methods of a skill, which is Halted at first. Each who asks has it Ready, at work, and Halted again.
+    /// Methods of a skill, which is Halted at first. Each caller resets it, starts it, and halts
+    /// it.
     fn skill() -> Self {
         let call = |letter, case, service: &str, method: &str, number| Call {
             letter,
@@ -104,12 +106,13 @@ impl Executing {
         }
     }
 
-    /// Calls of each who asks, of each case: what changes the state of a skill can be asked for once.
+    /// Returns the number of calls per caller and case: a call that changes the state of a skill is
+    /// made once.
     fn count(&self) -> u64 {
         if self.name == SKILL { 1 } else { COUNT }
     }
 
-    /// As its peers take them.
+    /// Returns the arguments of the executor's peers.
     fn words(&self) -> Vec<String> {
         let calls = self.calls.iter();
         calls
@@ -118,7 +121,8 @@ impl Executing {
     }
 }
 
-/// Who has no need of a bridge or of the server: those of the same ROS, and OPC UA clients of a server's Methods.
+/// Returns whether a caller needs neither a bridge nor the server: nodes of the same ROS, and OPC
+/// UA clients of a server's Methods.
 fn is_at_home(asking: Asking, executing: &Executing) -> bool {
     match asking {
         Asking::Rospy | Asking::Roscpp => executing.space == 1,
@@ -127,7 +131,7 @@ fn is_at_home(asking: Asking, executing: &Executing) -> bool {
     }
 }
 
-/// What is asked for in ROS by a name or a type of its own.
+/// Returns the part of the mapping with names and types for callers in ROS.
 fn methods() -> String {
     let node = "nsu=urn:ua-bridge:system-tests:plc;s=Line";
     let methods = Executing::methods();
@@ -151,7 +155,7 @@ fn methods() -> String {
     )
 }
 
-/// The Start of a skill, asked for in ROS by a type that has nothing to do with it.
+/// Returns a mapping of the Start of a skill to a ROS type that is unrelated to it.
 fn start() -> String {
     let zeros = [
         "byte", "char", "float32", "float64", "int8", "uint8", "int16", "uint16", "int32",
@@ -177,7 +181,7 @@ fn mapping(cell: &Cell, name: &str, space: u16, calls: &str) -> String {
     file.to_str().unwrap().to_owned()
 }
 
-/// Those who execute Methods of a component's skill need nothing but it.
+/// Starts a component. The Methods of its skill need no other executor.
 fn component(cell: &Cell) -> Child {
     let yaml = concat!(
         env!("CARGO_MANIFEST_DIR"),
@@ -189,7 +193,8 @@ fn component(cell: &Cell) -> Child {
         .start()
 }
 
-/// Asks all of them at once for one call; whether each is answered, and right each time.
+/// Has all callers make a call at once. Returns for each caller whether every answer was right, or
+/// `None` for a caller without a bridge.
 fn asked(askers: &mut [(Asking, Asker)], executing: &Executing, call: &Call) -> Vec<Option<bool>> {
     let away = |asking: &Asking| !is_at_home(*asking, executing);
     for ((asking, asker), turn) in askers.iter_mut().zip(0..).filter(|((of, _), _)| away(of)) {
@@ -223,7 +228,8 @@ fn asked(askers: &mut [(Asking, Asker)], executing: &Executing, call: &Call) -> 
 fn row(askers: &mut [(Asking, Asker)], executing: &Executing) -> Vec<String> {
     let mut cells = vec![executing.name.to_owned()];
     cells.extend(askers.iter().map(|_| String::new()));
-    // Of a skill one after the other: what its state does not allow, or who else has the lease, is refused.
+    // Callers of a skill take turns: the skill refuses calls that its state does not allow, or
+    // while another caller has the lease.
     let together = if executing.name == SKILL {
         1
     } else {
@@ -302,7 +308,7 @@ fn all_who_execute_are_asked_by_all_who_ask() {
     let calls = [methods(), start()].concat();
     let one = mapping(&cell, "one.yaml", 1, &calls);
     let two = mapping(&cell, "two.yaml", 2, &calls);
-    // Where a namespace of space 0 is named, ua-server takes it for its own.
+    // A mapping that names a namespace of space 0 makes ua-server treat it as its own.
     let zero = methods().replace(", 7: 'urn:test:gripper'", "");
     let zero = mapping(&cell, "zero.yaml", 2, &zero);
     let _programs = (
@@ -324,7 +330,7 @@ fn all_who_execute_are_asked_by_all_who_ask() {
         "seen:\n| {} |\n{table}",
         head.join(" | ")
     );
-    // Each call that was answered was executed once.
+    // Each answered call was executed once.
     for (executor, row) in executors.iter_mut().zip(&seen) {
         let calls = row[1..].iter().filter(|cell| *cell != "direct");
         let calls = calls.map(|cell| cell.len() as u64 * COUNT).sum::<u64>();

@@ -9,7 +9,7 @@ use system_tests::{
     Started, eventually, metrics, program,
 };
 
-/// rospy, rclpy and asyncua need seconds to start on a busy machine.
+/// The time that rospy, rclpy and asyncua need to start on a busy machine.
 const SOON: Duration = Duration::from_secs(60);
 const MAPPING: &str = "
 spaces: [{id: 1}, {id: 2, domain: 2}]
@@ -22,7 +22,7 @@ fn line(client: &mut Child, key: &str) -> Value {
     client.wait_for_json(key, SOON, |line| line.get(key).map(|_| line.clone()))
 }
 
-/// What a client says of so many calls.
+/// Returns the client's results of `count` calls.
 fn answers(client: &mut Child, count: usize) -> Vec<Value> {
     let mut all = Vec::new();
     client.wait_for_json("all answers", SOON, |line| {
@@ -57,7 +57,7 @@ fn asyncua_calls_a_service_of_rospy_and_is_told_how_it_went() {
     let mut client = cell.asyncua_started("opcua_call.py", &args).start();
     let found = line(&mut client, "node");
     assert_eq!(found["node"], "ns=2;i=61");
-    // Boolean 1, String 12; scalars.
+    // The DataTypes are Boolean (1) and String (12); both arguments are scalars.
     assert_eq!(found["takes"], json!([["data", 1, -1]]));
     assert_eq!(
         found["gives"],
@@ -75,11 +75,11 @@ fn asyncua_calls_a_service_of_rospy_and_is_told_how_it_went() {
         let wanted = json!({"status": status, "value": value, "arguments": arguments});
         assert_eq!(*told, wanted);
     }
-    // What was not right never reached the service.
+    // Invalid requests never reached the service.
     assert_eq!(server.values(), [true, false]);
     bridge.end();
     line(&mut client, "gone");
-    // And so is the object that had nothing else in it.
+    // The object that contained nothing else is removed, too.
     let object = ["UaSpace/Calls/Belt", "--wait", "0"];
     let args = [&[SERVER_ENDPOINT][..], &object].concat();
     let told = cell.asyncua_once("opcua_call.py", &args);
@@ -152,10 +152,10 @@ fn who_executes_is_told_that_a_client_has_given_up_or_gone_and_the_method_moves_
         let args = [&[SERVER_ENDPOINT, "UaSpace/Calls/Grip"][..], &value].concat();
         cell.asyncua_started("opcua_call.py", &args).start()
     };
-    // Its time is the one it gives, and not the one of the mapping.
+    // The call has the timeout that the client sends, not the timeout of the mapping.
     let mut client = asked("8");
     assert_eq!(line(&mut client, "node")["node"], "ns=2;s=Old");
-    // The server tells it so, or it is told too late.
+    // The server reports the timeout, or its report is too late.
     client.wait_for_json("it has given up", SOON, |line| {
         let told = line["fault"] == "BadTimeout" || line["given_up"] == true;
         told.then_some(())
@@ -165,7 +165,7 @@ fn who_executes_is_told_that_a_client_has_given_up_or_gone_and_the_method_moves_
     });
     assert_eq!(executor.executed(), 1);
     drop(executor);
-    // A variable takes the node that the Method had.
+    // A variable gets the node that the Method had.
     let more = "variables: [{node: ns=2;s=Old, alias: 70, name: Load, origin: 1, ros: {topic: /load, type: std_msgs/Float64}}]\n";
     let _ = cell.file("cell.yaml", &mapping("ns=2;s=Grip", more));
     ua_server.signal(Signal::SIGHUP);
@@ -209,10 +209,10 @@ fn a_skill_of_a_component_is_started_by_clients_that_know_only_the_server() {
     let good = |told: &Value| told["status"] == "Good" && told["value"][0] == true;
     let (takes, told) = asked("Reset");
     assert!(takes == json!([]) && good(&told), "{takes} {told}");
-    // All that it takes has a value of its own.
+    // Every input of this skill has a default value, so the Method takes no arguments.
     let (takes, told) = asked("Start");
     assert!(takes != json!([]) && good(&told), "{takes} {told}");
-    // And here it has not.
+    // The inputs of this skill have no default values.
     let asked = |method: &str, values: &[&str]| {
         let method = format!("UaSpace/Calls/robot/PtpMove/{method}");
         let args = [&[SERVER_ENDPOINT, &method], values].concat();
@@ -245,7 +245,7 @@ fn asyncua_calls_a_service_of_rclpy_that_nobody_mapped() {
     judge.ask(json!({"serve": "/ua_2_2_62", "type": "std_srvs/srv/Trigger", "value": answer}));
     let _bridge = cell.bridge_ros2(&[]);
     let _ua_server = cell.ua_server(&[]);
-    // A topic of the same name has a node beside it.
+    // The value of a topic of the same name has a separate node.
     let value = json!({"data": "on the scales"});
     let publish = json!({"publish": "/ua_2_2_62", "type": "std_msgs/msg/String", "value": value});
     let args = [SERVER_ENDPOINT, "ns=1;s=ua_2_2_62"];
@@ -266,7 +266,7 @@ fn asyncua_calls_a_service_of_rclpy_that_nobody_mapped() {
     );
 }
 
-/// Calls of the space that are Methods of another server.
+/// The server whose Methods are calls of the space.
 const OTHER: &str = "opc.tcp://127.0.0.1:4841";
 
 fn executed(more: &str) -> String {
@@ -299,7 +299,7 @@ fn reset(number: u16) -> String {
     )
 }
 
-/// `ua-space call`, which ends by itself.
+/// Starts `ua-space call`, which ends by itself.
 fn ua_space_call(words: &[&str]) -> Child {
     Started::new("ua-space", &program("ua-space"))
         .args(["call"])
@@ -316,7 +316,7 @@ fn ua_space_call(words: &[&str]) -> Child {
         .start()
 }
 
-/// Its exit code and what it printed.
+/// Waits for the end of a call. Returns the exit code and the printed lines.
 fn ended(mut child: Child) -> (i32, Vec<Value>) {
     let code = child.wait_for_end(SOON).code().unwrap();
     (code, child.json_lines())
@@ -343,7 +343,7 @@ fn methods_of_another_server_are_executed_once_for_each_who_asks() {
         begun,
         json!({"begun": "Move", "arguments": [2.5, [0.5, 0.25, 1.0]], "calls": 1})
     );
-    // The Method says no, in its own words.
+    // The Method fails with its own StatusCode.
     let args = ["Plc.Move", "TargetPosition=-1", "speeds=1"];
     let (code, told) = ended(ua_space_call(&args));
     let out_of_range = 0x803C_0000_u32;
@@ -352,21 +352,22 @@ fn methods_of_another_server_are_executed_once_for_each_who_asks() {
         (1, &json!(out_of_range)),
         "{told:?}"
     );
-    // Two at once, which asyncua executes one after the other.
+    // Two calls at once, which asyncua executes one after the other.
     let both =
         ["1", "1.5"].map(|seconds| ua_space_call(&["Plc.Wait", &format!("seconds={seconds}")]));
     for child in both {
         let (code, told) = ended(child);
         assert_eq!(code, 0, "{told:?}");
     }
-    // What no call can carry is told, and not offered.
+    // A Method with a type that no call can carry is logged and not offered.
     ua_server.wait_for_line("which no call has", SOON);
-    // A Method has another number from now on.
+    // The mapping gives a Method another number.
     let _ = cell.file("cell.yaml", &executed(&reset(84)));
     ua_server.signal(Signal::SIGHUP);
     let (code, told) = ended(ua_space_call(&["ua_0_3_84"]));
     assert_eq!(code, 0, "{told:?}");
-    // While: nobody knows what became of it, and it is not called again.
+    // During an execution: the server is lost, the result is unknown, and the Method is not called
+    // again.
     let slow = ua_space_call(&["Plc.Wait", "seconds=100"]);
     plc.wait_for_json("the last call", SOON, |line| {
         (line.get("arguments")? == &json!([100.0])).then_some(())
@@ -379,7 +380,7 @@ fn methods_of_another_server_are_executed_once_for_each_who_asks() {
     plc.signal(Signal::SIGKILL);
     let (code, told) = ended(slow);
     assert_eq!((code, told), (69, Vec::new()));
-    // After: another index for the same namespace.
+    // After a restart: the namespace has another index.
     let plc = cell.asyncua("opcua_methods.py", &[OTHER, "--before", "3"]);
     let (code, told) = ended(ua_space_call(&["Plc.Reset"]));
     assert_eq!(code, 0, "{told:?}");
@@ -482,12 +483,12 @@ fn asyncua_drives_an_action_of_ros_2_by_its_methods() {
     };
     let ids = ["01", "02"].map(|byte| byte.repeat(16));
     let accepted = |id: &str, order: i32| ask("ua_2_2_70", &json!([id, order]))[0].clone();
-    // It reports the first three numbers, and goes on until it is cancelled.
+    // The goal reports the first three numbers and runs until it is cancelled.
     assert_eq!(accepted(&ids[0], 100), true);
     assert_eq!(accepted(&ids[1], -1), false);
     eventually("its feedback is shown", SOON, || {
         let told = cell.asyncua_try("opcua_read.py", &[SERVER_ENDPOINT, "ns=1;s=ua_2_2_73"])?;
-        // Two fields: whose it is, and the numbers.
+        // Feedback has two fields: the goal id and the numbers.
         let shown = told[0]["value"].to_string();
         shown.contains("[1, 1, 2]").then_some(())
     });
@@ -496,7 +497,8 @@ fn asyncua_drives_an_action_of_ros_2_by_its_methods() {
     server.wait_for_json("the server agrees", SOON, |line| {
         (line.get("cancel")? == 100).then_some(())
     });
-    // CANCELED of action_msgs/GoalStatus, and what it had until then.
+    // The status is CANCELED of action_msgs/GoalStatus; the result has the numbers up to the
+    // cancellation.
     let result = ask("ua_2_2_72", &json!([ids[0]]));
     assert_eq!((&result[0], &result[2]), (&json!(5), &json!([1, 1, 2])));
 }
@@ -543,10 +545,10 @@ fn asyncua_drives_an_action_of_ros_2_as_a_program() {
         "Message",
         "ns=1;s=ua_2_2_70.program",
     ];
-    // There as soon as the action is.
+    // The Program exists as soon as the action exists.
     becomes("CurrentState", "Ready");
     let mut watch = cell.asyncua("opcua_subscribe.py", &events);
-    // It reports the first three numbers, and goes on until it is cancelled.
+    // The goal reports the first three numbers and runs until it is cancelled.
     assert_eq!(ask("Start", &json!([100])), "Good");
     assert!(shown("CurrentState").contains("Running"));
     assert_eq!(ask("Start", &json!([100])), "BadInvalidState");
@@ -577,7 +579,7 @@ fn asyncua_drives_an_action_of_ros_2_as_a_program() {
     transitions(&mut watch);
 }
 
-/// Of two goals: one is cancelled, the other is reached.
+/// Waits for the transitions of two goals: the first is cancelled, the second succeeds.
 fn transitions(watch: &mut Child) {
     let mut told = Vec::new();
     let told = watch.wait_for_json("all transitions", SOON, |line| {

@@ -1,4 +1,5 @@
-//! Services of one ROS, asked for from the other: under their names of the space, and as a mapping says.
+//! Services of a ROS, called from the other ROS under their names of the space and under names of a
+//! mapping.
 
 mod examples;
 
@@ -12,7 +13,7 @@ use system_tests::{
     Cell, Child, Distribution, Judge, MASTER, Peer, Started, eventually, metrics, program, xml_rpc,
 };
 
-/// rospy and rclpy need seconds to start on a busy machine.
+/// The time that rospy and rclpy need to start on a busy machine.
 const SOON: Duration = Duration::from_secs(40);
 const OF_ROS1: &str = "/ua_1_2_61";
 const OF_ROS2: &str = "/ua_2_2_62";
@@ -35,14 +36,14 @@ fn rospy_call(cell: &Cell, service: &str, kind: &str, values: &[&str]) -> Vec<Va
     })
 }
 
-/// The node that the master knows as server of a service.
+/// Returns the server of a service according to the master.
 fn server_of(service: &str) -> Option<String> {
     let answer = xml_rpc(MASTER, "lookupService", &["/system_tests", service])?;
     let (_, rest) = answer.split_once("rosrpc://")?;
     Some(rest.split('<').next()?.to_owned())
 }
 
-/// Waits until the bridge has that service in ROS 2, or has it no longer.
+/// Waits until the bridge has or does not have that service in ROS 2.
 fn has_service(judge: &mut Judge, bridge: &str, service: &str, wanted: bool) {
     judge.until(&json!({"nodes": 1}), |nodes| {
         nodes.as_array()?.contains(&json!(bridge)).then_some(())
@@ -68,7 +69,7 @@ fn rclpy_asks_for_a_service_of_rospy_and_is_told_that_it_fails() {
     let _bridges = (cell.bridge_ros1(&[]), cell.bridge_ros2(&[]));
     let mut judge = cell.judge(Distribution::Jazzy, &["judge"]);
     assert_eq!(set_bool(&mut judge, OF_ROS1, true), done());
-    // What the server raises is no answer of its own.
+    // An exception of the server is not a response of the service type.
     let refused = set_bool(&mut judge, OF_ROS1, false);
     assert_eq!(refused["success"], false, "{refused}");
     let why = refused["message"].as_str().unwrap();
@@ -141,7 +142,8 @@ fn a_server_that_ends_takes_its_service_along_and_of_a_killed_one_who_asks_is_to
     }
     let mut server = cell.rospy("ros1_serve.py", &[OF_ROS1]);
     assert_eq!(set_bool(&mut judge, OF_ROS1, true), done());
-    // The master goes on to name it. While its sockets are still there, nobody could know whether it executes.
+    // The master still lists the server. While its sockets exist, the bridge cannot know whether it
+    // executes.
     server.signal(Signal::SIGKILL);
     server.wait_for_end(SOON);
     let refused = set_bool(&mut judge, OF_ROS1, true);
@@ -174,14 +176,14 @@ fn of_two_bridges_in_one_domain_one_asks_and_a_call_is_executed_once() {
     for _ in 0..5 {
         assert_eq!(set_bool(&mut judge, OF_ROS1, true), done());
     }
-    // What is asked twice is asked at the same time; the last word of the server comes after both.
+    // Both requests are sent at the same time; the server's last line is printed after both.
     assert_eq!(set_bool(&mut judge, OF_ROS1, false)["success"], false);
     let asked = |line: &Value| (line.get("value")? == false).then_some(());
     server.wait_for_json("the server is asked", SOON, asked);
     assert_eq!(server.values().len(), 6);
 }
 
-/// A belt of ROS 1 that is switched from ROS 2, under names and fields of its own.
+/// A mapping for a belt of ROS 1 that is switched from ROS 2 under other names and fields.
 fn belt(asked: &str) -> String {
     format!(
         "
@@ -199,7 +201,7 @@ calls:
     )
 }
 
-/// Saves a file as editors do: under another name first.
+/// Saves a file as editors do: writes another file and renames it.
 fn save(file: &Path, text: &str) {
     let beside = file.with_extension("new");
     fs::write(&beside, text).unwrap();
@@ -220,7 +222,7 @@ fn a_mapping_names_what_is_executed_and_what_is_asked_for_and_is_read_again_mean
     let mut judge = cell.judge(Distribution::Jazzy, &["judge"]);
     assert_eq!(set_bool(&mut judge, "/switch", true), done());
     has_service(&mut judge, "/ua_bridge_ros2", OF_ROS1, false);
-    // With nothing to say, the belt starts; what it answers goes by the mapping as well.
+    // An empty request starts the belt; the response is also converted by the mapping.
     let as_trigger = "{space: 2, service: /start, type: std_srvs/Trigger, request: {data: true}, \
                       response: {success: true, message: {field: message}}}";
     save(&file, &belt(as_trigger));
@@ -228,7 +230,7 @@ fn a_mapping_names_what_is_executed_and_what_is_asked_for_and_is_read_again_mean
     has_service(&mut judge, "/ua_bridge_ros2", "/start", true);
     has_service(&mut judge, "/ua_bridge_ros2", "/switch", false);
     assert_eq!(judge.ask(trigger), done());
-    // The mapping that is gone leaves nothing behind.
+    // Removing the mapping removes the service.
     save(&file, "spaces: [{id: 1}, {id: 2, domain: 2}]\n");
     has_service(&mut judge, "/ua_bridge_ros2", "/start", false);
     assert_eq!(server.values().len(), 2);
@@ -267,7 +269,7 @@ calls:
     ros1.wait_for_line("is not offered as /mine", SOON);
     assert_eq!(set_bool(&mut judge, "/taken", true), theirs);
     assert_eq!(server_of("/mine").as_ref(), Some(&before));
-    // Once the name is free, it is taken.
+    // The bridge takes the name as soon as it is free.
     mine.end();
     let ours = eventually("the bridge has the name", SOON, || server_of("/mine"));
     assert_ne!(ours, before);

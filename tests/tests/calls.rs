@@ -1,4 +1,4 @@
-//! Calls of the space, asked for by nodes of ROS 1 and ROS 2 themselves.
+//! Calls of the space, made by nodes of ROS 1 and ROS 2.
 
 use std::time::{Duration, Instant};
 
@@ -11,10 +11,10 @@ use system_tests::{
 const START: (u16, u16, u16) = (0, 7, 105);
 const SERVICE: &str = "/ua_0_7_105";
 const NAME: &str = "gripper.Grasp.Start";
-/// rospy and rclpy need seconds to start on a busy machine.
+/// The time that rospy and rclpy need to start on a busy machine.
 const SOON: Duration = Duration::from_secs(30);
 
-/// What a rospy client that calls `times` times is told: answers, or texts of errors.
+/// Returns the results of a rospy client that calls `times` times: responses, or texts of errors.
 fn rospy_calls(cell: &Cell, times: usize) -> Vec<Value> {
     let mut args = vec![SERVICE, "std_srvs/Trigger"];
     for _ in 0..times {
@@ -81,7 +81,7 @@ fn an_rclpy_client_sees_and_asks_for_a_call_and_is_told_when_its_executor_is_kil
             .contains(&json!("/ua_bridge_ros2"))
             .then_some(())
     });
-    // `ros2 node info`.
+    // The services as in `ros2 node info`.
     let info = judge.until(&json!({"info": "/ua_bridge_ros2"}), |info| {
         let services = info["services"].as_array()?;
         services
@@ -90,7 +90,7 @@ fn an_rclpy_client_sees_and_asks_for_a_call_and_is_told_when_its_executor_is_kil
             .cloned()
     });
     assert_eq!(info, json!([SERVICE, ["std_srvs/srv/Trigger"]]));
-    // What its type is, the bridge tells as a node of ROS does that has such a service.
+    // The bridge describes the type of the service as a node of ROS with such a service does.
     judge.ask(json!({"serve": "/own", "type": "std_srvs/srv/Trigger", "value": {}}));
     let trigger = "std_srvs/Trigger".parse().unwrap();
     let hashes = Registry::bundle(Dialect::Ros2).service_type_hashes(&trigger);
@@ -150,7 +150,7 @@ fn a_skill_of_a_component_is_started_from_ros_2_and_from_ros_1() {
         judge.ask(json!({"call": service, "type": "std_srvs/srv/Trigger", "value": {}}))
     };
     let [start, halt, reset] = [105, 106, 109];
-    // Whether it begins in Halted or in Ready.
+    // The skill may be Halted or Ready at first.
     call(reset);
     let started = call(start);
     assert_eq!(started["success"], true, "{started}");
@@ -168,5 +168,5 @@ fn a_skill_of_a_component_is_started_from_ros_2_and_from_ros_1() {
     assert_eq!(answers[0]["success"], true, "{answers:?}");
 }
 
-/// Within that a caller is told that the one who executes is gone.
+/// Time within which a caller learns that the executor is lost.
 const BOUND: Duration = Duration::from_secs(8);

@@ -1,4 +1,4 @@
-//! Values from one space to the others, by real peers on both ends, typed and equal.
+//! Values between spaces, with real peers on both ends, compared with their types.
 
 use std::time::Duration;
 
@@ -18,7 +18,8 @@ fn joints() -> Value {
            "position": [0.1, -1.5e-3], "velocity": [], "effort": [12.25]})
 }
 
-/// What both ROS versions have of a JointState: ROS 1 alone has a sequence number in its header.
+/// Compares the fields of a JointState that both ROS versions have: only ROS 1 has a sequence
+/// number in the header.
 fn same_joints(heard: &Value) {
     let sent = joints();
     for field in ["name", "position", "velocity", "effort"] {
@@ -27,7 +28,7 @@ fn same_joints(heard: &Value) {
     assert_eq!(heard["header"]["frame_id"], sent["header"]["frame_id"]);
 }
 
-/// A rospy node, named after the topic, that publishes the value ten times a second.
+/// Starts a rospy node, named after the topic, that publishes the value ten times a second.
 fn in_ros1(cell: &Cell, topic: &str, kind: &str, value: &Value) -> Child {
     let node = topic.replace('/', "_");
     let value = value.to_string();
@@ -39,7 +40,7 @@ fn in_ros1(cell: &Cell, topic: &str, kind: &str, value: &Value) -> Child {
     )
 }
 
-/// A Cyclone writer in domain 2 that publishes the value ten times a second.
+/// Starts a Cyclone DDS writer in domain 2 that publishes the value ten times a second.
 fn in_ros2(cell: &Cell, topic: &str, kind: &str, value: &Value) -> Child {
     let value = value.to_string();
     cell.cyclone(
@@ -148,7 +149,7 @@ fn a_joint_state_crosses_from_ros_2_to_ros_1_without_a_mapping() {
     let mut heard = cell.rospy("ros1_sub.py", &topic);
     let got = heard.wait_for_json("the joints in ROS 1", SOON, value);
     same_joints(&got);
-    // An OPC UA DateTime counts 100 ns.
+    // An OPC UA DateTime has a resolution of 100 ns.
     assert_eq!(
         got["header"]["stamp"],
         json!({"secs": 1_700_000_000, "nsecs": 123_456_700})
@@ -290,7 +291,7 @@ fn a_value_whose_writer_is_gone_is_uncertain_and_still_there() {
     assert_eq!(status("Good"), "last");
     drop(sends);
     drop(bridge);
-    // Nothing else of its space is heard either.
+    // No other value of that space is received either.
     assert_eq!(status("UncertainNoCommunicationLastUsableValue"), "last");
 }
 

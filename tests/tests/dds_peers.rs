@@ -1,4 +1,5 @@
-//! The peers themselves: what the tests of bridge-ros2 conclude from them holds only if they understand each other.
+//! The DDS peers themselves: the tests of bridge-ros2 are only valid if the peers interoperate with
+//! each other.
 
 use std::time::Duration;
 
@@ -7,8 +8,9 @@ use system_tests::{Cell, Child, Peer};
 const SOON: Duration = Duration::from_secs(20);
 const STRING: &str = "std_msgs/String";
 
-// Kept for who joins late. The writer counts a reader as matched before the reader's match with it is through, and of a
-// volatile topic Cyclone DDS then misses some of the first samples when the machine is busy.
+// Kept for late joiners. The writer counts a reader as matched before the reader has finished
+// matching, and on a busy machine Cyclone DDS then misses some of the first samples of a volatile
+// topic.
 const TEXTS: [&str; 6] = [
     "/chatter",
     STRING,

@@ -1,4 +1,5 @@
-//! Who is there: `ua-lds`, servers that tell of themselves, and clients and packets of other makers as judges.
+//! Discovery: `ua-lds` and servers that announce themselves, checked with third-party clients and
+//! packets.
 
 mod clock;
 mod embedded;
@@ -25,8 +26,8 @@ use system_tests::{
 
 const LDS: &str = "opc.tcp://127.0.0.1:4840";
 const STATUS: &str = "127.0.0.1:9104";
-/// For what has no promised time: each look of a peer in Python starts an interpreter, which takes
-/// seconds on a loaded machine.
+/// Timeout of events without a promised time: each poll of a Python peer starts an interpreter,
+/// which takes seconds on a loaded machine.
 const SOON: Duration = Duration::from_secs(30);
 const MDNS: SocketAddrV4 = SocketAddrV4::new(Ipv4Addr::new(224, 0, 0, 251), 5353);
 
@@ -37,7 +38,7 @@ fn lds(args: &[&str]) -> Child {
     child
 }
 
-/// The example `who`, ready.
+/// Starts the example `who` and waits until it is ready.
 fn who(args: &[&str]) -> Child {
     who_started(args).start().ready(SOON)
 }
@@ -46,7 +47,7 @@ fn who_started(args: &[&str]) -> Started {
     Started::new("who", &program("examples/who")).args(args)
 }
 
-/// Somebody who has no room for any client, and is there.
+/// A listener that accepts connections but serves no client.
 struct Greeter {
     url: String,
     end: Arc<AtomicBool>,
@@ -79,7 +80,7 @@ impl Greeter {
 impl Drop for Greeter {
     fn drop(&mut self) {
         self.end.store(true, Ordering::Relaxed);
-        // So that it looks.
+        // Wakes the listener so that it checks `end`.
         drop(TcpStream::connect(self.at));
     }
 }
@@ -88,7 +89,7 @@ fn announced(name: &str, args: &[&str]) -> Child {
     who(&[&["announce", name, "--lds", LDS], args].concat())
 }
 
-/// Waits until who watches is told this of that server, and gives the line.
+/// Waits until the watcher reports this event of that server, and returns the line.
 fn told(watch: &mut Child, found: &str, name: &str) -> Value {
     watch.wait_for_json(&format!("{name} {found}"), SOON, |line| {
         let of_it = line["name"].as_str()?.starts_with(name) && line["found"] == found;
@@ -96,7 +97,7 @@ fn told(watch: &mut Child, found: &str, name: &str) -> Value {
     })
 }
 
-/// Milliseconds from an instant of this process to a line of another.
+/// Returns the milliseconds from an instant of this process to a line of another process.
 fn after(since: Duration, line: &Value) -> u64 {
     let at = Duration::from_millis(line["at_ms"].as_u64().unwrap());
     u64::try_from(at.saturating_sub(since).as_millis()).unwrap()
@@ -213,7 +214,7 @@ fn asyncua_registers_is_announced_and_gone_at_once_when_it_takes_that_back() {
         None
     );
     told(&mut watch, "gone", "py-arm");
-    // The faults of OPC 10000-4, 5.5.5.
+    // The error codes of OPC 10000-4, 5.5.5.
     assert_eq!(register(&["--old"])["status"], "Good");
     assert_eq!(
         register(&["--old", "--name", ""])["status"],
@@ -280,7 +281,7 @@ fn who_registers_is_known_by_its_authority_until_its_certificate_is_revoked() {
     let _made = cell.asyncua_once("opcua_access.py", &["issued", issued.to_str().unwrap()]);
     let greeter = Greeter::start();
     let register = |name: &str| {
-        // The script takes the pair that is called so.
+        // The script uses the pair with this name.
         let theirs = cell.folder().join(name);
         std::fs::create_dir_all(&theirs).unwrap();
         for file in ["certificate.der", "key.pem"] {
@@ -311,7 +312,7 @@ fn who_registers_is_known_by_its_authority_until_its_certificate_is_revoked() {
     assert_eq!(register("client"), "Good");
     assert!(registered("urn:ua-bridge:system-tests:client").is_some());
     assert_eq!(register("gone"), "BadCertificateRevoked");
-    // A stranger is not told which of the checks it was.
+    // A stranger does not learn which of the checks failed.
     assert_eq!(register("stranger"), "BadSecurityChecksFailed");
     trust("plant-now.crl");
     assert_eq!(register("client"), "BadCertificateRevoked");
@@ -447,7 +448,7 @@ fn the_cells_server_is_found_and_shows_who_is_there() {
     });
     let gripper = announced("gripper", &[]);
     server.wait_for_line("a server is seen", SOON);
-    // Each of the two looks for itself.
+    // Both programs discover for themselves.
     let gripper_there = eventually("its discovery server sees it", SOON, || {
         on_network("gripper")
     });
@@ -518,7 +519,7 @@ fn tshark_reads_the_announcement_and_the_goodbye() {
     assert!(goodbye.is_some(), "no goodbye in {lines:#?}");
 }
 
-/// Greetings, channels and messages that are none.
+/// Invalid greetings, channels and messages.
 fn malformed() -> Vec<Vec<u8>> {
     let hello = {
         let url = b"opc.tcp://127.0.0.1:4840";
@@ -574,15 +575,15 @@ fn malformed_packets_disturb_nobody_beside_them() {
     for round in 0..20 {
         for bytes in malformed() {
             let mut stream = TcpStream::connect("127.0.0.1:4840").unwrap();
-            // It may be cut off before all of it is said.
+            // The server may close the connection before all is sent.
             drop(stream.write_all(&bytes));
-            // Half of them stay, and say nothing more.
+            // Half of the connections stay open and send nothing more.
             match round % 2 {
                 0 => open.push(stream),
                 _ => {
                     stream.set_read_timeout(Some(SOON)).unwrap();
                     drop(stream.shutdown(std::net::Shutdown::Write));
-                    // Cut off or told why: it ends.
+                    // Whether the server closes the connection or reports an error, the read ends.
                     drop(stream.read_to_end(&mut Vec::new()));
                 }
             }
@@ -616,7 +617,7 @@ fn malformed_packets_disturb_nobody_beside_them() {
     assert!(watch.runs());
 }
 
-/// An mDNS response for one server: PTR, SRV, TXT and A.
+/// Returns an mDNS response for a single server: PTR, SRV, TXT and A.
 fn announcement() -> Vec<u8> {
     let name = |labels: &[&str]| -> Vec<u8> {
         let label =

@@ -1,4 +1,4 @@
-//! `ua-space init` and `ua-space check --environment` against graphs, domains and servers of other makers.
+//! `ua-space init` and `ua-space check --environment` on third-party graphs, domains and servers.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -12,19 +12,19 @@ const SOON: Duration = Duration::from_secs(40);
 const ALL: &[Peer] = &[Peer::Ros1, Peer::Python];
 const SNAPSHOTS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/init");
 
-/// `ua-space` as it ended, in a cell's network.
+/// An ended `ua-space` in a cell's network.
 struct Ended {
     code: i32,
     child: Child,
 }
 
 impl Ended {
-    /// All it printed.
+    /// Returns the whole output.
     fn text(&self) -> String {
         self.child.lines().join("\n")
     }
 
-    /// The list that it printed as JSON.
+    /// Returns the list that was printed as JSON.
     fn list(&self) -> Vec<Value> {
         let lines = self.child.lines();
         let mut lists = lines
@@ -47,7 +47,7 @@ fn ua_space(args: &[&str]) -> Ended {
     Ended { code, child }
 }
 
-/// What was written is as the snapshot has it, and can run without a word.
+/// Checks that the written mapping equals the snapshot and has no diagnostics.
 fn like_snapshot(file: &Path, name: &str) {
     let folder = file.parent().unwrap().to_str().unwrap();
     let written = fs::read_to_string(file).unwrap().replace(folder, "FOLDER");
@@ -70,7 +70,8 @@ fn path(cell: &Cell, name: &str) -> PathBuf {
     cell.folder().join(name)
 }
 
-/// A graph is whole when its last topic is there; what `ready` says comes before the master knows.
+/// Waits until the graph has its last topic, because `ready` of a peer is printed before the master
+/// lists its topics.
 fn settled(args: &[&str], wanted: &str) {
     eventually(wanted, SOON, || {
         ua_space(args).text().contains(wanted).then_some(())
@@ -106,7 +107,7 @@ fn a_mapping_of_two_graphs_and_a_server_ties_what_belongs_together() {
     assert_eq!(ended.object()["changed"], true);
     like_snapshot(&file, "cell.yaml");
 
-    // Nothing is new: nothing is written, though it may be.
+    // Without changes, the file is not written, although writing is allowed.
     let before = fs::read(&file).unwrap();
     let again = ua_space(&[&looks[..], &["--merge", "--json"]].concat());
     assert_eq!(again.code, 0, "{}", again.text());
@@ -115,7 +116,8 @@ fn a_mapping_of_two_graphs_and_a_server_ties_what_belongs_together() {
     everything_is_there(name);
 }
 
-/// The mapping is of what is there, so nothing of it is missing but the cell's own server, which is not started yet.
+/// Checks that everything in the mapping is present, except the cell's own server, which is not
+/// started yet.
 fn everything_is_there(name: &str) {
     let ended = ua_space(&["check", "--environment", "--json", name]);
     assert_eq!(ended.code, 69, "{}", ended.text());
@@ -124,9 +126,9 @@ fn everything_is_there(name: &str) {
     let away = asked.iter().filter(|one| one["there"] == false);
     let away: Vec<&Value> = away.map(|one| &one["whom"]).collect();
     assert_eq!(away, ["OPC UA server opc.tcp://127.0.0.1:4841"], "{told}");
-    // The graphs, and the server for its Method and for its nodes.
+    // The checked environments: the graphs, and the server for its Method and for its nodes.
     assert_eq!(asked.len(), 5, "{told}");
-    // A robot knows whether the conveyor runs, and that server lets nobody write it.
+    // A robot reads whether the conveyor runs, and that server allows no writes to it.
     let findings = told["findings"].as_array().unwrap().iter();
     let found: Vec<(&Value, bool)> = findings
         .map(|one| {
@@ -163,7 +165,7 @@ fn what_is_new_is_put_behind_what_somebody_has_edited() {
         ended.text()
     );
 
-    // A server and the file it came from have the same nodes.
+    // A server and the NodeSet file it was made from have the same nodes.
     let of_server = path(&cell, "server.yaml");
     let ended = ua_space(&[
         "init",
@@ -178,17 +180,17 @@ fn what_is_new_is_put_behind_what_somebody_has_edited() {
         let (_, nodes) = text.split_once("variables:").unwrap();
         let calls = "\n# What one space executes";
         let (nodes, calls) = nodes.split_once(calls).unwrap_or((nodes, ""));
-        // Only a server that runs has values.
+        // Only a running server has values.
         let nodes = nodes.lines().filter(|line| !line.contains(" from: {"));
         (nodes.collect::<Vec<_>>().join("\n"), calls.to_owned())
     };
     let (of_server, of_file) = (nodes(&of_server), nodes(&of_set));
     assert_eq!(of_server.0, of_file.0);
-    // Only a server that runs can be called.
+    // Only a running server can be called.
     assert!(of_server.1.contains("name: Line.Start"), "{}", of_server.1);
     assert_eq!(of_file.1, "");
 
-    // Edits stay, an alias is never given to another node, and what a comment names is left out.
+    // Edits are kept, and a node that the edited file lacks is appended.
     let edited = fs::read_to_string(&of_set)
         .unwrap()
         .replace("name: Mode", "name: Betriebsart   # renamed")
@@ -210,7 +212,7 @@ fn a_server_that_announces_itself_to_nobody_is_found_where_somebody_asks_for_tha
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
     };
-    // At 4840 it would be asked as the discovery server of this host.
+    // At port 4840, the server would be queried as the discovery server of this host.
     let endpoint = "opc.tcp://127.0.0.1:4841";
     let _server = cell.asyncua("opcua_line.py", &[endpoint]);
     let look = ["discover", "--seconds", "1", "--json"];
@@ -229,7 +231,7 @@ fn a_server_that_announces_itself_to_nobody_is_found_where_somebody_asks_for_tha
     assert_eq!(found["foundBy"], serde_json::json!(["scan"]));
     let url = found["urls"][0].as_str().unwrap();
     assert!(url.starts_with(endpoint), "{found}");
-    // What is too much to be tried is not tried.
+    // Scans of too many addresses are refused.
     let ended = ua_space(&["discover", "--scan", "127.0.0.0/8"]);
     assert_eq!(ended.code, 64, "{}", ended.text());
     assert!(
@@ -237,7 +239,7 @@ fn a_server_that_announces_itself_to_nobody_is_found_where_somebody_asks_for_tha
         "{}",
         ended.text()
     );
-    // A mapping of whoever is found.
+    // A mapping of the discovered servers.
     let file = path(&cell, "found.yaml");
     let init = ["init", "--discover", "-o", file.to_str().unwrap()];
     let ended = ua_space(&[&init[..], &["--seconds", "1", "--wait", "1"], &scan].concat());
@@ -288,7 +290,7 @@ fn who_is_not_there_is_named_and_nothing_is_written() {
         .iter()
         .filter(|one| one["there"] == false && one["why"].is_string());
     assert_eq!((asked.len(), absent.count()), (3, 3), "{told}");
-    // What cannot run has no environment to be asked for.
+    // The environment of an invalid mapping is not checked.
     let mapping = cell.file("faulty.yaml", "spaces: 1\n");
     let ended = ua_space(&[&check[..], &[mapping.to_str().unwrap()]].concat());
     assert_eq!(
@@ -323,12 +325,13 @@ fn values_named_alike_become_the_nodes_of_our_own_server() {
         checked.mapping.unwrap()
     };
     let (written, shipped) = (read(name), read(shipped));
-    // What is named alike is as somebody has written it by hand: node, origin, topics of both sides.
+    // Variables with the same name are written as in the shipped mapping: node, origin, topics of
+    // both sides.
     for topic in ["ua_1_2_10", "ua_2_2_20", "ua_2_2_21"] {
         let topic = topic.parse().unwrap();
         assert_eq!(written.variable(topic), shipped.variable(topic));
     }
-    // /storage/covers and CoversInStorage are not, and are values each for itself.
+    // /storage/covers and CoversInStorage have different names and are separate values.
     let covers = written
         .variables()
         .iter()
@@ -367,7 +370,7 @@ fn what_is_named_otherwise_than_it_is_there_is_found() {
         cell.cyclone("ros2_service.py", &offered)
     };
     let _services = (serves("/arm/grip"), serves("/arm/home"));
-    // There the namespace has another index.
+    // On that server, the namespace has another index.
     let before = ["--before", "urn:ua-bridge:system-tests:before"];
     let _server = cell.asyncua("opcua_line.py", &[&[SERVER_ENDPOINT][..], &before].concat());
     settled(&["init", "--ros1"], "/conveyor/start");
@@ -401,7 +404,7 @@ fn what_is_named_otherwise_than_it_is_there_is_found() {
         assert_eq!((found.0, found.1), (expected.0, expected.1), "{found:?}");
         assert!(found.2.contains(expected.2), "{found:?}");
     }
-    // Only the graphs are asked.
+    // Only the graphs are checked.
     let ended = ua_space(&["check", "--environment=ros1,ros2", "--json", file]);
     assert_eq!(ended.object()["environment"].as_array().unwrap().len(), 2);
 }

@@ -1,4 +1,5 @@
-//! Network interfaces that are deleted and made again, or get another address, while the bridges run.
+//! Network interfaces that are deleted and recreated, or get another address, while the bridges
+//! run.
 
 use std::time::{Duration, Instant};
 
@@ -12,12 +13,14 @@ use uadp::Scalar;
 /// Another address of this host on the cable.
 const ELSEWHERE: &str = "10.77.0.3";
 const START: Duration = Duration::from_secs(20);
-/// A look each second and a repetition each second, and a loaded machine.
+/// The interfaces are polled each second and values repeated each second; the rest is for a loaded
+/// machine.
 const SOON: Duration = Duration::from_secs(20);
 const OUT: (Triple, &str) = ((1, 2, 10), "/ua_1_2_10");
 const IN: (Triple, &str) = ((2, 2, 20), "ua_2_2_20");
 
-/// A ROS 1 graph on loopback with one topic that is published, for a bridge whose PubSub network is elsewhere.
+/// A ROS 1 graph on loopback with a published topic, for a bridge whose PubSub network is
+/// elsewhere.
 struct Graph {
     _master: Core,
     _runtime: tokio::runtime::Runtime,
@@ -38,7 +41,7 @@ impl Graph {
     }
 }
 
-/// Other nodes are told that address of it.
+/// Starts a bridge that announces this address to other nodes.
 fn bridge_ros1(address: &str, more: &[&str]) -> Child {
     let bridge = Started::new("bridge-ros1", &program("bridge-ros1"))
         .env("ROS_MASTER_URI", "http://127.0.0.1:11311")
@@ -56,7 +59,7 @@ fn until_ready(metrics: &str, within: Duration) {
     });
 }
 
-/// Waits until the bridge says that it is not ready, and gives the reasons.
+/// Waits until the bridge reports that it is not ready, and returns the reasons.
 fn until_not_ready(metrics: &str) -> String {
     eventually("the bridge is not ready", SOON, || {
         let (code, why) = http_answer(metrics, "/readyz")?;
@@ -64,7 +67,7 @@ fn until_not_ready(metrics: &str) -> String {
     })
 }
 
-/// Whether the bridge has the interfaces of that side, by its gauge.
+/// Returns whether the bridge has the interfaces of that side, by its gauge.
 fn has_interface(metrics: &str, side: &str) -> bool {
     let side = format!("side=\"{side}\"}} ");
     let text = http_get(metrics, "/metrics").unwrap();
@@ -80,11 +83,11 @@ fn delivered() -> u64 {
         .unwrap_or_default()
 }
 
-/// Values cross the cable in both directions, before long.
+/// Waits until values cross the cable in both directions.
 fn cross(cable: &Cable, value: &str) {
     let start = Instant::now();
     let mut ua: UaSide = cable.ua_side();
-    // Repeated each second.
+    // The value is repeated each second.
     ua.hear_scalar(OUT.0, Scalar::String(Some("out")));
     let before = delivered();
     eventually("a value of the other host is delivered", SOON, || {
@@ -94,7 +97,7 @@ fn cross(cable: &Cable, value: &str) {
     assert!(start.elapsed() < SOON, "{:?}", start.elapsed());
 }
 
-/// With the interface named, or left to the system.
+/// Checks a bridge whose interface is named by `arguments` or chosen by the system.
 fn values_cross_again(arguments: &[&str]) {
     let Some(cell) = Cell::with(&[]) else {
         return;
@@ -124,11 +127,11 @@ fn values_cross_again(arguments: &[&str]) {
         until_ready(METRICS_ROS1, SOON);
         bridge.wait_for_line("the PubSub network is within reach", SOON);
     }
-    // So quickly that nobody saw it go.
+    // The interface is recreated so quickly that the bridge does not see its absence.
     cable.pull();
     lay(ELSEWHERE);
     cross(&cable, "at once");
-    // Its own datagrams are known by the address they have now.
+    // The bridge recognizes its own datagrams by the new address.
     let status = metrics(METRICS_ROS1).unwrap();
     assert_eq!(
         status["others"]["dropped"]["space_taken"],

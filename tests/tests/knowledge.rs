@@ -1,4 +1,5 @@
-//! What is known of the plant, judged by rdflib: the same questions on the same statements have the same answers.
+//! The knowledge graph of the plant, compared with rdflib: the same queries on the same statements
+//! have the same answers.
 
 use std::collections::BTreeMap;
 
@@ -24,7 +25,7 @@ fn of_type(namespace: &str, identifier: &str, browse_name: &str) -> TypeFacts {
     }
 }
 
-/// A component with one skill; the names have all that has to be escaped somewhere.
+/// Returns a component with a skill; its names contain all characters that need escapes.
 fn component(uri: &str, own: Option<TypeFacts>, capabilities: &[&str]) -> ComponentFacts {
     let ours = "urn:ua-bridge:skills";
     let common = [
@@ -68,7 +69,7 @@ fn component(uri: &str, own: Option<TypeFacts>, capabilities: &[&str]) -> Compon
 
 const GRASP: &str = "urn:example:capability:grasp";
 
-/// Fills one store with components, manifests with the names of their modules, NodeSets and a file.
+/// Fills a store with components, manifests with the names of their modules, NodeSets and a file.
 fn plant(manifests: &[(&str, String)], node_sets: &[String]) -> Knowledge {
     let knowledge = Knowledge::new().unwrap();
     let vendor = of_type("urn:example:vendor", "s=Vacuum Grasp", "VacuumGraspType");
@@ -121,7 +122,7 @@ fn plant(manifests: &[(&str, String)], node_sets: &[String]) -> Knowledge {
     knowledge
 }
 
-/// Rows in one order, numbers as floats, lists in one order.
+/// Returns sorted rows, with numbers as floats and lists sorted.
 fn comparable(question: Question, columns: &[String], rows: Vec<Vec<Value>>) -> Vec<String> {
     let lists: Vec<&str> = question.lists().collect();
     let value = |(column, value): (&String, Value)| {
@@ -199,7 +200,8 @@ fn rdflib_answers_every_question_alike_about_data_of_other_makers() {
     are_answered_alike(&cell, &knowledge, "http://opcfoundation.org/UA/DI/#i=15063");
 }
 
-/// All questions, some of them about one thing; `device` is a type with subtypes.
+/// Compares the answers of all queries, some of them with parameters; `device` is a type with
+/// subtypes.
 fn are_answered_alike(cell: &Cell, knowledge: &Knowledge, device: &str) {
     let asked: Vec<(Question, Vec<(String, String)>)> = QUESTIONS
         .iter()
@@ -255,6 +257,6 @@ fn are_answered_alike(cell: &Cell, knowledge: &Knowledge, device: &str) {
             question.name
         );
     }
-    // Nothing has run, and no process is known.
+    // No process has run, and no process is known.
     assert_eq!(empty, ["processes", "run-steps", "runs"]);
 }

@@ -13,13 +13,13 @@ use uadp::{
 const SOON: Duration = Duration::from_secs(60);
 const SIZE: usize = 10_000_000;
 
-/// As `ros1_image.py` fills images: that of image `number` begins at `number`. Made once, since a receiver that looks up
-/// from its socket for long loses what comes meanwhile.
+/// Returns the image data of `ros1_image.py`: the data of image `number` starts at `number`. Made
+/// once, because a receiver that leaves its socket unread for long loses datagrams.
 fn patterns() -> Vec<u8> {
     (0..=250).cycle().take(SIZE + 251).collect()
 }
 
-/// What the images of the cell's camera cross as, and that none of them gives way to a newer one.
+/// The mapping of the cell's camera; its images are queued, so none is replaced by a newer image.
 const CAMERA: &str = r#"
 spaces: [{id: 1}]
 namespaces: {5: "urn:cell"}
@@ -36,7 +36,7 @@ variables:
     ros: {topic: /button, type: std_msgs/String}
 "#;
 
-/// The number of an image and its data, out of the ROS message, which ends with them.
+/// Returns the number of an image and its data, from the end of the ROS message.
 fn image<'a>(message: &DataSetMessage<'a>) -> (u32, &'a [u8]) {
     let fields: Vec<_> = message.fields().unwrap().map(Result::unwrap).collect();
     let [Variant::Scalar(Scalar::ByteString(Some(bytes)))] = fields[..] else {
@@ -62,7 +62,8 @@ fn images_of_ten_megabytes_leave_ros_1_as_they_were_and_a_button_beside_them_los
     let button = ["/button", "std_msgs/String", "--numbered", &presses];
     let paced = ["--rate", "50", "--wait-subscribers", "1"];
     let _button = cell.rospy("ros1_pub.py", &[&button[..], &paced].concat());
-    // Last, as it begins at once: what comes before somebody listens is more than a socket holds.
+    // Started last, because it publishes at once: the images sent before the test listens are
+    // larger than a socket's buffer.
     let count = IMAGES.to_string();
     let _camera = cell.rospy("ros1_image.py", &["pub", "/camera", "--count", &count]);
     let mut reassembler = Reassembler::new(ReassemblyLimits {
@@ -110,7 +111,7 @@ fn images_of_ten_megabytes_leave_ros_1_as_they_were_and_a_button_beside_them_los
     assert!(pressed.into_iter().eq(0..PRESSES));
 }
 
-/// Sends an image of space 2 as the chunks a writer makes of it.
+/// Sends an image of space 2 in the chunks that a writer makes of it.
 fn send_image(group: &UadpSocket, data: &[u8], sequence: u16) {
     let now = std::time::SystemTime::now()
         .duration_since(std::time::UNIX_EPOCH)
@@ -166,7 +167,7 @@ fn send_image(group: &UadpSocket, data: &[u8], sequence: u16) {
         written.unwrap();
         group.send(&datagram);
         datagram.clear();
-        // The pace of a sender: a socket buffer holds less than an image.
+        // Paced like a sender, because a socket buffer is smaller than an image.
         std::thread::sleep(Duration::from_millis(1));
     }
 }

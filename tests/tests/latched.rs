@@ -1,4 +1,4 @@
-//! Values that were there before anyone listened.
+//! Values that were published before a subscriber started.
 
 use std::collections::BTreeSet;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -112,7 +112,7 @@ fn a_transient_local_value_reaches_a_ros_1_side_that_starts_later() {
     );
 }
 
-/// The value of a std_msgs/String in a datagram of the triple 5, 10.
+/// Returns the value of a std_msgs/String in a datagram of the triple 5, 10.
 fn text_of(datagram: &[u8]) -> Option<String> {
     let message = NetworkMessage::decode(datagram).ok()?;
     let message = message.messages().next()?.ok()?;
@@ -174,7 +174,7 @@ fn a_late_reader_of_the_space_gets_the_value_of_each_transient_local_writer_also
     eventually("all three are repeated", SOON, || {
         (repeated(&late) == all).then_some(())
     });
-    // What does not latch is an event, and is not repeated beside states.
+    // A value that is not latched is an event, and is not repeated together with states.
     let volatile = write("passing", "volatile");
     eventually("the volatile one is heard", SOON, || {
         repeated(&late).contains("passing").then_some(())
@@ -192,7 +192,7 @@ fn a_late_reader_of_the_space_gets_the_value_of_each_transient_local_writer_also
     });
 }
 
-/// A std_msgs/String of space 2 taken at `stamp`, as a key frame.
+/// Encodes a std_msgs/String of space 2 with the timestamp `stamp` as a key frame.
 fn key_frame(sequence: u16, stamp: i128, text: &str) -> Vec<u8> {
     let header = NetworkHeader {
         publisher_id: Some(PublisherId::UInt16(2)),

@@ -1,4 +1,5 @@
-//! Subscribers that start after a value was published: they get no event, and no state of a producer that has ended.
+//! Subscribers that start after a value was published: they receive no event, and no state of a
+//! producer that has ended.
 
 use std::time::Duration;
 
@@ -13,7 +14,7 @@ const SOON: Duration = Duration::from_secs(30);
 const BOTH: &[Peer] = &[Peer::Ros1, Peer::Python];
 const TYPE: &str = "std_msgs/UInt32";
 
-/// The subscribers of a topic by rclpy and rospy, of which none has got a value.
+/// Starts subscribers of a topic: volatile and transient_local in ROS 2, and a subscriber in ROS 1.
 fn late(cell: &Cell, topic: &str) -> [Child; 3] {
     let durability = |durability: &'static str| {
         let args = [topic, TYPE, "--domain", "2", "--durability", durability];
@@ -28,7 +29,7 @@ fn numbers(heard: &Child) -> Vec<u64> {
     values.filter_map(|value| value["data"].as_u64()).collect()
 }
 
-/// How many values of a topic a bridge has delivered.
+/// Returns the number of values of a topic that a bridge has delivered.
 fn delivered(bridge: &str, topic: &str) -> Option<u64> {
     let status: Value = metrics(bridge)?;
     status["topics"][topic]["delivered"].as_u64()
@@ -44,7 +45,7 @@ fn a_command_of_opc_ua_reaches_present_subscribers_once_and_late_ones_never() {
     let mut side = UaSide::join();
     let topic = "/ua_0_5_10";
     let mut present = late(&cell, topic);
-    // Written until all of them are known.
+    // Written until all subscribers are known.
     for subscriber in &mut present {
         eventually("the subscriber is there", SOON, || {
             side.write((0, 5, 10), Scalar::UInt32(1));
@@ -67,8 +68,8 @@ fn a_command_of_opc_ua_reaches_present_subscribers_once_and_late_ones_never() {
     }
 }
 
-/// The bridges advertise each topic with its first value, and subscribers that they know have yet
-/// to connect then.
+/// The bridges advertise each topic with its first value, so even known subscribers have to connect
+/// first.
 #[test]
 fn the_first_event_of_a_topic_reaches_subscribers_that_are_present() {
     let Some(cell) = Cell::with(&[Peer::Ros1, Peer::Ros2]) else {
@@ -88,7 +89,7 @@ fn the_first_event_of_a_topic_reaches_subscribers_that_are_present() {
         judge.ask(json!({"subscribe": topic, "type": "std_msgs/msg/UInt32", "qos": qos}));
     }
     let mut side = UaSide::join();
-    // The last topic is for waiting until all subscribers are known.
+    // The last topic shows when all subscribers are known.
     eventually("the subscribers are known", SOON, || {
         side.write((0, 5, 10), Scalar::UInt32(1));
         let heard = judge.child().json_lines();
@@ -129,7 +130,7 @@ fn a_value_of_ros_1_that_is_not_latched_reaches_no_late_subscriber_of_ros_2_in_e
         let _ros1 = cell.bridge_ros1(&[]);
         let ros2 = (!bridge_is_late).then(|| cell.bridge_ros2(&[]));
         let name = topic.trim_start_matches('/');
-        // ROS 1 hands the value to those that are connected by then.
+        // In ROS 1, the value is delivered to the subscribers connected at that time.
         let value = ["--value", "7", "--wait-subscribers", "1"];
         let mut sends = cell.rospy("ros1_pub.py", &[&[topic, TYPE][..], &value].concat());
         eventually("the bridge has sent the value", SOON, || {
@@ -187,7 +188,8 @@ fn a_latched_value_is_handed_to_nobody_once_its_producer_is_killed() {
     });
     let before = delivered(METRICS_ROS2, name);
     let third = cell.cyclone("ros2_sub.py", &reader);
-    // A marker on another topic comes after what the bridge would have handed over at discovery.
+    // A marker on another topic arrives after the values that the bridge could deliver at
+    // discovery.
     let mut side = UaSide::join();
     let marker = ["/ua_0_5_20", TYPE, "--domain", "2"];
     let marker = cell.cyclone("ros2_sub.py", &marker);

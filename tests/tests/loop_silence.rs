@@ -1,4 +1,4 @@
-//! A node that sends every topic of the space back onto itself: traffic must fall silent.
+//! A node that returns every topic of the space to the same topic: traffic must end.
 
 use std::time::Duration;
 
@@ -7,11 +7,11 @@ use system_tests::{Cell, METRICS_ROS1, Peer, UadpSocket, eventually, metrics, nu
 
 const SOON: Duration = Duration::from_secs(30);
 const BOTH: &[Peer] = &[Peer::Ros1, Peer::Python];
-/// Long enough for a loop to show: one turn takes a few milliseconds.
+/// Long enough to reveal a loop: a round trip takes a few milliseconds.
 const WINDOW: Duration = Duration::from_secs(4);
 
 fn of_publisher(datagrams: &[Vec<u8>], space: u8) -> usize {
-    // UADP version and flags, extended flags 1, then the PublisherId as UInt16.
+    // UADP version and flags, ExtendedFlags1, then the PublisherId as UInt16.
     datagrams
         .iter()
         .filter(|bytes| bytes.len() > 3 && bytes[1] & 0b111 == 1 && bytes[2..4] == [space, 0])
@@ -19,7 +19,7 @@ fn of_publisher(datagrams: &[Vec<u8>], space: u8) -> usize {
 }
 
 fn wait_for_silence(group: &UadpSocket) -> Vec<Vec<u8>> {
-    // Two topics, each with a key frame or keep-alive a second, and some air for a busy machine.
+    // Two topics, each with a key frame or keep-alive a second, and a margin for a busy machine.
     let most = 2 * (WINDOW.as_secs() as usize + 2);
     eventually("traffic falls to key frames and keep-alives", SOON, || {
         group.drain();
@@ -65,7 +65,8 @@ fn an_echoing_ros_1_node_makes_no_loop() {
         (line["echoed"] == "/ua_2_5_10").then_some(())
     });
 
-    // The rule was put to work: what the echo sent back under the other space's name came in and was dropped.
+    // The rule was applied: values that the echo returned under the other space's name were
+    // received and dropped.
     eventually("the bridge drops what looped", SOON, || {
         (number(&metrics(METRICS_ROS1)?, "looped") > 0).then_some(())
     });

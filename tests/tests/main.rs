@@ -1,4 +1,5 @@
-//! The system tests, one program: each module has its own peers, and `cargo xtask test` runs each test in a process of its own.
+//! All system tests in a single program. Each module has its own peers, and `cargo xtask test` runs
+//! each test in a separate process.
 
 mod assembly_line;
 mod asyncua_pubsub;

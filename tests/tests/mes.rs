@@ -1,4 +1,5 @@
-//! The MES beside components that come, are killed and are replaced: what it knows, and what becomes of a process.
+//! The MES with components that start, are killed and are replaced: its knowledge, and the outcome
+//! of processes.
 
 use std::fs;
 use std::path::Path;
@@ -15,7 +16,7 @@ const MANIFEST: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/data/mtp/stage.aml"
 const AT: &str = "127.0.0.1:8087";
 const PROCESS: &str = "urn:example:process:move-part";
 
-/// A program of the plant with a file of the examples, of which some is changed.
+/// Starts a program of the plant with a modified file of the examples.
 fn start(cell: &Cell, name: &str, file: &str, changes: &[(&str, &str)], more: &[&str]) -> Child {
     let text = fs::read_to_string(Path::new(EXAMPLES).join(file)).unwrap();
     let text = changes.iter().fold(text, |text, (from, to)| {
@@ -38,7 +39,7 @@ fn rows(question: &str) -> Vec<Value> {
     answer["rows"].as_array().cloned().unwrap_or_default()
 }
 
-/// The run of the process, when it is as wanted.
+/// Waits until the run of the process is as wanted, and returns it.
 fn run(what: &str, wanted: impl Fn(&Value) -> bool) -> Value {
     eventually(what, SOON, || {
         let run = get("/status")?["runs"][0].clone();
@@ -46,12 +47,12 @@ fn run(what: &str, wanted: impl Fn(&Value) -> bool) -> Value {
     })
 }
 
-/// A list in an answer.
+/// Returns a list of an answer.
 fn list<'a>(value: &'a Value, key: &str) -> &'a [Value] {
     value[key].as_array().map_or(&[], Vec::as_slice)
 }
 
-/// The MES, asked for the process while nobody is there for it.
+/// Starts the MES and requests the process while no component is available for it.
 fn mes(cell: &Cell) -> Child {
     for file in ["capabilities.ttl", "vacuum-gripper.xml"] {
         fs::copy(Path::new(EXAMPLES).join(file), cell.folder().join(file)).unwrap();
@@ -116,7 +117,8 @@ fn a_gripper_that_is_killed_in_the_middle_is_replaced_by_another_makers() {
     is_replaced(&done);
 }
 
-/// The vacuum gripper was chosen by what is above its type and capability, and the graph has all of it.
+/// Checks that the vacuum gripper was chosen by the supertype and capability of its skill, and that
+/// the graph has the whole run.
 fn is_replaced(run: &Value) {
     let [_, plan] = list(run, "plans") else {
         panic!("{run}")
@@ -131,7 +133,7 @@ fn is_replaced(run: &Value) {
     let by_type = rows("skills?type=urn:ua-bridge:skills%23i=1200");
     let types: Vec<&Value> = by_type.iter().map(|row| &row["type"]).collect();
     assert_eq!(types, ["VacuumGraspSkillType"], "by the type above its own");
-    // The graph is told of a run after `/status` is.
+    // The graph is updated after `/status`.
     let ran = eventually("the graph has the run as done", SOON, || {
         let done = rows("runs").first()?["outcome"] == "done";
         done.then(|| rows("run-steps"))

@@ -1,4 +1,5 @@
-//! What bridges say their topics consist of: understood by the bridge on the other side, and by asyncua.
+//! DataSetMetaData that bridges announce for their topics, as used by the bridge of the other ROS
+//! and by asyncua.
 
 use std::time::Duration;
 
@@ -40,7 +41,7 @@ fn area() -> Value {
     json!({"header": {"frame_id": "floor"}, "polygon": {"points": [point(1.0), point(2.0)]}})
 }
 
-/// A rospy node that publishes the value ten times a second.
+/// Starts a rospy node that publishes the value ten times a second.
 fn in_ros1(cell: &Cell, topic: &str, kind: &str, value: &Value) -> Child {
     let (node, value) = (topic.replace('/', "_"), value.to_string());
     let repeat = ["--node", &node, "--repeat", "0", "--value", &value];
@@ -64,7 +65,7 @@ fn a_mapping_on_one_side_is_enough_for_a_type_both_sides_have() {
     );
     let mut graph = cell.cyclone("ros2_graph.py", &["--domain", "2"]);
     let _sends = in_ros1(&cell, "/speed", TWIST, &speed());
-    // Nobody in ROS 2 asked for the type.
+    // No node of ROS 2 requested the type.
     let dds = json!("geometry_msgs::msg::dds_::Twist_");
     graph.wait_for_json("the topic in ROS 2 as a Twist", SOON, |line| {
         let writers = line["graph"]["publications"].as_object()?;
@@ -139,7 +140,7 @@ fn asyncua_reads_what_topics_consist_of_and_structures_by_it() {
 
     let velocity = &of("ua_1_2_13")["fields"][0]["properties"];
     let unit = "http://www.opcfoundation.org/UA/units/un/cefact";
-    // The bytes of "MTS".
+    // The UnitId encodes the characters of "MTS".
     assert_eq!(
         velocity,
         &json!({"EngineeringUnits": [unit, 5_067_859, "m/s", "metre per second"], "EURange": [-1.0, 1.5]})
@@ -159,7 +160,7 @@ fn asyncua_reads_what_topics_consist_of_and_structures_by_it() {
             "geometry_msgs/Point32"
         ])
     );
-    // One that came before its description is bytes to the judge.
+    // A structure received before its description is shown as bytes.
     let values = judge.wait_for_json("the structure", SOON, |line| {
         let values = &line["values"];
         let is_told = line["topic"] == "ua_1_2_12" && values[0].get("polygon").is_some();

@@ -1,4 +1,5 @@
-//! `mappings/niryo-ned.yaml` against a Niryo Ned as its ROS graph shows it: every topic, every service, by their real names.
+//! `mappings/niryo-ned.yaml` with the ROS graph of a Niryo Ned: every topic and every service by
+//! its real name.
 
 use std::{path::Path, time::Duration};
 
@@ -13,13 +14,14 @@ use uadp::{Scalar, Variant};
 
 const SOON: Duration = Duration::from_secs(30);
 const MAPPING: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../mappings/niryo-ned.yaml");
-/// The definitions of ned_ros, a peer: they are under the GPL and no part of the project.
+/// Returns the definitions of ned_ros, a peer: they are under the GPL and not part of the project.
 fn definitions() -> Option<String> {
     let path = test_data::foreign("ros1-niryo")?;
     Some(path.to_str().unwrap().to_owned())
 }
 
-/// The request of the next call of that service the robot tells of, after those it told of before.
+/// Waits for the next call of a service that the robot reports, after `before` calls, and returns
+/// its request.
 fn called(robot: &Child, service: &str, before: usize) -> Value {
     eventually(&format!("{service} is called"), SOON, || {
         calls(robot, service).get(before).cloned()
@@ -122,7 +124,7 @@ fn what_a_niryo_shows_reaches_the_space_as_typed_values() {
 fn values_of_the_space_add_and_run_a_conveyor_and_its_answers_are_values() {
     let Some(cell) = cell() else { return };
     let mut line = start(&cell);
-    // Joints arrive, so the bridge and the robot have found one another.
+    // Received joints show that the bridge and the robot have discovered each other.
     line.side.hear((1, 2, 11), "joints", |_| Some(()));
 
     line.side.write((0, 2, 40), Scalar::Byte(1));
@@ -157,7 +159,7 @@ fn values_of_the_space_add_and_run_a_conveyor_and_its_answers_are_values() {
     line.side.write((0, 2, 43), Scalar::Boolean(false));
     assert_eq!(called(&line.robot, control, 1)["control_on"], false);
 
-    // A conveyor that is not there: the fault is a value too.
+    // A conveyor that does not exist: the fault is a value, too.
     line.side.write((0, 2, 40), Scalar::Byte(2));
     line.side.hear_scalar((1, 2, 42), Scalar::Int16(-123));
 }
@@ -179,7 +181,7 @@ fn digital_outputs_learning_mode_and_stop_are_called_with_what_the_mapping_says(
     line.side.write((0, 2, 48), Scalar::Boolean(false));
     line.side.write((0, 2, 48), Scalar::Boolean(true));
     called(&line.robot, stop, 0);
-    // What is called for later is there, so whatever was called for before has come.
+    // A later call has arrived, so all earlier calls have arrived.
     line.side.write((0, 2, 48), Scalar::Boolean(false));
     line.side.write((0, 2, 48), Scalar::Boolean(true));
     called(&line.robot, stop, 1);
@@ -189,7 +191,7 @@ fn digital_outputs_learning_mode_and_stop_are_called_with_what_the_mapping_says(
 #[test]
 fn a_state_waits_for_its_service_and_an_event_does_not() {
     let Some(cell) = cell() else { return };
-    // A value that calls a service is an event, unless its mapping says otherwise.
+    // A value that calls a service is an event, unless its mapping sets another queue.
     let output = "name: DigitalOutput1\n    type: Boolean\n";
     let text = std::fs::read_to_string(MAPPING).unwrap();
     assert_eq!(text.matches(output).count(), 1);
@@ -308,7 +310,7 @@ fn the_arm_its_gripper_and_its_conveyor_are_run_by_skills() {
     assert_eq!(request, wanted);
 }
 
-/// The type of RobotMove's goal topic, and a goal with one field set.
+/// Returns the type of RobotMove's goal topic, and a goal with a single field set.
 fn move_goal(path: &str, value: &str) -> (TopicType, Vec<u8>) {
     let mut registry = Registry::bundle(Dialect::Ros1);
     let definitions = definitions().unwrap();

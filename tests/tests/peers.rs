@@ -1,4 +1,4 @@
-//! The peers among themselves, with no bridge between: when one of these fails, the machine or a peer is at fault.
+//! The peers without a bridge between them: a failure here is a fault of the machine or of a peer.
 
 use std::time::Duration;
 
@@ -135,7 +135,7 @@ fn the_echoing_node_repeats_others_and_not_itself() {
         ],
     );
     heard.wait_for_line("/rospy_echo", SOON);
-    // It says so after it has done it.
+    // The peer reports the echo after sending it.
     echo.wait_for_line("\"echoed\"", SOON);
     let echoed: Vec<Value> = echo
         .json_lines()
@@ -254,7 +254,8 @@ fn asyncua_decodes_a_datagram_of_the_group() {
     };
     let mut listener = cell.uadp_listener();
     let group = UadpSocket::join();
-    // PublisherId UInt16 1, WriterGroupId 5, DataSetWriterId 10, a key frame of one Boolean, true.
+    // PublisherId UInt16 1, WriterGroupId 5, DataSetWriterId 10, a key frame with a single Boolean,
+    // true.
     group.send(&[
         0xf1, 0x01, 0x01, 0x00, 0x01, 0x05, 0x00, 0x01, 0x0a, 0x00, 0x01, 0x01, 0x00, 0x01, 0x01,
     ]);

@@ -1,4 +1,5 @@
-//! The demo of plug and produce, from the first component to the last question, with the programs that people run.
+//! The demo of plug and produce, from the first component to the last query, with the programs that
+//! users run.
 
 use std::time::Duration;
 
@@ -31,7 +32,7 @@ fn components_are_found_run_lost_and_replaced_within_the_published_times() {
             "{known}"
         );
         let first = ms(&known["announced"]).min(ms(&known["registered"]));
-        // 211 ms were published for the fastest of three components, on a machine of its own.
+        // Published were 211 ms for the fastest of three components, on an otherwise idle machine.
         assert!(ms(&known["listed"]) - first < 1000.0, "{part}: {known}");
     }
     for ros in ["ros1", "ros2"] {
@@ -53,7 +54,7 @@ fn components_are_found_run_lost_and_replaced_within_the_published_times() {
     assert_eq!(report["question"]["skills"], 5, "{report}");
 }
 
-/// The steps that a composite may show, in their order; short ones are not seen by who looks now and then.
+/// Returns whether the steps of a composite are in order; polling may miss short steps.
 fn are_in_order(seen: &Value, steps: &[&str]) -> bool {
     let mut left = steps.iter();
     let seen = seen.as_array().unwrap();

@@ -1,8 +1,8 @@
-//! The arrows of the workspace: what a crate may not know, it does not reach.
+//! The dependency rules of the workspace: the crates that each crate must not reach.
 
 use system_tests::{forbidden, tree};
 
-/// IO, clocks and libraries of one ROS or one OPC UA implementation.
+/// IO, clocks and libraries of a single ROS version or OPC UA implementation.
 const IMPURE: &[&str] = &[
     "tokio*",
     "async-std",
@@ -296,7 +296,7 @@ fn the_check_sees_what_a_shell_reaches() {
     assert!(forbidden(&tree("bridge-node"), IMPURE).contains(&"tokio".to_owned()));
 }
 
-/// The programs that `ua-bridge` acts as, and the programs each of them may use.
+/// The programs that `ua-bridge` contains, and the programs each of them may use.
 const NAMES_OF_UA_BRIDGE: [(&str, &[&str]); 6] = [
     ("ua-component", &[]),
     ("ua-gds", &[]),

@@ -1,4 +1,4 @@
-//! 10 000 numbered messages at 1 kHz: in order, none lost.
+//! 10 000 numbered messages at 1 kHz: in order and without loss.
 
 use std::time::{Duration, Instant};
 
@@ -10,7 +10,8 @@ const BOTH: &[Peer] = &[Peer::Ros1, Peer::Python];
 const PLANT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/cells/plant.yaml");
 const COUNT: u32 = 10_000;
 
-/// The numbers heard so far, without the text that is sent until the whole path stands.
+/// Returns the numbers received so far, without the text that is sent until the whole path is
+/// established.
 fn numbers(heard: &Child) -> Vec<u32> {
     heard
         .values()
@@ -52,7 +53,7 @@ fn all_arrive_in_order(sends: &mut Child, heard: &mut Child) {
             status(METRICS_ROS2)
         );
     }
-    // A sender that cannot keep its own pace tests less than it says.
+    // A sender that cannot keep its pace tests less than intended.
     assert!(
         sent_in < Duration::from_secs(20),
         "{COUNT} messages took {sent_in:?}"

@@ -1,4 +1,4 @@
-//! A mapping that is saved while the programs run.
+//! Mappings that are saved while the programs run.
 
 use std::{
     collections::BTreeMap,
@@ -22,15 +22,16 @@ use system_tests::{
 use uadp::{NetworkMessage, NetworkMessageType, Scalar, Variant};
 
 const SOON: Duration = Duration::from_secs(30);
-/// What a busy machine lost of 25 000 samples a second is repaired, which took 25 to 30 s beside nine busy loops on two cores.
+/// Time to repair the samples that a busy machine lost at 25 000 samples a second. It took 25 to 30
+/// s with nine busy loops on two cores.
 const REPAIRED: Duration = Duration::from_secs(60);
 const ROUTES: u16 = 500;
-/// How often each route is sent from DDS: at 50 Hz, for 8 s.
+/// Number of samples that are sent from DDS for each route: 8 s at 50 Hz.
 const TICKS: u16 = 400;
-/// Each route is sent at 50 Hz: so many of them are due each millisecond.
+/// Number of samples due each millisecond, with 50 Hz per route.
 const EACH_MS: usize = 25;
 
-/// A mapping of so many routes from ROS 1, of which the first is read from that topic.
+/// Returns a mapping of `routes` routes from ROS 1, with the topic `first` for the first route.
 fn mapping(routes: u16, first: &str) -> String {
     let mut text = "spaces:\n  - {id: 1}\nnamespaces:\n  2: urn:test\nvariables:\n".to_owned();
     for route in 1..=routes {
@@ -47,7 +48,7 @@ fn mapping(routes: u16, first: &str) -> String {
     text
 }
 
-/// Saves a file as editors do: under another name first.
+/// Saves a file as editors do: writes another file and renames it.
 fn save(file: &Path, text: &str) {
     let beside = file.with_extension("new");
     fs::write(&beside, text).unwrap();
@@ -58,11 +59,11 @@ fn about(key: &str) -> Value {
     metrics(METRICS_ROS1).map_or(Value::Null, |status| status["mapping"][key].clone())
 }
 
-/// What was heard of the routes: of each, the sequence numbers with the number that was said. Events that were sent again
-/// stand there once.
+/// The received values: for each route, sequence numbers and sent numbers. Repeated events are
+/// recorded once.
 type Heard = BTreeMap<u16, Vec<(u16, u16)>>;
 
-/// Hears the group in a thread of its own until `ended`.
+/// Receives from the group on a separate thread until `ended`.
 fn listen(heard: &Arc<Mutex<Heard>>, ended: &Arc<AtomicBool>) -> std::thread::JoinHandle<()> {
     let socket = UadpSocket::join();
     let (heard, ended) = (Arc::clone(heard), Arc::clone(ended));
@@ -82,7 +83,8 @@ fn listen(heard: &Arc<Mutex<Heard>>, ended: &Arc<AtomicBool>) -> std::thread::Jo
                     continue;
                 };
                 let route = message.writer_id.unwrap();
-                // Of what the peer of Cyclone DDS paces, the 12 digits before the time.
+                // The Cyclone DDS peer's texts end with a stamp; its number is the 12 digits before
+                // the time.
                 let number = match text.len() {
                     36 => &text[8..20],
                     _ => text,
@@ -90,7 +92,7 @@ fn listen(heard: &Arc<Mutex<Heard>>, ended: &Arc<AtomicBool>) -> std::thread::Jo
                 let said = number.parse().unwrap();
                 let mut heard = heard.lock().unwrap();
                 let all = heard.entry(route).or_default();
-                // An event is sent again under its number, unless a newer one followed.
+                // An event is repeated with its sequence number, unless a newer event followed.
                 if all.last() != Some(&(sequence, said)) {
                     all.push((sequence, said));
                 }
@@ -107,7 +109,7 @@ fn send(to: &mut [TcpStream], said: &mut u16, until: impl Fn() -> bool) {
         let frame = string_frame(&said.to_string());
         for some in to.chunks_mut(EACH_MS) {
             for stream in some {
-                // The one that the mapping no longer names has ended.
+                // The connection of the topic that the mapping has dropped is closed.
                 drop(stream.write_all(&frame));
             }
             due += Duration::from_millis(1);
@@ -133,7 +135,7 @@ fn of_500_routes_at_50_hz_only_the_edited_one_notices_the_edit() {
     let reloads = |count: u64| {
         let next = Mutex::new(Instant::now());
         move || {
-            // Not at each turn: the answer has 500 topics in it.
+            // Not polled at each turn: the status contains 500 topics.
             let mut next = next.lock().unwrap();
             if Instant::now() < *next {
                 return false;
@@ -165,21 +167,21 @@ fn of_500_routes_at_50_hz_only_the_edited_one_notices_the_edit() {
     assert_eq!(heard.len(), usize::from(ROUTES));
     assert!(before < after && said > after);
     for (route, all) in heard.iter().filter(|(route, _)| **route != 1) {
-        // A number more is said with each sequence number, from first to last: none was left out, said twice or renumbered
-        // by the bridge, whatever this socket missed.
+        // Sent numbers and sequence numbers increase together from first to last: the bridge
+        // skipped, repeated and renumbered no value, whatever this socket missed.
         let (first, number) = all[0];
         let offset = first.wrapping_sub(number);
         for (sequence, number) in all {
             assert_eq!(sequence.wrapping_sub(*number), offset, "{route}: {all:?}");
         }
     }
-    // The edited one goes on with its numbers.
+    // The edited route continues its sequence numbers.
     let sequences: Vec<u16> = heard[&1].iter().map(|(sequence, _)| *sequence).collect();
     assert!(sequences.is_sorted_by(|a, b| a < b), "{sequences:?}");
     let status = metrics(METRICS_ROS1).unwrap();
     assert_eq!(system_tests::drops(&status["topics"]), 0, "{status}");
     assert_eq!(status["mapping"]["stale"], Value::Null);
-    // The bridge is no longer a subscriber of what it does not read.
+    // The bridge unsubscribes from topics that the mapping does not read.
     eventually("/r1 is published, and not subscribed", SOON, || {
         let graph = xml_rpc(MASTER, "getSystemState", &["/test"])?;
         (graph.matches(">/r1<").count() == 1).then_some(())
@@ -218,7 +220,7 @@ fn a_faulty_file_changes_nothing_and_says_why_and_a_mended_one_is_taken() {
     };
     eventually("what ran still runs", SOON, || carries(&socket, "still"));
 
-    // Written in place, and asked for at once instead of waited for.
+    // The file is written in place, and the reload is requested instead of awaited.
     fs::write(&file, mapping(1, "/r1")).unwrap();
     bridge.signal(Signal::SIGHUP);
     eventually("it is taken", SOON, || {
@@ -231,7 +233,7 @@ fn a_faulty_file_changes_nothing_and_says_why_and_a_mended_one_is_taken() {
     assert_ne!(about("hash"), first);
     bridge.wait_for_line("unbound", SOON);
 
-    // As a Kubernetes ConfigMap is changed: the file stays a link, and what it leads to is another.
+    // Changed as a Kubernetes ConfigMap is: the file stays a link, and its target is replaced.
     let (folder, link) = (cell.folder(), file.with_extension("link"));
     fs::write(
         folder.join("other.yaml"),
@@ -247,7 +249,8 @@ fn a_faulty_file_changes_nothing_and_says_why_and_a_mended_one_is_taken() {
     bridge.end();
 }
 
-/// A mapping whose first value is written to a topic of that type, and whose second is read from `/r1`.
+/// A mapping whose first value is written to a topic of a defined type, and whose second value is
+/// read from `/r1`.
 const DEFINED: &str = "
 spaces:
   - {id: 1}
@@ -259,7 +262,8 @@ variables:
   - {node: ns=2;i=2, name: Said, origin: 1, ros: {topic: /r1, type: std_msgs/String, field: data}}
 ";
 
-/// [`DEFINED`], with a definition of its type and another one, and the folder of the first.
+/// Writes [`DEFINED`], a definition of its type, and another definition. Returns the mapping and
+/// the folder of the definitions.
 fn defined(cell: &Cell, point: &str) -> (PathBuf, PathBuf) {
     let folder = cell.folder().join("types/geometry_msgs/msg");
     fs::create_dir_all(&folder).unwrap();
@@ -293,7 +297,7 @@ fn a_definition_file_that_is_saved_counts_and_a_faulty_one_changes_nothing_and_s
         (0.into(), 1.into()),
         "{why}"
     );
-    // Its field is there no longer, so that the mapping cannot run with it.
+    // The definition lacks a mapped field, so the mapping cannot run with it.
     save(&folder.join("Point.msg"), "float64 y\n");
     eventually("it is refused", SOON, || {
         (about("refused") == 2).then_some(())
@@ -325,7 +329,7 @@ fn a_definition_file_that_is_saved_counts_and_a_faulty_one_changes_nothing_and_s
         values.iter().any(|value| value["x"] == 1.5).then_some(())
     });
 
-    // One more file, in a folder of its own, and one less.
+    // A file is added in a new folder, and a file is removed.
     let more = folder.with_file_name("action");
     fs::create_dir(&more).unwrap();
     fs::write(more.join("Go.action"), "---\n---\n").unwrap();
@@ -362,7 +366,7 @@ fn values_cross_while_definitions_are_read_and_what_is_saved_meanwhile_is_read_n
     };
 
     let mut held = lease();
-    // This one is read before the other.
+    // This definition is read before the other definition.
     save(&folder.join("Other.msg"), "bool b\n");
     waits(&mut held);
     crosses("meanwhile");
@@ -379,7 +383,7 @@ fn values_cross_while_definitions_are_read_and_what_is_saved_meanwhile_is_read_n
     let mut held = lease();
     bridge.signal(Signal::SIGHUP);
     waits(&mut held);
-    // A reader that waits for a disk does not keep the program from its end.
+    // A reader that waits for a disk does not prevent the end of the program.
     assert!(bridge.end().success());
 }
 
@@ -437,8 +441,8 @@ fn bridge_ros2_leaves_the_routes_alone_that_an_edit_does_not_name() {
     assert!(sequences.is_sorted_by(|a, b| a < b), "{sequences:?}");
 }
 
-/// Has the peer send so many values on each of its topics, spread over 20 ms each; from which number on, and how many
-/// readers it had at the end.
+/// Has the peer send `ticks` values on each of its topics, each tick spread over 20 ms. Returns the
+/// first number, and the number of readers at the end.
 fn paced(peer: &mut Child, ticks: u16) -> (u16, u64) {
     let sent = |peer: &Child| -> Vec<(u64, u64)> {
         let lines = peer.json_lines();
@@ -467,7 +471,7 @@ fn of_500_routes_from_dds_at_50_hz_only_the_edited_one_notices_the_edit() {
     let file = cell.file("cell.yaml", &mapping("/r1", written));
     let mut bridge = cell.bridge_ros2(&[file.to_str().unwrap()]);
     let routes = ROUTES.to_string();
-    // It keeps all it sends, so that a busy machine costs time and no samples.
+    // The peer keeps all samples, so that a busy machine causes delay instead of loss.
     let kept = ["--first", "1", "--spread", "--depth", "1000"];
     let pace = [&["pace", "/r", "--topics", &routes][..], &kept].concat();
     let mut sends = cell.cyclone_c(&pace);
@@ -567,7 +571,7 @@ fn the_server_has_the_nodes_of_the_saved_mapping_and_its_clients_stay() {
     };
     let (added, deleted, other_type) = (1, 2, 16);
 
-    // The file that was started with does not change, only what it includes.
+    // The main file stays the same, only an included file changes.
     save(
         &part,
         "variables:\n  - {node: ns=2;i=3, name: New, type: Double, origin: 4}\n  - {node: ns=2;i=4, name: Far, \

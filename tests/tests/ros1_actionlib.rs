@@ -1,4 +1,5 @@
-//! Actions between this workspace and the actionlib of ROS 1: its clients at our server, our client at its servers.
+//! Actions between this workspace and the actionlib of ROS 1: actionlib clients with our server,
+//! our client with actionlib servers.
 
 use std::time::{Duration, Instant};
 
@@ -34,7 +35,7 @@ fn action() -> ActionType {
     }
 }
 
-/// The threads of the runtime are made by the test's thread and so are in its network.
+/// Returns a runtime. Its threads are created by the test's thread, so they are in its network.
 fn runtime() -> Runtime {
     Builder::new_multi_thread()
         .worker_threads(2)
@@ -65,7 +66,7 @@ fn number(body: &[u8]) -> i32 {
     i32::from_le_bytes(body.try_into().unwrap())
 }
 
-/// What the rospy server does with a goal.
+/// Executes a goal as the rospy server does.
 async fn work(goal: ServerGoal) {
     let n = number(goal.body());
     if n == -2 {
@@ -170,7 +171,7 @@ fn a_simple_actionlib_client_preempts_its_goal_with_the_next_one() {
     let _inside = runtime.enter();
     let robot = node("robot");
     runtime.spawn(serve_simply(SimpleActionServer::new(serve(&robot))));
-    // A client whose clock is an hour ahead, and one beside it that is an hour late.
+    // A client whose clock is an hour ahead, and a client whose clock is an hour behind.
     let mut other = rospy_client(&cell, &["--node", "late", "--clock-offset", "-3600"]);
     let mut client = rospy_client(&cell, &["--simple", "--clock-offset", "3600"]);
     other.tell("send 100");
@@ -194,7 +195,7 @@ fn send(client: &ActionClient, goal: i32) -> GoalHandle {
     client.send_goal(&goal.to_le_bytes())
 }
 
-/// How a goal ended: status, text and number.
+/// Returns the result of a goal: status, text and number.
 async fn outcome(handle: &mut GoalHandle) -> (Status, String, i32) {
     let result = timeout(SOON, handle.outcome()).await.unwrap().unwrap();
     (result.status, result.text, number(&result.body))

@@ -1,4 +1,4 @@
-//! What bridge-ros1 makes of a graph that changes while it runs.
+//! bridge-ros1 in a graph that changes while it runs.
 
 use std::time::{Duration, Instant};
 
@@ -18,7 +18,7 @@ patterns:
   - {topics: "/robot*/temperature", exclude: ["/robot9/**"], origin: 1, node: "ns=2;i=10{1}", name: "Robot{1}Temperature", field: data}
 "#;
 
-/// A node of this process, in a cell's graph.
+/// A node of this process in a cell's graph.
 struct OwnNode {
     runtime: Runtime,
     node: Node,
@@ -107,7 +107,7 @@ fn topics_of_a_pattern_become_values_as_they_appear() {
     let heard = side.triples_for(Duration::from_secs(2));
     assert!(heard.contains(&(1, 2, 101)) && !heard.contains(&(1, 2, 109)));
 
-    // A name the pattern makes no number of is told of, and costs the others nothing.
+    // A name from which the pattern gets no number is logged, and does not affect other names.
     let _odd = node.latched("/robot_b/temperature", float32(), &[0; 4]);
     eventually("the odd name is told of", SOON, || {
         (lines(&bridge, "/robot_b/temperature") > 0).then_some(())
@@ -134,7 +134,7 @@ fn a_type_that_cannot_be_read_is_named_once_with_the_reason() {
     eventually("the reason is told", SOON, || {
         (lines(&bridge, "missing_msgs/Thing") > 0).then_some(())
     });
-    // It comes and goes, and is not told of again.
+    // The topic comes and goes, and is not logged again.
     drop(odd);
     for _ in 0..3 {
         let _odd = node.latched("/ua_1_2_1", unreadable.clone(), &[0; 4]);

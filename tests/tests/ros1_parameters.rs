@@ -1,4 +1,4 @@
-//! Parameters, simulated time, names and IPv6 beside rosmaster, rosparam and rospy.
+//! Parameters, simulated time, names and IPv6 with rosmaster, rosparam and rospy.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -15,7 +15,7 @@ use tokio::runtime::Runtime;
 const SOON: Duration = Duration::from_secs(30);
 const ROS1: &[Peer] = &[Peer::Ros1];
 
-/// A node of this process. It works in a thread of its own, so a test may wait for others meanwhile.
+/// A node of this process. It works in a separate thread, so a test may wait for peers meanwhile.
 struct Ours {
     node: Option<Node>,
     runtime: Runtime,
@@ -27,7 +27,7 @@ impl Ours {
     }
 
     fn with(words: &[&str], master: &str, address: &str, ipv6: bool) -> Self {
-        // Its threads are made by this one, and so live in the network of the test.
+        // The runtime's threads are created by this thread, so they are in the network of the test.
         let runtime = tokio::runtime::Builder::new_multi_thread()
             .worker_threads(1)
             .enable_all()
@@ -94,7 +94,7 @@ fn rosparam(cell: &Cell, args: &[&str]) -> String {
     child.lines().join("\n")
 }
 
-/// Has the rospy node do something, and waits until it has.
+/// Orders the rospy node to do something, and waits until it is done.
 fn tell(peer: &mut Child, asked: &Value) -> Value {
     peer.tell(&asked.to_string());
     peer.wait_for_json("it is done", SOON, |line| {
@@ -122,7 +122,7 @@ fn string() -> TopicType {
     }
 }
 
-/// `std_msgs/String` as bytes.
+/// Returns a `std_msgs/String` as bytes.
 fn text(text: &str) -> Bytes {
     let length = u32::try_from(text.len()).unwrap().to_le_bytes();
     Bytes::from([&length, text.as_bytes()].concat())
@@ -163,7 +163,7 @@ fn rosparam_reads_every_kind_of_value_that_we_set() {
     }
     let listed = rosparam(&cell, &["list"]);
     assert!(listed.contains("/all/inner/deep/er") && !listed.contains("/all/inner/deep\n"));
-    // What rosparam dumps and loads again is what we set.
+    // rosparam dumps the parameters that we set, and loads them again.
     let dump = cell.folder().join("dump.yaml");
     let dump = dump.to_str().unwrap();
     rosparam(&cell, &["dump", dump, "/all"]);
@@ -233,7 +233,7 @@ fn a_subscribed_parameter_follows_rospy_and_a_restart_of_the_master() {
     tell(&mut rospy, &json!({"delete": "/gains"}));
     becomes(&gains, None);
     becomes(&p, None);
-    // What we set ourselves is news to us as well, and rospy reads it.
+    // Our subscription also receives the values that we set ourselves, and rospy reads them.
     ours.set("/gains/p", 4);
     becomes(&p, Some(4.into()));
     assert_eq!(tell(&mut rospy, &json!({"get": "/gains"})), json!({"p": 4}));
@@ -252,7 +252,7 @@ fn a_subscribed_parameter_follows_rospy_and_a_restart_of_the_master() {
     tell(&mut rospy, &json!({"set": "/gains", "value": {"p": 7}}));
     becomes(&p, Some(7.into()));
     assert_eq!(rosparam(&cell, &["get", "/ours/rate"]), "5");
-    // Once unsubscribed, the node is not known for it any more.
+    // After unsubscribing, the master does not list the node as a subscriber of the parameter.
     drop((gains, p));
     ours.shut_down();
     let gone = xml_rpc(MASTER, "lookupNode", &["/system_tests", "/ours"]).unwrap();
@@ -287,14 +287,15 @@ fn time_is_that_of_a_rospy_clock_while_use_sim_time_is_true() {
     };
     time_is(1000, 5);
     time_is(3, 999_999_999);
-    // It stands still from here on, and the node notices all the same that the master goes and comes.
+    // Time stands still from here on, but the node still detects that the master is lost and
+    // returns.
     drop(master);
     ours.reaches(MasterState::Awaited);
     assert_eq!(ours.node().now().secs, 3);
     let _master = cell.roscore();
     ours.reaches(MasterState::Registered);
     simulated(false);
-    // One that starts in a simulation is in it as soon as it is registered.
+    // A node that starts in a simulation has simulated time as soon as it is registered.
     rosparam(&cell, &["set", "/use_sim_time", "true"]);
     simulated(true);
     let late = Ours::start(&["__name:=late"]);

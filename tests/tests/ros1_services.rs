@@ -22,7 +22,7 @@ const MD5: &str = "09fb03525b03e7ea1fd3992bafd87e16";
 /// `SetBoolResponse(True, "done")`.
 const DONE: &[u8] = b"\x01\x04\0\0\0done";
 
-/// A node of ours, served by a thread in the cell's network while the test waits for its peers.
+/// A node of `tcpros`, served by a thread in the cell's network while the test waits for its peers.
 struct Ours {
     runtime: Runtime,
     node: Node,
@@ -45,7 +45,7 @@ impl Ours {
         Self { runtime, node }
     }
 
-    /// Offers `std_srvs/SetBool`: true is done, false fails.
+    /// Offers `std_srvs/SetBool`: true succeeds, false fails.
     fn offer(&self, service: &str) -> ServiceServer {
         let service_type = ServiceType {
             name: "std_srvs/SetBool".to_owned(),
@@ -91,10 +91,11 @@ fn persistent() -> ServiceClientOptions {
     }
 }
 
-/// Where the master says a service is, as `127.0.0.1:40001`; `None` while it knows none.
+/// Returns the address of a service from the master, as `127.0.0.1:40001`; `None` while the master
+/// knows no server.
 fn uri(service: &str) -> Option<String> {
     let answer = xml_rpc(MASTER, "lookupService", &["/system_tests", service])?;
-    // The address stands in the message and then, last, in the result.
+    // The address is in the message and then, last, in the result.
     let (_, rest) = answer.rsplit_once("rosrpc://")?;
     Some(rest.split(['/', '<']).next()?.to_owned())
 }
@@ -111,7 +112,7 @@ fn error(line: &Value) -> Option<String> {
     Some(line.get("error")?.as_str()?.to_owned())
 }
 
-/// Connects to a service of ours as a client made by hand, past the headers.
+/// Connects to our service as a hand-written client, and exchanges the headers.
 fn client_by_hand(fields: &[(&str, &str)]) -> TcpStream {
     let mut stream = TcpStream::connect(uri(SERVICE).unwrap()).unwrap();
     stream.set_read_timeout(Some(SOON)).unwrap();
@@ -297,7 +298,7 @@ fn a_stopped_server_costs_the_time_limit() {
         "{late}"
     );
     assert!(late.may_have_run());
-    // The system still accepts for it; nobody answers.
+    // The operating system still accepts connections, but no process answers.
     let late = ours.call(&client, true).unwrap_err();
     assert!(
         matches!(
@@ -337,7 +338,7 @@ fn rosrust_calls_our_service_and_we_call_its() {
     });
 
     let _rosrust = cell.rosrust(&["serve", SERVICE]);
-    // It closes after each answer, and takes no `*`.
+    // rosrust closes the connection after each answer, and rejects `*`.
     let client = ours.client(ServiceClientOptions {
         md5sum: Some(MD5.to_owned()),
         ..persistent()
@@ -463,7 +464,7 @@ fn a_thousand_calls_leave_no_file_descriptor_behind() {
     for _ in 0..1000 {
         assert_eq!(ours.call(&client, true).unwrap(), DONE);
     }
-    // Up to the connections of the node's watchdog, which come and go.
+    // Except for the connections of the node's watchdog, which come and go.
     eventually("all connections are closed", SOON, || {
         (open() <= before + 2).then_some(())
     });

@@ -1,4 +1,4 @@
-//! Actions of ROS 2 between us and the middleware of each vendor, in both roles.
+//! Actions of ROS 2 between this workspace and the middleware of each vendor, in both roles.
 
 mod fastdds;
 mod fibonacci;
@@ -38,7 +38,7 @@ async fn outcome(goal: &mut GoalHandle) -> Outcome {
     timeout(SOON, goal.outcome()).await.unwrap()
 }
 
-/// Status and numbers of a goal's end.
+/// Returns the status and the numbers of a goal's result.
 async fn done(goal: &mut GoalHandle) -> (Status, Vec<i32>) {
     match outcome(goal).await {
         Outcome::Done { status, result } => (status, numbers(&result, 4)),
@@ -46,7 +46,8 @@ async fn done(goal: &mut GoalHandle) -> (Status, Vec<i32>) {
     }
 }
 
-/// How the next goal that is not lost with the server before ends: until its lease is over it is asked, too.
+/// Returns the result of the next goal that is not lost with the previous server. Until its lease
+/// ends, the previous server receives requests, too.
 async fn next(client: &ActionClient) -> (Status, Vec<i32>) {
     let served = async {
         loop {
@@ -61,7 +62,7 @@ async fn next(client: &ActionClient) -> (Status, Vec<i32>) {
     timeout(SOON, served).await.unwrap()
 }
 
-/// Waits for the goal's feedback of that many numbers.
+/// Waits for the goal's feedback with this count of numbers.
 async fn feedback(goal: &mut GoalHandle, count: usize) {
     let heard = async {
         while let Some(event) = goal.recv().await {
@@ -74,7 +75,7 @@ async fn feedback(goal: &mut GoalHandle, count: usize) {
     timeout(SOON, heard).await.unwrap();
 }
 
-/// All that is told of a goal, but for how it ended.
+/// Returns all events of a goal, except its end.
 async fn story(goal: &mut GoalHandle) -> Vec<String> {
     let mut told = Vec::new();
     while let Some(event) = timeout(SOON, goal.recv()).await.unwrap() {
@@ -98,7 +99,7 @@ async fn a_server_of_cyclone_ends_our_goals_in_every_way() {
     };
     let ours = Ours::join();
     let client = client(&ours);
-    // Sent before there is a server: it is waited for.
+    // Sent before a server exists: the client waits for the server.
     let mut early = client.send_goal(&goal(5));
     let _server = cyclone(&cell, &[]);
     let mut told = story(&mut early).await;
@@ -108,7 +109,7 @@ async fn a_server_of_cyclone_ends_our_goals_in_every_way() {
         (Status::Succeeded, vec![1, 1, 2, 3, 5])
     );
     assert_eq!(early.status(), Status::Succeeded);
-    // Feedback is volatile, and the server may have begun before it knew our reader.
+    // Feedback is volatile, and the server may have started before it knew our reader.
     let known = async {
         while !told.iter().any(|one| one == "[1, 1, 2, 3, 5]") {
             told = story(&mut client.send_goal(&goal(5))).await;
@@ -158,7 +159,7 @@ async fn a_server_of_cyclone_is_asked_to_cancel_one_some_and_all() {
         goals.push(goal);
         stamps.push(stamp);
     }
-    // Odd orders go on.
+    // Goals with odd orders continue.
     let refused = goals[1].cancel().await.unwrap();
     assert_eq!(
         (refused.code, refused.goals.len()),
@@ -195,13 +196,13 @@ async fn a_goal_has_the_id_that_was_chosen_for_it_and_there_is_one_of_each() {
     assert_eq!(client.send_goal_as(id, &goal(2)).unwrap_err(), IdInUse(id));
     feedback(&mut first, 3).await;
     assert_eq!(first.id(), id);
-    // By its id, as the server knows it.
+    // Cancelled by its id as known to the server.
     let cancelled = client.cancel(CancelWhat::Goal(id)).await.unwrap();
     assert_eq!(cancelled.goals[0].id, id);
     assert_eq!(done(&mut first).await, (Status::Canceled, vec![1, 1, 2]));
     drop(first);
     let mut again = client.send_goal_as(id, &goal(2)).unwrap();
-    // The server has not forgotten it.
+    // The server remembers the goal id.
     assert_eq!(outcome(&mut again).await, Outcome::Rejected);
 }
 
@@ -257,7 +258,8 @@ async fn a_goal_whose_server_is_killed_is_lost_and_the_next_one_is_served_again(
     let mut running = client.send_goal(&goal(100));
     feedback(&mut running, 3).await;
     server.signal(Signal::SIGKILL);
-    // A new one at once: it knows nothing of the goal, and the old one's lease may still run.
+    // A new server at once: it does not know the goal, and the lease of the old server may not have
+    // ended.
     let _server = cyclone(&cell, &[]);
     assert_eq!(next(&client).await, (Status::Succeeded, vec![1, 1, 2]));
     let lost = outcome(&mut running).await;

@@ -1,4 +1,4 @@
-//! One `bridge-ros2` that serves several spaces, each in a DDS domain of its own.
+//! A single `bridge-ros2` that serves several spaces, each in a separate DDS domain.
 
 use std::time::Duration;
 
@@ -6,7 +6,7 @@ use nix::sys::signal::Signal;
 use system_tests::{Cell, Child, METRICS_ROS2, Peer, eventually, metrics};
 
 const SOON: Duration = Duration::from_secs(30);
-/// Long enough for a loop to show: one turn takes a few milliseconds.
+/// Long enough to reveal a loop: a round trip takes a few milliseconds.
 const WINDOW: Duration = Duration::from_secs(2);
 const STRING: &str = "std_msgs/String";
 const COUNT: usize = 100;
@@ -15,7 +15,7 @@ fn subscriber(cell: &Cell, topic: &str, domain: &str) -> Child {
     cell.cyclone("ros2_sub.py", &[topic, STRING, "--domain", domain])
 }
 
-/// Publishes numbers when it is told to, and something else until then.
+/// Starts a publisher that sends numbers when it is ordered to, and other texts until then.
 fn numbers(cell: &Cell, topic: &str, domain: &str) -> Child {
     let count = COUNT.to_string();
     cell.cyclone_started(
@@ -37,7 +37,7 @@ fn numbers(cell: &Cell, topic: &str, domain: &str) -> Child {
     .start()
 }
 
-/// What a subscriber heard of the numbers.
+/// Returns the numbers that a subscriber received.
 fn numbers_of(subscriber: &Child) -> Vec<String> {
     let text = |value: &serde_json::Value| value["data"].as_str().map(str::to_owned);
     subscriber
@@ -64,7 +64,7 @@ fn values_cross_between_two_domains_of_one_bridge_once_and_do_not_come_home() {
     let file = file.to_str().unwrap();
     let mut bridge = cell.bridge_ros2_alone(&[file, "--space", "2,3"]).start();
     eventually("the bridge answers", SOON, || metrics(METRICS_ROS2));
-    // Of each value: a subscriber at home, and one in the other domain.
+    // For each value, a subscriber in its own domain and a subscriber in the other domain.
     let mut subscribers = [
         ("/ua_2_5_10", "12"),
         ("/ua_2_5_10", "13"),

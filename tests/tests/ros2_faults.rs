@@ -1,4 +1,4 @@
-//! bridge-ros2 among peers that come, vanish, are many, and ask for what is not offered.
+//! bridge-ros2 with peers that come, vanish, are numerous, and request QoS that is not offered.
 
 use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
@@ -13,14 +13,14 @@ use uadp::Scalar;
 const SOON: Duration = Duration::from_secs(30);
 const BOTH: &[Peer] = &[Peer::FastDds, Peer::CycloneC];
 const STRING: &str = "std_msgs/String";
-/// A value of the space, and one of the domain.
+/// A value of the space, and a value of the domain.
 const THERE: (Triple, &str) = ((1, 2, 10), "/ua_1_2_10");
 const BACK: (Triple, &str) = ((2, 2, 20), "/ua_2_2_20");
 
 type Peers = [fn(&Cell, &[&str]) -> Child; 2];
 const MAKERS: Peers = [Cell::fastdds, Cell::cyclone_c];
 
-/// Writes the text to the space ten times a second until all readers have it as their newest.
+/// Writes the text to the space ten times a second until it is the newest value of all readers.
 fn reaches(ua: &mut UaSide, triple: Triple, text: &str, readers: &mut [&mut Child]) {
     let mut written: Option<Instant> = None;
     eventually(&format!("all readers have `{text}`"), SOON, || {
@@ -101,12 +101,13 @@ fn values_flow_again_each_time_the_bridge_is_killed_and_started() {
             ua.hear_scalar(triple, Scalar::String(Some(text)));
         }
         kill(bridge);
-        // What the killed one had sent is read away.
+        // The datagrams that the killed bridge sent are discarded.
         ua.drain();
     }
 }
 
-/// Ctrl-Z and `fg`, a debugger, a frozen container: the waits of all of its threads are interrupted.
+/// Like Ctrl-Z and `fg`, a debugger, or a frozen container: the waits of all its threads are
+/// interrupted.
 #[test]
 fn a_bridge_that_was_stopped_and_goes_on_finds_who_comes_and_is_found() {
     let Some(cell) = Cell::with(BOTH) else {
@@ -133,8 +134,9 @@ fn a_bridge_that_was_stopped_and_goes_on_finds_who_comes_and_is_found() {
     assert!(bridge.runs());
 }
 
-/// E.g. the wire was cut for 30 s: a node of ROS 2 is lost after 20 s, and loses the bridge after 50 s. It goes on as
-/// before then, and Fast DDS drops an ACKNACK whose count is not above the one before.
+/// For example, the wire was cut for 30 s: the bridge loses a ROS 2 node after 20 s, and the node
+/// loses the bridge after 50 s. The node keeps its state, and Fast DDS drops an ACKNACK whose count
+/// is not above the previous count.
 #[test]
 fn a_participant_that_was_lost_and_has_not_lost_us_is_asked_with_counts_that_go_on() {
     let Some(cell) = Cell::with(&[]) else {
@@ -143,7 +145,7 @@ fn a_participant_that_was_lost_and_has_not_lost_us_is_asked_with_counts_that_go_
     let _bridge = cell.bridge_ros2(&[]);
     let node = Announcer::open();
     node.announce();
-    // Meanwhile its lease of a second ends, which is looked after every two seconds.
+    // Meanwhile the node's lease of a second ends, which is checked every two seconds.
     let before = node.asked(Duration::from_secs(4), |_| false);
     node.announce();
     let after = node.asked(SOON, |counts| !counts.is_empty());
@@ -152,7 +154,7 @@ fn a_participant_that_was_lost_and_has_not_lost_us_is_asked_with_counts_that_go_
     assert!(after.first() > highest, "{after:?} after {before:?}");
 }
 
-/// Hears texts of topics `2_3_k` until each of `count` has brought its k.
+/// Receives texts of the topics `2_3_k` until each of `count` topics has sent its k.
 fn hear_each(ua: &UaSide, count: u16) {
     for number in 1..=count {
         ua.hear_scalar((2, 3, number), Scalar::String(Some(&number.to_string())));
@@ -239,7 +241,7 @@ fn five_thousand_routes_of_a_mapping_take_little_memory() {
     };
     let mut text = "spaces: [{id: 1}, {id: 2}]\nnamespaces: {2: urn:test}\nvariables:\n".to_owned();
     for route in 1..=ROUTES {
-        // Half of them are read, the others written.
+        // Half of the routes are read, the others written.
         let origin = 1 + route % 2;
         text += &format!(
             "  - {{node: ns=2;i={route}, name: R{route}, origin: {origin}, \
@@ -249,12 +251,12 @@ fn five_thousand_routes_of_a_mapping_take_little_memory() {
     }
     let mapping = cell.file("cell.yaml", &text);
     let mut bridge = cell.bridge_ros2(&[mapping.to_str().unwrap()]);
-    // The log has the first routes only. An endpoint of RustDDS has three descriptors.
+    // The log lists the first routes only. An endpoint of RustDDS has three descriptors.
     eventually("all routes are there", 2 * SOON, || {
         let descriptors = std::fs::read_dir(format!("/proc/{}/fd", bridge.id())).unwrap();
         (descriptors.count() >= 3 * ROUTES).then_some(())
     });
-    // It hears its own announcements for a while.
+    // The bridge processes its own announcements for a while.
     let (mut memory, mut since) = (0, Instant::now());
     eventually("its memory stays as it is", SOON, || {
         let more = resident(bridge.id());
@@ -269,7 +271,7 @@ fn five_thousand_routes_of_a_mapping_take_little_memory() {
         memory / 1_000_000,
         idle * 100.0
     );
-    // What the routes take is its own; some 25 MB are pages of the program file.
+    // The routes' memory is private; some 25 MB are pages of the program file.
     let own = anonymous(bridge.id());
     assert!(own < 60_000_000, "{own} bytes");
     assert!(memory < 85_000_000, "{memory} bytes");
@@ -277,7 +279,7 @@ fn five_thousand_routes_of_a_mapping_take_little_memory() {
     assert!(bridge.runs());
 }
 
-/// A second bridge on the domain, for the values of that space, as it answers.
+/// Starts a second bridge on the domain, for the values of that space, and waits until it answers.
 fn second_bridge(space: &str) -> Child {
     const METRICS: &str = "127.0.0.1:9202";
     let bridge = Started::new("the second bridge", &program("bridge-ros2"))
@@ -288,7 +290,8 @@ fn second_bridge(space: &str) -> Child {
     bridge
 }
 
-/// A value published once is heard once by a subscriber, and the space falls silent but for its repetitions.
+/// Checks that a subscriber receives a value that was published once exactly once, and that traffic
+/// of the space ends except for repetitions.
 fn is_heard_once_beside(space: &str) {
     let Some(cell) = Cell::with(&[Peer::CycloneC]) else {
         return;
@@ -310,7 +313,7 @@ fn is_heard_once_beside(space: &str) {
     reader.wait_for_line("once", SOON);
     let _settling = ua.triples_for(Duration::from_secs(2));
     let repeated = ua.triples_for(Duration::from_secs(3));
-    // Of each bridge a key frame or keep-alive a second, and some air.
+    // Each bridge sends a key frame or keep-alive a second; the rest is a margin.
     assert!(repeated.len() <= 10, "{}: {repeated:?}", repeated.len());
     assert_eq!(reader.values().len(), 1);
 }

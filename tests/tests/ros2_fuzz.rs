@@ -1,8 +1,8 @@
-//! bridge-ros2 under datagrams that nobody in their right mind sends.
+//! bridge-ros2 under datagrams that no correct participant sends.
 //!
-//! What stops RustDDS as published is known ([`claims_too_much`]) and left out when the bridge runs on it, unless
-//! `UA_FUZZ_ALL` is set.
-//! `UA_FUZZ_DATAGRAMS` and `UA_FUZZ_SEED` run it longer and otherwise, with `--nocapture` to see what it takes.
+//! The datagrams that stop RustDDS as published are known ([`claims_too_much`]). They are left out
+//! when the bridge runs on it, unless `UA_FUZZ_ALL` is set. `UA_FUZZ_DATAGRAMS` and `UA_FUZZ_SEED`
+//! set the number of datagrams and their seed; `--nocapture` shows the duration.
 
 use std::env;
 use std::net::{Ipv4Addr, SocketAddrV4, UdpSocket};
@@ -15,21 +15,22 @@ use system_tests::{
 use uadp::Scalar;
 
 const SOON: Duration = Duration::from_secs(30);
-/// What domain 2 announces participants to (RTPS 2.5, 9.6.2.3), and what the first participant listens at.
+/// The multicast address for announcements of participants in domain 2 (RTPS 2.5, 9.6.2.3), and the
+/// ports of the first participant.
 const GROUP: SocketAddrV4 = SocketAddrV4::new(Ipv4Addr::new(239, 255, 0, 1), 7900);
 const PORTS: [u16; 2] = [7910, 7911];
-/// Datagrams between two looks at how much the bridge has still to read.
+/// Number of datagrams between two checks of the bridge's unread data.
 const BATCH: usize = 50;
-/// What may wait at the bridge before more is sent.
+/// Bytes that may wait at the bridge before more is sent.
 const WAITING: u64 = 0;
-/// What the bridge may hold more afterwards, however many datagrams there were.
+/// Allowed growth of the bridge's memory, independent of the number of datagrams.
 const GROWTH: u64 = 48_000_000;
 
 fn setting(name: &str, otherwise: u64) -> u64 {
     env::var(name).map_or(otherwise, |value| value.parse().unwrap())
 }
 
-/// Values still cross, both ways.
+/// Checks that values still cross in both directions.
 fn traffic_goes_on(ua: &mut UaSide, reader: &Child, turn: u64) {
     let text = format!("turn {turn}");
     let mut written: Option<Instant> = None;
@@ -47,7 +48,8 @@ fn traffic_goes_on(ua: &mut UaSide, reader: &Child, turn: u64) {
     ua.hear_scalar((2, 2, 20), Scalar::String(Some("cyclone")));
 }
 
-/// Waits until the bridge has read most of what was sent. Keeps the datagrams that stopped it.
+/// Waits until the bridge has read the sent datagrams. Stores the last datagrams if the bridge
+/// stops reading.
 fn wait_until_read(cell: &Cell, recent: &mut Vec<Vec<u8>>) {
     let start = Instant::now();
     while queued(&PORTS).0 > WAITING {
@@ -70,7 +72,7 @@ fn changed_datagrams_of_all_kinds_neither_stop_nor_swell_the_bridge() {
     };
     let group = group_member(GROUP);
     group.set_read_timeout(Some(SOON)).unwrap();
-    // The first in the domain, so that it has the first ports.
+    // The first participant in the domain, so it has the first ports.
     let mut bridge = cell.bridge_ros2(&[]);
     let receiver = eventually("the bridge announces itself", SOON, || announced(&group));
     drop(group);

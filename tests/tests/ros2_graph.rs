@@ -1,4 +1,5 @@
-//! The bridge as a node of the ROS 2 graph, seen by Cyclone DDS: its name, its readers and writers, what they announce.
+//! The bridge as a node of the ROS 2 graph in the view of Cyclone DDS: its name, its readers and
+//! writers, and their announcements.
 
 use std::collections::BTreeSet;
 use std::time::Duration;
@@ -27,7 +28,8 @@ fn join(node: NodeOptions) -> Domain {
     .unwrap()
 }
 
-/// A participant that hears of nodes with Gids of that many bytes, and is the nodes `names`.
+/// Starts a participant that reads node lists with Gids of `gid` bytes and announces the nodes
+/// `names`.
 fn sees(cell: &Cell, gid: &str, names: &[&str]) -> Child {
     let mut args = vec!["--domain", "2", "--gid", gid];
     for name in names {
@@ -36,7 +38,7 @@ fn sees(cell: &Cell, gid: &str, names: &[&str]) -> Child {
     cell.cyclone("ros2_graph.py", &args)
 }
 
-/// The graph as a peer last printed it.
+/// Returns the graph as last printed by a peer.
 fn graph(peer: &Child) -> Value {
     let lines = peer.json_lines();
     let last = lines
@@ -46,7 +48,7 @@ fn graph(peer: &Child) -> Value {
     last.cloned().unwrap_or_default()
 }
 
-/// The node of that name as a peer sees it.
+/// Returns the node with this name in the view of a peer.
 fn node(peer: &Child, name: &str) -> Option<Value> {
     let graph = graph(peer);
     let mut nodes = graph["nodes"]
@@ -68,7 +70,8 @@ fn texts(list: &Value) -> BTreeSet<String> {
         .collect()
 }
 
-/// The topics a peer's built-in topics have the participant of `domain` write or read.
+/// Returns the topics that the participant of `domain` writes or reads according to a peer's
+/// built-in topics.
 fn announced(peer: &Child, domain: &Domain, kind: &str) -> BTreeSet<(String, String)> {
     let participant = hex(domain.guid().to_bytes());
     graph(peer)[kind]
@@ -80,7 +83,7 @@ fn announced(peer: &Child, domain: &Domain, kind: &str) -> BTreeSet<(String, Str
         .collect()
 }
 
-/// Names and endpoints of a node as a peer sees it once they are these.
+/// Waits until the peer sees exactly the endpoints of the domain at the node.
 fn has_exactly(peer: &Child, name: &str, domain: &Domain, what: &str) {
     eventually(what, SOON, || {
         let node = node(peer, name)?;
@@ -89,7 +92,7 @@ fn has_exactly(peer: &Child, name: &str, domain: &Domain, what: &str) {
             announced(peer, domain, "publications"),
             announced(peer, domain, "subscriptions"),
         );
-        // The topic the lists themselves travel on is no node's.
+        // The topic of the node lists itself belongs to no node.
         let of_node = |endpoints: BTreeSet<(String, String)>| -> BTreeSet<String> {
             let endpoints = endpoints.into_iter();
             let of_node = endpoints.filter(|(_, topic)| topic != "ros_discovery_info");
@@ -169,7 +172,7 @@ fn a_node_lists_the_readers_and_writers_the_domain_knows_and_no_odd_topics() {
     });
 }
 
-/// A node of rmw_cyclonedds warns of each that does not.
+/// A node of rmw_cyclonedds logs a warning for each endpoint without a type hash.
 #[test]
 fn each_reader_and_writer_of_the_bridge_says_the_hash_of_its_type() {
     let Some(cell) = Cell::with(&[]) else {
@@ -305,7 +308,7 @@ fn warnings_of_the_bridge_are_on_rosout_under_its_name() {
             "2",
         ],
     );
-    // Late joiners get it too.
+    // Late joiners get the line, too.
     let mut rosout = cell.cyclone(
         "ros2_sub.py",
         &[
@@ -450,7 +453,7 @@ fn each_of_a_burst_of_endpoints_is_announced_or_known_not_to_be() {
     };
     let _cell = cell;
     let domain = join("bridge".into());
-    // Three times what fits into RustDDS' queue, and no time to work it off.
+    // Three times as many as RustDDS' queue holds, without time to process them.
     let writers: Vec<_> = (1..=1500)
         .map(|number| {
             let topic = format!("rt/ua_1_1_{number}");
@@ -499,7 +502,7 @@ patterns:
     side.hear_scalar((2, 2, 101), Scalar::String(Some("one")));
     let _second = says("/robot2/status", "two");
     side.hear_scalar((2, 2, 102), Scalar::String(Some("two")));
-    // A name the pattern makes no number of is told of, and costs the others nothing.
+    // A name from which the pattern gets no number is logged, and does not affect other names.
     let _odd = says("/robot_b/status", "odd");
     let odd = || {
         let lines = bridge.lines();

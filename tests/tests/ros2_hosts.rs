@@ -1,4 +1,5 @@
-//! bridge-ros2 on one host, its ROS 2 peers on another, and a wire of MTU 1500 between them that loses and delays.
+//! bridge-ros2 on a host, its ROS 2 peers on another, and a wire with an MTU of 1500 between them
+//! that loses and delays frames.
 
 use std::time::{Duration, Instant};
 
@@ -7,15 +8,15 @@ use system_tests::{
 };
 use uadp::{Scalar, Variant};
 
-/// Peers come up in seconds; on a lossy wire a repair takes some heartbeats.
+/// Peers start in seconds; on a lossy wire, a repair takes some heartbeats.
 const SOON: Duration = Duration::from_secs(60);
 const BOTH: &[Peer] = &[Peer::FastDds, Peer::CycloneC];
 const PLANT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/cells/plant.yaml");
 const STRING: &str = "std_msgs/String";
-/// Values of which every one counts, there and back.
+/// Events in both directions: every value counts.
 const EVENTS: (Triple, &str) = ((1, 2, 12), "/ua_1_2_12");
 const EVENTS_BACK: (Triple, &str) = ((2, 2, 22), "/ua_2_2_22");
-/// A value of which the last one counts.
+/// A state: only the last value counts.
 const STATE: (Triple, &str) = ((1, 2, 10), "/ua_1_2_10");
 
 const CLEAN: Wire = Wire {
@@ -30,7 +31,8 @@ const fn lossy(loss: f64) -> Wire {
     }
 }
 
-/// Both makers' peers on the other host with these arguments, as they are ready.
+/// Starts the peers of both vendors on the other host with these arguments, and waits until they
+/// are ready.
 fn peers(cell: &Cell, host: &Host, args: &[&str]) -> [Child; 2] {
     [
         host.fastdds_started(cell, args),
@@ -43,7 +45,8 @@ fn bridge(cell: &Cell) -> Child {
     cell.bridge_ros2(&[PLANT, "--ros-interface", HERE])
 }
 
-/// Readers on the other host that have heard the first value, so that no later one is from before their time.
+/// Starts readers on the other host and waits until they have received a first value, so that later
+/// values are not missed.
 fn listeners(cell: &Cell, host: &Host, ua: &mut UaSide) -> [Child; 2] {
     let readers = peers(cell, host, &["sub", EVENTS.1, STRING, "--counts"]);
     eventually("both readers hear the bridge", SOON, || {
@@ -78,7 +81,8 @@ fn await_all(readers: &mut [Child], count: u32) {
     }
 }
 
-/// Hears numbered texts of the topic until those of both ranges below `count` are there.
+/// Receives numbered texts of the topic until all numbers of both ranges below `count` have
+/// arrived.
 fn hear_all(ua: &UaSide, firsts: [u32; 2], count: u32) {
     let mut heard = Numbered::default();
     let wanted = count as usize * firsts.len();
@@ -149,7 +153,8 @@ fn reliable_topics_lose_nothing_on_a_wire_that_loses_five_percent() {
     nothing_is_lost_on(lossy(0.05));
 }
 
-/// Serialized, one of them is a multiple of four bytes long and the other is not, and both are more than one datagram.
+/// One serialized text is a multiple of four bytes long, the other is not, and both are longer than
+/// a datagram.
 #[test]
 fn texts_of_2002_and_2003_characters_arrive_both_ways() {
     const COUNT: u32 = 10;
@@ -248,17 +253,17 @@ fn the_last_state_of_best_effort_writers_reaches_the_space_on_a_wire_that_loses_
     }
 }
 
-/// How long Cyclone DDS says it may be silent before it counts as gone, in this test.
+/// The lease duration that Cyclone DDS announces in this test.
 const LEASE: &str = "<LeaseDuration>2s</LeaseDuration>";
 
-/// Hears whether the topic is repeated, which it is every second while somebody latches it.
+/// Returns whether the topic is repeated; a latched value is repeated every second.
 fn is_repeated(ua: &UaSide, triple: Triple) -> bool {
     ua.drain();
     ua.triples_for(Duration::from_millis(2500))
         .contains(&triple)
 }
 
-/// A robot has written its map once, and then the radio is out for longer than the robot's lease.
+/// A robot writes its map once, and then the radio link is down for longer than the robot's lease.
 #[test]
 fn a_latched_value_is_back_after_the_wire_was_cut_for_longer_than_the_lease() {
     const MAP: (Triple, &str) = ((2, 2, 20), "/ua_2_2_20");

@@ -1,4 +1,5 @@
-//! Large samples between our endpoints and those of other makers, with the socket buffers a system has by default.
+//! Large samples between our endpoints and third-party endpoints, with the default socket buffers
+//! of a system.
 
 use std::num::NonZeroU16;
 use std::time::{Duration, Instant};
@@ -23,7 +24,7 @@ const TOPIC: (&str, &str) = ("/ua_1_1_1", "rt/ua_1_1_1");
 const MEGA: usize = 1_000_000;
 const EVENTS: Offered = Offered::DropOldest(NonZeroU16::new(100).unwrap());
 
-/// Whether RustDDS is the patched one; else the test is not for it.
+/// Returns whether RustDDS is patched; otherwise the test is left out.
 fn patched() -> bool {
     if !limits::PATCHED {
         test_data::leave_out("RustDDS is as published; `cargo xtask test` builds with the patches");
@@ -49,7 +50,7 @@ fn options(network: &str) -> DomainOptions {
     }
 }
 
-/// A writer of the topic that knows so many readers, and is known to them.
+/// Creates a writer of the topic and waits until it has matched `readers` readers.
 fn outlet(domain: &Domain, offered: Offered, readers: usize) -> Outlet {
     let mut outlet = Outlet::new(
         domain.writer(TOPIC.1, STRING, offered).unwrap(),
@@ -108,7 +109,7 @@ fn inbox(domain: &Domain, topic: &str) -> Inbox<()> {
     inbox
 }
 
-/// The text of the next sample.
+/// Returns the text of the next sample.
 async fn text(inbox: &mut Inbox<()>) -> String {
     match tokio::time::timeout(SOON, inbox.recv()).await.unwrap() {
         Taken::Sample {
@@ -123,7 +124,7 @@ async fn text(inbox: &mut Inbox<()>) -> String {
     }
 }
 
-/// Asserts that the texts are the same, and prints little of them when they are not.
+/// Checks that the texts are equal, and prints only a part of them if they differ.
 fn is_whole(got: &str, sent: &str) {
     let differs = got.bytes().zip(sent.bytes()).position(|(a, b)| a != b);
     let head = |text: &str| text.get(..30).unwrap_or(text).to_owned();
@@ -165,7 +166,7 @@ async fn all_thirty_samples_of_5_mb_reach_fast_dds_and_cyclone() {
     all_thirty_arrive(5 * MEGA).await;
 }
 
-/// It takes longer for what is on its way to it than a reader may be silent.
+/// The reader needs more time for the data in transit than it may be silent.
 #[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn a_reader_that_is_slow_for_large_states_is_not_given_up_as_a_silent_one() {
     const COUNT: u32 = 7;
@@ -178,7 +179,7 @@ async fn a_reader_that_is_slow_for_large_states_is_not_given_up_as_a_silent_one(
     let mut reader = cell.fastdds(&["sub", TOPIC.0, TEXT, "--counts"]);
     let domain = join("127.0.0.1");
     let mut outlet = outlet(&domain, Offered::KeepLatest, 1);
-    // One more than there is memory for.
+    // One sample more than fits into the memory limit.
     for number in 0..COUNT {
         let large = payload(&numbered(number, 10 * MEGA));
         outlet.offer(large, None, now()).unwrap();
@@ -255,7 +256,8 @@ async fn ten_megabytes_of_cyclone_and_fast_dds_are_read() {
     ];
     let args = [&writes[..], &["--wait-readers", "1"]].concat();
     for writer in [Cell::cyclone_c, Cell::fastdds] {
-        // A participant each: RustDDS gives a new reader what it still holds of the topic.
+        // A separate participant per writer, because RustDDS passes retained samples of a topic to
+        // a new reader.
         let domain = join("127.0.0.1");
         let mut inbox = inbox(&domain, TOPIC.1);
         let _writer = writer(&cell, &args);
@@ -279,7 +281,8 @@ async fn texts_of_every_length_cross_an_ethernet() {
     .map(|peer| peer.start().ready(SOON));
     let domain = join(HERE);
     let mut outlet = outlet(&domain, EVENTS, readers.len());
-    // Around the size where samples are fragmented, and those of which Cyclone once got every fourth only.
+    // Sizes around the start of fragmentation, and sizes of which Cyclone DDS may lose three in
+    // four samples.
     let sizes: Vec<usize> = (1280..1400).chain(1995..2010).chain(2555..2570).collect();
     let count = sizes.len();
     write(&mut outlet, sizes, 200).await;
@@ -314,7 +317,8 @@ async fn large_samples_survive_a_wire_that_loses() {
     }
 }
 
-/// The last fragments of a sample and the HEARTBEAT after them are lost together now and then, and nothing follows them.
+/// Sometimes the last fragments of a sample and the HEARTBEAT after them are lost together, and
+/// nothing follows.
 #[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn large_samples_of_others_survive_a_wire_that_loses() {
     if !patched() {
@@ -323,12 +327,14 @@ async fn large_samples_of_others_survive_a_wire_that_loses() {
     let Some(cell) = Cell::with(BOTH) else {
         return;
     };
-    // Fast DDS sends 64 kB in one datagram: of five in a hundred packets lost, nine in ten datagrams would be.
+    // Fast DDS sends 64 kB in a datagram: with a packet loss of 5 %, nine in ten datagrams would be
+    // lost.
     let host = cell.host(Wire {
         loss: 0.01,
         delay: Duration::from_millis(20),
     });
-    // Else Linux keeps what it has of each datagram for 30 s, and soon has no room for new ones (docs/ros2.md).
+    // Otherwise Linux keeps the fragments of each datagram for 30 s, and soon has no room for new
+    // fragments (docs/ros2.md).
     std::fs::write("/proc/sys/net/ipv4/ipfrag_time", "3").unwrap();
     let domain = join(HERE);
     for fast in [true, false] {
@@ -406,7 +412,7 @@ async fn a_sample_beyond_the_limit_is_refused_by_name() {
     have_all(&mut reader, 1);
 }
 
-/// Cyclone on the other host, deaf and dumb to multicast.
+/// Returns Cyclone DDS on the other host, without multicast in both directions.
 fn without_multicast(cell: &Cell, host: &Host, args: &[&str]) -> Child {
     let uri = format!(
         "<CycloneDDS><Domain id=\"any\"><General><AllowMulticast>false</AllowMulticast>\

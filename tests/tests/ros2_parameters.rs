@@ -1,4 +1,5 @@
-//! The parameters of the bridge's node, as `ros2 param` of either vendor asks for them.
+//! The parameters of the bridge's node, in requests of `ros2 param` on the middleware of each
+//! vendor.
 
 use std::time::Duration;
 
@@ -47,7 +48,8 @@ fn cyclone_lists_describes_and_gets_the_parameters_of_the_bridge() {
         got["values"][0]["integer_value"].clone()
     };
     assert_eq!(space(&cell), json!(2));
-    // As rclpy: nothing is told where any of the names is not declared, and `ros2 param get` says "Parameter not set".
+    // As in rclpy, the response is empty if any of the names is not declared, and `ros2 param get`
+    // prints "Parameter not set".
     let names = json!({"names": ["space", "nothing"]});
     for (service, kind, list) in [
         ("describe_parameters", "DescribeParameters", "descriptors"),
@@ -59,7 +61,8 @@ fn cyclone_lists_describes_and_gets_the_parameters_of_the_bridge() {
     }
 }
 
-/// The same through Fast DDS; request and reply are the hexadecimal digits of CDR.
+/// Calls a parameter service of the bridge through Fast DDS. Request and reply are hexadecimal
+/// digits of CDR.
 fn call(cell: &Cell, service: &str, kind: &str, request: &str) -> String {
     let service = format!("{NODE}/{service}");
     let kind = format!("rcl_interfaces/{kind}");
@@ -75,9 +78,10 @@ fn hex(text: &str) -> String {
 
 /// Sets a parameter to true.
 fn set_true(cell: &Cell, name: &str) -> String {
-    // One parameter, its name, and a value of type 1 that is true; the rest of the value is empty.
+    // A single parameter, its name, and a value of type 1 that is true; the rest of the value is
+    // empty.
     let mut request = format!("01000000{:02x}000000{}00", name.len() + 1, hex(name));
-    // The type and the Boolean follow the text at once.
+    // The type and the Boolean follow the text directly.
     request.push_str("0101");
     request.push_str(&"00".repeat(64));
     call(cell, "set_parameters", "SetParameters", &request)
@@ -95,7 +99,7 @@ fn fast_dds_lists_and_gets_the_parameters_of_the_bridge_and_is_told_that_none_ca
     for name in ["domain", "space", "use_sim_time"] {
         assert!(all.contains(&hex(name)), "{all}");
     }
-    // One result: not successful, and the reason.
+    // A single result: not successful, and the reason.
     for name in ["use_sim_time", "space"] {
         let refused = set_true(&cell, name);
         assert!(refused.starts_with("0100000000"), "{refused}");
@@ -106,11 +110,12 @@ fn fast_dds_lists_and_gets_the_parameters_of_the_bridge_and_is_told_that_none_ca
         "GetParameters",
         &format!("010000000d000000{}00", hex("use_sim_time")),
     );
-    // One value: of type 1, true.
+    // A single value: of type 1, true.
     assert!(got.starts_with("010000000101"), "{got}");
 }
 
-/// The bridge's own parameters cannot be set, so this is a node like its own with one that can.
+/// The bridge's own parameters cannot be set, so this test runs a similar node with a parameter
+/// that can be set.
 #[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn who_listens_to_parameter_events_is_told_what_was_set_and_of_which_node() {
     let Some(cell) = Cell::with(&[Peer::Python, Peer::FastDds]) else {
@@ -136,9 +141,9 @@ async fn who_listens_to_parameter_events_is_told_what_was_set_and_of_which_node(
     let event = ["/parameter_events", "rcl_interfaces/ParameterEvent"];
     let mut listener = cell.cyclone("ros2_sub.py", &[&event[..], &["--domain", "2"]].concat());
     listener.wait_for_line("\"ready\"", SOON);
-    // The listener may not be matched yet at the first time.
+    // The listener may not be matched yet at the first attempt.
     let heard = eventually("an event", SOON, || {
-        // One result each: not successful, and successful.
+        // A single result each: not successful, and successful.
         assert!(set_true(&cell, "fixed").starts_with("0100000000"));
         assert!(set_true(&cell, "enabled").starts_with("0100000001"));
         listener.values().first().cloned()
@@ -160,7 +165,7 @@ fn a_request_that_is_none_is_counted_in_the_status() {
         return;
     };
     let _bridge = cell.bridge_ros2(&[]);
-    // A sequence of two billion names that are not there; nobody answers that.
+    // A sequence of two billion missing names, which gets no answer.
     let service = format!("{NODE}/get_parameters");
     let kind = "rcl_interfaces/GetParameters";
     let _client = cell.fastdds(&["call", &service, kind, "--hex", "ffffff7f"]);

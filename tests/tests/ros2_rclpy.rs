@@ -1,4 +1,5 @@
-//! bridge-ros2 beside nodes of ROS 2 itself, rclpy over Fast DDS, of each distribution that is there as a peer.
+//! bridge-ros2 with nodes of ROS 2 itself, rclpy over Fast DDS, of each distribution that is
+//! available as a peer.
 
 use std::{collections::BTreeSet, time::Duration};
 
@@ -22,7 +23,7 @@ variables:
   - {node: ns=2;i=4, name: Answer, origin: 2, ros: {answer: ns=2;i=3, field: message}}
 ";
 
-/// For each distribution, in a cell of its own.
+/// Runs a test for each distribution, in a separate cell.
 fn each(test: impl Fn(&Cell, Distribution)) {
     for distribution in Distribution::ALL {
         let Some(cell) = Cell::with(&[Peer::Ros2]) else {
@@ -32,13 +33,14 @@ fn each(test: impl Fn(&Cell, Distribution)) {
     }
 }
 
-/// The names in a list of names and types.
+/// Returns the names in a list of names and types.
 fn names(of: &Value) -> BTreeSet<&str> {
     let pairs = of.as_array().unwrap().iter();
     pairs.map(|pair| pair[0].as_str().unwrap()).collect()
 }
 
-/// The one endpoint of that kind the bridge has of a topic, and the publisher the judge has.
+/// Waits for the bridge's only endpoint of that kind on a topic and the endpoint of the judge, and
+/// returns both.
 fn endpoints(judge: &mut Judge, topic: &str, kind: &str) -> (Value, Value) {
     judge.until(&json!({"topic": topic}), |endpoints| {
         let all = || endpoints.as_array().into_iter().flatten();
@@ -63,7 +65,7 @@ fn a_node_of_ros_2_sees_nothing_odd_in_the_bridge() {
             (*nodes == json!(["/judge/judge", NODE])).then_some(())
         });
 
-        // `ros2 node info`.
+        // The node as in `ros2 node info`.
         let info = judge.until(&json!({"info": NODE}), |info| {
             let there = names(&info["publishers"]).contains("/lamp")
                 && names(&info["subscribers"]).contains("/said")
@@ -86,7 +88,7 @@ fn a_node_of_ros_2_sees_nothing_odd_in_the_bridge() {
                 ["/said", ["std_msgs/msg/String"]],
             ])
         );
-        // A node of its own has the same.
+        // An rclpy node has the same services.
         let own = judge.ask(json!({"info": "/judge/judge"}));
         let tails = |info: &Value, node: &str| -> BTreeSet<String> {
             let all = names(&info["services"]).into_iter();
@@ -103,7 +105,8 @@ fn a_node_of_ros_2_sees_nothing_odd_in_the_bridge() {
             (&json!([]), &json!([]))
         );
 
-        // `ros2 topic info -v`, beside an endpoint of rclpy's own on the same topic.
+        // The endpoints as in `ros2 topic info -v`, compared with an rclpy endpoint on the same
+        // topic.
         for (topic, kind, of_type) in [
             ("/said", "SUBSCRIPTION", "std_msgs/msg/String"),
             ("/lamp", "PUBLISHER", "std_msgs/msg/Bool"),
@@ -117,7 +120,7 @@ fn a_node_of_ros_2_sees_nothing_odd_in_the_bridge() {
                 );
             }
         }
-        // What every node publishes is the same in every respect.
+        // The topics that every node publishes are equal in every respect.
         for topic in ["/rosout", "/parameter_events"] {
             let (mut bridge, own) = endpoints(&mut judge, topic, "PUBLISHER");
             bridge["node"] = own["node"].clone();
@@ -186,7 +189,7 @@ fn values_and_calls_cross_to_and_from_a_node_of_ros_2() {
         let lit = judge.hears("/lamp", |value| Some(value["data"].clone()));
         assert_eq!(lit, true, "{distribution:?}");
 
-        // A state is tried until its service is there.
+        // A state is retried until its service is available.
         ua.write((0, 2, 3), Scalar::Boolean(true));
         judge.ask(json!({"serve": "/light", "type": "std_srvs/srv/SetBool",
                          "value": {"success": true, "message": "lit"}}));
@@ -196,7 +199,7 @@ fn values_and_calls_cross_to_and_from_a_node_of_ros_2() {
             .wait_for_json("a call", SOON, |line| Some(line.get("asked")?.clone()));
         assert_eq!(asked, "/light");
 
-        // What the bridge warns of, here a publisher of another type, is in rqt_console.
+        // The bridge's warnings, here about a publisher of another type, are shown in rqt_console.
         judge.ask(json!({"publish": "/odd", "type": "std_msgs/msg/Bool"}));
         judge.ask(
             json!({"subscribe": "/rosout", "type": "rcl_interfaces/msg/Log",
@@ -211,7 +214,7 @@ fn values_and_calls_cross_to_and_from_a_node_of_ros_2() {
     });
 }
 
-/// A bridge between the domains 2 and 3, and a node in each.
+/// Starts a bridge between the domains 2 and 3, and a node in each domain.
 fn two_domains(cell: &Cell, distribution: Distribution) -> (Child, Judge, Judge) {
     let file = cell.file(
         "cell.yaml",
@@ -227,7 +230,7 @@ fn two_domains(cell: &Cell, distribution: Distribution) -> (Child, Judge, Judge)
     )
 }
 
-/// Types that no file here has: what a message of them is, the nodes that publish it tell.
+/// Types without local definition files: the publishing nodes describe them.
 const UNKNOWN: [&str; 13] = [
     "Arrays",
     "BasicTypes",
@@ -270,12 +273,12 @@ fn large_samples_reach_nodes_of_ros_2_with_the_socket_buffers_they_have() {
         from.until(&json!({"publish": topic, "type": kind}), |subscribers| {
             (*subscribers == 1).then_some(())
         });
-        // The writer of the other domain is made by the first value, and DDS matches it meanwhile.
+        // The first value creates the writer in the other domain, and DDS matches it meanwhile.
         let first = json!({"publish": topic, "type": kind, "bytes": 8, "seed": 9});
         from.until(&first, |sent| {
             to.child().values().contains(sent).then_some(())
         });
-        // Not multiples of four: the last fragment is an odd one.
+        // Not multiples of four, so the last fragment has an odd size.
         for (seed, bytes) in (1..).zip([999_999, 1_000_001, 2_000_003, 4_999_997, 1_000_002]) {
             let sent =
                 from.ask(json!({"publish": topic, "type": kind, "bytes": bytes, "seed": seed}));

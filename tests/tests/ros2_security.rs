@@ -1,7 +1,7 @@
-//! bridge-ros2 with DDS Security, by the enclaves of SROS2.
+//! bridge-ros2 with DDS Security, with the enclaves of SROS2.
 //!
-//! What needs a bridge that has it is skipped where it was built without (`bridge-ros2 --version`); `cargo xtask` builds
-//! it with.
+//! Tests that need DDS Security are skipped if the bridge was built without it (`bridge-ros2
+//! --version`); `cargo xtask` builds the bridge with it.
 
 mod kinds;
 mod node;
@@ -20,7 +20,7 @@ use uadp::Scalar;
 
 const SOON: Duration = Duration::from_secs(30);
 const STRING: &str = "std_msgs/String";
-/// A value of the space, and one of the domain.
+/// A value of the space, and a value of the domain.
 const THERE: (Triple, &str) = ((1, 2, 10), "/ua_1_2_10");
 const BACK: (Triple, &str) = ((2, 2, 20), "/ua_2_2_20");
 
@@ -32,7 +32,7 @@ fn sends<'a>(topic: &'a str, text: &'a str) -> [&'a str; 9] {
     ]
 }
 
-/// The value reaches the reader; it is written again until then.
+/// Writes the value repeatedly until it reaches the reader.
 fn reaches(ua: &mut UaSide, text: &str, reader: &Child) {
     let mut written: Option<Instant> = None;
     eventually(&format!("the reader has `{text}`"), SOON, || {
@@ -52,7 +52,7 @@ fn answering(bridge: Started) -> Child {
     bridge
 }
 
-/// Whether the text is anywhere, in one byte a character as CDR has it.
+/// Returns whether the text is in any packet, with a byte per character as in CDR.
 fn is_in(packets: &[Vec<u8>], text: &str) -> bool {
     packets.iter().any(|packet| {
         let mut windows = packet.windows(text.len());
@@ -75,7 +75,7 @@ fn values_cross_both_ways_with_secured_peers_and_nothing_of_them_is_readable_on_
         (Cell::secured_fastdds, "fast"),
     ];
     for (maker, name) in makers {
-        // Of lengths that are no multiple of 4, which the makers pad differently.
+        // The lengths are no multiples of 4, which the vendors pad differently.
         let (there, back) = (format!("there {name}"), format!("and back {name}"));
         let reader = maker(&cell, &keystore, &["sub", THERE.1, STRING])
             .start()
@@ -94,7 +94,8 @@ fn values_cross_both_ways_with_secured_peers_and_nothing_of_them_is_readable_on_
     }
 }
 
-/// The GUIDs of secured peers do not tell whose they are, and each maker ties replies to requests in its own way.
+/// GUIDs of secured peers do not show their participant, and each vendor relates replies to
+/// requests in its own way.
 #[test]
 fn services_of_secured_peers_of_both_makers_answer() {
     const CELL: &str = "
@@ -175,7 +176,7 @@ fn who_is_not_of_the_enclave_gets_and_gives_nothing_and_is_told_of() {
         .start();
     bridge.wait_for_line("does not prove who it is", SOON);
 
-    // Those of the enclave are heard all the while.
+    // Values of the peers in the enclave cross throughout.
     let reader = cell
         .secured_cyclone(&keystore, &["sub", THERE.1, STRING])
         .start()
@@ -208,7 +209,7 @@ fn who_is_not_of_the_enclave_gets_and_gives_nothing_and_is_told_of() {
     );
 }
 
-/// How a bridge ends that must not run, and what it says.
+/// Returns the exit code and the output of a bridge that must refuse to run.
 fn refusal(started: Started) -> (Option<i32>, String) {
     let mut bridge = started.start();
     let code = bridge.wait_for_end(SOON).code();
@@ -249,7 +250,7 @@ fn an_enclave_that_is_not_in_order_is_refused_with_the_file_to_mend() {
         &theirs.join("permissions.p7s"),
         &["permissions.p7s", "signature"],
     );
-    // Of another enclave, but signed: RustDDS finds no grant for the bridge in it.
+    // Signed permissions of another enclave: RustDDS finds no grant for the bridge in them.
     with(
         "permissions.p7s",
         &own.join("permissions.p7s"),
@@ -272,7 +273,7 @@ fn an_enclave_that_is_not_in_order_is_refused_with_the_file_to_mend() {
         &["cert.pem", "not a PEM certificate"],
     );
 
-    // Also where the bridge may run in the clear: whose files are wrong means to be secured.
+    // Also where the bridge may run unsecured: invalid files show the intent to be secured.
     let revoked = enclave.join("crl.pem");
     fs::write(&revoked, "").unwrap();
     refused(&["crl.pem", "make a new keystore"]);
@@ -303,7 +304,7 @@ fn a_key_others_can_read_is_told_of() {
     bridge.wait_for_line("others on this machine can read this key (mode 644)", SOON);
 }
 
-/// With either build: without DDS Security nothing else can be had of it.
+/// With either build: without DDS Security, only this behaviour can be tested.
 #[test]
 fn a_bridge_that_cannot_be_secured_does_not_run_in_the_clear_unless_it_may() {
     let Some(cell) = Cell::with(&[]) else {

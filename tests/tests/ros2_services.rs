@@ -1,4 +1,4 @@
-//! Services of ROS 2 between us and the middleware of each vendor, in both roles.
+//! Services of ROS 2 between this workspace and the middleware of each vendor, in both roles.
 
 mod bindings;
 mod peer;
@@ -31,7 +31,7 @@ fn within(timeout: Duration) -> ServiceClientOptions {
     }
 }
 
-/// A request of `std_srvs/SetBool`.
+/// Encodes a request of `std_srvs/SetBool`.
 fn set(on: bool) -> Bytes {
     Bytes::from(vec![0, 1, 0, 0, u8::from(on)])
 }
@@ -40,7 +40,7 @@ fn client(ours: &Ours, options: ServiceClientOptions) -> ServiceClient {
     ServiceClient::open(&ours.domain, &ours.peers, &grip(), options).unwrap()
 }
 
-/// Answers `done` to true and nothing to false.
+/// Creates a server that answers `done` to true and nothing to false.
 fn server(ours: &Ours, options: ServiceOptions) -> ServiceServer {
     let handler = async |on: Option<u8>| match on {
         Some(1) => Ok(Bytes::from_static(DONE)),
@@ -63,7 +63,7 @@ async fn a_server_of_theirs_answers(vendor: Vendor) {
     };
     let ours = Ours::join();
     let client = client(&ours, within(SOON));
-    // Asked before there is a server: it is waited for.
+    // Called before a server exists: the client waits for the server.
     let early = tokio::spawn({
         let client = client.clone();
         async move { client.call(set(true)).await }
@@ -146,7 +146,7 @@ async fn a_client_finds_a_killed_server_again_even_as_one_of_another_vendor() {
     let client = client(&ours, within(Duration::from_secs(1)));
     for vendor in [Vendor::Cyclone, Vendor::FastDds, Vendor::Cyclone] {
         let server = vendor.serves(&cell, GRIP);
-        // Until the lease of a killed one ends, a call may still be for it alone.
+        // Until the lease of a killed server ends, a call may go to it alone.
         let deadline = tokio::time::Instant::now() + SOON;
         while let Err(error) = client.call(set(true)).await {
             assert!(error.may_have_run(), "{error}");
@@ -212,7 +212,7 @@ async fn a_call_without_a_server_says_so_and_has_not_run() {
         return;
     };
     let ours = Ours::join();
-    // One of our own does not count: it is what we tell others of.
+    // Our own server does not count: it is the server that we offer to others.
     let _server = server(&ours, ServiceOptions::default());
     let client = client(&ours, within(Duration::from_secs(1)));
     let error = client.call(set(true)).await.unwrap_err();
@@ -286,7 +286,8 @@ async fn garbage_is_counted_and_does_no_harm() {
             .told()
             .start()
             .ready(SOON);
-        // Too short for its header, and a header without a body, which the handler refuses.
+        // A request too short for its header, and a header without a body, which the handler
+        // refuses.
         match form {
             "short" => until("ten are malformed", || server.counters().malformed == 10).await,
             _ => until("ten fail", || server.counters().failures == 10).await,
@@ -316,7 +317,7 @@ async fn clients_of_both_vendors_are_answered_by_one_server_of_ours() {
     let clients = both.map(|vendor| (vendor, vendor.calls(&cell, GRIP, 50)));
     for (vendor, client) in &clients {
         until("the client is done", || vendor.answers(client).is_some()).await;
-        // Replies to others of its vendor reach it too, and are none of its own.
+        // Replies to other clients of the vendor also arrive, and are ignored.
         assert_eq!(vendor.answers(client).unwrap().0, 50);
     }
     let counters = server.counters();
@@ -326,7 +327,7 @@ async fn clients_of_both_vendors_are_answered_by_one_server_of_ours() {
     );
 }
 
-/// Requests of Cyclone DDS do not say which reader of their participant waits for the reply.
+/// Requests of Cyclone DDS do not name the reader of their participant that waits for the reply.
 #[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn each_more_client_of_one_cyclone_participant_is_answered() {
     const CLIENTS: usize = 20;
@@ -407,7 +408,7 @@ async fn more_calls_than_allowed_are_refused_and_others_go_on() {
     let calls = join_all((0..5).map(|_| client.call(set(true)))).await;
     let busy = |call: &&Result<Bytes, ServiceError>| matches!(call, Err(ServiceError::Busy { .. }));
     assert_eq!(calls.iter().filter(busy).count(), 2);
-    // Those that were given up make room.
+    // Calls that timed out make room.
     let next = client.call(set(true)).await;
     assert!(
         matches!(next, Err(ServiceError::Timeout { .. })),

@@ -1,4 +1,4 @@
-//! `mappings/schema.json` judged by a JSON Schema validator and a YAML parser of other makers.
+//! `mappings/schema.json` checked with a third-party JSON Schema validator and YAML parser.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -8,7 +8,7 @@ use system_tests::{Cell, Peer};
 
 const ROOT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/..");
 
-/// What the judge says of each file.
+/// Returns the validator's result for each file.
 fn judged(cell: &Cell, files: &[PathBuf]) -> Vec<Value> {
     let schema = format!("{ROOT}/mappings/schema.json");
     let names: Vec<&str> = files.iter().map(|file| file.to_str().unwrap()).collect();
@@ -26,7 +26,7 @@ fn yaml_in(folder: &str) -> Vec<PathBuf> {
     files
 }
 
-/// Pages whose YAML is that of components and of `ua-mes`, which have no schema.
+/// Pages with YAML of components and of `ua-mes`, which have no schema.
 const WITHOUT_MAPPINGS: [&str; 3] = ["components.md", "plug-and-produce.md", "processes.md"];
 
 /// Returns the README and the pages of `docs/` that show mappings.
@@ -85,7 +85,7 @@ fn what_breaks_the_schema_is_refused_at_its_place() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
     };
-    // Faults of shape and range. What shows only across keys the schema does not know.
+    // Errors of shape and range. The schema does not cover errors across keys.
     let expected = [
         ("M003", "$"),
         ("M005", "$.variables[0]"),
@@ -109,7 +109,7 @@ fn what_breaks_the_schema_is_refused_at_its_place() {
     }
 }
 
-/// Keys of each kind that takes no text of any form, with a value that is in order.
+/// Keys of each kind that does not accept arbitrary text, each with a valid value.
 const LIMITED: [(&str, &str); 12] = [
     ("spaces: [{id: 2, domain: @}]", "7"),
     ("pubsub: {ttl: @}", "1"),
@@ -169,7 +169,7 @@ fn an_environment_variable_may_stand_wherever_the_program_takes_one_and_nothing_
         let expected = [true, true, true, false, false, false];
         assert_eq!(sound, expected, "{document}: {told:?}");
     }
-    // The program reads what the schema lets pass.
+    // The program accepts the values that the schema accepts.
     for (document, value) in LIMITED {
         let text = document.replace('@', &format!("\"${{NO_SUCH_VARIABLE:-{value}}}\""));
         let checked = mappings::Mapping::from_yaml(&text, "cell.yaml");

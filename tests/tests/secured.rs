@@ -1,4 +1,4 @@
-//! A secured group, live: both bridges have its keys, and a third program has none.
+//! A secured group in operation: both bridges have its keys, and a third program has no keys.
 
 mod sks;
 
@@ -22,7 +22,7 @@ const GRIPPER: &str = concat!(
 );
 const METRICS_COMPONENT: &str = "127.0.0.1:9107";
 
-/// Runs `ua-space` and gives what it printed.
+/// Runs `ua-space` and returns its output.
 fn space(args: &[&str]) -> String {
     let output = Command::new(program("ua-space")).args(args).output();
     let output = output.unwrap();
@@ -35,12 +35,12 @@ fn path(path: &Path) -> &str {
     path.to_str().unwrap()
 }
 
-/// The key a program uses, by its SecurityTokenId.
+/// Returns the key that a program uses, by its SecurityTokenId.
 fn token(address: &str) -> Option<u64> {
     metrics(address)?["groups"]["cell"]["token"].as_u64()
 }
 
-/// Every drop for that reason, of topics and of none.
+/// Returns the number of drops for that reason, with and without a topic.
 fn dropped(address: &str, reason: &str) -> u64 {
     let status = metrics(address).unwrap_or_default();
     status["others"]["dropped"][reason]
@@ -72,7 +72,7 @@ fn bridges_with_the_keys_hear_each_other_and_a_third_program_neither_hears_nor_i
     let got = heard.wait_for_json("the string in ROS 2", SOON, value);
     assert_eq!(got, json!({ "data": SECRET }));
 
-    // Whoever listens without the keys learns that somebody speaks, and no more.
+    // A listener without the keys sees that messages are sent, but cannot read them.
     let datagrams = UadpSocket::join().receive_for(Duration::from_secs(2));
     assert!(!datagrams.is_empty());
     for datagram in &datagrams {
@@ -83,7 +83,7 @@ fn bridges_with_the_keys_hear_each_other_and_a_third_program_neither_hears_nor_i
             0
         );
     }
-    // Whoever speaks without them is not heard, nor one who repeats what it heard.
+    // A sender without the keys is ignored, and so are replayed messages.
     let mut third = UaSide::join();
     third.write((0, 5, 11), Scalar::String(Some("forged")));
     let socket = UadpSocket::join();
@@ -100,7 +100,7 @@ fn bridges_with_the_keys_hear_each_other_and_a_third_program_neither_hears_nor_i
         let topics = metrics(address).unwrap()["topics"].clone();
         assert_eq!(topics.get("ua_0_5_11"), None, "{topics}");
     }
-    // Who has them looks in.
+    // A program with the keys reads the values.
     let echoed = space(&[
         "echo",
         "ua_1_5_10",
@@ -115,7 +115,7 @@ fn bridges_with_the_keys_hear_each_other_and_a_third_program_neither_hears_nor_i
     ]);
     assert!(echoed.contains(SECRET), "{echoed}");
 
-    // Another key, while values run.
+    // The key is replaced while values are sent.
     space(&["keys", "--next", path(&keys)]);
     space(&["keys", "--drop", path(&keys)]);
     for address in [METRICS_ROS1, METRICS_ROS2] {
@@ -130,7 +130,7 @@ fn bridges_with_the_keys_hear_each_other_and_a_third_program_neither_hears_nor_i
     assert_eq!(dropped(METRICS_ROS2, "unknown_key"), before);
 }
 
-/// A call by `ua-space` of what a component executes: its exit code and what it printed.
+/// Calls a component with `ua-space`. Returns the exit code and the output.
 fn called(words: &[&str]) -> (Option<i32>, String) {
     let told = Command::new(program("ua-space"))
         .args(["call", "--interface", "lo", "--json"])
@@ -166,7 +166,7 @@ fn skills_of_a_secured_group_are_run_by_who_has_its_keys_and_by_nobody_else() {
         token(METRICS_COMPONENT)
     });
 
-    // Who is in ROS runs one of its skills by the bridge, which has them.
+    // A ROS client runs a skill through the bridge, which has the keys.
     for method in ["/ua_0_7_209", "/ua_0_7_205"] {
         let asked = [method, "std_srvs/Trigger", "--value", "{}"];
         let mut robot = cell.rospy("ros1_call.py", &asked);
@@ -175,7 +175,7 @@ fn skills_of_a_secured_group_are_run_by_who_has_its_keys_and_by_nobody_else() {
         });
         assert_eq!(told["success"], true, "{method}: {told}");
     }
-    // And whoever looks into the space with them is told how another went.
+    // A program with the keys in the space runs another skill and gets its result.
     let with_keys = ["--keys", path(&keys), "--wait", "20"];
     let reset = called(&[&["parallel-gripper.Grasp.Reset"], &with_keys[..]].concat());
     assert_eq!(reset.0, Some(0), "{}", reset.1);
@@ -188,7 +188,7 @@ fn skills_of_a_secured_group_are_run_by_who_has_its_keys_and_by_nobody_else() {
         assert!(NetworkMessage::decode(datagram).unwrap().is_sealed());
     }
 
-    // Who has none learns of no skill, and what it asks for in clear is not heard.
+    // A program without keys sees no skill, and its unsecured requests are ignored.
     let before = dropped(METRICS_COMPONENT, "unsecured");
     let refused = called(&["ua_0_7_109", "--wait", "2"]);
     assert!(refused.0.is_some_and(|code| code != 0), "{}", refused.1);

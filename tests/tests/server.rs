@@ -1,4 +1,4 @@
-//! The OPC UA server by itself: datagrams of the tests' own on one side, asyncua on the other.
+//! The OPC UA server alone: datagrams of the tests on one side, asyncua on the other.
 
 mod access;
 mod authorities;
@@ -28,7 +28,7 @@ use uadp::{
 
 const SOON: Duration = Duration::from_secs(20);
 
-/// Values of a robot in space 2, and two of the server's own.
+/// Values of a robot in space 2, and two values of the server itself.
 const MAPPING: &str = "
 namespaces:
   2: urn:ua-bridge:system-tests
@@ -54,7 +54,7 @@ fn serving(cell: &Cell, mapping: &str) -> Child {
     server
 }
 
-/// What a Read of the node's value says.
+/// Returns the result of a Read of the node's value.
 fn read(cell: &Cell, node: &str) -> Value {
     cell.asyncua_once("opcua_read.py", &[SERVER_ENDPOINT, node])
         .remove(0)
@@ -64,7 +64,7 @@ fn write(cell: &Cell, node: &str, kind: &str, value: &str) -> Value {
     cell.asyncua_once("opcua_write.py", &[SERVER_ENDPOINT, node, kind, value])[0]["status"].clone()
 }
 
-/// A client that has subscribed to the node.
+/// Starts a client that subscribes to the node.
 fn watch(cell: &Cell, node: &str) -> Child {
     cell.asyncua("opcua_subscribe.py", &[SERVER_ENDPOINT, node])
 }
@@ -81,7 +81,7 @@ fn now() -> Timestamp {
     Timestamp::from_unix_nanos(i128::try_from(since.as_nanos()).unwrap())
 }
 
-/// One key frame of one Double, as a publisher sends it.
+/// Encodes a key frame with a single Double, as a publisher sends it.
 fn key_frame(triple: (u16, u16, u16), sequence: u16, value: f64, more: DataSetHeader) -> Vec<u8> {
     let mut datagram = Vec::new();
     let header = NetworkHeader {
@@ -139,7 +139,7 @@ fn a_client_that_is_not_trusted_is_refused_and_the_log_says_which_file_to_move()
     assert_eq!(answer[0]["status"], "BadWaitingForInitialData");
 }
 
-/// What a client that was refused printed.
+/// Returns the output of a client that was refused.
 fn ended(mut client: Child) -> String {
     let status = client.wait_for_end(SOON);
     assert!(!status.success(), "{status}");
@@ -212,7 +212,7 @@ fn a_subscriber_is_told_what_comes_after_the_clock_of_a_publisher_was_set_back()
         timestamp: Some(uadp::DateTime(now().time.0 + shift)),
         ..DataSetHeader::default()
     };
-    // As it was, an hour ahead, as it was again, and an hour behind.
+    // With the present time, an hour ahead, with the present time again, and an hour behind.
     for (sequence, shift, value) in [
         (1, 0, 20.0),
         (2, hour, 21.0),
@@ -262,7 +262,7 @@ fn a_clients_write_leaves_as_a_key_frame_of_the_nodes_topic() {
     assert_eq!(read(&cell, "ns=2;i=30")["value"], 3.25);
 }
 
-/// The triple and the Doubles of a key frame; `None` for another message.
+/// Returns the triple and the Doubles of a key frame; `None` for another message.
 fn written(datagram: &[u8]) -> Option<((u16, u16, u16), Vec<f64>)> {
     let message = NetworkMessage::decode(datagram).unwrap();
     if message.message_type() != NetworkMessageType::DataSet {
@@ -327,7 +327,7 @@ fn a_topic_the_mapping_does_not_name_appears_under_unmapped() {
     let folder = [SERVER_ENDPOINT, "--children", "ns=1;s=UaSpace.Unmapped"];
     let children = || cell.asyncua_once("opcua_read.py", &folder)[0]["children"].clone();
     assert_eq!(children(), json!([]));
-    // One of another space, and one of a component in the server's own.
+    // A topic of another space, and a topic of a component in the server's own space.
     for triple in [(2, 7, 77), (0, 7, 101)] {
         group.send(&key_frame(triple, 1, 4.5, DataSetHeader::default()));
     }

@@ -1,5 +1,5 @@
-//! What the OPC UA server shows of values that are large, structured, or none: datagrams of the tests' own on one side,
-//! asyncua on the other.
+//! The OPC UA server with values that are large, structured, or missing: datagrams of the tests on
+//! one side, asyncua on the other.
 
 mod certificates;
 mod sources;
@@ -19,7 +19,7 @@ use uadp::{
 
 const SOON: Duration = Duration::from_secs(20);
 
-/// Not in the order of their numbers, nor of their names.
+/// Ordered neither by number nor by name.
 const MAPPING: &str = "
 namespaces:
   2: urn:ua-bridge:system-tests
@@ -42,7 +42,7 @@ fn server(cell: &Cell) -> Child {
     server
 }
 
-/// What a Read of the node's value says.
+/// Returns the result of a Read of the node's value.
 fn read(cell: &Cell, arguments: &[&str]) -> Value {
     let arguments = [&[SERVER_ENDPOINT], arguments].concat();
     cell.asyncua_once("opcua_read.py", &arguments).remove(0)
@@ -76,7 +76,7 @@ fn data_set_header(sequence: u16) -> DataSetHeader {
     }
 }
 
-/// One key frame of space 2, with the fields that `write` writes.
+/// Encodes a key frame of space 2 with the fields that `write` writes.
 fn key_frame(writer: u16, sequence: u16, write: impl FnOnce(&mut FieldEncoder<'_>)) -> Vec<u8> {
     let mut datagram = Vec::new();
     let header = header();
@@ -88,7 +88,7 @@ fn key_frame(writer: u16, sequence: u16, write: impl FnOnce(&mut FieldEncoder<'_
     datagram
 }
 
-/// Sends an array of space 2 as the chunks a writer makes of it.
+/// Sends an array of space 2 in the chunks that a writer makes of it.
 fn send_array(group: &UadpSocket, writer: u16, sequence: u16, elements: &[u8]) {
     let mut encoded = Vec::new();
     let mut message =
@@ -117,7 +117,7 @@ fn send_array(group: &UadpSocket, writer: u16, sequence: u16, elements: &[u8]) {
         written.unwrap();
         group.send(&datagram);
         datagram.clear();
-        // The pace of a sender: a socket buffer holds less than the array.
+        // Paced like a sender, because a socket buffer is smaller than the array.
         std::thread::sleep(Duration::from_millis(2));
     }
 }
@@ -125,7 +125,7 @@ fn send_array(group: &UadpSocket, writer: u16, sequence: u16, elements: &[u8]) {
 #[test]
 fn a_large_array_takes_up_no_more_than_three_times_its_size_and_can_be_read_by_parts() {
     const SIZE: usize = 8 << 20;
-    /// What the connections of clients come to.
+    /// Memory for the connections of clients.
     const CLIENTS: u64 = 4 << 20;
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
@@ -136,8 +136,8 @@ fn a_large_array_takes_up_no_more_than_three_times_its_size_and_can_be_read_by_p
     let mut elements = vec![0; SIZE];
     elements[SIZE - 3..].copy_from_slice(&[7, 8, 9]);
     let last = format!("{}:{}", SIZE - 3, SIZE - 1);
-    // The second value takes the place of the first. A chunk may be lost on a busy machine: what came of such a value is
-    // waited for and takes up room, until it is given up.
+    // The second value replaces the first. A busy machine may lose a chunk: the received chunks of
+    // such a value use memory until the value is discarded.
     let (mut sequence, mut lost, mut came) = (0, 0, 0);
     while came < 2 {
         sequence += 1;
@@ -230,7 +230,7 @@ fn a_value_whose_messages_are_all_dropped_is_not_good_until_a_value_comes() {
     group.send(&frame(&[Scalar::Boolean(true)]));
     shows(&mut watch, "BadTypeMismatch", &Value::Null);
     for (value, misfit) in [
-        // Another type, and one field more.
+        // A value of another type, and a value with an additional field.
         (21.5, &[Scalar::String(Some("warm"))][..]),
         (22.5, &[double(1.0), double(2.0)][..]),
     ] {
@@ -241,7 +241,7 @@ fn a_value_whose_messages_are_all_dropped_is_not_good_until_a_value_comes() {
     }
     group.send(&frame(&[double(23.5)]));
     shows(&mut watch, "Good", &json!(23.5));
-    // What cannot be read at all comes all the time.
+    // Undecodable values arrive all the time.
     let start = Instant::now();
     let fell = eventually("the value falls", SOON, || {
         let mut cut_off = frame(&[double(4.0)]);
@@ -295,7 +295,7 @@ fn a_client_writes_a_megabyte_and_it_leaves_in_chunks() {
     assert_eq!(read["value"], "AAAAAAAA", "its last six bytes");
 }
 
-/// A geometry_msgs/Pose at `x`, as a structure.
+/// Encodes a geometry_msgs/Pose at `x` as a structure.
 fn pose(fields: &mut FieldEncoder<'_>, x: f64) {
     fields
         .begin_structure(NodeId::string(2, "geometry_msgs/Pose"))
@@ -343,7 +343,7 @@ fn a_client_reads_structures_by_the_definitions_the_server_has() {
         let encodings = json!({"Default Binary": "ns=2;s=geometry_msgs/Pose"});
         assert_eq!(one["encodings"], encodings);
     }
-    // The variables in the order of the mapping, the fields in that of the message.
+    // The variables in the order of the mapping, the fields in the order of the message.
     let below = |node| read(&cell, &["--children", node])["children"].clone();
     assert_eq!(
         below("ns=1;s=UaSpace.2"),

@@ -1,4 +1,5 @@
-//! Parts of messages, structures and converted values, by real peers on both ends and by what UADP carries between them.
+//! Parts of messages, structures and converted values, with real peers on both ends and checks of
+//! the UADP messages between them.
 
 use std::time::Duration;
 
@@ -9,8 +10,8 @@ use uadp::{ExtensionBody, Scalar, Variant};
 const SOON: Duration = Duration::from_secs(30);
 const BOTH: &[Peer] = &[Peer::Ros1, Peer::Python];
 
-/// The same patterns for both ROS, numbered from 100 for what ROS 1 has and from 600 for what ROS 2 has; those of ROS 2
-/// are bound by the types their topics have.
+/// The same patterns for both ROS, numbered from 100 for topics of ROS 1 and from 600 for topics of
+/// ROS 2. The patterns of ROS 2 are bound by the types of their topics.
 const PATTERNS: &str = r#"
 spaces: [{id: 1}, {id: 2}]
 namespaces: {2: urn:test}
@@ -35,12 +36,12 @@ fn twist() -> Value {
     json!({"linear": {"x": 0.25, "y": 1.0, "z": 2.0}, "angular": {"x": 3.0, "y": 4.0, "z": -0.5}})
 }
 
-/// What of it the fields `linear.x` and `angular.z` make.
+/// The message made of the fields `linear.x` and `angular.z`.
 fn turn() -> Value {
     json!({"linear": {"x": 0.25, "y": 0.0, "z": 0.0}, "angular": {"x": 0.0, "y": 0.0, "z": -0.5}})
 }
 
-/// What a robot has of each topic of the patterns.
+/// Returns the parts of a robot's topics that match the patterns: topic, type and value.
 fn robot() -> [(&'static str, &'static str, Value); 6] {
     let joints = "sensor_msgs/JointState";
     let twists = "geometry_msgs/Twist";
@@ -101,7 +102,7 @@ fn scalars(ua: &UaSide, triple: (u16, u16, u16), expected: &[Scalar<'_>]) {
     });
 }
 
-/// What UADP carries of a robot, by the numbers of its values.
+/// Checks the UADP values of a robot, by the numbers of its variables.
 fn carried(ua: &UaSide, space: u16, [elbow, closed, speed, goal, effort, turn]: [u16; 6]) {
     scalars(ua, (space, 2, elbow), &[Scalar::Double(1250.0)]);
     scalars(ua, (space, 2, closed), &[Scalar::Boolean(false)]);
@@ -170,7 +171,8 @@ fn what_patterns_take_of_messages_reaches_the_peers_of_the_other_side() {
     has(&turned, &turn());
 }
 
-/// Somebody subscribed before anything was known of the value: what is sent then is not the whole message.
+/// The subscriber starts before the value is known, so the value sent then is not the whole
+/// message.
 #[test]
 fn a_header_that_is_no_part_of_the_value_is_stamped_by_the_bridge() {
     let Some(cell) = Cell::with(BOTH) else {
@@ -197,7 +199,8 @@ fn a_header_that_is_no_part_of_the_value_is_stamped_by_the_bridge() {
     assert!(stamp(&in_one)["secs"].as_i64() > Some(0));
 }
 
-/// A service whose request and answer are converted, in both ROS; the values of ROS 2 have twenty more.
+/// A service with converted request and response, in both ROS; the numbers for ROS 2 are higher by
+/// twenty.
 const SERVICES: &str = r#"
 spaces: [{id: 1}, {id: 2}]
 namespaces: {2: urn:test}

@@ -1,4 +1,5 @@
-//! Samples of many topics in shared datagrams, as other makers read them and as they come out of the other bridge.
+//! Samples of many topics in shared datagrams, as read by third-party software and as received
+//! through the other bridge.
 
 use std::collections::{BTreeMap, HashSet};
 use std::fmt::Write as _;
@@ -14,14 +15,15 @@ use uadp::{DataSetMessage, NetworkMessage};
 const SOON: Duration = Duration::from_secs(30);
 const FIRST: u64 = 10;
 const TOPICS: u64 = 20;
-/// What each topic says. All of it fits the receive buffer a system grants by default, should a listener be late.
+/// Number of samples per topic. All of them fit into a system's default receive buffer if a
+/// listener is late.
 const TICKS: u64 = 12;
-/// What each topic says as fast as its sender can.
+/// Number of samples per topic that are sent as fast as possible.
 const BURST: u64 = 20;
-/// None may give way to another.
+/// A queue in which no sample replaces another.
 const EVENTS: &str = "{drop_oldest: 1000}";
 
-/// Texts of ROS 2, with that rule for their queues.
+/// Writes a mapping of texts of ROS 2 with that rule for their queues.
 fn mapping(cell: &Cell, queue: &str) -> String {
     let mut text = "spaces: [{id: 1}, {id: 2}]\nnamespaces: {2: urn:plant:line}\n\
                     pubsub: {messages_per_datagram: 32}\nvariables:\n"
@@ -37,7 +39,7 @@ fn mapping(cell: &Cell, queue: &str) -> String {
     path.to_string_lossy().into_owned()
 }
 
-/// Sends stamped texts on all topics at once, every 10 ms; which number was the first.
+/// Sends stamped texts on all topics at once, every 10 ms. Returns the first number.
 fn send(pacer: &mut Child, ticks: u64) -> u64 {
     send_every(pacer, ticks, Duration::from_millis(10))
 }
@@ -60,7 +62,7 @@ fn number(text: &str) -> Option<u64> {
     Stamp::of(text.as_bytes()).map(|stamp| stamp.number)
 }
 
-/// What asyncua heard of each topic so far: writer, and numbers in their order.
+/// Returns the samples that asyncua received so far: writer, and numbers in their order.
 fn heard(listener: &Child) -> BTreeMap<u64, Vec<u64>> {
     let mut heard: BTreeMap<u64, Vec<u64>> = BTreeMap::new();
     for line in listener.json_lines() {
@@ -138,7 +140,7 @@ fn a_state_that_waits_to_share_a_datagram_gives_way_to_no_newer_one() {
         let topics: HashSet<u16> = crossed.iter().map(|one| one.0).collect();
         (topics.len() == all).then_some(())
     });
-    // As fast as the sender can, so that several of a topic come before the bridge looks.
+    // As fast as possible, so that several samples of a topic arrive before the bridge polls.
     let first = send_every(&mut pacer, BURST, Duration::ZERO);
     eventually("the last sample of each", SOON, || {
         crossed.extend(waiting(&group).iter().flat_map(|one| texts(one)));
@@ -151,7 +153,7 @@ fn a_state_that_waits_to_share_a_datagram_gives_way_to_no_newer_one() {
     assert_eq!((since_first, number_of(&status, "overflow")), (sent, 0));
 }
 
-/// The DataSetWriterId and the number of each text.
+/// Returns the DataSetWriterId and the number of each text.
 fn texts(datagram: &[u8]) -> Vec<(u16, u64)> {
     let message = NetworkMessage::decode(datagram).unwrap();
     let messages = message.messages().flatten();
@@ -162,12 +164,12 @@ fn texts(datagram: &[u8]) -> Vec<(u16, u64)> {
     messages.filter_map(stamped).collect()
 }
 
-/// The datagrams that have come.
+/// Returns the waiting datagrams.
 fn waiting(group: &UadpSocket) -> Vec<Vec<u8>> {
     std::iter::from_fn(|| group.receive(Duration::from_millis(1))).collect()
 }
 
-/// The DataSetWriterIds of its messages, of which an announcement has none.
+/// Returns the DataSetWriterIds of the messages; an announcement has none.
 fn ids(datagram: &[u8]) -> Vec<u16> {
     let message = NetworkMessage::decode(datagram).unwrap();
     let messages = message.messages().flatten();

@@ -1,4 +1,4 @@
-//! The mappings that no make of robot has a test for: each runs against what it is for.
+//! The shipped mappings without a robot-specific test, each with the systems it is made for.
 
 use std::time::Duration;
 
@@ -13,7 +13,7 @@ fn shipped(name: &str) -> String {
     format!("{FOLDER}/{name}")
 }
 
-/// Waits until the robot has heard the value on the topic.
+/// Waits until the robot has received the value on the topic.
 fn hears(robot: &mut Child, topic: &str, expected: Value) {
     robot.wait_for_json(&format!("{topic} is {expected}"), SOON, |line| {
         (line["heard"] == topic && line["value"] == expected).then_some(())
@@ -50,7 +50,7 @@ fn every_value_of_the_assembly_line_reaches_all_sides() {
     }
     hears(&mut niryo, "/park/busy", json!(true));
     hears(&mut niryo, "/bucket/busy", json!(false));
-    // What an OPC UA client calls, and a node of ROS 2, the robot executes.
+    // The robot executes calls of an OPC UA client and of a ROS 2 node.
     let _server = cell.ua_server(&[&mapping]);
     let args = [SERVER_ENDPOINT, "UaSpace/Calls/Conveyor/Switch"];
     let args = [&args[..], &["--value", "[true]"]].concat();

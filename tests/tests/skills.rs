@@ -1,4 +1,4 @@
-//! A component as clients of other makers see it: asyncua and node-opcua call its skills, which they know as Programs only.
+//! A component with third-party clients: asyncua and node-opcua call its skills as plain Programs.
 
 use std::fs;
 use std::path::Path;
@@ -19,7 +19,8 @@ const FAULTS_TOLD: &str = concat!(
     "/../plant/skills/tests/faults.txt"
 );
 
-/// A skill that goes on until it is halted, one that is done at once, and one that must be told where to.
+/// A component with a skill that runs until it is halted, a skill that completes at once, and a
+/// skill with a target parameter.
 const COMPONENT: &str = "
 component: bench
 application_uri: urn:ua-bridge:system-tests:component
@@ -30,7 +31,7 @@ skills:
   - {name: Move, type: PtpMoveSkillType, driver: simulated}
 ";
 
-/// Transition, its node, from, to: by number, as OPC 10000-10 has them.
+/// Transition, its node, and its from and to states, with the numbers of OPC 10000-10.
 const TRANSITIONS: [(&str, &str, &str, &str); 9] = [
     ("HaltedToReady", "i=2408", "Halted", "Ready"),
     ("ReadyToRunning", "i=2410", "Ready", "Running"),
@@ -85,7 +86,7 @@ fn a_client_with_a_queue_sees_each_state_of_runs_that_are_over_at_once() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
     };
-    // Several runs begin and end within one sampling interval of the client.
+    // Several runs start and end within a sampling interval of the client.
     let yaml = COMPONENT.replace("50 ms", "1 ms");
     let _component = component(&cell.file("component.yaml", &yaml));
     let lines = cell.asyncua_once("opcua_skill.py", &[ENDPOINT, "quick"]);
@@ -126,7 +127,7 @@ fn a_client_that_names_types_of_events_is_told_of_transitions_or_of_none() {
         client
     };
     let base_model_change = listening("i=2132");
-    // Those of skills are a subtype of ProgramTransitionEventType.
+    // Transitions of skills are a subtype of ProgramTransitionEventType.
     let transitions = listening("i=2378");
     let told = |client: &Child| -> Vec<Value> {
         let lines = client.json_lines().into_iter();
@@ -146,7 +147,8 @@ fn a_client_that_names_types_of_events_is_told_of_transitions_or_of_none() {
     assert_eq!(told(&base_model_change), Vec::<Value>::new());
 }
 
-/// Each state with each method, each transition with its numbers, and a run to its end, as a client saw them.
+/// Checks each state with each method, each transition with its numbers, and a run to its end, as
+/// seen by a client.
 #[expect(clippy::too_many_lines, reason = "one walk through all states")]
 fn assert_is_whole(lines: &[Value]) {
     let cells: Vec<&Value> = lines
@@ -270,7 +272,7 @@ fn a_run_begun_in_one_call_is_told_of_by_its_number_to_another_session() {
     let _component = component(&cell.file("component.yaml", COMPONENT));
     let lines = cell.asyncua_once("opcua_skill.py", &[ENDPOINT, "execute"]);
     let of = |what: &str| line_of(&lines, what);
-    // What is wrong with a call leaves a Halted skill Halted.
+    // Invalid calls leave a Halted skill Halted.
     for (what, status) in [
         ("uneven", "BadInvalidArgument"),
         ("wrong", "BadTypeMismatch"),
@@ -278,7 +280,7 @@ fn a_run_begun_in_one_call_is_told_of_by_its_number_to_another_session() {
         let told = (&of(what)["status"], &of(what)["state"]);
         assert_eq!(told, (&json!(status), &json!("Halted")), "{what}");
     }
-    // Arrays without an element are arrays of that type too.
+    // Empty arrays have the right type, too.
     assert_eq!(of("without")["status"], json!("Good"));
     let outcome = &of("outcome")["outcome"];
     let (ended, succeeded, message) = (&outcome[0], &outcome[1], &outcome[2]);
@@ -302,7 +304,8 @@ fn a_run_begun_in_one_call_is_told_of_by_its_number_to_another_session() {
         )
     );
 
-    // The first session has the lease of what it did, by a lock or without one, until it gives it back.
+    // The first session has the lease of the skill it uses, with or without a lock, until it
+    // releases it.
     assert_eq!(of("lock")["other"], json!("BadLocked"));
     assert_eq!(of("lock")["locked"], json!(false));
     let locked = of("locked");
@@ -394,7 +397,7 @@ fn a_yaml_with_faults_is_refused_with_all_of_them() {
     }
 }
 
-/// A simulator of a device, and where it says that it is.
+/// Starts a simulator of a device, and returns its address.
 fn simulator(args: &[&str]) -> (Child, String) {
     let child = Started::new("ua-component", &program("ua-component"))
         .args(["simulate"])
@@ -503,7 +506,7 @@ fn a_simulated_robot_and_its_tool_changer_are_what_clients_of_other_makers_expec
     let (_robot, _) = simulator(&["universal-robot"]);
     let dock = "3@0.4,0,0.5,0,0,1.5";
     let (_changer, at) = simulator(&["kelvin-tool-changer", "--tool", dock]);
-    // The flange stands in that dock, turned by more than the ring needs: the tool is locked.
+    // The flange is in that dock and turned by more than the ring needs, so the tool is locked.
     let seen = eventually("the tool is locked", SOON, || {
         let seen = cell.asyncua_once("device_registers.py", &["converter", &at]);
         (seen[0]["volts"] == json!(7.4)).then_some(seen)
@@ -531,7 +534,7 @@ fn a_simulated_robot_and_its_tool_changer_are_what_clients_of_other_makers_expec
     let half = (std::f64::consts::FRAC_PI_2 * 1e4).round() / 1e4;
     assert_eq!(moved["pose"], json!([0.2, 0.1, 0.4, 0.0, half, 0.0]));
     assert!(moved["fastest"].as_f64() <= Some(0.2505), "{moved}");
-    // The turn is longer than the way: pi/2 rad, 0.25 s to gain the speed, 0.25 s to lose it.
+    // The turn takes longer than the path: pi/2 rad, 0.25 s to accelerate, 0.25 s to decelerate.
     let seconds = |what: &str| line_of(&seen, what)["seconds"].as_f64().unwrap();
     let expected = std::f64::consts::FRAC_PI_2 / 0.25 + 0.25;
     assert!((seconds("moved") - expected).abs() < 0.5, "{moved}");

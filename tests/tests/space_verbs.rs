@@ -1,4 +1,5 @@
-//! `ua-space` beside programs that run: what it lists, echoes and measures of a bridge, and a skill it finds and starts.
+//! `ua-space` with running programs: it lists, echoes and measures values of a bridge, and finds
+//! and starts a skill.
 
 use std::path::Path;
 use std::time::Duration;
@@ -9,7 +10,7 @@ use system_tests::{Capture, Cell, METRICS_ROS1, Peer, Started, UadpSocket, event
 const SOON: Duration = Duration::from_secs(30);
 const TWIST: &str = "geometry_msgs/Twist";
 
-/// Exit code and output of `ua-space` in the cell's network.
+/// Runs `ua-space` in the cell's network. Returns the exit code and the output.
 fn ua_space(words: &[&str]) -> (i32, Vec<String>) {
     let mut child = Started::new("ua-space", &program("ua-space"))
         .args(words)
@@ -162,7 +163,7 @@ fn a_skill_of_a_component_is_found_and_run_to_its_result() {
     );
 }
 
-/// What bash offers for the last word of a line, with the script that it is given.
+/// Returns the completions of bash for the last word of a line, with the script of `ua-space`.
 fn completed(line: &[&str]) -> Vec<String> {
     let words: Vec<String> = line.iter().map(|word| format!("'{word}'")).collect();
     let ua_space = program("ua-space");
@@ -226,7 +227,7 @@ fn skills_of_two_components_are_told_run_watched_and_completed_by_their_names() 
     eventually("it says how they are", SOON, || {
         (events(&watch, "state").len() >= 2).then_some(())
     });
-    // Both are Halted: they are made ready first.
+    // Both skills are Halted: they are reset first.
     for name in names {
         let (code, lines) = ua_space(&["skills", "start", name, "Force=9", "--json"]);
         assert_eq!(code, 0, "{lines:?}");
@@ -247,7 +248,7 @@ fn skills_of_two_components_are_told_run_watched_and_completed_by_their_names() 
         )
     );
     let run = &result["run"];
-    // The last state may come after the result.
+    // The last state may arrive after the result.
     eventually("its states are watched", SOON, || {
         let states = events(&watch, "state");
         let states: Vec<&str> = states

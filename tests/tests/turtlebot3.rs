@@ -1,4 +1,5 @@
-//! `mappings/turtlebot3.yaml` against a TurtleBot3 as its DDS domain shows it: every topic by its real name and type.
+//! `mappings/turtlebot3.yaml` with the DDS domain of a TurtleBot3: every topic by its real name and
+//! type.
 
 use std::time::Duration;
 
@@ -77,7 +78,7 @@ fn what_a_turtlebot3_shows_reaches_the_space_as_typed_values() {
     });
 }
 
-/// Drives until the robot moves, and gives what it was told.
+/// Sends velocities until the robot moves, and returns the velocity that the robot received.
 fn drive(robot: &mut Child, side: &mut UaSide) -> Value {
     let velocity = [0.25, 0.0, 0.0, 0.0, 0.0, -0.5].map(Scalar::Double);
     system_tests::eventually("the robot is told a velocity", SOON, || {

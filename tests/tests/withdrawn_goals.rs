@@ -1,5 +1,5 @@
-//! Goals that are withdrawn before their action server, of rclpy, has decided about them: each way to withdraw one ends with
-//! the goal cancelled on acceptance, and nothing is reported as halted before.
+//! Goals that are withdrawn before their action server, of rclpy, has decided about them. In each
+//! case the goal is cancelled on acceptance, and nothing is reported as halted before.
 
 use std::time::Duration;
 
@@ -20,7 +20,7 @@ calls:
 ";
 const COMPONENT_METRICS: &str = "127.0.0.1:9105";
 
-/// A server that needs so many seconds to decide about a goal.
+/// Starts a server that needs this many seconds to decide about a goal.
 fn server(cell: &Cell, action: &str, seconds: &str) -> Child {
     let args = ["serve", action, "--decides-after", seconds];
     let server = cell.rclpy_started(Distribution::Kilted, "ros2_rclpy_action.py", &args);
@@ -33,7 +33,7 @@ fn asked(server: &mut Child, order: i32) {
     });
 }
 
-/// The goal was accepted, and cancelled before it did anything else.
+/// Checks that the goal was accepted and cancelled before it did anything else.
 fn cancelled(server: &mut Child, order: i32) {
     let worked = server.wait_for_json("the goal ends", SOON, |line| {
         (line.get("worked")? == order).then(|| line.clone())
@@ -56,7 +56,7 @@ fn event(child: &mut Child, event: &str) -> Value {
     })
 }
 
-/// What `/status` shows of pending cancellations.
+/// Returns the pending cancellations in `/status`.
 fn pending(address: &str) -> Vec<Value> {
     let status = metrics(address).unwrap_or_default();
     let lines = status["cancellations_pending"].as_array();
@@ -84,7 +84,7 @@ fn the_time_of_the_mapping_and_ctrl_c_cancel_a_goal_on_acceptance() {
     cancelled(&mut hasty, 100);
     assert_eq!(pending(METRICS_ROS2), Vec::<Value>::new());
 
-    // Ctrl-C waits for the end.
+    // Ctrl-C waits for the end of the goal.
     let mut call_of_patient = call(&["Patient", "order=102"]);
     asked(&mut patient, 102);
     call_of_patient.signal(Signal::SIGINT);
@@ -93,7 +93,7 @@ fn the_time_of_the_mapping_and_ctrl_c_cancel_a_goal_on_acceptance() {
     call_of_patient.wait_for_end(SOON);
     cancelled(&mut patient, 102);
 
-    // A second one leaves, and the goal is cancelled all the same.
+    // A second Ctrl-C ends the program, and the goal is still cancelled.
     let mut call_of_patient = call(&["Patient", "order=104"]);
     asked(&mut patient, 104);
     call_of_patient.signal(Signal::SIGINT);
@@ -183,7 +183,7 @@ skills:
     );
     run.wait_for_end(SOON);
 
-    // The end of the component halts its skills, and waits for that.
+    // The end of the component halts its skills and waits for their end.
     reset("Leaving");
     let _run = call(&["arm.Leaving"]);
     asked(&mut patient, 204);

@@ -1,4 +1,4 @@
-//! Every kind of action server driven by every kind of action client, with goals that end in every way.
+//! Every kind of action server with every kind of action client, and goals that end in every way.
 
 use std::time::Duration;
 
@@ -7,12 +7,12 @@ use system_tests::{Cell, Child, Distribution, Peer};
 
 use crate::call_matrix::{mapping, rows_of_page};
 
-/// rospy and rclpy need seconds to start on a busy machine.
+/// The time that rospy and rclpy need to start on a busy machine.
 const SOON: Duration = Duration::from_secs(60);
 const TYPE: &str = "test_msgs/Fibonacci";
 const RCLPY: &str = "ros2_rclpy_action.py";
 
-/// Who sends goals.
+/// The kinds of action clients.
 #[derive(Clone, Copy)]
 enum Sending {
     SimpleActionClient,
@@ -37,7 +37,7 @@ impl Sending {
         }
     }
 
-    /// A client of an action, which has found its server.
+    /// Starts a client of an action and waits until it has found its server.
     fn client(self, cell: &Cell, action: &str) -> Client {
         let of_ros1 = |args: &[&str]| cell.rospy_started("calls/actionlib_client.py", args);
         let started = match self {
@@ -59,7 +59,7 @@ impl Sending {
     }
 }
 
-/// Somebody who serves an action.
+/// An action server.
 struct Serving {
     name: &'static str,
     action: &'static str,
@@ -73,7 +73,7 @@ struct Client {
     sent: u64,
 }
 
-/// How a goal has ended, and with which numbers.
+/// The end of a goal, and the numbers of its result.
 #[derive(Debug, PartialEq)]
 enum End {
     Rejected,
@@ -97,7 +97,7 @@ impl Client {
         });
     }
 
-    /// Waits until a goal has reported these numbers.
+    /// Waits until the feedback of a goal has these numbers.
     fn reported(&mut self, goal: u64, numbers: &Value) {
         self.child.wait_for_json("feedback", SOON, |line| {
             let told = match self.of_ros1 {
@@ -133,7 +133,7 @@ impl Client {
         })
     }
 
-    /// A letter for each way in which a goal ended as its server says it does.
+    /// Returns a letter for each way in which a goal ended as its server intends.
     fn seen(&mut self) -> String {
         let of = |status: &str, numbers: Value| End::Of(status.to_owned(), numbers);
         let mut seen = String::new();

@@ -4,23 +4,23 @@ use std::time::Duration;
 
 use system_tests::{Cell, Child, Distribution, Peer, Started, eventually, program};
 
-/// rospy and rclpy need seconds to start on a busy machine.
+/// The time that rospy and rclpy need to start on a busy machine.
 const SOON: Duration = Duration::from_secs(60);
 const SECTION: &str = "### Three examples to paste\n";
 
 /// An example of the page.
 #[derive(Default)]
 struct Example {
-    /// Files by name.
+    /// The files: name and text.
     files: Vec<(String, String)>,
     commands: Vec<Command>,
-    /// What the last command prints.
+    /// The expected output of the last command.
     prints: String,
 }
 
 struct Command {
     words: Vec<String>,
-    /// What has to be set up where it runs.
+    /// The setup that the command needs, from the comment behind it.
     place: String,
 }
 
@@ -33,7 +33,7 @@ impl Command {
         }
     }
 
-    /// The program, in its place and in the folder with the files.
+    /// Returns the program in its environment and in the folder with the files.
     fn started(&self, cell: &Cell) -> Started {
         let (name, args) = self.words.split_first().unwrap();
         let ros1 = self.place.starts_with("ROS 1");
@@ -62,14 +62,14 @@ impl Command {
     }
 }
 
-/// The example with that mapping.
+/// Returns the example with this mapping.
 fn example(mapping: &str) -> Example {
     let page = concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/calls.md");
     let page = std::fs::read_to_string(page).unwrap();
     let (_, section) = page.split_once(SECTION).expect("the page has the section");
     let (section, _) = section.split_once("\n## ").unwrap_or((section, ""));
     let mut example = Example::default();
-    // Of what is between fences every second one is a block.
+    // Of the texts between fences, every second text is a block.
     for block in section.split("```").skip(1).step_by(2) {
         let (language, text) = block.split_once('\n').unwrap();
         match language {
@@ -91,7 +91,8 @@ fn example(mapping: &str) -> Example {
     panic!("docs/calls.md has no example with {mapping}");
 }
 
-/// Runs one with `others` in place of what the reader has, and with a roscore where it says so.
+/// Runs an example. `others` replaces the programs of the reader; a roscore is started where the
+/// example says so.
 fn runs(example: &Example, others: impl FnOnce(&Cell) -> Option<Child>) {
     let Some(cell) = Cell::with(&[Peer::Ros1, Peer::Ros2, Peer::Python]) else {
         return;
@@ -108,11 +109,12 @@ fn runs(example: &Example, others: impl FnOnce(&Cell) -> Option<Child>) {
             false => command.started(&cell).start(),
         });
     }
-    // What it asks for may not be there at once.
+    // The called service may not be available at once.
     eventually("the last one ends well", SOON, || {
         let mut asker = last.started(&cell).start();
         asker.wait_for_end(SOON).success().then(|| {
-            // What it printed may be read after its end, and libraries say things of their own.
+            // The output may be read after the end of the process, and libraries print lines of
+            // their own.
             let wanted = example.prints.trim_end();
             eventually(wanted, SOON, || {
                 asker

@@ -1,4 +1,4 @@
-//! A wall clock that jumps.
+//! Wall clocks that jump.
 
 use std::time::Duration;
 
@@ -11,7 +11,7 @@ const GRIPPER: &str = concat!(
     env!("CARGO_MANIFEST_DIR"),
     "/../examples/plant/parallel-gripper.yaml"
 );
-/// As the script that runs skills has it.
+/// The ApplicationUri that the script for skills uses.
 const GRIPPER_URI: &str = "urn:ua-bridge:system-tests:component";
 const ENDPOINT: &str = "opc.tcp://127.0.0.1:4842/";
 const SERVER: &str = "opc.tcp://127.0.0.1:4841/";
@@ -26,7 +26,7 @@ server:
   security: [None]
 ";
 const SETPOINT: &str = "ns=2;i=30";
-/// CurrentState of the gripper's first skill.
+/// NodeId of CurrentState of the gripper's first skill.
 const GRASP: &str = "ns=1;i=101";
 const START_TIME: &str = "ns=0;i=2257";
 const CURRENT_TIME: &str = "ns=0;i=2258";
@@ -38,12 +38,12 @@ fn read(cell: &Cell, server: &str, node: &str) -> String {
     read["value"].as_str().unwrap().to_owned()
 }
 
-/// The hour of the day in a time as asyncua tells it.
+/// Returns the hour of the day of a time as printed by asyncua.
 fn hour(time: &str) -> i64 {
     time[11..13].parse().unwrap()
 }
 
-/// Waits until all of these are announced once more.
+/// Waits until all of these servers are announced again.
 fn announced_again(names: &[&str]) {
     let socket = group_member(MDNS);
     let wait = Duration::from_millis(100);
@@ -63,7 +63,7 @@ fn announced_again(names: &[&str]) {
     }
 }
 
-/// The server is in the hour that is so many seconds ahead.
+/// Checks that the server's clock shows the hour `ahead` seconds after the present.
 fn tells_a_time(cell: &Cell, server: &str, ahead: i64) {
     let of_day = i64::try_from(now().as_secs()).unwrap() + ahead;
     let told = hour(&read(cell, server, CURRENT_TIME));
@@ -84,7 +84,7 @@ fn setpoint_is_told(cell: &Cell, subscriber: &mut Child, value: f64) {
     });
 }
 
-/// A run of the skill, of which whoever watches sees that it begins in this hour, and that it ends.
+/// Runs the skill and checks that the watcher sees it start in this hour, and sees it end.
 fn run_is_told(cell: &Cell, watching: &mut Child) {
     let begun = cell.asyncua_once("opcua_skill.py", &[ENDPOINT, "begin"]);
     assert_eq!(begun[0]["status"], "Good");

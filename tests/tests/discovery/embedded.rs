@@ -1,4 +1,4 @@
-//! A discovery server within another program, where no `ua-lds` runs.
+//! A discovery server inside another program, where no `ua-lds` runs.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -22,7 +22,7 @@ fn component(yaml: &str) -> Child {
         .start()
 }
 
-/// A server that registers at the port of the discovery server, and nothing else.
+/// Starts a server that only registers at the port of the discovery server.
 fn quiet() -> Child {
     who(&["announce", "quiet", "--lds", LDS])
 }
@@ -33,7 +33,8 @@ fn uris(lines: &[Value]) -> Vec<String> {
         .collect()
 }
 
-/// Asks asyncua for the registered servers until these are all but the discovery server itself. Gives what it said then.
+/// Polls with asyncua until these are all registered servers except the discovery server itself.
+/// Returns the lines of that poll.
 fn listed(cell: &Cell, what: &str, deadline: Duration, wanted: &[&str]) -> Vec<Value> {
     eventually(what, deadline, || {
         let lines = cell.asyncua_try("opcua_discovery.py", &["find", LDS])?;
@@ -43,7 +44,7 @@ fn listed(cell: &Cell, what: &str, deadline: Duration, wanted: &[&str]) -> Vec<V
     })
 }
 
-/// What the discovery server is called.
+/// Returns the name of the discovery server.
 fn called(lines: &[Value]) -> String {
     let all = list(lines, "registered").iter();
     let mut itself = all.filter(|server| {
@@ -94,8 +95,8 @@ fn the_first_component_of_a_host_is_its_discovery_server_and_the_next_one_when_i
     assert!(!embeds(&second), "one is enough: {second}");
     let mut second = second;
     first.signal(Signal::SIGKILL);
-    // Promised for a second or two; the rest is for a loaded machine. Starting asyncua takes
-    // seconds there, and is no part of it.
+    // The promised time is a second or two; the rest is for a loaded machine. The start of asyncua
+    // takes seconds on such a machine and is not included.
     let promised = Duration::from_secs(5);
     second.wait_for_line(TAKES_OVER, promised);
     second.wait_for_line(&format!("registered uri=\"{QUIET}\""), promised);
@@ -145,7 +146,7 @@ fn many_servers_that_may_embed_agree_on_one() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
     };
-    // More than the discovery server holds connections to from one address.
+    // More connections than the discovery server keeps from a single address.
     let many = who(&[
         "announce",
         "many",

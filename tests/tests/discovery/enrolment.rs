@@ -1,4 +1,5 @@
-//! A plant that is set up by one command a program: `ua-gds` invites, each program gets its certificate and trusts the others.
+//! A plant that is set up with a single command per program: `ua-gds` invites, and each program
+//! gets its certificate and trusts the others.
 
 use std::fs;
 use std::path::Path;
@@ -14,7 +15,7 @@ const GDS: &str = "opc.tcp://127.0.0.1:4841";
 const SERVER: &str = "opc.tcp://127.0.0.1:4858";
 const STATION_STATUS: &str = "127.0.0.1:9105";
 const COMPONENT_STATUS: &str = "127.0.0.1:9106";
-/// For programs that make keys and restart on a machine that has much else to do.
+/// Timeout of programs that make keys and restart on a loaded machine.
 const LATER: Duration = Duration::from_secs(90);
 
 struct Site {
@@ -40,7 +41,7 @@ impl Site {
         }
     }
 
-    /// A verb of an administrator.
+    /// Runs a command of an administrator.
     fn administrator(&self, verb: &[&str]) -> String {
         run(&[verb, &["--pki", &self.pki]].concat())
     }
@@ -60,12 +61,12 @@ fn run(args: &[&str]) -> String {
     String::from_utf8(done.stdout).unwrap().trim().to_owned()
 }
 
-/// The certificate that a program shows in its status.
+/// Returns the certificate in a program's status.
 fn certificate(status: &str) -> Option<Value> {
     Some(metrics(status)?["certificate"].clone())
 }
 
-/// The program answers between its restarts.
+/// Waits until the program has a certificate of the plant; the program restarts meanwhile.
 fn has_the_plants(status: &str) -> Value {
     let what = format!("{status} has a certificate of the plant");
     let shown = eventually(&what, LATER, || {
@@ -94,7 +95,7 @@ fn component(site: &Site, invitation: &str) -> Child {
         .start()
 }
 
-/// Knows the Global Discovery Server by its certificate, and has no token.
+/// Starts a station that knows the Global Discovery Server by its certificate and has no token.
 fn station(site: &Site) -> Child {
     let invitation = site.invitation("nobody");
     let (pinned, _token) = invitation.split_once(",token=").unwrap();
@@ -148,7 +149,7 @@ fn programs_that_are_invited_trust_one_another_and_others_wait_for_an_administra
         has_the_plants(status);
     }
     let station_uri = has_the_plants(STATION_STATUS)["application_uri"].clone();
-    // Registrations go over secured channels alone, so each side trusts the other.
+    // Registrations need secured channels, so both sides trust each other.
     for uri in ["urn:ua-bridge:server", station_uri.as_str().unwrap()] {
         eventually(&format!("{uri} is registered"), LATER, || registered(uri));
     }
@@ -159,7 +160,7 @@ fn programs_that_are_invited_trust_one_another_and_others_wait_for_an_administra
             .find(|uri| **uri == json!("urn:example:gripper"))
             .cloned()
     });
-    // The status gives a stranger no reason.
+    // The status hides the reason from strangers.
     let pairs = site.store("pairs");
     let _made = site
         .cell
@@ -173,7 +174,7 @@ fn programs_that_are_invited_trust_one_another_and_others_wait_for_an_administra
         tried[0]["connected"], "BadSecurityChecksFailed",
         "{tried:?}"
     );
-    // Neither log nor store has a secret.
+    // Neither the log nor the store contains a secret.
     let (_, token) = invitation.rsplit_once("token=").unwrap();
     let (_, secret) = token.split_once('-').unwrap();
     for lines in [

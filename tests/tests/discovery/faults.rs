@@ -1,4 +1,4 @@
-//! What goes wrong in a plant: programs that stop, cables that are cut, names that two have, hosts that nobody knows.
+//! Faults in a plant: programs that hang, cut cables, duplicate names, unknown hosts.
 
 use std::io::ErrorKind;
 use std::net::{Shutdown, SocketAddr, TcpListener, TcpStream};
@@ -29,7 +29,7 @@ fn a_program_that_hangs_is_missed_in_three_seconds_and_back_when_it_goes_on() {
     let before = now();
     gripper.signal(Signal::SIGSTOP);
     let gone = told(&mut watch, "gone", "gripper");
-    // Its host goes on to take connections.
+    // The host of the program still accepts connections.
     assert_eq!(gone["loss"], "hanging");
     assert!(after(before, &gone) < 4000, "{gone}, stopped at {before:?}");
     eventually("the discovery server misses it", SOON, || {
@@ -82,7 +82,7 @@ fn two_hosts_that_announce_one_name_are_told_apart() {
     let cable = cell.cable();
     cable.lay(HERE);
     let mut watch = who(&["watch", "--interface", WIRE]);
-    // One host name, one port, one name: as images of one disk have them.
+    // Equal host names, ports and server names, as hosts cloned from the same disk image have them.
     let port = ["--port", "4850"];
     let _here = who(&[&["announce", "arm", "--address", HERE][..], &port].concat());
     let _there = who_started(&[&["announce", "arm", "--address", THERE][..], &port].concat())
@@ -97,13 +97,13 @@ fn two_hosts_that_announce_one_name_are_told_apart() {
         };
         (here != there && (here.ends_with(" (2)") || there.ends_with(" (2)"))).then_some(())
     });
-    // And it stays so.
+    // The name stays.
     watch.wait_for_json("the one with the number", SOON, |line| {
         line["name"].as_str()?.ends_with(" (2)").then_some(())
     });
 }
 
-/// The name under which a server was seen last, and not lost since.
+/// Returns the last reported name of a server that has not been lost since.
 fn last_name(watch: &Child, url: &str) -> Option<String> {
     let lines = watch.json_lines();
     let mut of_it = lines.iter().filter(|line| line["url"] == url);
@@ -141,7 +141,7 @@ fn a_name_that_two_want_and_a_host_that_nobody_knows_disturb_no_other() {
     gripper.signal(Signal::SIGKILL);
     let gone = told(&mut watch, "gone", "gripper");
     assert!(after(before, &gone) < 2500, "{gone}, killed at {before:?}");
-    // Nobody can say that it is gone, either.
+    // The loss of the server at an unknown host cannot be detected, so it stays registered.
     assert!(registered("urn:nowhere").is_some());
 }
 
@@ -217,7 +217,7 @@ fn a_discovery_server_that_stood_still_holds_that_against_nobody() {
     let since = registered("urn:who:gripper").unwrap()["since_ms"].clone();
     for _ in 0..3 {
         server.signal(Signal::SIGSTOP);
-        // As long as a registration counts, and twice as long as a silence may take.
+        // As long as a registration is valid, and twice the timeout of a silent server.
         std::thread::sleep(Duration::from_secs(5));
         server.signal(Signal::SIGCONT);
         eventually("it goes on", SOON, || metrics(STATUS));
@@ -228,7 +228,7 @@ fn a_discovery_server_that_stood_still_holds_that_against_nobody() {
     assert_eq!(number(&metrics(STATUS).unwrap(), "lost_total"), 0);
 }
 
-/// One more of a line that was there already.
+/// Waits for another line of an event that was reported before.
 fn told_again(watch: &mut Child, found: &str, name: &str) -> Value {
     let of_it = |line: &&Value| {
         let its = line["name"].as_str();
@@ -241,7 +241,7 @@ fn told_again(watch: &mut Child, found: &str, name: &str) -> Value {
     })
 }
 
-/// A program in front of others that can be put behind each other.
+/// A proxy that can be switched between several programs.
 struct Switch {
     url: String,
     port: Arc<AtomicU16>,
@@ -277,13 +277,13 @@ impl Switch {
         }
     }
 
-    /// What is open breaks off.
+    /// Switches to another port. Open connections are closed.
     fn turn(&self, port: u16) {
         self.port.store(port, Ordering::Relaxed);
     }
 }
 
-/// Carries bytes both ways until one side closes, or the switch is turned.
+/// Carries bytes both ways until a side closes its connection, or the proxy is switched.
 fn carry(near: &TcpStream, wanted: &AtomicU16) {
     let port = wanted.load(Ordering::Relaxed);
     let Ok(far) = TcpStream::connect(("127.0.0.1", port)) else {
@@ -313,7 +313,7 @@ fn carry(near: &TcpStream, wanted: &AtomicU16) {
                         Err(_) => break,
                     }
                 }
-                // One may be closed already.
+                // A stream may be closed already.
                 drop(from.shutdown(Shutdown::Both));
                 drop(to.shutdown(Shutdown::Both));
             });

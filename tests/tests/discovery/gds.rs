@@ -1,5 +1,5 @@
-//! The Global Discovery Server: asyncua registers applications and has certificates issued, which another library looks at; people
-//! make, issue, revoke and list with `ua-gds ca`.
+//! The Global Discovery Server: asyncua registers applications and requests certificates, which
+//! another library checks. Administrators create, issue, revoke and list with `ua-gds ca`.
 
 use std::fs;
 use std::path::Path;
@@ -13,7 +13,7 @@ use super::SOON;
 
 const GDS: &str = "opc.tcp://127.0.0.1:4841";
 const PASSWORD: &str = "correct horse";
-/// For a script of a peer on a machine that has much else to do.
+/// Timeout of a peer's script on a loaded machine.
 const LATER: Duration = Duration::from_secs(40);
 const URI: &str = "urn:ua-bridge:system-tests:robot";
 
@@ -22,7 +22,7 @@ struct Site {
     gds: Child,
 }
 
-/// A server with an authority, a user `sara` who says who may do what, and a client that it trusts.
+/// Starts a server with an authority, an administrator `sara`, and a trusted client.
 fn site() -> Option<Site> {
     let cell = Cell::with(&[Peer::Python])?;
     let pki = cell.folder().join("gds");
@@ -65,7 +65,7 @@ fn text(bytes: &[u8]) -> String {
     String::from_utf8_lossy(bytes).into_owned()
 }
 
-/// A verb of a program about the store of the server.
+/// Runs a command of a program on the store of the server.
 fn run(cell: &Cell, name: &str, args: &[&str]) -> Output {
     let pki = cell.folder().join("gds");
     let mut command = Command::new(program(name));
@@ -118,7 +118,7 @@ fn applications_are_registered_found_changed_and_queried() {
         json!([["Robot 2", "opc.tcp://robot.cell:4840", ["DA"]]])
     );
     assert_eq!(said["gone"], "BadNotFound");
-    // Who may not: over a channel that others can read, an operator, and one without a name.
+    // Refused: a client of an unencrypted channel, an operator, and an anonymous user.
     let strangers = [
         (&["--way", "None"][..], "BadSecurityModeInsufficient"),
         (
@@ -172,7 +172,8 @@ fn a_certificate_is_issued_used_renewed_by_its_owner_and_revoked() {
     assert_eq!(said["revoked"], json!([true, false]));
     assert_eq!(said["status_revoked"], "BadCertificateRevoked");
     assert_eq!(said["list_lives"], true);
-    // With what was issued the application is let in without being known, and does for itself what sara did.
+    // With its issued certificate, the application is admitted and has the rights for itself that
+    // sara has.
     let robot = ["--client", "robot", "--application-uri", URI];
     let itself = site.asked("itself", &robot);
     assert_eq!(itself["connected"], "Good", "{itself}");
@@ -180,9 +181,9 @@ fn a_certificate_is_issued_used_renewed_by_its_owner_and_revoked() {
     assert_eq!(itself["other_host"], "BadInvalidArgument");
     assert_eq!(itself["trusted"], 1);
     assert!(itself["renewed"].is_string());
-    // People see what was issued, and revoke.
+    // Administrators list the issued certificates and revoke them.
     let listed = told(&site.cell, &["ca", "list"]);
-    // Beside the three of the robot that of the server itself.
+    // Three certificates of the robot and the certificate of the server itself.
     assert_eq!(listed.lines().count(), 4, "{listed}");
     assert_eq!(listed.matches("REVOKED").count(), 1, "{listed}");
     let certificate = pairs(&site.cell).join("robot_certificate.der");
@@ -190,7 +191,7 @@ fn a_certificate_is_issued_used_renewed_by_its_owner_and_revoked() {
     let folder = pairs(&site.cell);
     let args = [&["itself", GDS, path(&folder)], &robot[..]].concat();
     eventually("the application is let in no longer", LATER, || {
-        // One that is cut off in the midst of what it asks tells nothing.
+        // A script whose connection is closed prints nothing.
         let said = site.cell.asyncua_try("opcua_gds.py", &args)?.remove(0);
         (said["connected"] != "Good").then_some(())
     });
@@ -199,7 +200,8 @@ fn a_certificate_is_issued_used_renewed_by_its_owner_and_revoked() {
 #[test]
 fn whom_the_authority_issued_a_certificate_is_let_in_while_nothing_is_revoked() {
     let Some(site) = site() else { return };
-    // The list of the authority came into the store of the server when this started, and not once since.
+    // The authority's revocation list entered the server's store at the start of the server, and
+    // was never replaced.
     let [key, out] = ["robot_key.pem", "robot_certificate.der"];
     let [key, out] = [key, out].map(|name| pairs(&site.cell).join(name));
     let args = ["ca", "issue", "--application-uri", URI];
@@ -257,7 +259,8 @@ fn people_issue_certificates_for_requests_and_with_keys() {
     );
 }
 
-/// Nine days old, and over in one: as a server that was set up and left alone has it one day.
+/// A certificate that is nine days old and expires in a day, as in a server that was set up and
+/// left alone.
 #[test]
 fn a_server_has_its_certificate_renewed_before_it_is_over_and_hears_what_is_revoked() {
     let Some(site) = site() else { return };
@@ -286,7 +289,7 @@ fn a_server_has_its_certificate_renewed_before_it_is_over_and_hears_what_is_revo
     trust(&cell.folder().join("gds/own/cert.der"), &pki);
     let mapping = cell.file("cell.yaml", &format!("server: {{endpoint: '{server}'}}\n"));
     let mut child = cell.ua_server(&[path(&mapping), "--gds", GDS]);
-    // Whom nobody knows is not given anything.
+    // An unknown application receives no certificate.
     child.wait_for_line("waits for an administrator", LATER);
     let issuers = || {
         let said = cell.asyncua_try("opcua_access.py", &["endpoints", server])?;

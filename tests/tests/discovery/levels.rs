@@ -1,4 +1,5 @@
-//! A plant of two levels: a cell, two workstations, two devices each. Each level is a network of its own.
+//! A plant of two levels: a cell, two workstations, two devices each. Each level is a separate
+//! network.
 
 use std::collections::BTreeSet;
 use std::net::{Ipv4Addr, UdpSocket};
@@ -12,17 +13,17 @@ use system_tests::{
 
 use super::{MDNS, SOON, STATUS, list};
 
-/// The level of the cell, and that of each workstation.
+/// Network prefixes of the cell's level and of each workstation's level.
 const BUS: &str = "10.80.0";
 const INSIDE: [&str; 2] = ["10.81.0", "10.82.0"];
 
 struct Plant {
-    /// A network lasts as long as this.
+    /// Keeps the network alive.
     _bus: Segment,
-    /// Of each workstation: the network, the host of the station, those of its devices.
+    /// For each workstation: the network, the station's host, and the hosts of its devices.
     stations: [(Segment, Site, [Site; 2]); 2],
     cell: Site,
-    /// Hears all that is multicast on the bus and in each workstation.
+    /// Sockets that receive all mDNS traffic on the bus and in each workstation.
     ears: [(Site, UdpSocket); 3],
 }
 
@@ -109,7 +110,7 @@ fn station(plant: &Plant, at: usize, more: &[&str]) -> Child {
         .start()
 }
 
-/// A gripper of ours, which looks for the discovery server of its level.
+/// Starts a `ua-component` gripper, which finds the discovery server of its level.
 fn gripper(plant: &Plant, at: usize) -> Child {
     let example = std::path::Path::new(env!("CARGO_MANIFEST_DIR"))
         .join("../examples/plant/parallel-gripper.yaml");
@@ -128,7 +129,7 @@ fn gripper(plant: &Plant, at: usize) -> Child {
         .start()
 }
 
-/// A device of asyncua, which is told where the discovery server is.
+/// Starts an asyncua device that is configured with the address of the discovery server.
 fn device(cell: &Cell, plant: &Plant, at: usize) -> Child {
     let endpoint = format!("opc.tcp://{}.22:4850/", INSIDE[at]);
     let lds = format!("opc.tcp://{}.1:4840", INSIDE[at]);
@@ -139,7 +140,7 @@ fn device(cell: &Cell, plant: &Plant, at: usize) -> Child {
         .start()
 }
 
-/// What a station knows.
+/// Returns the status of a station.
 fn status(site: &Site) -> Option<Value> {
     site.within(|| metrics(STATUS))
 }
@@ -159,7 +160,7 @@ fn place(site: &Site, name: &str) -> Option<String> {
     below(site, name)?["place"].as_str().map(str::to_owned)
 }
 
-/// The answer of asyncua, run at a site, that calls a method.
+/// Calls a method with asyncua from a site, and returns the answer.
 fn call(cell: &Cell, site: &Site, url: &str, path: &str, value: &str) -> Value {
     let args = [url, path, "--value", value];
     let mut asked = cell
@@ -170,7 +171,7 @@ fn call(cell: &Cell, site: &Site, url: &str, path: &str, value: &str) -> Value {
     asked.json_lines().pop().unwrap()
 }
 
-/// Addresses in the records of mDNS that an ear has heard.
+/// Returns the addresses in the mDNS records that an ear received.
 fn told(cell: &Cell, (_, ear): &(Site, UdpSocket)) -> BTreeSet<String> {
     let mut packets = Vec::new();
     let mut buffer = [0; 9000];
@@ -186,7 +187,7 @@ fn told(cell: &Cell, (_, ear): &(Site, UdpSocket)) -> BTreeSet<String> {
         .collect()
 }
 
-/// The configuration phase: from the top down, whoever comes first.
+/// The configuration phase: from the top down, in order of arrival.
 fn are_configured(plant: &Plant, adders: &mut [Child; 2]) {
     let [a, b] = [0, 1].map(|at| &plant.stations[at].1);
     for (at, site) in [a, b].into_iter().enumerate() {
@@ -236,7 +237,8 @@ fn a_device_calls_a_device_of_another_workstation_and_no_level_sees_another() {
         let [on_a, on_b] = [seen(a, "station-b")?, seen(b, "station-a")?];
         (on_a > 10 && on_b > 10).then_some(())
     });
-    // A device on A asks the discovery server of its own level, finds B's server there, and calls its method.
+    // A device on A queries the discovery server of its level, finds B's server there, and calls
+    // its method.
     let device_on_a = &plant.stations[0].2[1];
     let lds = format!("opc.tcp://{}.1:4840", INSIDE[0]);
     let found = cell.asyncua_started("opcua_discovery.py", &["find", &lds]);
@@ -265,7 +267,8 @@ fn a_device_calls_a_device_of_another_workstation_and_no_level_sees_another() {
     );
     let wrong = call(&cell, device_on_a, url, path, r#"[{"String": "x"}, 4.0]"#);
     assert_eq!(wrong["status"], "BadInvalidArgument", "{wrong}");
-    // What means something at that server alone is not passed on, and says so.
+    // A method with arguments that are only meaningful at its own server is not passed on, and is
+    // counted.
     assert_eq!(below(b, "adder-b").unwrap()["methods_kept_back"], 1);
     let networks = [BUS, INSIDE[0], INSIDE[1]];
     for (ear, network) in plant.ears.iter().zip(networks) {
@@ -276,7 +279,7 @@ fn a_device_calls_a_device_of_another_workstation_and_no_level_sees_another() {
             "{network}: {addresses:?}"
         );
     }
-    // A device that is killed is missed where its methods were, and one that is back is there again.
+    // A killed device is reported lost at the level of its methods, and a restarted device returns.
     adders[1].signal(Signal::SIGKILL);
     let before = Instant::now();
     eventually("it is missed below", SOON, || {
@@ -299,10 +302,10 @@ fn a_device_calls_a_device_of_another_workstation_and_no_level_sees_another() {
     });
 }
 
-/// Where methods are called from above on the first workstation.
+/// The endpoint of the first workstation for calls from the upper level.
 const UPPER: &str = "opc.tcp://10.80.0.11:4870";
 
-/// An asyncua client that calls a method and keeps its session until it is told to leave.
+/// Starts an asyncua client that calls a method and keeps its session until it is ordered to leave.
 fn holding(cell: &Cell, site: &Site, path: &str, value: &str) -> Child {
     let args = [UPPER, path, "--value", value, "--hold", "--patience", "20"];
     let client = cell.asyncua_started("opcua_call.py", &args);
@@ -315,7 +318,7 @@ fn answer(client: &mut Child) -> Value {
     })
 }
 
-/// The URIs of the servers that the discovery server of a level lists.
+/// Returns whether the discovery server of a level lists the server with this URI.
 fn listed(site: &Site, uri: &str) -> bool {
     let status = status(site);
     let servers = status
@@ -350,7 +353,8 @@ fn a_device_that_serves_one_request_at_a_time_is_called_for_long_and_keeps_its_p
     });
     let held = json!({"status": "Good", "arguments": [], "value": [7.0]});
     assert_eq!(answer(&mut caller), held);
-    // A StatusCode arrives as the device has it: BadOutOfMemory beside what is wrong with an argument, and Uncertain.
+    // A StatusCode arrives as the device sent it: BadOutOfMemory besides an invalid argument, and
+    // Uncertain.
     for (code, name) in [
         (0x8003_0000_u32, "BadOutOfMemory"),
         (0x4000_0000, "Uncertain"),
@@ -369,7 +373,7 @@ fn a_device_that_serves_one_request_at_a_time_is_called_for_long_and_keeps_its_p
         let told = other.json_lines().pop().unwrap();
         assert_eq!(told, json!({"status": name, "value": [1.5]}));
     }
-    // Another device of the level calls it.
+    // Another device of the level calls the method directly.
     let url = format!("opc.tcp://{}.22:4850/", INSIDE[0]);
     let args = [&*url, "device/Hold", "--value", "[7.0]", "--patience", "20"];
     let direct = cell.asyncua_started("opcua_call.py", &args);
@@ -380,7 +384,7 @@ fn a_device_that_serves_one_request_at_a_time_is_called_for_long_and_keeps_its_p
         std::thread::yield_now();
     }
     assert_eq!(below(site, "adder-a").unwrap()["methods"], before);
-    // A host that is gone is noticed in the middle of a call.
+    // The loss of a host is detected during a call.
     let mut caller = holding(&cell, &plant.cell, path, "[30.0]");
     eventually("it holds again", SOON, || {
         let lines = adder.json_lines();
@@ -449,7 +453,7 @@ fn only_the_supervisor_configures_a_component_and_a_station() {
     assert_eq!(shown, "plant/cell-1/station-a");
 }
 
-/// Trusts a certificate, or takes up a revocation list, in a store.
+/// Adds a certificate or a revocation list to the trust list of a store.
 fn trust(cell: &Cell, store: &str, what: &str) {
     let told = std::process::Command::new(program("ua-server"))
         .args(["trust", what, "--pki"])
@@ -459,7 +463,7 @@ fn trust(cell: &Cell, store: &str, what: &str) {
     assert!(told.status.success(), "{told:?}");
 }
 
-/// Makes the user otto, an operator, in a store.
+/// Creates the user otto, an operator, in a store.
 fn operator(cell: &Cell, store: &str) {
     let password = cell.file("password", &format!("{PASSWORD}\n"));
     let made = std::process::Command::new(program("ua-server"))
@@ -473,7 +477,7 @@ fn operator(cell: &Cell, store: &str) {
 
 const PASSWORD: &str = "correct horse battery";
 
-/// A gripper of ours over secured channels alone, with a store of its own.
+/// Starts a `ua-component` gripper with secured channels only and a separate store.
 fn secured_gripper(cell: &Cell, site: &Site) -> Child {
     let example = std::path::Path::new(env!("CARGO_MANIFEST_DIR"))
         .join("../examples/plant/parallel-gripper.yaml");
@@ -491,16 +495,16 @@ fn secured_gripper(cell: &Cell, site: &Site) -> Child {
         .start()
 }
 
-/// A workstation that talks over secured channels alone, and hosts above and below it.
+/// A workstation with secured channels only, and hosts above and below it.
 struct Guarded {
     _networks: [Segment; 2],
     station: Site,
     above: Site,
     devices: [Site; 2],
     supervisor: Child,
-    /// The pairs of devices; it trusts the authority of most of them.
+    /// The folder with the key pairs of devices; most are issued by a trusted authority.
     pairs: String,
-    /// Where methods are called from above.
+    /// The endpoint for calls from the upper level.
     top: String,
 }
 
@@ -541,7 +545,7 @@ fn guarded(cell: &Cell) -> Guarded {
 }
 
 impl Guarded {
-    /// A device of asyncua with a pair, which registers with another or the same.
+    /// Starts an asyncua device with a key pair, which registers with the same or another pair.
     fn device(&self, cell: &Cell, name: &str, uri: &str, (pair, registers): (&str, &str)) -> Child {
         let port = 4850 + name.len();
         let endpoint = format!("opc.tcp://{}.22:{port}/", INSIDE[0]);
@@ -562,7 +566,7 @@ fn over_secured_channels_a_device_is_configured_and_called_and_one_that_is_not_t
     };
     let mut plant = guarded(&cell);
     let uri = "urn:ua-bridge:system-tests:plc";
-    // A device of asyncua, whose certificate is of the authority.
+    // An asyncua device whose certificate is issued by the authority.
     let mut adder = plant.device(&cell, "adder", uri, ("sound", "sound"));
     let told = adder.wait_for_json("its place", SOON * 3, |line| {
         line["place"].is_string().then(|| line.clone())
@@ -570,7 +574,8 @@ fn over_secured_channels_a_device_is_configured_and_called_and_one_that_is_not_t
     assert_eq!(told["place"], "plant/cell-1/adder");
     let shown = below(&plant.station, "adder").unwrap();
     assert_eq!(shown["secured"], true, "{shown}");
-    // Its method is called from above over a secured channel. A certificate that is trusted is no role.
+    // Its method is called from the upper level over a secured channel. A trusted certificate does
+    // not grant a role.
     let path = "Devices/adder/device/Add";
     let args = [&*plant.top, path, "--value", "[2.5, 4.0]"];
     let secured = [
@@ -596,7 +601,7 @@ fn over_secured_channels_a_device_is_configured_and_called_and_one_that_is_not_t
         sum,
         json!({"status": "Good", "arguments": [], "value": [6.5]})
     );
-    // One that registers with a certificate that is trusted, and shows another.
+    // A device that registers with a trusted certificate and presents another certificate.
     let another = format!("{uri}:another");
     let mut stranger = plant.device(&cell, "stranger", &another, ("stranger", "impostor"));
     let refused = eventually("the stranger is refused", SOON * 3, || {
@@ -611,7 +616,7 @@ fn over_secured_channels_a_device_is_configured_and_called_and_one_that_is_not_t
     plant.supervisor.wait_for_line(line, SOON);
     let lines = stranger.json_lines();
     assert!(lines.iter().all(|line| line.get("place").is_none()));
-    // What the station says is to be typed mends it.
+    // The command suggested by the station solves the problem.
     let (_, command) = why.rsplit_once("`ua-server trust ").unwrap();
     let (digits, _) = command.split_once(' ').unwrap();
     trust(&cell, "station-pki", digits);

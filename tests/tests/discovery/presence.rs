@@ -1,4 +1,4 @@
-//! Who is there as values of the space.
+//! Presence of servers as values of the space.
 
 use std::time::Duration;
 
@@ -31,7 +31,8 @@ fn heard(node: &mut Child, online: bool) -> Value {
     })
 }
 
-/// Milliseconds from an instant of this process to what a message tells in seconds.
+/// Returns the milliseconds from an instant of this process to the time of a message, given in
+/// seconds.
 fn after(since: Duration, seconds: &Value) -> f64 {
     (seconds.as_f64().unwrap() - since.as_secs_f64()) * 1000.0
 }
@@ -87,7 +88,7 @@ fn a_component_is_a_value_of_the_space_that_tells_within_two_seconds_that_it_die
     );
     assert_eq!(gone["uri"], "urn:example:gripper");
     assert_eq!(read("Online"), false);
-    // It comes back at another port, and is the same value again.
+    // The gripper restarts at another port and is the same value again.
     let _again = gripper(&cell);
     rospy.wait_for_json("another run of the gripper", SOON, |line| {
         let value = line.get("value")?;

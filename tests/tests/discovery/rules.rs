@@ -1,4 +1,5 @@
-//! What a discovery server owes whoever registers with it (OPC 10000-4, 5.5 and OPC 10000-12, 4), both ways round.
+//! Duties of a discovery server towards registering servers (OPC 10000-4, 5.5 and OPC 10000-12, 4),
+//! in both directions.
 
 use nix::sys::signal::Signal;
 use serde_json::{Value, json};
@@ -9,7 +10,7 @@ use super::{Greeter, LDS, SOON, STATUS, announced, lds, list, on_network, regist
 const NODE: &str = "opc.tcp://127.0.0.1:4843";
 const CLIENT_URI: &str = "urn:ua-bridge:system-tests:client";
 
-/// One registration by asyncua: its answer.
+/// Registers with asyncua once and returns the answer.
 fn register(cell: &Cell, args: &[&str]) -> Value {
     let all = [&["register", LDS][..], args].concat();
     cell.asyncua_once("opcua_discovery.py", &all).remove(0)
@@ -69,7 +70,7 @@ fn each_fault_of_a_registration_has_its_status_and_bounds_are_kept() {
         ),
     ] {
         let answer = register(&cell, &args);
-        // asyncua writes one of them as the standard's tables once did.
+        // asyncua spells a name as in an earlier version of the standard's tables.
         let told = answer["status"]
             .as_str()
             .unwrap()
@@ -143,7 +144,7 @@ fn records_on_the_network_rise_and_are_found_by_all_their_capabilities_in_any_ca
     assert!(find(&["--capability=DA", "--capability=LDS"]).is_empty());
     let second = all[1].1.to_string();
     assert_eq!(of(find(&["--start", &second])), ["leg"], "from that on");
-    // Another place is another record, and no number comes twice.
+    // Another address makes another record, and no record number is repeated.
     let (_moved, moved) = listener();
     named("arm", &moved, &["DA", "AC"]);
     let again = find(&[]);
@@ -242,11 +243,11 @@ fn ours_registers_with_node_opcua_over_a_secured_channel_once_that_is_trusted() 
     is_listed(&mut node, false);
 }
 
-/// A certificate store with a pair.
+/// Makes a certificate store with a key pair.
 fn store(cell: &Cell) -> std::path::PathBuf {
     let made = cell.folder().join("client");
     let secured = ["--security", "Basic256Sha256", "--certificates"];
-    // It makes its pair before it finds that there is no such channel.
+    // The script creates its pair before it finds that there is no such channel.
     let all = [&["find", LDS][..], &secured, &[made.to_str().unwrap()]].concat();
     drop(cell.asyncua_try("opcua_discovery.py", &all));
     let pki = cell.folder().join("gripper-pki");
@@ -262,7 +263,7 @@ fn store(cell: &Cell) -> std::path::PathBuf {
     pki
 }
 
-/// Waits until node-opcua lists ours, or no longer.
+/// Waits until node-opcua lists our server, or does not list it.
 fn is_listed(node: &mut Child, wanted: bool) {
     let what = format!("node-opcua lists the gripper: {wanted}");
     node.wait_for_json(&what, SOON * 2, |line| {

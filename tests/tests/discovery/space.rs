@@ -1,4 +1,5 @@
-//! Bridges say what they are, in the group and by mDNS, and `ua-space list` shows the whole space without configuration.
+//! Bridges describe themselves in the group and by mDNS, and `ua-space list` shows the whole space
+//! without configuration.
 
 use std::net::UdpSocket;
 use std::time::Duration;
@@ -35,7 +36,7 @@ fn listed() -> Value {
     serde_json::from_str(object.unwrap_or_else(|| panic!("{lines:?}"))).unwrap()
 }
 
-/// The one of a list of which that holds.
+/// Returns the first element of a list whose `key` is `value`.
 fn one<'v>(all: &'v Value, key: &str, value: &Value) -> Option<&'v Value> {
     all.as_array()?.iter().find(|one| one[key] == *value)
 }
@@ -147,7 +148,7 @@ fn the_whole_space_is_listed_without_configuration_and_tshark_reads_what_was_sai
     });
 }
 
-/// Waits for an mDNS packet of which that holds, as tshark reads it.
+/// Waits for an mDNS packet that satisfies `is_it`, as tshark prints it.
 fn packets_until(cell: &Cell, socket: &UdpSocket, is_it: impl Fn(&str) -> bool) {
     let fields = [
         "dns.resp.name",

@@ -8,7 +8,7 @@ use uadp::{NetworkMessage, PublisherId, SecurityHeader, discovery};
 
 use crate::dissector::messages::assert_shown;
 
-/// The bytes of `uadp/tests/action/vectors.txt` by name.
+/// Reads the bytes of `uadp/tests/action/vectors.txt` by name.
 fn vectors() -> Vec<(String, Vec<u8>)> {
     let file = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../uadp/tests/action/vectors.txt");
     let text = std::fs::read_to_string(file).unwrap();
@@ -162,7 +162,7 @@ fn what_our_reader_refuses_of_an_action_is_malformed() {
     assert!(counts.iter().all(|count| *count > 100), "{counts:?}");
 }
 
-/// Whether our reader refuses an Action message; `None` for what is none, or not to be read.
+/// Returns whether our reader refuses an Action message; `None` for other or unreadable messages.
 fn refused(datagram: &[u8]) -> Option<bool> {
     let message = NetworkMessage::decode(datagram).ok()?;
     if !message.is_action() || message.is_sealed() || message.is_chunk() {
@@ -174,7 +174,7 @@ fn refused(datagram: &[u8]) -> Option<bool> {
     for action in actions {
         let fields = match action {
             Ok(action) => action.fields,
-            // Shown as what it is, not as malformed.
+            // The dissector shows such a message as it is, not as malformed.
             Err(uadp::DecodeError::Misread(_)) => return None,
             Err(_) => return Some(true),
         };

@@ -34,7 +34,7 @@ pub(crate) fn numbered(sequence_number: u16) -> DataSetHeader {
     }
 }
 
-/// A message of `ua_2_5_10` that `write` writes the DataSetMessages of.
+/// Encodes a message of `ua_2_5_10` whose DataSetMessages are written by `write`.
 pub(crate) fn message(write: impl FnOnce(&mut NetworkMessageEncoder<'_>)) -> Vec<u8> {
     let mut datagram = Vec::new();
     let mut encoder =
@@ -44,7 +44,7 @@ pub(crate) fn message(write: impl FnOnce(&mut NetworkMessageEncoder<'_>)) -> Vec
     datagram
 }
 
-/// A key frame of `ua_2_5_10` with sequence number 3.
+/// Encodes a key frame of `ua_2_5_10` with sequence number 3.
 pub(crate) fn key_frame(write: impl FnOnce(&mut FieldEncoder<'_>)) -> Vec<u8> {
     message(|encoder| {
         let mut fields = encoder.key_frame(&numbered(3)).unwrap();
@@ -535,7 +535,7 @@ fn chunks_in_any_order_become_one_message() {
     let chunk = |number| Vector::load(&format!("composite_chunk_{number}")).datagram;
     let capture = Capture::of([chunk(1), chunk(2), chunk(1), chunk(0)]);
     let expected: Vec<u8> = (0_u16..600).map(|i| (i * 3).to_le_bytes()[0]).collect();
-    // Once as the packets come, once as they are shown again.
+    // In the first pass of tshark, and in the second pass over the same packets.
     for passes in [&[][..], &["-2"]] {
         let shown = cell.dissect(&capture, passes);
         let whole = &shown[3];
@@ -590,7 +590,7 @@ fn an_announcement_names_its_fields_chunked_or_not() {
     let (head, body) = whole.split_at(11);
     let chunks = body.chunks(100).enumerate().map(|(number, piece)| {
         let mut datagram = head.to_vec();
-        // ExtendedFlags2: a chunk of an announcement.
+        // ExtendedFlags2 marks a chunk of an announcement.
         datagram[2] |= 1;
         datagram.extend(7_u16.to_le_bytes());
         datagram.extend(u32::try_from(number * 100).unwrap().to_le_bytes());
@@ -621,17 +621,18 @@ fn an_announcement_names_its_fields_chunked_or_not() {
     }
 }
 
-/// Described DataTypes in front of the name of DataSetMetaData, one of each kind, and one field with a property.
+/// DataSetMetaData with described DataTypes before its name, a DataType of each kind, and a field
+/// with a property.
 const SCHEMA: &str = concat!(
     "919108ba080000000000000201000a00", // announcement 1: DataSetMetaData of DataSetWriterId 10
     "01000000050000007572 6e3a78",      // Namespaces: urn:x
     "0100000001010a00 0100020000005054", // StructureDataTypes: ns=1;i=10, 1:PT
-    "01010b00 0016 00000000 01000000",  // its encoding, base type and kind; one field
+    "01010b00 0016 00000000 01000000",  // its encoding, base type and kind; a field
     "0100000078 00 000b ffffffff 01000000 02000000 00000000 00", // x, Double, dimensions [2]
-    "0100000001010c00 01000100000045 01000000", // EnumDataTypes: 1:E with one field
+    "0100000001010c00 01000100000045 01000000", // EnumDataTypes: 1:E with a field
     "0500000000000000 02 02000000 6f6e 00 02000000 6f6e 06", // 5, on
     "0100000001010d00 01000100000053 000c 0c", // SimpleDataTypes: 1:S, a String
-    "0400000063656c6c 00 01000000",     // Name: cell; one field
+    "0400000063656c6c 00 01000000",     // Name: cell; a field
     "01000000 76 00 0000 0b 000b ffffffff ffffffff 00000000", // v, Double
     "01000000000000000000000000000000", // DataSetFieldId
     "01000000 0000 01000000 75 0c 01000000 43", // Properties: 0:u = "C"

@@ -1,4 +1,5 @@
-//! The Wireshark dissector in `docs/wireshark`: tshark has to show what was sent, and to point at what is wrong.
+//! The Wireshark dissector in `docs/wireshark`: tshark has to show the message that was sent, and
+//! to report errors in it.
 
 mod actions;
 mod messages;
@@ -10,10 +11,10 @@ mod wrong;
 use system_tests::{Capture, Cell, Dissected, Peer};
 use vectors::Vector;
 
-/// A chunk that is wrong only to who knows what was meant: its bytes are those of another one that is right.
+/// A chunk that is wrong only in its context: its bytes are equal to the bytes of a valid chunk.
 const LOOKS_RIGHT: &str = "asyncua_chunk";
 
-/// tshark's view of one datagram.
+/// Returns tshark's view of a datagram.
 fn dissected(cell: &Cell, datagram: &[u8]) -> Dissected {
     cell.dissect(&Capture::of([datagram]), &[]).remove(0)
 }

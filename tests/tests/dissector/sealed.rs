@@ -1,4 +1,4 @@
-//! What this project's own writers secure and split.
+//! Messages secured and split by this project's own writers.
 
 use system_tests::{Capture, Cell, Peer, hex};
 use uadp::{
@@ -16,7 +16,7 @@ fn sealer(mode: SecurityMode) -> Sealer {
     sealer
 }
 
-/// A key frame of `ua_2_5_10` with sequence number 3 and one Double.
+/// Encodes a sealed key frame of `ua_2_5_10` with sequence number 3 and a Double.
 fn sealed(sealer: &mut Sealer) -> Vec<u8> {
     let mut datagram = Vec::new();
     let seal = sealer.seal([0xA1, 0xA2, 0xA3, 0xA4]).unwrap();

@@ -1,7 +1,7 @@
-//! Times as Wireshark and the vectors write them.
+//! Timestamps in the notations of Wireshark and of the vectors.
 
-/// DateTime ticks, 100 ns since 1601, of "May 17, 2026 12:34:56.789012300 UTC" (Wireshark 4.0) or of an ISO 8601 text
-/// in UTC.
+/// Returns DateTime ticks, 100 ns since 1601, of "May 17, 2026 12:34:56.789012300 UTC" (Wireshark
+/// 4.0) or of an ISO 8601 text in UTC.
 pub(crate) fn ticks(text: &str) -> i64 {
     let words: Vec<&str> = text
         .split([' ', ',', '-', 'T', 'Z', ':', '.'])
@@ -28,7 +28,7 @@ fn number(digits: &str) -> i64 {
     digits.parse().unwrap()
 }
 
-/// Days from 1601-01-01 on, the first of a cycle of 400 years.
+/// Returns the days since 1601-01-01, the first day of a cycle of 400 years.
 fn days(year: i64, month: i64, day: i64) -> i64 {
     let past = year - 1601;
     let leap = year % 4 == 0 && (year % 100 != 0 || year % 400 == 0);

@@ -1,4 +1,4 @@
-//! What the JSON beside a vector says has to be what tshark shows of its datagram.
+//! Compares tshark's view of the vectors' datagrams with the JSON description of each vector.
 
 use std::path::PathBuf;
 
@@ -37,7 +37,7 @@ impl Vector {
         !self.json["malformed"].is_null()
     }
 
-    /// Everything that is shown differently from what the JSON says.
+    /// Returns the differences between tshark's view and the JSON.
     pub(crate) fn differences(&self, shown: &Dissected) -> Vec<String> {
         let mut check = Check {
             name: &self.name,
@@ -91,7 +91,7 @@ impl Check<'_> {
         }
     }
 
-    /// A number or text of the JSON, which may be null or left out.
+    /// Compares a number or text of the JSON, which may be null or missing.
     fn optional(&mut self, field: &str, expected: &Value, shown: &Dissected) {
         let expected: Vec<String> = plain(expected).into_iter().collect();
         self.same(field, &shown.all(field), &expected);
@@ -111,7 +111,7 @@ impl Check<'_> {
         if let Some(id) = json["publisherId"].as_object() {
             let types = ["Byte", "UInt16", "UInt32", "UInt64", "String"];
             let of_type = types.iter().position(|name| id["type"] == *name).unwrap();
-            // Without ExtendedFlags1 it is a Byte.
+            // Without ExtendedFlags1, the PublisherId is a Byte.
             let shown_type = shown.one("uadp.publisher_id.type");
             self.same(
                 "publisher_id.type",
@@ -202,7 +202,7 @@ impl Check<'_> {
         self.same(field, &shown.all(field), &sequence);
     }
 
-    /// Hex digits of the JSON.
+    /// Compares bytes with hex digits of the JSON.
     fn bytes(&mut self, field: &str, expected: Option<&str>, shown: &Dissected) {
         let expected: Vec<String> = expected
             .map(|digits| hex(&unhex(digits)))
@@ -297,7 +297,7 @@ impl Check<'_> {
     fn messages(&mut self, vector: &Vector, shown: &Dissected) {
         let expected = vector.json["dataSetMessages"].as_array();
         let expected: Vec<&Value> = expected.into_iter().flatten().collect();
-        // A reassembled message is described by the chunks, not as a message of its own.
+        // A reassembled message is described by its chunks and has no description itself.
         if !vector.json["chunk"].is_null() {
             return;
         }
@@ -385,12 +385,12 @@ impl Check<'_> {
         }
     }
 
-    /// A value of the JSON, `{"UaType": .., "Value": ..}`; `{}` is the null Variant.
+    /// Compares a value of the JSON, `{"UaType": .., "Value": ..}`; `{}` is the null Variant.
     fn variant(&mut self, json: &Value, shown: &Dissected) {
         let Some(builtin) = json["UaType"].as_u64() else {
             return;
         };
-        // Only the item's own: values inside of the value have types too.
+        // Only the type of the item itself: nested values have types, too.
         let encoding = shown.child("uadp.field.variant_encoding_tree").unwrap();
         self.same(
             "type",
@@ -438,11 +438,11 @@ impl Check<'_> {
     fn values(&mut self, builtin: u64, expected: &[&Value], shown: &Dissected) {
         let builtin = BuiltinType::from_id(builtin.try_into().unwrap()).unwrap();
         let field = format!("uadp.field.{}", builtin.name().to_lowercase());
-        // The null ExtensionObject is one without type and body.
+        // The null ExtensionObject has neither type nor body.
         let (nulls, expected): (Vec<&Value>, Vec<&Value>) = expected
             .iter()
             .partition(|json| json.is_null() && builtin != BuiltinType::ExtensionObject);
-        // The JSON does not tell a null array from an empty one.
+        // The JSON does not distinguish a null array from an empty array.
         if !(nulls.is_empty() && expected.is_empty()) {
             let shown_nulls = shown.all("uadp.field.null").len();
             assert_eq!(shown_nulls, nulls.len(), "{}", self.name);
@@ -474,7 +474,7 @@ fn plain(json: &Value) -> Option<String> {
 fn same_value(builtin: BuiltinType, shown: &str, json: &Value) -> bool {
     match builtin {
         BuiltinType::Boolean => json == is_true(shown),
-        // Wireshark writes 15 digits of a Double and 6 of a Float.
+        // Wireshark prints 15 digits of a Double and 6 of a Float.
         BuiltinType::Double => same_number(shown, json, 1e-14),
         BuiltinType::Float => same_number(shown, json, 1e-5),
         BuiltinType::DateTime => ticks(shown) == ticks(json.as_str().unwrap()),
@@ -489,7 +489,7 @@ fn same_value(builtin: BuiltinType, shown: &str, json: &Value) -> bool {
                     json["Name"].as_str().unwrap()
                 )
         }
-        // The bodies of structures are bytes to the dissector.
+        // The dissector shows the bodies of structures as bytes.
         BuiltinType::ExtensionObject => true,
         _ => Some(shown) == plain(json).as_deref(),
     }

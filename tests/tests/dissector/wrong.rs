@@ -1,4 +1,5 @@
-//! Datagrams that are wrong: what is said of them, at which byte, and that nothing makes the dissector fail.
+//! Invalid datagrams: the reported error and its byte, and that no datagram makes the dissector
+//! fail.
 
 use system_tests::{Capture, Cell, Dissected, Peer};
 use uadp::{DecodeError, MessageKind, NetworkMessage, NetworkMessageType, Scalar};
@@ -12,7 +13,7 @@ use crate::dissector::{
 /// PublisherId UInt16 2, WriterGroupId 5, DataSetWriterId 10: 10 bytes.
 const HEADERS: &str = "f1010200010500010a00";
 
-/// Datagrams, the byte that is wrong, and what is said of it.
+/// Datagrams, the position of the wrong byte, and the error.
 const WRONG: &[(&str, usize, &str)] = &[
     ("f2010200010500010a0001", 0, "UADPVersion 2, not 1"),
     ("f1050200", 1, "PublisherId type 5 is reserved"),
@@ -242,7 +243,7 @@ fn values_nested_too_deep_and_too_many_to_show_do_no_harm() {
     assert!(shown.iter().all(|shown| !shown.has("uadp.dissector_bug")));
 }
 
-/// A fixed sequence of numbers that look random (xorshift): a failure can be run again.
+/// A fixed sequence of pseudo-random numbers (xorshift), so that a failure can be reproduced.
 struct Noise(u64);
 
 impl Noise {
@@ -257,7 +258,7 @@ impl Noise {
         u8::try_from(self.below(256)).unwrap()
     }
 
-    /// A datagram with a few bytes changed, cut, put in or taken out.
+    /// Returns a datagram with a few bytes changed, cut, inserted or removed.
     fn damage(&mut self, datagram: &[u8]) -> Vec<u8> {
         let mut damaged = datagram.to_vec();
         let at = self.below(damaged.len());
@@ -275,7 +276,8 @@ impl Noise {
     }
 }
 
-/// What our reader makes of all of a message: `None` where it does not say whether that is malformed.
+/// Returns our reader's result for a whole message; `None` if the reader does not decide whether it
+/// is malformed.
 fn judged(datagram: &[u8]) -> Option<Result<(), DecodeError>> {
     let message = match NetworkMessage::decode(datagram) {
         Ok(message) => message,
@@ -291,7 +293,7 @@ fn judged(datagram: &[u8]) -> Option<Result<(), DecodeError>> {
         }
     }
     if message.is_action() {
-        // Judged where Actions are.
+        // Checked in the module of Actions.
         return None;
     }
     for data_set_message in message.messages() {
@@ -304,7 +306,7 @@ fn judged(datagram: &[u8]) -> Option<Result<(), DecodeError>> {
             }
         });
         match read {
-            // Without payload header, other messages may follow.
+            // Without payload header, further messages may follow.
             Err(DecodeError::TrailingBytes(_)) if message.writer_ids().is_none() => return None,
             Err(error) => return Some(Err(error)),
             Ok(()) => {}

@@ -1,4 +1,4 @@
-//! What is left of topics that came and went, and what very many of them cost.
+//! Leftovers of topics that came and went, and the cost of very many topics.
 
 use serde_json::Value;
 use std::path::Path;
@@ -6,7 +6,7 @@ use system_tests::{Cell, Child, MASTER, Peer, Started, program};
 
 use crate::ros1::support::SOON;
 
-/// More files than a shell usually allows: each topic between two nodes of one process takes two.
+/// More files than a shell usually allows: each topic between two nodes of a process takes two.
 const FILES: &str = "--nofile=8192";
 
 fn crowd(cell: &Cell, args: &[&str]) -> Child {
@@ -25,8 +25,8 @@ fn measured(crowd: &mut Child, what: &str) -> Value {
     line
 }
 
-/// Requirement: topics that come and go leave no thread, no file and no memory behind. Memory may differ by 2 MiB: the
-/// allocator keeps what it had.
+/// Requirement: topics that come and go leave no thread, no file and no memory behind. Memory may
+/// differ by 2 MiB, because the allocator keeps freed memory.
 #[test]
 fn a_hundred_rounds_of_topics_leave_nothing_behind() {
     let Some(cell) = Cell::with(&[Peer::Ros1]) else {
@@ -40,7 +40,7 @@ fn a_hundred_rounds_of_topics_leave_nothing_behind() {
     assert!(crowd.wait_for_end(SOON).success());
     assert_eq!(end["threads"], warm["threads"]);
     let number = |of: &Value, key: &str| of[key].as_u64().unwrap();
-    // The watchdog's call to the master may be under way in either count.
+    // A call of the watchdog to the master may be open during either count.
     assert!(
         number(&end, "files") <= number(&warm, "files") + 2,
         "{warm} {end}"
@@ -51,7 +51,7 @@ fn a_hundred_rounds_of_topics_leave_nothing_behind() {
     );
 }
 
-/// Requirement: a thousand topics need no thread of their own and little memory.
+/// Requirement: a thousand topics need no threads of their own and little memory.
 #[test]
 fn five_hundred_publishers_and_subscribers_live_in_one_small_process() {
     let Some(cell) = Cell::with(&[Peer::Ros1]) else {

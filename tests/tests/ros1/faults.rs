@@ -21,10 +21,10 @@ use tcpros::ConnectionHeader;
 use crate::ros1::support::{Ours, SOON, string, string_type};
 
 const ROS1: &[Peer] = &[Peer::Ros1];
-/// What the master or a peer may take on a busy machine besides what a rule allows.
+/// Time that the master or a peer may need on a busy machine in addition to the time a rule allows.
 const AIR: Duration = Duration::from_secs(2);
 
-/// A connection to a topic, as any peer may make it, and what it got in answer.
+/// Connects to a topic as any peer may, and returns the connection and the answered header.
 fn connect(port: &str, fields: &[(&str, &str)]) -> (TcpStream, ConnectionHeader) {
     let mut stream = TcpStream::connect(port).unwrap();
     stream.set_read_timeout(Some(SOON)).unwrap();
@@ -56,7 +56,8 @@ fn tally(child: &mut Child, least: u64) -> u64 {
     })
 }
 
-/// Requirement: slow peers cost only themselves (own queue in messages and bytes, drop-oldest, counted, write timeout).
+/// Requirement: slow peers affect only themselves (a separate queue, limited in messages and bytes;
+/// oldest messages dropped and counted; write timeout).
 #[test]
 fn a_stalled_subscriber_costs_nobody_else_a_message() {
     let Some(cell) = Cell::with(ROS1) else {
@@ -91,7 +92,8 @@ fn a_stalled_subscriber_costs_nobody_else_a_message() {
     assert_eq!(tally(&mut healthy, sent), sent);
 }
 
-/// Requirement: handshakes stand on their own; a peer that does not fit is told why by an `error=` field.
+/// Requirement: handshakes are independent of each other; a rejected peer gets the reason in an
+/// `error=` field.
 #[test]
 fn peers_that_break_the_handshake_cost_only_themselves() {
     let Some(cell) = Cell::with(ROS1) else {
@@ -162,7 +164,7 @@ fn peers_that_break_the_handshake_cost_only_themselves() {
     assert_eq!(chatter.refused_type().as_deref(), Some("std_msgs/Bool"));
 }
 
-/// What a publisher made by hand does with one connection after its header.
+/// The behaviour of a hand-written publisher after the header of a connection.
 #[derive(Clone, Copy)]
 enum Lie {
     /// Announces 2 GiB.
@@ -175,7 +177,8 @@ enum Lie {
     None,
 }
 
-/// A publisher of `/t` by hand, in the master and on the wire: each connection is treated by the next lie.
+/// A hand-written publisher of `/t` in the master and on the wire: each connection gets the next
+/// lie.
 struct ByHand {
     stop: Arc<AtomicBool>,
     threads: Vec<JoinHandle<()>>,
@@ -206,7 +209,7 @@ impl Drop for ByHand {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Relaxed);
         for thread in self.threads.drain(..) {
-            // One that panicked has failed the test by what it did not serve.
+            // A thread that panicked has already failed the test through the missing service.
             drop(thread.join());
         }
     }
@@ -280,8 +283,8 @@ fn serve(mut stream: TcpStream, lie: Lie) -> Option<TcpStream> {
     matches!(lie, Lie::Huge | Lie::None).then_some(stream)
 }
 
-/// Requirement: what a peer announces is believed only as far as it delivers, and a publisher is asked again for its
-/// address after each failure.
+/// Requirement: an announced length is trusted only as far as the data arrives, and after each
+/// failure the address of the publisher is requested again.
 #[test]
 fn a_publisher_that_lies_or_breaks_off_is_asked_again() {
     let Some(cell) = Cell::with(ROS1) else {
@@ -297,7 +300,7 @@ fn a_publisher_that_lies_or_breaks_off_is_asked_again() {
     assert_eq!(message.peer.caller_id, "/by_hand");
 }
 
-/// The values of `/ua_1_5_10` that reach the group.
+/// Waits until a value of `/ua_1_5_10` reaches the group.
 fn crosses(group: &UadpSocket, value: &str) {
     eventually(&format!("`{value}` is on the group"), SOON, || {
         let datagram = group.receive(Duration::from_millis(100))?;
@@ -324,8 +327,8 @@ fn rospy_pub(cell: &Cell, value: &str, ports: [&str; 2]) -> Child {
     cell.rospy("ros1_pub.py", &args)
 }
 
-/// Requirement: a publisher is tried until the master drops it, with few lines in the log that name the remedy, and is
-/// found again at once under its old address as under a new one.
+/// Requirement: a publisher is retried until the master drops it, with few log lines that name the
+/// remedy, and is found again at once under its old address or a new address.
 #[test]
 fn a_publisher_is_found_again_after_every_kind_of_end() {
     let Some(cell) = Cell::with(ROS1) else {
@@ -369,7 +372,8 @@ fn a_publisher_is_found_again_after_every_kind_of_end() {
     crosses(&group, "third");
 }
 
-/// Requirement: everything is registered again when the master has restarted; links stay and no message is lost.
+/// Requirement: everything is registered again when the master has restarted; links stay and no
+/// message is lost.
 #[test]
 fn twenty_restarts_of_the_master_cost_no_message() {
     const ROUNDS: usize = 20;
@@ -433,7 +437,8 @@ fn twenty_restarts_of_the_master_cost_no_message() {
     assert!(next > 100);
     assert_eq!((out.dropped(), out.subscribers()), (0, 1));
     let api = cell.slave_api("/ours").unwrap();
-    // [topic, bytes, [[connection, bytes, messages, connected]]]: what has been written.
+    // [topic, bytes, [[connection, bytes, messages, connected]]]: the statistics of written
+    // messages.
     let written = xml_rpc(&api, "getBusStats", &["/system_tests"]).unwrap();
     let numbers: Vec<u64> = written
         .split("<i4>")
@@ -444,7 +449,7 @@ fn twenty_restarts_of_the_master_cost_no_message() {
     assert_eq!(tally(&mut tallied, messages), messages);
 }
 
-/// Requirement: a node starts without a master, and takes no harm from one that answers nonsense.
+/// Requirement: a node starts without a master, and tolerates nonsense answers of a master.
 #[test]
 fn a_master_that_answers_nonsense_is_waited_for() {
     let Some(cell) = Cell::with(ROS1) else {
@@ -496,7 +501,8 @@ fn ends_in_time(bridge: &mut Child, when: &str) {
     assert!(took < Duration::from_secs(2) + AIR, "{when}: {took:?}");
 }
 
-/// Requirement: the end of a program leaves nothing in the master, and takes two seconds at most, master or not.
+/// Requirement: an ended program leaves nothing in the master, and its end takes two seconds at
+/// most, with or without a master.
 #[test]
 fn a_bridge_ends_in_time_with_and_without_a_master() {
     let Some(cell) = Cell::with(ROS1) else {
@@ -532,7 +538,7 @@ fn a_bridge_ends_in_time_with_and_without_a_master() {
     bridge.wait_for_line("rosnode cleanup", SOON);
 }
 
-/// Requirement: a program that was killed takes its place again when it is started anew.
+/// Requirement: a killed program replaces its old registrations when it is restarted.
 #[test]
 fn a_bridge_that_was_killed_takes_its_place_again() {
     let Some(cell) = Cell::with(ROS1) else {
@@ -553,7 +559,7 @@ fn a_bridge_that_was_killed_takes_its_place_again() {
     assert!(metrics(METRICS_ROS1).is_some());
 }
 
-/// Requirement: of two nodes of one name the earlier ends and says why.
+/// Requirement: of two nodes with the same name, the earlier node ends and reports the reason.
 #[test]
 fn a_bridge_whose_name_is_taken_ends_and_says_so() {
     let Some(cell) = Cell::with(ROS1) else {
@@ -574,7 +580,7 @@ fn a_bridge_whose_name_is_taken_ends_and_says_so() {
     });
 }
 
-/// A mapping with that many topics of the graph, half of them read and half written.
+/// Returns a mapping with `count` topics of the graph, half of them read and half written.
 fn many_topics(count: usize) -> String {
     let variables: String = (1..=count)
         .map(|n| {
@@ -591,8 +597,8 @@ fn many_topics(count: usize) -> String {
     )
 }
 
-/// Requirement: of two programs of one name that start in the same instant one stays with all it has, and the other ends
-/// and says where it runs.
+/// Requirement: of two programs with the same name that start at the same instant, exactly one
+/// program stays with all its registrations, and the other ends and reports where the first runs.
 #[test]
 fn of_two_bridges_that_start_at_once_exactly_one_stays() {
     let Some(cell) = Cell::with(ROS1) else {
@@ -602,7 +608,7 @@ fn of_two_bridges_that_start_at_once_exactly_one_stays() {
     let mapping = cell.folder().join("many.yaml");
     std::fs::write(&mapping, many_topics(300)).unwrap();
     let mapping = mapping.to_str().unwrap();
-    // The race is lost in some of the rounds only, by a program that loses it.
+    // A faulty program loses the race in some rounds only.
     for _ in 0..3 {
         let mut bridges = ["127.0.0.1:9111", "127.0.0.1:9112"]
             .map(|metrics| cell.bridge_ros1_at(&[mapping], metrics).start());

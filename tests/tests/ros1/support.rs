@@ -12,7 +12,7 @@ use tokio::runtime::{Builder, Runtime};
 
 pub(crate) const SOON: Duration = Duration::from_secs(30);
 
-/// A node and the threads it runs on.
+/// A node and the runtime it runs on.
 pub(crate) struct Ours {
     pub(crate) runtime: Runtime,
     pub(crate) node: Option<Node>,
@@ -23,7 +23,7 @@ impl Ours {
         Self::start_in("/", name)
     }
 
-    /// Starts a node in a namespace. Its threads are in the network of the thread that calls this.
+    /// Starts a node in a namespace. Its threads are in the network of the calling thread.
     pub(crate) fn start_in(namespace: &str, name: &str) -> Self {
         let runtime = Builder::new_multi_thread()
             .worker_threads(2)
@@ -77,7 +77,7 @@ impl Ours {
         }
     }
 
-    /// Ends the node and gives how long that took.
+    /// Shuts the node down and returns the time this took.
     pub(crate) fn end(mut self) -> Duration {
         let started = std::time::Instant::now();
         let node = self.node.take().unwrap();
@@ -86,14 +86,14 @@ impl Ours {
     }
 }
 
-/// A subscription and what comes of it.
+/// A subscription and its received messages.
 pub(crate) struct Heard {
     inbox: Inbox<()>,
     pub(crate) subscription: Subscription,
 }
 
 impl Heard {
-    /// The next message that is there.
+    /// Returns the next waiting message.
     pub(crate) fn try_next(&mut self) -> Option<Message> {
         loop {
             match self.inbox.try_recv()?.1 {
@@ -128,13 +128,13 @@ pub(crate) fn twist_type() -> TopicType {
     }
 }
 
-/// A `std_msgs/String`.
+/// Returns a `std_msgs/String`.
 pub(crate) fn string(text: &str) -> Bytes {
     let length = u32::try_from(text.len()).unwrap();
     [&length.to_le_bytes()[..], text.as_bytes()].concat().into()
 }
 
-/// A `geometry_msgs/Twist` of this forward speed.
+/// Returns a `geometry_msgs/Twist` with this forward speed.
 pub(crate) fn twist(forward: f64) -> Bytes {
     let mut bytes = forward.to_le_bytes().to_vec();
     bytes.resize(48, 0);

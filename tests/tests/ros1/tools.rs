@@ -1,4 +1,4 @@
-//! The tools that come with ROS 1, and roscpp and rosrust nodes, around a node of ours.
+//! The tools of ROS 1, and roscpp and rosrust nodes, with a node of `tcpros`.
 
 use std::{
     sync::Arc,
@@ -17,20 +17,20 @@ const PERIOD: Duration = Duration::from_millis(20);
 const RECORDED: u8 = 10;
 const TRIPS: u32 = 50;
 
-/// Publishes a `Twist` fifty times a second, its forward speed counting up.
+/// Publishes a `Twist` fifty times a second, with an increasing forward speed.
 fn driving(ours: &Ours, publisher: &Arc<Publisher>) -> JoinHandle<()> {
     let publisher = Arc::clone(publisher);
     ours.runtime.spawn(async move {
         let mut ticks = tokio::time::interval(PERIOD);
         for number in 0u32.. {
             ticks.tick().await;
-            // Whoever is there takes it.
+            // Delivered to the present subscribers.
             let _published = publisher.publish(twist(f64::from(number)));
         }
     })
 }
 
-/// What a tool that ends by itself has printed.
+/// Returns the output of a tool that ends by itself.
 fn said(mut tool: Child) -> String {
     tool.wait_for_end(SOON);
     tool.lines().join("\n")
@@ -42,7 +42,8 @@ fn shows(printed: &str, expected: &[&str]) {
     }
 }
 
-/// Requirement: the slave API answers all that `rosnode` and `rostopic` ask, and the topics all they measure.
+/// Requirement: the slave API answers all requests of `rosnode` and `rostopic`, and the topics work
+/// with all their measurements.
 #[test]
 fn the_tools_of_ros_see_and_hear_a_node() {
     let Some(cell) = Cell::with(&[Peer::Ros1]) else {
@@ -116,8 +117,9 @@ fn the_tools_of_ros_see_and_hear_a_node() {
     assert!(!left.contains("/ours"), "{left}");
 }
 
-/// Requirement: the connection header has the type, its definition and the latching that `rosbag` records; and of a
-/// topic it publishes and subscribes, a node hears the others only.
+/// Requirement: the connection header has the type, its definition and the latching that `rosbag`
+/// records. A node that publishes and subscribes to a topic receives the messages of other nodes
+/// only.
 #[test]
 fn a_bag_has_all_a_topic_says_and_plays_it_back() {
     let Some(cell) = Cell::with(&[Peer::Ros1]) else {
@@ -191,7 +193,8 @@ fn a_bag_has_all_a_topic_says_and_plays_it_back() {
     play.wait_for_end(SOON);
 }
 
-/// Requirement: small messages leave at once and whole, with the type they have, through nodes of roscpp.
+/// Requirement: small messages are sent at once and whole, with their type, through nodes of
+/// roscpp.
 #[test]
 fn roscpp_relays_and_throttles_stand_on_either_side() {
     let Some(cell) = Cell::with(&[Peer::Ros1]) else {
@@ -210,7 +213,8 @@ fn roscpp_relays_and_throttles_stand_on_either_side() {
         .start();
     let driving = driving(&ours, &cmd);
 
-    // The type is that of the publisher before the relay, and the first message it relays has come by then.
+    // The type is the type of the publisher before the relay, and the first relayed message has
+    // arrived by then.
     let first = relayed.next("a relayed message");
     let header = &first.peer.header;
     assert_eq!(header.type_name(), Some("geometry_msgs/Twist"));
@@ -224,7 +228,8 @@ fn roscpp_relays_and_throttles_stand_on_either_side() {
     assert_eq!(slowed.next("a throttled message").bytes.len(), 48);
     driving.abort();
 
-    // There and back through roscpp, one at a time: what Nagle's algorithm would hold back shows as 40 ms each.
+    // Round trips through roscpp, one at a time: a delay by Nagle's algorithm would show as 40 ms
+    // each.
     while relayed.try_next().is_some() {}
     let started = Instant::now();
     for number in 0..TRIPS {
@@ -236,7 +241,7 @@ fn roscpp_relays_and_throttles_stand_on_either_side() {
     assert!(took < TRIPS * Duration::from_millis(30), "{took:?}");
 }
 
-/// Requirement: a node of a third make is heard and hears.
+/// Requirement: topics cross in both directions with a node of a third implementation.
 #[test]
 fn rosrust_hears_a_node_and_is_heard() {
     let Some(cell) = Cell::with(&[Peer::Ros1]) else {

@@ -1,4 +1,4 @@
-//! The other end has Fast DDS.
+//! Actions with a peer on Fast DDS.
 
 use bridge_ros2::action::{CancelCode, Outcome, Status};
 use serde_json::{Value, json};
@@ -71,7 +71,7 @@ async fn a_client_of_fast_dds_sees_its_goals_end_in_every_way() {
     ];
     assert_eq!(ends, all);
     assert_eq!(with("cancel"), [json!({"cancel": 0, "goals": 1})]);
-    // Of each end by the status, too.
+    // The status topic also reported each end.
     assert!(with("status").iter().all(|end| end["told"] == true));
     assert_eq!(serving.counters(), Default::default());
 }

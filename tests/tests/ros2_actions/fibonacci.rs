@@ -7,11 +7,11 @@ use bridge_ros2::domain::{Domain, DomainOptions};
 use bridge_ros2::service::ServicePeers;
 use bytes::Bytes;
 
-/// How long a peer may take.
+/// The timeout of a peer.
 pub(crate) const SOON: Duration = Duration::from_secs(20);
 pub(crate) const ACTION: &str = "/count";
 
-/// A participant of ours on the cell's loopback.
+/// A participant of this workspace on the cell's loopback.
 pub(crate) struct Ours {
     pub(crate) peers: ServicePeers,
     pub(crate) domain: Domain,
@@ -40,12 +40,12 @@ pub(crate) fn action() -> Action {
 
 pub(crate) const DEFINITION: &str = "int32 order\n---\nint32[] sequence\n---\nint32[] sequence\n";
 
-/// A `Fibonacci_Goal`.
+/// Encodes a `Fibonacci_Goal`.
 pub(crate) fn goal(order: i32) -> Vec<u8> {
     [&[0, 1, 0, 0], &order.to_le_bytes()[..]].concat()
 }
 
-/// A `Fibonacci_Feedback`.
+/// Encodes a `Fibonacci_Feedback`.
 pub(crate) fn feedback(numbers: &[i32]) -> Vec<u8> {
     let mut bytes = vec![0, 1, 0, 0];
     bytes.extend_from_slice(&u32::try_from(numbers.len()).unwrap().to_le_bytes());
@@ -55,14 +55,14 @@ pub(crate) fn feedback(numbers: &[i32]) -> Vec<u8> {
     bytes
 }
 
-/// A `Fibonacci_GetResult_Response` without its status.
+/// Encodes a `Fibonacci_GetResult_Response` without its status.
 pub(crate) fn result(numbers: &[i32]) -> Vec<u8> {
     let mut bytes = vec![0, 1, 0, 0, 0, 0, 0, 0];
     bytes.extend_from_slice(&feedback(numbers)[4..]);
     bytes
 }
 
-/// The numbers of a sequence that begins that many bytes into a message's body.
+/// Decodes the numbers of a sequence at offset `at` of a message's body.
 pub(crate) fn numbers(message: &Bytes, at: usize) -> Vec<i32> {
     let (count, numbers) = message[4 + at..].split_first_chunk::<4>().unwrap();
     let count = usize::try_from(u32::from_le_bytes(*count)).unwrap();
@@ -75,7 +75,7 @@ pub(crate) fn numbers(message: &Bytes, at: usize) -> Vec<i32> {
     numbers
 }
 
-/// Fails when the condition does not hold within [`SOON`]. Lets other tasks run.
+/// Waits until the condition holds, and fails after [`SOON`]. Lets other tasks run.
 pub(crate) async fn until(what: &str, mut condition: impl FnMut() -> bool) {
     let deadline = tokio::time::Instant::now() + SOON;
     while !condition() {

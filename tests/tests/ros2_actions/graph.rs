@@ -1,4 +1,4 @@
-//! What others see of an action: endpoints, their types, hashes and quality, and whose they are.
+//! An action in the graph of its peers: endpoints, their types, hashes and QoS, and their nodes.
 
 use std::collections::BTreeSet;
 
@@ -10,14 +10,14 @@ use system_tests::{Cell, Child, Peer};
 use crate::ros2_actions::fibonacci::{self, DEFINITION, Ours, until};
 use crate::ros2_actions::served::{options, serve};
 
-/// The graph as a peer last printed it.
+/// Returns the graph as last printed by a peer.
 fn graph(peer: &Child) -> Value {
     let lines = peer.json_lines();
     let mut graphs = lines.iter().filter_map(|line| line.get("graph"));
     graphs.next_back().cloned().unwrap_or_default()
 }
 
-/// Guid, type and user data of the endpoint on a topic.
+/// Returns the GUID and the properties (type, user data) of the endpoint on a topic.
 fn endpoint(graph: &Value, kind: &str, topic: &str) -> Option<(String, Value)> {
     let endpoints = graph[kind].as_object()?;
     let found = endpoints.iter().find(|(_, one)| one["topic"] == topic)?;
@@ -27,7 +27,7 @@ fn endpoint(graph: &Value, kind: &str, topic: &str) -> Option<(String, Value)> {
 /// Kind, topic, type and hash of an endpoint.
 type Wanted = (&'static str, String, String, TypeHash);
 
-/// The endpoints of the server.
+/// Returns the endpoints of the server.
 fn wanted(registry: &Registry, hashes: &ActionTypeHashes) -> Vec<Wanted> {
     let shared = |name: &str| name.parse().unwrap();
     let cancel = registry.service_type_hashes(&shared("action_msgs/CancelGoal"));

@@ -1,4 +1,4 @@
-//! Servers of which not all is known at the same time.
+//! Servers that are discovered in parts.
 
 use std::time::Duration;
 
@@ -12,7 +12,8 @@ use tokio::time::timeout;
 use super::{client, done};
 use crate::ros2_actions::fibonacci::{ACTION, Ours, SOON, goal, until};
 
-/// Part of a server of the action, which answers the same to all; to nobody without `answer`.
+/// Creates a part of an action server that gives every request the same answer, or none if `answer`
+/// is `None`.
 fn part(ours: &Ours, name: &str, types: [&str; 2], answer: Option<&'static [u8]>) -> ServiceServer {
     let [request, response] = types.map(|one| format!("{one}_"));
     let service = Service {
@@ -47,11 +48,11 @@ const CANCEL_GOAL: [&str; 2] = [
     "action_msgs::srv::dds_::CancelGoal_Request",
     "action_msgs::srv::dds_::CancelGoal_Response",
 ];
-/// True, and the time.
+/// The response that the goal is accepted, and the time.
 const ACCEPTED: &[u8] = &[0, 1, 0, 0, 1, 0, 0, 0, 7, 0, 0, 0, 0, 0, 0, 0];
-/// Succeeded, with the one number 5.
+/// The result with the status Succeeded and the single number 5.
 const RESULT: &[u8] = &[0, 1, 0, 0, 4, 0, 0, 0, 1, 0, 0, 0, 5, 0, 0, 0];
-/// That the goal has ended, and no goals.
+/// The response that the goal has ended, with no goals.
 const ENDED: &[u8] = &[0, 1, 0, 0, 3, 0, 0, 0, 0, 0, 0, 0];
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 1)]
@@ -60,7 +61,7 @@ async fn who_accepted_a_goal_is_asked_for_its_result_though_another_is_known_soo
         return;
     };
     let (ours, dead, new) = (Ours::join(), Ours::join(), Ours::join());
-    // As one that was killed, whose lease runs.
+    // Like a killed server whose lease has not ended.
     let silent = [
         part(&dead, "get_result", GET_RESULT, None),
         part(&dead, "cancel_goal", CANCEL_GOAL, None),
@@ -83,7 +84,7 @@ async fn who_accepted_a_goal_is_asked_for_its_result_though_another_is_known_soo
         "{accepted:?}"
     );
 
-    // The client wants the result by now, and this too, before the rest is there.
+    // The client requests the result and a cancellation before the other parts of the server exist.
     let early = timeout(Duration::from_millis(300), running.cancel()).await;
     assert!(early.is_err(), "{early:?}");
     let asked = silent.each_ref().map(|part| part.counters().calls);

@@ -1,4 +1,4 @@
-//! The other end is ROS 2 itself: rclpy over rcl_action and Fast DDS, of each distribution.
+//! Actions with ROS 2 itself: rclpy over rcl_action and Fast DDS, of each distribution.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -21,14 +21,14 @@ use crate::ros2_actions::served::{of, options, said, serve_as};
 use crate::ros2_actions::{client_of, done, feedback, outcome, story};
 
 const SCRIPT: &str = "ros2_rclpy_action.py";
-/// An action of rclpy whose messages have messages inside.
+/// An action of rclpy whose messages have nested messages.
 const NESTED: &str = "/nested";
 
 fn type_name(name: &str) -> TypeName {
     format!("test_msgs/{name}").parse().unwrap()
 }
 
-/// The action, whose hashes the domain announces.
+/// Returns the action with the type hashes that the domain announces.
 fn fibonacci(ours: &Ours) -> Action {
     announced(
         ours,
@@ -50,7 +50,7 @@ fn announced(ours: &Ours, name: &str, kind: &str, text: &str, mut registry: Regi
     action
 }
 
-/// An action defined in files of the distribution.
+/// Returns an action defined in files of the distribution.
 fn nested(ours: &Ours, distribution: Distribution) -> Action {
     let package = distribution.share("test_msgs");
     let read = |path: &str| fs::read_to_string(package.join(path)).unwrap();
@@ -83,7 +83,7 @@ fn caller(cell: &Cell, distribution: Distribution, more: &[&str]) -> Child {
     started(cell, distribution, &args).start().ready(SOON)
 }
 
-/// What a peer says next of that kind when it is told a line; it may say other things before.
+/// Sends a line to a peer and returns its next line of that kind; other lines may come before.
 async fn asked(peer: &mut Child, line: &str, kind: &str) -> Value {
     let of_kind = |peer: &Child| -> Vec<Value> {
         let lines = peer.json_lines().into_iter();
@@ -95,20 +95,20 @@ async fn asked(peer: &mut Child, line: &str, kind: &str) -> Value {
     of_kind(peer).swap_remove(before)
 }
 
-/// Asks until that is the answer.
+/// Repeats a line until the answer is `wanted`.
 async fn comes_to(peer: &mut Child, line: &str, kind: &str, wanted: &Value) {
     let comes = async { while asked(peer, line, kind).await != *wanted {} };
     let came = timeout(SOON, comes).await;
     assert!(came.is_ok(), "`{line}` never says {wanted}");
 }
 
-/// What rclpy finds in the graph: our node has these actions, as `ros2 node info` lists them.
+/// Waits until our node has these actions in the graph of rclpy, as `ros2 node info` lists them.
 async fn lists(peer: &mut Child, servers: Value, clients: Value) {
     let wanted = json!({"node": "actions", "servers": servers, "clients": clients});
     comes_to(peer, "node actions", "node", &wanted).await;
 }
 
-/// The ends of an action as rclpy finds them: by topic, writers and readers.
+/// Returns the endpoints of an action in the graph of rclpy: by topic, writers and readers.
 async fn ends_of(peer: &mut Child, action: &str) -> BTreeMap<String, BTreeMap<String, Vec<Value>>> {
     let seen = asked(peer, &format!("action {action}"), "action").await;
     let mut topics: BTreeMap<_, BTreeMap<_, Vec<_>>> = BTreeMap::new();
@@ -120,7 +120,8 @@ async fn ends_of(peer: &mut Child, action: &str) -> BTreeMap<String, BTreeMap<St
     topics
 }
 
-/// What rclpy finds of an action between it and us: ends that fit, each of one type, hash and quality.
+/// Waits until rclpy finds matching endpoints of an action, with the same type, hash and QoS on
+/// both sides.
 async fn fits(peer: &mut Child, action: &str) {
     let whole = async {
         loop {
@@ -151,7 +152,7 @@ async fn a_server_of_rclpy_ends_our_goals_in_every_way(distribution: Distributio
     };
     let ours = Ours::join();
     let client = client(&ours);
-    // Sent before there is a server: it is waited for.
+    // Sent before a server exists: the client waits for the server.
     let mut early = client.send_goal(&goal(5));
     let mut server = server(&cell, distribution);
     let mut told = story(&mut early).await;
@@ -163,7 +164,7 @@ async fn a_server_of_rclpy_ends_our_goals_in_every_way(distribution: Distributio
         done(&mut early).await,
         (Status::Succeeded, vec![1, 1, 2, 3, 5])
     );
-    // Feedback is volatile, and the server may have begun before it knew our reader.
+    // Feedback is volatile, and the server may have started before it knew our reader.
     let known = async {
         while !told.iter().any(|one| one == "[1, 1, 2, 3, 5]") {
             told = story(&mut client.send_goal(&goal(5))).await;
@@ -215,7 +216,7 @@ async fn a_server_of_rclpy_ends_our_goals_in_every_way(distribution: Distributio
     )
     .await;
     fits(&mut server, ACTION).await;
-    // One that leaves as rclpy leaves takes its goals along.
+    // A server that leaves as rclpy does ends its goals.
     server.tell("leave");
     let lost = outcome(&mut obstinate).await;
     assert!(
@@ -224,7 +225,7 @@ async fn a_server_of_rclpy_ends_our_goals_in_every_way(distribution: Distributio
     );
 }
 
-/// It is the server that says how a goal ends that was cancelled.
+/// Checks that the server decides how a cancelled goal ends.
 async fn end_cancelled(client: &ActionClient) {
     for (order, end) in [
         (100, Status::Canceled),
@@ -244,7 +245,7 @@ async fn end_cancelled(client: &ActionClient) {
     }
 }
 
-/// More goals at once than a server of rmw keeps requests, and all of some cancelled at once.
+/// Sends more goals at once than a server of rmw keeps requests, and cancels some of them at once.
 async fn end_at_once(client: &ActionClient) {
     let mut many: Vec<_> = (0..20)
         .map(|order| client.send_goal(&goal(order)))
@@ -278,7 +279,7 @@ async fn a_server_of_kilted_ends_our_goals_in_every_way() {
     a_server_of_rclpy_ends_our_goals_in_every_way(Distribution::Kilted).await;
 }
 
-/// A server that counts as gone when nothing is heard of it for three seconds.
+/// Starts a server with a lease of three seconds.
 fn mortal(cell: &Cell, distribution: Distribution) -> Child {
     let profile = cell.file(
         "lease.xml",
@@ -309,13 +310,14 @@ async fn a_goal_whose_server_is_killed_is_lost_and_the_next_one_is_served_again(
     let mut running = client.send_goal(&goal(100));
     feedback(&mut running, 3).await;
     killed.signal(Signal::SIGKILL);
-    // A new one at once: it knows nothing of the goal, and the old one's lease still runs.
+    // A new server at once: it does not know the goal, and the lease of the old server has not
+    // ended.
     let _server = server(&cell, distribution);
     let next = async {
         loop {
             match outcome(&mut client.send_goal(&goal(3))).await {
                 Outcome::Done { status, .. } => return status,
-                // The new one is not known yet, and the old one never answers.
+                // The new server is not discovered yet, and the old server never answers.
                 Outcome::Lost(LostReason::Unanswered(ServiceError::Lost { .. })) => {}
                 other => panic!("{other:?}"),
             }
@@ -350,7 +352,7 @@ async fn a_client_of_rclpy_sees_its_goals_end_in_every_way(distribution: Distrib
     let serving = serve_as(&ours, &fibonacci(&ours), options());
     let mut client = caller(&cell, distribution, &["--results", "--nested", NESTED]);
     client.tell("send 55");
-    // Before the end: rclpy takes no notice of feedback for a goal once it has the result.
+    // Before the end, because rclpy ignores feedback for a goal once it has the result.
     until("all feedback is heard", || {
         of(&client.json_lines(), "feedback", 0).count() == 5
     })
@@ -362,7 +364,7 @@ async fn a_client_of_rclpy_sees_its_goals_end_in_every_way(distribution: Distrib
     for (count, heard) in of(&lines, "feedback", 0).enumerate() {
         assert_eq!(heard["sequence"], json!([1, 1, 2, 3, 5][..=count]));
     }
-    // Its end is known to who comes late.
+    // Late joiners receive the status of the ended goal.
     client.tell("watch");
     said(&client, &json!({"list": ["SUCCEEDED"]})).await;
     client.tell("send -2");
@@ -410,7 +412,7 @@ async fn a_client_of_rclpy_sees_its_goals_end_in_every_way(distribution: Distrib
     .await;
 }
 
-/// Of four goals one will not be cancelled; five have ended before.
+/// Of four goals, a single goal refuses cancellation; five goals have ended before.
 async fn cancels_many(client: &mut Child) {
     for (number, order) in [(6, 100), (7, 101), (8, 102), (9, 104)] {
         client.tell(&format!("send {order}"));
@@ -464,7 +466,8 @@ async fn a_server_that_comes_back_serves_a_client_that_stayed(distribution: Dist
     client.tell("send 100");
     said(&client, &json!({"feedback": 0, "sequence": [1, 1, 2]})).await;
     said(&client, &json!({"list": ["EXECUTING"]})).await;
-    // What it had is withdrawn although its participant stays, and then that, too.
+    // The action's endpoints are withdrawn although the participant stays. Then the participant is
+    // withdrawn, too.
     serving.end().await;
     let answer = asked(&mut client, "gone", "gone").await;
     assert_eq!(answer, json!({"gone": true}));
@@ -477,7 +480,7 @@ async fn a_server_that_comes_back_serves_a_client_that_stayed(distribution: Dist
     let _serving = serve_as(&again, &fibonacci(&again), brief);
     let answer = asked(&mut client, "back", "back").await;
     assert_eq!(answer, json!({"back": true}));
-    // It knows no goal of before.
+    // The restarted server does not know the earlier goals.
     let unknown = |goal| json!({"result": goal, "status": "UNKNOWN", "sequence": []});
     assert_eq!(asked(&mut client, "result 0", "result").await, unknown(0));
     client.tell("send 3");
@@ -486,7 +489,7 @@ async fn a_server_that_comes_back_serves_a_client_that_stayed(distribution: Dist
     client.tell("result 1");
     let kept = json!({"result": 1, "status": "SUCCEEDED", "sequence": [1, 1, 2]});
     said(&client, &kept).await;
-    // And forgets those that have ended.
+    // Ended goals are removed.
     said(&client, &json!({"list": []})).await;
     assert_eq!(asked(&mut client, "result 1", "result").await, unknown(1));
 }

@@ -1,4 +1,4 @@
-//! Both ends are secured.
+//! Actions with DDS Security on both sides.
 
 use bridge_ros2::action::{CancelCode, Outcome, Status};
 use bridge_ros2::domain::{Domain, DomainOptions};

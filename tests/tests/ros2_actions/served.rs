@@ -1,4 +1,4 @@
-//! Our server, and clients of others.
+//! Our action server with clients of other implementations.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -17,7 +17,7 @@ use tokio::task::JoinHandle;
 
 use crate::ros2_actions::fibonacci::{self, ACTION, Ours, SOON, feedback, result, until};
 
-/// A server at work, until dropped.
+/// A running server, until dropped.
 pub(crate) struct Serving {
     counters: watch::Receiver<ServerCounters>,
     ends: Arc<Semaphore>,
@@ -31,7 +31,7 @@ impl Drop for Serving {
 }
 
 impl Serving {
-    /// Ends it, and returns when all of it is gone.
+    /// Ends the server, and returns when all of its entities are removed.
     pub(crate) async fn end(mut self) {
         self.task.abort();
         assert!((&mut self.task).await.unwrap_err().is_cancelled());
@@ -41,7 +41,7 @@ impl Serving {
         *self.counters.borrow()
     }
 
-    /// Ends a goal of an order of 50 to 99.
+    /// Ends a goal with an order of 50 to 99.
     pub(crate) fn end_a_goal(&self) {
         self.ends.add_permits(1);
     }
@@ -51,13 +51,13 @@ pub(crate) fn options() -> ActionServerOptions {
     ActionServerOptions::new(Bytes::from(result(&[])))
 }
 
-/// What the peers do with goals, so does this. One of an order of 50 to 99 it works on as on that of 50 less, but waits to
-/// be told before it ends.
+/// Serves goals as the peers do. A goal with an order of 50 to 99 runs like a goal with an order
+/// that is lower by 50, but waits for [`Serving::end_a_goal`] before it ends.
 pub(crate) fn serve(ours: &Ours, options: ActionServerOptions) -> Serving {
     serve_as(ours, &fibonacci::action(), options)
 }
 
-/// The same for an action with the messages of Fibonacci, whatever its name and type.
+/// Serves an action with the messages of Fibonacci and any name and type.
 pub(crate) fn serve_as(ours: &Ours, action: &Action, options: ActionServerOptions) -> Serving {
     let mut server = ActionServer::open(&ours.domain, &ours.peers, action, options).unwrap();
     let (counters, heard) = watch::channel(server.counters());
@@ -127,7 +127,7 @@ async fn work(goal: ServerGoal, order: i32, told: &Semaphore) {
             112 => goal.abort(&result),
             _ => goal.canceled(&result),
         };
-        // Or the server is no more.
+        // The server may have been closed.
         assert!(matches!(end, Ok(()) | Err(GoalError::Closed)), "{end:?}");
     } else {
         if order >= 50 {
@@ -190,7 +190,7 @@ async fn a_client_of_cyclone_sees_its_goals_end_in_every_way() {
     let feedback: Vec<_> = of(&lines, "feedback", 0).collect();
     assert_eq!(feedback.len(), 5, "{feedback:?}");
     assert_eq!(feedback[0]["sequence"], json!([1]));
-    // The client knows of the goal before it hears of its progress.
+    // The client receives the acceptance of the goal before its feedback.
     let at = |key: &str| lines.iter().position(|line| line[key] == 0).unwrap();
     assert!(at("goal") < at("feedback"), "{lines:?}");
     client.tell("send -2");
@@ -282,7 +282,7 @@ fn kept_for(time: Option<Duration>) -> ActionServerOptions {
     }
 }
 
-/// Hears the status.
+/// Starts a subscriber of the status.
 fn watches(cell: &Cell) -> Child {
     cell.cyclone("ros2_action.py", &["status", ACTION, "--domain", "2"])
 }
@@ -339,7 +339,7 @@ async fn results_that_are_waited_for_do_not_hold_up_other_goals() {
         lines.iter().filter(|line| line["accepted"] == true).count() == 100
     })
     .await;
-    // And one goal's result is asked for more often than is kept.
+    // The result of a single goal is requested more often than requests are kept.
     for _ in 0..20 {
         waits.tell("result 0");
     }
@@ -351,7 +351,7 @@ async fn results_that_are_waited_for_do_not_hold_up_other_goals() {
     other.tell("send 5");
     said(&other, &json!({"result": 0, "status": "SUCCEEDED"})).await;
     waits.signal(Signal::SIGKILL);
-    // A client that died leaves its goals running; whoever wants to may cancel them.
+    // The goals of a dead client continue; any other client may cancel them.
     other.tell("cancel_all");
     let answer = || {
         let lines = other.json_lines();
@@ -442,7 +442,7 @@ async fn a_server_that_comes_back_serves_a_client_that_stayed_and_knows_no_old_g
     drop((serving, ours));
     let again = Ours::join();
     let _serving = serve(&again, options());
-    // The client does not wait for it, so what it asks before both know each other is lost.
+    // The client does not wait for the server, so requests sent before mutual discovery are lost.
     let asked = async {
         while of(&client.json_lines(), "result", 0).count() == 0 {
             client.tell("result 0");

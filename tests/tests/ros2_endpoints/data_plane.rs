@@ -1,4 +1,4 @@
-//! Bytes between our endpoints and the peer.
+//! Samples between our endpoints and the peer.
 
 use std::num::NonZeroU16;
 use std::time::{Duration, Instant};
@@ -18,9 +18,9 @@ use crate::ros2_endpoints::peer::{SOON, heard, is_string, options, reads, string
 
 const STRING: &str = "std_msgs::msg::dds_::String_";
 const TEXT: &str = "std_msgs/String";
-/// What the peer writes.
+/// The topic that the peer writes.
 const THEIRS: (&str, &str) = ("/ua_2_1_1", "rt/ua_2_1_1");
-/// What we write.
+/// The topic that we write.
 const OURS: (&str, &str) = ("/ua_1_1_1", "rt/ua_1_1_1");
 const LATCHED: [&str; 4] = ["--durability", "transient_local", "--depth", "1"];
 
@@ -32,7 +32,7 @@ fn join() -> Domain {
     Domain::join(&options()).unwrap()
 }
 
-/// What fits the writers of the peer's topic, once there are some.
+/// Returns the QoS that fits the writers of the peer's topic, once they are discovered.
 fn writers(domain: &Domain) -> Requested {
     eventually("a writer is discovered", SOON, || {
         let graph = Graph::snapshot(domain.participant());
@@ -47,7 +47,7 @@ fn inbox(domain: &Domain, requested: Requested) -> Inbox<()> {
     inbox
 }
 
-/// The next sample, and how many were lost before it.
+/// Returns the next sample, and the number of samples lost before it.
 async fn sample(inbox: &mut Inbox<()>) -> (Vec<u8>, u64) {
     match tokio::time::timeout(SOON, inbox.recv()).await.unwrap() {
         Taken::Sample {
@@ -130,12 +130,13 @@ async fn five_thousand_messages_at_1_khz_arrive_in_order_without_loss() {
     }
 }
 
-/// Writers of Fast DDS whose periodic HEARTBEAT never comes, made when the peer knows our reader: the HEARTBEAT they send at
-/// the match may come before we know of them, and then only the one we ask for tells that nothing is before the sample.
+/// Checks writers of Fast DDS without periodic HEARTBEAT, created when the peer knows our reader.
+/// The HEARTBEAT they send at the match may arrive before we know the writers. Then only the
+/// HEARTBEAT that we request shows that no sample precedes the first.
 #[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn writers_of_fast_dds_are_heard_before_their_heartbeat_period_is_over() {
     const EARLIER: (&str, &str) = ("/ua_2_1_2", "rt/ua_2_1_2");
-    /// Which end knows the other first is up to chance; either is about as likely.
+    /// The end that discovers the other first is random; both orders are about equally likely.
     const WRITERS: usize = 6;
     let Some(cell) = Cell::with(&[Peer::FastDds]) else {
         return;
@@ -143,7 +144,7 @@ async fn writers_of_fast_dds_are_heard_before_their_heartbeat_period_is_over() {
     let domain = join();
     let reliable = Requested::from_writers(&[]);
     let mut inbox = inbox(&domain, reliable);
-    // Announced after the other, so a peer that has matched it knows both.
+    // Announced after the other reader, so a peer that has matched this reader knows both.
     let _known = domain.reader(EARLIER.1, STRING, reliable).unwrap();
     for writer in 0..WRITERS {
         let text = format!("of {writer}");
@@ -220,7 +221,7 @@ async fn a_late_joiner_gets_no_old_value_that_another_reader_has_not_acknowledge
         offer(&mut out, &number.to_string());
     }
     sent(&mut out).await;
-    // Of a depth that has room for all of them.
+    // The reader's depth has room for all samples.
     let mut later = reads(&cell, OURS.0, TEXT, &LATCHED[..2]);
     later.wait_for_line("\"49\"", SOON);
     assert_eq!(heard(&later), ["49"]);
@@ -255,7 +256,7 @@ async fn who_comes_when_nobody_listened_gets_the_newest_value_and_not_what_the_l
     for value in ["dim", "off"] {
         offer(&mut out, value);
     }
-    // Of a depth that has room for all of them.
+    // The reader's depth has room for all samples.
     let mut later = reads(&cell, OURS.0, TEXT, &LATCHED[..2]);
     meet_readers(&domain, &mut out);
     sent(&mut out).await;
@@ -277,7 +278,7 @@ async fn a_writer_that_is_replaced_repairs_what_its_reader_lacks() {
     sent(&mut out).await;
     reader.wait_for_line("\"first\"", SOON);
     reader.signal(Signal::SIGSTOP);
-    // More than its socket has room for.
+    // More than the reader's socket buffer holds.
     let large = "x".repeat(100_000);
     for number in 0..30 {
         offer(&mut out, &format!("{number} {large}"));

@@ -1,4 +1,5 @@
-//! The endpoints of `bridge-ros2`, used as a library, against Cyclone DDS: more than a running bridge lets see.
+//! The endpoints of `bridge-ros2` as a library, with Cyclone DDS: tests that a running bridge does
+//! not allow.
 
 mod data_plane;
 mod peer;

@@ -1,16 +1,16 @@
-//! The Cyclone DDS end, and payloads as both ends know them.
+//! The Cyclone DDS peer, and payloads in the format of both ends.
 
 use std::time::Duration;
 
 use bridge_ros2::domain::DomainOptions;
 use system_tests::{Cell, Child};
 
-/// Where the tests of one cell meet.
+/// The domain of the tests.
 pub(crate) const DOMAIN: u16 = 2;
-/// How long a peer may take.
+/// The timeout of a peer.
 pub(crate) const SOON: Duration = Duration::from_secs(10);
 
-/// A participant on the cell's loopback.
+/// Returns the options of a participant on the cell's loopback.
 pub(crate) fn options() -> DomainOptions {
     DomainOptions {
         domain: DOMAIN,
@@ -21,7 +21,8 @@ pub(crate) fn options() -> DomainOptions {
     }
 }
 
-/// A Cyclone writer that has said it is ready; it stays until it is told a line, and then leaves in order.
+/// Starts a Cyclone DDS writer and waits until it is ready. The writer stays until it receives a
+/// line, and then leaves in order.
 pub(crate) fn writes(cell: &Cell, topic: &str, kind: &str, more: &[&str]) -> Child {
     let arguments = [&[topic, kind, "--domain", "2"], more].concat();
     cell.cyclone_started("ros2_pub.py", &arguments)
@@ -30,7 +31,7 @@ pub(crate) fn writes(cell: &Cell, topic: &str, kind: &str, more: &[&str]) -> Chi
         .ready(SOON)
 }
 
-/// A Cyclone reader that has said it is ready.
+/// Starts a Cyclone DDS reader and waits until it is ready.
 pub(crate) fn reads(cell: &Cell, topic: &str, kind: &str, more: &[&str]) -> Child {
     cell.cyclone(
         "ros2_sub.py",
@@ -38,7 +39,7 @@ pub(crate) fn reads(cell: &Cell, topic: &str, kind: &str, more: &[&str]) -> Chil
     )
 }
 
-/// The `data` of the samples a Cyclone reader has heard.
+/// Returns the `data` of the samples that a Cyclone DDS reader has received.
 pub(crate) fn heard(reader: &Child) -> Vec<String> {
     reader
         .values()
@@ -47,7 +48,7 @@ pub(crate) fn heard(reader: &Child) -> Vec<String> {
         .collect()
 }
 
-/// A `std_msgs/String` in little endian CDR, without padding behind it.
+/// Encodes a `std_msgs/String` in little-endian CDR, without trailing padding.
 pub(crate) fn string(text: &str) -> Vec<u8> {
     let mut bytes = vec![0, 1, 0, 0];
     bytes.extend_from_slice(&u32::try_from(text.len() + 1).unwrap().to_le_bytes());
@@ -56,9 +57,10 @@ pub(crate) fn string(text: &str) -> Vec<u8> {
     bytes
 }
 
-/// Whether these are the bytes of a `std_msgs/String` with that text, padded or not.
+/// Returns whether these are the bytes of a `std_msgs/String` with that text, padded or not.
 ///
-/// The second half of the encapsulation header is not compared: writers may say the padding there.
+/// The second half of the encapsulation header is not compared, because writers may encode the
+/// padding there.
 pub(crate) fn is_string(bytes: &[u8], text: &str) -> bool {
     let wanted = string(text);
     bytes[..2] == wanted[..2] && bytes[4..].starts_with(&wanted[4..])

@@ -1,4 +1,4 @@
-//! What the port reports and what its peers receive.
+//! The events of the port and the samples its peers receive.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -43,7 +43,7 @@ pub(crate) fn topic(name: &str) -> TopicId {
     name.parse().unwrap()
 }
 
-/// The first event that `wanted` takes; others are let go. Fails after [`SOON`].
+/// Returns the first event accepted by `wanted` and discards others. Fails after [`SOON`].
 pub(crate) async fn event<T>(
     port: &mut Ros2Port,
     mut wanted: impl FnMut(PortEvent) -> Option<T>,
@@ -92,7 +92,7 @@ pub(crate) async fn run_until(
     }
 }
 
-/// Runs the port for a while without wanting anything of it.
+/// Runs the port for a while and discards its events.
 async fn run(port: &mut Ros2Port, time: Duration) {
     let until = tokio::time::Instant::now() + time;
     while tokio::time::timeout_at(until, port.recv()).await.is_ok() {}
@@ -148,7 +148,7 @@ async fn a_topic_whose_publisher_leaves_is_reported_dead() {
     let left = Instant::now();
     peer.tell("leave");
     assert!(!live(&mut port, topic("ua_2_1_1")).await);
-    // By its word: the end of its lease would tell after 10 s.
+    // By its announcement: the end of its lease would be reported after 10 s.
     assert!(
         left.elapsed() < Duration::from_secs(5),
         "{:?}",
@@ -181,8 +181,8 @@ async fn a_subscriber_decides_the_type() {
     };
     let mut port = port();
     let _decides = reads(&cell, "/ua_0_2_3", "std_msgs/UInt32", &[]);
-    // No standard type fits two fields, so that this topic is bound when its subscriber is discovered, which came
-    // after the other one.
+    // No standard type has two fields, so this topic is bound when its subscriber is discovered,
+    // later than the other subscriber.
     let _later = reads(&cell, "/ua_0_2_4", "std_msgs/Bool", &[]);
     let two = [(BuiltinType::Double, false); 2];
     port.wanted(topic("ua_0_2_4"), &two, None);
@@ -235,7 +235,7 @@ async fn samples_of_another_type_than_the_topics_are_not_handed_up() {
     assert_eq!(bound(&mut port, topic).await, "std_msgs/Bool");
     let other = ["--repeat", "0", "--rate", "50", "--value", "\"no\""];
     let _other = writes(&cell, "/ua_2_1_1", "std_msgs/String", &other);
-    // Two seconds of both.
+    // About two seconds of samples from both writers.
     for _ in 0..40 {
         let payload = event(&mut port, |event| match event {
             PortEvent::Sample { payload, .. } => Some(payload),
@@ -247,7 +247,7 @@ async fn samples_of_another_type_than_the_topics_are_not_handed_up() {
     }
 }
 
-/// A mapping of space 2.
+/// Returns a mapping of space 2.
 fn cell_of(text: &str) -> Arc<Mapping> {
     let text = format!("spaces: [{{id: 1}}, {{id: 2}}]\nnamespaces: {{2: urn:test}}\n{text}");
     Arc::new(Mapping::from_yaml(&text, "cell.yaml").mapping.unwrap())
@@ -304,7 +304,7 @@ async fn a_value_that_waits_for_room_when_its_topic_is_given_up_is_counted() {
     port.publish(delivery(of, "before")).unwrap();
     run_until(&mut port, "it hears", || last_is(&reader, "before")).await;
     reader.signal(Signal::SIGSTOP);
-    // One takes the place of another that waits when there is no room.
+    // Without room, a new value replaces a waiting value.
     let refused = (0..1000).find_map(|number| {
         let refused = port.publish(delivery(of, &number.to_string()));
         refused.err()
@@ -386,7 +386,8 @@ async fn a_subscriber_that_is_killed_does_not_keep_values_from_the_others() {
     .await;
     killed.signal(Signal::SIGKILL);
     killed.wait_for_end(SOON);
-    // More than the send window holds, over more time than a reader may be silent before that.
+    // More values than the send window holds, over a longer time than a reader may be silent
+    // before.
     let numbers: Vec<String> = (0..600).map(|number| number.to_string()).collect();
     let mut refused = 0;
     for number in &numbers {
@@ -394,7 +395,7 @@ async fn a_subscriber_that_is_killed_does_not_keep_values_from_the_others() {
         run(&mut port, Duration::from_millis(3)).await;
     }
     run_until(&mut port, "the newest value", || last_is(&other, "599")).await;
-    // RustDDS as published stops, and another writer goes on with the newest value.
+    // RustDDS as published stops, and another writer continues with the newest value.
     assert_eq!(refused > 0, !PATCHED);
     if PATCHED {
         let expected = [&["before".to_owned()], &numbers[..]].concat();
@@ -409,7 +410,7 @@ async fn made_up_values_keep_out_none_that_speaks_when_they_have_fallen_silent()
     };
     let mut port = port();
     let made_up = |number: u16| TopicId::new(9, 1, number + 1).unwrap();
-    // Two values have no standard type, and their topic costs the domain nothing.
+    // Values with two fields have no standard type, so their topics create nothing in the domain.
     let no_type = [(BuiltinType::Double, false); 2];
     for number in 0..4096 {
         port.wanted(made_up(number), &no_type, None);
@@ -425,7 +426,7 @@ async fn made_up_values_keep_out_none_that_speaks_when_they_have_fallen_silent()
     let deadline = tokio::time::Instant::now() + SOON;
     let mut gone = Vec::new();
     loop {
-        // The Router asks again while values come.
+        // The Router requests the topic again while values arrive.
         port.wanted(robot, &boolean, None);
         let soon = tokio::time::Instant::now() + Duration::from_millis(50);
         match tokio::time::timeout_at(soon, port.recv()).await {

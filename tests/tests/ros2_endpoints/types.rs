@@ -1,4 +1,4 @@
-//! Types that nodes tell one another.
+//! Type descriptions that nodes exchange.
 
 use std::time::Duration;
 
@@ -17,7 +17,7 @@ use crate::ros2_endpoints::port::{bound, event, port, port_of, run_until, topic,
 
 const UNKNOWN: &str = "type_description_interfaces/FieldType";
 
-/// The hash of another type of that name: of its first two fields.
+/// Returns the hash of another type with the same name that has only its first two fields.
 fn short() -> String {
     let name = UNKNOWN.parse().unwrap();
     let mut registry = Registry::empty(Dialect::Ros2);
@@ -193,10 +193,10 @@ async fn what_came_before_the_publisher_of_another_definition_is_read_as_it_was_
         return;
     }
     const FIELD_TYPE: &str = "type_description_interfaces::msg::dds_::FieldType_";
-    // What ROS 2 publishes.
+    // The hash that ROS 2 publishes.
     const LONG: &str = "RIHS01_a70b6dd919645a03a3586f7f821defbc886ea3e531a1d95cc0f380a3973ccaa6";
     let (mut port, short, of) = (port(), short(), topic("ua_2_2_7"));
-    // They tell both definitions.
+    // Nodes that serve both definitions.
     let _long = cell.cyclone("ros2_describe.py", &["serve"]);
     let other_topic = ["serve", "--topic", "/ua_2_2_8", "--name", "other"];
     let _short = cell.cyclone(
@@ -212,7 +212,7 @@ async fn what_came_before_the_publisher_of_another_definition_is_read_as_it_was_
     let publishes = |node: &str, hash: &str| {
         let domain = other(node);
         domain.learn_type_hash(FIELD_TYPE, hash);
-        // RustDDS as published hands out nothing of a reliable writer that has left.
+        // RustDDS as published delivers nothing of a reliable writer that has left.
         let mut best_effort = eventually("any writer is known", SOON, || {
             domain.graph().writers("rt/ua_2_2_9").first().cloned()
         });
@@ -233,13 +233,13 @@ async fn what_came_before_the_publisher_of_another_definition_is_read_as_it_was_
         readers.any(|reader| !reader.reliable)
     })
     .await;
-    // From here on nobody reads what comes.
+    // From here on, the samples are not read.
     let message = |number| {
         let payload = [&[0, 1, 0, 0, number][..], &[0; 31]].concat();
         Payload::to_write(payload.into()).unwrap()
     };
     let (new, _writer) = publishes("new", &short);
-    // Made after the other, so that who acknowledges what it writes knows of both.
+    // Created after the other writer, so a reader that acknowledges its samples knows both.
     let last = new.writer("rt/ua_2_2_8", FIELD_TYPE, Offered::KeepLatest);
     let last = last.unwrap();
     eventually("the readers are known", SOON, || {
@@ -310,7 +310,7 @@ async fn a_value_is_written_to_a_subscriber_whose_type_only_its_node_knows() {
         json!({"type_id": 7, "capacity": 8, "string_capacity": 9, "nested_type_name": "ten"});
     assert_eq!(reader.values(), [value]);
 
-    // Another that takes the same bytes for something else.
+    // Another subscriber that reads the same bytes as another type.
     let other = [&reads[..], &["--name", "other", "--short", &short]].concat();
     let _other = cell.cyclone("ros2_describe.py", &other);
     let lost = event(&mut port, |event| match event {
@@ -324,7 +324,7 @@ async fn a_value_is_written_to_a_subscriber_whose_type_only_its_node_knows() {
 
 const STRING: &str = "std_msgs::msg::dds_::String_";
 
-/// Another node of the domain, which tells nobody what its types are.
+/// Joins as another node of the domain, which does not describe its types.
 fn other(name: &str) -> Domain {
     Domain::join(&DomainOptions {
         node: name.into(),
@@ -338,7 +338,7 @@ async fn a_type_that_a_node_is_asked_for_keeps_no_topic_of_a_known_type_waiting(
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
     };
-    // Their vendor comes first: so do their endpoints.
+    // The vendor id of this peer sorts first, so its endpoints come first, too.
     let asked = ["--silent", "--name", "asked"];
     let reads = [&["read", "--topic", "/ua_1_2_9"], &asked[..]].concat();
     let _reader = cell.cyclone("ros2_describe.py", &reads);
@@ -355,7 +355,7 @@ async fn a_type_that_a_node_is_asked_for_keeps_no_topic_of_a_known_type_waiting(
     let shape = [(BuiltinType::Double, false); 2];
     port.wanted(topic("ua_1_2_9"), &shape, None);
     let mut types = std::collections::BTreeMap::new();
-    // The calls time out after 12 s together.
+    // The calls time out after 12 s in total.
     while types.len() < 2 {
         let (topic, name) = event(&mut port, |event| match event {
             PortEvent::Bound {
@@ -412,7 +412,7 @@ async fn a_topic_does_not_wait_for_ever_for_nodes_that_leave_before_they_could_t
             leaves.writer(name, kind, Offered::KeepLatest).unwrap()
         };
         let writers = (write("rt/ua_2_2_8", STRING), write("rt/ua_2_2_9", NOBODYS));
-        // Less than the 3 s that a node has to tell of its services.
+        // Shorter than the 3 s that a node has to announce its services.
         let until = tokio::time::Instant::now() + Duration::from_secs(1);
         while let Ok(event) = tokio::time::timeout_at(until, port.recv()).await {
             match event {
@@ -430,7 +430,7 @@ async fn a_topic_does_not_wait_for_ever_for_nodes_that_leave_before_they_could_t
             };
         }
         assert!(leaves.leave(writers).await);
-        // Before anybody could know that nobody tells it.
+        // Too early to know that the types are not described.
         assert!(number > 0 || found.is_empty(), "{found:?}");
     }
     let expected = [
@@ -459,7 +459,7 @@ async fn of_subscribers_of_two_definitions_the_one_that_is_not_written_is_told()
     let misreads = (Some(of), "subscriber of another definition");
     let volatile = Requested::from_writers(&[]);
 
-    // Nobody tells its definition, so ours is written.
+    // No node serves the definition of this type, so our own definition is written.
     let untold = other("untold");
     untold.learn_type_hash(STRING, format!("RIHS01_{}", "5".repeat(64)));
     let _untold = untold.reader("rt/ua_1_2_3", STRING, volatile).unwrap();
@@ -470,7 +470,7 @@ async fn of_subscribers_of_two_definitions_the_one_that_is_not_written_is_told()
     let hash = Registry::bundle(Dialect::Ros2).type_hash(&name).unwrap();
     ours.learn_type_hash(STRING, hash.to_string());
     let _ours = ours.reader("rt/ua_1_2_3", STRING, volatile).unwrap();
-    // Discovered after it.
+    // Discovered after the reader.
     let after = topic("ua_1_2_4");
     let bool = "std_msgs::msg::dds_::Bool_";
     let _after = ours.reader("rt/ua_1_2_4", bool, volatile).unwrap();
@@ -490,7 +490,8 @@ async fn of_subscribers_of_two_definitions_the_one_that_is_not_written_is_told()
     assert_eq!(told, []);
 }
 
-/// The next topic that is bound or unbound, with how many fields its type has, if it is bound.
+/// Returns the next topic that is bound or unbound, and for a bound topic the number of fields of
+/// its type.
 async fn next_bound(port: &mut bridge_ros2::Ros2Port) -> (mappings::TopicId, Option<usize>) {
     event(port, |event| match event {
         PortEvent::Bound {

@@ -1,4 +1,4 @@
-//! Kinds of protection: each of them everywhere, and mixed.
+//! Kinds of protection: each kind everywhere, and mixed kinds.
 
 use std::time::Duration;
 
@@ -7,13 +7,14 @@ use uadp::Scalar;
 
 use crate::ros2_security::{BACK, SOON, STRING, Secured, THERE, answering, is_in, reaches, sends};
 
-/// A maker, and the value its peer writes.
+/// A vendor, and the value that its peer writes.
 const MAKERS: [(Secured, Triple, &str); 2] = [
     (Cell::secured_cyclone, (2, 2, 20), "/ua_2_2_20"),
     (Cell::secured_fastdds, (2, 2, 21), "/ua_2_2_21"),
 ];
 
-/// Values cross both ways with both makers, and can be read on the wire where nothing is encrypted.
+/// Checks that values cross in both directions with both vendors, and are readable on the wire if
+/// nothing is encrypted.
 fn values_cross(governance: Governance) {
     let Some(cell) = Cell::secured(&[Peer::CycloneC, Peer::FastDds]) else {
         return;
@@ -23,7 +24,7 @@ fn values_cross(governance: Governance) {
     let mut ua = UaSide::join();
     let mut tap = Wiretap::tap();
     let _bridge = answering(cell.secured_bridge(&keystore, &[]));
-    // One after the other: Debian's Fast DDS seldom ends where two appear at the same moment.
+    // Started in sequence: Debian's Fast DDS sometimes ends if two peers appear at the same moment.
     let _relays = MAKERS.map(|(maker, _, topic)| -> Child {
         let relay = ["relay", THERE.1, topic, "--type", STRING];
         maker(&cell, &keystore, &relay).start().ready(SOON)
@@ -35,7 +36,7 @@ fn values_cross(governance: Governance) {
             heard.contains(&triple).then_some(())
         });
     }
-    // Of all lengths modulo 4: the makers pad differently.
+    // Texts of all lengths modulo 4, because the vendors pad differently.
     let texts = ["", "+", "++", "+++"].map(|more| format!("of a length {more}"));
     for (_, triple, _) in MAKERS {
         for text in &texts {
@@ -93,7 +94,7 @@ fn values_cross_where_samples_and_submessages_have_different_keys() {
     });
 }
 
-/// Cyclone DDS then tells of its topics in datagrams anybody could have sent.
+/// Cyclone DDS then announces its topics in datagrams that any participant could have sent.
 #[test]
 fn open_discovery_in_protected_datagrams_is_warned_of_and_works_with_who_protects_them() {
     let Some(cell) = Cell::secured(&[Peer::FastDds]) else {

@@ -1,4 +1,4 @@
-//! The node of a secured bridge, and nodes of ROS 2 itself beside it.
+//! The node of a secured bridge, and nodes of ROS 2 itself.
 
 use serde_json::json;
 use system_tests::{Cell, Distribution, Keystore, METRICS_ROS2, Peer, UaSide, eventually, metrics};
@@ -7,7 +7,7 @@ use crate::ros2_security::{BACK, SOON, STRING, THERE, answering, reaches};
 
 const NODE: &str = "/ua_bridge_ros2";
 
-/// Request and reply are the hexadecimal digits of CDR.
+/// Calls a parameter service of the bridge. Request and reply are hexadecimal digits of CDR.
 fn ask(cell: &Cell, keystore: &Keystore, service: &str, kind: &str, request: &str) -> String {
     let (service, kind) = (
         format!("{NODE}/{service}"),
@@ -40,11 +40,11 @@ fn secured_peers_list_and_get_the_parameters_of_the_bridge() {
     }
     let name = format!("010000000d000000{}00", hex("use_sim_time"));
     let got = ask("get_parameters", "GetParameters", &name);
-    // One value: of type 1, true.
+    // A single value: of type 1, true.
     assert!(got.starts_with("010000000101"), "{got}");
 }
 
-/// The wheels of ROS 2 have a Fast DDS without DDS Security: its nodes can be in the open only.
+/// The wheels of ROS 2 contain a Fast DDS without DDS Security, so their nodes cannot be secured.
 #[test]
 fn a_node_of_ros_2_without_an_enclave_gets_and_gives_nothing_and_is_told_of() {
     for distribution in Distribution::ALL {
@@ -60,7 +60,7 @@ fn a_node_of_ros_2_without_an_enclave_gets_and_gives_nothing_and_is_told_of() {
         let publish = json!({"publish": BACK.1, "type": string, "value": {"data": "in the open"}});
         judge.ask(publish.clone());
         bridge.wait_for_line("is kept out: it is not secured", SOON);
-        // Those of the enclave are served all the while.
+        // Peers in the enclave are served throughout.
         let reader = cell
             .secured_cyclone(&keystore, &["sub", THERE.1, STRING])
             .start()

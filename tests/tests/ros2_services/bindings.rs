@@ -1,4 +1,4 @@
-//! Services as values of the space, by the program.
+//! Services as values of the space, with the bridge program.
 
 use serde_json::json;
 use system_tests::{Cell, Peer, UaSide, eventually};
@@ -26,11 +26,11 @@ fn values_call_services_of_both_vendors_and_their_answers_are_values() {
     let file = cell.file("cell.yaml", CELL);
     let mut ua = UaSide::join();
     let _bridge = cell.bridge_ros2(&[file.to_str().unwrap()]);
-    // Written before the service is there: a state is tried until it is.
+    // Written before the service is available: a state is retried until then.
     ua.write((0, 2, 1), Scalar::Boolean(true));
     let light = Vendor::FastDds.serves(&cell, "/light");
     ua.hear_scalar((2, 2, 2), Scalar::String(Some("done")));
-    // The answer may be here before the server's line about it is.
+    // The answer may arrive before the server's line about the call.
     eventually("the server has told of the call", SOON, || {
         (!Vendor::FastDds.asked(&light).is_empty()).then_some(())
     });
@@ -42,7 +42,7 @@ fn values_call_services_of_both_vendors_and_their_answers_are_values() {
     eventually("the trigger has called", SOON, || {
         (!go.values().is_empty()).then_some(())
     });
-    // False calls nothing.
+    // False does not call the service.
     assert_eq!(go.values(), [json!({"data": true})]);
 
     let _ask = cyclone_serves(&cell, "/ask", &[]);

@@ -1,4 +1,4 @@
-//! The other ends of services, by vendor.
+//! The peers of services, by vendor.
 
 use std::time::Duration;
 
@@ -6,12 +6,12 @@ use bridge_ros2::domain::{Domain, DomainOptions};
 use bridge_ros2::service::ServicePeers;
 use system_tests::{Cell, Child, Peer};
 
-/// How long a peer may take.
+/// The timeout of a peer.
 pub(crate) const SOON: Duration = Duration::from_secs(20);
 /// A reply of `std_srvs/SetBool`: success, `done`.
 pub(crate) const DONE: &[u8] = b"\0\x01\0\0\x01\0\0\0\x05\0\0\0done\0\0\0\0";
 
-/// A participant of ours on the cell's loopback.
+/// A participant of this workspace on the cell's loopback.
 pub(crate) struct Ours {
     pub(crate) peers: ServicePeers,
     pub(crate) domain: Domain,
@@ -34,7 +34,7 @@ impl Ours {
     }
 }
 
-/// Whose middleware the other end has.
+/// The vendor of the peer's middleware.
 #[derive(Clone, Copy)]
 pub(crate) enum Vendor {
     Cyclone,
@@ -49,7 +49,7 @@ impl Vendor {
         }
     }
 
-    /// A server of `std_srvs/SetBool` that answers success and `done`.
+    /// Starts a server of `std_srvs/SetBool` that answers success and `done`.
     pub(crate) fn serves(self, cell: &Cell, service: &str) -> Child {
         match self {
             Self::Cyclone => cyclone_serves(cell, service, &[]),
@@ -60,7 +60,7 @@ impl Vendor {
         }
     }
 
-    /// The `data` of the requests a server has had.
+    /// Returns the `data` of the requests that a server has received.
     pub(crate) fn asked(self, server: &Child) -> Vec<bool> {
         let lines = server.json_lines();
         match self {
@@ -76,7 +76,8 @@ impl Vendor {
         }
     }
 
-    /// A client that asks true that many times: of Cyclone all at once, of Fast DDS one after the other.
+    /// Starts a client that calls with true `count` times: with Cyclone DDS all at once, with Fast
+    /// DDS in sequence.
     pub(crate) fn calls(self, cell: &Cell, service: &str, count: usize) -> Child {
         let count = count.to_string();
         match self {
@@ -91,8 +92,8 @@ impl Vendor {
         }
     }
 
-    /// How many replies `done` a client has had, and how many samples that were none of its replies, when it has said
-    /// that it is done.
+    /// Returns the numbers of `done` replies and of unrelated samples that a client received, once
+    /// the client is done.
     pub(crate) fn answers(self, client: &Child) -> Option<(usize, u64)> {
         let lines = client.json_lines();
         let end = if matches!(self, Self::Cyclone) {
@@ -135,7 +136,7 @@ pub(crate) fn cyclone_calls(cell: &Cell, service: &str, more: &[&str]) -> Child 
 
 pub(crate) const SET_BOOL: &str = "std_srvs/SetBool";
 
-/// Fails when the condition does not hold within [`SOON`]. Lets other tasks run.
+/// Waits until the condition holds, and fails after [`SOON`]. Lets other tasks run.
 pub(crate) async fn until(what: &str, mut condition: impl FnMut() -> bool) {
     let deadline = tokio::time::Instant::now() + SOON;
     while !condition() {

@@ -1,4 +1,4 @@
-//! Clients that are secured, of both makers.
+//! Secured clients of both vendors.
 
 use bridge_ros2::domain::{Domain, DomainOptions};
 use bridge_ros2::security::Enclave;

@@ -1,4 +1,5 @@
-//! Keys of a Security Key Service: ua-server makes them, hands them out and replaces them, and the bridges live with them.
+//! Keys of a Security Key Service: ua-server creates, distributes and rotates them, and the bridges
+//! use them.
 
 use std::fs;
 
@@ -12,7 +13,7 @@ use super::{SOON, TOPIC, dropped, path, token};
 
 const METHOD: &str = "Server/PublishSubscribe/GetSecurityKeys";
 
-/// A cell whose server makes the keys, each for so long.
+/// Writes a mapping of a cell whose server creates the keys with the settings `sks`.
 fn mapping(cell: &Cell, sks: &str) -> String {
     let text = format!("security: [{{group: cell, keys: {{sks: {sks}}}}}]\n");
     path(&cell.file("cell.yaml", &text)).to_owned()
@@ -26,7 +27,8 @@ fn server(cell: &Cell, mapping: &str) -> Child {
     server
 }
 
-/// The certificate store of a program in which the server is trusted, once it has a certificate.
+/// Creates the certificate store of a program that trusts the server, once the server has a
+/// certificate.
 fn store(cell: &Cell, program: &str) -> String {
     let store = cell.folder().join(format!("pki-{program}"));
     fs::create_dir_all(store.join("trusted")).unwrap();
@@ -35,7 +37,7 @@ fn store(cell: &Cell, program: &str) -> String {
     path(&store).to_owned()
 }
 
-/// What asyncua is told when it asks for keys: the status, then what the service answers.
+/// Requests keys with asyncua. Returns the status and the output arguments of the service.
 fn asked(cell: &Cell, security: &str, arguments: &Value) -> Value {
     let certificates = cell.folder().join("client");
     let told = cell.asyncua_once(
@@ -76,7 +78,7 @@ fn clients_of_other_makers_get_the_keys_that_they_may_have_over_sessions_nobody_
     assert!(next > 0.0 && next <= 600_000.0, "{next}");
     assert_eq!(value[4], 600_000.0);
 
-    // Those that are refused learn no more than that.
+    // Refused clients learn nothing but the status.
     for (security, arguments, status) in [
         ("None", json!(["cell", 0, 2]), "BadSecurityModeInsufficient"),
         ("Basic256Sha256", json!(["plant", 0, 2]), "BadNotFound"),
@@ -131,7 +133,7 @@ fn who_is_no_member_of_the_group_gets_no_keys() {
     }
 }
 
-/// Values of ROS 1 as they come in ROS 2, and how many.
+/// Values of ROS 1 as received in ROS 2.
 struct Stream {
     heard: Child,
     _rest: Vec<Child>,
@@ -148,7 +150,7 @@ impl Stream {
     }
 }
 
-/// Both bridges with the mapping, and numbers from ROS 1 to ROS 2, twenty a second.
+/// Starts both bridges with the mapping, and sends numbers from ROS 1 to ROS 2, twenty a second.
 fn stream(cell: &Cell, mapping: &str) -> Stream {
     let pki = [store(cell, "ros1"), store(cell, "ros2")];
     let master = cell.roscore();
@@ -180,7 +182,7 @@ fn stream(cell: &Cell, mapping: &str) -> Stream {
     }
 }
 
-/// That numbers came one after the other, none of them lost or twice.
+/// Checks that numbers are consecutive, without loss or duplicates.
 fn are_whole(values: &[Value]) {
     let numbers: Vec<u64> = values
         .iter()
@@ -205,16 +207,17 @@ fn bridges_live_with_the_keys_of_the_service_through_its_rotations_and_without_i
             ["unknown_key", "no_keys", "signature"].map(|reason| dropped(address, reason))
         })
     };
-    // Before there were any keys.
+    // Before any keys existed.
     let before = refused();
 
-    // Rotation under traffic: each goes on to the next key.
+    // Rotation under traffic: each program changes to the next key.
     for address in [METRICS_ROS1, METRICS_ROS2, METRICS_SERVER] {
         eventually("the key after the next is used", SOON, || {
             (token(address)? >= begun + 2).then_some(())
         });
     }
-    // The service is away for longer than a key is used: those it handed out before are used.
+    // The service is offline for longer than a key's lifetime: the keys it distributed before are
+    // used.
     server.end();
     let away = token(METRICS_ROS1).unwrap();
     for address in bridges {
@@ -233,7 +236,7 @@ fn bridges_live_with_the_keys_of_the_service_through_its_rotations_and_without_i
     are_whole(&stream.heard.values());
     assert_eq!(refused(), before);
 
-    // It is away for longer than all of them are used: the last goes on.
+    // The service is offline for longer than the lifetime of all keys: the last key stays in use.
     server.end();
     let is_overdue = |address: &str| {
         let state = metrics(address)?["groups"]["cell"].clone();
@@ -276,7 +279,8 @@ fn a_bridge_waits_for_a_service_that_starts_after_it_and_says_what_is_missing() 
     );
 
     let _server = server(&cell, &mapping);
-    // It trusts nobody it was not told to, and says how to tell it.
+    // The bridge trusts only certificates it was configured to trust, and the message has the
+    // command to trust.
     let untrusted = bridge.wait_for_line("BadCertificateUntrusted", SOON);
     let told = ["`ua-server trust", "pki-ros1"];
     assert!(

@@ -1,4 +1,5 @@
-//! Who may do what: users, roles, certificates, and the verbs that decide on them, with asyncua as judge.
+//! Access control: users, roles, certificates, and the commands that manage them, checked with
+//! asyncua.
 
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
@@ -17,7 +18,7 @@ pub(super) const PASSWORD: &str = "correct horse battery";
 const SECURED: &str = "Basic256Sha256/Sign,Basic256Sha256/SignAndEncrypt,Aes128_Sha256_RsaOaep/Sign,\
     Aes128_Sha256_RsaOaep/SignAndEncrypt,Aes256_Sha256_RsaPss/Sign,Aes256_Sha256_RsaPss/SignAndEncrypt";
 
-/// Nothing of security is said.
+/// A mapping without security settings.
 const MAPPING: &str = "
 namespaces:
   2: urn:ua-bridge:system-tests
@@ -50,7 +51,7 @@ impl Site {
         site
     }
 
-    /// Runs a verb, with a line for its stdin.
+    /// Runs a command with a line for its standard input.
     fn verb(&self, args: &[&str], line: &str) -> Output {
         verb(&self.cell, args, line)
     }
@@ -80,7 +81,7 @@ impl Site {
         self.cell.asyncua_once("opcua_access.py", &args)
     }
 
-    /// Of one try.
+    /// Returns the outcome of a single try.
     fn tried(&self, node: &str, way: &str, user: &str) -> Value {
         self.tries(node, way, user, &[]).remove(0)
     }
@@ -104,7 +105,7 @@ pub(super) fn verb(cell: &Cell, args: &[&str], line: &str) -> Output {
         .stderr(Stdio::piped())
         .spawn()
         .unwrap();
-    // One that reads no password may have ended.
+    // A command that reads no password may have ended.
     let _unread = child.stdin.take().unwrap().write_all(line.as_bytes());
     child.wait_with_output().unwrap()
 }
@@ -124,7 +125,7 @@ fn each_policy_takes_each_kind_of_user_and_each_may_do_what_its_role_may() {
     let Some(site) = Site::with(MAPPING, &["--trust-any-client-certificate"]) else {
         return;
     };
-    // Without users whoever is on this host operates, as before.
+    // Without users, every client on this host has the rights of an operator.
     let first = site.tried(SETPOINT, "None", "anonymous");
     assert_eq!(outcome(&first), ["Good", NEVER, "Good"]);
     let first = site.tried(LIMIT, "None", "anonymous");
@@ -163,7 +164,7 @@ fn each_policy_takes_each_kind_of_user_and_each_may_do_what_its_role_may() {
         };
         assert_eq!(outcome(tried), wanted, "{tried}");
     }
-    // What is kept to engineers.
+    // Nodes that only engineers may write.
     let way = "Aes256_Sha256_RsaPss/SignAndEncrypt";
     for (user, write) in [
         ("anonymous", "BadUserAccessDenied"),
@@ -172,12 +173,12 @@ fn each_policy_takes_each_kind_of_user_and_each_may_do_what_its_role_may() {
     ] {
         assert_eq!(site.tried(LIMIT, way, user)["write"], write, "{user}");
     }
-    // A name and a password do not go in clear.
+    // A user name and password are not sent unencrypted.
     let clear = site.tried(SETPOINT, "None", "password");
     assert_ne!(clear["connected"], "Good", "{clear}");
 }
 
-/// As node-opcua sees it, which makes its signatures and secrets by other means.
+/// Checked with node-opcua, which creates its signatures and secrets with another library.
 #[test]
 fn node_opcua_comes_in_by_each_policy_and_kind_of_user() {
     let Some(cell) = Cell::with(&[Peer::Python, Peer::NodeOpcua]) else {
@@ -277,7 +278,7 @@ fn more_sessions_than_there_may_be_are_refused_and_those_of_killed_clients_make_
     };
     let came = crowd("200", &[]);
     assert_eq!(came["Good"], 100, "{came}");
-    // A session that is created before another one is activated takes its place.
+    // A session that is created before another session is activated takes its place.
     let refused = ["BadTooManySessions", "BadSessionIdInvalid"];
     let refused: u64 = refused.iter().filter_map(|name| came[name].as_u64()).sum();
     assert_eq!(refused, 100, "{came}");

@@ -1,5 +1,5 @@
-//! Certificates that authorities issue and revoke: clients that have one are let in without being known, with asyncua as judge
-//! and authorities made by another library.
+//! Certificates that authorities issue and revoke: clients with an issued certificate are admitted
+//! without being known. Checked with asyncua and authorities made by another library.
 
 use std::fs;
 
@@ -17,7 +17,8 @@ variables:
   - {node: ns=2;i=30, name: setpoint, type: Double, origin: 0}
 ";
 
-/// A server that trusts an authority, and what that and others issued in the folder of the clients.
+/// Starts a server that trusts an authority, with certificates of that and other authorities in the
+/// folder of the clients.
 fn site() -> Option<Site> {
     let cell = Cell::with(&[Peer::Python])?;
     let pairs = cell.folder().join("pairs");
@@ -52,7 +53,7 @@ fn outcome(site: &Site, client: &str) -> String {
     tried["connected"].as_str().unwrap().to_owned()
 }
 
-/// The server looks at its store once a second.
+/// Waits until a client has this outcome; the server checks its store once a second.
 fn becomes(site: &Site, client: &str, wanted: &str) {
     eventually(&format!("{client}: {wanted}"), SOON, || {
         (outcome(site, client) == wanted).then_some(())
@@ -71,7 +72,7 @@ fn whom_a_trusted_authority_issued_a_certificate_is_let_in_and_each_fault_has_it
     for (client, wanted) in [
         ("gone", "BadCertificateRevoked"),
         ("late", "BadCertificateTimeInvalid"),
-        // A stranger is not told what is wrong.
+        // A stranger does not learn the reason.
         ("stranger", "BadSecurityChecksFailed"),
         ("below", "BadSecurityChecksFailed"),
         ("orphan", "BadSecurityChecksFailed"),
@@ -90,7 +91,7 @@ fn whom_a_trusted_authority_issued_a_certificate_is_let_in_and_each_fault_has_it
     eventually("nobody is let in any longer", SOON, || {
         fs::read_dir(&left).ok()?.next().is_none().then_some(())
     });
-    // One that stands between is known, and then both lists are.
+    // An intermediate authority becomes known, and then its revocation lists.
     let between = site.cell.folder().join("pairs/between.der");
     site.told(&["trust", "--issuer", path(&between)], "");
     becomes(&site, "below", "BadCertificateRevocationUnknown");
@@ -101,7 +102,7 @@ fn whom_a_trusted_authority_issued_a_certificate_is_let_in_and_each_fault_has_it
     takes(&site, "over.der");
     takes(&site, "over.crl");
     becomes(&site, "orphan", "BadCertificateIssuerTimeInvalid");
-    // A stranger that somebody decides on is let in, and its authority is not.
+    // A stranger that an administrator trusts is admitted, but its authority is not.
     let stranger = site.cell.folder().join("pairs/stranger_certificate.der");
     site.told(&["trust", path(&stranger)], "");
     becomes(&site, "stranger", "Good");

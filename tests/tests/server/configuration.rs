@@ -1,4 +1,5 @@
-//! The certificates of the server as an administrator manages them over OPC UA, with asyncua as that and another library as authority.
+//! The certificates of the server, managed over OPC UA: asyncua is the administrator, and another
+//! library the authority.
 
 use serde_json::json;
 use system_tests::{SERVER_ENDPOINT, eventually};
@@ -35,7 +36,7 @@ fn an_administrator_gives_the_server_another_certificate_and_says_whom_it_trusts
         let args = [&["refused", SERVER_ENDPOINT, path(&folder)][..], &sara].concat();
         site.cell.asyncua_try("opcua_push.py", &args)
     });
-    // Who may not: an engineer, somebody without a name, and she over a channel that others can read.
+    // Refused: an engineer, an anonymous user, and the administrator over an unencrypted channel.
     let anna = ["--user", "anna", "--password", PASSWORD];
     for who in [&anna[..], &[]] {
         let said = asked("refused", who);
@@ -46,7 +47,7 @@ fn an_administrator_gives_the_server_another_certificate_and_says_whom_it_trusts
     let said = asked("refused", &read);
     assert_eq!(said["request"], "BadSecurityModeInsufficient", "{said}");
     assert_eq!(said["open"], "BadSecurityModeInsufficient", "{said}");
-    // A stranger, which is refused and told of.
+    // A stranger, which is refused and listed as rejected.
     let way = "Basic256Sha256/SignAndEncrypt";
     let stranger = site.tries(SETPOINT, way, "anonymous", &["--client", "user"]);
     assert_ne!(stranger[0]["connected"], "Good", "{stranger:?}");
@@ -71,7 +72,8 @@ fn an_administrator_gives_the_server_another_certificate_and_says_whom_it_trusts
             "removed_again": "BadInvalidArgument",
         })
     );
-    // The same process starts anew with the new pair, and lets in whom the authority has issued a certificate.
+    // The same process restarts the server with the new key pair and admits a client with a
+    // certificate of the authority.
     let shown = eventually("the server shows the new certificate", SOON, || {
         let args = ["shown", SERVER_ENDPOINT, path(&folder)];
         let said = site.cell.asyncua_try("opcua_push.py", &args)?.remove(0);

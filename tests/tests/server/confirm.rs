@@ -1,4 +1,5 @@
-//! Writes that have succeeded when a bridge confirms them or the robot answers, and not when they have been sent.
+//! Writes that succeed when a bridge confirms them or the robot answers, and not when they have
+//! been sent.
 
 use system_tests::Distribution;
 
@@ -45,17 +46,17 @@ fn got(robot: &mut Child, setpoint: f64) {
     });
 }
 
-/// Whether what goes out in `window` has a setpoint in it.
+/// Returns whether a datagram of `window` contains a setpoint.
 fn is_sent(group: &UadpSocket, window: Duration) -> bool {
     let sent = group.receive_for(window);
     let mut written = sent.iter().filter_map(|datagram| written(datagram));
     written.any(|(triple, _)| triple == (0, 2, 30))
 }
 
-/// A robot that is there behind its bridge, and then is not.
+/// Checks writes to a robot that is present behind its bridge, and then is lost.
 fn confirms(cell: &Cell, mut robot: Child) {
     let set = |value: &str| write(cell, SETPOINT, "Double", value);
-    // The first one may leave before everybody has found everybody.
+    // The first write may be sent before discovery is complete.
     eventually("the robot answers", SOON * 2, || {
         (set("5.0") == "Good").then_some(())
     });
@@ -71,7 +72,7 @@ fn confirms(cell: &Cell, mut robot: Child) {
         (&shown["value"], &shown["status"]),
         (&json!(5.0), &json!("Good"))
     );
-    // What was on its way.
+    // Datagrams that were already sent.
     let _before = group.receive_for(Duration::from_millis(100));
     let three_periods = Duration::from_secs(3);
     assert!(!is_sent(&group, three_periods), "it is still repeated");
@@ -106,12 +107,12 @@ fn a_write_has_succeeded_when_a_robot_of_rclpy_answers_and_has_not_happened_when
     confirms(&cell, robot);
 }
 
-/// A bridge that confirms: without a robot, with one that is there, and one that is gone.
+/// Checks a bridge that confirms: without a robot, with a present robot, and with a lost robot.
 fn is_confirmed_by_the_bridge(cell: &Cell, bridge: Child, start: impl FnOnce() -> Child) {
     let set = |value: &str| write(cell, SETPOINT, "Double", value);
     assert_eq!(set("1.0"), "BadTimeout", "there is no subscriber");
     let mut robot = start();
-    // The bridge and the robot may still be about to find each other.
+    // The bridge and the robot may still be discovering each other.
     let mut value = 10.0;
     eventually("a write is confirmed", SOON * 2, || {
         value += 1.0;
@@ -211,7 +212,7 @@ fn the_last_write_that_a_killed_server_confirmed_is_what_the_robot_got() {
         .iter()
         .filter_map(|line| line.get("confirmed")?.as_f64());
     let last = confirmed.max_by(f64::total_cmp).unwrap();
-    // One more may have left whose confirmation did not.
+    // One more value may have been sent without its confirmation.
     eventually(&format!("{last} has come"), SOON, || {
         let told = robot.json_lines();
         let got = told

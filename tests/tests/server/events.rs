@@ -1,4 +1,4 @@
-//! Which events a client is told of that names their types, as asyncua does.
+//! The events that a client receives if it names event types, as asyncua does.
 
 use super::*;
 
@@ -16,7 +16,7 @@ fn a_client_that_names_types_of_events_is_told_of_those_and_of_no_others() {
     let _server = server(&cell);
     let mut updates = listening(&cell, &[AUDIT_UPDATE]);
     let mut sessions = listening(&cell, &[AUDIT_SESSION]);
-    // Each of its events happens with others between two answers of the server.
+    // Each of these events happens together with others between two responses of the server.
     let mut all = listening(&cell, &[AUDIT, "--interval", "2000"]);
     for value in ["1.5", "2.5"] {
         write(&cell, "ns=2;i=30", "Double", value);
@@ -27,7 +27,7 @@ fn a_client_that_names_types_of_events_is_told_of_those_and_of_no_others() {
     told_of(&mut all, &[pair, pair].concat());
 }
 
-/// A client that watches the Server object for events of the types.
+/// Starts a client that subscribes to events of these types at the Server object.
 fn listening(cell: &Cell, args: &[&str]) -> Child {
     let args = [&[SERVER_ENDPOINT], args].concat();
     let mut client = cell.asyncua("opcua_events.py", &args);
@@ -37,8 +37,9 @@ fn listening(cell: &Cell, args: &[&str]) -> Child {
     client
 }
 
-/// Waits until the last events that the client was told of are of these types. All others must be, too, such as those of
-/// the sessions of who began to listen later; and there must be no value.
+/// Waits until the last events that the client received are of these types. All other events must
+/// be of these types, too, such as events of the sessions of later clients. The client must have
+/// received no value.
 fn told_of(client: &mut Child, types: &[&str]) {
     eventually(&format!("{types:?} are told"), SOON, || {
         let lines = client.json_lines();

@@ -1,4 +1,4 @@
-//! Where the variables stand, and that they do so again after a restart and a reload.
+//! The folders of variables, also after a restart and a reload.
 
 use super::*;
 
@@ -22,7 +22,7 @@ const CONVEYOR: &str = "  - {node: ns=2;i=11, name: Line.Conveyor.Speed, type: D
   - {node: ns=2;s=On, alias: 31, name: Line.On, type: Boolean, origin: 2}
 ";
 
-/// The nodes and names below the folder of the space, and in the folders in it.
+/// Returns the nodes and names below the folder of the space, and in its subfolders.
 fn stand(cell: &Cell) -> Vec<Value> {
     let folders = ["", "/Line", "/Line/Oven", "/Line/Conveyor"];
     let folders = folders.map(|path| format!("ns=1;s=UaSpace.2{path}"));

@@ -1,4 +1,4 @@
-//! The history of the values: raw and as aggregates, judged by asyncua and node-opcua.
+//! The history of values: raw and as aggregates, checked with asyncua and node-opcua.
 
 use serde_json::{Value, json};
 use system_tests::{Cell, Child, Peer, SERVER_ENDPOINT, UadpSocket, eventually};
@@ -6,7 +6,8 @@ use uadp::{DataSetHeader, Timestamp};
 
 use super::{SOON, TEMPERATURE, TEMPERATURE_NODE, key_frame, shows, watch, write};
 
-/// A value that others write, one that clients write, and one that not everybody may read.
+/// A value written by others, a value written by clients, and a value that only some users may
+/// read.
 const MAPPING: &str = "
 namespaces:
   2: urn:ua-bridge:system-tests
@@ -18,12 +19,12 @@ variables:
   - {node: ns=2;i=31, name: secret, type: Double, origin: 0, permissions: {read: engineer}}
 ";
 
-/// HistorianBits of a StatusCode, with that it is one of a value (OPC 10000-4, 7.39.1).
+/// HistorianBits of a StatusCode, with the InfoType of a DataValue (OPC 10000-4, 7.39.1).
 const CALCULATED: u32 = 0x0401;
 const INTERPOLATED: u32 = 0x0402;
 const BAD: u32 = 0x8000_0000;
 
-/// Where the times of questions begin, in nanoseconds.
+/// The start of the times in queries, in nanoseconds.
 const EPOCH: i128 = 1_700_000_000_000_000_000;
 
 fn server(cell: &Cell) -> Child {
@@ -35,7 +36,7 @@ fn server(cell: &Cell) -> Child {
     server
 }
 
-/// What a judge is answered.
+/// Returns the answers of a judge.
 fn asyncua(cell: &Cell, questions: &Value) -> Vec<Value> {
     cell.asyncua_once(
         "opcua_history.py",
@@ -47,7 +48,7 @@ fn node_opcua(cell: &Cell, questions: &Value) -> Vec<Value> {
     cell.node_opcua_once("history.js", &[SERVER_ENDPOINT, &questions.to_string()])
 }
 
-/// A sample of that many milliseconds after [`EPOCH`].
+/// Encodes a sample with the time `at` milliseconds after [`EPOCH`].
 fn sample(sequence: u16, (at, value): (i32, f64), status: Option<u16>) -> Vec<u8> {
     let time = Timestamp::from_unix_nanos(EPOCH + i128::from(at) * 1_000_000);
     let header = DataSetHeader {
@@ -58,7 +59,7 @@ fn sample(sequence: u16, (at, value): (i32, f64), status: Option<u16>) -> Vec<u8
     key_frame(TEMPERATURE, sequence, value, header)
 }
 
-/// Four values a second apart, and a bad one after their writer was silent.
+/// Sends four values a second apart, and a bad value after their writer was silent.
 fn five_values(cell: &Cell) {
     let group = UadpSocket::join();
     let mut watch = watch(cell, TEMPERATURE_NODE);
@@ -73,7 +74,7 @@ fn five_values(cell: &Cell) {
     });
 }
 
-/// Whether each judge is answered so.
+/// Checks that each judge gets these answers.
 fn assert_answers(cell: &Cell, expected: &[(Value, Value)]) {
     let questions = expected.iter().map(|(question, _)| question.clone());
     let questions = Value::Array(questions.collect());
@@ -89,7 +90,7 @@ fn assert_answers(cell: &Cell, expected: &[(Value, Value)]) {
     }
 }
 
-/// Judges write numbers without a fraction in two ways.
+/// Converts numbers to floats, because the judges write whole numbers in two ways.
 fn numbers(value: &Value) -> Value {
     match value {
         Value::Number(number) => json!(number.as_f64()),
@@ -198,7 +199,7 @@ fn aggregates_of_past_values_are_worked_out_for_each_interval() {
                 of("Average", (0, 6000, 2000)),
                 json!({"status": "Good", "answers": 1, "values": with_the_bad_one}),
             ),
-            // The least ones are at the starts of their intervals, so they are as they came.
+            // The minima are at the starts of their intervals, so they are raw values.
             (
                 of("Minimum", halves),
                 good(1, &[(0, 1.0, 0), (2000, 3.0, 0)]),

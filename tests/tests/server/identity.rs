@@ -1,4 +1,4 @@
-//! What the server says of itself and of its values, to clients that read everything.
+//! The server's description of itself and of its values, for clients that read everything.
 
 use super::*;
 

@@ -1,7 +1,8 @@
-//! What a client may send that no client would: conversations of one, changed. Others are served all the while.
+//! Mutated conversations of a client that no correct client would send. Other clients are served
+//! throughout.
 //!
-//! The corpus in `fuzz/corpus/opcua` has a frame of asyncua for each service. `UA_FUZZ_CONNECTIONS` and `UA_FUZZ_SEED` run it
-//! longer and otherwise.
+//! The corpus in `fuzz/corpus/opcua` has a frame of asyncua for each service. `UA_FUZZ_CONNECTIONS`
+//! and `UA_FUZZ_SEED` set the number of connections and their seed.
 
 use std::io::{self, Read as _, Write as _};
 use std::net::{Shutdown, TcpStream};
@@ -23,7 +24,7 @@ fn malformed_chunks_of_many_clients_neither_stop_nor_swell_the_server() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
     };
-    // The sessions of those that are gone last a minute.
+    // The sessions of closed connections last a minute.
     let mapping = format!("{MAPPING}  limits: {{sessions: 10000}}\n");
     let mut server = serving(&cell, &mapping);
     let group = UadpSocket::join();
@@ -75,14 +76,14 @@ fn malformed_chunks_of_many_clients_neither_stop_nor_swell_the_server() {
     assert!(grown < MOST_GROWTH, "{grown} bytes more than before");
 }
 
-/// How far a conversation came.
+/// The progress of a conversation.
 enum Reached {
     Nothing,
     Channel,
     Session,
 }
 
-/// Who says what no client says. The same seed says the same.
+/// A client that sends mutated messages. The same seed sends the same messages.
 pub(super) struct Stranger {
     hello: Vec<u8>,
     open: Vec<u8>,
@@ -92,12 +93,12 @@ pub(super) struct Stranger {
     random: u64,
 }
 
-/// A channel, as the server has opened it.
+/// A channel that the server has opened.
 pub(super) struct Channel {
     id: [u8; 4],
     token: [u8; 4],
     sequence: u32,
-    /// The AuthenticationToken of the session, or nothing.
+    /// The AuthenticationToken of the session, if there is a session.
     session: Option<Vec<u8>>,
 }
 
@@ -123,7 +124,7 @@ impl Stranger {
         }
     }
 
-    /// One connection, which ends when the server has closed it.
+    /// Makes a connection, which ends when the server has closed it.
     fn visit(&mut self, kind: u64) -> Reached {
         let mut stream = TcpStream::connect(SERVER_ENDPOINT.trim_start_matches("opc.tcp://"))
             .expect("the server listens");
@@ -131,7 +132,7 @@ impl Stranger {
         stream.set_write_timeout(Some(SOON)).unwrap();
         let mut reached = Reached::Nothing;
         let said = self.say(&mut stream, kind, &mut reached);
-        // It closes the connection as soon as something is wrong.
+        // The server closes the connection at the first error.
         drop(said);
         drop(stream.shutdown(Shutdown::Write));
         let mut heard = Vec::new();
@@ -225,7 +226,7 @@ impl Stranger {
         answer(stream)
     }
 
-    /// Another frame from a place on.
+    /// Mutates a frame at or after position `from`.
     fn change(&mut self, frame: &mut Vec<u8>, from: usize) {
         const NUMBERS: [u32; 9] = [
             0,
@@ -274,7 +275,7 @@ impl Stranger {
         }
     }
 
-    /// The size that a frame has, most times.
+    /// Sets the size of the frame, which is right most times.
     fn set_size(&mut self, frame: &mut [u8]) {
         let Ok(size) = u32::try_from(frame.len()) else {
             return;
@@ -289,7 +290,7 @@ impl Stranger {
         }
     }
 
-    /// The same message in two chunks or more, the last of which may be missing or given up.
+    /// Splits a message into two chunks or more. The last chunk may be missing or aborted.
     fn split(&mut self, frame: &[u8], channel: &mut Channel) -> Vec<u8> {
         let Some((header, body)) = frame.split_at_checked(BODY) else {
             return frame.to_vec();
@@ -328,10 +329,12 @@ impl Stranger {
 }
 
 impl Channel {
-    /// That of an answer to an OpenSecureChannel request (OPC 10000-6, 6.7.2; OPC 10000-4, 5.6.2).
+    /// Returns the channel of an answer to an OpenSecureChannel request (OPC 10000-6, 6.7.2; OPC
+    /// 10000-4, 5.6.2).
     fn opened(answer: &[u8]) -> Self {
         let policy = "http://opcfoundation.org/UA/SecurityPolicy#None".len();
-        // The header of the chunk with no certificates, the SequenceHeader, the type, the ResponseHeader, the ProtocolVersion.
+        // The header of the chunk without certificates, the SequenceHeader, the type, the
+        // ResponseHeader, the ProtocolVersion.
         let at = 12 + 4 + policy + 4 + 4 + 8 + 4 + 24 + 4;
         Self {
             id: answer[at..at + 4].try_into().unwrap(),
@@ -341,7 +344,7 @@ impl Channel {
         }
     }
 
-    /// A recorded request as the next of this channel and its session.
+    /// Returns a recorded request as the next request of this channel and its session.
     pub(super) fn addressed(&mut self, frame: &[u8]) -> Vec<u8> {
         self.sequence += 1;
         let mut frame = frame.to_vec();
@@ -359,19 +362,19 @@ impl Channel {
     }
 }
 
-/// The AuthenticationToken in an answer to a CreateSession request.
+/// Returns the AuthenticationToken of an answer to a CreateSession request.
 fn token(answer: &[u8]) -> io::Result<Vec<u8>> {
     let at = answer
         .windows(TOKEN.len())
         .skip(BODY + 28)
         .position(|bytes| bytes == TOKEN)
-        // There are as many sessions as there may be.
+        // The maximum number of sessions exists.
         .ok_or(io::ErrorKind::ConnectionRefused)?;
     let begin = BODY + 28 + at;
     Ok(answer[begin..begin + TOKEN.len() + 32].to_vec())
 }
 
-/// The next frame that the server says.
+/// Returns the next frame of the server.
 pub(super) fn answer(stream: &mut TcpStream) -> io::Result<Vec<u8>> {
     let mut frame = vec![0; 8];
     stream.read_exact(&mut frame)?;
@@ -382,12 +385,12 @@ pub(super) fn answer(stream: &mut TcpStream) -> io::Result<Vec<u8>> {
     Ok(frame)
 }
 
-/// Where the body of a chunk begins that is not secured.
+/// The position of the body of a chunk without security.
 pub(super) const BODY: usize = 24;
-/// How a token of this server begins: an opaque NodeId of namespace 0 with 32 bytes.
+/// The head of a token of this server: an opaque NodeId of namespace 0 with 32 bytes.
 const TOKEN: &[u8] = &[5, 0, 0, 32, 0, 0, 0];
-/// Of one connection, if it is not closed before.
+/// Requests per connection, if the server does not close it before.
 const REQUESTS: usize = 20;
-/// What a connection may be told.
+/// The maximum number of bytes that a connection may receive.
 const MOST_HEARD: usize = 8 << 20;
 const MOST_GROWTH: u64 = 128 << 20;

@@ -1,10 +1,10 @@
-//! The nodes of NodeSet2 files beside those of the mapping.
+//! The nodes of NodeSet2 files together with the nodes of the mapping.
 
 use std::collections::BTreeSet;
 
 use super::*;
 
-/// A NodeSet of the OPC Foundation, which are a peer.
+/// Returns a NodeSet of the OPC Foundation, which is a peer.
 fn node_set(name: &str) -> Option<String> {
     let path = test_data::foreign(&format!("nodesets/Opc.Ua.{name}.NodeSet2.xml"))?;
     Some(path.to_str().unwrap().to_owned())
@@ -12,7 +12,8 @@ fn node_set(name: &str) -> Option<String> {
 
 const LINE: &str = include_str!("data/line.xml");
 
-/// A line of the cell among the devices of DI. The order of the files is none that they could be loaded in.
+/// A line of the cell among the devices of DI. The files are listed in an order in which they
+/// cannot be loaded.
 fn mapping(variables: &str) -> String {
     let of = |name: &str| format!("'{}'", node_set(name).unwrap());
     format!(
@@ -42,7 +43,7 @@ const LIVE: &str =
 ";
 const SPEED: (u16, u16, u16) = (2, 3, 6000);
 
-/// Whether the NodeSets are there.
+/// Returns whether the NodeSets are available.
 fn has_nodesets() -> bool {
     node_set("Di").is_some()
 }
@@ -68,7 +69,7 @@ fn nodes_of_nodesets_are_browsed_and_those_of_the_mapping_live() {
     group.send(&key_frame(SPEED, 1, 1.25, DataSetHeader::default()));
     shows(&mut speed, "Good", &json!(1.25));
 
-    // Written by a client it leaves for the space, which no Value of the file did.
+    // A value written by a client is sent to the space, while no Value of the file was sent.
     assert_eq!(write(&cell, "ns=3;s=Line.Target", "Double", "2.5"), "Good");
     eventually("the written value is sent", SOON, || {
         let datagram = group.receive(Duration::from_millis(100))?;
@@ -79,7 +80,7 @@ fn nodes_of_nodesets_are_browsed_and_those_of_the_mapping_live() {
     });
     assert_eq!(read(&cell, "ns=3;s=Line.Target")["value"], json!(2.5));
 
-    // What nobody keeps up is as the file has it, and is neither written nor called.
+    // A node without a source has the value of the file and can be neither written nor called.
     let count = read(&cell, "ns=3;i=6020");
     assert_eq!(count["value"], json!(7));
     let time = |key: &str| {
@@ -119,7 +120,8 @@ fn nodes_of_nodesets_are_browsed_and_those_of_the_mapping_live() {
     assert_eq!(export["exported"], json!(13), "{export}");
 }
 
-/// Both read every node and attribute, find the same bad, and asyncua's importer takes what its exporter wrote of them.
+/// Checks that both clients read every node and attribute and find the same bad results, and that
+/// asyncua imports its own export of the nodes.
 fn are_walked_by_asyncua_and_node_opcua(cell: &Cell) {
     let tree = cell.asyncua_started("opcua_tree.py", &[SERVER_ENDPOINT, "--export"]);
     let mut tree = tree.start();
@@ -141,7 +143,7 @@ fn are_walked_by_asyncua_and_node_opcua(cell: &Cell) {
     let sum = told.last().unwrap();
     assert!(sum["nodes"].as_u64() > Some(5_000), "{sum}");
 
-    // node-opcua reads the same tree, and finds nothing else.
+    // node-opcua reads the same tree and finds the same bad results.
     let walked = cell.node_opcua_once("tree.js", &[SERVER_ENDPOINT]);
     let theirs = walked.last().unwrap();
     assert_eq!(theirs["nodes"], sum["nodes"], "{theirs} {sum}");
@@ -170,7 +172,7 @@ variables:
   - {node: ns=2;i=10, name: temperature, type: Double, origin: 2}
 ";
     let mut server = serving(&cell, mapping);
-    // Of one that is none by its definition it is told, and it has no value.
+    // A Value that does not match its definition is logged, and the node has no value.
     let told = server.wait_for_line("M170", SOON);
     assert!(
         told.contains("the value cannot be read") && told.contains("ns=1;i=6002"),
@@ -198,7 +200,8 @@ variables:
         (&json!("right"), &Value::Null)
     );
     assert_eq!(right["Corners"], json!([]));
-    // It has what it inherits from a structure of the other file, before its own.
+    // The structure has the fields inherited from a structure of the other file before its own
+    // fields.
     assert_eq!(told[2]["type"], "Post", "{told:?}");
     let post = json!({"X": 1.0, "Y": 2.0, "Height": 2.5});
     assert_eq!(told[2]["value"], post, "{told:?}");
@@ -213,7 +216,7 @@ fn a_node_that_the_mapping_leaves_is_that_of_its_file_again_and_other_files_need
         return;
     }
     let mut server = started(&cell, "");
-    // Nobody keeps it up.
+    // No source updates the node.
     assert_eq!(read(&cell, "ns=3;i=6000")["value"], json!(0.5));
     drop(cell.file("server.yaml", &mapping(LIVE)));
     let group = UadpSocket::join();
@@ -236,13 +239,13 @@ fn a_node_that_the_mapping_leaves_is_that_of_its_file_again_and_other_files_need
     assert!(told.contains("another one"), "{told}");
     assert_eq!(read(&cell, "ns=3;i=6000")["value"], json!(0.5));
 
-    // A file that cannot be loaded leaves what runs as it is.
+    // A file that cannot be loaded leaves the running configuration unchanged.
     drop(cell.file("line.xml", "<UANodeSet>"));
     server.wait_for_line("error[M170]", SOON);
     assert_eq!(read(&cell, "ns=3;i=6000")["value"], json!(0.5));
 }
 
-/// Does something again and again until the client has been told of that value last.
+/// Repeats `done` until the last value that the client received is this value.
 fn shows_last(watch: &Child, value: f64, mut done: impl FnMut()) {
     eventually(&format!("the node shows {value}"), SOON, || {
         done();

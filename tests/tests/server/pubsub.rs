@@ -1,4 +1,4 @@
-//! The PubSub configuration as it stands in the address space, judged by asyncua.
+//! The PubSub configuration in the address space, checked with asyncua.
 
 use std::time::{Duration, Instant};
 
@@ -20,7 +20,7 @@ const PAUSED: i32 = 1;
 const OPERATIONAL: i32 = 2;
 const PRE_OPERATIONAL: i32 = 4;
 
-/// A client at the configuration.
+/// A client of the configuration.
 struct Client {
     asyncua: Child,
     orders: u64,
@@ -35,7 +35,7 @@ impl Client {
         }
     }
 
-    /// What becomes of an order.
+    /// Sends an order and returns its result.
     fn told(&mut self, order: &str) -> Value {
         self.asyncua.tell(order);
         self.orders += 1;
@@ -50,7 +50,7 @@ impl Client {
         read["value"].take()
     }
 
-    /// Calls a method; its status.
+    /// Calls a method and returns its status.
     fn call(&mut self, path: &str) -> Value {
         self.told(&format!("call {path}"))["called"].take()
     }
@@ -203,9 +203,10 @@ fn what_is_below_a_group_that_is_disabled_sends_nothing() {
         assert_eq!(client.state(above), DISABLED, "{above}");
         assert_eq!(client.state(WRITER), state, "{above}");
         assert_eq!(write(&cell, SETPOINT, "Double", "9"), "BadInvalidState");
-        // What was sent before waits in this socket still.
+        // Datagrams sent before are still in this socket's buffer.
         while group.receive(Duration::from_millis(100)).is_some() {}
-        // What was under way may still come; then nothing does, for as long as a value is repeated in.
+        // A datagram in transit may still arrive. Then nothing is received for as long as the
+        // repetition period of a value.
         let quiet = Instant::now();
         let mut late = 0;
         while quiet.elapsed() < Duration::from_millis(2_500) {
@@ -243,7 +244,7 @@ fn the_configuration_is_a_file_that_says_what_the_nodes_say() {
     assert_eq!(file["body"], "PubSubConfiguration2DataType", "{file}");
     assert_eq!(file["mime"], "application/opcua+uabinary");
     assert_eq!(file["complete"], true, "its Size is that of what was read");
-    // Index 1 of the NamespaceArray is the first.
+    // Index 1 of the NamespaceArray is the first namespace of the file.
     assert_eq!(file["namespaces"][1], "urn:ua-bridge:system-tests");
     let content = &file["content"];
     assert_eq!(content["Enabled"], true);
@@ -309,7 +310,7 @@ fn the_configuration_is_a_file_that_says_what_the_nodes_say() {
     let target_node = format!("{READER}/SubscribedDataSet");
     of_node(&mut client, &target_node, targets, &["TargetVariables"]);
 
-    // What somebody has disabled is so in the file, and nothing else.
+    // In the file, only the disabled element is disabled.
     assert_eq!(client.call(&format!("{WRITER}/Status/Disable")), "Good");
     let file = client.told(&format!("file {FILE}"));
     let connection = &file["content"]["Connections"][0];
@@ -328,7 +329,7 @@ fn the_file_of_the_configuration_is_not_written_and_what_a_session_left_open_is_
     let _server = server(&cell);
     let (mut first, mut second) = (Client::of(&cell), Client::of(&cell));
     let mut opened = |mode: u8| first.told(&format!("open {FILE} {mode}"))["opened"].take();
-    // Anew; read and written; no mode of this file.
+    // The modes erase and write, read and write, and write alone, which is no mode of this file.
     let modes = [6, 3, 2].map(&mut opened);
     assert_eq!(
         modes,

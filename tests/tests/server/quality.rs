@@ -1,8 +1,9 @@
-//! What the status of a value says of its age and of who sends it.
+//! The status of a value as a function of its age and of the state of its publisher.
 
 use super::*;
 
-/// One value that has to come regularly, one that may be of any age, and one that the server's own rule makes bad.
+/// A value that has to arrive regularly, a value of any age, and a value that a rule of the server
+/// makes bad.
 const AGES: &str = "
 namespaces:
   2: urn:ua-bridge:system-tests
@@ -29,7 +30,7 @@ fn served(cell: &Cell) -> Child {
 const SETTING: (u16, u16, u16) = (2, 2, 11);
 const SETTING_NODE: &str = "ns=2;i=11";
 
-/// A word of the writer that it lives and has nothing new.
+/// Encodes a keep-alive message of the writer.
 fn keep_alive(triple: (u16, u16, u16), next: u16) -> Vec<u8> {
     let mut datagram = Vec::new();
     let header = NetworkHeader {
@@ -52,7 +53,7 @@ fn keep_alive(triple: (u16, u16, u16), next: u16) -> Vec<u8> {
     datagram
 }
 
-/// Sends `datagram` again and again until the client has been told that status and value.
+/// Repeats `send` until the client has received that status and value.
 fn shows_while(watch: &Child, (status, value): (&str, &Value), mut send: impl FnMut()) {
     let mut sent = Instant::now() - Duration::from_secs(1);
     eventually(&format!("{value} as {status}"), SOON, || {
@@ -85,7 +86,7 @@ fn a_value_that_has_to_come_regularly_is_uncertain_and_then_bad_though_its_write
     let uncertain = ("UncertainLastUsableValue", &json!(21.5));
     shows_while(&regular, uncertain, alive);
     shows_while(&regular, ("BadNoCommunication", &Value::Null), alive);
-    // As long as its writer is heard; from here on it is not.
+    // True while the writer is received; from here on it is silent.
     let told: Vec<Value> = setting.json_lines();
     let others: Vec<&Value> = told
         .iter()
@@ -111,7 +112,7 @@ fn a_writer_that_ended_is_told_from_a_publisher_that_is_not_heard_at_all_and_bot
     let group = UadpSocket::join();
     group.send(&key_frame(SETTING, 1, 3.5, DataSetHeader::default()));
     shows(&mut setting, "Good", &json!(3.5));
-    // Another value of the same publisher keeps coming.
+    // Another value of the same publisher continues to arrive.
     let mut sequence = 0;
     let uncertain = ("UncertainLastUsableValue", &json!(3.5));
     shows_while(&setting, uncertain, || {
@@ -126,7 +127,7 @@ fn a_writer_that_ended_is_told_from_a_publisher_that_is_not_heard_at_all_and_bot
     let away = "UncertainNoCommunicationLastUsableValue";
     shows(&mut setting, away, &json!(3.5));
     shows(&mut setting, "BadNoCommunication", &Value::Null);
-    // It lives after all, and its last value holds.
+    // The writer is alive after all, and its last value is valid again.
     group.send(&keep_alive(SETTING, 2));
     shows(&mut setting, "Good", &json!(3.5));
 }

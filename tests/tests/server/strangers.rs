@@ -1,4 +1,5 @@
-//! Clients that the server does not know yet, and clients that vanish: neither keeps others out or takes memory for good.
+//! Unknown clients and clients that vanish: they neither lock other clients out nor use memory
+//! permanently.
 
 use std::fs;
 use std::io::{self, Write as _};
@@ -10,7 +11,7 @@ use system_tests::{Cell, Peer, eventually, resident};
 use super::malformed::{BODY, Stranger, answer};
 use super::{MAPPING, SOON, read, serving, write};
 
-/// The server, and a client whose frames were recorded.
+/// Starts the server, and creates a client with recorded frames.
 fn site(mapping: &str) -> Option<(Cell, system_tests::Child, Stranger)> {
     let cell = Cell::with(&[Peer::Python])?;
     let server = serving(&cell, mapping);
@@ -33,7 +34,8 @@ fn sessions_that_are_never_activated_lock_nobody_out() {
         open.push((stream, channel));
     }
     answers(&cell);
-    // The newest one is still there. Its activation carries a nonce of 32 bytes (OPC 10000-4, 5.7.3).
+    // The newest session is still open. Its activation response has a nonce of 32 bytes (OPC
+    // 10000-4, 5.7.3).
     let (mut stream, mut channel) = open.pop().unwrap();
     let activated = stranger
         .activate_session(&mut stream, &mut channel)
@@ -104,7 +106,7 @@ fn a_client_without_a_session_takes_little_memory() {
     answers(&cell);
 }
 
-/// Whether the server has closed a connection.
+/// Returns whether the server has closed a connection.
 fn is_closed(sent: io::Result<()>) -> bool {
     let Err(error) = sent else { return false };
     let closed = [io::ErrorKind::ConnectionReset, io::ErrorKind::BrokenPipe];
@@ -118,8 +120,9 @@ fn subscriptions_of_vanished_clients_end() {
     };
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../fuzz/corpus/opcua");
     let mut subscribe = fs::read(folder.join("create_subscription")).unwrap();
-    // The last of the request are the publishing interval (100 ms), the lifetime (30 of these), the keep-alive count, the most
-    // notifications, whether it publishes, and the priority.
+    // The request ends with the publishing interval (100 ms), the lifetime (30 intervals), the
+    // keep-alive count, the maximum number of notifications, whether publishing is enabled, and the
+    // priority.
     let begin = subscribe.len() - 22;
     subscribe[begin..begin + 8].copy_from_slice(&100_f64.to_le_bytes());
     subscribe[begin + 8..begin + 12].copy_from_slice(&30_u32.to_le_bytes());

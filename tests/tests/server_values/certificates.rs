@@ -1,4 +1,5 @@
-//! Servers whose certificates an authority issued: with asyncua as each of them, and `ua-server` as their client.
+//! Servers with certificates issued by an authority: asyncua is each of the servers, and
+//! `ua-server` their client.
 
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
@@ -9,7 +10,7 @@ use serde_json::Value;
 use system_tests::{Cell, Child, METRICS_SERVER, Peer, eventually, metrics, program};
 
 const SOON: Duration = Duration::from_secs(40);
-/// The pairs, by their names: each server has one.
+/// The names of the key pairs: each server has a pair.
 const PAIRS: [&str; 6] = ["sound", "gone", "late", "elsewhere", "impostor", "stranger"];
 
 struct Site {
@@ -19,7 +20,7 @@ struct Site {
     server: Child,
 }
 
-/// A client that trusts the authority `plant`, and six servers.
+/// Starts a client that trusts the authority `plant`, and six servers.
 fn site() -> Option<Site> {
     let cell = Cell::with(&[Peer::Python])?;
     let folder = cell.folder().join("pairs");
@@ -84,7 +85,7 @@ impl Site {
     }
 }
 
-/// Waits until the link to a server is as it should be, and says all of it.
+/// Waits until the link to a server satisfies `pick`, and returns its status.
 fn link(name: &str, what: &str, pick: impl Fn(&Value) -> bool) -> Value {
     eventually(&format!("{name}: {what}"), SOON, || {
         let told = metrics(METRICS_SERVER)?["servers"].clone();
@@ -131,14 +132,14 @@ fn a_server_is_connected_to_by_its_authority_and_each_fault_has_its_status_and_i
         assert!(told["certificates_refused"].as_u64() > Some(0), "{told}");
     }
     site.server.wait_for_line("BadCertificateRevoked", SOON);
-    // What is to be typed is what it says.
+    // The message has the command to trust the server.
     let told = is_refused("stranger", "BadCertificateChainIncomplete", "alone: `");
     let why = told["why"].as_str().unwrap();
     let (_, command) = why.rsplit_once("`ua-server trust ").unwrap();
     let (digits, _) = command.split_once(' ').unwrap();
     trust(&site.cell, digits);
     is_secured("stranger");
-    // A connection that is open ends with the certificate.
+    // An open connection ends when its certificate is revoked.
     site.takes("plant-now.crl");
     is_refused(
         "sound",

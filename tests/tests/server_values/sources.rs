@@ -1,4 +1,4 @@
-//! Servers of other makers, which know nothing of the space, as sources and as those that are told.
+//! Third-party servers, which know nothing of the space, as sources and as destinations of values.
 
 use std::fs;
 use std::path::Path;
@@ -15,7 +15,7 @@ use uadp::{NetworkMessage, Scalar, Variant};
 
 use super::key_frame;
 
-/// asyncua and node-opcua need seconds to start on a busy machine.
+/// The time that asyncua and node-opcua need to start on a busy machine.
 const SOON: Duration = Duration::from_secs(40);
 const PLC: &str = "opc.tcp://127.0.0.1:4841";
 const URI: &str = "urn:ua-bridge:system-tests:plc";
@@ -39,7 +39,7 @@ variables:
     )
 }
 
-/// Waits for a notification of that node with that status and value; all of it.
+/// Waits for a notification of that node with that status and value, and returns it.
 fn shows(watch: &mut Child, node: &str, status: &str, value: &Value) -> Value {
     let what = format!("{node} shows {value} as {status}");
     watch.wait_for_json(&what, SOON, |line| {
@@ -48,7 +48,7 @@ fn shows(watch: &mut Child, node: &str, status: &str, value: &Value) -> Value {
     })
 }
 
-/// How often the node has been shown with that status.
+/// Returns how often the client received a value of the node with that status.
 fn times(watch: &Child, node: &str, status: &str) -> usize {
     let lines = watch.json_lines();
     let shown = lines.iter();
@@ -63,7 +63,7 @@ fn becomes(watch: &Child, node: &str, status: &str, before: usize) {
     });
 }
 
-/// What the server tells of the PLC.
+/// Waits until the status of the PLC satisfies `pick`, and returns it.
 fn link(pick: impl Fn(&Value) -> bool) -> Value {
     eventually("the link is told as it is", SOON, || {
         let told = metrics(METRICS_SERVER)?["servers"][0].clone();
@@ -71,7 +71,7 @@ fn link(pick: impl Fn(&Value) -> bool) -> Value {
     })
 }
 
-/// A message of the server with that value: its Status, and its age in seconds.
+/// Waits until the server sends that value. Returns its Status and its age in seconds.
 fn sent(group: &UadpSocket, id: u16, value: f64) -> (u16, i128) {
     eventually("the value is sent", SOON, || {
         let datagram = group.receive(Duration::from_secs(1))?;
@@ -124,7 +124,7 @@ fn a_plc_that_boots_second_is_heard_with_its_times_and_qualities_and_is_bad_whil
 
     let mut plc = asyncua_plc(&cell, &[]);
     shows(&mut watch, speed, "Good", &json!(0.5));
-    // One that the server does not have is bad alone, and told by its name.
+    // A node that the server does not have is bad by itself, and reported by its name.
     shows(&mut watch, "ns=2;i=3", "BadNodeIdUnknown", &Value::Null);
     let told = link(|told| told["up"] == true && told["faults"]["missing (from)"].is_string());
     assert_eq!((&told["name"], &told["url"]), (&json!("plc"), &json!(PLC)));
@@ -133,7 +133,7 @@ fn a_plc_that_boots_second_is_heard_with_its_times_and_qualities_and_is_bad_whil
     let up = r#"ua_server_up{program="ua-server",space="0",server="plc"} 1"#;
     assert!(page.contains(up), "{page}");
 
-    // A time of its own and a quality of its own, for clients and for the space.
+    // The value keeps its own timestamp and quality, for clients and for the space.
     let uncertain =
         r#"{"set": "Speed", "value": 7.5, "age": 600, "status": "UncertainLastUsableValue"}"#;
     plc.ask(uncertain, SOON);
@@ -151,7 +151,7 @@ fn a_plc_that_boots_second_is_heard_with_its_times_and_qualities_and_is_bad_whil
     plc.ask(r#"{"set": "Speed", "value": 9.5}"#, SOON);
     shows(&mut watch, speed, "Good", &json!(9.5));
 
-    // Nobody but the PLC says what it is.
+    // Only the PLC writes this value.
     let write = [SERVER_ENDPOINT, speed, "Double", "1.0"];
     let refused = cell.asyncua_once("opcua_write.py", &write).remove(0);
     assert!(
@@ -159,7 +159,7 @@ fn a_plc_that_boots_second_is_heard_with_its_times_and_qualities_and_is_bad_whil
         "{refused}"
     );
 
-    // What another space says is written there, and again when it comes back.
+    // A value of another space is written to the PLC, and again when the PLC returns.
     group.send(&key_frame(4, 1, |fields| {
         fields.scalar(Scalar::Double(42.0)).unwrap();
     }));
@@ -169,13 +169,13 @@ fn a_plc_that_boots_second_is_heard_with_its_times_and_qualities_and_is_bad_whil
     becomes(&watch, speed, "BadNoCommunication", before);
     drop(plc);
     let good = times(&watch, speed, "Good");
-    // It numbers its namespaces otherwise now.
+    // The restarted PLC has other namespace indices.
     let mut plc = asyncua_plc(&cell, &["--before", "2"]);
     becomes(&watch, speed, "Good", good);
     plc.ask(r#"{"set": "Speed", "value": 10.5}"#, SOON);
     shows(&mut watch, speed, "Good", &json!(10.5));
 
-    // Another mapping leaves the session alone.
+    // Another mapping keeps the session.
     let connects = link(|told| told["up"] == true)["connects"].clone();
     let load = format!(
         "  - {{node: ns=2;i=5, name: load, type: Double, origin: 0, from: {{server: plc, node: 'nsu={URI};s=Line.Load'}}}}\n"
@@ -212,7 +212,7 @@ fn a_server_of_node_opcua_is_heard_and_told_before_and_after_it_was_killed() {
     plc.ask(r#"{"set": 1.5}"#, SOON);
     shows(&mut watch, speed, "Good", &json!(1.5));
     shows(&mut watch, "ns=2;i=3", "BadNodeIdUnknown", &Value::Null);
-    // What a client of ours writes goes on to it.
+    // A value written by a client of our server is forwarded to the PLC.
     let write = [SERVER_ENDPOINT, "ns=2;i=6", "Double", "21.5"];
     let wrote = cell.asyncua_once("opcua_write.py", &write).remove(0);
     assert_eq!(wrote["status"], "Good");
@@ -222,7 +222,7 @@ fn a_server_of_node_opcua_is_heard_and_told_before_and_after_it_was_killed() {
     becomes(&watch, speed, "BadNoCommunication", before);
     drop(plc);
     let mut plc = node_opcua_plc(&cell);
-    // The mapping says that it is a state, which is written again.
+    // In the mapping, the value is a state, so it is written again.
     written(&mut plc, 21.5);
     plc.ask(r#"{"set": 2.5}"#, SOON);
     shows(&mut watch, speed, "Good", &json!(2.5));
@@ -259,7 +259,8 @@ fn a_password_goes_over_no_session_without_security_unless_told() {
     shows(&mut watch, speed, "Good", &json!(0.5));
 }
 
-/// The three, each at a server that takes no other: who is heard there has spoken it.
+/// The three security policies, each at a server that accepts no other, so every connection proves
+/// its policy.
 const POLICIES: [&str; 3] = [
     "Basic256Sha256",
     "Aes128_Sha256_RsaOaep",
@@ -309,7 +310,7 @@ fn each_security_policy_is_spoken_with_servers_of_two_makers_once_they_are_trust
             (all.len() == 6 && all.iter().all(pick)).then_some(())
         });
     };
-    // Nobody is trusted for having a certificate.
+    // No server is trusted only because it has a certificate.
     links(&|told| told["up"] == false && told["why"].is_string());
     let trusted = Command::new(program("ua-server"))
         .arg("trust")

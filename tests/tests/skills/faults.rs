@@ -1,4 +1,4 @@
-//! Skills whose component or client is lost, and clients that want the same at once.
+//! Skills whose component or client is lost, and clients that compete for the same skill.
 
 use std::time::{Duration, Instant};
 
@@ -43,7 +43,7 @@ fn a_session_that_has_nothing_done_keeps_nobody_from_the_component_for_long() {
     let later = line_of(&lines, "later");
     let seconds = later["seconds"].as_f64().unwrap();
     assert!((1.5..10.0).contains(&seconds), "{later}");
-    // And now it is the other's.
+    // The other client has the lease.
     assert_eq!(later["mine"], json!("BadLocked"));
 }
 
@@ -60,11 +60,11 @@ fn of_two_sessions_that_begin_at_once_one_does_and_the_other_is_told() {
         .map(|line| line["runs"][0].as_u64().unwrap())
         .collect();
     assert_eq!(runs.len(), 20);
-    // Each of them began one run, and nobody any other.
+    // Each race started a single run, and no further runs were started.
     assert!(runs.windows(2).all(|two| two[1] == two[0] + 1), "{runs:?}");
 }
 
-/// Whom the composite finds by its name alone.
+/// The robot's address; the composite finds the robot by its name alone.
 const ROBOT: &str = "opc.tcp://127.0.0.1:24840";
 const HANDLING: &str = "opc.tcp://127.0.0.1:12346";
 const GRIPPER: &str = "opc.tcp://127.0.0.1:10254";

@@ -1,4 +1,5 @@
-//! Skills of a server of another maker, which knows Programs of OPC 10000-10 and nothing of the space: `ua-server` speaks for it.
+//! Skills of a third-party server that has Programs of OPC 10000-10 and knows nothing of the space:
+//! `ua-server` acts for it.
 
 use std::fs;
 use std::process::Command;
@@ -10,7 +11,7 @@ use system_tests::{
     Cell, Child, Distribution, METRICS_SERVER, Peer, Started, eventually, metrics, program,
 };
 
-/// asyncua needs seconds to start on a busy machine.
+/// The time that asyncua needs to start on a busy machine.
 const SOON: Duration = Duration::from_secs(40);
 const MACHINE: &str = "opc.tcp://127.0.0.1:4857";
 const MAPPING: &str = "
@@ -40,7 +41,7 @@ fn objects(lines: &[String]) -> Vec<Value> {
         .collect()
 }
 
-/// The skills that are listed, when there are so many whose state and calls are known.
+/// Waits until `count` skills with known states and calls are listed, and returns them.
 fn listed(count: usize) -> Vec<Value> {
     listed_of("press", count)
 }
@@ -56,7 +57,8 @@ fn listed_of(machine: &str, count: usize) -> Vec<Value> {
     })
 }
 
-/// Of a run by `ua-space skills start`: how it ended, the states that were seen, and the result.
+/// Runs a skill with `ua-space skills start`. Returns the exit code, the states that were seen, and
+/// the result.
 fn run(words: &[&str]) -> (i32, Vec<String>, Value) {
     let (code, lines) = ua_space(&[&["skills", "start"], words, &["--json"]].concat());
     let events = objects(&lines);
@@ -73,7 +75,7 @@ fn run(words: &[&str]) -> (i32, Vec<String>, Value) {
     (code, states, result)
 }
 
-/// Of the second Stamp: a frame is the six numbers of a position, ranges are two each.
+/// Checks the second Stamp: a frame is the six numbers of a position, a range is two numbers.
 fn takes_structures_that_are_numbers(machine: &mut Child) {
     let target = "Target=0.25,0,0.5,0,1.5,-0.25";
     let (code, _, result) = run(&["press.Stamp_2", target, "Bounds=-2,2,-3,3"]);
@@ -122,7 +124,7 @@ fn a_machine_that_knows_programs_only_is_in_the_space_as_a_component_is() {
         let [name, of, topic] = expected;
         assert_eq!(*shown, [name, of, topic, &halted]);
     }
-    // What is not understood, and who is called alike, is listed with the reason.
+    // Unknown Programs and duplicate names are listed with the reason.
     let faults = metrics(METRICS_SERVER).unwrap()["servers"][0]["faults"].clone();
     let fault = |name: &str| faults[name].as_str().unwrap_or_default().to_owned();
     assert!(fault("press.Odd").contains("CurrentState"), "{faults}");
@@ -133,7 +135,7 @@ fn a_machine_that_knows_programs_only_is_in_the_space_as_a_component_is() {
     );
     assert_eq!(faults.as_object().unwrap().len(), 2, "{faults}");
 
-    // It is made ready, given its parameter and run; what it says at its end comes back.
+    // The skill is reset, gets its parameter and runs; its results are returned.
     let (code, states, result) = run(&["press.Stamp", "Force=33.5"]);
     assert_eq!((code, &result["succeeded"]), (0, &json!(true)), "{result}");
     assert_eq!(states, ["Running", "Ready"]);
@@ -145,7 +147,7 @@ fn a_machine_that_knows_programs_only_is_in_the_space_as_a_component_is() {
         (&started["state"], &started["force"]),
         (&json!("Ready"), &json!(33.5))
     );
-    // A run that ends at once was one all the same.
+    // A run that ends at once is still reported as a run.
     let echo = Started::new("ua-space", &program("ua-space"))
         .args(["echo", "ua_0_12_202", "--json", "--interface", "lo"])
         .start();
@@ -159,12 +161,12 @@ fn a_machine_that_knows_programs_only_is_in_the_space_as_a_component_is() {
     let (code, _, result) = run(&["press.Grasp", "Force=5"]);
     assert_eq!((code, &result["succeeded"]), (0, &json!(true)), "{result}");
     takes_structures_that_are_numbers(&mut machine);
-    // One that fails says so.
+    // A failed run is reported.
     let (code, states, result) = run(&["press.Stamp", "Force=99"]);
     assert_eq!((code, &result["succeeded"]), (1, &json!(false)), "{result}");
     assert_eq!(states, ["Running", "Halted"]);
 
-    // Its own Start takes every state; the space does not.
+    // The Start of the machine accepts every state; the space does not.
     let (code, lines) = ua_space(&["call", "press.Stamp.Start"]);
     assert!(
         code == 1 && lines.iter().any(|line| line.contains("BadInvalidState")),
@@ -180,7 +182,7 @@ fn a_machine_is_reached_as_the_saved_mapping_says() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
     };
-    // The machine knows no such security.
+    // The machine does not support this security policy.
     let secured = MAPPING.replace("None", "Basic256Sha256");
     let mapping = cell.file("press.yaml", &secured);
     let server = cell.ua_server(&[mapping.to_str().unwrap()]);
@@ -251,7 +253,7 @@ fn goals_for_a_machine_run_it_are_cancelled_and_end_when_it_is_gone() {
     assert_eq!((code, &result["succeeded"]), (0, &json!(true)), "{result}");
 }
 
-/// For the bridge alone: which action of ROS 2 the first Program of the machine is.
+/// A mapping for the bridge alone: the ROS 2 action of the machine's first Program.
 const STAMP: &str = "
 spaces: [{id: 2, domain: 2}]
 namespaces: {12: 'urn:ua-bridge:system-tests:machine'}
@@ -305,7 +307,7 @@ fn a_client_of_rclpy_runs_and_cancels_the_program_of_a_machine_as_an_action() {
 
 const LDS: &str = "opc.tcp://127.0.0.1:4840";
 
-/// ua-lds, when it answers.
+/// Starts ua-lds and waits until it answers.
 fn discovery_server(cell: &Cell) -> Child {
     discovery_server_with(cell, &[])
 }
@@ -322,7 +324,7 @@ fn discovery_server_with(cell: &Cell, more: &[&str]) -> Child {
     child
 }
 
-/// Registers a machine as asyncua does, which renews nothing.
+/// Registers a machine with asyncua, which renews no registrations.
 fn register(cell: &Cell, machine: &str, uri: &str, more: &[&str]) {
     let args = [
         "register", LDS, "--url", machine, "--uri", uri, "--name", "machine",
@@ -331,7 +333,8 @@ fn register(cell: &Cell, machine: &str, uri: &str, more: &[&str]) {
     assert_eq!(said[0]["status"], "Good", "{said:?}");
 }
 
-/// The servers that ua-server has sessions with: each with its name, and whether it is there.
+/// Returns the servers that ua-server has sessions with: the name, and whether the server is
+/// connected.
 fn servers() -> Vec<(String, bool)> {
     let status = metrics(METRICS_SERVER).unwrap();
     let servers = status["servers"].as_array().cloned().unwrap_or_default();
@@ -393,12 +396,12 @@ server:
     };
     assert!(!left.as_array().unwrap().iter().any(callable), "{left}");
 
-    // It is back where it was.
+    // The machine is back at its old number.
     let _second = machine(&cell, &[]);
     register(&cell, MACHINE, uri, &["--mdns", "press on the left"]);
     assert_eq!(topics(&listed_of("machine", 4)), numbers);
 
-    // And nobody speaks for it when nobody is to be found any more.
+    // Without discovery of servers, ua-server does not act for the machine.
     fs::write(&mapping, "server: {endpoint: 'opc.tcp://127.0.0.1:4858'}").unwrap();
     server.signal(Signal::SIGHUP);
     eventually("the machine is left alone", SOON, || {
@@ -420,7 +423,7 @@ server:
 ",
     );
     let _lds = discovery_server(&cell);
-    // Nothing is announced here: the list of the discovery server has to be read.
+    // Nothing is announced by mDNS here, so the list of the discovery server has to be read.
     let lds = ["--lds", LDS];
     let server = cell.ua_server(&[&[mapping.to_str().unwrap()], &lds[..]].concat());
     let says = |words: [&str; 2]| {
@@ -431,7 +434,7 @@ server:
             says.then_some(())
         });
     };
-    // A component that has a number takes nobody's place.
+    // A component that has a number takes no number of the machines.
     let component = cell.file("bench.yaml", super::COMPONENT);
     let _component = super::component(&component);
     let uri = "urn:ua-bridge:system-tests:component";
@@ -486,7 +489,8 @@ server:
             (told["up"] == false && is_meant(told["why"].as_str()?)).then_some(())
         });
     };
-    // It has no channel without security, and with it nobody is trusted for having a certificate.
+    // The server has no channel without security; with security, its certificate is not trusted
+    // automatically.
     refused("there is no channel without security", &|why| {
         why.contains("it offers Basic256Sha256/SignAndEncrypt, wanted is None")
     });

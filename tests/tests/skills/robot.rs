@@ -1,4 +1,4 @@
-//! A robot to clients of OPC 40010-1, which know no skills.
+//! A robot for clients of OPC 40010-1, which know no skills.
 
 use serde_json::{Value, json};
 use system_tests::{Cell, Peer, eventually};
@@ -20,7 +20,7 @@ fn a_client_that_knows_robots_and_no_skills_sees_what_it_is_and_which_program_ru
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
     };
-    // Of the OPC Foundation.
+    // NodeSets of the OPC Foundation.
     let files = ["Robotics", "Di"].map(|name| format!("nodesets/Opc.Ua.{name}.NodeSet2.xml"));
     let [Some(robotics), Some(di)] = files.map(|file| test_data::foreign(&file)) else {
         return;
@@ -41,7 +41,7 @@ fn a_client_that_knows_robots_and_no_skills_sees_what_it_is_and_which_program_ru
         "system": "arm",
         "types": [1004, 1003, 1011],
         "arm": arm,
-        // No driver knows these two.
+        // No driver has these two properties.
         "speed": {"SpeedOverride": "BadNotSupported"},
         "controller": plate,
         "user": {"Level": "BadNotSupported"},

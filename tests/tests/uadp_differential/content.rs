@@ -1,21 +1,26 @@
-//! Random messages that both codecs can express, in the foreign crate's own types.
+//! Random messages that both codecs can express, in the types of the foreign crate.
 //!
-//! What is left out because of the foreign crate:
-//! - chunks: it refuses them.
+//! Left out because of the foreign crate:
+//! - chunks: the foreign crate refuses them.
 //! - discovery messages: it has neither their SecurityHeader nor the ProbeType.
-//! - security: it is a feature of its own there, and judged by other vectors.
-//! - ExpandedNodeId, DataValue, Variant and DiagnosticInfo in a Variant: its type for values has none of them.
-//! - null String, ByteString, XmlElement and null in NodeIds, names and texts: it reads null as empty and cannot write it.
-//! - null and empty arrays: it refuses the one and writes the other as a null Variant.
-//! - arrays of one dimension that say so in ArrayDimensions: it does not keep that apart from a plain array.
-//! - DataValues with SourcePicoSeconds and ServerTimestamp: it has both times first and both PicoSeconds behind them.
-//! - a key frame without FieldCount: it wants one.
-//! - padding to a ConfiguredSize: it refuses it between messages.
+//! - security: there it is a separate feature, checked with other vectors.
+//! - ExpandedNodeId, DataValue, Variant and DiagnosticInfo in a Variant: its type for values has
+//!   none of them.
+//! - null String, ByteString, XmlElement and null in NodeIds, names and texts: it reads null as
+//!   empty and cannot write it.
+//! - null and empty arrays: it refuses null arrays and writes empty arrays as a null Variant.
+//! - arrays of one dimension with ArrayDimensions: it does not distinguish them from plain arrays.
+//! - DataValues with SourcePicoSeconds and ServerTimestamp: it has both times first and both
+//!   PicoSeconds behind them.
+//! - a key frame without FieldCount: it requires the FieldCount.
+//! - padding to a ConfiguredSize: it refuses padding between messages.
 //!
-//! And because of the standard, where it would do otherwise:
-//! - events as DataValues or RawData and delta frames as RawData (OPC 10000-14, 7.2.4.5.6 and 7.2.4.5.7).
+//! Left out because of the standard:
+//! - events as DataValues or RawData and delta frames as RawData (OPC 10000-14, 7.2.4.5.6 and
+//!   7.2.4.5.7).
 //! - PicoSeconds without their time, and of 10 000 and more (OPC 10000-6, 5.2.2.17).
-//! - PromotedFields with several DataSetMessages (OPC 10000-14, 7.2.4.4.2), and a Count of 0 (7.2.4.5.2).
+//! - PromotedFields with several DataSetMessages (OPC 10000-14, 7.2.4.4.2), and a Count of 0
+//!   (7.2.4.5.2).
 
 use proptest::collection::vec;
 use proptest::option;
@@ -29,13 +34,13 @@ use zerodds_opcua_pubsub::uadp::{
     DataSetData, DataSetMessage, DataSetMessageKind, GroupHeader, NetworkMessage, PublisherId,
 };
 
-/// Every valid message both codecs can express.
+/// Generates every valid message that both codecs can express.
 pub(crate) fn messages() -> impl Strategy<Value = NetworkMessage> {
     let payload = prop_oneof![
         3 => data_set_message().prop_map(|message| (true, vec![message])),
         3 => vec(data_set_message(), 2..5).prop_map(|messages| (true, messages)),
         1 => data_set_message().prop_map(|message| {
-            // Nothing says the DataSetWriterId then.
+            // Without payload header, the message has no DataSetWriterId.
             (false, vec![DataSetMessage { writer_id: 0, ..message }])
         }),
     ];
@@ -157,7 +162,7 @@ fn data_value() -> impl Strategy<Value = DataValue> {
     )
 }
 
-/// A DateTime and its PicoSeconds.
+/// Generates a DateTime and its PicoSeconds.
 fn time() -> impl Strategy<Value = (Option<i64>, Option<u16>)> {
     prop_oneof![
         Just((None, None)),
@@ -187,7 +192,7 @@ fn variant() -> impl Strategy<Value = Variant> {
     prop_oneof![6 => scalar, 3 => array, 1 => matrix, 1 => null]
 }
 
-/// Values of one type.
+/// Generates values of a single type.
 fn arrays(len: std::ops::Range<usize>) -> impl Strategy<Value = Vec<VariantValue>> {
     (0..KINDS).prop_flat_map(move |kind| vec(value_of(kind), len.clone()))
 }
@@ -198,7 +203,7 @@ fn value() -> impl Strategy<Value = VariantValue> {
 
 const KINDS: usize = 21;
 
-/// One of the types [`VariantValue`] has.
+/// Generates a value of a type of [`VariantValue`].
 fn value_of(kind: usize) -> BoxedStrategy<VariantValue> {
     match kind {
         0 => any::<bool>().prop_map(VariantValue::Boolean).boxed(),
@@ -210,7 +215,7 @@ fn value_of(kind: usize) -> BoxedStrategy<VariantValue> {
         6 => any::<u32>().prop_map(VariantValue::UInt32).boxed(),
         7 => any::<i64>().prop_map(VariantValue::Int64).boxed(),
         8 => any::<u64>().prop_map(VariantValue::UInt64).boxed(),
-        // From the bits, so that every NaN is among them.
+        // Made from bits, so that every NaN is included.
         9 => (any::<u32>())
             .prop_map(|bits| VariantValue::Float(f32::from_bits(bits)))
             .boxed(),
@@ -257,7 +262,7 @@ fn extension_object() -> impl Strategy<Value = ExtensionObject> {
     (node_id(), body).prop_map(|(type_id, body)| ExtensionObject { type_id, body })
 }
 
-/// Numeric identifiers of every width, since each width has an encoding of its own.
+/// Generates numeric identifiers of every width, because each width has its own encoding.
 fn node_id() -> impl Strategy<Value = NodeId> {
     let identifier = prop_oneof![
         (0..=0xFF_u32).prop_map(NodeIdentifier::Numeric),

@@ -1,5 +1,6 @@
-//! Our codec against `zerodds-opcua-pubsub`, an implementation of UADP that shares nothing with ours: both write the
-//! same bytes, each reads what the other wrote, and of damaged bytes both read the same or one refuses them.
+//! Compares our codec with `zerodds-opcua-pubsub`, an independent implementation of UADP: both
+//! write the same bytes, each reads the bytes of the other, and damaged bytes are either read
+//! equally by both or refused by one of them.
 
 mod content;
 mod ours;
@@ -34,7 +35,7 @@ proptest! {
         let datagram = to_binary(&message).unwrap();
         let read = ours::read(&datagram).unwrap();
         prop_assert_eq!(content(&read), content(&message));
-        // The bits of a NaN too, which its text does not show.
+        // Compares also the bits of a NaN, which its text does not show.
         prop_assert_eq!(ours::write(&read).unwrap(), datagram);
     }
 }
@@ -59,7 +60,8 @@ proptest! {
     }
 }
 
-/// What the standard lets a message be and theirs does not read; why [`content`] leaves it out.
+/// Messages that the standard allows and the foreign codec does not read; the reason why
+/// [`content`] leaves them out.
 const ONLY_OURS: &[(&str, &[u8])] = &[
     ("heartbeat without FieldCount", &[0x01, 0x01]),
     ("ExpandedNodeId", &[0x01, 0x01, 1, 0, 18, 0, 5]),
@@ -89,7 +91,7 @@ const ONLY_OURS: &[(&str, &[u8])] = &[
     ("invalid message", &[0x01, 0x00, 1, 0, 0x3F]),
 ];
 
-/// What theirs reads although the standard has no such message.
+/// Messages that the foreign codec reads although the standard has no such message.
 const ONLY_THEIRS: &[(&str, &[u8])] = &[
     ("bytes behind the end", &[0x01, 0x01, 0, 0, 7]),
     ("Count 0", &[0x41, 0]),
@@ -163,12 +165,12 @@ fn picoseconds_stand_behind_their_time_as_the_standard_has_it_and_theirs_does_no
     );
 }
 
-/// What a message says, as text: there -0 is not 0, and a NaN is as good as another.
+/// Returns the content of a message as text, in which -0 is not 0, and all NaNs are equal.
 fn content(message: &NetworkMessage) -> String {
     format!("{message:#?}")
 }
 
-/// One thing that happens to a datagram.
+/// A change of a datagram.
 #[derive(Debug, Clone)]
 enum Damage {
     Flip(Index, u8),
@@ -215,11 +217,12 @@ impl Damage {
     }
 }
 
-/// The message without what the two do not read alike, each for a reason.
+/// Returns the message without the parts that the two codecs read differently; each has a reason.
 fn settled(mut message: NetworkMessage) -> NetworkMessage {
     for one in &mut message.messages {
         if !one.valid {
-            // Nothing of it is to be processed (OPC 10000-14, 7.2.4.5.4); theirs reads on.
+            // An invalid message must not be processed (OPC 10000-14, 7.2.4.5.4); the foreign codec
+            // reads it.
             let blank = DataSetMessage::key_frame_variant(one.writer_id, Vec::new());
             *one = DataSetMessage {
                 valid: false,
@@ -246,14 +249,14 @@ fn settle_data(data: &mut DataSetData) {
     }
 }
 
-/// Decoders take more than 9999 PicoSeconds for that many (OPC 10000-6, 5.2.2.17); theirs does not.
+/// Decoders limit PicoSeconds to 9999 (OPC 10000-6, 5.2.2.17); the foreign codec does not.
 fn settle_data_value(value: &mut DataValue) {
     value.value.iter_mut().for_each(settle);
     value.source_pico_sec = value.source_pico_sec.map(|rest| rest.min(9999));
     value.server_pico_sec = value.server_pico_sec.map(|rest| rest.min(9999));
 }
 
-/// A part of a LocalizedText that is there and null reads as empty there and as left out here.
+/// The foreign codec reads a null part of a LocalizedText that is present as empty, ours as absent.
 fn settle(variant: &mut Variant) {
     for value in &mut variant.value {
         if let VariantValue::LocalizedText(text) = value {
@@ -263,7 +266,7 @@ fn settle(variant: &mut Variant) {
     }
 }
 
-/// Holds a DataValue whose times they order otherwise.
+/// Returns whether the message has a DataValue whose times the foreign codec orders differently.
 fn has_its_own_order(message: &NetworkMessage) -> bool {
     let apart =
         |value: &DataValue| value.source_pico_sec.is_some() && value.server_timestamp.is_some();

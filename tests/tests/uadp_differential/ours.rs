@@ -1,4 +1,4 @@
-//! Our codec with the content of the foreign crate's types: what we write of it, and what we read as it.
+//! Conversions between our codec and the types of the foreign crate, for writing and reading.
 
 use uadp::{
     Array, BuiltinType, DataSetHeader, DateTime, DecodeError, DeltaEncoder, EncodeError, Encoded,
@@ -13,7 +13,7 @@ use zerodds_opcua_pubsub::uadp::{
     DataSetData, DataSetMessage, DataSetMessageKind, GroupHeader, NetworkMessage, PublisherId,
 };
 
-/// The message as our encoder writes it.
+/// Encodes the message with our encoder.
 pub(crate) fn write(message: &NetworkMessage) -> Result<Vec<u8>, EncodeError> {
     let header = NetworkHeader {
         publisher_id: message.publisher_id.as_ref().map(our_publisher_id),
@@ -104,7 +104,7 @@ fn write_delta(
     frame.finish()
 }
 
-/// By the calls for single values where there are such, so that those are judged as well.
+/// Uses the calls for single values where they exist, so that they are tested as well.
 fn write_field(frame: &mut FieldEncoder<'_>, field: &foreign::Variant) -> Result<(), EncodeError> {
     match (&field.array_dimensions[..], &field.value[..]) {
         ([], []) => frame.null(),
@@ -120,7 +120,7 @@ fn write_field(frame: &mut FieldEncoder<'_>, field: &foreign::Variant) -> Result
     }
 }
 
-/// What one of our Variants borrows from.
+/// The data that one of our Variants borrows.
 struct Value<'a> {
     foreign: &'a foreign::Variant,
     elements: Vec<u8>,
@@ -133,7 +133,7 @@ impl<'a> Value<'a> {
         let mut one = Vec::new();
         for value in &foreign.value {
             let scalar = uadp::Variant::Scalar(our_scalar(value));
-            // Behind the encoding byte.
+            // The bytes after the encoding byte.
             elements.extend_from_slice(&Encoded::variant(&scalar, &mut one).unwrap().bytes()[1..]);
         }
         let dimensions = foreign.array_dimensions.iter();
@@ -248,12 +248,12 @@ fn our_scalar(value: &VariantValue) -> Scalar<'_> {
     }
 }
 
-/// Why our reading of a datagram has no counterpart.
+/// The reason why a datagram that we read has no counterpart.
 #[derive(Debug, PartialEq)]
 pub(crate) enum Unread {
-    /// We refuse it.
+    /// Our decoder refuses the datagram.
     Refused(DecodeError),
-    /// We read it, and the foreign types cannot say what.
+    /// Our decoder reads the datagram, but the foreign types cannot express it.
     NoWords(&'static str),
 }
 
@@ -263,7 +263,7 @@ impl From<DecodeError> for Unread {
     }
 }
 
-/// The datagram as our decoder reads it, to its last byte.
+/// Decodes the datagram with our decoder, to its last byte.
 pub(crate) fn read(datagram: &[u8]) -> Result<NetworkMessage, Unread> {
     let message = uadp::NetworkMessage::decode(datagram)?;
     let header = message.header();
@@ -357,7 +357,7 @@ fn their_publisher_id(id: uadp::PublisherId<'_>) -> PublisherId {
     }
 }
 
-/// Field by field from the text form, which is the standard's and not ours.
+/// Converts from the text form, which is the standard's and not ours.
 fn their_guid(guid: uadp::Guid) -> Guid {
     let digits = guid.to_string().replace('-', "");
     Guid::from_bytes(u128::from_str_radix(&digits, 16).unwrap().to_be_bytes())
@@ -408,7 +408,7 @@ fn their_node_id(id: uadp::NodeId<'_>) -> NodeId {
     }
 }
 
-/// Null is empty there.
+/// Null is empty in the foreign types.
 fn owned(text: Option<&str>) -> String {
     text.unwrap_or_default().to_owned()
 }
