@@ -13,7 +13,7 @@ impl Announcer {
     /// Opens the participant's socket.
     ///
     /// # Panics
-    /// When that fails.
+    /// Panics if the socket cannot be opened.
     #[must_use]
     pub fn open() -> Self {
         let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
@@ -24,7 +24,7 @@ impl Announcer {
     /// Announces itself to the first participant of domain 2 on this host (RTPS 2.5, 8.5.3).
     ///
     /// # Panics
-    /// When it cannot be sent.
+    /// Panics if the announcement cannot be sent.
     pub fn announce(&self) {
         let port = u32::from(self.socket.local_addr().unwrap().port());
         let locator = [
@@ -69,7 +69,7 @@ impl Announcer {
     /// `enough` accepts them or `time` is over.
     ///
     /// # Panics
-    /// When the socket fails.
+    /// Panics if the socket fails.
     pub fn asked(&self, time: Duration, mut enough: impl FnMut(&[i32]) -> bool) -> Vec<i32> {
         let start = Instant::now();
         let (mut counts, mut datagram) = (Vec::new(), [0; 2048]);

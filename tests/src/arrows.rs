@@ -6,7 +6,7 @@ use std::process::Command;
 /// `cargo tree` prints them.
 ///
 /// # Panics
-/// When cargo does not answer.
+/// Panics if cargo fails.
 #[must_use]
 pub fn tree(package: &str) -> String {
     let output = Command::new(env!("CARGO"))

@@ -69,7 +69,7 @@ impl Cell {
     /// `files` and `messages` and the text `more`. Returns its path.
     ///
     /// # Panics
-    /// When it cannot be written.
+    /// Panics if the mapping cannot be written.
     #[must_use]
     pub fn call_mapping(&self, space: u16, more: &str) -> String {
         let name = self.call_types(space);
@@ -83,7 +83,7 @@ impl Cell {
     /// Returns the name of their folder.
     ///
     /// # Panics
-    /// When they cannot be written.
+    /// Panics if the definitions cannot be written.
     #[must_use]
     pub fn call_types(&self, space: u16) -> &'static str {
         let (name, basic) = if space == 1 {
@@ -214,7 +214,7 @@ impl Asker {
     /// Returns the result of the last order: `right`, `wrongs` and `failures` are numbers of calls.
     ///
     /// # Panics
-    /// When it does not end in time.
+    /// Panics if the order does not end in time.
     pub fn told(&mut self) -> Value {
         let id = json!(self.asked);
         self.peer
@@ -226,7 +226,7 @@ impl Asker {
     /// Sends an order and returns its result.
     ///
     /// # Panics
-    /// As [`Self::told`].
+    /// Panics as [`Self::told`] does.
     pub fn ask(&mut self, order: Value) -> Value {
         self.begin(order);
         self.told()
@@ -243,7 +243,7 @@ impl Counting {
     /// executed `twice`, and the `most` and `running` calls at a time.
     ///
     /// # Panics
-    /// When it does not say so in time.
+    /// Panics if the executor does not answer in time.
     pub fn counts(&mut self) -> Value {
         self.0.ask("counts", PATIENCE)
     }
@@ -251,7 +251,7 @@ impl Counting {
     /// Ends all running calls at once.
     ///
     /// # Panics
-    /// As [`Self::counts`].
+    /// Panics as [`Self::counts`] does.
     pub fn end(&mut self) {
         self.0.ask("end", PATIENCE);
     }

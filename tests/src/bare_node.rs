@@ -22,7 +22,7 @@ impl BareNode {
     /// Opens the node's two ports. `name` is a resolved name, such as `/bench`.
     ///
     /// # Panics
-    /// When no port can be opened.
+    /// Panics if no port can be opened.
     #[must_use]
     pub fn start(name: &str) -> Self {
         let data = TcpListener::bind("127.0.0.1:0").unwrap();
@@ -51,7 +51,7 @@ impl BareNode {
     /// the same order.
     ///
     /// # Panics
-    /// When a topic has none in time.
+    /// Panics if a topic has no subscriber in time.
     #[must_use]
     pub fn publish(&self, topics: &[String]) -> Vec<TcpStream> {
         for topic in topics {
@@ -115,7 +115,7 @@ impl BareSubscription {
     /// Reads frames from a connection, waiting for [`PATIENCE`] at most.
     ///
     /// # Panics
-    /// When the connection cannot be set up.
+    /// Panics if the connection cannot be configured.
     #[must_use]
     pub fn of(stream: TcpStream) -> Self {
         stream.set_nodelay(true).unwrap();
@@ -130,7 +130,7 @@ impl BareSubscription {
     /// Sets the timeout of `receive`.
     ///
     /// # Panics
-    /// When the system does not take it.
+    /// Panics if the system refuses the timeout.
     pub fn wait_at_most(&self, patience: Duration) {
         self.stream
             .get_ref()
@@ -141,7 +141,7 @@ impl BareSubscription {
     /// Lets `receive` wait until the connection ends.
     ///
     /// # Panics
-    /// When the system does not take it.
+    /// Panics if the system refuses the timeout.
     pub fn wait_without_end(&self) {
         self.stream.get_ref().set_read_timeout(None).unwrap();
     }
@@ -149,7 +149,7 @@ impl BareSubscription {
     /// Returns the next message: a frame without its length.
     ///
     /// # Errors
-    /// When none comes in time, and when the connection has ended.
+    /// Fails if no message arrives in time, and if the connection has ended.
     pub fn receive(&mut self) -> io::Result<&[u8]> {
         self.receive_frame().map(|frame| &frame[4..])
     }
@@ -157,7 +157,7 @@ impl BareSubscription {
     /// Returns the next frame as received, its length first.
     ///
     /// # Errors
-    /// As [`Self::receive`].
+    /// Fails as [`Self::receive`] does.
     pub fn receive_frame(&mut self) -> io::Result<&[u8]> {
         let mut length = [0; 4];
         self.stream.read_exact(&mut length)?;
@@ -175,7 +175,7 @@ impl BareSubscription {
 /// Returns a frame with a `std_msgs/String`.
 ///
 /// # Panics
-/// When the text is longer than 4 GiB.
+/// Panics if the text is longer than 4 GiB.
 #[must_use]
 pub fn string_frame(text: &str) -> Vec<u8> {
     let length = u32::try_from(text.len()).unwrap();

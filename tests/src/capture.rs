@@ -91,7 +91,7 @@ impl Cell {
     /// where tshark chose another dissector. `args` follow the arguments that are always needed.
     ///
     /// # Panics
-    /// When tshark fails or says anything about Lua, which it does when the dissector has an error.
+    /// Panics if tshark fails or prints a line about Lua, as it does if the dissector has an error.
     #[must_use]
     pub fn dissect(&self, capture: &Capture, args: &[&str]) -> Vec<Dissected> {
         let json = ["-T", "json", "--no-duplicate-keys", "-J", "uadp"];
@@ -108,7 +108,7 @@ impl Cell {
     /// them.
     ///
     /// # Panics
-    /// As for [`dissect`](Self::dissect).
+    /// Panics as [`dissect`](Self::dissect) does.
     #[must_use]
     pub fn columns(&self, capture: &Capture, args: &[&str]) -> Vec<String> {
         let columns = "-T fields -E separator=/s -e _ws.col.Protocol -e _ws.col.Info";
@@ -121,7 +121,7 @@ impl Cell {
     /// field are separated by commas.
     ///
     /// # Panics
-    /// As for [`dissect`](Self::dissect).
+    /// Panics as [`dissect`](Self::dissect) does.
     #[must_use]
     pub fn fields(&self, capture: &Capture, fields: &[&str]) -> Vec<String> {
         let mut args = vec!["-T", "fields"];
@@ -181,7 +181,7 @@ impl Dissected {
     /// Returns the value of the field with this name, or `None` without such a field.
     ///
     /// # Panics
-    /// When there are several.
+    /// Panics if there are several such fields.
     #[must_use]
     pub fn one(&self, name: &str) -> Option<String> {
         let mut all = self.all(name);

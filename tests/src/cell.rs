@@ -99,7 +99,8 @@ impl Cell {
     /// Puts this thread into a new network, or logs why the test is skipped and returns `None`.
     ///
     /// # Panics
-    /// When a peer is missing and `CI=true`, and when this process may not make network namespaces.
+    /// Panics if a peer is missing and `CI=true`, or if this process may not create network
+    /// namespaces.
     #[must_use]
     pub fn with(peers: &[Peer]) -> Option<Self> {
         let python = python();
@@ -119,7 +120,7 @@ impl Cell {
     /// Reports a test that cannot run with the programs as they were built.
     ///
     /// # Panics
-    /// When `CI=true`.
+    /// Panics if `CI=true`.
     pub fn skip(reason: &str) {
         test_data::skip(reason);
     }
@@ -162,7 +163,7 @@ impl Cell {
     /// Writes a file into the folder and returns its path.
     ///
     /// # Panics
-    /// When that fails.
+    /// Panics if the file cannot be written.
     #[must_use]
     pub fn file(&self, name: &str, text: &str) -> PathBuf {
         let path = self.folder.join(name);

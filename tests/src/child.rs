@@ -125,7 +125,7 @@ impl Started {
     /// Starts the process.
     ///
     /// # Panics
-    /// When it cannot be started.
+    /// Panics if the process cannot be started.
     #[must_use]
     pub fn start(mut self) -> Child {
         self.command
@@ -170,7 +170,7 @@ impl Child {
     /// after the call.
     ///
     /// # Panics
-    /// After `deadline`, or when the process ends without having printed one.
+    /// Panics after `deadline`, or if the process ends without such a line.
     pub fn wait_for_line(&mut self, pattern: &str, deadline: Duration) -> String {
         self.wait_for(&format!("a line with `{pattern}`"), deadline, |line| {
             line.text.contains(pattern).then(|| line.text.clone())
@@ -180,7 +180,7 @@ impl Child {
     /// Returns the first result of `pick` for the JSON lines of standard output that is not `None`.
     ///
     /// # Panics
-    /// As [`Self::wait_for_line`].
+    /// Panics as [`Self::wait_for_line`] does.
     pub fn wait_for_json<T>(
         &mut self,
         what: &str,
@@ -195,7 +195,7 @@ impl Child {
     /// Waits until the peer has reported that it is ready.
     ///
     /// # Panics
-    /// As [`Self::wait_for_line`].
+    /// Panics as [`Self::wait_for_line`] does.
     #[must_use]
     pub fn ready(mut self, deadline: Duration) -> Self {
         self.wait_for_json("it says that it is ready", deadline, |line| {
@@ -208,7 +208,7 @@ impl Child {
     /// lines.
     ///
     /// # Panics
-    /// As [`Self::wait_for_line`].
+    /// Panics as [`Self::wait_for_line`] does.
     pub fn ask(&mut self, line: &str, deadline: Duration) -> Value {
         let before = self.output.lines.lock().unwrap().kept.len();
         self.tell(line);
@@ -267,7 +267,7 @@ impl Child {
     /// Writes a line to the process's standard input.
     ///
     /// # Panics
-    /// When it has none, or does not read it.
+    /// Panics if the process has no standard input, or has closed it.
     pub fn tell(&mut self, line: &str) {
         let input = self.process.stdin.as_mut().unwrap();
         writeln!(input, "{line}").unwrap();
@@ -311,7 +311,7 @@ impl Child {
     /// Sends the process a signal.
     ///
     /// # Panics
-    /// When the process is gone.
+    /// Panics if the process has ended.
     pub fn signal(&self, signal: Signal) {
         kill(self.pid(), signal).unwrap();
     }
@@ -319,7 +319,7 @@ impl Child {
     /// Waits for the end of the process.
     ///
     /// # Panics
-    /// After `deadline`.
+    /// Panics after `deadline`.
     pub fn wait_for_end(&mut self, deadline: Duration) -> ExitStatus {
         let name = self.name.clone();
         let status = crate::eventually(&format!("{name} ends"), deadline, || {
@@ -332,7 +332,7 @@ impl Child {
     /// Ends the process with the signal a user would send, and waits for its end.
     ///
     /// # Panics
-    /// When it has not ended in ten seconds.
+    /// Panics if the process has not ended after ten seconds.
     pub fn end(&mut self) -> ExitStatus {
         self.signal(self.ends_on);
         self.wait_for_end(GRACE)

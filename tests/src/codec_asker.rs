@@ -46,7 +46,7 @@ impl CodecAsker {
     /// Starts a call with fields as Variants, preceded by their count.
     ///
     /// # Panics
-    /// When it is not taken.
+    /// Panics if the requestor refuses the call.
     pub fn call(
         &mut self,
         (space, namespace, id): Triple,
@@ -70,7 +70,7 @@ impl CodecAsker {
     /// Sends and receives for a turn of at most 5 ms, and returns the calls that have ended.
     ///
     /// # Panics
-    /// When the group cannot be used.
+    /// Panics if the group cannot be read or written.
     pub fn turn(&mut self) -> Vec<(CallId, Ended)> {
         let now = self.start.elapsed();
         self.requestor.handle_timeout(now);
@@ -126,7 +126,7 @@ impl CodecAsker {
 /// senders.
 ///
 /// # Panics
-/// When it does not leave.
+/// Panics if the datagram cannot be sent.
 pub fn send_from(address: Ipv4Addr, datagram: &[u8]) {
     let socket = UdpSocket::bind(SocketAddr::from((address, 0))).unwrap();
     let options = SockRef::from(&socket);

@@ -79,7 +79,7 @@ impl Keystore {
     /// Creates a keystore in the cell's folder, with the domain governed by [`Governance::SROS2`].
     ///
     /// # Panics
-    /// When `openssl` does not do it.
+    /// Panics if `openssl` fails.
     #[must_use]
     pub fn make(cell: &Cell, name: &str) -> Self {
         let keystore = Self(cell.folder().join(name));
@@ -101,7 +101,7 @@ impl Keystore {
     /// Replaces the governance of the domain, for programs that start later.
     ///
     /// # Panics
-    /// When `openssl` does not do it.
+    /// Panics if `openssl` fails.
     pub fn govern(&self, governance: &Governance) {
         self.sign("governance", &governance.text());
         for enclave in ENCLAVES {
@@ -131,7 +131,7 @@ impl Keystore {
     /// Renews the certificate of an enclave, valid for `days` days from the present.
     ///
     /// # Panics
-    /// When `openssl` does not do it.
+    /// Panics if `openssl` fails.
     pub fn certify(&self, name: &str, days: i32) {
         self.openssl(&format!(
             "x509 -req -in enclaves/{name}/request.pem -CA ca.cert.pem -CAkey ca.key.pem -CAcreateserial -sha256 \
@@ -183,7 +183,7 @@ impl Keystore {
 /// Returns whether bridge-ros2 was built with DDS Security.
 ///
 /// # Panics
-/// When it does not say so.
+/// Panics if bridge-ros2 does not print its version.
 #[must_use]
 pub fn has_security() -> bool {
     let version = Command::new(program("bridge-ros2"))
@@ -289,7 +289,7 @@ impl Wiretap {
     /// Starts the capture.
     ///
     /// # Panics
-    /// When the socket cannot be made.
+    /// Panics if the socket cannot be created.
     #[must_use]
     pub fn tap() -> Self {
         let socket = Socket::new(Domain::IPV4, Type::RAW, Some(Protocol::UDP)).unwrap();
@@ -303,7 +303,7 @@ impl Wiretap {
     /// Returns the IPv4 packets captured after the last call.
     ///
     /// # Panics
-    /// When reading fails.
+    /// Panics if reading fails.
     #[must_use]
     pub fn heard(&mut self) -> Vec<Vec<u8>> {
         let mut packets = Vec::new();

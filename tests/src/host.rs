@@ -38,7 +38,7 @@ impl Cell {
     /// cell keeps its loopback.
     ///
     /// # Panics
-    /// When the network cannot be made.
+    /// Panics if the network cannot be created.
     #[must_use]
     pub fn host(&self, wire: Wire) -> Host {
         let (here, middle, there) = (Namespace::current(), Namespace::fresh(), Namespace::fresh());
@@ -87,7 +87,7 @@ impl Cable {
     /// Creates [`WIRE`] on this host with `address`, and its end on the other host with [`THERE`].
     ///
     /// # Panics
-    /// When it is there already.
+    /// Panics if the cable is laid already.
     pub fn lay(&self, address: &str) {
         self.here.join("far", &self.there, address);
         let there = format!("{THERE}/24");
@@ -103,7 +103,7 @@ impl Cable {
     /// Deletes both ends.
     ///
     /// # Panics
-    /// When there is none.
+    /// Panics if there is no cable.
     pub fn pull(&self) {
         self.here.ip(&["link", "delete", WIRE]);
     }
@@ -111,7 +111,7 @@ impl Cable {
     /// Sets the link down at its far end: no frames pass, and the addresses stay.
     ///
     /// # Panics
-    /// When there is no cable.
+    /// Panics if there is no cable.
     pub fn cut(&self) {
         self.there.ip(&["link", "set", WIRE, "down"]);
     }
@@ -119,7 +119,7 @@ impl Cable {
     /// Ends [`cut`](Self::cut).
     ///
     /// # Panics
-    /// When there is no cable.
+    /// Panics if there is no cable.
     pub fn mend(&self) {
         self.there.ip(&["link", "set", WIRE, "up"]);
     }
@@ -132,7 +132,7 @@ impl Cable {
     /// Routes multicast without a named interface through the cable instead of loopback.
     ///
     /// # Panics
-    /// When there is no cable.
+    /// Panics if there is no cable.
     pub fn route(&self) {
         let group = "224.0.0.0/4";
         self.here.ip(&["route", "replace", group, "dev", WIRE]);
@@ -141,7 +141,7 @@ impl Cable {
     /// Creates a member of the UADP group on the other host, which works while the cable lies.
     ///
     /// # Panics
-    /// When there is no cable.
+    /// Panics if there is no cable.
     #[must_use]
     pub fn ua_side(&self) -> UaSide {
         std::thread::scope(|scope| {

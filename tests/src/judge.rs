@@ -38,7 +38,7 @@ impl Judge {
     /// Returns the node's answer to a command, see `peers/ros2_node.py`.
     ///
     /// # Panics
-    /// When there is none in time, or the command failed.
+    /// Panics if there is no answer in time, or the command failed.
     pub fn ask(&mut self, mut command: Value) -> Value {
         self.asked += 1;
         let id = json!(self.asked);
@@ -59,7 +59,7 @@ impl Judge {
     /// Repeats a command until `pick` returns a value for the answer, and returns this value.
     ///
     /// # Panics
-    /// When that takes too long.
+    /// Panics if there is no such answer in time.
     pub fn until<T>(&mut self, command: &Value, mut pick: impl FnMut(&Value) -> Option<T>) -> T {
         let mut last = Value::Null;
         let start = std::time::Instant::now();
@@ -78,7 +78,7 @@ impl Judge {
     /// before or after the call.
     ///
     /// # Panics
-    /// When none comes in time.
+    /// Panics if there is no such value in time.
     pub fn hears<T>(&mut self, topic: &str, mut pick: impl FnMut(&Value) -> Option<T>) -> T {
         let what = format!("a value on {topic}");
         self.node.wait_for_json(&what, PATIENCE, |line| {

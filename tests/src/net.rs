@@ -22,7 +22,7 @@ impl UadpSocket {
     /// Joins [`GROUP`].
     ///
     /// # Panics
-    /// When the socket cannot be made.
+    /// Panics if the socket cannot be created.
     #[must_use]
     pub fn join() -> Self {
         Self::join_on(Ipv4Addr::LOCALHOST)
@@ -31,7 +31,7 @@ impl UadpSocket {
     /// Joins [`GROUP`] on the interface with this address.
     ///
     /// # Panics
-    /// When the socket cannot be made.
+    /// Panics if the socket cannot be created.
     #[must_use]
     pub fn join_on(interface: Ipv4Addr) -> Self {
         let socket = member(GROUP, interface);
@@ -44,7 +44,7 @@ impl UadpSocket {
     /// Sends a datagram to the group.
     ///
     /// # Panics
-    /// When it does not leave.
+    /// Panics if the datagram cannot be sent.
     pub fn send(&self, datagram: &[u8]) {
         let sent = self.0.send_to(datagram, GROUP).unwrap();
         assert_eq!(sent, datagram.len());
@@ -54,7 +54,7 @@ impl UadpSocket {
     /// `deadline`.
     ///
     /// # Panics
-    /// When reading fails.
+    /// Panics if reading fails.
     #[must_use]
     pub fn receive(&self, deadline: Duration) -> Option<Vec<u8>> {
         self.0
@@ -91,7 +91,7 @@ impl UadpSocket {
 /// Opens a socket that receives a group on loopback, with a buffer for bursts.
 ///
 /// # Panics
-/// When the socket cannot be made.
+/// Panics if the socket cannot be created.
 #[must_use]
 pub fn group_member(group: SocketAddrV4) -> UdpSocket {
     member(group, Ipv4Addr::LOCALHOST)

@@ -6,7 +6,7 @@ use std::collections::BTreeSet;
 /// number and filler in hexadecimal, and filler.
 ///
 /// # Panics
-/// When `size` is below 18 or `number` has more digits.
+/// Panics if `size` is below 18 or `number` has more than eight digits.
 #[must_use]
 pub fn numbered(number: u32, size: usize) -> String {
     assert!(number < 100_000_000, "{number}");

@@ -92,7 +92,7 @@ impl Cell {
     /// lines.
     ///
     /// # Panics
-    /// When it fails.
+    /// Panics if the program fails.
     #[must_use]
     pub fn ros1_tool(&self, name: &str, args: &[&str]) -> Vec<String> {
         let path = Path::new("/usr/bin").join(name);
@@ -210,7 +210,7 @@ impl Cell {
     /// Runs an asyncua script of `peers/` that ends by itself, and returns its JSON lines.
     ///
     /// # Panics
-    /// When it fails.
+    /// Panics if the program fails.
     #[must_use]
     pub fn asyncua_once(&self, script: &str, args: &[&str]) -> Vec<serde_json::Value> {
         let mut child = self.python(script, args).start();
@@ -239,7 +239,7 @@ impl Cell {
     /// lines.
     ///
     /// # Panics
-    /// When it fails.
+    /// Panics if the program fails.
     #[must_use]
     pub fn node_opcua_once(&self, script: &str, args: &[&str]) -> Vec<serde_json::Value> {
         let mut child = self.node_opcua_started(script, args).start();
@@ -277,7 +277,7 @@ impl Cell {
     /// path.
     ///
     /// # Panics
-    /// When it cannot be written.
+    /// Panics if the folder cannot be written.
     #[must_use]
     pub fn nav2_prefix(&self) -> PathBuf {
         let prefix = self.folder().join("nav2");

@@ -41,7 +41,7 @@ impl Segment {
     /// network.
     ///
     /// # Panics
-    /// When it has one of that name.
+    /// Panics if the host has an interface with this name.
     pub fn plug(&self, site: &Site, interface: &str, address: &str) {
         let Self(here) = self;
         // Interface names are at most 15 characters and have to be unique in this namespace.
@@ -64,7 +64,7 @@ impl Segment {
     /// Pulls the cable of the host with this address, which removes the interface.
     ///
     /// # Panics
-    /// When nobody is plugged in there.
+    /// Panics if no host is connected with this address.
     pub fn pull(&self, address: &str) {
         let end = format!("p{}", address.replace('.', "-"));
         self.0.ip(&["link", "delete", &end]);

@@ -150,8 +150,8 @@ pub fn drops(status: &Value) -> u64 {
 /// Returns the path of a program of this workspace.
 ///
 /// # Panics
-/// If the program has not been built, or if a program with the name of a link to `ua-bridge` is
-/// left from another build.
+/// Panics if the program has not been built, or if a program with the name of a link to `ua-bridge`
+/// is left from another build.
 #[must_use]
 pub fn program(name: &str) -> PathBuf {
     let given = env::var_os("UA_BIN_DIR").map(PathBuf::from);

@@ -66,7 +66,7 @@ impl Relay {
     /// Starts the relay.
     ///
     /// # Panics
-    /// When the sockets cannot be made.
+    /// Panics if the sockets cannot be created.
     #[must_use]
     pub fn start(weather: Weather) -> Self {
         let (stop, bad) = (Arc::<AtomicBool>::default(), Arc::<AtomicU32>::default());

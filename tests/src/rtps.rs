@@ -15,7 +15,7 @@ impl Mutator {
     /// Creates datagrams for the participant with this GUID prefix.
     ///
     /// # Panics
-    /// When the corpus in `fuzz/corpus/rtps` cannot be read.
+    /// Panics if the corpus in `fuzz/corpus/rtps` cannot be read.
     #[must_use]
     pub fn new(receiver: [u8; 12], seed: u64) -> Self {
         let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../fuzz/corpus/rtps");
@@ -268,7 +268,7 @@ fn addressed(mut datagram: Vec<u8>, receiver: [u8; 12]) -> Vec<u8> {
 /// Returns the GUID prefix of a participant's announcement to the multicast group of the domain.
 ///
 /// # Panics
-/// When the group cannot be read.
+/// Panics if the group cannot be read.
 #[must_use]
 pub fn announced(group: &UdpSocket) -> Option<[u8; 12]> {
     let mut datagram = [0; 2048];
@@ -281,7 +281,7 @@ pub fn announced(group: &UdpSocket) -> Option<[u8; 12]> {
 /// and the number of datagrams dropped because of full buffers.
 ///
 /// # Panics
-/// When the system does not tell.
+/// Panics if `/proc/thread-self/net/udp` cannot be read.
 #[must_use]
 pub fn queued(ports: &[u16]) -> (u64, u64) {
     let table = fs::read_to_string("/proc/thread-self/net/udp").unwrap();

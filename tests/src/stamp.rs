@@ -41,7 +41,7 @@ impl Stamp {
 /// Returns the machine's monotonic clock, which all processes share.
 ///
 /// # Panics
-/// When there is none.
+/// Panics if the system has no monotonic clock.
 #[must_use]
 pub fn now() -> Duration {
     clock_gettime(ClockId::CLOCK_MONOTONIC).unwrap().into()

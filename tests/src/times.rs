@@ -8,7 +8,7 @@ use std::time::Duration;
 /// `/proc/PID/stat` counts in ticks of 10 ms; the scheduler's own count is in nanoseconds.
 ///
 /// # Panics
-/// If the process has ended.
+/// Panics if the process has ended.
 #[must_use]
 pub fn processor_time(pid: u32) -> Duration {
     let threads = fs::read_dir(format!("/proc/{pid}/task")).unwrap();

@@ -25,7 +25,7 @@ impl UaSide {
     /// Joins the group.
     ///
     /// # Panics
-    /// When the socket cannot be made.
+    /// Panics if the socket cannot be created.
     #[must_use]
     pub fn join() -> Self {
         Self::on(UadpSocket::join())
@@ -43,7 +43,7 @@ impl UaSide {
     /// Returns the first result of `pick`, other than `None`, for the values of the triple.
     ///
     /// # Panics
-    /// When none comes in time, with `what` in the message.
+    /// Panics if there is no such value in time, with the text `what` in the message.
     pub fn hear<T>(
         &self,
         triple: Triple,
@@ -70,7 +70,7 @@ impl UaSide {
     /// Waits for a value with a single field.
     ///
     /// # Panics
-    /// When it does not come in time.
+    /// Panics if the value does not arrive in time.
     pub fn hear_scalar(&self, triple: Triple, expected: Scalar<'_>) {
         self.hear(triple, &format!("{expected:?}"), |fields| {
             matches!(fields, [Variant::Scalar(found)] if *found == expected).then_some(())
@@ -80,7 +80,7 @@ impl UaSide {
     /// Writes a value with a single field.
     ///
     /// # Panics
-    /// When it cannot be sent.
+    /// Panics if the value cannot be sent.
     pub fn write(&mut self, triple: Triple, value: Scalar<'_>) {
         self.write_fields(triple, &[value]);
     }
@@ -88,7 +88,7 @@ impl UaSide {
     /// Writes a value with several fields.
     ///
     /// # Panics
-    /// When it cannot be sent.
+    /// Panics if the value cannot be sent.
     pub fn write_fields(&mut self, (space, namespace, id): Triple, values: &[Scalar<'_>]) {
         self.sequence = self.sequence.wrapping_add(1);
         let header = NetworkHeader {

@@ -8,7 +8,7 @@ use std::{
 /// Returns the number of threads of a process.
 ///
 /// # Panics
-/// When it is gone.
+/// Panics if the process has ended.
 #[must_use]
 pub fn threads(process: u32) -> u64 {
     status(process, "Threads:")
@@ -17,7 +17,7 @@ pub fn threads(process: u32) -> u64 {
 /// Returns the resident memory of a process, in bytes.
 ///
 /// # Panics
-/// When it is gone.
+/// Panics if the process has ended.
 #[must_use]
 pub fn resident(process: u32) -> u64 {
     status(process, "VmRSS:") * 1024
@@ -27,7 +27,7 @@ pub fn resident(process: u32) -> u64 {
 /// file, in bytes.
 ///
 /// # Panics
-/// When it is gone.
+/// Panics if the process has ended.
 #[must_use]
 pub fn anonymous(process: u32) -> u64 {
     status(process, "RssAnon:") * 1024
@@ -36,7 +36,7 @@ pub fn anonymous(process: u32) -> u64 {
 /// Returns the peak resident memory of a process, in bytes.
 ///
 /// # Panics
-/// When it is gone.
+/// Panics if the process has ended.
 #[must_use]
 pub fn peak(process: u32) -> u64 {
     status(process, "VmHWM:") * 1024
@@ -45,7 +45,7 @@ pub fn peak(process: u32) -> u64 {
 /// Returns the share of a processor that a process uses within `window`.
 ///
 /// # Panics
-/// When it is gone.
+/// Panics if the process has ended.
 #[must_use]
 pub fn cpu_share(process: u32, window: Duration) -> f64 {
     let (start, before) = (Instant::now(), cpu_time(process));

@@ -7,7 +7,7 @@ const POLL: Duration = Duration::from_millis(5);
 /// Polls `condition` until it returns a value, and returns this value.
 ///
 /// # Panics
-/// After `deadline`, with `what` in the message.
+/// Panics after `deadline`, with the text `what` in the message.
 pub fn eventually<T>(
     what: &str,
     deadline: Duration,
@@ -30,7 +30,7 @@ pub fn eventually<T>(
 /// nothing happens.
 ///
 /// # Panics
-/// As soon as `condition` is false, with `what` in the message.
+/// Panics as soon as `condition` is false, with the text `what` in the message.
 pub fn holds_for(what: &str, window: Duration, mut condition: impl FnMut() -> bool) {
     let start = Instant::now();
     while start.elapsed() < window {

@@ -131,7 +131,8 @@ fn is_at_home(asking: Asking, executing: &Executing) -> bool {
     }
 }
 
-/// Returns the part of the mapping with names and types for callers in ROS.
+/// Returns a mapping of the Methods of the other server, with a name and a type in ROS where the
+/// call needs them.
 fn methods() -> String {
     let node = "nsu=urn:ua-bridge:system-tests:plc;s=Line";
     let methods = Executing::methods();

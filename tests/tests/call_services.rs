@@ -176,7 +176,8 @@ fn of_two_bridges_in_one_domain_one_asks_and_a_call_is_executed_once() {
     for _ in 0..5 {
         assert_eq!(set_bool(&mut judge, OF_ROS1, true), done());
     }
-    // Both requests are sent at the same time; the server's last line is printed after both.
+    // If two bridges executed a call, both requests would be sent at the same time. The server's
+    // last line is printed after both.
     assert_eq!(set_bool(&mut judge, OF_ROS1, false)["success"], false);
     let asked = |line: &Value| (line.get("value")? == false).then_some(());
     server.wait_for_json("the server is asked", SOON, asked);

@@ -29,7 +29,7 @@ pub fn own(file: &str) -> PathBuf {
 /// Reads a file of the project's own data.
 ///
 /// # Panics
-/// The file cannot be read.
+/// Panics if the file cannot be read.
 #[must_use]
 pub fn read_own(file: &str) -> String {
     read(&own(file))
@@ -40,7 +40,7 @@ pub fn read_own(file: &str) -> String {
 /// repository.
 ///
 /// # Panics
-/// The data is missing and `CI=true`, or [`FOREIGN`] does not declare its folder.
+/// Panics if the data is missing and `CI=true`, or if [`FOREIGN`] does not declare its folder.
 #[must_use]
 pub fn foreign(file: &str) -> Option<PathBuf> {
     let folder = file.split('/').next().unwrap_or_default();
@@ -61,7 +61,7 @@ pub fn foreign(file: &str) -> Option<PathBuf> {
 /// Reads a file of third-party data.
 ///
 /// # Panics
-/// As [`foreign`], and where the file cannot be read.
+/// Panics as [`foreign`] does, and if the file cannot be read.
 #[must_use]
 pub fn read_foreign(file: &str) -> Option<String> {
     foreign(file).map(|path| read(&path))
@@ -71,7 +71,7 @@ pub fn read_foreign(file: &str) -> Option<String> {
 /// reason is also written to the file `UA_SKIPPED`, which `cargo xtask test` shows at the end.
 ///
 /// # Panics
-/// `CI=true`, where no test is left out.
+/// Panics if `CI=true`, where no test is left out.
 pub fn skip(reason: &str) {
     assert!(
         env::var_os("CI").is_none_or(|ci| ci != "true"),

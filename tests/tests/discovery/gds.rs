@@ -172,8 +172,8 @@ fn a_certificate_is_issued_used_renewed_by_its_owner_and_revoked() {
     assert_eq!(said["revoked"], json!([true, false]));
     assert_eq!(said["status_revoked"], "BadCertificateRevoked");
     assert_eq!(said["list_lives"], true);
-    // With its issued certificate, the application is admitted and has the rights for itself that
-    // sara has.
+    // With its issued certificate, the application is admitted and does for itself the steps that
+    // sara did for it.
     let robot = ["--client", "robot", "--application-uri", URI];
     let itself = site.asked("itself", &robot);
     assert_eq!(itself["connected"], "Good", "{itself}");

@@ -24,7 +24,8 @@ fn values_cross(governance: Governance) {
     let mut ua = UaSide::join();
     let mut tap = Wiretap::tap();
     let _bridge = answering(cell.secured_bridge(&keystore, &[]));
-    // Started in sequence: Debian's Fast DDS sometimes ends if two peers appear at the same moment.
+    // Started in sequence: in rare cases, Debian's Fast DDS ends if two peers appear at the same
+    // moment.
     let _relays = MAKERS.map(|(maker, _, topic)| -> Child {
         let relay = ["relay", THERE.1, topic, "--type", STRING];
         maker(&cell, &keystore, &relay).start().ready(SOON)
