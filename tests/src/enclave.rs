@@ -273,7 +273,7 @@ impl Cell {
 }
 
 /// Returns the path of a plugin of Cyclone DDS in the folder of Debian and Ubuntu, which the loader
-/// does not search; the bare name if there is no such file.
+/// does not search. Returns the bare name if there is no such file.
 fn plugin(name: &str) -> String {
     let folders = fs::read_dir("/usr/lib").into_iter().flatten().flatten();
     folders

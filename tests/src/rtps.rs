@@ -176,10 +176,12 @@ impl Mutator {
 }
 
 /// Returns whether a datagram claims more than RustDDS 0.15.1 can bear. After such a datagram,
-/// RustDDS stops reading for long, or forever. It is a HEARTBEAT or GAP of more than a hundred
-/// thousand samples, through which RustDDS iterates (`rtps_writer_proxy.rs`, `missing_seqnums` and
-/// `irrelevant_changes_range`), or a DATA_FRAG of a sample of more than 64 MB, for which RustDDS
-/// fills as much memory at the first fragment (`fragment_assembler.rs`, `AssemblyBuffer::new`).
+/// RustDDS stops reading for long, or forever:
+///
+/// - a HEARTBEAT or GAP of more than a hundred thousand samples, which RustDDS visits one by one
+///   (`rtps_writer_proxy.rs`, `missing_seqnums` and `irrelevant_changes_range`);
+/// - a DATA_FRAG of a sample of more than 64 MB, for which RustDDS fills as much memory at the
+///   first fragment (`fragment_assembler.rs`, `AssemblyBuffer::new`).
 #[must_use]
 pub fn claims_too_much(datagram: &[u8]) -> bool {
     const SAMPLES: i64 = 100_000;

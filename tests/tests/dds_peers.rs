@@ -9,7 +9,7 @@ const SOON: Duration = Duration::from_secs(20);
 const STRING: &str = "std_msgs/String";
 
 // Kept for late joiners. The writer counts a reader as matched before the reader has finished
-// matching, and on a busy machine Cyclone DDS then misses some of the first samples of a volatile
+// matching. On a busy machine, Cyclone DDS then misses some of the first samples of a volatile
 // topic.
 const TEXTS: [&str; 6] = [
     "/chatter",

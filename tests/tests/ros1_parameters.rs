@@ -252,7 +252,7 @@ fn a_subscribed_parameter_follows_rospy_and_a_restart_of_the_master() {
     tell(&mut rospy, &json!({"set": "/gains", "value": {"p": 7}}));
     becomes(&p, Some(7.into()));
     assert_eq!(rosparam(&cell, &["get", "/ours/rate"]), "5");
-    // After unsubscribing, the master does not list the node as a subscriber of the parameter.
+    // After the node has unsubscribed and shut down, the master does not know it.
     drop((gains, p));
     ours.shut_down();
     let gone = xml_rpc(MASTER, "lookupNode", &["/system_tests", "/ours"]).unwrap();

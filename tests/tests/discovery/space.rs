@@ -36,7 +36,7 @@ fn listed() -> Value {
     serde_json::from_str(object.unwrap_or_else(|| panic!("{lines:?}"))).unwrap()
 }
 
-/// Returns the first element of a list whose `key` is `value`.
+/// Returns the first list element with this value of `key`.
 fn one<'v>(all: &'v Value, key: &str, value: &Value) -> Option<&'v Value> {
     all.as_array()?.iter().find(|one| one[key] == *value)
 }

@@ -328,7 +328,7 @@ fn rospy_pub(cell: &Cell, value: &str, ports: [&str; 2]) -> Child {
 }
 
 /// Requirement: a publisher is retried until the master drops it, with few log lines that name the
-/// remedy, and is found again at once under its old address or a new address.
+/// remedy. It is found again at once under its old address or a new address.
 #[test]
 fn a_publisher_is_found_again_after_every_kind_of_end() {
     let Some(cell) = Cell::with(ROS1) else {
@@ -598,7 +598,7 @@ fn many_topics(count: usize) -> String {
 }
 
 /// Requirement: of two programs with the same name that start at the same instant, exactly one
-/// program stays with all its registrations, and the other ends and reports where the first runs.
+/// program stays with all its registrations. The other ends and reports where the first runs.
 #[test]
 fn of_two_bridges_that_start_at_once_exactly_one_stays() {
     let Some(cell) = Cell::with(ROS1) else {

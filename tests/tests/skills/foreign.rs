@@ -124,7 +124,7 @@ fn a_machine_that_knows_programs_only_is_in_the_space_as_a_component_is() {
         let [name, of, topic] = expected;
         assert_eq!(*shown, [name, of, topic, &halted]);
     }
-    // Unknown Programs and duplicate names are listed with the reason.
+    // Unsupported Programs and duplicate names are listed with the reason.
     let faults = metrics(METRICS_SERVER).unwrap()["servers"][0]["faults"].clone();
     let fault = |name: &str| faults[name].as_str().unwrap_or_default().to_owned();
     assert!(fault("press.Odd").contains("CurrentState"), "{faults}");

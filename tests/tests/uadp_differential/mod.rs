@@ -1,5 +1,5 @@
 //! Compares our codec with `zerodds-opcua-pubsub`, an independent implementation of UADP: both
-//! write the same bytes, each reads the bytes of the other, and damaged bytes are either read
+//! write the same bytes, and each reads the bytes of the other. Damaged bytes are either read
 //! equally by both or refused by one of them.
 
 mod content;

@@ -1,10 +1,10 @@
 //! `cargo xtask bench hop`: the duration of a hop through each bridge, compared with a raw relay
 //! and roscpp's relay.
 //!
-//! A single process sends a message into a path and waits for it at the other end, one at a time,
-//! with the paths in turn, so that all of them see the same machine. The lower bound is a program
-//! that reads frames from a TCP connection and sends each as a UDP multicast datagram with blocking
-//! calls, which is the minimum between ROS 1 and UADP.
+//! A single process sends a message into a path and waits for it at the other end, one at a time.
+//! The paths take turns, so that all of them see the same machine. The lower bound is the minimum
+//! between ROS 1 and UADP: a program that reads frames from a TCP connection and sends each as a
+//! UDP multicast datagram with blocking calls.
 
 mod dds;
 mod ros1;

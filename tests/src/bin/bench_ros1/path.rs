@@ -69,8 +69,8 @@ impl Path {
     }
 }
 
-/// Runs an echo of many lanes: frames of a connection are sent to the next connection, in the order
-/// of a readiness queue. Connections are taken in pairs, input first.
+/// Runs an echo of many lanes: data received on a connection is sent to the next connection, in the
+/// order of a readiness queue. Connections are taken in pairs, input first.
 pub(crate) fn echo_many(lanes: usize) -> ExitCode {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     println!("{}", listener.local_addr().unwrap());

@@ -1,5 +1,5 @@
-//! The cost of a message in a relay that carries few topics or many, at the same total rate, and in
-//! an echo with as many connections that does nothing else.
+//! The cost of a message in a relay that carries few topics or many, at the same total rate. It is
+//! compared with an echo of as many connections that does nothing else.
 
 use std::net::TcpStream;
 use std::time::Duration;

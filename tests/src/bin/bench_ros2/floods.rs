@@ -34,7 +34,7 @@ fn flood(ways: &mut Ways, way: usize, floods: u64) {
             let mut report = ways.send(way, pace);
             let mut took = now().saturating_sub(start);
             if report.distinct < ticks {
-                // The time that was spent waiting for missing samples.
+                // `took` includes the silence at the end, in which missing samples were awaited.
                 took = took.saturating_sub(Duration::from_millis(SILENCE_MS));
             }
             #[expect(clippy::cast_precision_loss, reason = "a rate for people")]
