@@ -674,7 +674,7 @@ fn goals_of_either_ros_run_skills_and_are_refused_with_the_reason_of_the_compone
     assert!(why.contains("who executes the action is gone"), "{why}");
 }
 
-/// A component whose skills are executed by a base of ROS 2 and a belt of ROS 1.
+/// A component with skills executed by a base of ROS 2 and a belt of ROS 1.
 const LINE: &str = "
 component: line
 application_uri: urn:ua-bridge:system-tests:line
@@ -759,7 +759,7 @@ fn skills_have_their_work_done_by_an_action_of_ros_2_and_a_service_of_ros_1() {
     assert_eq!(line(&mut belt, "value", &json!(true), "value"), true);
     let (code, result) = run(&["line.Belt", "On=false"]);
     assert_eq!(code, 1, "the service failed: {result}");
-    // Called as an action of ROS 1 whose work is done by an action of ROS 2.
+    // Called as an action of ROS 1; an action of ROS 2 does the work.
     let mut client = actionlib_client(&cell, &["/ua_0_9_110", "ua_msgs/NavigateTo"]);
     send(&mut client, &json!({"goal": [3.0, 0.0, 0.0]}));
     let reached = end(&mut client, 0);

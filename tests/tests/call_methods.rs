@@ -266,7 +266,7 @@ fn asyncua_calls_a_service_of_rclpy_that_nobody_mapped() {
     );
 }
 
-/// The server whose Methods are calls of the space.
+/// The server with Methods that are calls of the space.
 const OTHER: &str = "opc.tcp://127.0.0.1:4841";
 
 fn executed(more: &str) -> String {

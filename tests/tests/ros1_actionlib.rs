@@ -171,7 +171,7 @@ fn a_simple_actionlib_client_preempts_its_goal_with_the_next_one() {
     let _inside = runtime.enter();
     let robot = node("robot");
     runtime.spawn(serve_simply(SimpleActionServer::new(serve(&robot))));
-    // A client whose clock is an hour ahead, and a client whose clock is an hour behind.
+    // A client with a clock an hour ahead, and a client with a clock an hour behind.
     let mut other = rospy_client(&cell, &["--node", "late", "--clock-offset", "-3600"]);
     let mut client = rospy_client(&cell, &["--simple", "--clock-offset", "3600"]);
     other.tell("send 100");

@@ -191,7 +191,7 @@ fn a_certificate_is_issued_used_renewed_by_its_owner_and_revoked() {
     let folder = pairs(&site.cell);
     let args = [&["itself", GDS, path(&folder)], &robot[..]].concat();
     eventually("the application is let in no longer", LATER, || {
-        // A script whose connection is closed prints nothing.
+        // A script prints nothing if its connection is closed.
         let said = site.cell.asyncua_try("opcua_gds.py", &args)?.remove(0);
         (said["connected"] != "Good").then_some(())
     });

@@ -566,7 +566,7 @@ fn over_secured_channels_a_device_is_configured_and_called_and_one_that_is_not_t
     };
     let mut plant = guarded(&cell);
     let uri = "urn:ua-bridge:system-tests:plc";
-    // An asyncua device whose certificate is issued by the authority.
+    // An asyncua device with a certificate issued by the authority.
     let mut adder = plant.device(&cell, "adder", uri, ("sound", "sound"));
     let told = adder.wait_for_json("its place", SOON * 3, |line| {
         line["place"].is_string().then(|| line.clone())

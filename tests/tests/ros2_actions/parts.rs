@@ -61,7 +61,7 @@ async fn who_accepted_a_goal_is_asked_for_its_result_though_another_is_known_soo
         return;
     };
     let (ours, dead, new) = (Ours::join(), Ours::join(), Ours::join());
-    // Like a killed server whose lease has not ended.
+    // Like a killed server with a lease that has not ended.
     let silent = [
         part(&dead, "get_result", GET_RESULT, None),
         part(&dead, "cancel_goal", CANCEL_GOAL, None),

@@ -21,7 +21,7 @@ use crate::ros2_actions::served::{of, options, said, serve_as};
 use crate::ros2_actions::{client_of, done, feedback, outcome, story};
 
 const SCRIPT: &str = "ros2_rclpy_action.py";
-/// An action of rclpy whose messages have nested messages.
+/// An action of rclpy with nested messages.
 const NESTED: &str = "/nested";
 
 fn type_name(name: &str) -> TypeName {

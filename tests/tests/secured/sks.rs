@@ -13,7 +13,7 @@ use super::{SOON, TOPIC, dropped, path, token};
 
 const METHOD: &str = "Server/PublishSubscribe/GetSecurityKeys";
 
-/// Writes a mapping of a cell whose server creates the keys with the settings `sks`.
+/// Writes a mapping of a cell with a server that creates the keys with the settings `sks`.
 fn mapping(cell: &Cell, sks: &str) -> String {
     let text = format!("security: [{{group: cell, keys: {{sks: {sks}}}}}]\n");
     path(&cell.file("cell.yaml", &text)).to_owned()

@@ -1,4 +1,4 @@
-//! Skills whose component or client is lost, and clients that compete for the same skill.
+//! Skills that lose their component or client, and clients that compete for the same skill.
 
 use std::time::{Duration, Instant};
 

@@ -266,7 +266,7 @@ fn settle(variant: &mut Variant) {
     }
 }
 
-/// Returns whether the message has a DataValue whose times the foreign codec orders differently.
+/// Returns whether the message has a DataValue with times in another order in the foreign codec.
 fn has_its_own_order(message: &NetworkMessage) -> bool {
     let apart =
         |value: &DataValue| value.source_pico_sec.is_some() && value.server_timestamp.is_some();

@@ -65,7 +65,7 @@ cargo xtask bench skills finding [--runs N] [--servers N]
   --servers N  servers that register with one discovery server (500)
 ";
 
-/// Starts a component with this number of grippers, whose actions complete at once.
+/// Starts a component with this number of grippers that complete their actions at once.
 fn component(cell: &Cell, pairs: usize, ready: &mut Times) -> Child {
     let mut yaml =
         "component: bench\napplication_uri: urn:ua-bridge:bench\nnamespace: 9\nskills:\n"
