@@ -98,6 +98,8 @@ fn wait(child: &mut Child, start: Instant) -> std::io::Result<Option<ExitStatus>
             Command::new("kill")
                 .args(["-KILL", "--", &group])
                 .status()?;
+            // The process may lead no group, and may have ended meanwhile.
+            let _killed = child.kill();
             child.wait()?;
             return Ok(None);
         }
