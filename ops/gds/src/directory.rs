@@ -1,7 +1,7 @@
 //! The register of applications (OPC 10000-12, 6.6).
 
-use opcua::types::{ExtensionObject, StatusCode, UAString, Variant};
-use plant_opcua::server::MethodRequest;
+use opcua::types::{ExtensionObject, NodeId, StatusCode, UAString, Variant};
+use plant_opcua::server::{Caller, MethodRequest};
 use tracing::info;
 
 use crate::records::{Query, Record, check};
@@ -21,36 +21,63 @@ pub(crate) fn find(gds: &Gds, request: &MethodRequest) -> Answer {
 
 /// RegisterApplication: returns the ApplicationId.
 pub(crate) fn register(gds: &Gds, request: &MethodRequest) -> Answer {
-    let (told, caller) = (record(request)?, &request.caller);
-    let standing = gds.standing(caller, told.application_uri.as_ref())?;
-    let record = Record::of(told, 0);
-    match standing {
-        Standing::Administrator | Standing::Itself => {}
-        Standing::Applicant(key) => {
-            check(&record).map_err(|fault| unregistered(&fault, caller))?;
-            let id = gds.applicants.lock().put(record, key);
-            return Ok(vec![Variant::from(id)]);
-        }
-        Standing::Stranger => return Err(StatusCode::BadUserAccessDenied.into()),
-    }
-    let (uri, urls) = (record.uri.clone(), record.urls.clone());
-    let registered = gds.records.lock().register(record);
-    let number = registered.map_err(|fault| unregistered(&fault, caller))?;
-    info!(application = ?uri, ?urls, number, by = ?caller.user, "an application is registered");
-    Ok(vec![Variant::from(id(number))])
+    let id = gds.register(&request.caller, Record::of(record(request)?, 0))?;
+    Ok(vec![Variant::from(id)])
 }
 
 /// UpdateApplication: changes everything except the ApplicationUri.
 pub(crate) fn update(gds: &Gds, request: &MethodRequest) -> Answer {
-    let (told, caller) = (record(request)?, &request.caller);
-    let known = gds.own(caller, &told.application_id)?;
-    let updated = gds.records.lock().update(Record::of(told, known.number));
-    updated.map_err(|fault| unregistered(&fault, caller))?;
-    info!(application = ?known.uri, by = ?caller.user, "an application is registered otherwise");
+    let told = record(request)?;
+    let known = gds.own(&request.caller, &told.application_id)?;
+    gds.update(&request.caller, Record::of(told, known.number))?;
     Ok(Vec::new())
 }
 
-/// UnregisterApplication: also revokes the certificates of the application (OPC 10000-12, 6.6.8).
+impl Gds {
+    /// Registers an application, and returns its ApplicationId. An administrator confirms the
+    /// hosts of its DiscoveryUrls.
+    ///
+    /// # Errors
+    /// The status for the caller.
+    pub(crate) fn register(
+        &self,
+        caller: &Caller,
+        mut record: Record,
+    ) -> Result<NodeId, StatusCode> {
+        match self.standing(caller, &record.uri)? {
+            Standing::Administrator => record.confirm(&record.hosts()),
+            Standing::Itself => {}
+            Standing::Applicant(key) => {
+                check(&record).map_err(|fault| unregistered(&fault, caller))?;
+                return Ok(self.applicants.lock().put(record, key));
+            }
+            Standing::Stranger => return Err(StatusCode::BadUserAccessDenied),
+        }
+        let (uri, urls) = (record.uri.clone(), record.urls.clone());
+        let registered = self.records.lock().register(record);
+        let number = registered.map_err(|fault| unregistered(&fault, caller))?;
+        info!(application = ?uri, ?urls, number, by = ?caller.user, "an application is registered");
+        Ok(id(number))
+    }
+
+    /// Updates the record of an application that the caller may change. An administrator confirms
+    /// the hosts of its DiscoveryUrls.
+    ///
+    /// # Errors
+    /// The status for the caller.
+    pub(crate) fn update(&self, caller: &Caller, mut record: Record) -> Result<(), StatusCode> {
+        if self.is_administrator(caller) {
+            record.confirm(&record.hosts());
+        }
+        let uri = record.uri.clone();
+        let updated = self.records.lock().update(record);
+        updated.map_err(|fault| unregistered(&fault, caller))?;
+        info!(application = ?uri, by = ?caller.user, "an application is registered otherwise");
+        Ok(())
+    }
+}
+
+/// UnregisterApplication: its certificates are revoked (OPC 10000-12, 6.6.8).
 pub(crate) fn unregister(gds: &Gds, request: &MethodRequest) -> Answer {
     let [Variant::NodeId(id)] = request.arguments.as_slice() else {
         return Err(StatusCode::BadInvalidArgument.into());

@@ -1,7 +1,6 @@
 //! The certificates of applications (OPC 10000-12, 7.9): requests, issue and revocation.
 
 use std::io;
-use std::net::IpAddr;
 use std::sync::Arc;
 
 use async_trait::async_trait;
@@ -37,20 +36,7 @@ pub(crate) fn start_signing(gds: &Gds, request: &MethodRequest) -> Answer {
     if wanted.application_uri() != record.uri {
         return Err(unfit(&record, "it is for another ApplicationUri"));
     }
-    let number = match standing {
-        Standing::Applicant(key) => gds.apply(&record, wanted, key)?,
-        Standing::Administrator | Standing::Itself | Standing::Stranger => {
-            gds.may_have_hosts(caller, &record, wanted.hosts())?;
-            if wanted.challenge().is_some() {
-                return Err(unfit(
-                    &record,
-                    "a challengePassword is for the first certificate of an application",
-                ));
-            }
-            let by = format!("{} {}", caller.user, caller.application_uri);
-            gds.keep_request(wanted, (None, Some(by)))?
-        }
-    };
+    let number = gds.ask(caller, (&record, standing), wanted)?;
     Ok(vec![Variant::from(request_id(number))])
 }
 
@@ -80,15 +66,14 @@ impl MethodHandler for StartNewKeyPair {
         }
         let (name, organization) = parts(subject, &record);
         let hosts = texts(hosts);
-        gds.may_have_hosts(&request.caller, &record, &hosts)?;
+        let waiting = gds.unconfirmed_hosts(&request.caller, &record, &hosts)?;
         let made = tokio::task::spawn_blocking(|| new_key(KEY_BITS)).await;
         let key = made.map_err(|_| StatusCode::BadInternalError)?;
         let key = key.map_err(|fault| refused(&fault))?;
         let wanted = Request::make(&key, &record.uri, (&name, &organization), &hosts);
         let wanted = wanted.map_err(|why| unfit(&record, &why.to_string()))?;
         let key = pem_of(&key).map_err(|fault| refused(&fault))?;
-        let by = format!("{} {}", request.caller.user, request.caller.application_uri);
-        let number = gds.keep_request(wanted, (None, Some(by)))?;
+        let number = gds.keep_checked(&request.caller, &record, (wanted, &waiting))?;
         let mut keys = gds.keys.lock();
         while keys.len() >= MOST_KEYS {
             keys.pop_first();
@@ -107,27 +92,8 @@ pub(crate) fn finish(gds: &Gds, request: &MethodRequest) -> Answer {
     let caller = &request.caller;
     let (record, standing) = gds.asking(caller, application)?;
     let number = number_of_request(id).ok_or(StatusCode::BadNotFound)?;
-    let requests: Requests =
-        kept::read(&gds.folder.join(requests::FILE)).map_err(|error| unkept(&error))?;
-    let asked = requests.get(number, now());
-    let asked = asked.filter(|one| one.uri == record.uri);
-    let asked = asked.ok_or(StatusCode::BadNotFound)?;
+    let issued = gds.fetch(caller, (&record, standing), number)?;
     let key = gds.keys.lock().get(&number).cloned();
-    if let Standing::Applicant(key) = standing
-        && !asked.is_of_key(key)
-    {
-        return Err(StatusCode::BadUserAccessDenied.into());
-    }
-    let issued = match (&asked.state, standing) {
-        (State::Issued { .. }, _) => asked.certificate().ok_or(StatusCode::BadNotFound)?,
-        (State::Approved { by }, _) => gds.issue(asked, by)?,
-        // An administrator approves a request by fetching the certificate. A request of a trusted
-        // application needs no approval.
-        (State::Waiting | State::Refused, Standing::Administrator)
-        | (State::Waiting, Standing::Itself) => gds.issue(asked, &caller.user)?,
-        (State::Waiting, _) => return Err(StatusCode::BadRequestNotComplete.into()),
-        (State::Refused, _) => return Err(StatusCode::BadUserAccessDenied.into()),
-    };
     let authority = ByteString::from(gds.store.lock().certificate().der().to_vec());
     let key = key.map_or_else(ByteString::null, |key| ByteString::from(key.into_bytes()));
     Ok(vec![
@@ -263,8 +229,88 @@ impl Gds {
         }
     }
 
-    /// Handles the request of an application without a trusted certificate. With the token of an
-    /// invitation it is approved, otherwise it waits for an administrator.
+    /// Keeps the request of an application, and returns its number.
+    ///
+    /// # Errors
+    /// The refusal for the caller.
+    pub(crate) fn ask(
+        &self,
+        caller: &Caller,
+        (record, standing): (&Record, Standing),
+        wanted: Request,
+    ) -> Result<u32, Refusal> {
+        match standing {
+            Standing::Applicant(key) => self.apply(record, wanted, key),
+            Standing::Administrator | Standing::Itself | Standing::Stranger => {
+                let waiting = self.unconfirmed_hosts(caller, record, wanted.hosts())?;
+                if wanted.challenge().is_some() {
+                    return Err(unfit(
+                        record,
+                        "a challengePassword is for the first certificate of an application",
+                    ));
+                }
+                self.keep_checked(caller, record, (wanted, &waiting))
+            }
+        }
+    }
+
+    /// Keeps the request of an administrator or a known application. It is approved unless some of
+    /// its hosts wait for an administrator.
+    fn keep_checked(
+        &self,
+        caller: &Caller,
+        record: &Record,
+        (wanted, waiting): (Request, &[String]),
+    ) -> Result<u32, Refusal> {
+        let approved = waiting.is_empty();
+        let by = approved.then(|| format!("{} {}", caller.user, caller.application_uri));
+        let number = self.keep_request(wanted, (None, by))?;
+        self.report_unconfirmed(record, number, waiting);
+        Ok(number)
+    }
+
+    /// Returns the certificate of a request. It is issued if the request is approved.
+    ///
+    /// # Errors
+    /// The refusal for the caller.
+    pub(crate) fn fetch(
+        &self,
+        caller: &Caller,
+        (record, standing): (&Record, Standing),
+        number: u32,
+    ) -> Result<Certificate, Refusal> {
+        let requests: Requests =
+            kept::read(&self.folder.join(requests::FILE)).map_err(|error| unkept(&error))?;
+        let asked = requests.get(number, now());
+        let asked = asked.filter(|one| one.uri == record.uri);
+        let asked = asked.ok_or(StatusCode::BadNotFound)?;
+        if let Standing::Applicant(key) = standing
+            && !asked.is_of_key(key)
+        {
+            return Err(StatusCode::BadUserAccessDenied.into());
+        }
+        match (&asked.state, standing) {
+            (State::Issued { .. }, _) => Ok(asked.certificate().ok_or(StatusCode::BadNotFound)?),
+            (State::Approved { by }, _) => self.issue(asked, by),
+            // An administrator approves a request by fetching the certificate.
+            (State::Waiting | State::Refused, Standing::Administrator) => {
+                self.issue(asked, &caller.user)
+            }
+            // Trust in an application approves its request, but no further hosts.
+            (State::Waiting, Standing::Itself) => {
+                let wanted = asked.request().ok_or(StatusCode::BadNotFound)?;
+                match self.are_confirmed(caller, &record.uri, wanted.hosts())? {
+                    true => self.issue(asked, &caller.user),
+                    false => Err(StatusCode::BadRequestNotComplete.into()),
+                }
+            }
+            (State::Waiting, _) => Err(StatusCode::BadRequestNotComplete.into()),
+            (State::Refused, _) => Err(StatusCode::BadUserAccessDenied.into()),
+        }
+    }
+
+    /// Keeps the request of an application that is not known by its certificate: with the token of an invitation it is
+    /// approved, otherwise it waits for an administrator.
     fn apply(&self, record: &Record, wanted: Request, key: Fingerprint) -> Result<u32, Refusal> {
         if wanted.key_fingerprint() != key {
             return Err(unfit(record, "it is for another key than the channel's"));
@@ -294,7 +340,7 @@ impl Gds {
         wanted: &Request,
         (token, key): (&str, Fingerprint),
     ) -> Result<u32, Refusal> {
-        self.may_name_hosts(record, wanted.hosts())?;
+        self.require_registered_hosts(record, wanted.hosts())?;
         let shows = Shows {
             uri: &record.uri,
             names: &record.names,
@@ -354,28 +400,35 @@ impl Gds {
         Ok(issued)
     }
 
-    /// Registers an approved application and issues its certificate.
+    /// Registers an application that was approved, confirms the hosts of its request, and issues
+    /// its certificate.
     fn register_and_issue(
         &self,
         record: Option<&Record>,
         request: &Request,
         by: &str,
     ) -> Result<Certificate, Refusal> {
-        if let Some(record) = record {
-            let mut records = self.records.lock();
-            let known = records.of_uri(&record.uri).next().map(|one| one.number);
-            let registered = match known {
-                Some(number) => records.update(Record {
-                    number,
-                    ..record.clone()
-                }),
-                None => records.register(record.clone()).map(drop),
+        let uri = request.application_uri();
+        let mut records = self.records.lock();
+        let known = records.of_uri(uri).next().cloned();
+        let number = known.as_ref().map(|one| one.number);
+        let approved = record.map(|record| Record {
+            number: number.unwrap_or_default(),
+            confirmed: Vec::new(),
+            ..record.clone()
+        });
+        if let Some(mut approved) = approved.or(known) {
+            approved.confirm(request.hosts());
+            let registered = match number {
+                Some(_) => records.update(approved),
+                None => records.register(approved).map(drop),
             };
             registered.map_err(|fault| {
-                warn!(application = ?record.uri, "cannot register an application: {fault}");
+                warn!(application = ?uri, "cannot register an application: {fault}");
                 StatusCode::BadInvalidArgument
             })?;
         }
+        drop(records);
         let issued = self.store.lock().issue(request, now(), self.life);
         let issued = issued.map_err(|fault| refused(&fault))?;
         info!(
@@ -389,43 +442,6 @@ impl Gds {
     /// is suppressed too.
     pub(crate) fn another(&self, message: &str) -> Option<u64> {
         self.logged.lock().admit(message, Instant::now())
-    }
-
-    /// Checks the hosts of a requested certificate. Allowed are the hosts of the application's
-    /// DiscoveryUrls and current certificate, and the computer itself. A security administrator may
-    /// request others.
-    fn may_have_hosts(
-        &self,
-        caller: &Caller,
-        record: &Record,
-        hosts: &[String],
-    ) -> Result<(), Refusal> {
-        match self.is_administrator(caller) {
-            true => Ok(()),
-            false => self.may_name_hosts(record, hosts),
-        }
-    }
-
-    /// Checks the hosts of a requested certificate of an application without an administrator.
-    fn may_name_hosts(&self, record: &Record, hosts: &[String]) -> Result<(), Refusal> {
-        let current = self.store.lock().of_application(&record.uri);
-        let current = current.map_err(|fault| refused(&fault))?;
-        let current = current.first().map(Certificate::hosts).unwrap_or_default();
-        let own = record.hosts();
-        let is_own = |host: &String| {
-            let mut known = own.iter().chain(&current);
-            is_loopback(host) || known.any(|one| one.eq_ignore_ascii_case(host))
-        };
-        match hosts.iter().find(|host| !is_own(host)) {
-            None => Ok(()),
-            Some(host) => Err(unfit(
-                record,
-                &format!(
-                    "the host {host:?} is in none of its DiscoveryUrls; register the application with it, or ask as a user with \
-                     the role security_admin"
-                ),
-            )),
-        }
     }
 
     fn group(&self) -> NodeId {
@@ -466,15 +482,7 @@ pub(crate) fn kind() -> NodeId {
     ObjectTypeId::RsaSha256ApplicationCertificateType.into()
 }
 
-/// Returns true if a host is the computer itself, by a loopback address or the name `localhost`.
-fn is_loopback(host: &str) -> bool {
-    match host.parse::<IpAddr>() {
-        Ok(address) => address.is_loopback(),
-        Err(_) => host.eq_ignore_ascii_case("localhost"),
-    }
-}
-
-fn unfit(record: &Record, why: &str) -> Refusal {
+pub(crate) fn unfit(record: &Record, why: &str) -> Refusal {
     info!(application = ?record.uri, "what is asked for a certificate is refused: {why}");
     StatusCode::BadInvalidArgument.into()
 }

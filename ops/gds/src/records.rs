@@ -25,6 +25,9 @@ pub(crate) struct Record {
     pub(crate) product_uri: String,
     pub(crate) urls: Vec<String>,
     pub(crate) capabilities: Vec<String>,
+    /// The hosts of `urls` that an administrator or an invitation has confirmed.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub(crate) confirmed: Vec<String>,
 }
 
 /// The reason why an application is refused.
@@ -131,14 +134,19 @@ impl Records {
         Ok(number)
     }
 
-    /// Replaces the record with the same number. The ApplicationUri must not change.
-    pub(crate) fn update(&mut self, record: Record) -> Result<(), RecordFault> {
+    /// Puts a record in the place of that of its number. The ApplicationUri stays, and so do the
+    /// confirmed hosts that the DiscoveryUrls still name.
+    pub(crate) fn update(&mut self, mut record: Record) -> Result<(), RecordFault> {
         check(&record)?;
         let all = &mut self.kept.records;
         let known = all.iter_mut().find(|one| one.number == record.number);
         let known = known.ok_or(RecordFault::Unknown)?;
         if known.uri != record.uri {
             return Err(RecordFault::Unfit("the ApplicationUri is another"));
+        }
+        record.confirm(&known.confirmed);
+        if *known == record {
+            return Ok(());
         }
         let number = record.number;
         let before = std::mem::replace(known, record);
@@ -210,6 +218,7 @@ impl Record {
             product_uri: told.product_uri.as_ref().to_owned(),
             urls: texts(&told.discovery_urls),
             capabilities: texts(&told.server_capabilities),
+            confirmed: Vec::new(),
         }
     }
 
@@ -273,6 +282,18 @@ impl Record {
         self.urls.iter().filter_map(|url| host(url)).collect()
     }
 
+    /// Confirms hosts as far as the DiscoveryUrls name them, and drops confirmed hosts that they do
+    /// not name.
+    pub(crate) fn confirm(&mut self, hosts: &[String]) {
+        let registered = self.hosts();
+        let before = std::mem::take(&mut self.confirmed);
+        for host in before.iter().chain(hosts) {
+            if has_host(&registered, host) && !has_host(&self.confirmed, host) {
+                self.confirmed.push(host.clone());
+            }
+        }
+    }
+
     fn fits(&self, query: &Query<'_>) -> bool {
         let kind = match query.kinds {
             0 | 3 => true,
@@ -295,6 +316,11 @@ impl Record {
             && (query.product_uri.is_empty() || query.product_uri == self.product_uri)
             && query.capabilities.iter().all(has)
     }
+}
+
+/// Returns whether a host is among others, in any case of its letters.
+pub(crate) fn has_host(hosts: &[String], host: &str) -> bool {
+    hosts.iter().any(|one| one.eq_ignore_ascii_case(host))
 }
 
 /// Returns the host of a URL.
@@ -414,6 +440,7 @@ mod tests {
             product_uri: "urn:maker".to_owned(),
             urls: vec![format!("opc.tcp://robot-{number}:4840")],
             capabilities: vec!["DA".to_owned(), "HD".to_owned()],
+            confirmed: Vec::new(),
         }
     }
 
@@ -500,6 +527,36 @@ mod tests {
             ..robot(1)
         };
         assert_eq!(record.hosts(), ["robot", "fe80::1", "10.0.0.7"]);
+    }
+
+    #[test]
+    fn confirmed_hosts_stay_over_an_update_and_a_restart_while_a_url_names_them() {
+        let mut all = records("confirmed");
+        let mut first = robot(1);
+        first.confirm(&["ROBOT-1".to_owned(), "mes".to_owned()]);
+        let number = all.register(first).unwrap();
+        let renamed = |hosts: &[&str]| Record {
+            number,
+            urls: hosts
+                .iter()
+                .map(|host| format!("opc.tcp://{host}"))
+                .collect(),
+            ..robot(1)
+        };
+        all.update(renamed(&["robot-1", "mes"])).unwrap();
+        let mut all = Records::open(all.path.clone(), 0).unwrap();
+        assert_eq!(all.get(number).unwrap().confirmed, ["ROBOT-1"]);
+        all.update(renamed(&["mes"])).unwrap();
+        all.update(renamed(&["robot-1"])).unwrap();
+        assert!(all.get(number).unwrap().confirmed.is_empty());
+        fs::remove_file(&all.path).unwrap();
+    }
+
+    #[test]
+    fn a_register_without_confirmed_hosts_is_read() {
+        let text = serde_json::to_string(&robot(1)).unwrap();
+        assert!(!text.contains("confirmed"), "{text}");
+        assert_eq!(serde_json::from_str::<Record>(&text).unwrap(), robot(1));
     }
 
     #[test]

@@ -95,8 +95,8 @@ impl Requests {
         }
         let is_approved = wanted.approved.is_some();
         if self.all.len() >= MOST {
-            // Waiting requests never displace each other; an approved request displaces the oldest
-            // waiting request.
+            // Requests that wait never displace each other; an approved request displaces the
+            // oldest that waits.
             let oldest = self.all.iter().position(|one| one.state == State::Waiting);
             let displaced = oldest.filter(|_| is_approved).ok_or(Unkept::Full)?;
             self.all.remove(displaced);

@@ -74,24 +74,29 @@ impl Gds {
         if self.is_administrator(caller) {
             return Ok(Standing::Administrator);
         }
-        let shown = caller.certificate.as_deref();
-        let certificate = shown.and_then(|der| Certificate::read(der).ok());
-        let Some(certificate) = certificate.filter(|_| caller.proven) else {
+        let Some(certificate) = Self::proof(caller, uri) else {
             return Ok(Standing::Stranger);
         };
-        if caller.application_uri != uri {
-            return Ok(Standing::Stranger);
-        }
-        let checked = trust::check(&certificate, &[], &self.judge.known(), now());
         let key = certificate.key_fingerprint();
-        match checked.is_ok() || self.has_issued(uri, key) {
+        match self.is_trusted(&certificate) || self.has_issued(uri, key) {
             true => Ok(Standing::Itself),
             false => Ok(Standing::Applicant(key)),
         }
     }
 
-    /// Returns true if the authority has issued a certificate for that application and key, and
-    /// revoked no certificate of the key.
+    /// Returns the certificate of a caller if it has the ApplicationUri. It may be untrusted.
+    pub(crate) fn proof(caller: &Caller, uri: &str) -> Option<Certificate> {
+        let shown = caller.certificate.as_deref();
+        let shown = shown.filter(|_| caller.proven && caller.application_uri == uri);
+        Certificate::read(shown?).ok()
+    }
+
+    /// Returns whether the store of the server trusts a certificate.
+    pub(crate) fn is_trusted(&self, certificate: &Certificate) -> bool {
+        trust::check(certificate, &[], &self.judge.known(), now()).is_ok()
+    }
+
+    /// Returns whether the authority has issued a certificate to an application with that key, and revoked none of the key.
     fn has_issued(&self, uri: &str, key: Fingerprint) -> bool {
         let all = self.store.lock().list().unwrap_or_default();
         let mut own = all.iter().filter(|one| {

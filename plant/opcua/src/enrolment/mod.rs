@@ -240,13 +240,18 @@ impl Enrolment {
         let issued = match old {
             Some(old) => match self.issued(&directory, old).await? {
                 Some(issued) => Some(issued),
-                None => return Ok(Visit::Waiting),
+                None if old.is_self_signed() => return Ok(Visit::Waiting),
+                None => {
+                    // A renewal may wait for weeks, in which certificates of others are revoked.
+                    if let Ok(lists) = self.lists(&directory).await {
+                        self.trust(&lists)?;
+                    }
+                    return Ok(Visit::Waiting);
+                }
             },
             None => None,
         };
-        let application = directory.registered(&self.applicant.record()).await;
-        let application = application.map_err(text)?;
-        let lists = directory.trust_lists(&application).await.map_err(text)?;
+        let lists = self.lists(&directory).await.map_err(text)?;
         let is_first = !known::trusts_authorities(&self.root);
         // The trust list comes first: the certificate is useless until its authority is trusted
         // here.
@@ -260,8 +265,13 @@ impl Enrolment {
         }
     }
 
-    /// Returns the issued certificate and its issuer certificates; `None` while the request is
-    /// pending.
+    /// Fetches the trust list of the registered application.
+    async fn lists(&self, directory: &Directory) -> Result<TrustLists, DirectoryError> {
+        let application = directory.registered(&self.applicant.record()).await?;
+        directory.trust_lists(&application).await
+    }
+
+    /// Returns the certificate that the authority issued, with those of the authorities above; `None` while the request waits.
     async fn issued(
         &mut self,
         directory: &Directory,
