@@ -589,8 +589,8 @@ impl Port for Ros1Port {
             if let Some(event) = self.events.pop_front() {
                 return event;
             }
-            // All branches are cancel-safe. The graph comes before samples, so a flood of samples does
-            // not delay new topics.
+            // All branches are cancel-safe. The graph comes before samples, so a flood of samples
+            // does not delay new topics.
             let flush_at = self.flush_at;
             tokio::select! {
                 biased;

@@ -9,6 +9,7 @@ use std::{
 use anyhow::Context as _;
 
 use crate::{
+    comments,
     patches::Patched,
     shell::{Ended, line, run as must, status, step, succeeds},
     workspace::Workspace,
@@ -18,7 +19,7 @@ const DENY: &str = "0.20.2";
 /// Time limit of the download of the advisory database, which has a few megabytes.
 const FETCH: Duration = Duration::from_secs(120);
 
-/// Checks formatting, lints and documentation. All checks run, so that one run shows every finding.
+/// Checks formatting, the width of comments, lints and documentation. All checks run, so that one run shows every finding.
 ///
 /// # Errors
 /// Returns an error if cargo cannot be started or the patched sources cannot be prepared.
@@ -29,6 +30,9 @@ pub(crate) fn run(workspace: &Workspace) -> anyhow::Result<Ended> {
         "formatting",
         &mut workspace.cargo(&["fmt", "--all", "--check"]),
     )?;
+    if !comments::are_narrow(workspace)? {
+        checks.failed.push("width of comments".to_owned());
+    }
     let clippy = ["clippy", "--workspace", "--all-targets", "--locked"];
     checks.run(
         "clippy",

@@ -6,6 +6,7 @@
 )]
 
 mod bench;
+mod comments;
 mod demo;
 mod dist;
 mod docs;

@@ -1,10 +1,10 @@
 //! The Global Discovery Server of a plant (OPC 10000-12, 6 and 7): a register of its applications
 //! in all subnets, and a small authority that issues their certificates.
 //!
-//! Reading order: `records` (the applications in a file), `store` (the authority in its folder), `kept` (lists that the server and
-//! the command line share), `invitations` and `requests`, `applicants`, `service` (permissions of callers),
-//! `hosts` (the hosts of a certificate), `directory` and `manager` (the methods), `serve` (the
-//! server), `ca` and `people` (the same for people).
+//! Reading order: `records` (the applications in a file), `store` (the authority in its folder),
+//! `kept` (lists that the server and the command line share), `invitations` and `requests`,
+//! `applicants`, `service` (permissions and shared state), `hosts` (the hosts of a certificate),
+//! `directory` and `manager` (the methods), `serve` (the server), `ca` and `people` (the commands).
 
 mod applicants;
 mod ca;

@@ -309,8 +309,8 @@ impl Gds {
         }
     }
 
-    /// Keeps the request of an application that is not known by its certificate: with the token of an invitation it is
-    /// approved, otherwise it waits for an administrator.
+    /// Handles the request of an application without a trusted certificate. With the token of an
+    /// invitation it is approved, otherwise it waits for an administrator.
     fn apply(&self, record: &Record, wanted: Request, key: Fingerprint) -> Result<u32, Refusal> {
         if wanted.key_fingerprint() != key {
             return Err(unfit(record, "it is for another key than the channel's"));

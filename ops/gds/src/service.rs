@@ -96,7 +96,8 @@ impl Gds {
         trust::check(certificate, &[], &self.judge.known(), now()).is_ok()
     }
 
-    /// Returns whether the authority has issued a certificate to an application with that key, and revoked none of the key.
+    /// Returns whether the authority has issued a certificate to an application with that key, and
+    /// revoked none of the key.
     fn has_issued(&self, uri: &str, key: Fingerprint) -> bool {
         let all = self.store.lock().list().unwrap_or_default();
         let mut own = all.iter().filter(|one| {

@@ -272,7 +272,8 @@ fn certificates(settings: &StationSettings, uri: &str) -> Result<Option<PathBuf>
     Ok(Some(root.clone()))
 }
 
-/// Keeps the certificate of the station current at the Global Discovery Server, for the addresses of all its interfaces.
+/// Keeps the certificate of the station current at the Global Discovery Server, for the addresses
+/// of all its interfaces.
 fn enrol(settings: &StationSettings, uri: &str, faces: Option<&Faces>) -> Option<Abort> {
     let (root, gds) = (settings.lds.pki.as_ref()?, settings.gds.clone()?);
     let faces = faces

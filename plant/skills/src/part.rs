@@ -25,9 +25,9 @@ pub enum PartEnd<T> {
     },
 }
 
-/// Runs one skill to its end, or until `interrupted` is ready. An interrupted run is halted, and the function returns when the
-/// run has ended. Until then the teller shows that the cancellation is pending. If the end is unknown, the teller is told so,
-/// and the composite needs a Reset.
+/// Runs one skill to its end, or until `interrupted` is ready. An interrupted run is halted, and
+/// the function returns when the run has ended. Until then the teller shows that the cancellation
+/// is pending. If the end is unknown, the composite needs a Reset.
 pub async fn run_part<T>(
     skill: &dyn Runs,
     parameters: Vec<(String, Value)>,

@@ -271,7 +271,8 @@ impl Enrolment {
         directory.trust_lists(&application).await
     }
 
-    /// Returns the certificate that the authority issued, with those of the authorities above; `None` while the request waits.
+    /// Returns the certificate that the authority issued and the certificates of the authorities
+    /// above it; `None` while the request waits.
     async fn issued(
         &mut self,
         directory: &Directory,
