@@ -8,6 +8,7 @@ mod actions;
 mod brought;
 mod definitions;
 mod ends;
+pub mod entry;
 mod port;
 mod services;
 mod sink;

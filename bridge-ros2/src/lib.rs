@@ -14,6 +14,7 @@ pub mod discovery_info;
 pub mod domain;
 #[cfg(feature = "patched-dds")]
 mod driver;
+pub mod entry;
 pub mod environment;
 pub mod graph;
 pub mod inbox;

@@ -4,52 +4,33 @@
 //! complete if its burst overflows the receiver's socket buffer. The patches in `patches/` change
 //! that; `cargo xtask` builds with them.
 
+use std::sync::LazyLock;
+
 use crate::graph::Endpoint;
-
-/// A macro, because `concat!` takes literals.
-#[cfg(feature = "patched-dds")]
-macro_rules! rustdds {
-    () => {
-        "RustDDS 0.15.1 with 56 patches, samples up to 10 MB"
-    };
-}
-
-#[cfg(feature = "security")]
-macro_rules! security {
-    () => {
-        "with DDS Security"
-    };
-}
-
-#[cfg(not(feature = "security"))]
-macro_rules! security {
-    () => {
-        "without DDS Security"
-    };
-}
-
-#[cfg(not(feature = "patched-dds"))]
-macro_rules! rustdds {
-    () => {
-        "RustDDS 0.15.1 as published, samples up to 256 kB to Fast DDS, 2 MB to others"
-    };
-}
 
 /// True with the patched RustDDS.
 pub const PATCHED: bool = cfg!(feature = "patched-dds");
 
 /// The version and the limits of RustDDS, for log messages.
-pub const RUSTDDS: &str = rustdds!();
+pub const RUSTDDS: &str = if PATCHED {
+    "RustDDS 0.15.1 with 56 patches, samples up to 10 MB"
+} else {
+    "RustDDS 0.15.1 as published, samples up to 256 kB to Fast DDS, 2 MB to others"
+};
 
-/// The version of this program and of its RustDDS.
-pub const VERSION: &str = concat!(
-    env!("CARGO_PKG_VERSION"),
-    " (",
-    rustdds!(),
-    ", ",
-    security!(),
-    ")"
-);
+const SECURITY: &str = if cfg!(feature = "security") {
+    "with DDS Security"
+} else {
+    "without DDS Security"
+};
+
+/// Returns the version of this program and of its RustDDS.
+#[must_use]
+pub fn version() -> &'static str {
+    static VERSION: LazyLock<String> =
+        LazyLock::new(|| format!("{} ({RUSTDDS}, {SECURITY})", build_info::version()));
+    &VERSION
+}
 
 /// Returns the size in bytes of the largest serialized sample that all readers with the system's
 /// default socket buffers receive. A larger sample is not written, but refused

@@ -135,7 +135,14 @@ fn the_server_knows_no_ros_library() {
 
 #[test]
 fn what_the_plant_thinks_with_reaches_no_io_and_knows_no_space() {
-    for package in ["mtp", "program", "registry", "trust", "xml-text"] {
+    for package in [
+        "build-info",
+        "mtp",
+        "program",
+        "registry",
+        "trust",
+        "xml-text",
+    ] {
         does_not_reach(package, IMPURE);
         does_not_reach(
             package,

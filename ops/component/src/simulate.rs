@@ -13,7 +13,7 @@ pub(crate) const VERB: &str = "simulate";
 
 /// Simulates a device behind its protocol, until SIGINT or SIGTERM. Says on standard output where it is
 #[derive(Debug, clap::Parser)]
-#[command(name = "ua-component simulate", version)]
+#[command(name = "ua-component simulate", version = build_info::version())]
 struct Simulate {
     #[command(subcommand)]
     device: Device,

@@ -54,6 +54,7 @@ pub(crate) async fn serve(
     let _claimed = claim(&settings.authority).map_err(|fault| of_store(&fault))?;
     let server = Serving::start(&settings, store)?;
     let told = server.tell(&settings)?;
+    bridge_node::ready();
     let mut look = interval(LOOK);
     look.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut warned = None;

@@ -76,7 +76,7 @@ mod tests {
 
     #[test]
     fn the_file_name_of_the_called_path_selects_the_program() {
-        for program in &PROGRAMS {
+        for program in PROGRAMS {
             let path = format!("/opt/ua/{}", program.name);
             assert_eq!(
                 called(&[&path, "server", "--help"]),

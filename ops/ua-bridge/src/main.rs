@@ -1,4 +1,4 @@
-//! `ua-bridge`: the programs of the plant in one file.
+//! `ua-bridge`: the programs of the plant in one file, in packages also the two bridges.
 //!
 //! The program acts as `ua-server`, `ua-component` and so on. It chooses by the name under which it
 //! is called, which a link sets, or by its first argument: `ua-bridge server` is `ua-server`.
@@ -21,7 +21,19 @@ struct Program {
 }
 
 /// All programs. The first argument of `ua-bridge` is a name without `ua-`.
-const PROGRAMS: [Program; 7] = [
+const PROGRAMS: &[Program] = &[
+    #[cfg(feature = "bridges")]
+    Program {
+        name: "bridge-ros1",
+        about: "carries topics between a ROS 1 graph and the space",
+        run: bridge_ros1::entry::run,
+    },
+    #[cfg(feature = "bridges")]
+    Program {
+        name: "bridge-ros2",
+        about: "carries topics between a ROS 2 domain and the space",
+        run: bridge_ros2::entry::run,
+    },
     Program {
         name: "ua-server",
         about: "the OPC UA server of the cell",
@@ -68,7 +80,7 @@ fn main() -> ExitCode {
             ExitCode::SUCCESS
         }
         Called::Version => {
-            let _written = writeln!(io::stdout(), "ua-bridge {}", env!("CARGO_PKG_VERSION"));
+            let _written = writeln!(io::stdout(), "ua-bridge {}", build_info::version());
             ExitCode::SUCCESS
         }
         Called::Nothing => {
@@ -88,9 +100,9 @@ fn help() -> String {
     let mut help = String::from(
         "The programs of the plant in one file\n\nUsage: ua-bridge <PROGRAM> [ARGUMENTS]\n\nPrograms (each with --help):\n",
     );
-    for program in &PROGRAMS {
+    for program in PROGRAMS {
         let word = called::word(program);
-        help.push_str(&format!("  {word:<10} {}\n", program.about));
+        help.push_str(&format!("  {word:<11} {}\n", program.about));
     }
     help.push_str(
         "\nA link with the name of a program acts as that program: `ln -s ua-bridge ua-server`.\n\

@@ -20,7 +20,7 @@ pub(crate) fn build_info() -> BuildInfo {
         manufacturer_name: UAString::from(MANUFACTURER),
         product_name: UAString::from(APPLICATION_NAME),
         software_version: UAString::from(env!("CARGO_PKG_VERSION")),
-        build_number: UAString::from(env!("CARGO_PKG_VERSION")),
+        build_number: UAString::from(build_info::version()),
         build_date: built(),
     }
 }

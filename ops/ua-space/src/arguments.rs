@@ -17,7 +17,7 @@ use mappings::{Code, SpaceId};
 /// Shows a running space (topics, values, skills and calls), proposes and checks mappings, and
 /// converts datagrams of OPC UA PubSub to JSON and back.
 #[derive(Debug, Parser)]
-#[command(name = "ua-space", version)]
+#[command(name = "ua-space", version = build_info::version())]
 pub(crate) struct Arguments {
     #[command(subcommand)]
     pub(crate) verb: Verb,

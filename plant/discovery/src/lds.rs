@@ -191,6 +191,7 @@ pub enum OnLevel {
 #[derive(Debug, Clone, Serialize)]
 pub struct LdsStatus {
     program: &'static str,
+    version: &'static str,
     library: &'static str,
     application_uri: String,
     endpoint: String,
@@ -296,6 +297,7 @@ pub async fn run_around(
     };
     let (mut lds, questions) = Lds::start(&settings, listening).await?;
     lds.around = around;
+    bridge_node::ready();
     lds.run(questions, &mut pages, stop).await;
     Ok(())
 }
@@ -622,6 +624,7 @@ impl Lds {
         let why = format!("the interface {} has no IPv4 address", self.interface);
         LdsStatus {
             program: "ua-lds",
+            version: build_info::version(),
             library: plant_opcua::patches::library(),
             application_uri: self.shared.own.application_uri.clone(),
             endpoint: self.shared.own.url.clone(),

@@ -47,7 +47,7 @@ pub fn library() -> &'static str {
 #[must_use]
 pub fn version() -> &'static str {
     static VERSION: LazyLock<String> =
-        LazyLock::new(|| format!("{} ({})", env!("CARGO_PKG_VERSION"), library()));
+        LazyLock::new(|| format!("{} ({})", build_info::version(), library()));
     &VERSION
 }
 

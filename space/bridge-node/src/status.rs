@@ -15,6 +15,8 @@ use crate::port::LinkState;
 #[derive(Debug, Clone, Serialize)]
 pub(crate) struct Status {
     program: &'static str,
+    /// The version, with the commit of a packaged build.
+    version: &'static str,
     #[serde(skip_serializing_if = "Option::is_none")]
     library: Option<&'static str>,
     space: u8,
@@ -164,6 +166,7 @@ impl Status {
             .collect();
         Self {
             program,
+            version: build_info::version(),
             library: None,
             space: space.get(),
             readiness,
@@ -526,5 +529,6 @@ mod tests {
         let json: serde_json::Value = serde_json::from_str(&status.json()).unwrap();
         assert_eq!(json["calls"]["ua_0_7_105"]["refused"], 1);
         assert_eq!(json["calls"]["ua_0_7_105"]["known"], false);
+        assert_eq!(json["version"], build_info::version());
     }
 }
