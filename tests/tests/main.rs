@@ -52,6 +52,7 @@ mod schema;
 mod secured;
 mod server;
 mod server_values;
+mod service_manager;
 mod shaped;
 mod sharing;
 mod shipped_mappings;

@@ -33,6 +33,7 @@ use crate::port::Port;
 use crate::restart;
 use crate::run::{Fixed, Shell};
 use crate::service;
+use crate::service_manager;
 use crate::signals;
 use crate::status::Status;
 
@@ -193,6 +194,7 @@ fn serve<P: Program>(program: P, file: MappingFile) -> Result<(), Failure> {
         let signal = signals::stopped()?;
         let hangup = signals::listen(SignalKind::hangup())?;
         let (changed, changes) = watch::channel(running);
+        service_manager::start_watchdog();
         let mut requests = metrics::serve(arguments.flags.metrics, spaces.len()).await?;
         let several = spaces.len() > 1;
         let (stopping, stop) = watch::channel(false);
@@ -212,12 +214,14 @@ fn serve<P: Program>(program: P, file: MappingFile) -> Result<(), Failure> {
             // time.
             shells.spawn(ended.instrument(span));
         }
+        service_manager::ready();
         let mut ended = Ok(());
         tokio::select! {
             () = signal => {}
             first = shells.join_next() => ended = how(first),
             () = file.follow(hangup, changed) => {}
         }
+        service_manager::ending();
         stopping.send_replace(true);
         while let Some(next) = shells.join_next().await {
             ended = ended.and(how(Some(next)));
@@ -243,7 +247,7 @@ async fn prepare<P: Program>(
         about,
     } = changes.borrow().clone();
     info!(
-        version = env!("CARGO_PKG_VERSION"),
+        version = build_info::version(),
         space = %own,
         mapping = arguments.mapping.as_ref().map(|file| tracing::field::display(file.display())),
         hash = about.hash(),

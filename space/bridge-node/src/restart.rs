@@ -27,9 +27,14 @@ pub fn restart() {
     }
 }
 
+/// Returns whether the program ends in order to be executed again.
+pub(crate) fn is_requested() -> bool {
+    REQUESTED.load(Ordering::Relaxed)
+}
+
 /// Executes the program again after [`restart`]; otherwise returns its exit code.
 pub(crate) fn executed_again(ended: ExitCode) -> ExitCode {
-    if !REQUESTED.load(Ordering::Relaxed) {
+    if !is_requested() {
         return ended;
     }
     let mut arguments = env::args_os();

@@ -10,7 +10,7 @@ use tracing::error;
 
 use crate::exit::{Failure, FailureKind};
 use crate::logging::{self, LogFormat};
-use crate::{descriptors, restart, signals};
+use crate::{descriptors, restart, service_manager, signals};
 
 /// The parts of a program, for [`run_service`].
 pub trait Service: Parser {
@@ -20,7 +20,8 @@ pub trait Service: Parser {
     /// Returns the format of log lines.
     fn log(&self) -> LogFormat;
 
-    /// Runs the program until `stop` completes.
+    /// Runs the program until `stop` completes. A program that serves calls
+    /// [`ready`](crate::ready) as soon as it listens.
     ///
     /// # Errors
     /// The reason why the program cannot run.
@@ -54,7 +55,15 @@ fn serve<S: Service>(service: S) -> Result<(), Failure> {
         .enable_all()
         .build()
         .map_err(|error| Failure::new(FailureKind::Io, format!("cannot start: {error}")))?;
-    let ended = runtime.block_on(async move { service.serve(signals::stopped()?).await });
+    let ended = runtime.block_on(async move {
+        let signal = signals::stopped()?;
+        service_manager::start_watchdog();
+        let stop = async move {
+            signal.await;
+            service_manager::ending();
+        };
+        service.serve(stop).await
+    });
     runtime.shutdown_background();
     ended
 }
