@@ -1,10 +1,28 @@
 //! `cargo xtask dist`: builds the shipped programs.
 
-use std::fs;
+mod completion;
+mod manual;
+mod notices;
+mod package;
+mod sysroot;
+mod tree;
+mod units;
 
-use anyhow::Context as _;
+use std::{
+    fs,
+    path::{Path, PathBuf},
+    process::Command,
+};
 
+use anyhow::{Context as _, ensure};
+
+use self::{
+    package::{MAINTAINER, Package},
+    sysroot::{MACHINES, Machine},
+    tree::Tree,
+};
 use crate::{
+    help::{Help, output},
     links,
     patches::Patched,
     shell::{Ended, run as must, step},
@@ -27,8 +45,375 @@ pub(crate) fn build(workspace: &Workspace) -> anyhow::Result<Ended> {
     Ok(Ended::WELL)
 }
 
-/// Builds the programs with optimisation and puts them into `target/dist`.
-pub(crate) fn run(workspace: &Workspace) -> anyhow::Result<Ended> {
+/// Builds the programs with optimisation and puts them into `target/dist`, as packages if the
+/// arguments name formats.
+///
+/// # Errors
+/// Returns an error if a program cannot be built, or a package cannot be written.
+pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
+    let Some(wanted) = Wanted::parse(arguments) else {
+        eprintln!("xtask: dist takes {USAGE}, not `{}`", arguments.join(" "));
+        return Ok(Ended::USAGE);
+    };
+    if wanted.formats.is_empty() {
+        return programs(workspace);
+    }
+    let patched = Patched::prepare(workspace)?;
+    let commit = Commit::read(workspace)?;
+    let program = match &wanted.program {
+        Some(program) => program.clone(),
+        None => packaged(workspace, &patched, (wanted.machine, &commit))?,
+    };
+    let tree = tree(workspace, &patched, (wanted.machine, &commit), &program)?;
+    let folder = workspace.target.join("dist");
+    fs::create_dir_all(&folder).with_context(|| folder.display().to_string())?;
+    let package = Package {
+        workspace,
+        machine: wanted.machine,
+        version: commit.version(),
+        time: commit.seconds,
+        tree: &tree,
+    };
+    for format in wanted.formats {
+        let path = match format {
+            Format::Deb => package.deb(&folder)?,
+            Format::Rpm => package.rpm(&folder)?,
+            Format::Tar => package.tar(&folder)?,
+        };
+        println!("{}", path.display());
+    }
+    println!("installed: {:.1} MB", tree.size() as f64 / 1e6);
+    Ok(Ended::WELL)
+}
+
+const USAGE: &str = "--deb, --rpm, --tar, --target TRIPLE and --program FILE";
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Format {
+    Deb,
+    Rpm,
+    Tar,
+}
+
+/// The command line.
+#[derive(Debug, PartialEq, Eq)]
+struct Wanted {
+    formats: Vec<Format>,
+    machine: Machine,
+    /// A program that was built elsewhere, with the feature `bridges`.
+    program: Option<PathBuf>,
+}
+
+impl Wanted {
+    fn parse(arguments: &[&str]) -> Option<Self> {
+        let mut wanted = Self {
+            formats: Vec::new(),
+            machine: Machine::host()?,
+            program: None,
+        };
+        let mut rest = arguments.iter();
+        while let Some(argument) = rest.next() {
+            match *argument {
+                "--deb" => wanted.formats.push(Format::Deb),
+                "--rpm" => wanted.formats.push(Format::Rpm),
+                "--tar" => wanted.formats.push(Format::Tar),
+                "--program" => wanted.program = Some(PathBuf::from(rest.next()?)),
+                "--target" => {
+                    let triple = rest.next()?;
+                    let mut machines = MACHINES.into_iter();
+                    wanted.machine = machines.find(|machine| machine.triple == *triple)?;
+                }
+                _ => return None,
+            }
+        }
+        let is_complete = !wanted.formats.is_empty() || arguments.is_empty();
+        is_complete.then_some(wanted)
+    }
+}
+
+/// The commit of the sources.
+struct Commit {
+    /// The abbreviated hash, with `.dirty` if the sources have other changes.
+    hash: String,
+    /// The time in seconds, and in the formats `202601020304`, `2026-01-02`, of ISO 8601 and of
+    /// mail.
+    seconds: String,
+    minutes: String,
+    date: String,
+    iso: String,
+    mail: String,
+}
+
+impl Commit {
+    fn read(workspace: &Workspace) -> anyhow::Result<Self> {
+        let git = |arguments: &[&str]| -> anyhow::Result<String> {
+            let mut command = Command::new("git");
+            command.current_dir(&workspace.root).env("TZ", "UTC0");
+            let output = command.args(arguments).output();
+            let output = output.context("git does not start")?;
+            ensure!(
+                output.status.success(),
+                "git: {}",
+                String::from_utf8_lossy(&output.stderr)
+            );
+            Ok(String::from_utf8(output.stdout)?.trim().to_owned())
+        };
+        let time = |format: &str| {
+            let date = format!("--date=format-local:{format}");
+            git(&["log", "-1", "--format=%cd", &date])
+        };
+        let hash = git(&["rev-parse", "--short=12", "HEAD"])?;
+        let changes = git(&["status", "--porcelain", "--untracked-files=no"])?;
+        Ok(Self {
+            hash: match changes.is_empty() {
+                true => hash,
+                false => format!("{hash}.dirty"),
+            },
+            seconds: git(&["log", "-1", "--format=%ct"])?,
+            minutes: time("%Y%m%d%H%M")?,
+            date: time("%Y-%m-%d")?,
+            iso: time("%Y-%m-%dT%H:%M:%SZ")?,
+            mail: time("%a, %d %b %Y %H:%M:%S +0000")?,
+        })
+    }
+
+    /// Returns the version of a package. Packages of later commits are newer.
+    fn version(&self) -> String {
+        let version = env!("CARGO_PKG_VERSION");
+        format!("{version}+{}.{}", self.minutes, self.hash)
+    }
+}
+
+/// Builds the program that acts as all programs, for packages, and returns its path.
+fn packaged(
+    workspace: &Workspace,
+    patched: &Patched,
+    (machine, commit): (Machine, &Commit),
+) -> anyhow::Result<PathBuf> {
+    step("building the program of the packages (half an hour the first time)");
+    let mut build = patched.cargo(
+        workspace,
+        &["build", "--profile", SHIPPED, "--locked", "--bins"],
+    );
+    let features = format!("{}/vendored", links::TARGET);
+    build.args(["--package", links::TARGET, "--features", &features]);
+    build.env("UA_COMMIT", &commit.hash);
+    machine.configure(workspace, &mut build)?;
+    must(&mut build)?;
+    let folder = workspace.target.join(machine.triple).join(SHIPPED);
+    Ok(folder.join(links::TARGET))
+}
+
+/// Collects the files of a package.
+fn tree(
+    workspace: &Workspace,
+    patched: &Patched,
+    (machine, commit): (Machine, &Commit),
+    program: &Path,
+) -> anyhow::Result<Tree> {
+    let mut tree = Tree::default();
+    let read = |path: &Path| fs::read(path).with_context(|| path.display().to_string());
+    let text = |path: &str| {
+        let path = workspace.root.join(path);
+        fs::read_to_string(&path).with_context(|| path.display().to_string())
+    };
+    tree.program(format!("usr/bin/{}", links::TARGET), read(program)?);
+    for name in links::BRIDGES.into_iter().chain(links::NAMES) {
+        tree.link(format!("usr/bin/{name}"), links::TARGET);
+    }
+    pages(workspace, (machine, commit), program, &mut tree)?;
+    for (name, unit) in units::all(&text("packages/systemd/program.service")?) {
+        tree.file(format!("usr/lib/systemd/system/{name}"), unit);
+    }
+    for name in ["environment", "cell.yaml"] {
+        tree.file(
+            format!("etc/ua-bridge/{name}"),
+            text(&format!("packages/etc/{name}"))?,
+        );
+    }
+    tree.folder("etc/ua-bridge/components", 0o755);
+    tree.folder("etc/ua-bridge/keys", 0o750);
+    tree.file(
+        "usr/share/ua-bridge/schema.json",
+        text("mappings/schema.json")?,
+    );
+    tree.file(
+        "usr/share/ua-bridge/wireshark/uadp.lua",
+        text("docs/wireshark/uadp.lua")?,
+    );
+    for folder in ROS_FOLDERS {
+        for path in files(&workspace.root.join("ros").join(folder))? {
+            let name = path.file_name().unwrap_or_default().to_string_lossy();
+            let to = format!("usr/share/ua-bridge/ros/{folder}/{name}");
+            match folder.ends_with("scripts") {
+                true => tree.program(to, read(&path)?),
+                false => tree.file(to, read(&path)?),
+            }
+        }
+    }
+    for (from, to) in EXAMPLES {
+        for path in files(&workspace.root.join(from))? {
+            let name = path.file_name().unwrap_or_default().to_string_lossy();
+            tree.file(format!("{DOC}/examples/{to}{name}"), read(&path)?);
+        }
+    }
+    for (from, to) in [("docs", ""), ("docs/reference", "reference/")] {
+        for path in files(&workspace.root.join(from))? {
+            let name = path.file_name().unwrap_or_default().to_string_lossy();
+            tree.file(format!("{DOC}/{to}{name}"), read(&path)?);
+        }
+    }
+    documents(workspace, patched, (machine, commit), &mut tree)?;
+    Ok(tree)
+}
+
+const DOC: &str = "usr/share/doc/ua-bridge";
+/// Folders of the ROS packages below `ros/`.
+const ROS_FOLDERS: [&str; 6] = [
+    "ua_bridge",
+    "ua_bridge/launch",
+    "ua_bridge/scripts",
+    "ua_msgs",
+    "ua_msgs/action",
+    "ua_msgs/msg",
+];
+/// Folders with examples, and their places below the examples of a package.
+const EXAMPLES: [(&str, &str); 4] = [
+    ("packages/examples", ""),
+    ("packages/examples/robots", "robots/"),
+    ("mappings", "mappings/"),
+    ("examples/plant", "plant/"),
+];
+
+/// Returns the files of a folder with text for users, without folders below.
+fn files(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
+    let entries = fs::read_dir(folder).with_context(|| folder.display().to_string())?;
+    let paths = entries.map(|entry| entry.map(|entry| entry.path()));
+    let mut paths: Vec<PathBuf> = paths.collect::<Result<_, _>>()?;
+    paths.retain(|path| {
+        let name = path.file_name().unwrap_or_default();
+        path.is_file() && name != "Cargo.toml" && name != "schema.json"
+    });
+    paths.sort();
+    Ok(paths)
+}
+
+/// Adds manual pages and completions.
+fn pages(
+    workspace: &Workspace,
+    (machine, commit): (Machine, &Commit),
+    program: &Path,
+    tree: &mut Tree,
+) -> anyhow::Result<()> {
+    // The links of the program, beside it in a folder of their own.
+    let folder = workspace.target.join(format!("names-{}", machine.debian));
+    fs::create_dir_all(&folder).with_context(|| folder.display().to_string())?;
+    let target = folder.join(links::TARGET);
+    fs::copy(program, &target).with_context(|| program.display().to_string())?;
+    links::make_all(&folder)?;
+    let all = Help::all(&folder)?;
+    let version = env!("CARGO_PKG_VERSION");
+    for help in &all {
+        let page = manual::page(help, version, &commit.date);
+        let path = format!("usr/share/man/man1/{}.1", help.words.join("-"));
+        tree.compressed(&path, page.as_bytes())?;
+    }
+    tree.compressed(
+        &format!("usr/share/man/man1/{}.1", links::TARGET),
+        manual::overview(version, &commit.date).as_bytes(),
+    )?;
+    for name in links::BRIDGES.into_iter().chain(links::NAMES) {
+        let own: Vec<&Help> = all
+            .iter()
+            .filter(|help| help.words.first().is_some_and(|first| first == name))
+            .collect();
+        let mut scripts = completion::scripts(name, &own);
+        // ua-space knows the names of the running space.
+        if name == "ua-space" {
+            let shell = |shell| output(&folder, &[name, "completion", shell]);
+            scripts.bash = shell("bash")?;
+            scripts.zsh = format!("#compdef {name}\n{}_ua_space \"$@\"\n", shell("zsh")?);
+            scripts.fish = shell("fish")?;
+        }
+        tree.file(
+            format!("usr/share/bash-completion/completions/{name}"),
+            scripts.bash,
+        );
+        tree.file(
+            format!("usr/share/zsh/vendor-completions/_{name}"),
+            scripts.zsh,
+        );
+        tree.file(
+            format!("usr/share/fish/vendor_completions.d/{name}.fish"),
+            scripts.fish,
+        );
+    }
+    fs::remove_dir_all(&folder).with_context(|| folder.display().to_string())
+}
+
+/// Adds licences, the bill of materials, patches and changes.
+fn documents(
+    workspace: &Workspace,
+    patched: &Patched,
+    (machine, commit): (Machine, &Commit),
+    tree: &mut Tree,
+) -> anyhow::Result<()> {
+    let text = |path: &str| {
+        let path = workspace.root.join(path);
+        fs::read_to_string(&path).with_context(|| path.display().to_string())
+    };
+    let crates = notices::crates(workspace, machine)?;
+    let names: Vec<String> = patched
+        .sources()
+        .iter()
+        .map(|source| source.name().to_owned())
+        .collect();
+    let notices = notices::licences(&crates, &names)?;
+    tree.compressed(&format!("{DOC}/THIRD-PARTY"), notices.as_bytes())?;
+    let bill = notices::bill(
+        &crates,
+        &text("Cargo.lock")?,
+        &names,
+        (&commit.version(), &commit.iso),
+    );
+    let bill = serde_json::to_vec_pretty(&bill)?;
+    tree.compressed(&format!("{DOC}/sbom.cdx.json"), &bill)?;
+    let mut tar = Command::new("tar");
+    tar.args(["--sort=name", "--owner=0", "--group=0", "--numeric-owner"])
+        .arg(format!("--mtime=@{}", commit.seconds))
+        .args(["-cf", "-", "patches"])
+        .current_dir(&workspace.root);
+    let archive = tar.output().context("tar does not start")?;
+    ensure!(
+        archive.status.success(),
+        "tar ended with {}",
+        archive.status
+    );
+    tree.compressed(&format!("{DOC}/patches.tar"), &archive.stdout)?;
+    tree.file(
+        format!("{DOC}/copyright"),
+        text("packages/debian/copyright")?,
+    );
+    tree.compressed(
+        &format!("{DOC}/changelog"),
+        text("CHANGELOG.md")?.as_bytes(),
+    )?;
+    let debian = format!(
+        "ua-bridge ({}-1) unstable; urgency=medium\n\n  * Package of commit {}.\n\n -- {MAINTAINER}  {}\n",
+        commit.version(),
+        commit.hash,
+        commit.mail,
+    );
+    tree.compressed(&format!("{DOC}/changelog.Debian"), debian.as_bytes())?;
+    tree.file(
+        "usr/share/lintian/overrides/ua-bridge",
+        text("packages/debian/lintian-overrides")?,
+    );
+    Ok(())
+}
+
+/// Builds the programs as separate files, for this machine.
+fn programs(workspace: &Workspace) -> anyhow::Result<Ended> {
     let patched = Patched::prepare(workspace)?;
     step("building the programs with optimisation (some minutes the first time)");
     let mut build = patched.cargo(

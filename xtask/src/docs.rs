@@ -1,28 +1,21 @@
 //! `cargo xtask docs`: generates the reference pages from the programs and the schema of mappings.
 
-use std::{fmt::Write as _, fs, path::Path, process::Command};
+use std::{fmt::Write as _, fs, path::Path};
 
-use anyhow::{Context as _, ensure};
+use anyhow::Context as _;
 use serde_json::{Map, Value};
 
 use crate::{
-    dist, links, markdown,
-    shell::{Ended, line, step},
+    dist,
+    help::{Help, output},
+    markdown,
+    shell::{Ended, step},
     workspace::Workspace,
 };
 
 const FOLDER: &str = "docs/reference";
 const NOTE: &str =
     "<!-- Written by `cargo xtask docs`. Change the program or the schema instead. -->";
-/// Verbs that the help of their program lists outside of its commands.
-const FURTHER: [&[&str]; 6] = [
-    &["ua-component", "simulate"],
-    &["ua-server", "certificates"],
-    &["ua-server", "reject"],
-    &["ua-server", "renew"],
-    &["ua-server", "trust"],
-    &["ua-server", "user"],
-];
 /// Sources of the metrics: the file, the text before the name of a metric, and the end of the name.
 const METRICS: [(&str, &str, &str); 3] = [
     ("space/bridge-node/src/status.rs", "line(", ""),
@@ -104,40 +97,17 @@ fn commands(programs: &Path) -> anyhow::Result<String> {
         "{NOTE}\n# Commands\n\nEach program and verb with its options. An option wins over its \
          environment variable, which wins over the YAML.\n"
     );
-    for name in ["bridge-ros1", "bridge-ros2"]
-        .into_iter()
-        .chain(links::NAMES)
-    {
-        command(programs, &[name], &mut page)?;
-        for words in FURTHER.iter().filter(|words| words.first() == Some(&name)) {
-            command(programs, words, &mut page)?;
-        }
+    for help in Help::all(programs)? {
+        let text: Vec<&str> = help.text.trim().lines().map(str::trim_end).collect();
+        // Writing to a string does not fail.
+        let _written = write!(
+            page,
+            "\n## {}\n\n```text\n{}\n```\n",
+            help.words.join(" "),
+            text.join("\n")
+        );
     }
     Ok(page)
-}
-
-/// Appends the help of a program or verb, and of the verbs below it.
-fn command(programs: &Path, words: &[&str], page: &mut String) -> anyhow::Result<()> {
-    let help = output(programs, &[words, &["--help"]].concat())?;
-    let text: Vec<&str> = help.trim().lines().map(str::trim_end).collect();
-    // Writing to a string does not fail.
-    let _written = write!(
-        page,
-        "\n## {}\n\n```text\n{}\n```\n",
-        words.join(" "),
-        text.join("\n")
-    );
-    for verb in verbs(&help) {
-        command(programs, &[words, &[verb]].concat(), page)?;
-    }
-    Ok(())
-}
-
-/// Returns the verbs that a help text lists, without `help`.
-fn verbs(help: &str) -> Vec<&str> {
-    let lines = help.lines().skip_while(|line| *line != "Commands:").skip(1);
-    let verbs = lines.map_while(|line| line.split_whitespace().next());
-    verbs.filter(|verb| *verb != "help").collect()
 }
 
 /// Returns the page of all finding codes from lines of the form `CODE  text`.
@@ -293,37 +263,11 @@ fn metrics<'a>(source: &'a str, before: &'a str, end: &'a str) -> impl Iterator<
     texts.filter(named).filter(move |name| name.ends_with(end))
 }
 
-/// Runs a program and returns its output. The environment is empty, because a help text shows the
-/// variables that are set.
-fn output(programs: &Path, words: &[&str]) -> anyhow::Result<String> {
-    let (name, arguments) = words.split_first().context("a program is named")?;
-    let mut command = Command::new(programs.join(name));
-    command.args(arguments).env_clear();
-    let output = command
-        .output()
-        .with_context(|| format!("{} does not start", line(&command)))?;
-    ensure!(
-        output.status.success(),
-        "{} ended with {}",
-        line(&command),
-        output.status
-    );
-    String::from_utf8(output.stdout).with_context(|| line(&command))
-}
-
 #[cfg(test)]
 mod tests {
     use serde_json::json;
 
     use super::*;
-
-    #[test]
-    fn verbs_are_read_from_the_help_of_a_program() {
-        let help = "Usage: a <COMMAND>\n\nCommands:\n  list   List\n  trace  Trace\n  help   Print\n\n\
-                    Options:\n  -h\n";
-        assert_eq!(verbs(help), ["list", "trace"]);
-        assert_eq!(verbs("Usage: a\n\nOptions:\n  -h\n"), [""; 0]);
-    }
 
     #[test]
     fn keys_of_the_schema_are_rows_with_their_kinds_and_links() {

@@ -23,13 +23,29 @@ pub(crate) const NAMES: [&str; 7] = [
     "ua-station",
 ];
 
+/// The bridges, which are programs of their own and, in packages, names of `ua-bridge`.
+pub(crate) const BRIDGES: [&str; 2] = ["bridge-ros1", "bridge-ros2"];
+
 /// Creates the links in a folder with `ua-bridge`. A file with the name of a link is replaced. Each
 /// link is replaced atomically, because tests may run at the same time.
 ///
 /// # Errors
 /// Returns an error if the folder cannot be written.
 pub(crate) fn make(folder: &Path) -> anyhow::Result<()> {
-    for name in NAMES {
+    make_named(folder, &NAMES)
+}
+
+/// Creates the links in a folder whose `ua-bridge` has the bridges, too.
+///
+/// # Errors
+/// Returns an error if the folder cannot be written.
+pub(crate) fn make_all(folder: &Path) -> anyhow::Result<()> {
+    make_named(folder, &BRIDGES)?;
+    make(folder)
+}
+
+fn make_named(folder: &Path, names: &[&str]) -> anyhow::Result<()> {
+    for name in names {
         let link = folder.join(name);
         if fs::read_link(&link).is_ok_and(|target| target == Path::new(TARGET)) {
             continue;

@@ -10,6 +10,7 @@ mod comments;
 mod demo;
 mod dist;
 mod docs;
+mod help;
 mod instructions;
 mod links;
 mod lint;
@@ -34,7 +35,9 @@ cargo xtask <verb>
   lint [--dependencies]          formatting, clippy, documentation; or licences, sources and advisories of dependencies, and the
                                  workspace with all crates as published
   build                          build the programs without optimisation into target/debug, with the links of ua-bridge
-  dist                           build the programs that are handed out, with optimisation, into target/dist, with the links
+  dist [--deb] [--rpm] [--tar] [--target TRIPLE] [--program FILE]
+                                 build the programs that are handed out, with optimisation, into target/dist, with the links;
+                                 or packages of them with units, manual pages and completions (docs/packages.md)
   docs [--check] [--no-build]    build the programs and write docs/reference from them; or only check that its pages are current
   patches [--test]               only patch the crates of patches/, which all verbs build with, and print the flags to do so by hand;
                                  or run the tests that the patches add, which `test` leaves out
@@ -70,7 +73,7 @@ fn run(arguments: &[&str]) -> anyhow::Result<Ended> {
         ["peers"] => Ok(peers::run(&Workspace::find()?)),
         ["peers", "--build"] => peers::for_building(),
         ["build"] => dist::build(&Workspace::find()?),
-        ["dist"] => dist::run(&Workspace::find()?),
+        ["dist", rest @ ..] => dist::run(&Workspace::find()?, rest),
         ["docs", rest @ ..] => docs::run(&Workspace::find()?, rest),
         ["patches"] => patches::run(&Workspace::find()?),
         ["patches", "--test"] => test::of_all_patches(&Workspace::find()?),
