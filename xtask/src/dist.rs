@@ -79,6 +79,7 @@ pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<E
             Format::Deb => package.deb(&folder)?,
             Format::Rpm => package.rpm(&folder)?,
             Format::Tar => package.tar(&folder)?,
+            Format::Container => package.container(&folder)?,
         };
         println!("{}", path.display());
     }
@@ -86,13 +87,14 @@ pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<E
     Ok(Ended::WELL)
 }
 
-const USAGE: &str = "--deb, --rpm, --tar, --target TRIPLE and --program FILE";
+const USAGE: &str = "--deb, --rpm, --tar, --container, --target TRIPLE and --program FILE";
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Format {
     Deb,
     Rpm,
     Tar,
+    Container,
 }
 
 /// The command line.
@@ -117,6 +119,7 @@ impl Wanted {
                 "--deb" => wanted.formats.push(Format::Deb),
                 "--rpm" => wanted.formats.push(Format::Rpm),
                 "--tar" => wanted.formats.push(Format::Tar),
+                "--container" => wanted.formats.push(Format::Container),
                 "--program" => wanted.program = Some(PathBuf::from(rest.next()?)),
                 "--target" => {
                     let triple = rest.next()?;

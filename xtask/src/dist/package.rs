@@ -112,6 +112,21 @@ impl Package<'_> {
         Ok(String::from_utf8(output.stdout)?)
     }
 
+    /// Writes the folder that a container is built from, and returns its path.
+    ///
+    /// # Errors
+    /// Returns an error if the package of Debian cannot be written.
+    pub(crate) fn container(&self, folder: &Path) -> anyhow::Result<PathBuf> {
+        let package = self.deb(folder)?;
+        let context = folder.join("container");
+        fs::create_dir_all(&context).with_context(|| context.display().to_string())?;
+        let file = self.workspace.root.join("packages/Containerfile");
+        for (from, to) in [(&package, "ua-bridge.deb"), (&file, "Containerfile")] {
+            fs::copy(from, context.join(to)).with_context(|| from.display().to_string())?;
+        }
+        Ok(context)
+    }
+
     /// Writes the tarball and returns its path.
     ///
     /// # Errors
