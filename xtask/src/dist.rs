@@ -204,7 +204,21 @@ fn packaged(
     machine.configure(workspace, &mut build)?;
     must(&mut build)?;
     let folder = workspace.target.join(machine.triple).join(SHIPPED);
-    Ok(folder.join(links::TARGET))
+    let built = folder.join(links::TARGET);
+    let listed = workspace
+        .target
+        .join(format!("{}-{}", links::TARGET, machine.debian));
+    let crates = notices::crates(workspace, machine)?;
+    let list = listed.with_extension("crates");
+    fs::write(&list, notices::audit(&crates)?).with_context(|| list.display().to_string())?;
+    let mut objcopy = Command::new(machine.objcopy());
+    objcopy
+        .arg(format!("--add-section=.dep-v0={}", list.display()))
+        .arg("--set-section-flags=.dep-v0=noload,readonly")
+        .args([&built, &listed]);
+    must(&mut objcopy)?;
+    fs::remove_file(&list).with_context(|| list.display().to_string())?;
+    Ok(listed)
 }
 
 /// Collects the files of a package.

@@ -8,6 +8,7 @@ use std::{
 };
 
 use anyhow::{Context as _, ensure};
+use miniz_oxide::deflate::compress_to_vec_zlib;
 use serde_json::{Value, json};
 
 use super::sysroot::Machine;
@@ -281,6 +282,34 @@ pub(crate) fn bill(
     })
 }
 
+/// Returns the list of crates that scanners read from a program: JSON in the format of
+/// cargo-auditable, compressed by zlib.
+///
+/// # Errors
+/// Returns an error if the list cannot be encoded.
+pub(crate) fn audit(crates: &[Crate]) -> anyhow::Result<Vec<u8>> {
+    let place = |id: &String| crates.iter().position(|found| found.id == *id);
+    let packages: Vec<Value> = crates
+        .iter()
+        .map(|found| {
+            let uses: BTreeSet<usize> = found.uses.iter().filter_map(place).collect();
+            let source = match found.source {
+                Some(_) => "crates.io",
+                None => "local",
+            };
+            json!({
+                "name": &found.name,
+                "version": &found.version,
+                "source": source,
+                "dependencies": uses,
+                "root": found.name == links::TARGET,
+            })
+        })
+        .collect();
+    let list = serde_json::to_vec(&json!({ "packages": packages }))?;
+    Ok(compress_to_vec_zlib(&list, 9))
+}
+
 /// Returns the checksums of published crates by `NAME-VERSION`.
 fn checksums(lock: &str) -> BTreeMap<String, String> {
     let value = |block: &str, key: &str| -> Option<String> {
@@ -389,5 +418,21 @@ mod tests {
             json!(["pkg:cargo/openssl-sys@0.9.1"])
         );
         fs::remove_dir_all(&folder).unwrap();
+    }
+
+    #[test]
+    fn a_program_has_the_list_of_its_crates_for_scanners() {
+        let crates = linked(&metadata(Path::new("/nowhere"))).unwrap();
+        let list = audit(&crates).unwrap();
+        let list = miniz_oxide::inflate::decompress_to_vec_zlib(&list).unwrap();
+        let list: Value = serde_json::from_slice(&list).unwrap();
+        let root = &list["packages"][2];
+        assert_eq!(
+            (&root["name"], &root["root"]),
+            (&json!("ua-bridge"), &json!(true))
+        );
+        assert_eq!(root["source"], "local");
+        assert_eq!(root["dependencies"], json!([1]));
+        assert_eq!(list["packages"][1]["source"], "crates.io");
     }
 }

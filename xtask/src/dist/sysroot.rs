@@ -55,6 +55,11 @@ impl Machine {
         MACHINES.into_iter().find(|machine| machine.rpm == here)
     }
 
+    /// Returns the program that adds sections to programs.
+    pub(crate) fn objcopy(self) -> String {
+        self.cc.replace("gcc", "objcopy")
+    }
+
     /// Adds the settings to `build` that compile and link for this machine and the old C library.
     ///
     /// # Errors
