@@ -130,7 +130,7 @@ impl Unit {
             .needs
             .map(|file| format!("ConditionPathExists={file}\n"));
         let reload = match self.reloads {
-            true => "ExecReload=/bin/kill -HUP $MAINPID\n",
+            true => "ExecReload=/bin/sh -c 'kill -HUP ${MAINPID}'\n",
             false => "",
         };
         let text = template
