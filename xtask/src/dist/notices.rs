@@ -201,8 +201,8 @@ fn texts_of(folder: &Path) -> anyhow::Result<Vec<String>> {
     read.collect()
 }
 
-/// Returns the bill of materials in the JSON of CycloneDX 1.5. `lock` is the text of Cargo.lock, and
-/// `patched` has `NAME-VERSION` of the patched crates. The last argument is the version of the
+/// Returns the bill of materials in the JSON of CycloneDX 1.5. `lock` is the text of Cargo.lock,
+/// and `patched` has `NAME-VERSION` of the patched crates. The last argument is the version of the
 /// package and its time.
 pub(crate) fn bill(
     crates: &[Crate],
