@@ -18,7 +18,7 @@ use anyhow::{Context as _, ensure};
 
 use self::{
     package::{MAINTAINER, Package},
-    sysroot::{MACHINES, Machine},
+    sysroot::Machine,
     tree::Tree,
 };
 use crate::{
@@ -87,7 +87,7 @@ pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<E
     Ok(Ended::WELL)
 }
 
-const USAGE: &str = "--deb, --rpm, --tar, --container, --target TRIPLE and --program FILE";
+const USAGE: &str = "--deb, --rpm, --tar, --container and --program FILE";
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Format {
@@ -121,11 +121,6 @@ impl Wanted {
                 "--tar" => wanted.formats.push(Format::Tar),
                 "--container" => wanted.formats.push(Format::Container),
                 "--program" => wanted.program = Some(PathBuf::from(rest.next()?)),
-                "--target" => {
-                    let triple = rest.next()?;
-                    let mut machines = MACHINES.into_iter();
-                    wanted.machine = machines.find(|machine| machine.triple == *triple)?;
-                }
                 _ => return None,
             }
         }
@@ -211,7 +206,7 @@ fn packaged(
     let crates = notices::crates(workspace, machine)?;
     let list = listed.with_extension("crates");
     fs::write(&list, notices::audit(&crates)?).with_context(|| list.display().to_string())?;
-    let mut objcopy = Command::new(machine.objcopy());
+    let mut objcopy = Command::new("objcopy");
     objcopy
         .arg(format!("--add-section=.dep-v0={}", list.display()))
         .arg("--set-section-flags=.dep-v0=noload,readonly")
@@ -328,6 +323,12 @@ fn pages(
     let target = folder.join(links::TARGET);
     fs::copy(program, &target).with_context(|| program.display().to_string())?;
     links::make_all(&folder)?;
+    let [bridge, _] = links::BRIDGES;
+    ensure!(
+        output(&folder, &[bridge, "--version"])?.starts_with(bridge),
+        "{} has no bridges: build it with `--features ua-bridge/bridges`",
+        program.display()
+    );
     let all = Help::all(&folder)?;
     let version = env!("CARGO_PKG_VERSION");
     for help in &all {

@@ -35,7 +35,7 @@ cargo xtask <verb>
   lint [--dependencies]          formatting, clippy, documentation; or licences, sources and advisories of dependencies, and the
                                  workspace with all crates as published
   build                          build the programs without optimisation into target/debug, with the links of ua-bridge
-  dist [--deb] [--rpm] [--tar] [--container] [--target TRIPLE] [--program FILE]
+  dist [--deb] [--rpm] [--tar] [--container] [--program FILE]
                                  build the programs that are handed out, with optimisation, into target/dist, with the links;
                                  or packages of them with units, manual pages and completions (docs/packages.md)
   docs [--check] [--no-build]    build the programs and write docs/reference from them; or only check that its pages are current

@@ -28,23 +28,19 @@ pub(crate) struct Machine {
     pub(crate) debian: &'static str,
     /// The architecture in names of RPM and of containers' base systems.
     pub(crate) rpm: &'static str,
-    /// The compiler of C, which also links.
-    cc: &'static str,
 }
 
-/// All machines that packages can be made for.
-pub(crate) const MACHINES: [Machine; 2] = [
+/// All machines that packages can be made for, each on a machine of its kind.
+const MACHINES: [Machine; 2] = [
     Machine {
         triple: "x86_64-unknown-linux-gnu",
         debian: "amd64",
         rpm: "x86_64",
-        cc: "gcc",
     },
     Machine {
         triple: "aarch64-unknown-linux-gnu",
         debian: "arm64",
         rpm: "aarch64",
-        cc: "aarch64-linux-gnu-gcc",
     },
 ];
 
@@ -53,11 +49,6 @@ impl Machine {
     pub(crate) fn host() -> Option<Self> {
         let here = std::env::consts::ARCH;
         MACHINES.into_iter().find(|machine| machine.rpm == here)
-    }
-
-    /// Returns the program that adds sections to programs.
-    pub(crate) fn objcopy(self) -> String {
-        self.cc.replace("gcc", "objcopy")
     }
 
     /// Adds the settings to `build` that compile and link for this machine and the old C library.
@@ -70,13 +61,8 @@ impl Machine {
         build: &mut Command,
     ) -> anyhow::Result<()> {
         ensure!(
-            succeeds(self.cc, &["--version"]),
-            "{} is missing: install it (on Debian `apt-get install {}`)",
-            self.cc,
-            match self.cc {
-                "gcc" => "gcc libc6-dev",
-                _ => "gcc-aarch64-linux-gnu libc6-dev-arm64-cross",
-            }
+            succeeds("gcc", &["--version"]),
+            "gcc is missing: install it (on Debian `apt-get install gcc libc6-dev`)"
         );
         let sysroot = self.sysroot(workspace)?;
         let sysroot = sysroot.display();
@@ -90,9 +76,9 @@ impl Machine {
         }
         build
             .args(["--target", self.triple])
-            .env(format!("{prefix}_LINKER"), self.cc)
+            .env(format!("{prefix}_LINKER"), "gcc")
             .env(format!("{prefix}_RUSTFLAGS"), flags.join(" "))
-            .env(format!("CC_{variable}"), self.cc)
+            .env(format!("CC_{variable}"), "gcc")
             .env(format!("CFLAGS_{variable}"), format!("--sysroot={sysroot}"));
         Ok(())
     }
