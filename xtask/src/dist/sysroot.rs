@@ -3,6 +3,7 @@
 
 use std::{
     fs,
+    os::unix::fs::symlink,
     path::{Path, PathBuf},
     process::Command,
 };
@@ -68,7 +69,12 @@ impl Machine {
         let sysroot = sysroot.display();
         let variable = self.triple.replace('-', "_");
         let prefix = format!("CARGO_TARGET_{}", variable.to_uppercase());
+        // gcc searches the folders of this host, too, and those of `-B` before them.
         let mut flags = vec![format!("-Clink-arg=--sysroot={sysroot}")];
+        for folder in ["usr/lib", "lib"] {
+            let folder = format!("{sysroot}/{folder}/{}-linux-gnu/", self.rpm);
+            flags.push(format!("-Clink-arg=-B{folder}"));
+        }
         // The linker folds functions with equal code, which generics produce in numbers. Rust links
         // with LLD on this machine only.
         if self.rpm == "x86_64" {
@@ -86,33 +92,58 @@ impl Machine {
     /// Returns a folder with the C library and its headers, which is made once.
     fn sysroot(self, workspace: &Workspace) -> anyhow::Result<PathBuf> {
         let folder = workspace.target.join(format!("sysroot-{}", self.debian));
-        if folder.join("usr/include/stdio.h").exists() {
+        if folder.exists() {
             return Ok(folder);
         }
         step(&format!(
             "unpacking the C library of Debian {RELEASE} into {}",
             folder.display()
         ));
+        let root = folder.with_extension("debootstrap");
+        let new = folder.with_extension("new");
+        for folder in [&root, &new] {
+            if folder.exists() {
+                fs::remove_dir_all(folder).with_context(|| folder.display().to_string())?;
+            }
+        }
         let mirror = std::env::var("UA_DEBIAN_MIRROR");
         let mut debootstrap = Command::new("debootstrap");
-        // The first stage unpacks packages and runs none of their programs.
+        // The first stage downloads packages, checks their signature, and runs none of their
+        // programs.
         debootstrap
             .args(["--foreign", "--variant=minbase", "--include=libc6-dev"])
             .arg(format!("--arch={}", self.debian))
             .arg(RELEASE)
-            .arg(&folder)
+            .arg(&root)
             .arg(mirror.as_deref().unwrap_or(MIRROR));
         must(&mut debootstrap).context("debootstrap makes the folder, as root")?;
-        for package in packages(&folder.join("var/cache/apt/archives"))? {
-            must(
-                Command::new("dpkg-deb")
-                    .arg("-x")
-                    .arg(&package)
-                    .arg(&folder),
-            )?;
+        for package in packages(&root.join("var/cache/apt/archives"))? {
+            must(Command::new("dpkg-deb").arg("-x").arg(&package).arg(&new))?;
         }
+        relate_links(&new, 0)?;
+        fs::remove_dir_all(&root).with_context(|| root.display().to_string())?;
+        fs::rename(&new, &folder).with_context(|| folder.display().to_string())?;
         Ok(folder)
     }
+}
+
+/// Makes all absolute links below a folder relative, because they would lead to the libraries of
+/// this host. `depth` is the number of folders above `folder` in the root.
+fn relate_links(folder: &Path, depth: usize) -> anyhow::Result<()> {
+    let entries = fs::read_dir(folder).with_context(|| folder.display().to_string())?;
+    for entry in entries {
+        let path = entry?.path();
+        if let Ok(target) = fs::read_link(&path) {
+            if let Ok(below) = target.strip_prefix("/") {
+                let relative = Path::new(&"../".repeat(depth)).join(below);
+                fs::remove_file(&path).with_context(|| path.display().to_string())?;
+                symlink(relative, &path).with_context(|| path.display().to_string())?;
+            }
+        } else if path.is_dir() {
+            relate_links(&path, depth + 1)?;
+        }
+    }
+    Ok(())
 }
 
 /// Returns the downloaded packages with files for linking.
@@ -127,4 +158,30 @@ fn packages(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
     });
     paths.sort();
     Ok(paths)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn absolute_links_lead_to_files_of_the_folder() {
+        let folder = std::env::temp_dir().join(format!("xtask-sysroot-{}", std::process::id()));
+        for below in ["lib", "usr/lib/x"] {
+            fs::create_dir_all(folder.join(below)).unwrap();
+        }
+        fs::write(folder.join("lib/libc.so.6"), "old").unwrap();
+        symlink("/lib/libc.so.6", folder.join("usr/lib/x/libc.so")).unwrap();
+        symlink("libc.so", folder.join("usr/lib/x/other.so")).unwrap();
+        symlink("/lib/libc.so.6", folder.join("top")).unwrap();
+        relate_links(&folder, 0).unwrap();
+        for link in ["usr/lib/x/libc.so", "usr/lib/x/other.so", "top"] {
+            assert_eq!(
+                fs::read_to_string(folder.join(link)).unwrap(),
+                "old",
+                "{link}"
+            );
+        }
+        fs::remove_dir_all(&folder).unwrap();
+    }
 }
