@@ -11,6 +11,7 @@ use discovery::lds::LdsSettings;
 use discovery::{DEFAULT_LDS, Interface};
 use plant_opcua::client::HostNames;
 use plant_opcua::enrolment::GdsArguments;
+use plant_opcua::limits::LimitArguments;
 use plant_opcua::pki::default_named;
 use plant_opcua::server::EndpointUrl;
 use plant_opcua::users::{Role, Roles};
@@ -90,6 +91,8 @@ struct UaStation {
     /// connects to them and logs a warning
     #[arg(long)]
     refuse_other_hosts: bool,
+    #[command(flatten)]
+    limits: LimitArguments,
     /// Serve what is known at this address: /status as JSON, /metrics for Prometheus, and /readyz
     #[arg(long, value_name = "ADDRESS:PORT", env = "UA_METRICS")]
     metrics: Option<SocketAddr>,
@@ -160,6 +163,7 @@ impl Service for UaStation {
             lds,
             devices_endpoint: self.devices_endpoint,
             upper,
+            clients: self.limits.limits(),
         };
         crate::run(settings, pages, stop).await
     }

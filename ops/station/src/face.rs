@@ -8,6 +8,7 @@ use std::time::Duration;
 use async_trait::async_trait;
 use plant_opcua::changes::{Became, ModelChange};
 use plant_opcua::client::{CallOptions, ClientError};
+use plant_opcua::limits::ClientLimits;
 use plant_opcua::server::{
     EndpointUrl, InstanceError, MethodHandler, MethodRequest, MethodSpec, ObjectSpec, Refusal,
     Security, Server, ServerBuilder, ServerConfig, ServerError, VariableSpec,
@@ -42,6 +43,7 @@ pub(crate) struct FaceSettings {
     pub(crate) trust_any: bool,
     /// Checks callers.
     pub(crate) admission: Admission,
+    pub(crate) clients: ClientLimits,
 }
 
 /// A server to be shown.
@@ -66,6 +68,7 @@ impl Face {
             allow_unsecured,
             trust_any,
             admission,
+            clients,
         } = settings;
         let security = match (&pki, allow_unsecured) {
             (None, _) => vec![Security::None],
@@ -76,6 +79,7 @@ impl Face {
             security,
             pki,
             trust_unknown_clients: trust_any,
+            clients,
             ..ServerConfig::new(&application_uri, &name, endpoint)
         };
         let users = Arc::clone(&admission.users);

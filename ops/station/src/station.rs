@@ -14,6 +14,7 @@ use discovery::{
 };
 use plant_opcua::client::{ClientConfig, HostNames, SecurityChoice};
 use plant_opcua::enrolment::{Applicant, Enrolment, Invitation};
+use plant_opcua::limits::ClientLimits;
 use plant_opcua::pki::Pki;
 use plant_opcua::server::{EndpointUrl, MethodRequest, MethodSpec, Refusal, ServerError, method};
 use plant_opcua::supervision::{CONFIGURE, Supervision, configure_takes};
@@ -50,6 +51,8 @@ pub struct StationSettings {
     pub host_names: HostNames,
     /// The Global Discovery Server that issues its certificate. Needs the store of `lds`.
     pub gds: Option<Invitation>,
+    /// The limits of the clients of each face.
+    pub clients: ClientLimits,
 }
 
 /// The level above.
@@ -318,6 +321,7 @@ fn open_below(
         allow_unsecured: settings.lds.allow_unsecured,
         trust_any: settings.lds.trust_any,
         admission,
+        clients: settings.clients,
     };
     Face::open(settings, "Neighbours").map_err(|error| unavailable(&error))
 }
@@ -341,6 +345,7 @@ fn open_above(
         allow_unsecured: settings.lds.allow_unsecured,
         trust_any: settings.lds.trust_any,
         admission,
+        clients: settings.clients,
     };
     Face::open(settings, "Devices").map_err(|error| unavailable(&error))
 }

@@ -58,6 +58,40 @@ pub struct ClientLimits {
     pub connections_per_address: usize,
 }
 
+/// The options that bound the clients of a server without a configuration file.
+#[cfg(feature = "server")]
+#[derive(Debug, Clone, Copy, Default, clap::Args)]
+pub struct LimitArguments {
+    /// The maximum number of sessions of clients, of all addresses together
+    #[arg(long, value_name = "COUNT", value_parser = clap::value_parser!(u16).range(1..))]
+    sessions: Option<u16>,
+    /// The maximum number of sessions of a client address, while less than an eighth of --sessions
+    /// is free
+    #[arg(long, value_name = "COUNT", value_parser = clap::value_parser!(u16).range(1..))]
+    sessions_per_address: Option<u16>,
+    /// The maximum number of connections. Beyond it the oldest connection without an activated
+    /// session is closed
+    #[arg(long, value_name = "COUNT", value_parser = clap::value_parser!(u16).range(1..))]
+    connections: Option<u16>,
+    /// The maximum number of connections of a client address
+    #[arg(long, value_name = "COUNT", value_parser = clap::value_parser!(u16).range(1..))]
+    connections_per_address: Option<u16>,
+}
+
+#[cfg(feature = "server")]
+impl LimitArguments {
+    /// Returns the limits, with defaults for options that are not given.
+    #[must_use]
+    pub fn limits(self) -> ClientLimits {
+        ClientLimits::given([
+            self.sessions,
+            self.sessions_per_address,
+            self.connections,
+            self.connections_per_address,
+        ])
+    }
+}
+
 impl ClientLimits {
     /// Returns the limits of a server with this number of sessions.
     #[must_use]
@@ -152,6 +186,29 @@ pub fn server(clients: ClientLimits) -> Limits {
 #[cfg(all(test, feature = "server"))]
 mod tests {
     use super::*;
+
+    #[test]
+    fn options_set_limits_and_the_others_have_their_defaults() {
+        #[derive(clap::Parser)]
+        struct Program {
+            #[command(flatten)]
+            limits: LimitArguments,
+        }
+        let limits = |arguments: &[&str]| {
+            let words = ["program"].iter().chain(arguments);
+            let program = <Program as clap::Parser>::try_parse_from(words);
+            program.map(|program| program.limits.limits()).ok()
+        };
+        assert_eq!(limits(&[]), Some(ClientLimits::default()));
+        let usual = ClientLimits::of(8);
+        let wanted = ClientLimits {
+            connections_per_address: 5,
+            ..usual
+        };
+        let given = ["--sessions", "8", "--connections-per-address", "5"];
+        assert_eq!(limits(&given), Some(wanted));
+        assert_eq!(limits(&["--sessions", "0"]), None);
+    }
 
     #[test]
     fn the_limits_of_clients_are_those_of_the_library() {
