@@ -9,7 +9,7 @@ use messages::TypeName;
 use tokio::time::Instant;
 
 use super::Ros2Port;
-use super::calls::{Kind, Left, SEEN, SETTLED};
+use super::calls::{Kind, Left, SETTLED};
 use super::services::Ros2Graph;
 use crate::graph::Graph;
 use crate::service::{Snapshot, action_type};
@@ -17,7 +17,7 @@ use crate::service::{Snapshot, action_type};
 impl Ros2Port {
     /// Serves the known actions, as [`offer_calls`](Self::offer_calls) does for services.
     pub(super) fn offer_actions(&mut self) {
-        let snapshot = self.peers.look(Instant::now(), SEEN);
+        let snapshot = self.peers.current(Instant::now());
         let mut taken = Vec::new();
         for (topic, action) in self.actions.chosen(&self.policy) {
             if is_served(&self.graph, &snapshot, &action) {
@@ -66,7 +66,7 @@ impl Ros2Port {
     /// Offers the action servers of other nodes that are actions of our space, and withdraws the
     /// lost servers. If servers of one name have two types, neither can be called.
     pub(super) fn find_actions(&mut self) {
-        let snapshot = self.peers.look(Instant::now(), SEEN);
+        let snapshot = self.peers.current(Instant::now());
         let mapping = Arc::clone(self.policy.mapping());
         let mapped = Actions::mapped(&mapping, &self.policy);
         let is_wanted = |policy: &Policy, action: &str| {

@@ -7,7 +7,6 @@ use mappings::ServiceRole;
 use tokio::time::Instant;
 
 use super::Ros2Port;
-use super::calls::SEEN;
 use super::services::Client;
 use crate::graph::{Endpoint, ros_topic};
 use crate::sink::Sink;
@@ -114,7 +113,7 @@ impl Ros2Port {
         if services.is_empty() && actions.is_empty() {
             return;
         }
-        let snapshot = self.peers.look(Instant::now(), SEEN);
+        let snapshot = self.peers.current(Instant::now());
         let served = self.of_nodes(snapshot.offered());
         add_unserved("service", services, &served, missing);
         let served = self.of_nodes(snapshot.served_actions());

@@ -26,7 +26,7 @@ impl Ros2Port {
     /// - calls that such a bridge offers too
     /// - calls under a chosen name that another node offers
     pub(super) fn offer_calls(&mut self) {
-        let snapshot = self.peers.look(Instant::now(), SEEN);
+        let snapshot = self.peers.current(Instant::now());
         let mut taken = Vec::new();
         for (topic, service) in self.calls.chosen(&self.policy) {
             if is_offered(&self.graph, &snapshot, &service) {
@@ -71,7 +71,7 @@ impl Ros2Port {
     /// Offers the services of other nodes that are calls of our space, and withdraws the lost
     /// services. If servers of one name have two types, neither can be called.
     pub(super) fn find_services(&mut self) {
-        let snapshot = self.peers.look(Instant::now(), SEEN);
+        let snapshot = self.peers.current(Instant::now());
         let mapping = Arc::clone(self.policy.mapping());
         let mapped = Executing::<Client>::mapped(&mapping, &self.policy);
         let is_wanted = |policy: &Policy, service: &str| {
@@ -212,5 +212,3 @@ fn is_offered(graph: &Graph, snapshot: &Snapshot, service: &str) -> bool {
 
 /// The delay after joining a domain before services are offered.
 pub(super) const SETTLED: Duration = Duration::from_secs(1);
-/// The maximum age of a snapshot of the service peers.
-pub(super) const SEEN: Duration = Duration::from_millis(100);

@@ -79,6 +79,16 @@ impl ServicePeers {
         snapshot
     }
 
+    /// Returns a snapshot that has all changes so far. With the published RustDDS, which does not
+    /// count changes, the snapshot may be as old as [`SEEN`].
+    ///
+    /// A pass that is made because of a change must not judge by an older snapshot, since it is not
+    /// made again.
+    pub(crate) fn current(&self, now: Instant) -> Arc<Snapshot> {
+        let age = changes_of(&self.0.participant).map_or(SEEN, |_| Duration::ZERO);
+        self.look(now, age)
+    }
+
     /// Returns the mapping of the vendor of the endpoint's participant.
     pub(crate) fn mapping_of(&self, endpoint: GUID) -> ServiceMapping {
         ServiceMapping::of(vendor_of(&self.0.participant, endpoint))
@@ -236,6 +246,9 @@ pub(crate) fn action_type(request: &str) -> String {
         |(package, name)| format!("{package}/{name}"),
     )
 }
+
+/// Maximum age of a current snapshot without change counts.
+const SEEN: Duration = Duration::from_millis(100);
 
 fn is_wanted(topic: &str) -> bool {
     topic.starts_with("rq/") || topic.starts_with("rr/") || topic.contains("/_action/")

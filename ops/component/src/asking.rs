@@ -157,11 +157,6 @@ impl Asks {
         found.ok_or_else(|| format!("nobody in the space executes {topic}"))
     }
 
-    /// Returns true if a call has an executor.
-    pub(crate) fn is_known(&self, topic: TopicId) -> bool {
-        self.known.borrow().contains_key(&topic)
-    }
-
     /// Sends a request and waits for the answer. Dropping the future abandons the request.
     ///
     /// # Errors

@@ -280,7 +280,9 @@ impl SpaceDriver {
             let goes_on = fault
                 .as_ref()
                 .is_some_and(|fault| fault.kind != AskErrorKind::Failed);
-            if !goes_on || !self.asks.is_known(action.result) {
+            // An executor that returns answers for its goals: its action may have been withdrawn for
+            // a moment only, and after a restart it does not know them.
+            if !goes_on || self.asks.known(action.result, RETURNS).await.is_err() {
                 let topic = self.topic;
                 return Err(format!(
                     "{topic} is gone, and the goal may go on: {}",
@@ -656,6 +658,8 @@ const RESULT_WITHIN: Duration = Duration::from_secs(30);
 const CANCEL_WITHIN: Duration = Duration::from_secs(4);
 /// Pause before a goal is cancelled again.
 const ASK_AGAIN: Duration = Duration::from_millis(500);
+/// Time that an executor has to return before the outcome of its goal is unknown.
+const RETURNS: Duration = Duration::from_secs(3);
 /// Pause before the result is requested again.
 const PAUSE: Duration = Duration::from_millis(200);
 /// ERROR_REJECTED of `action_msgs/CancelGoal`.

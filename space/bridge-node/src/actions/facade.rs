@@ -227,9 +227,15 @@ async fn comes_back(asks: &Asks, fault: &AskFault) -> bool {
     }
     // The loss of the executor is noticed within moments of the refusal.
     sleep(FIRST_PAUSE).await;
+    let is_gone = asks.gone.borrow().is_some();
+    is_gone && returns(asks).await
+}
+
+/// Returns whether the executor is present, or returns before the timeout.
+async fn returns(asks: &Asks) -> bool {
     let mut gone = asks.gone.clone();
     let Some(since) = *gone.borrow_and_update() else {
-        return false;
+        return true;
     };
     let left = (since + asks.silence).saturating_duration_since(now().monotonic);
     let back = timeout(left, gone.wait_for(Option::is_none));
@@ -276,8 +282,9 @@ async fn wait(asks: &Asks, id: GoalId) -> End {
             }
             Err(fault) => fault,
         };
-        // The executor timed out or has said goodbye. It does not know its earlier goals any more.
-        if asks.gone.borrow().is_some() {
+        // An executor that returns answers for its goals: its action may have been withdrawn for a
+        // moment only, and after a restart it does not know them.
+        if !returns(asks).await {
             return End::aborted(format!(
                 "who executes the action is gone; the goal may go on: {}",
                 fault.text
