@@ -1,6 +1,8 @@
 //! One action server of the graph, executed for the space: a task that sends goals and answers
 //! requests about them.
 
+use std::collections::HashMap;
+use std::collections::hash_map::Entry;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
@@ -65,11 +67,14 @@ pub(super) struct Serving<C> {
     news: mpsc::Receiver<News>,
     tell: mpsc::Sender<News>,
     tasks: JoinSet<()>,
+    /// Goals whose server was asked to cancel them, each with the further requests to cancel it.
+    cancels: HashMap<GoalId, Vec<ExecutionId>>,
 }
 
 enum News {
     Goal(GoalId, GoalEvent),
-    Cancelled(ExecutionId, Result<CancelAnswer, CallFault>),
+    /// The response to a request to cancel a single goal, or several goals.
+    Cancelled(ExecutionId, Option<GoalId>, Result<CancelAnswer, CallFault>),
 }
 
 impl<C: ActionClient> Serving<C> {
@@ -82,6 +87,7 @@ impl<C: ActionClient> Serving<C> {
             news,
             tell,
             tasks: JoinSet::new(),
+            cancels: HashMap::new(),
         }
     }
 
@@ -127,7 +133,16 @@ impl<C: ActionClient> Serving<C> {
     async fn take(&mut self, news: News) -> Result<(), Over> {
         match news {
             News::Goal(id, event) => self.goal_event(id, event).await,
-            News::Cancelled(execution, answer) => self.cancelled(execution, answer).await,
+            News::Cancelled(execution, id, answer) => {
+                let together = id.and_then(|id| self.cancels.remove(&id));
+                if let Ok(CancelAnswer { code: NONE, goals }) = &answer {
+                    goals.iter().for_each(|id| self.goals.cancel_agreed(*id));
+                }
+                for execution in together.into_iter().flatten() {
+                    self.cancelled(execution, answer.clone()).await?;
+                }
+                self.cancelled(execution, answer).await
+            }
         }
     }
 
@@ -232,8 +247,11 @@ impl<C: ActionClient> Serving<C> {
                     };
                     return self.cancelled(run, Ok(answer)).await;
                 }
-                Progress::Undecided => {
-                    self.withdraw(id).await?;
+                // Servers refuse a second cancellation of a goal.
+                progress @ (Progress::Undecided | Progress::Cancelling) => {
+                    if progress == Progress::Undecided {
+                        self.withdraw(id).await?;
+                    }
                     let answer = CancelAnswer {
                         code: NONE,
                         goals: vec![id],
@@ -259,6 +277,19 @@ impl<C: ActionClient> Serving<C> {
                 self.withdraw(id).await?;
             }
         }
+        let single = match what[..] {
+            [CancelWhat::Goal(id)] => Some(id),
+            _ => None,
+        };
+        if let Some(id) = single {
+            match self.cancels.entry(id) {
+                Entry::Occupied(mut together) => {
+                    together.get_mut().push(run);
+                    return Ok(());
+                }
+                Entry::Vacant(first) => drop(first.insert(Vec::new())),
+            }
+        }
         let (client, tell) = (Arc::clone(&self.client), self.tell.clone());
         self.tasks.spawn(async move {
             let answer = timeout_at(deadline.into(), cancel_each(&*client, what)).await;
@@ -270,7 +301,7 @@ impl<C: ActionClient> Serving<C> {
                 })
             };
             let answer = answer.unwrap_or_else(late);
-            drop(tell.send(News::Cancelled(run, answer)).await);
+            drop(tell.send(News::Cancelled(run, single, answer)).await);
         });
         Ok(())
     }
@@ -362,8 +393,8 @@ impl<C: ActionClient> Serving<C> {
                 self.withdraw_overdue(id).await?;
                 self.tell_failure(text).await
             }
+            GoalEvent::CancelRefused if !self.goals.cancel_refused(id) => Ok(()),
             GoalEvent::CancelRefused => {
-                self.goals.cancel_refused(id);
                 self.tell_failure(format!(
                     "the action server refuses to cancel the goal {}, which was withdrawn before it was accepted: it goes on",
                     Hex(id)

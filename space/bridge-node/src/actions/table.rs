@@ -34,6 +34,8 @@ struct Goal {
     withdrawn: Option<Instant>,
     /// Whether the server refuses to cancel the goal.
     is_refused: bool,
+    /// Whether the server has agreed to cancel the goal.
+    agreed: bool,
 }
 
 #[derive(Debug)]
@@ -99,6 +101,8 @@ pub(super) enum Progress {
     /// The server has not decided about the goal.
     Undecided,
     Open,
+    /// The server is cancelling the goal, or will cancel it as soon as it has accepted it.
+    Cancelling,
     Ended,
 }
 
@@ -150,6 +154,7 @@ impl Goals {
             waiting: Vec::new(),
             withdrawn: None,
             is_refused: false,
+            agreed: false,
         };
         self.known.insert(id, goal);
         self.order.push_back(id);
@@ -368,10 +373,23 @@ impl Goals {
         GivenUp::NotAsked
     }
 
-    /// Notes that the server refuses to cancel a withdrawn goal.
-    pub(super) fn cancel_refused(&mut self, id: GoalId) {
+    /// Notes that the server refuses to cancel a withdrawn goal. Returns false if the goal is being
+    /// cancelled: servers refuse a second cancellation.
+    pub(super) fn cancel_refused(&mut self, id: GoalId) -> bool {
+        match self.known.get_mut(&id) {
+            Some(goal) if goal.is_cancelling() => false,
+            Some(goal) => {
+                goal.is_refused = true;
+                true
+            }
+            None => true,
+        }
+    }
+
+    /// Notes that the server has agreed to cancel the goal.
+    pub(super) fn cancel_agreed(&mut self, id: GoalId) {
         if let Some(goal) = self.known.get_mut(&id) {
-            goal.is_refused = true;
+            goal.agreed = true;
         }
     }
 
@@ -399,11 +417,15 @@ impl Goals {
 
     /// Returns the progress of a goal.
     pub(super) fn progress(&self, id: GoalId) -> Progress {
-        match self.known.get(&id).map(|goal| &goal.state) {
-            None => Progress::Unknown,
-            Some(State::Sent(_)) => Progress::Undecided,
-            Some(State::Running(_)) => Progress::Open,
-            Some(State::Rejected { .. } | State::Ended { .. }) => Progress::Ended,
+        let Some(goal) = self.known.get(&id) else {
+            return Progress::Unknown;
+        };
+        let is_pending = goal.withdrawn.is_some() && !goal.is_refused;
+        match &goal.state {
+            State::Sent(_) => Progress::Undecided,
+            State::Running(_) if is_pending || goal.is_cancelling() => Progress::Cancelling,
+            State::Running(_) => Progress::Open,
+            State::Rejected { .. } | State::Ended { .. } => Progress::Ended,
         }
     }
 
@@ -478,6 +500,11 @@ impl State {
 }
 
 impl Goal {
+    /// Returns whether the server is cancelling the goal.
+    fn is_cancelling(&self) -> bool {
+        self.agreed || matches!(self.state, State::Running(CANCELING))
+    }
+
     const fn has_ended(&self) -> bool {
         match &self.state {
             State::Rejected { .. } | State::Ended { .. } => true,

@@ -683,6 +683,66 @@ async fn a_goal_waits_for_a_server_that_is_started_anew_and_is_rejected_where_no
 }
 
 #[tokio::test]
+async fn a_goal_goes_on_while_its_action_is_withdrawn_for_a_moment() {
+    const PATIENT: &str = "spaces: [{id: 1}, {id: 2}]\npubsub: {receive_timeout: 60s}\n";
+    let mut space = Space::offered_by(PATIENT);
+    let (goal, mut heard) = space.running().await;
+    space.offering.gone(of_goals(), now().monotonic);
+    // The request for the result is refused, because the action is not known.
+    let asked: Vec<AskId> = space.asked.values().copied().collect();
+    for ask in asked {
+        let refused = AskError {
+            kind: AskErrorKind::Refused,
+            status: StatusCode::GOOD,
+            text: "nobody executes it".to_owned(),
+        };
+        space.calls.answered(ask, Err(refused));
+    }
+    space.deserted = true;
+    space
+        .until(tokio::time::sleep(Duration::from_millis(300)))
+        .await;
+    while let Ok(told) = heard.try_recv() {
+        assert!(!matches!(told, Told::Ended(..)), "{told:?}");
+    }
+    space.deserted = false;
+    let events = Space::new(PATIENT).reconcile();
+    space.announce(&events);
+    let ended = GoalEvent::Ended {
+        status: 4,
+        message: String::new(),
+        result: number(3),
+    };
+    goal.say.send(ended).await.unwrap();
+    let end = Told::Ended(4, String::new(), Some(number(3)));
+    assert_eq!(space.told(&mut heard).await, end);
+}
+
+#[tokio::test]
+async fn of_two_cancellations_of_one_moment_a_server_hears_one() {
+    let mut space = Space::offered();
+    let (goal, mut heard) = space.running().await;
+    let first = space.cancel().await;
+    let cancel = space.cancelled().await;
+    let second = space.cancel().await;
+    let goals = vec![ID];
+    cancel.answer.send(Ok(CancelAnswer { code: 0, goals })).ok();
+    assert!(space.until(first).await.unwrap());
+    assert!(space.until(second).await.unwrap());
+    // A further request is answered without asking the server, which would refuse it.
+    let third = space.cancel().await;
+    assert!(space.until(third).await.unwrap());
+    let ended = GoalEvent::Ended {
+        status: 5,
+        message: String::new(),
+        result: number(3),
+    };
+    goal.say.send(ended).await.unwrap();
+    let end = Told::Ended(5, String::new(), Some(number(3)));
+    assert_eq!(space.told(&mut heard).await, end);
+}
+
+#[tokio::test]
 async fn the_goals_of_a_bridge_that_is_gone_are_aborted_and_its_server_withdrawn() {
     let mut space = Space::offered();
     let (_goal, mut heard) = space.running().await;

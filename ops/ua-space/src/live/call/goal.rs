@@ -1,6 +1,7 @@
 //! Runs an action: sends its goal, shows its feedback and waits for its result. Ctrl-C cancels the
 //! goal.
 
+use std::collections::VecDeque;
 use std::hash::{BuildHasher as _, RandomState};
 use std::sync::Arc;
 use std::time::Duration;
@@ -99,13 +100,43 @@ struct Goal {
 
 /// The cancellation of a goal.
 struct Cancelling {
-    /// The latest request.
-    call: CallId,
+    /// The requests without a response, oldest first.
+    calls: VecDeque<CallId>,
     /// The time of the next request; a request may arrive before the goal, or get lost.
     again: Duration,
     /// The time limit for the end of the goal.
     until: Duration,
     is_refused: bool,
+    /// The server has agreed to cancel the goal, and is not asked again.
+    is_agreed: bool,
+}
+
+impl Cancelling {
+    /// Records a response. Returns true if the server refuses the cancellation: servers also refuse
+    /// a second request, so the refusal counts when no request was or may be agreed to.
+    fn answered(&mut self, call: CallId, answer: CancelAnswer) -> bool {
+        let Some(place) = self.calls.iter().position(|of| *of == call) else {
+            return false;
+        };
+        self.calls.remove(place);
+        match answer {
+            CancelAnswer::Agreed => self.is_agreed = true,
+            CancelAnswer::Refused if !self.is_agreed && self.calls.is_empty() => {
+                return !std::mem::replace(&mut self.is_refused, true);
+            }
+            CancelAnswer::Refused | CancelAnswer::Other => {}
+        }
+        false
+    }
+}
+
+/// The response of an executor to a cancel request.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum CancelAnswer {
+    Agreed,
+    Refused,
+    /// The goal is unknown or has ended, or there is no response.
+    Other,
 }
 
 /// The outcome of the call that waits for the result.
@@ -265,7 +296,9 @@ impl Asking<'_> {
                         ENDS_WITHIN.as_secs()
                     )));
                 }
-                Some(cancelling) if cancelling.again <= now => self.cancel_goal(&mut goal)?,
+                Some(cancelling) if cancelling.again <= now && !cancelling.is_agreed => {
+                    self.cancel_goal(&mut goal)?;
+                }
                 Some(_) => {}
                 None => {
                     let is_over = now >= limit;
@@ -287,13 +320,15 @@ impl Asking<'_> {
         let cancel = Arc::clone(&goal.cancel);
         let call = self.begin((goal.parts.cancel, &cancel), &request, CANCEL_WITHIN)?;
         let now = self.live.now();
-        let before = goal.cancelling.as_ref();
-        goal.cancelling = Some(Cancelling {
-            call,
-            again: now + CANCEL_AGAIN,
-            until: before.map_or(now + ENDS_WITHIN, |before| before.until),
-            is_refused: before.is_some_and(|before| before.is_refused),
+        let cancelling = goal.cancelling.get_or_insert_with(|| Cancelling {
+            calls: VecDeque::new(),
+            again: now,
+            until: now + ENDS_WITHIN,
+            is_refused: false,
+            is_agreed: false,
         });
+        cancelling.again = now + CANCEL_AGAIN;
+        cancelling.calls.push_back(call);
         Ok(())
     }
 
@@ -322,9 +357,7 @@ impl Asking<'_> {
                         if call == goal.waits {
                             came = Some(hear(&outcome, &goal.result));
                         } else if let Some(cancelling) = &mut goal.cancelling
-                            && call == cancelling.call
-                            && is_refused(&outcome, &goal.cancel)
-                            && !std::mem::replace(&mut cancelling.is_refused, true)
+                            && cancelling.answered(call, cancel_answer(&outcome, &goal.cancel))
                         {
                             warn("the action server refuses to cancel the goal, which goes on");
                         }
@@ -353,6 +386,8 @@ impl Asking<'_> {
         while let Some((call, why)) = requestor.poll_given_up() {
             if call == goal.waits && came.is_none() {
                 came = Some(unknown(why));
+            } else if let Some(cancelling) = &mut goal.cancelling {
+                cancelling.answered(call, CancelAnswer::Other);
             }
         }
         Ok((ended, told, came))
@@ -431,17 +466,21 @@ fn hear(outcome: &Outcome<'_>, described: &Described) -> Came {
     }
 }
 
-/// Returns true if the server rejects the cancellation and continues the goal.
-fn is_refused(outcome: &Outcome<'_>, cancel: &Described) -> bool {
+/// Reads the response to a cancel request.
+fn cancel_answer(outcome: &Outcome<'_>, cancel: &Described) -> CancelAnswer {
     let Outcome::Answered { status, fields } = outcome else {
-        return false;
+        return CancelAnswer::Other;
     };
     let answer = plain::response(*fields, cancel.fields()).ok();
     let code = answer.and_then(|answer| {
         let code = answer.get("return_code")?;
         code.as_i64()
     });
-    status.0 & super::BAD == 0 && code == Some(REJECTED)
+    match code.filter(|_| status.0 & super::BAD == 0) {
+        Some(AGREED) => CancelAnswer::Agreed,
+        Some(REJECTED) => CancelAnswer::Refused,
+        Some(_) | None => CancelAnswer::Other,
+    }
 }
 
 fn unknown(why: Unknown) -> Came {
@@ -508,10 +547,67 @@ const CANCEL_WITHIN: Duration = Duration::from_secs(5);
 const CANCEL_AGAIN: Duration = Duration::from_secs(1);
 /// Time limit for the end of a goal after its cancellation.
 const ENDS_WITHIN: Duration = Duration::from_secs(60);
-/// ERROR_REJECTED of `action_msgs/CancelGoal`.
+/// ERROR_NONE and ERROR_REJECTED of `action_msgs/CancelGoal`.
+const AGREED: i64 = 0;
 const REJECTED: i64 = 1;
 /// EncodingMasks of OPC 10000-6, 5.2.2.16.
 const BYTE_STRING: u8 = 15;
 const DATE_TIME: u8 = 13;
 /// The start of 1970 as a DateTime.
 const UNIX_EPOCH: i64 = 116_444_736_000_000_000;
+
+#[cfg(test)]
+mod tests {
+    use uadp::OwnedPublisherId;
+    use uadp::action::{ActionAddress, ActionDialect, ActionFields, ActionRequest};
+
+    use super::*;
+
+    #[test]
+    fn a_refusal_counts_when_no_other_request_was_agreed_to() {
+        use CancelAnswer::{Agreed, Other, Refused};
+        let mut requestor = super::super::requestor();
+        let ids: Vec<CallId> = (0..10)
+            .map(|_| {
+                let request = ActionRequest {
+                    address: ActionAddress {
+                        publisher_id: OwnedPublisherId::UInt16(2),
+                        writer_group_id: Some(2),
+                        writer_id: 71,
+                        target_id: 1,
+                    },
+                    dialect: ActionDialect::Standard,
+                    fields: ActionFields::Variants(&[0, 0]),
+                    timeout: CANCEL_WITHIN,
+                };
+                requestor.call(request, Duration::ZERO).unwrap()
+            })
+            .collect();
+        let call = |number: usize| ids[number];
+        let asked = |calls: &[usize]| Cancelling {
+            calls: calls.iter().copied().map(call).collect(),
+            again: Duration::ZERO,
+            until: ENDS_WITHIN,
+            is_refused: false,
+            is_agreed: false,
+        };
+        // A server agrees to the first request and refuses the second, in either order of arrival.
+        for order in [[(1, Agreed), (2, Refused)], [(2, Refused), (1, Agreed)]] {
+            let mut cancelling = asked(&[1, 2]);
+            for (id, answer) in order {
+                assert!(!cancelling.answered(call(id), answer));
+            }
+            assert!(cancelling.is_agreed);
+        }
+        // A refusal of all requests is reported once.
+        let mut cancelling = asked(&[1, 2, 3, 4]);
+        let answers = [Refused, Other, Refused, Refused];
+        let told = (1..).zip(answers);
+        let told = told.map(|(id, answer)| cancelling.answered(call(id), answer));
+        assert_eq!(told.collect::<Vec<_>>(), [false, false, false, true]);
+        cancelling.calls.push_back(call(5));
+        assert!(!cancelling.answered(call(5), Refused));
+        // Responses to other calls do not count.
+        assert!(!asked(&[1]).answered(call(9), Refused));
+    }
+}
