@@ -196,6 +196,12 @@ impl Live {
         self.prober.want(space, writer_id, self.start.elapsed());
     }
 
+    /// Probes for the description of a topic again and again, while this function is called.
+    pub(crate) fn insist(&mut self, topic: TopicId) {
+        let (space, _, writer_id) = topic.triple();
+        self.prober.insist(space, writer_id, self.start.elapsed());
+    }
+
     pub(crate) fn send(&mut self, datagram: &[u8]) {
         let sealed = self.sealing.as_mut().map(|sealing| sealing.seal(datagram));
         let sent = match sealed.transpose() {

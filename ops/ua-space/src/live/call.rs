@@ -415,6 +415,7 @@ impl Asking<'_> {
         } = self;
         let next = requestor.poll_timeout().unwrap_or(Duration::MAX);
         let next = next.min(live.now() + LOOK);
+        let mut undescribed = None;
         let mut each = |news: News<'_>, now| {
             match &news {
                 News::Response(response, from) => {
@@ -427,8 +428,9 @@ impl Asking<'_> {
                     if places.has(sample.topic) && executor.publishes(sample.from) =>
                 {
                     let described = sample.described.as_deref();
-                    if let Ok(value) = plain::message(&sample.message, described)
-                        && described.is_some()
+                    if described.is_none() {
+                        undescribed = Some(sample.topic);
+                    } else if let Ok(value) = plain::message(&sample.message, described)
                         && !value.0.is_empty()
                     {
                         steps.extend(run.handle(places, (sample.topic, &value), now));
@@ -439,6 +441,10 @@ impl Asking<'_> {
             if steps.is_empty() { Go::On } else { Go::Enough }
         };
         let ended = live.listen(next, &mut each).await?;
+        // The announcement may be lost several times, and nothing can be read without it.
+        if let Some(topic) = undescribed {
+            live.insist(topic);
+        }
         requestor.handle_timeout(live.now());
         while requestor.poll_given_up().is_some() {}
         Ok(ended)

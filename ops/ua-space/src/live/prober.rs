@@ -32,12 +32,26 @@ enum Question {
 struct Wanted {
     next: Duration,
     attempts: u32,
+    answered: bool,
+    /// Number of times that the question was asked anew after an answer.
+    renewed: u32,
 }
 
 impl Prober {
-    /// Queues a probe for a DataSetWriter, unless it was queued before.
+    /// Queues a probe for a DataSetWriter, unless it was queued before. After an answer, the probe
+    /// is queued again a few times: several programs may use a DataSetWriterId.
     pub(crate) fn want(&mut self, space: u16, writer_id: u16, now: Duration) {
         self.ask(space, Question::Writer(writer_id), now);
+    }
+
+    /// Probes for a DataSetWriter until [`answered`](Self::answered), at a limited rate, while this
+    /// function is called.
+    pub(crate) fn insist(&mut self, space: u16, writer_id: u16, now: Duration) {
+        self.want(space, writer_id, now);
+        if let Some(wanted) = self.wanted.get_mut(&(space, Question::Writer(writer_id))) {
+            wanted.attempts = wanted.attempts.min(ATTEMPTS - 1);
+            wanted.next = wanted.next.min(now + INSIST);
+        }
     }
 
     /// Queues a probe for the calls of a space, unless it was queued before.
@@ -51,18 +65,30 @@ impl Prober {
     }
 
     fn ask(&mut self, space: u16, question: Question, now: Duration) {
-        if self.wanted.len() < MOST {
-            self.wanted.entry((space, question)).or_insert(Wanted {
+        if let Some(wanted) = self.wanted.get_mut(&(space, question)) {
+            if wanted.answered && wanted.renewed < RENEWED {
+                *wanted = Wanted {
+                    next: now + GATHER,
+                    attempts: 0,
+                    answered: false,
+                    renewed: wanted.renewed + 1,
+                };
+            }
+        } else if self.wanted.len() < MOST {
+            let wanted = Wanted {
                 next: now + GATHER,
                 attempts: 0,
-            });
+                answered: false,
+                renewed: 0,
+            };
+            self.wanted.insert((space, question), wanted);
         }
     }
 
     /// Marks a question as answered.
     pub(crate) fn answered(&mut self, space: u16, writer_id: u16) {
         if let Some(wanted) = self.wanted.get_mut(&(space, Question::Writer(writer_id))) {
-            wanted.attempts = ATTEMPTS;
+            (wanted.attempts, wanted.answered) = (ATTEMPTS, true);
         }
     }
 
@@ -137,6 +163,10 @@ const PACE: Duration = Duration::from_millis(100);
 /// Time before the second probe; the third probe follows after twice this time.
 const WAIT: Duration = Duration::from_millis(700);
 const ATTEMPTS: u32 = 3;
+/// Maximum number of times that an answered question is asked anew.
+const RENEWED: u32 = 8;
+/// Interval of the probes for the values that a command cannot do without.
+const INSIST: Duration = Duration::from_millis(500);
 
 #[cfg(test)]
 mod tests {
@@ -194,14 +224,34 @@ mod tests {
     }
 
     #[test]
-    fn what_was_answered_is_not_asked_again() {
+    fn an_answered_question_is_asked_anew_a_few_times() {
         let mut prober = Prober::default();
         prober.want(0, 101, Duration::ZERO);
         let probe = prober.poll(GATHER).unwrap();
         assert_eq!(read(&probe), (Some(PublisherId::UInt16(0)), vec![101]));
         prober.answered(0, 101);
-        prober.want(0, 101, GATHER);
         assert_eq!(prober.poll(Duration::from_secs(9)), None);
+        // A second program uses the same DataSetWriterId.
+        let mut probes = 0;
+        for second in 10..100 {
+            let now = Duration::from_secs(second);
+            prober.want(0, 101, now);
+            probes += u32::from(prober.poll(now + GATHER).is_some());
+            prober.answered(0, 101);
+        }
+        assert_eq!(probes, RENEWED);
+    }
+
+    #[test]
+    fn a_needed_description_is_asked_for_until_it_comes() {
+        let mut prober = Prober::default();
+        let mut probes = 0;
+        for millis in 0..10_000 {
+            let now = Duration::from_millis(millis);
+            prober.insist(0, 101, now);
+            probes += u32::from(prober.poll(now).is_some());
+        }
+        assert_eq!(probes, 20);
     }
 
     #[test]

@@ -46,16 +46,21 @@ struct Seen {
 
 impl Component {
     pub(crate) fn start() -> Self {
-        Self::start_beside(false)
+        Self::start_beside(false, 0)
+    }
+
+    /// Starts the component with a network that loses the first announcements of the state.
+    pub(crate) fn start_losing(announcements: u32) -> Self {
+        Self::start_beside(false, announcements)
     }
 
     /// Starts the component beside a forger, which answers every request before the component does,
     /// from another port.
     pub(crate) fn start_beside_a_forger() -> Self {
-        Self::start_beside(true)
+        Self::start_beside(true, 0)
     }
 
-    fn start_beside(is_forged: bool) -> Self {
+    fn start_beside(is_forged: bool, lost: u32) -> Self {
         let port = UdpSocket::bind("127.0.0.1:0").unwrap();
         let port = port.local_addr().unwrap().port();
         let address = SocketAddr::from((Ipv4Addr::new(239, 255, 41, 7), port));
@@ -75,6 +80,7 @@ impl Component {
                 };
                 let udp = Udp::open(&options).unwrap();
                 let mut gripper = Gripper::new(udp, its);
+                gripper.lost = lost;
                 if is_forged {
                     let udp = Udp::open(&options).unwrap();
                     let responder = Responder::new(ResponderSettings::default());
@@ -134,6 +140,8 @@ struct Gripper {
     last_transition: &'static str,
     succeeded: bool,
     sequence: u16,
+    /// Number of announcements of the state that are still to be lost.
+    lost: u32,
 }
 
 impl Gripper {
@@ -149,6 +157,7 @@ impl Gripper {
             last_transition: "HaltedToReady",
             succeeded: false,
             sequence: 0,
+            lost: 0,
         }
     }
 
@@ -335,7 +344,11 @@ impl Gripper {
         self.udp.try_send(&datagram).unwrap();
     }
 
-    fn announce(&self, writer_id: u16) {
+    fn announce(&mut self, writer_id: u16) {
+        if writer_id == STATE && self.lost > 0 {
+            self.lost -= 1;
+            return;
+        }
         let (name, fields) = match writer_id {
             STATE => ("State", STATE_FIELDS),
             RESULT => ("Result", RESULT_FIELDS),

@@ -324,6 +324,28 @@ fn ctrl_c_halts_the_run_and_says_how_it_ended() {
 }
 
 #[test]
+fn a_run_is_followed_although_announcements_are_lost() {
+    let component = Component::start_losing(4);
+    let mut child = named("ua-space")
+        .args(component.words(&["call", "gripper.Grasp", "Force=0"]))
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
+    let running = lines.find(|line| line.as_ref().unwrap().contains("Running"));
+    if running.is_some() {
+        let id = child.id().to_string();
+        let halted = Command::new("kill").args(["-INT", &id]).status();
+        assert!(halted.unwrap().success());
+    }
+    let ended = child.wait_with_output().unwrap();
+    let told = String::from_utf8(ended.stderr).unwrap();
+    assert_eq!(ended.status.code(), Some(1), "{told}");
+    assert!(told.contains("run 1 did not succeed"), "{told}");
+}
+
+#[test]
 fn of_who_falls_silent_in_a_call_it_is_said_that_nobody_knows() {
     let component = Component::start();
     let words = component.words(&["call", "gripper.Grasp", "Force=0", "--json"]);
