@@ -27,7 +27,7 @@ pub(crate) struct Run {
     result: Callable,
     /// The call that sends the goals.
     goal: TopicId,
-    /// The Programs that need a Reset.
+    /// The Programs that need a Reset after a restart.
     unknown: Arc<UnknownOutcomes>,
     inner: Mutex<Inner>,
     /// The state, for tasks that wait for a change. Never closed.
@@ -86,7 +86,7 @@ impl Run {
         let (state, _) = watch::channel(program.state());
         nodes.show_first(program.state());
         if needs_reset {
-            nodes.show_outcome(&Outcome::lost(GONE.to_owned()));
+            nodes.show_outcome(&Outcome::lost(BEFORE_RESTART.to_owned()));
         }
         Arc::new(Self {
             name,
@@ -163,6 +163,8 @@ impl Run {
             // Feedback may arrive before the answer.
             inner.goal = Some(id.clone());
         }
+        // If the server is killed during the goal, its outcome is unknown to the next one.
+        self.unknown.begin(self.goal).await;
         let mut goal = vec![Variant::from(id.clone())];
         goal.extend(arguments);
         let answer = self.send.call(&goal, &questions, || false).await;
@@ -200,6 +202,7 @@ impl Run {
                     }
                     None => {
                         inner.goal = None;
+                        self.unknown.end(self.goal);
                         self.nodes.show_goal(&id);
                         self.nodes.show_outcome(&outcome);
                     }
@@ -310,8 +313,8 @@ impl Run {
         true
     }
 
-    /// Repeats the cancellation until the goal has ended, because a request may arrive before the
-    /// goal or be lost.
+    /// Repeats the cancellation until the action server agrees or the goal has ended, because a
+    /// request may arrive before the goal or be lost.
     async fn cancel_until_ended(self: Arc<Self>, id: ByteString, questions: Questions) {
         loop {
             let answer = self.ask_to_cancel(&id, &questions).await;
@@ -321,7 +324,7 @@ impl Run {
                 if is_current && matches!(answer, Ok(REJECTED)) {
                     self.refused(&mut inner);
                 }
-                is_current && inner.halting.is_some()
+                is_current && inner.halting.is_some() && !matches!(answer, Ok(AGREED))
             };
             if !is_current {
                 return;
@@ -353,6 +356,9 @@ impl Run {
         };
         inner.goal = None;
         inner.halting = None;
+        if outcome.status != UNKNOWN {
+            self.unknown.end(self.goal);
+        }
         // Clients that see the state change can read the result.
         self.nodes.show_outcome(&outcome);
         if let Some(transition) = ended {
@@ -391,7 +397,7 @@ impl Run {
             self.refused(&mut self.inner.lock());
             return Err(Refused::Status(StatusCode::BadRequestNotAllowed));
         }
-        if is_first {
+        if is_first && !matches!(answer, Ok(AGREED)) {
             let again = Arc::clone(self).cancel_until_ended(id, questions.clone());
             tokio::spawn(again);
         }
@@ -522,12 +528,15 @@ const NOT_NOW_AND_NEVER: Refused = Refused::Status(StatusCode::BadNotSupported);
 const PENDING: &str = "cancellation pending: the goal has not ended";
 pub(super) const GONE: &str =
     "the executor of the action is lost: the outcome is unknown, the goal may go on";
+const BEFORE_RESTART: &str =
+    "the outcome of the last goal before the restart is unknown, the goal may go on";
 pub(super) const ENDS: &str = "the server ends: the outcome is unknown, the goal may go on";
 /// Statuses of `action_msgs/GoalStatus`; `NEVER_RAN` marks goals that were not executed.
 pub(super) const SUCCEEDED: i64 = 4;
 pub(super) const NEVER_RAN: i64 = -1;
 const UNKNOWN: i64 = 0;
-/// ERROR_REJECTED of `action_msgs/CancelGoal`.
+/// ERROR_NONE and ERROR_REJECTED of `action_msgs/CancelGoal`.
+const AGREED: i64 = 0;
 const REJECTED: i64 = 1;
 /// Time that Halt waits for the end of the goal before it reports a pending cancellation.
 const AT_ONCE: Duration = Duration::from_secs(1);

@@ -1,9 +1,11 @@
-//! The Programs with an unknown outcome of their last goal. They are stored in a file, so that they
-//! need a Reset after a restart of the server too.
+//! The Programs with an open goal, or with an unknown outcome of their last goal. They are stored in
+//! a file, so that they need a Reset after a restart of the server, and also if the server was
+//! killed during the goal.
 
 use std::collections::BTreeSet;
 use std::io;
 use std::path::PathBuf;
+use std::sync::Arc;
 
 use mappings::TopicId;
 use opcua::sync::Mutex;
@@ -14,6 +16,8 @@ use tracing::warn;
 pub(crate) struct UnknownOutcomes {
     file: PathBuf,
     goals: Mutex<BTreeSet<TopicId>>,
+    /// Serializes the writes of the file.
+    writing: Mutex<()>,
 }
 
 impl UnknownOutcomes {
@@ -35,29 +39,55 @@ impl UnknownOutcomes {
         Self {
             file,
             goals: Mutex::new(goals),
+            writing: Mutex::new(()),
         }
     }
 
-    /// Returns true if the Program of a goal needs a Reset.
+    /// Returns true if the Program of a goal needs a Reset after a restart.
     pub(crate) fn has(&self, goal: TopicId) -> bool {
         self.goals.lock().contains(&goal)
     }
 
     pub(crate) fn insert(&self, goal: TopicId) {
-        let mut goals = self.goals.lock();
-        if goals.len() < MOST && goals.insert(goal) {
-            self.write(&goals);
+        if self.add(goal) {
+            self.write();
         }
     }
 
     pub(crate) fn remove(&self, goal: TopicId) {
-        let mut goals = self.goals.lock();
-        if goals.remove(&goal) {
-            self.write(&goals);
+        if self.goals.lock().remove(&goal) {
+            self.write();
         }
     }
 
-    fn write(&self, goals: &BTreeSet<TopicId>) {
+    /// Stores that a goal is about to be sent. Returns when the file is written.
+    pub(crate) async fn begin(self: &Arc<Self>, goal: TopicId) {
+        if self.add(goal) {
+            let outcomes = Arc::clone(self);
+            // The write is synced, which takes long on some disks.
+            let written = tokio::task::spawn_blocking(move || outcomes.write());
+            let _is_over = written.await.is_err();
+        }
+    }
+
+    /// Removes a goal with a known end. The file is written later.
+    pub(crate) fn end(self: &Arc<Self>, goal: TopicId) {
+        if self.goals.lock().remove(&goal) {
+            let outcomes = Arc::clone(self);
+            drop(tokio::task::spawn_blocking(move || outcomes.write()));
+        }
+    }
+
+    /// Returns true if the goal is new.
+    fn add(&self, goal: TopicId) -> bool {
+        let mut goals = self.goals.lock();
+        goals.len() < MOST && goals.insert(goal)
+    }
+
+    /// Writes the goals as they are now, so that the last write has all changes.
+    fn write(&self) {
+        let _turn = self.writing.lock();
+        let goals = self.goals.lock().clone();
         let text: String = goals.iter().map(|goal| format!("{goal}\n")).collect();
         if let Err(error) = replace(&self.file, text.as_bytes()) {
             let file = self.file.display();
@@ -90,6 +120,25 @@ mod tests {
         assert!(restarted.has(goal) && restarted.has(other));
         restarted.remove(goal);
 
+        let restarted = UnknownOutcomes::open(file.clone());
+        assert!(!restarted.has(goal) && restarted.has(other));
+        std::fs::remove_file(file).unwrap();
+    }
+
+    #[tokio::test]
+    async fn a_goal_is_in_the_file_before_it_is_sent_and_until_its_end() {
+        let name = format!("ua-server-open-{}", std::process::id());
+        let file = std::env::temp_dir().join(name);
+        drop(std::fs::remove_file(&file));
+        let goal: TopicId = "ua_2_2_70".parse().unwrap();
+        let outcomes = Arc::new(UnknownOutcomes::open(file.clone()));
+        outcomes.begin(goal).await;
+        assert!(UnknownOutcomes::open(file.clone()).has(goal));
+        outcomes.end(goal);
+        assert!(!outcomes.has(goal));
+        // The next write is after that of the end.
+        let other: TopicId = "ua_2_2_80".parse().unwrap();
+        outcomes.begin(other).await;
         let restarted = UnknownOutcomes::open(file.clone());
         assert!(!restarted.has(goal) && restarted.has(other));
         std::fs::remove_file(file).unwrap();
