@@ -348,6 +348,24 @@ impl SpaceNodes {
         let _kept = self.put(subscriptions, topic, (shown, false));
     }
 
+    /// Shows a written value as uncertain if it is unknown whether it has arrived, until it is
+    /// confirmed or a newer value replaces it.
+    pub(crate) fn show_arrival(
+        &self,
+        subscriptions: &SubscriptionCache,
+        topic: &TopicNode,
+        has_arrived: bool,
+    ) {
+        // A write is sent and shown under this lock.
+        let _alone = self.writing.lock();
+        let mut shown = self.shown(topic.topic);
+        if let Some(status) = arrived(shown.stamp.status, has_arrived) {
+            shown.stamp.status = status;
+            shown.stamp.server = DateTime::now();
+            self.show_again(subscriptions, topic, shown);
+        }
+    }
+
     fn put(
         &self,
         subscriptions: &SubscriptionCache,
@@ -760,6 +778,15 @@ impl SpaceNodes {
     }
 }
 
+/// Returns the new status of a written value, or `None` if its status stays.
+fn arrived(shown: StatusCode, has_arrived: bool) -> Option<StatusCode> {
+    let (before, after) = match has_arrived {
+        true => (UNCONFIRMED, StatusCode::Good),
+        false => (StatusCode::Good, UNCONFIRMED),
+    };
+    (shown == before).then_some(after)
+}
+
 /// Returns the source timestamp of a client's value, or the current time.
 fn source_of(value: &DataValue) -> Timestamp {
     let picoseconds = value.source_picoseconds.unwrap_or_default().min(9_999);
@@ -1109,6 +1136,8 @@ fn now() -> Instant {
 
 /// The name of the node manager in the server's log.
 const NAME: &str = "space";
+/// Status of a written value while it is unknown if it has arrived.
+const UNCONFIRMED: StatusCode = StatusCode::UncertainLastUsableValue;
 /// A sampling interval that is practically zero, but above the 0 that the server treats as "not
 /// requested".
 const AS_IT_COMES_MS: f64 = 0.000_1;

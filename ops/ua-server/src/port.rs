@@ -326,6 +326,8 @@ impl Port for ServerPort {
     }
 
     fn settled(&mut self, topic: TopicId, arrival: &Arrival) {
+        self.space
+            .show_arrival(topic, matches!(arrival, Arrival::Confirmed));
         self.confirms.arrivals.settled(topic, arrival);
     }
 

@@ -220,6 +220,14 @@ impl Space {
         }
     }
 
+    /// Shows if the last written value of a topic has arrived at the bridges.
+    pub(crate) fn show_arrival(&self, topic: TopicId, has_arrived: bool) {
+        if let Some(known) = self.topics.get(&topic) {
+            let nodes = self.manager.inner();
+            nodes.show_arrival(&self.subscriptions, &known.node, has_arrived);
+        }
+    }
+
     /// Returns true if the mapping has a variable for a topic.
     pub(crate) fn is_mapped(&self, topic: TopicId) -> bool {
         self.topics.get(&topic).is_some_and(|known| known.mapped)

@@ -1,7 +1,7 @@
 //! Writes that succeed when a bridge confirms them or the robot answers, and not when they have
 //! been sent.
 
-use system_tests::Distribution;
+use system_tests::{Distribution, program};
 
 use super::*;
 
@@ -110,7 +110,12 @@ fn a_write_has_succeeded_when_a_robot_of_rclpy_answers_and_has_not_happened_when
 /// Checks a bridge that confirms: without a robot, with a present robot, and with a lost robot.
 fn is_confirmed_by_the_bridge(cell: &Cell, bridge: Child, start: impl FnOnce() -> Child) {
     let set = |value: &str| write(cell, SETPOINT, "Double", value);
+    let shown = || {
+        let shown = read(cell, SETPOINT);
+        (shown["value"].clone(), shown["status"].clone())
+    };
     assert_eq!(set("1.0"), "BadTimeout", "there is no subscriber");
+    assert_eq!(shown(), (json!(1.0), json!("UncertainLastUsableValue")));
     let mut robot = start();
     // The bridge and the robot may still be discovering each other.
     let mut value = 10.0;
@@ -123,6 +128,7 @@ fn is_confirmed_by_the_bridge(cell: &Cell, bridge: Child, start: impl FnOnce() -
         assert_eq!(set(value), "Good");
         got(&mut robot, value.parse().unwrap());
     }
+    assert_eq!(shown(), (json!(52.0), json!("Good")));
     let came = robot.json_lines();
     let came = came
         .iter()
@@ -135,6 +141,7 @@ fn is_confirmed_by_the_bridge(cell: &Cell, bridge: Child, start: impl FnOnce() -
     bridge.signal(nix::sys::signal::Signal::SIGKILL);
     drop(bridge);
     assert_eq!(set("60.0"), "BadTimeout", "there is no bridge");
+    assert_eq!(shown(), (json!(60.0), json!("UncertainLastUsableValue")));
 }
 
 fn confirmed_by_the_bridge(space: &str) -> String {
@@ -168,6 +175,81 @@ fn a_write_is_good_when_a_subscriber_of_rclpy_has_it_and_else_unknown() {
     is_confirmed_by_the_bridge(&cell, bridge, || {
         cell.rclpy(Distribution::Jazzy, "ros2_arm.py", &TOPICS)
     });
+}
+
+#[test]
+fn a_bridge_confirms_the_writes_of_a_secured_group() {
+    let Some(cell) = Cell::with(&[Peer::Python, Peer::Ros2]) else {
+        return;
+    };
+    let keys = cell.folder().join("cell.keys");
+    let made = std::process::Command::new(program("ua-space"))
+        .arg("keys")
+        .arg(&keys)
+        .status();
+    assert!(made.unwrap().success());
+    let secured = "security: [{group: cell, keys: {file: cell.keys}}]\n";
+    let mapping = format!("{}{secured}", confirmed_by_the_bridge("2"));
+    let group = UadpSocket::join();
+    let _server = serving(&cell, &mapping);
+    let mapping = cell.file("bridge.yaml", &mapping);
+    let bridge = cell.bridge_ros2(&[mapping.to_str().unwrap()]);
+    is_confirmed_by_the_bridge(&cell, bridge, || {
+        cell.rclpy(Distribution::Jazzy, "ros2_arm.py", &TOPICS)
+    });
+    let sent = group.receive_for(Duration::from_millis(100));
+    let messages = sent.iter().map(|datagram| NetworkMessage::decode(datagram));
+    let messages: Vec<NetworkMessage<'_>> = messages.map(Result::unwrap).collect();
+    assert!(messages.iter().any(NetworkMessage::is_sealed));
+    let is_clear = |message: &NetworkMessage<'_>| message.is_action() && !message.is_sealed();
+    assert!(
+        !messages.iter().any(is_clear),
+        "requests and confirmations are sealed"
+    );
+}
+
+const LIGHT: &str = "
+namespaces:
+  2: urn:ua-bridge:system-tests
+spaces:
+  - id: 1
+variables:
+  - {node: ns=2;i=3, name: Light, type: Boolean, origin: 0, ros: {space: 1, call: /light, type: std_srvs/SetBool, field: data}}
+server:
+  security: [None]
+";
+
+#[test]
+fn a_write_is_good_when_a_service_of_rospy_has_its_call_and_else_unknown() {
+    let Some(cell) = Cell::with(&[Peer::Python, Peer::Ros1]) else {
+        return;
+    };
+    let _master = cell.roscore();
+    let _server = serving(&cell, LIGHT);
+    let mapping = cell.file("bridge.yaml", LIGHT);
+    let _bridge = cell.bridge_ros1(&[mapping.to_str().unwrap()]);
+    let light = "ns=2;i=3";
+    let set = || write(&cell, light, "Boolean", "true");
+    assert_eq!(set(), "BadTimeout", "there is no service");
+    assert_eq!(read(&cell, light)["status"], "UncertainLastUsableValue");
+    let mut service = cell.rospy("ros1_serve.py", &["/light"]);
+    // The bridge may not have found the service.
+    eventually("a write is confirmed", SOON * 2, || {
+        (set() == "Good").then_some(())
+    });
+    assert_eq!(read(&cell, light)["status"], "Good");
+    let calls = |service: &Child| service.values().len();
+    let before = calls(&service);
+    assert!(before >= 1, "{service}");
+    assert_eq!(set(), "Good");
+    eventually("the next write calls once", SOON, || {
+        (calls(&service) > before).then_some(())
+    });
+    service.signal(nix::sys::signal::Signal::SIGKILL);
+    service.wait_for_end(SOON);
+    assert_eq!(calls(&service), before + 1, "{service}");
+    assert_eq!(set(), "BadTimeout", "the service is killed");
+    assert_eq!(read(&cell, light)["status"], "UncertainLastUsableValue");
 }
 
 #[test]
