@@ -280,8 +280,8 @@ impl SpaceDriver {
             let goes_on = fault
                 .as_ref()
                 .is_some_and(|fault| fault.kind != AskErrorKind::Failed);
-            // An executor that returns answers for its goals: its action may have been withdrawn for
-            // a moment only, and after a restart it does not know them.
+            // An executor that returns answers for its goals: its action may have been withdrawn
+            // for a moment only, and after a restart it does not know them.
             if !goes_on || self.asks.known(action.result, RETURNS).await.is_err() {
                 let topic = self.topic;
                 return Err(format!(

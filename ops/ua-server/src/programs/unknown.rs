@@ -1,5 +1,5 @@
-//! The Programs with an open goal, or with an unknown outcome of their last goal. They are stored in
-//! a file, so that they need a Reset after a restart of the server, and also if the server was
+//! The Programs with an open goal, or with an unknown outcome of their last goal. They are stored
+//! in a file, so that they need a Reset after a restart of the server, and also if the server was
 //! killed during the goal.
 
 use std::collections::BTreeSet;
