@@ -337,6 +337,15 @@ impl Series {
         let value = match outcome {
             Outcome::Raw(at) => sample(at)?,
             Outcome::Picked(at, quality) => made(sample(at)?.value, (quality, CALCULATED), time),
+            Outcome::Actual(at, quality) => {
+                let time = self.shown.get(at).map_or(time, |one| one.time);
+                made(sample(at)?.value, (quality, RAW), time)
+            }
+            Outcome::Status(at) => {
+                let status = self.view(at).map(|view| view.stamp().status);
+                let value = status.map(Variant::StatusCode);
+                made(value, (Quality::Good, CALCULATED), time)
+            }
             Outcome::Held(at) => made(sample(at)?.value, (Quality::Good, INTERPOLATED), time),
             Outcome::Calculated(value, quality) => {
                 made(Some(Variant::Double(value)), (quality, CALCULATED), time)
@@ -520,7 +529,7 @@ fn stamped(mut value: DataValue, wanted: TimestampsToReturn) -> DataValue {
 }
 
 /// The aggregates by their nodes.
-const AGGREGATES: [(ObjectId, Aggregate); 5] = [
+const AGGREGATES: [(ObjectId, Aggregate); 16] = [
     (
         ObjectId::AggregateFunction_Interpolative,
         Aggregate::Interpolative,
@@ -529,6 +538,35 @@ const AGGREGATES: [(ObjectId, Aggregate); 5] = [
     (ObjectId::AggregateFunction_Minimum, Aggregate::Minimum),
     (ObjectId::AggregateFunction_Maximum, Aggregate::Maximum),
     (ObjectId::AggregateFunction_Count, Aggregate::Count),
+    (
+        ObjectId::AggregateFunction_MinimumActualTime,
+        Aggregate::MinimumActualTime,
+    ),
+    (
+        ObjectId::AggregateFunction_MaximumActualTime,
+        Aggregate::MaximumActualTime,
+    ),
+    (ObjectId::AggregateFunction_Range, Aggregate::Range),
+    (ObjectId::AggregateFunction_Start, Aggregate::Start),
+    (ObjectId::AggregateFunction_End, Aggregate::End),
+    (ObjectId::AggregateFunction_Delta, Aggregate::Delta),
+    (
+        ObjectId::AggregateFunction_TimeAverage,
+        Aggregate::TimeAverage,
+    ),
+    (ObjectId::AggregateFunction_Total, Aggregate::Total),
+    (
+        ObjectId::AggregateFunction_DurationGood,
+        Aggregate::DurationGood,
+    ),
+    (
+        ObjectId::AggregateFunction_PercentGood,
+        Aggregate::PercentGood,
+    ),
+    (
+        ObjectId::AggregateFunction_WorstQuality,
+        Aggregate::WorstQuality,
+    ),
 ];
 
 /// Adds the aggregates to the folders in which clients look for them.
@@ -606,6 +644,7 @@ fn like(number: f64, others: Option<&Variant>) -> Variant {
 }
 
 /// InfoType DataValue with the bits of a historian (OPC 10000-4, 7.39.1).
+const RAW: u32 = 0x0400;
 const CALCULATED: u32 = 0x0401;
 const INTERPOLATED: u32 = 0x0402;
 const PARTIAL: u32 = 0x0404;

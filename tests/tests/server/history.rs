@@ -216,7 +216,34 @@ fn aggregates_of_past_values_are_worked_out_for_each_interval() {
                 of("Interpolative", (0, 3000, 1500)),
                 good(1, &[(0, 1.0, 0), (1500, 4.0, INTERPOLATED)]),
             ),
-            (of("Range", halves), refused("BadAggregateNotSupported")),
+            (
+                of("Range", halves),
+                good(1, &[(0, 4.0, CALCULATED), (2000, 6.0, CALCULATED)]),
+            ),
+            (
+                of("Delta", halves),
+                good(1, &[(0, 4.0, CALCULATED), (2000, 6.0, CALCULATED)]),
+            ),
+            (
+                of("End", halves),
+                good(1, &[(1000, 5.0, 0), (3000, 9.0, 0)]),
+            ),
+            (
+                of("MaximumActualTime", halves),
+                good(1, &[(1000, 5.0, 0), (3000, 9.0, 0)]),
+            ),
+            (
+                of("TimeAverage", (0, 2000, 2000)),
+                good(1, &[(0, 3.5, CALCULATED)]),
+            ),
+            (
+                of("DurationGood", (0, 6000, 3000)),
+                good(1, &[(0, 3000.0, CALCULATED), (3000, 1000.0, CALCULATED)]),
+            ),
+            (
+                of("NumberOfTransitions", halves),
+                refused("BadAggregateNotSupported"),
+            ),
         ],
     );
     let at = json!([{"node": TEMPERATURE_NODE, "at": [500, 2000]}]);
@@ -272,6 +299,23 @@ fn the_last_thousand_values_are_kept_and_variables_and_server_say_so() {
     assert_eq!(answers[1..6], attributes.map(told)[..]);
     assert_eq!(
         answers[6]["children"],
-        json!(["Average", "Count", "Interpolative", "Maximum", "Minimum"])
+        json!([
+            "Average",
+            "Count",
+            "Delta",
+            "DurationGood",
+            "End",
+            "Interpolative",
+            "Maximum",
+            "MaximumActualTime",
+            "Minimum",
+            "MinimumActualTime",
+            "PercentGood",
+            "Range",
+            "Start",
+            "TimeAverage",
+            "Total",
+            "WorstQuality"
+        ])
     );
 }

@@ -24,7 +24,29 @@ pub(super) enum Aggregate {
     Average,
     Minimum,
     Maximum,
+    /// The minimum, at its own time.
+    MinimumActualTime,
+    /// The maximum, at its own time.
+    MaximumActualTime,
     Count,
+    /// The difference of the maximum and the minimum.
+    Range,
+    /// The first sample.
+    Start,
+    /// The last sample.
+    End,
+    /// The difference of the last and the first sample.
+    Delta,
+    /// The average over time.
+    TimeAverage,
+    /// The integral over time, in seconds.
+    Total,
+    /// The time with good values, in milliseconds.
+    DurationGood,
+    /// The share of that time, in percent.
+    PercentGood,
+    /// The worst status of a sample.
+    WorstQuality,
 }
 
 /// The outcome of an interval.
@@ -34,6 +56,10 @@ pub(super) enum Outcome {
     Raw(usize),
     /// The value of that sample, at the time of the interval.
     Picked(usize, Quality),
+    /// The value of that sample, at the time of the sample.
+    Actual(usize, Quality),
+    /// The status of that sample.
+    Status(usize),
     /// A value calculated from several samples.
     Calculated(f64, Quality),
     /// A number of samples.
@@ -92,6 +118,54 @@ pub(super) fn of(
     let (first, last) = (place(from), place(to));
     let within = samples.get(first..last).unwrap_or_default();
     let within: Vec<(usize, &Sample)> = (first..).zip(within).collect();
+    match aggregate {
+        Aggregate::TimeAverage => average_over_time(samples, (from, to), rules).0,
+        Aggregate::Total => {
+            let (average, seconds) = average_over_time(samples, (from, to), rules);
+            if let Outcome::Calculated(value, quality) = average {
+                return Outcome::Calculated(value * seconds, quality);
+            }
+            average
+        }
+        Aggregate::DurationGood => {
+            let good = time_good(samples, (from, to));
+            Outcome::Calculated(good / TICKS_PER_MILLISECOND, Quality::Good)
+        }
+        Aggregate::PercentGood => {
+            let good = time_good(samples, (from, to));
+            let whole = length((from, to)).max(1.0);
+            Outcome::Calculated(good * 100.0 / whole, Quality::Good)
+        }
+        Aggregate::WorstQuality => {
+            let worst = within.iter().rev();
+            let worst = worst.max_by_key(|(_, sample)| sample.quality.rank());
+            worst.map_or(Outcome::NoData, |(at, _)| Outcome::Status(*at))
+        }
+        Aggregate::Start => within
+            .first()
+            .map_or(Outcome::NoData, |(at, _)| Outcome::Raw(*at)),
+        Aggregate::End => within
+            .last()
+            .map_or(Outcome::NoData, |(at, _)| Outcome::Raw(*at)),
+        Aggregate::Interpolative
+        | Aggregate::Average
+        | Aggregate::Minimum
+        | Aggregate::Maximum
+        | Aggregate::MinimumActualTime
+        | Aggregate::MaximumActualTime
+        | Aggregate::Count
+        | Aggregate::Range
+        | Aggregate::Delta => of_values(aggregate, (samples, &within), start, rules),
+    }
+}
+
+/// Returns an aggregate of the values within an interval.
+fn of_values(
+    aggregate: Aggregate,
+    (samples, within): (&[Sample], &[(usize, &Sample)]),
+    start: i64,
+    rules: Rules,
+) -> Outcome {
     let usable = |sample: &Sample| rules.takes(sample.quality);
     let good: Vec<(usize, f64)> = within
         .iter()
@@ -107,32 +181,130 @@ pub(super) fn of(
     let Some(quality) = quality else {
         return Outcome::NoData;
     };
-    if quality == Quality::Bad || good.is_empty() {
+    let (Some(first), Some(last)) = (good.first(), good.last()) else {
+        return Outcome::Bad;
+    };
+    if quality == Quality::Bad {
         return Outcome::Bad;
     }
-    let least = |pair: &(usize, f64), other: &(usize, f64)| pair.1.total_cmp(&other.1);
+    let order = |pair: &&(usize, f64), other: &&(usize, f64)| pair.1.total_cmp(&other.1);
+    // The first of equal samples is used.
+    let low = good.iter().min_by(order).unwrap_or(first);
+    let high = good.iter().rev().max_by(order).unwrap_or(first);
     match aggregate {
-        Aggregate::Minimum => {
-            let found = good.iter().copied().min_by(least);
-            found.map_or(Outcome::NoData, |(at, _)| {
-                picked(samples, at, (start, quality))
-            })
+        Aggregate::Minimum => picked(samples, low.0, (start, quality)),
+        Aggregate::Maximum => picked(samples, high.0, (start, quality)),
+        Aggregate::MinimumActualTime => actual(low.0, quality),
+        Aggregate::MaximumActualTime => actual(high.0, quality),
+        Aggregate::Range => Outcome::Calculated(high.1 - low.1, quality),
+        Aggregate::Delta => {
+            // Samples before the first and after the last number are bad.
+            let ends = [within.first(), within.last()].map(|end| end.map(|(at, _)| *at));
+            let quality = match ends == [Some(first.0), Some(last.0)] {
+                true => Quality::Good,
+                false => Quality::Uncertain,
+            };
+            Outcome::Calculated(last.1 - first.1, quality)
         }
-        Aggregate::Maximum => {
-            // The first of equal samples is used.
-            let found = good.iter().copied().rev().max_by(least);
-            found.map_or(Outcome::NoData, |(at, _)| {
-                picked(samples, at, (start, quality))
-            })
-        }
-        Aggregate::Average => {
+        Aggregate::Average
+        | Aggregate::Interpolative
+        | Aggregate::Count
+        | Aggregate::Start
+        | Aggregate::End
+        | Aggregate::TimeAverage
+        | Aggregate::Total
+        | Aggregate::DurationGood
+        | Aggregate::PercentGood
+        | Aggregate::WorstQuality => {
             let sum: f64 = good.iter().map(|(_, value)| value).sum();
             let count = u32::try_from(good.len()).unwrap_or(u32::MAX);
             Outcome::Calculated(sum / f64::from(count), quality)
         }
-        Aggregate::Interpolative | Aggregate::Count => Outcome::NoData,
     }
 }
+
+/// Returns the length of an interval in ticks.
+fn length((from, to): (i64, i64)) -> f64 {
+    to.saturating_sub(from) as f64
+}
+
+/// Returns the outcome for a selected sample at its own time.
+fn actual(at: usize, quality: Quality) -> Outcome {
+    match quality {
+        Quality::Good => Outcome::Raw(at),
+        Quality::Uncertain | Quality::Bad => Outcome::Actual(at, quality),
+    }
+}
+
+/// Returns the average of the line through the samples (OPC 10000-13, 5.4.3.6), and the length of
+/// the interval in seconds. The time before the first sample has no data, and the value after the
+/// last sample is uncertain.
+fn average_over_time(samples: &[Sample], (from, to): (i64, i64), rules: Rules) -> (Outcome, f64) {
+    let whole = length((from, to));
+    let seconds = whole / TICKS_PER_MILLISECOND / 1e3;
+    let value_at = |time| {
+        let outcome = at(samples, time, rules);
+        if let Outcome::Interpolated(value, _) = outcome {
+            return Some(value);
+        }
+        let Outcome::Raw(at) = outcome else {
+            return None;
+        };
+        samples.get(at).and_then(|sample| sample.value)
+    };
+    let usable = |sample: &&Sample| rules.takes(sample.quality) && sample.value.is_some();
+    let inner = samples
+        .iter()
+        .filter(|one| one.time > from && one.time < to);
+    let mut points = vec![(from, value_at(from))];
+    points.extend(inner.filter(usable).map(|one| (one.time, one.value)));
+    points.push((to, value_at(to)));
+    let last = samples.iter().rfind(usable).map(|sample| sample.time);
+    let (mut area, mut good, mut bad) = (0.0, 0.0, 0.0);
+    for (left, right) in points.iter().zip(points.iter().skip(1)) {
+        let time = length((left.0, right.0));
+        let (Some(low), Some(high)) = (left.1, right.1) else {
+            bad += time;
+            continue;
+        };
+        area += (low + high) / 2.0 * time;
+        let skipped =
+            |one: &Sample| one.time > left.0 && one.time < right.0 && !rules.takes(one.quality);
+        let is_held = last.is_none_or(|last| last < right.0);
+        if !is_held && !samples.iter().any(skipped) {
+            good += time;
+        }
+    }
+    let known = whole - bad;
+    if known <= 0.0 {
+        return (Outcome::NoData, seconds);
+    }
+    let quality = if bad > 0.0 && bad * 100.0 >= whole * f64::from(rules.percent_bad) {
+        return (Outcome::Bad, seconds);
+    } else if good * 100.0 >= whole * f64::from(rules.percent_good) {
+        Quality::Good
+    } else {
+        Quality::Uncertain
+    };
+    (Outcome::Calculated(area / known, quality), seconds)
+}
+
+/// Returns the time with good values, in ticks. Each value counts until the next value (OPC
+/// 10000-13, 5.4.3.22).
+fn time_good(samples: &[Sample], (from, to): (i64, i64)) -> f64 {
+    let mut good = 0.0;
+    let nexts = samples.iter().skip(1).map(|next| next.time);
+    for (sample, next) in samples.iter().zip(nexts.chain([i64::MAX])) {
+        let (begin, end) = (sample.time.max(from), next.min(to));
+        if sample.quality == Quality::Good && end > begin {
+            good += length((begin, end));
+        }
+    }
+    good
+}
+
+/// Ticks of 100 ns.
+const TICKS_PER_MILLISECOND: f64 = 1e4;
 
 /// Returns the outcome for a selected sample: the raw value if the sample is good and at the start
 /// of the interval.
@@ -183,6 +355,17 @@ pub(super) fn at(samples: &[Sample], time: i64, rules: Rules) -> Outcome {
         }
         Some(_) => Outcome::Held(last),
         None => Outcome::Interpolated(from, Quality::Uncertain),
+    }
+}
+
+impl Quality {
+    /// Returns a number that is higher for worse qualities.
+    const fn rank(self) -> u8 {
+        match self {
+            Self::Good => 0,
+            Self::Uncertain => 1,
+            Self::Bad => 2,
+        }
     }
 }
 
@@ -309,6 +492,87 @@ mod tests {
         assert_eq!(
             of(Aggregate::Average, &all, (20, 30), lenient),
             Outcome::Calculated(5.0, Quality::Good)
+        );
+    }
+
+    #[test]
+    fn the_first_and_the_last_sample_and_their_difference() {
+        let mut all = samples();
+        assert_eq!(of_all(Aggregate::Start, &all, (15, 45)), Outcome::Raw(1));
+        assert_eq!(of_all(Aggregate::End, &all, (15, 40)), Outcome::Raw(2));
+        assert_eq!(of_all(Aggregate::Start, &all, (50, 60)), Outcome::NoData);
+        assert_eq!(
+            of_all(Aggregate::Delta, &all, (10, 50)),
+            Outcome::Calculated(8.0, Quality::Good)
+        );
+        all[3].quality = Quality::Bad;
+        assert_eq!(
+            of_all(Aggregate::Delta, &all, (10, 50)),
+            Outcome::Calculated(2.0, Quality::Uncertain),
+            "without the last sample"
+        );
+        assert_eq!(
+            of_all(Aggregate::Range, &all, (10, 40)),
+            Outcome::Calculated(4.0, Quality::Good)
+        );
+        assert_eq!(
+            of_all(Aggregate::WorstQuality, &all, (10, 50)),
+            Outcome::Status(3)
+        );
+        assert_eq!(
+            of_all(Aggregate::WorstQuality, &all, (10, 40)),
+            Outcome::Status(0)
+        );
+    }
+
+    #[test]
+    fn extremes_have_their_own_time_on_request() {
+        let mut all = samples();
+        assert_eq!(
+            of_all(Aggregate::MaximumActualTime, &all, (10, 40)),
+            Outcome::Raw(1)
+        );
+        all[0].quality = Quality::Bad;
+        assert_eq!(
+            of_all(Aggregate::MinimumActualTime, &all, (10, 40)),
+            Outcome::Actual(2, Quality::Uncertain)
+        );
+    }
+
+    #[test]
+    fn the_average_over_time_is_the_area_below_the_line() {
+        let all = samples();
+        // The line from 1 to 5, to 3 and to 9: areas of 30, 40 and 60.
+        let whole = of_all(Aggregate::TimeAverage, &all, (10, 40));
+        assert_eq!(whole, Outcome::Calculated(130.0 / 30.0, Quality::Good));
+        let half = of_all(Aggregate::TimeAverage, &all, (15, 20));
+        assert_eq!(half, Outcome::Calculated(4.0, Quality::Good));
+        let held = of_all(Aggregate::TimeAverage, &all, (40, 50));
+        assert_eq!(held, Outcome::Calculated(9.0, Quality::Uncertain));
+        let before = of_all(Aggregate::TimeAverage, &all, (0, 5));
+        assert_eq!(before, Outcome::NoData);
+        // Half of this interval is before the first sample.
+        let partly = of_all(Aggregate::TimeAverage, &all, (5, 15));
+        assert_eq!(partly, Outcome::Calculated(2.0, Quality::Uncertain));
+        let seconds: Vec<Sample> = [0, 1].map(|at| sample(at * 10_000_000, 3.0)).to_vec();
+        let total = of_all(Aggregate::Total, &seconds, (0, 10_000_000));
+        assert_eq!(total, Outcome::Calculated(3.0, Quality::Good));
+    }
+
+    #[test]
+    fn a_value_is_good_until_the_next_value() {
+        let mut all: Vec<Sample> = (0..4).map(|at| sample(at * 10_000, 1.0)).collect();
+        all[1].quality = Quality::Bad;
+        all[2].quality = Quality::Uncertain;
+        let interval = (-10_000, 40_000);
+        assert_eq!(
+            of_all(Aggregate::DurationGood, &all, interval),
+            Outcome::Calculated(2.0, Quality::Good),
+            "in milliseconds"
+        );
+        assert_eq!(
+            of_all(Aggregate::PercentGood, &all, interval),
+            Outcome::Calculated(40.0, Quality::Good)
         );
     }
 
