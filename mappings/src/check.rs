@@ -1,5 +1,6 @@
 //! Document -> mapping: checks that need several parts of a document together.
 
+mod alarm;
 mod bindings;
 mod calls;
 mod cell;

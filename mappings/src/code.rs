@@ -111,6 +111,7 @@ codes! {
     DefinitionFile = "M101", "A definition file does not parse, in the ROS it is of. It counts as not there, and all others count.";
     DefinitionsDiffer = "M102", "A definition in a file differs from the one that is built in under its name. The file counts. Where peers have the other one, ROS 1 refuses the connection, and ROS 2 messages are misread unless type hashes are announced.";
     VersionsDiffer = "M103", "The message types of two bindings of one variable have different fields, beyond what ROS 2 renamed. Fields cross by their place in the message, so two of another name may be something else.";
+    Alarm = "M104", "An `alarm` has one thing that triggers it: limits of a number in ascending order, `normal` or `when` with values of a Boolean, an integer or a text, or `diagnostics` of a DiagnosticArray. At most 5000 variables have one.";
     Include = "M110", "`include` names files beside the file it stands in, one or a list; in the last part of a path `*` stands for any characters. Each of them can be read, and together they are as one document.";
     IncludeTwice = "M111", "A file is included once, and not by itself. Includes nest no deeper than 8 and lead to no more than 256 files.";
     EnvironmentVariable = "M112", "`${NAME}` is the value of an environment variable, `${NAME:-default}` has a default for one that is not set or empty, and `$${` stands for `${` itself.";
@@ -167,6 +168,7 @@ impl Code {
                 | Self::LossyConversion
                 | Self::FieldOrder
                 | Self::StructureOf
+                | Self::Alarm
                 | Self::CallMap
                 | Self::UnknownActionType
                 | Self::NodeSet

@@ -1,6 +1,7 @@
 //! The document as it is written: keys and their documentation for the schema. Nothing is checked
 //! across keys.
 
+mod alarm;
 mod security;
 
 use std::collections::BTreeMap;
@@ -15,6 +16,7 @@ use crate::read::{At, Read, Reader, choice, document, help_octal, is_octal, shor
 use crate::server_entries::{FindSkillsEntry, FromEntry, RemoteServerEntry, ToEntry};
 use crate::tree::{Kind, Node, Place};
 
+pub(crate) use alarm::{AlarmEntry, ReportsEntry};
 pub(crate) use security::{
     GroupEntry, GroupModeEntry, GroupPolicyEntry, KeysEntry, ReplayEntry, SksEntry,
 };
@@ -125,6 +127,9 @@ document! {
         /// says nothing else. Left out: it stays uncertain.
         #[schemars(regex(pattern = DURATION))]
         bad_after: String,
+        /// Whether the server has alarms for the publishers of the space: lost, dropped values,
+        /// another clock. Default false.
+        publisher_alarms: bool,
         /// How much the server keeps of what was.
         history: HistoryEntry,
         /// How much clients may take up.
@@ -237,6 +242,13 @@ document! {
         at_most: String,
         /// When the server no longer shows the value as good, because no newer one comes.
         quality: QualityEntry,
+        /// Which values are an alarm at the server, as {high: 70, high_high: 90} or {normal:
+        /// false}.
+        alarm: AlarmEntry,
+        /// `alarms`, with `origin: 0`: the value is a diagnostic_msgs/DiagnosticArray that the
+        /// server makes of its conditions, once a second and when one changes. Diagnostics of
+        /// robots are not in it.
+        reports: ReportsEntry,
         /// What says that a value has arrived. `bridge`, the default for events of origin 0 and for values that call a service:
         /// each bridge that the mapping ties the value to, when a present subscriber or the service has it; the value is sent
         /// again until then, 1 s at most, and a client's write is answered accordingly. `none`: a write is answered when the

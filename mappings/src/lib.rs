@@ -1,5 +1,6 @@
 //! Names of the space, and the YAML document that ties them to ROS topics and OPC UA nodes.
 
+mod alarm;
 mod call;
 mod check;
 mod code;
@@ -32,6 +33,7 @@ mod tree;
 mod unit;
 mod variables;
 
+pub use alarm::{Alarm, AlarmLimits, AlarmTrigger, AlarmValue};
 pub use call::{
     Assigned, Assignment, Call, CallBinding, CallKind, CallTarget, ExecutedBy, FieldMap,
     MethodTarget,

@@ -9,6 +9,7 @@ use std::time::Duration;
 use messages::{Leaf, Selection, TypeName};
 use uadp::BuiltinType;
 
+use crate::alarm::Alarm;
 use crate::call::{Call, CallBinding};
 use crate::endpoint::Endpoint;
 use crate::loss::Loss;
@@ -457,6 +458,8 @@ pub struct Server {
     /// Time after which uncertain values of other programs are bad, if a variable names no other
     /// time.
     pub bad_after: Option<Duration>,
+    /// `true` if it has alarms for the publishers of the space.
+    pub publisher_alarms: bool,
     /// Size of the history.
     pub history: History,
     /// Limits for clients.
@@ -509,6 +512,7 @@ impl Default for Server {
             anonymous: Anonymous::Usual,
             refuse_other_hosts: false,
             bad_after: None,
+            publisher_alarms: false,
             history: History::default(),
             limits: ServerLimits::default(),
             find_skills: None,
@@ -585,6 +589,10 @@ pub struct Variable {
     pub permissions: Permissions,
     /// Maximum ages of its values.
     pub ages: Ages,
+    /// Its alarm at the server.
+    pub alarm: Option<Box<Alarm>>,
+    /// `true` if the server makes its values, as a DiagnosticArray, of its conditions.
+    pub reports_alarms: bool,
     /// Number of past values that are kept; `None` for the number of the server's history.
     pub history: Option<u16>,
     /// Reaction to the loss of its commander.

@@ -1,6 +1,7 @@
 //! The OPC UA server alone: datagrams of the tests on one side, asyncua on the other.
 
 mod access;
+mod alarms;
 mod authorities;
 mod configuration;
 mod confirm;

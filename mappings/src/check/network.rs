@@ -263,6 +263,7 @@ pub(super) fn server(entry: Option<&At<ServerEntry>>, findings: &mut Findings) -
         anonymous: permissions::anonymous(entry),
         refuse_other_hosts: given(&entry.refuse_other_hosts).is_some_and(|(refuse, _)| *refuse),
         bad_after: duration(&entry.bad_after, findings),
+        publisher_alarms: given(&entry.publisher_alarms).is_some_and(|(on, _)| *on),
         history: history(&entry.history, findings),
         limits: limits(&entry.limits, findings),
         find_skills: None,

@@ -11,7 +11,7 @@ use super::bindings::{self, Bindings};
 use super::servers::Servers;
 use super::services::Calls;
 use super::types::{self, Types, ValueType};
-use super::{Declared, confirm, loss, meaning, permissions, quality, remote, required};
+use super::{Declared, alarm, confirm, loss, meaning, permissions, quality, remote, required};
 use crate::code::Code;
 use crate::document::{PublishEntry, Queue, UaFieldEntry, VariableEntry};
 use crate::findings::Findings;
@@ -100,6 +100,7 @@ pub(super) fn check(
         .iter()
         .filter_map(|draft| Some((draft.topic()?, draft.entry)));
     confirm::check(entries.clone(), &mut variables, findings);
+    alarm::check(entries.clone(), &mut variables, findings);
     loss::check(entries, &mut variables, bindings.types(), findings);
     // The list lives as long as the mapping.
     variables.shrink_to_fit();
@@ -405,6 +406,8 @@ fn variable(
         meaning: meaning?,
         permissions: permissions?,
         ages: ages?,
+        alarm: None,
+        reports_alarms: false,
         history: given(&entry.history).map(|(count, _)| *count),
         loss: None,
         confirm: None,

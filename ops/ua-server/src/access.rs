@@ -13,6 +13,7 @@ use plant_opcua::users::{Anonymous, Permissions, Role, Roles, Rules};
 use tracing::warn;
 
 use crate::address;
+use crate::alarms;
 use crate::layout::{Layout, node_id};
 
 /// Records, for each session, if its ApplicationUri matches its certificate.
@@ -99,6 +100,7 @@ pub(crate) fn rules(mapping: &Mapping, layout: &Layout) -> Rules {
     // Methods of the core namespace are open to every client by default.
     let switches = SWITCHES.map(|method| (method.into(), Permissions::default()));
     nodes.extend(switches);
+    nodes.extend(alarms::permissions());
     let certificates = Permissions {
         call: roles(&[mappings::Role::SecurityAdmin]),
         ..Permissions::default()

@@ -99,6 +99,7 @@ pub(crate) fn add_folders(layout: &Layout, address_space: &mut AddressSpace) {
 pub(crate) fn order(layout: &Layout) -> HashMap<NodeId, usize> {
     let mut order = HashMap::from([
         (root(), 1),
+        (alarms_folder(), usize::MAX - 3),
         (programs_folder(), usize::MAX - 2),
         (components_folder(), usize::MAX - 1),
         (unmapped_folder(), usize::MAX),
@@ -146,6 +147,11 @@ pub(crate) fn origin_folder(space: SpaceId) -> NodeId {
 
 pub(crate) fn unmapped_folder() -> NodeId {
     NodeId::new(APPLICATION, "UaSpace.Unmapped")
+}
+
+/// Returns the folder of the conditions, which is the notifier of their events.
+pub(crate) fn alarms_folder() -> NodeId {
+    NodeId::new(APPLICATION, "UaSpace.Alarms")
 }
 
 /// Returns the folder of the servers found in the network.

@@ -36,7 +36,8 @@ pub(crate) struct TopicNode {
     pub(crate) compound: bool,
     /// Units, ranges and descriptions of the values.
     pub(crate) meaning: Meaning,
-    /// True if the values come from another server. Clients cannot write them.
+    /// True if the values come from another server or from the conditions of this server. Clients
+    /// cannot write them.
     pub(crate) sourced: bool,
     /// True if the values are written to another server; its result answers the writes of clients.
     pub(crate) targeted: bool,
@@ -262,7 +263,7 @@ impl TopicNode {
         );
         let mut node = Self {
             meaning: variable.meaning.clone(),
-            sourced: variable.from.is_some(),
+            sourced: variable.from.is_some() || variable.reports_alarms,
             targeted: variable.to.is_some(),
             historizing: variable.history.unwrap_or(history.values) > 0,
             ..node

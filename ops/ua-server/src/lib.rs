@@ -20,11 +20,13 @@
 //! - The server itself: `port` (the interface to the shell), `endpoint` (endpoints and security),
 //!   `changes` (notifications of reloads), `identity` (BuildInfo and limits), `confirm` and
 //!   `arrivals` (confirmation of writes), `commanders` (sessions that wrote commands), `access`
-//!   (permissions), `auditing` (audit events), `sks` (keys of secured groups), `pubsub` (the PubSub
-//!   configuration as nodes), `verbs` (commands for certificates and users).
+//!   (permissions), `auditing` (audit events), `alarms` (alarms and conditions), `sks` (keys of
+//!   secured groups), `pubsub` (the PubSub configuration as nodes), `verbs` (commands for
+//!   certificates and users).
 
 mod access;
 mod address;
+mod alarms;
 mod argument_types;
 mod arrivals;
 mod asking;

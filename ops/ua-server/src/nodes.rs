@@ -1,8 +1,8 @@
 //! The node manager of the space: values of nodes, writes of clients, and monitored items.
 //!
 //! Locks are taken in this order and never across an await: the address space, the places, the
-//! values, the past values, the subscriptions, the watched items. While a lock is held, only the
-//! subscriptions are called: a write leaves through a bounded channel.
+//! conditions, the values, the past values, the subscriptions, the watched items. While a lock is
+//! held, only the subscriptions are called: a write leaves through a bounded channel.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -34,6 +34,7 @@ use uadp::Timestamp;
 
 use crate::access::{self, Genuine};
 use crate::address;
+use crate::alarms::Alarms;
 use crate::arrivals::Awaited;
 use crate::asking::{Drive, Drives, Questions, Refused, Table};
 use crate::budget::{Answers, LARGEST, SMALL, Watched};
@@ -97,6 +98,8 @@ pub(crate) struct Exits {
     pub(crate) pubsub: Arc<PubSub>,
     /// The confirmations of writes.
     pub(crate) confirms: Arc<Confirms>,
+    /// The conditions of values.
+    pub(crate) alarms: Arc<Alarms>,
 }
 
 /// A value that a client wrote to a topic of the OPC UA side.
@@ -387,6 +390,9 @@ impl SpaceNodes {
         for (node, (before, view)) in topic.nodes().zip(views) {
             self.notify(subscriptions, node, &view, &before);
         }
+        drop(values);
+        let alarms = &self.exits.alarms;
+        alarms.look(topic.topic, || self.shown(topic.topic));
         kept
     }
 
@@ -932,7 +938,8 @@ impl InMemoryNodeManagerImpl for SpaceNodes {
                         ..DataValue::default()
                     };
                 }
-                match self.answer(&node.node_id, &node.index_range) {
+                let answer = self.answer(&node.node_id, &node.index_range);
+                match answer.or_else(|| self.exits.alarms.read(&node.node_id)) {
                     Some(value) => stamped(value, timestamps_to_return),
                     None => address_space.read(context, node, max_age, timestamps_to_return),
                 }
@@ -959,7 +966,10 @@ impl InMemoryNodeManagerImpl for SpaceNodes {
             self.watched.lock().insert(handle, unfiltered, queue);
             let node = item.item_to_monitor();
             let value = match address_space.validate_node_read(context, node) {
-                Ok(_) => self.answer_item(&node.node_id, handle),
+                Ok(_) => {
+                    let answer = self.answer_item(&node.node_id, handle);
+                    answer.or_else(|| self.exits.alarms.read(&node.node_id))
+                }
                 Err(_) => None,
             };
             let value = value.unwrap_or_else(|| {

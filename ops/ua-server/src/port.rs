@@ -25,7 +25,7 @@ use plant_opcua::enrolment::Invitation;
 use plant_opcua::nodeset::NodeSets;
 use plant_opcua::own;
 use plant_opcua::pki::Pki;
-use plant_opcua::server::{Security, core_of, core_with};
+use plant_opcua::server::{CoreMethod, Security, core_of, core_with};
 use plant_opcua::users::{self, Access, UserFault};
 use tokio::runtime::Runtime;
 use tokio::sync::{Semaphore, mpsc, oneshot};
@@ -35,6 +35,7 @@ use tracing::{info, warn};
 use uadp::BuiltinType;
 
 use crate::access;
+use crate::alarms::Alarms;
 use crate::asking::{Heard, Questions};
 use crate::auditing;
 use crate::browse::Ordered;
@@ -108,6 +109,8 @@ pub(crate) struct ServerPort {
     readers: Readers,
     /// Writes that wait for a confirmation.
     confirms: Arc<Confirms>,
+    /// The conditions of values, robots and publishers.
+    alarms: Arc<Alarms>,
     /// The sessions that wrote commands. Their topics are stopped when the session is lost.
     commanders: Commanders,
     /// Notified when the last reported write has been sent.
@@ -139,6 +142,7 @@ impl ServerPort {
         let pubsub = Arc::new(PubSub::new());
         let (exits, (writes, created_items, asked)) = exits(mapping, &access, &pubsub);
         let (confirms, layout) = (Arc::clone(&exits.confirms), Arc::new(layout));
+        let alarms = Arc::clone(&exits.alarms);
         let nodes = NodesBuilder {
             layout: Arc::clone(&layout),
             sets,
@@ -146,7 +150,8 @@ impl ServerPort {
         };
         let certificates = Configuration::new(setup.pki.root(), &described.application_uri);
         let mdns = matches!(&setup.announce, Some(to) if to.mdns.is_some());
-        let core = core(&setup.sks, &pubsub, (&certificates, mdns), described);
+        let methods = [setup.sks.methods(), pubsub.methods(), alarms.methods()].concat();
+        let core = core(methods, (&certificates, mdns), described);
         let builder = endpoint::server(described, (&setup.url, port), &security);
         let (door, listener, builder) = endpoint::door(
             &setup.pki,
@@ -162,6 +167,7 @@ impl ServerPort {
             .map_err(configuration)?;
         let manager = manager(&handle, &layout).map_err(configuration)?;
         show_limits(mapping, &layout, (&handle, &manager), &pubsub);
+        alarms.stand(Arc::clone(&manager), &handle, mapping);
         let (runtime, listener) = endpoint::threads(listener)?;
         let serving = runtime.spawn(server.run_with(listener));
         endpoint::stand(&runtime, door)?;
@@ -201,6 +207,7 @@ impl ServerPort {
             pubsub,
             readers: Readers::default(),
             confirms,
+            alarms,
             commanders: Commanders::new(mapping),
             leaving: None,
             receive_timeout: mapping.pubsub().receive_timeout,
@@ -279,6 +286,17 @@ impl Port for ServerPort {
                     self.live.extend(taken_back.map(|topic| (topic, false)));
                 }
                 () = at(self.space.due()) => self.space.grow_old(),
+                () = self.alarms.elapsed() => {
+                    for (topic, block) in self.alarms.elapse() {
+                        let taken = bridge_node::now().utc;
+                        let status = StatusCode::Good;
+                        let event = self.sourced(Sourced { topic, block, taken, status });
+                        self.events.push_back(event);
+                    }
+                    if let Some(event) = self.events.pop_front() {
+                        return event;
+                    }
+                }
                 () = self.certificates.applied() => bridge_node::restart(),
                 _ = self.look.tick() => {
                     self.pki.report_rejected();
@@ -345,6 +363,7 @@ impl Port for ServerPort {
     fn counted(&mut self, router: &Router) {
         self.pubsub.look(&self.readers, router);
         self.space.hear(router.heard(), self.receive_timeout);
+        self.alarms.publishers(router, self.receive_timeout);
     }
 
     fn call_known(&mut self, topic: TopicId, description: &Arc<CallDescription>) {
@@ -408,6 +427,7 @@ impl Port for ServerPort {
                 self.live
                     .extend(written(new.into_iter()).map(|topic| (topic, true)));
                 self.pubsub.show(mapping, &layout);
+                self.alarms.reload(mapping);
                 // Disabled readers and writers stay disabled.
                 self.switch();
             }
@@ -596,12 +616,11 @@ fn audit(access: &Access, handle: &ServerHandle) {
 
 /// Builds the core namespace with its methods and values.
 fn core(
-    sks: &Arc<Sks>,
-    pubsub: &Arc<PubSub>,
+    methods: Vec<CoreMethod>,
     (configuration, is_announced): (&Arc<Configuration>, bool),
     described: &Server,
 ) -> impl NodeManagerBuilder + use<> {
-    let methods = [sks.methods(), pubsub.methods(), configuration.methods()].concat();
+    let methods = [methods, configuration.methods()].concat();
     let values = [capabilities(described), Configuration::values(is_announced)].concat();
     core_with(methods, values, prepared)
 }
@@ -691,6 +710,7 @@ fn exits(mapping: &Mapping, access: &Arc<Access>, pubsub: &Arc<PubSub>) -> (Exit
         access: Arc::clone(access),
         pubsub: Arc::clone(pubsub),
         confirms: Arc::default(),
+        alarms: Arc::default(),
     };
     exits.confirms.follow(mapping);
     (exits, (written, created_items, heard))

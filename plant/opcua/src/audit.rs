@@ -8,7 +8,7 @@ use opcua::nodes::{BaseEventType, Event, EventField};
 use opcua::server::node_manager::RequestContext;
 use opcua::server::{ANONYMOUS_USER_TOKEN_ID, SubscriptionCache};
 use opcua::types::{
-    AttributeId, DateTime, LocalizedText, NodeId, NumericRange, ObjectId, ObjectTypeId,
+    AttributeId, ByteString, DateTime, LocalizedText, NodeId, NumericRange, ObjectId, ObjectTypeId,
     QualifiedName, StatusCode, Variant,
 };
 use tracing::{debug, warn};
@@ -58,12 +58,27 @@ pub enum Action {
         /// The method.
         method: NodeId,
     },
+    /// A client called a method of a condition (OPC 10000-9, 5.10).
+    Condition {
+        /// The SourceName of the event, such as `Method/Acknowledge`.
+        source: &'static str,
+        /// The type of the event, a subtype of AuditConditionEventType.
+        kind: ObjectTypeId,
+        /// The condition.
+        condition: NodeId,
+        /// The method.
+        method: NodeId,
+        /// The EventId that the client named.
+        event: Option<ByteString>,
+        /// The comment of the client.
+        comment: Option<LocalizedText>,
+    },
 }
 
 impl Action {
     /// Returns the type of the event and its supertypes.
-    const fn types(&self) -> &'static [ObjectTypeId] {
-        match self {
+    fn types(&self) -> Vec<NodeId> {
+        let types: &[ObjectTypeId] = match self {
             Self::CameIn { .. } => &[
                 ObjectTypeId::AuditActivateSessionEventType,
                 ObjectTypeId::AuditSessionEventType,
@@ -82,7 +97,15 @@ impl Action {
                 ObjectTypeId::AuditEventType,
                 ObjectTypeId::BaseEventType,
             ],
-        }
+            Self::Condition { kind, .. } => &[
+                *kind,
+                ObjectTypeId::AuditConditionEventType,
+                ObjectTypeId::AuditUpdateMethodEventType,
+                ObjectTypeId::AuditEventType,
+                ObjectTypeId::BaseEventType,
+            ],
+        };
+        types.iter().map(|id| (*id).into()).collect()
     }
 
     /// Returns the SourceName of the event in the standard.
@@ -91,6 +114,7 @@ impl Action {
             Self::CameIn { .. } => "Session/ActivateSession",
             Self::Wrote { .. } => "Attribute/Write",
             Self::Called { .. } => "Attribute/Call",
+            Self::Condition { source, .. } => source,
         }
     }
 
@@ -99,6 +123,7 @@ impl Action {
             Self::CameIn { .. } => ObjectId::Server.into(),
             Self::Wrote { node, .. } => node.clone(),
             Self::Called { object, .. } => object.clone(),
+            Self::Condition { condition, .. } => condition.clone(),
         }
     }
 }
@@ -109,6 +134,9 @@ impl std::fmt::Display for Action {
             Self::CameIn { by, endpoint } => write!(f, "comes in ({by}, {endpoint})"),
             Self::Wrote { node, .. } => write!(f, "writes {node}"),
             Self::Called { method, .. } => write!(f, "calls {method}"),
+            Self::Condition {
+                condition, method, ..
+            } => write!(f, "calls {method} of {condition}"),
         }
     }
 }
@@ -167,7 +195,7 @@ struct Told {
 impl Told {
     fn new(audit: Audit) -> Self {
         let now = DateTime::now();
-        let types: Vec<NodeId> = audit.action.types().iter().map(|id| (*id).into()).collect();
+        let types = audit.action.types();
         let message = format!("{} {}: {}", audit.user, audit.action, audit.status);
         let base = BaseEventType {
             event_id: opcua::crypto::random::byte_string(16),
@@ -205,7 +233,11 @@ impl Told {
             (Action::Wrote { range, .. }, "IndexRange") => Some(range.as_str().into()),
             (Action::Wrote { old, .. }, "OldValue") => Some(old.clone()),
             (Action::Wrote { new, .. }, "NewValue") => Some(new.clone()),
-            (Action::Called { method, .. }, "MethodId") => Some(method.clone().into()),
+            (Action::Called { method, .. } | Action::Condition { method, .. }, "MethodId") => {
+                Some(method.clone().into())
+            }
+            (Action::Condition { event, .. }, "ConditionEventId") => event.clone().map(Into::into),
+            (Action::Condition { comment, .. }, "Comment") => comment.clone().map(Into::into),
             _ => None,
         }
     }

@@ -27,11 +27,13 @@ use crate::limits::LONGEST_REQUEST;
 /// A method of an object of the core namespace, and its handler.
 #[derive(Clone)]
 pub struct CoreMethod {
-    object: NodeId,
+    /// `None` for every object of the type of the method.
+    object: Option<NodeId>,
     /// The method node of the object and the method nodes of its types.
     methods: Vec<NodeId>,
     name: String,
     handler: Arc<dyn MethodHandler>,
+    audit: fn(&MethodCall) -> Action,
 }
 
 impl CoreMethod {
@@ -44,15 +46,46 @@ impl CoreMethod {
         handler: Arc<dyn MethodHandler>,
     ) -> Self {
         Self {
-            object: object.into(),
+            object: Some(object.into()),
             methods: methods.into_iter().collect(),
             name: name.to_owned(),
             handler,
+            audit: called,
         }
     }
 
+    /// Creates the method `name` of a type for all objects, also of other namespaces. The handler
+    /// checks the object.
+    #[must_use]
+    pub fn of_type(method: NodeId, name: &str, handler: Arc<dyn MethodHandler>) -> Self {
+        Self {
+            object: None,
+            methods: vec![method],
+            name: name.to_owned(),
+            handler,
+            audit: called,
+        }
+    }
+
+    /// Sets the action by which calls are audited.
+    #[must_use]
+    pub fn audited(self, audit: fn(&MethodCall) -> Action) -> Self {
+        Self { audit, ..self }
+    }
+
     fn is(&self, call: &MethodCall) -> bool {
-        self.object == *call.object_id() && self.methods.contains(call.method_id())
+        let is_of = self
+            .object
+            .as_ref()
+            .is_none_or(|object| object == call.object_id());
+        is_of && self.methods.contains(call.method_id())
+    }
+}
+
+fn called(call: &MethodCall) -> Action {
+    Action::Called {
+        object: call.object_id().clone(),
+        method: call.method_id().clone(),
     }
 }
 
@@ -135,10 +168,7 @@ impl Overlay {
                 Err(refusal) => Err(refusal),
             };
             calls::end(call, ended);
-            let action = Action::Called {
-                object: call.object_id().clone(),
-                method: call.method_id().clone(),
-            };
+            let action = (method.audit)(call);
             Audit::of(context, action, call.status()).tell(&context.subscriptions);
         }
         others
@@ -163,7 +193,7 @@ impl Overlay {
         Ok(MethodRequest {
             caller: Caller::of(context),
             presence: Presence::of(context),
-            object: method.object.clone(),
+            object: call.object_id().clone(),
             method: own.clone(),
             name: method.name.clone(),
             arguments: call.arguments().to_vec(),

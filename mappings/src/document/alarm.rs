@@ -1,0 +1,91 @@
+//! `alarm` of a variable in the document.
+
+use schemars::JsonSchema;
+
+use crate::document::DURATION;
+use crate::read::{At, Read, Reader, choice, document};
+use crate::tree::{Kind, Node};
+
+document! {
+    /// An alarm of the value at the server of the cell (OPC 10000-9): limits of a number, `normal`
+    /// or `when` of a Boolean, an integer or a text, or `diagnostics`.
+    struct AlarmEntry {
+        /// The alarm is at LowLow while the value is below this limit.
+        low_low: f64,
+        /// The alarm is at Low while the value is below this limit.
+        low: f64,
+        /// The alarm is at High while the value is above this limit.
+        high: f64,
+        /// The alarm is at HighHigh while the value is above this limit.
+        high_high: f64,
+        /// `true` (the default): the alarm is at the outermost limit that the value exceeds
+        /// (ExclusiveLevelAlarmType). `false`: it is at each limit that the value exceeds
+        /// (NonExclusiveLevelAlarmType).
+        exclusive: bool,
+        /// How far a value has to return behind a limit before the alarm leaves it; default 0.
+        deadband: f64,
+        /// The alarm is active while the value is not this one, as false, 0 or a text of `enum`
+        /// (OffNormalAlarmType).
+        #[schemars(extend("type" = ["string", "boolean", "number", "null"]))]
+        normal: String,
+        /// The alarm is active while the value is this one, or one of a list, as [2, 3] or texts of
+        /// `enum` (DiscreteAlarmType).
+        when: ValueList,
+        /// `true`: each status of a diagnostic_msgs/DiagnosticArray is an alarm of its own, by its
+        /// hardware_id and name, and active unless its level is OK (SystemDiagnosticAlarmType).
+        diagnostics: bool,
+        /// Severity, 1 to 1000; default 500. At LowLow and HighHigh it is halfway between this and
+        /// 1000.
+        #[schemars(range(min = 1, max = 1000))]
+        severity: u16,
+        /// Whether an acknowledged alarm has to be confirmed too; default false.
+        confirm: bool,
+        /// How long the value has to be beyond a limit before the alarm is active, as 500ms. Left
+        /// out: it is active at once.
+        #[schemars(regex(pattern = DURATION))]
+        delay: String,
+        /// Text of the alarm while it is active. Left out: the name of the variable, its value and
+        /// the limit.
+        #[schemars(length(min = 1, max = 1000))]
+        message: String,
+    }
+}
+
+choice! {
+    enum ReportsEntry {
+        /// A diagnostic_msgs/DiagnosticArray with a status for each condition of the server.
+        Alarms = "alarms",
+    }
+}
+
+/// A value or a list of values, as texts.
+#[derive(Clone, Debug)]
+pub(crate) struct ValueList(pub(crate) Vec<At<String>>);
+
+impl Read for ValueList {
+    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
+        match &node.kind {
+            Kind::List(_) => Vec::read(node, reader).map(Self),
+            Kind::Scalar(_) => Some(Self(vec![reader.at(node)])),
+            Kind::Null | Kind::Map(_) => {
+                reader.wrong(node, "a value such as `3`, or a list of them");
+                None
+            }
+        }
+    }
+}
+
+impl JsonSchema for ValueList {
+    fn inline_schema() -> bool {
+        true
+    }
+
+    fn schema_name() -> std::borrow::Cow<'static, str> {
+        "ValueList".into()
+    }
+
+    fn json_schema(_: &mut schemars::SchemaGenerator) -> schemars::Schema {
+        let one = schemars::json_schema!({ "type": ["string", "boolean", "number"] });
+        schemars::json_schema!({ "anyOf": [one, { "type": "array", "items": one, "minItems": 1 }] })
+    }
+}
