@@ -193,7 +193,10 @@ fn kind(fault: &VerbFault) -> FailureKind {
             | PkiError::Issued(_),
         )
         | VerbFault::Store(
-            StoreFault::Certificate { .. } | StoreFault::Unknown { .. } | StoreFault::Several(_),
+            StoreFault::Certificate { .. }
+            | StoreFault::Useless { .. }
+            | StoreFault::Unknown { .. }
+            | StoreFault::Several(_),
         )
         | VerbFault::User(
             UserFault::Name

@@ -78,6 +78,14 @@ pub enum StoreFault {
         /// The reason.
         why: String,
     },
+    /// No connection can use the certificate, so it cannot be trusted.
+    #[error("{path} can never be used: {why}")]
+    Useless {
+        /// The file.
+        path: PathBuf,
+        /// The reason.
+        why: String,
+    },
     /// No certificate has a thumbprint with this prefix.
     #[error(
         "no {standing} certificate has a thumbprint that begins with `{given}`, and there is no such file"
@@ -128,11 +136,13 @@ pub fn list(root: &Path) -> Result<Vec<Stored>, StoreFault> {
 /// certificate in a DER or PEM file.
 ///
 /// # Errors
-/// Returns an error if no certificate matches or if the store cannot be written.
+/// Returns an error if no certificate matches, if no connection can use the certificate, or if the
+/// store cannot be written.
 pub fn trust(root: &Path, given: &str) -> Result<Stored, StoreFault> {
     let file = Path::new(given);
     if file.is_file() {
         let certificate = read(file)?;
+        check_use(&certificate, file)?;
         let kept = keep(root, &certificate, Standing::Trusted)?;
         let all = list(root)?;
         let refused = all
@@ -173,7 +183,11 @@ fn transfer(
     if fitting.any(|other| other.thumbprint != first.thumbprint) {
         return Err(StoreFault::Several(begin));
     }
-    let kept = keep(root, &read(&first.path)?, to)?;
+    let certificate = read(&first.path)?;
+    if to == Standing::Trusted {
+        check_use(&certificate, &first.path)?;
+    }
+    let kept = keep(root, &certificate, to)?;
     // The library refuses a certificate that is both trusted and rejected.
     let same = all
         .iter()
@@ -242,6 +256,36 @@ fn keep(root: &Path, certificate: &X509, standing: Standing) -> Result<Stored, S
         path,
         why: "it cannot be read back".to_owned(),
     })
+}
+
+/// Checks that the security policies and the rules of OPC UA (OPC 10000-6, 6.2.2) permit to use a
+/// certificate at all.
+fn check_use(certificate: &X509, path: &Path) -> Result<(), StoreFault> {
+    let useless = |why: String| StoreFault::Useless {
+        path: path.to_owned(),
+        why,
+    };
+    let der = certificate.to_der().unwrap_or_default();
+    let Ok(certificate) = trust::Certificate::read(&der) else {
+        return Err(useless("it cannot be decoded".to_owned()));
+    };
+    match certificate.key_bits() {
+        None => {
+            let why = "its key is no RSA key, and the security policies of this server need one";
+            return Err(useless(why.to_owned()));
+        }
+        Some(bits) if !(2048..=4096).contains(&bits) => {
+            return Err(useless(format!(
+                "its RSA key has {bits} bits, and the security policies of this server need 2048 to 4096"
+            )));
+        }
+        Some(_) => {}
+    }
+    if !certificate.is_authority() && certificate.application_uri().is_none() {
+        let why = "it has no ApplicationUri, which is a URI among its subject alternative names";
+        return Err(useless(why.to_owned()));
+    }
+    Ok(())
 }
 
 fn read(path: &Path) -> Result<X509, StoreFault> {
@@ -376,6 +420,43 @@ mod tests {
             trust(&root, file.to_str().unwrap()).unwrap().standing,
             Standing::Trusted
         );
+        fs::remove_dir_all(root).unwrap();
+    }
+
+    #[test]
+    fn a_certificate_that_no_connection_can_use_is_not_trusted() {
+        use opcua::crypto::X509Data;
+
+        let root = scratch("useless");
+        let _pki = Pki::open(root.clone()).unwrap();
+        let file = root.join("rejected/client.der");
+        let refused = |key_size: u32, uri: Option<&str>| {
+            let mut data = X509Data {
+                key_size,
+                ..X509Data::sample_cert()
+            };
+            let _names = std::mem::take(&mut data.alt_host_names);
+            if let Some(uri) = uri {
+                data.alt_host_names.add_uri(uri);
+            }
+            data.alt_host_names.add_dns("localhost");
+            let (certificate, _) = X509::cert_and_pkey(&data).unwrap();
+            fs::write(&file, certificate.to_der().unwrap()).unwrap();
+            let thumbprint = certificate.thumbprint().as_hex_string();
+            let by_file = trust(&root, file.to_str().unwrap());
+            let by_digits = trust(&root, &thumbprint);
+            match (by_file, by_digits) {
+                (Err(StoreFault::Useless { why, .. }), Err(StoreFault::Useless { .. })) => {
+                    Some(why)
+                }
+                _ => None,
+            }
+        };
+        let short = refused(1024, Some("urn:client")).unwrap();
+        assert!(short.contains("1024 bits"), "{short}");
+        let nameless = refused(2048, None).unwrap();
+        assert!(nameless.contains("ApplicationUri"), "{nameless}");
+        assert_eq!(refused(2048, Some("urn:client")), None);
         fs::remove_dir_all(root).unwrap();
     }
 
