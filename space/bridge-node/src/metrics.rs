@@ -3,11 +3,14 @@
 use std::collections::VecDeque;
 use std::convert::Infallible;
 use std::net::{IpAddr, SocketAddr};
+use std::pin::Pin;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use bytes::Bytes;
-use http_body_util::Full;
+use http_body_util::combinators::UnsyncBoxBody;
+use http_body_util::{BodyExt as _, Full};
 use hyper::body::Incoming;
 use hyper::service::service_fn;
 use hyper::{Request, Response, StatusCode};
@@ -15,7 +18,7 @@ use hyper_util::rt::{TokioIo, TokioTimer};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::AbortHandle;
-use tracing::{debug, info};
+use tracing::{debug, error, info};
 
 use crate::clock;
 use crate::exit::{Failure, FailureKind};
@@ -39,6 +42,52 @@ pub trait Told: Send + 'static {
     }
 }
 
+/// A future of a trait object.
+pub type BoxFuture<T> = Pin<Box<dyn Future<Output = T> + Send>>;
+/// The body of a page.
+pub type PageBody = UnsyncBoxBody<Bytes, Infallible>;
+/// Requests the status of each run loop, as `/status` has it.
+pub type Statuses = Arc<dyn Fn() -> BoxFuture<Vec<String>> + Send + Sync>;
+
+/// Pages that a program serves beside its status. They are served by a thread of their own, so that
+/// browsers do not delay samples.
+pub trait Site: Send + Sync + 'static {
+    /// Works for the pages as long as they are served.
+    fn run(self: Arc<Self>, statuses: Statuses) -> BoxFuture<()>;
+
+    /// Answers a request for another path than those of the status.
+    fn answer(
+        self: Arc<Self>,
+        request: Request<Incoming>,
+        visit: Visit,
+    ) -> BoxFuture<Response<PageBody>>;
+
+    /// Describes the pages at an address, for the log.
+    fn describe(&self, at: SocketAddr) -> String;
+}
+
+/// The connection of a request.
+#[derive(Debug, Clone)]
+pub struct Visit {
+    /// The address of the client.
+    pub peer: SocketAddr,
+    is_long: Arc<AtomicBool>,
+}
+
+impl Visit {
+    /// Keeps the connection open for longer than a request takes: for a stream of events, or for a
+    /// request that waits for other programs.
+    pub fn keep_open(&self) {
+        self.is_long.store(true, Ordering::Relaxed);
+    }
+}
+
+/// Returns a body that is complete.
+#[must_use]
+pub fn full(bytes: impl Into<Bytes>) -> PageBody {
+    Full::new(bytes.into()).boxed_unsync()
+}
+
 /// The run loops that answer requests, in the order of their spaces.
 type Ask<T> = Arc<[mpsc::Sender<oneshot::Sender<T>>]>;
 /// The receiver of a run loop: each request carries the sender for its response.
@@ -54,15 +103,16 @@ pub(crate) fn never<T>() -> Requests<T> {
 /// # Errors
 /// The address cannot be bound.
 pub async fn serve_pages<T: Told>(address: Option<SocketAddr>) -> Result<Requests<T>, Failure> {
-    let requests = serve(address, 1).await?.pop();
+    let requests = serve(address, 1, None).await?.pop();
     Ok(requests.unwrap_or_else(never))
 }
 
 /// Listens at `address` and returns the receivers of requests for `loops` run loops. Without an
-/// address there are no requests.
+/// address there are no requests. Further paths are answered by `site`.
 pub(crate) async fn serve<T: Told>(
     address: Option<SocketAddr>,
     loops: usize,
+    site: Option<Arc<dyn Site>>,
 ) -> Result<Vec<Requests<T>>, Failure> {
     let (ask, mut requests): (Vec<_>, Vec<_>) = (0..loops).map(|_| mpsc::channel(4)).unzip();
     // The caller pops from the end; responses have to be in the order of the spaces.
@@ -80,11 +130,64 @@ pub(crate) async fn serve<T: Told>(
     info!(
         "metrics at http://{at}/metrics, status at http://{at}/status, readiness at http://{at}/readyz"
     );
-    tokio::spawn(accept(listener, ask.into()));
+    let ask: Ask<T> = ask.into();
+    match site {
+        None => drop(tokio::spawn(accept(listener, Served { ask, site: None }))),
+        Some(site) => {
+            info!("{}", site.describe(at));
+            serve_apart(listener, (ask, site)).map_err(|error| {
+                Failure::new(FailureKind::Io, format!("cannot serve the page: {error}"))
+            })?;
+        }
+    }
     Ok(requests)
 }
 
-async fn accept<T: Told>(listener: TcpListener, ask: Ask<T>) {
+/// Serves the pages in a thread of their own.
+fn serve_apart<T: Told>(
+    listener: TcpListener,
+    (ask, site): (Ask<T>, Arc<dyn Site>),
+) -> std::io::Result<()> {
+    let listener = listener.into_std()?;
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()?;
+    let serve = async move {
+        let listener = match TcpListener::from_std(listener) {
+            Ok(listener) => listener,
+            Err(error) => return error!(%error, "cannot serve the page"),
+        };
+        let asked = Arc::clone(&ask);
+        let statuses: Statuses = Arc::new(move || {
+            let ask = Arc::clone(&asked);
+            Box::pin(async move { statuses(&ask).await.iter().map(T::json).collect() })
+        });
+        let work = tokio::spawn(Arc::clone(&site).run(statuses));
+        let site = Some(site);
+        accept(listener, Served { ask, site }).await;
+        work.abort();
+    };
+    let thread = std::thread::Builder::new().name("page".to_owned());
+    drop(thread.spawn(move || runtime.block_on(serve))?);
+    Ok(())
+}
+
+/// The sources of the pages.
+struct Served<T> {
+    ask: Ask<T>,
+    site: Option<Arc<dyn Site>>,
+}
+
+impl<T> Clone for Served<T> {
+    fn clone(&self) -> Self {
+        Self {
+            ask: Arc::clone(&self.ask),
+            site: self.site.clone(),
+        }
+    }
+}
+
+async fn accept<T: Told>(listener: TcpListener, served: Served<T>) {
     let mut crowd = Crowd::default();
     loop {
         let (stream, peer) = tokio::select! {
@@ -97,45 +200,80 @@ async fn accept<T: Told>(listener: TcpListener, ask: Ask<T>) {
                     continue;
                 }
             },
-            () = all_closed(&ask) => return,
+            () = all_closed(&served.ask) => return,
         };
-        let ask = Arc::clone(&ask);
+        let served = served.clone();
+        let visit = Visit {
+            peer,
+            is_long: Arc::default(),
+        };
+        let is_long = Arc::clone(&visit.is_long);
         let task = tokio::spawn(async move {
-            if tokio::time::timeout(CONNECTION_TIME, answer(stream, ask))
-                .await
-                .is_err()
-            {
-                debug!("a connection for metrics was closed for its age");
+            let is_long = Arc::clone(&visit.is_long);
+            let mut answered = Box::pin(answer(stream, served, visit));
+            let in_time = tokio::time::timeout(CONNECTION_TIME, &mut answered).await;
+            match in_time {
+                Ok(()) => {}
+                Err(_) if is_long.load(Ordering::Relaxed) => answered.await,
+                Err(_) => debug!("a connection for metrics was closed for its age"),
             }
         });
-        crowd.admit(peer.ip(), task.abort_handle());
+        crowd.admit(Connection {
+            from: peer.ip(),
+            task: task.abort_handle(),
+            is_long,
+        });
     }
 }
 
 /// The open connections, oldest first. A new connection is always admitted: at the limit the oldest
 /// connection is closed, from the same address if that address has reached its share. A request
-/// takes milliseconds, so an old connection is idle.
+/// takes milliseconds, so an old connection is idle. Long connections have limits of their own.
 #[derive(Debug, Default)]
 struct Crowd {
-    open: VecDeque<(IpAddr, AbortHandle)>,
+    open: VecDeque<Connection>,
+}
+
+/// An open connection.
+#[derive(Debug)]
+struct Connection {
+    from: IpAddr,
+    task: AbortHandle,
+    is_long: Arc<AtomicBool>,
+}
+
+impl Connection {
+    fn is_long(&self) -> bool {
+        self.is_long.load(Ordering::Relaxed)
+    }
 }
 
 impl Crowd {
-    fn admit(&mut self, address: IpAddr, task: AbortHandle) {
-        self.open.retain(|(_, task)| !task.is_finished());
-        let same = |(from, _): &&(IpAddr, AbortHandle)| *from == address;
-        let has_share = self.open.iter().filter(same).count() >= MAX_PER_ADDRESS;
-        if has_share || self.open.len() >= MAX_CONNECTIONS {
-            let oldest = self
-                .open
-                .iter()
-                .position(|(from, _)| !has_share || *from == address);
-            if let Some((from, task)) = oldest.and_then(|at| self.open.remove(at)) {
-                debug!(%from, "a connection for metrics gave way to another");
-                task.abort();
-            }
+    fn admit(&mut self, connection: Connection) {
+        self.open.retain(|open| !open.task.is_finished());
+        let from = connection.from;
+        self.make_room(from, false, (MAX_CONNECTIONS, MAX_PER_ADDRESS));
+        self.make_room(from, true, (MAX_LONG, MAX_LONG_PER_ADDRESS));
+        self.open.push_back(connection);
+    }
+
+    /// Closes the oldest connection of a kind if there is no room for another one.
+    fn make_room(&mut self, address: IpAddr, long: bool, (most, share): (usize, usize)) {
+        let of_kind = |open: &&Connection| open.is_long() == long;
+        let all = self.open.iter().filter(of_kind).count();
+        let same = self.open.iter().filter(of_kind);
+        let has_share = same.filter(|open| open.from == address).count() >= share;
+        if !has_share && all < most {
+            return;
         }
-        self.open.push_back((address, task));
+        let oldest = self
+            .open
+            .iter()
+            .position(|open| open.is_long() == long && (!has_share || open.from == address));
+        if let Some(open) = oldest.and_then(|at| self.open.remove(at)) {
+            debug!(from = %open.from, "a connection for metrics gave way to another");
+            open.task.abort();
+        }
     }
 }
 
@@ -145,14 +283,15 @@ async fn all_closed<T>(ask: &Ask<T>) {
     }
 }
 
-async fn answer<T: Told>(stream: TcpStream, ask: Ask<T>) {
+async fn answer<T: Told>(stream: TcpStream, served: Served<T>, visit: Visit) {
     let service = service_fn(|request| {
-        let ask = Arc::clone(&ask);
-        async move { Ok::<_, Infallible>(page(&request, &ask).await) }
+        let (served, visit) = (served.clone(), visit.clone());
+        async move { Ok::<_, Infallible>(page(request, served, visit).await) }
     });
     let served = hyper::server::conn::http1::Builder::new()
         .timer(TokioTimer::new())
         .header_read_timeout(HEADER_TIME)
+        .max_buf_size(LARGEST_BUFFER)
         .serve_connection(TokioIo::new(stream), service)
         .await;
     if let Err(error) = served {
@@ -160,18 +299,8 @@ async fn answer<T: Told>(stream: TcpStream, ask: Ask<T>) {
     }
 }
 
-async fn page<T: Told>(request: &Request<Incoming>, ask: &Ask<T>) -> Response<Full<Bytes>> {
-    let page = match request.uri().path() {
-        "/metrics" => Page::Metrics,
-        "/status" => Page::Status,
-        "/readyz" => Page::Ready,
-        _ => {
-            return text(
-                StatusCode::NOT_FOUND,
-                "there are /metrics, /status and /readyz here\n".into(),
-            );
-        }
-    };
+/// Returns the status of each run loop.
+async fn statuses<T>(ask: &Ask<T>) -> Vec<T> {
     let mut all = Vec::with_capacity(ask.len());
     for ask in ask.iter() {
         let (reply, status) = oneshot::channel();
@@ -181,6 +310,29 @@ async fn page<T: Told>(request: &Request<Incoming>, ask: &Ask<T>) -> Response<Fu
             all.push(status);
         }
     }
+    all
+}
+
+async fn page<T: Told>(
+    request: Request<Incoming>,
+    Served { ask, site }: Served<T>,
+    visit: Visit,
+) -> Response<PageBody> {
+    let page = match request.uri().path() {
+        "/metrics" => Page::Metrics,
+        "/status" => Page::Status,
+        "/readyz" => Page::Ready,
+        _ => {
+            return match site {
+                Some(site) => site.answer(request, visit).await,
+                None => text(
+                    StatusCode::NOT_FOUND,
+                    "there are /metrics, /status and /readyz here\n".into(),
+                ),
+            };
+        }
+    };
+    let all = statuses(&ask).await;
     if all.is_empty() || (page == Page::Ready && all.len() < ask.len()) {
         let ending = "the program is ending\n".to_owned();
         return text(StatusCode::SERVICE_UNAVAILABLE, ending);
@@ -220,14 +372,19 @@ enum Page {
     Ready,
 }
 
-fn text(status: StatusCode, body: String) -> Response<Full<Bytes>> {
-    let mut response = Response::new(Full::new(Bytes::from(body)));
+fn text(status: StatusCode, body: String) -> Response<PageBody> {
+    let mut response = Response::new(full(body));
     *response.status_mut() = status;
     response
 }
 
 const MAX_CONNECTIONS: usize = 16;
 const MAX_PER_ADDRESS: usize = 8;
+/// Limits of connections that are kept open.
+const MAX_LONG: usize = 128;
+const MAX_LONG_PER_ADDRESS: usize = 64;
+/// The limit of a request header, and of bytes that wait for a client.
+const LARGEST_BUFFER: usize = 64 << 10;
 const HEADER_TIME: Duration = Duration::from_secs(5);
 const CONNECTION_TIME: Duration = Duration::from_secs(10);
 const ACCEPT_AGAIN: Duration = Duration::from_millis(100);
@@ -246,7 +403,11 @@ mod tests {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let address = listener.local_addr().unwrap();
         let (ask, requests) = mpsc::channel(1);
-        tokio::spawn(accept(listener, [ask].into()));
+        let served = Served {
+            ask: [ask].into(),
+            site: None,
+        };
+        tokio::spawn(accept(listener, served));
         (address, requests)
     }
 

@@ -28,7 +28,8 @@ use crate::exit::{Failure, FailureKind};
 use crate::keys::{KeyRing, KeyService};
 use crate::logging;
 use crate::mapping_file::{MappingFile, NodeSetReader, Running};
-use crate::metrics::{self, Requests};
+use crate::metrics::{self, Requests, Site};
+use crate::observer::Observer;
 use crate::port::Port;
 use crate::restart;
 use crate::run::{Fixed, Shell};
@@ -93,6 +94,19 @@ pub trait Program: Parser {
     fn tell(&self, carried: &Carried<'_>) -> Option<Box<dyn Send + Sync>> {
         let _nobody = carried;
         None
+    }
+
+    /// Returns the observer of the run loops, if the program has a page.
+    fn observer(&self) -> Option<Arc<dyn Observer>> {
+        None
+    }
+
+    /// Returns the pages that the program serves beside its status.
+    ///
+    /// # Errors
+    /// The arguments for the pages contradict each other.
+    fn site(&self) -> Result<Option<Arc<dyn Site>>, Failure> {
+        Ok(None)
     }
 
     /// Returns the spaces that the program serves, without duplicates. Each has a local side, a
@@ -195,7 +209,8 @@ fn serve<P: Program>(program: P, file: MappingFile) -> Result<(), Failure> {
         let hangup = signals::listen(SignalKind::hangup())?;
         let (changed, changes) = watch::channel(running);
         service_manager::start_watchdog();
-        let mut requests = metrics::serve(arguments.flags.metrics, spaces.len()).await?;
+        let mut requests =
+            metrics::serve(arguments.flags.metrics, spaces.len(), program.site()?).await?;
         let several = spaces.len() > 1;
         let (stopping, stop) = watch::channel(false);
         let mut shells = JoinSet::new();
@@ -275,6 +290,10 @@ async fn prepare<P: Program>(
         types,
         own,
     };
+    let observer = program.observer();
+    if let Some(observer) = &observer {
+        observer.mapped(&taken);
+    }
     let port = program.start(context).await?;
     let application = port.application();
     let application = application.unwrap_or_else(|| plain(P::NAME, own));
@@ -309,6 +328,7 @@ async fn prepare<P: Program>(
         awaited: PeerWatch::new(now().monotonic),
         busy: BusyPoll::new(Duration::from_micros(arguments.flags.busy_poll.into())),
         dry_run: arguments.flags.dry_run,
+        observer,
         _told: told,
     })
 }

@@ -27,6 +27,7 @@ use crate::exit::{Failure, FailureKind};
 use crate::keys::{self, KeyRing, NewKeys};
 use crate::mapping_file::Running;
 use crate::metrics::{Requests, Told as _};
+use crate::observer::Observer;
 use crate::policy::NO_SUBSCRIBER;
 use crate::port::{Delivery, Port, PortEvent};
 use crate::status::{Interfaces, Readiness, Status};
@@ -58,6 +59,7 @@ pub(crate) struct Shell<P> {
     pub(crate) awaited: PeerWatch,
     pub(crate) busy: BusyPoll,
     pub(crate) dry_run: bool,
+    pub(crate) observer: Option<Arc<dyn Observer>>,
     /// Announces the space outside the group until it is dropped.
     pub(crate) _told: Option<Box<dyn Send + Sync>>,
 }
@@ -169,6 +171,7 @@ impl<P: Port> Shell<P> {
                     self.look_at_held()?;
                     self.port.counted(&self.router);
                     self.look_for_peers();
+                    self.send_probes();
                 }
                 Ok(()) = self.changes.changed() => self.reload(),
                 Some(NewKeys { group, delivery }) = self.keys.next() => {
@@ -330,6 +333,7 @@ impl<P: Port> Shell<P> {
             return;
         }
         self.fixed.taken = Arc::clone(&mapping);
+        self.observe(|observer| observer.mapped(&mapping));
         let mapping = self.keys.applied(mapping);
         self.router.replace_mapping(Arc::clone(&mapping), now());
         self.keys.follow(&mapping);
@@ -362,6 +366,7 @@ impl<P: Port> Shell<P> {
                 let datagram = buffer.get(..len).unwrap_or_default();
                 let now = now();
                 self.busy.arrived(now.monotonic);
+                self.observe(|observer| observer.datagram(datagram, from));
                 self.router.handle_datagram(datagram, from, now);
             }
             // Probably an ICMP error for a unicast peer; the socket stays usable.
@@ -371,6 +376,7 @@ impl<P: Port> Shell<P> {
 
     /// Handles an event of the port; fails when the port cannot continue.
     fn port_event(&mut self, event: PortEvent) -> Result<(), Failure> {
+        self.observe(|observer| observer.event(&event));
         match event {
             PortEvent::Sample {
                 topic,
@@ -507,7 +513,30 @@ impl<P: Port> Shell<P> {
         if let Some(reason) = dropped {
             debug!(%topic, %reason, "its writer is heard, but its values are dropped");
         }
+        self.observe(|observer| observer.silent(topic, silent));
         self.port.silent(topic, silent);
+    }
+
+    /// Passes an event to the observer, if there is one.
+    fn observe(&self, note: impl FnOnce(&dyn Observer)) {
+        if let Some(observer) = &self.observer {
+            note(observer.as_ref());
+        }
+    }
+
+    /// Sends the probes of the observer.
+    fn send_probes(&self) {
+        let Some(observer) = &self.observer else {
+            return;
+        };
+        for _ in 0..MOST_PROBES {
+            let Some(probe) = observer.probe() else {
+                return;
+            };
+            if let Err(error) = self.send(&probe) {
+                debug!(%error, "a probe was not sent");
+            }
+        }
     }
 
     fn send(&self, datagram: &[u8]) -> Result<(), SendError> {
@@ -541,6 +570,7 @@ impl<P: Port> Shell<P> {
             kept,
             lasting,
         };
+        self.observe(|observer| observer.received(&sample));
         match self.port.publish(sample) {
             Ok(()) => {
                 self.router.published(topic, arrived, now());
@@ -599,6 +629,8 @@ fn tell(notice: &Notice) {
 const DRAINED_AT_ONCE: usize = 64;
 /// The maximal number of datagrams, or of events of the port, handled in a row.
 const TAKEN_AT_ONCE: usize = 32;
+/// The maximal number of probes of the observer in a second.
+const MOST_PROBES: usize = 8;
 /// How long the end of the program waits for pending cancellations.
 const PENDING_AT_END: Duration = Duration::from_secs(5);
 /// A deadline for when there is nothing to wait for.

@@ -110,11 +110,13 @@ impl<P: Port> Shell<P> {
 
     fn call_known(&mut self, topic: TopicId, description: &Arc<CallDescription>) {
         debug!(%topic, name = description.name, "call offered by another program");
+        self.observe(|observer| observer.call_known(topic, description));
         self.port.call_known(topic, description);
     }
 
     fn call_gone(&mut self, topic: TopicId) {
         debug!(%topic, "call withdrawn by its program");
+        self.observe(|observer| observer.call_gone(topic));
         self.port.call_gone(topic);
     }
 
