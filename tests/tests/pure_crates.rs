@@ -134,6 +134,23 @@ fn the_server_knows_no_ros_library() {
 }
 
 #[test]
+fn the_page_knows_no_ros_and_opc_ua_library() {
+    does_not_reach(
+        "supervisor",
+        &[
+            "tcpros",
+            "ros2-client",
+            "rustdds",
+            "rosrust*",
+            "async-opcua*",
+            "plant-opcua",
+            "ua-server",
+            "ua-space",
+        ],
+    );
+}
+
+#[test]
 fn what_the_plant_thinks_with_reaches_no_io_and_knows_no_space() {
     for package in [
         "build-info",

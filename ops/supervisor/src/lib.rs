@@ -1,0 +1,31 @@
+//! The page of the cell: programs, values, topics, skills and processes in a browser.
+//!
+//! A program gives a [`Page`] to its run loop as observer and as site. The page learns values and
+//! calls from the run loop, and the state of programs from their `/status`. It is served beside
+//! that status, without files: HTML, styles and scripts are part of the program.
+//!
+//! Reading order: `board` (the last value of each topic), `announced` (names and units),
+//! `program` (rows of programs), `skill` (tiles of skills), `view` (what a browser is sent),
+//! `stream` (server-sent events), `fetch` (the status of other programs), `page` (state and
+//! events), `session` (signed-in users), `encode` (forms), `operations` (commands), `proxy` and
+//! `site` (requests).
+
+mod announced;
+mod board;
+mod encode;
+mod fetch;
+mod operations;
+mod page;
+mod program;
+mod proxy;
+mod session;
+mod site;
+mod skill;
+mod stream;
+mod value;
+mod view;
+
+pub use fetch::{StatusUrl, StatusUrlError};
+pub use operations::{OperationFault, Operations};
+pub use page::Page;
+pub use proxy::{ProxyUrl, ProxyUrlError};

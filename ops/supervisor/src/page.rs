@@ -1,0 +1,279 @@
+//! The state of the page, and the events of the run loop.
+
+use std::net::SocketAddr;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::time::{Duration, Instant};
+
+use bridge_node::{CallDescription, Delivery, Observer, PortEvent, Statuses, now};
+use mappings::{Mapping, SpaceId, TopicId};
+use serde_json::Value;
+use tokio::time::{MissedTickBehavior, interval};
+use uadp::discovery::{List, Probe};
+use uadp::{PublisherId, SecurityHeader};
+
+use crate::announced::{self, Description};
+use crate::board::{At, Board, Sample};
+use crate::fetch::StatusUrl;
+use crate::operations::Operations;
+use crate::program::Program;
+use crate::proxy::ProxyUrl;
+use crate::session::Sessions;
+use crate::view::Viewer;
+
+/// The page of a program.
+pub struct Page {
+    /// The name of the program that serves it.
+    pub(crate) program: &'static str,
+    /// The reverse proxy through which browsers reach the page, if there is one.
+    pub(crate) proxy: Option<ProxyUrl>,
+    /// The users and the commands of the program, if it has any.
+    pub(crate) operations: OnceLock<Arc<dyn Operations>>,
+    pub(crate) sessions: Mutex<Sessions>,
+    board: Mutex<Board>,
+    started: Instant,
+    /// The locations of the status of other programs.
+    others: Vec<StatusUrl>,
+    viewers: AtomicUsize,
+}
+
+impl std::fmt::Debug for Page {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Page")
+            .field("program", &self.program)
+            .finish_non_exhaustive()
+    }
+}
+
+impl Page {
+    /// Creates the page of a program. `others` are the locations of the status of other programs.
+    /// Browsers reach the page on loopback, and through `proxy`.
+    #[must_use]
+    pub fn new(
+        program: &'static str,
+        others: Vec<StatusUrl>,
+        proxy: Option<ProxyUrl>,
+    ) -> Arc<Self> {
+        Arc::new(Self {
+            program,
+            proxy,
+            operations: OnceLock::new(),
+            sessions: Mutex::default(),
+            board: Mutex::default(),
+            started: now().monotonic,
+            others,
+            viewers: AtomicUsize::new(0),
+        })
+    }
+
+    /// Lets signed-in users operate the cell.
+    pub fn operate(&self, operations: Arc<dyn Operations>) {
+        // A program sets its users once.
+        let _first = self.operations.set(operations);
+    }
+
+    pub(crate) fn sessions(&self) -> MutexGuard<'_, Sessions> {
+        self.sessions.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    pub(crate) fn board(&self) -> MutexGuard<'_, Board> {
+        self.board.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    pub(crate) fn at(&self) -> At {
+        let now = now();
+        At {
+            since: now.monotonic.saturating_duration_since(self.started),
+            utc: now.utc,
+        }
+    }
+
+    /// Counts a browser.
+    pub(crate) fn came(&self) {
+        self.viewers.fetch_add(1, Ordering::Relaxed);
+    }
+
+    /// Counts a browser that has left.
+    pub(crate) fn left(&self) {
+        self.viewers.fetch_sub(1, Ordering::Relaxed);
+    }
+
+    /// Returns the next event of a browser.
+    pub(crate) fn next_event(&self, viewer: &mut Viewer) -> Option<String> {
+        let now = self.at().since;
+        viewer.next(&mut self.board(), now)
+    }
+
+    /// Reads the status of all programs while browsers are present.
+    pub(crate) async fn follow(self: Arc<Self>, statuses: Statuses) {
+        let mut ticks = interval(LOOK);
+        ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        let mut idle = 0_u32;
+        loop {
+            ticks.tick().await;
+            idle = match self.viewers.load(Ordering::Relaxed) {
+                0 => idle.saturating_add(1),
+                _ => 0,
+            };
+            // The status of the first browser is there when it comes.
+            if idle > 0 && idle % IDLE_LOOKS != 1 {
+                continue;
+            }
+            let mut programs = own(statuses().await);
+            for url in &self.others {
+                programs.extend(other(url, url.fetch().await));
+            }
+            self.board().set_programs(programs);
+        }
+    }
+}
+
+impl Observer for Page {
+    fn mapped(&self, mapping: &Arc<Mapping>) {
+        self.board().map(mapping);
+    }
+
+    fn datagram(&self, datagram: &[u8], from: SocketAddr) {
+        if let Some((topic, description)) = announced::read(datagram, from) {
+            self.board().describe(topic, description);
+        }
+    }
+
+    fn received(&self, sample: &Delivery) {
+        let at = self.at();
+        let sample = Sample {
+            topic: sample.topic,
+            block: &sample.payload,
+            source: sample.source,
+            status: sample.status,
+        };
+        self.board().take(sample, at);
+    }
+
+    #[expect(
+        clippy::wildcard_enum_match_arm,
+        reason = "the other events are not shown"
+    )]
+    fn event(&self, event: &PortEvent) {
+        let (topic, block, source, status) = match event {
+            PortEvent::Sample {
+                topic,
+                payload,
+                received,
+                ..
+            } => (*topic, payload, *received, 0),
+            PortEvent::Qualified {
+                topic,
+                payload,
+                taken,
+                status,
+            } => (*topic, payload, *taken, *status),
+            PortEvent::Described { topic, description } => {
+                let type_name = description.message_type.as_ref();
+                let shown = Description {
+                    name: description.name.clone(),
+                    type_name: type_name.map_or_else(String::new, ToString::to_string),
+                    about: description.about.clone(),
+                    unit: String::new(),
+                    fields: description
+                        .fields
+                        .iter()
+                        .map(|leaf| leaf.path.clone())
+                        .collect(),
+                    from: None,
+                };
+                return self.board().describe(*topic, shown);
+            }
+            PortEvent::Offer { topic, offered } => {
+                let description = Arc::new(offered.description.clone());
+                return self.board().offer(*topic, &description, true);
+            }
+            PortEvent::Withdrawn { topic } => return self.board().withdraw(*topic),
+            _ => return,
+        };
+        let at = self.at();
+        let sample = Sample {
+            topic,
+            block,
+            source: Some(source),
+            status,
+        };
+        self.board().take(sample, at);
+    }
+
+    fn silent(&self, topic: TopicId, is_silent: bool) {
+        self.board().set_silent(topic, is_silent);
+    }
+
+    fn call_known(&self, topic: TopicId, description: &Arc<CallDescription>) {
+        self.board().offer(topic, description, false);
+    }
+
+    fn call_gone(&self, topic: TopicId) {
+        self.board().withdraw(topic);
+    }
+
+    fn probe(&self) -> Option<Vec<u8>> {
+        let topics = self.board().nameless();
+        let space = topics.first()?.space;
+        probe(space, topics.iter().filter(|topic| topic.space == space))
+    }
+}
+
+/// Returns a probe for the descriptions of topics of a space.
+fn probe<'t>(space: SpaceId, topics: impl Iterator<Item = &'t TopicId>) -> Option<Vec<u8>> {
+    let ids: Vec<u16> = topics.map(|topic| topic.identifier.get()).collect();
+    let mut datagram = Vec::new();
+    let publisher = Some(PublisherId::UInt16(space.into()));
+    let probe = Probe::DataSetMetaData(List::new(&ids));
+    let encoded = probe.encode(publisher, SecurityHeader::NONE, &mut datagram);
+    encoded.ok().map(|_| datagram)
+}
+
+/// Returns the status of each run loop of this program.
+fn own(statuses: Vec<String>) -> Vec<Program> {
+    let statuses = statuses.into_iter();
+    statuses
+        .map(|text| Program {
+            source: "this program".to_owned(),
+            status: serde_json::from_str(&text).map_err(|error| error.to_string()),
+        })
+        .collect()
+}
+
+/// Returns the status of another program; a program with several spaces has several.
+fn other(url: &StatusUrl, status: Result<Value, String>) -> Vec<Program> {
+    let source = url.to_string();
+    let each = match status {
+        Ok(Value::Array(all)) => all.into_iter().map(Ok).collect(),
+        other => vec![other],
+    };
+    each.into_iter()
+        .map(|status| Program {
+            source: source.clone(),
+            status,
+        })
+        .collect()
+}
+
+/// The period in which the status of programs is read.
+const LOOK: Duration = Duration::from_secs(1);
+/// Without browsers, the status is read once in this number of periods.
+const IDLE_LOOKS: u32 = 10;
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    #[test]
+    fn a_program_with_several_spaces_is_several_rows() {
+        let url: StatusUrl = "127.0.0.1:9100".parse().unwrap();
+        let two = other(&url, Ok(json!([{ "space": 2 }, { "space": 3 }])));
+        assert_eq!(two.len(), 2);
+        assert_eq!(two[1].space(), Some(3));
+        assert!(!other(&url, Err("gone".to_owned()))[0].is_ready());
+        assert_eq!(own(vec!["{}".to_owned(), "?".to_owned()]).len(), 2);
+    }
+}

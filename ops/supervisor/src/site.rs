@@ -1,0 +1,691 @@
+//! The requests of browsers.
+
+use std::fs::File;
+use std::io::Read as _;
+use std::net::{IpAddr, SocketAddr};
+use std::sync::Arc;
+
+use bridge_node::{BoxFuture, PageBody, Site, Statuses, Visit, full};
+use bytes::Bytes;
+use http_body_util::{BodyExt as _, Limited};
+use hyper::body::Incoming;
+use hyper::header::{
+    ALLOW, CACHE_CONTROL, CONTENT_SECURITY_POLICY, CONTENT_TYPE, COOKIE, HOST, HeaderMap,
+    HeaderName, HeaderValue, ORIGIN, REFERRER_POLICY, SET_COOKIE, X_CONTENT_TYPE_OPTIONS,
+    X_FRAME_OPTIONS,
+};
+use hyper::{Method, Request, Response, StatusCode};
+use mappings::TopicId;
+use serde::Deserialize;
+use serde_json::{Map, Value, json};
+use subtle::ConstantTimeEq as _;
+use tracing::{info, warn};
+
+use crate::encode;
+use crate::operations::{OperationFault, Operations};
+use crate::page::Page;
+use crate::proxy::ProxyUrl;
+use crate::session::{Session, cookie};
+use crate::stream::Events;
+use crate::value;
+use crate::view::View;
+
+/// The origin of a request: its Host, and its session.
+struct Browser {
+    host: String,
+    session: Option<Session>,
+    token: String,
+}
+
+/// The body of a request to sign in.
+#[derive(Deserialize)]
+struct SignIn {
+    user: String,
+    password: String,
+}
+
+/// The body of a request for a call.
+#[derive(Deserialize)]
+struct Call {
+    topic: String,
+    #[serde(default)]
+    fields: Map<String, Value>,
+}
+
+/// The body of a request to write a value.
+#[derive(Deserialize)]
+struct Write {
+    topic: String,
+    value: Value,
+}
+
+impl Site for Page {
+    fn run(self: Arc<Self>, statuses: Statuses) -> BoxFuture<()> {
+        Box::pin(self.follow(statuses))
+    }
+
+    fn answer(
+        self: Arc<Self>,
+        request: Request<Incoming>,
+        visit: Visit,
+    ) -> BoxFuture<Response<PageBody>> {
+        Box::pin(async move {
+            match self.respond(request, &visit).await {
+                Ok(response) => response,
+                Err(Refusal(status, why)) => refused(status, &why),
+            }
+        })
+    }
+
+    fn describe(&self, at: SocketAddr) -> String {
+        let here = match at.ip().is_loopback() {
+            true => format!("page at http://{at}/"),
+            false => format!(
+                "page at http://127.0.0.1:{}/, for browsers on this host only",
+                at.port()
+            ),
+        };
+        match &self.proxy {
+            Some(proxy) => format!("{here}, and at {proxy}/ for users who sign in"),
+            None => here,
+        }
+    }
+}
+
+/// The status and the reason of a refused request.
+struct Refusal(StatusCode, String);
+
+impl Refusal {
+    fn new(status: StatusCode, why: impl Into<String>) -> Self {
+        Self(status, why.into())
+    }
+}
+
+impl Page {
+    async fn respond(
+        self: Arc<Self>,
+        request: Request<Incoming>,
+        visit: &Visit,
+    ) -> Result<Response<PageBody>, Refusal> {
+        let host = self.host(request.headers(), visit.peer)?;
+        let path = request.uri().path().to_owned();
+        if request.method() == Method::POST {
+            check_origin(request.headers(), &host, self.proxy.as_ref())?;
+            let browser = self.browser(request.headers(), host);
+            return self.change(&path, request, browser, visit).await;
+        }
+        if request.method() != Method::GET {
+            let mut response = refused(StatusCode::METHOD_NOT_ALLOWED, "GET or POST is wanted");
+            let allowed = HeaderValue::from_static("GET, POST");
+            response.headers_mut().insert(ALLOW, allowed);
+            return Ok(response);
+        }
+        if let Some((_, media, content)) = FILES.iter().find(|(name, ..)| *name == path) {
+            return Ok(with_headers(media, full(content.as_bytes())));
+        }
+        let browser = self.browser(request.headers(), host);
+        match path.as_str() {
+            "/session" => Ok(json_page(&self.told(browser.session.as_ref()))),
+            "/events" => {
+                self.check_reader(&browser)?;
+                let query = request.uri().query().unwrap_or_default();
+                let view =
+                    View::parse(query).map_err(|why| Refusal::new(StatusCode::BAD_REQUEST, why))?;
+                visit.keep_open();
+                let events = Events::new(self, view);
+                Ok(with_headers("text/event-stream", events.boxed_unsync()))
+            }
+            _ => Err(Refusal::new(
+                StatusCode::NOT_FOUND,
+                "there is no such page; the start is /",
+            )),
+        }
+    }
+
+    /// Handles a request that changes something.
+    async fn change(
+        self: Arc<Self>,
+        path: &str,
+        request: Request<Incoming>,
+        browser: Browser,
+        visit: &Visit,
+    ) -> Result<Response<PageBody>, Refusal> {
+        let operations = self.operations.get().cloned().ok_or_else(|| {
+            let why = format!("{} has no users: the page is read-only", self.program);
+            Refusal::new(StatusCode::FORBIDDEN, why)
+        })?;
+        let token = request.headers().get("x-csrf-token");
+        let token = token
+            .and_then(|token| token.to_str().ok())
+            .unwrap_or_default();
+        let token = token.to_owned();
+        visit.keep_open();
+        if path == "/sign-in" {
+            return self
+                .sign_in(&operations, &browser, body(request).await?)
+                .await;
+        }
+        let session = browser
+            .session
+            .as_ref()
+            .ok_or_else(|| Refusal::new(StatusCode::UNAUTHORIZED, "sign in first"))?;
+        let is_own: bool = session.csrf.as_bytes().ct_eq(token.as_bytes()).into();
+        if !is_own {
+            return Err(Refusal::new(
+                StatusCode::FORBIDDEN,
+                "the request does not come from the page: load it again",
+            ));
+        }
+        match path {
+            "/sign-out" => {
+                self.sessions().close(&browser.token);
+                info!(user = session.user, "signed out of the page");
+                let mut response = json_page(&self.told(None));
+                let expired = self.cookie(&browser.host, "", 0);
+                set_cookie(&mut response, &expired);
+                Ok(response)
+            }
+            "/call" => self.call(&operations, session, body(request).await?).await,
+            "/write" => {
+                let written = body(request).await?;
+                self.write(&operations, session, written).await
+            }
+            _ => Err(Refusal::new(
+                StatusCode::NOT_FOUND,
+                "there is no such request",
+            )),
+        }
+    }
+
+    async fn sign_in(
+        &self,
+        operations: &Arc<dyn Operations>,
+        browser: &Browser,
+        SignIn { user, password }: SignIn,
+    ) -> Result<Response<PageBody>, Refusal> {
+        let now = self.at().since;
+        let may_try = self.sessions().may_try(&user, now);
+        may_try.map_err(|why| Refusal::new(StatusCode::TOO_MANY_REQUESTS, why))?;
+        // Counted before the check, so that attempts at the same time are limited too.
+        self.sessions().fail(&user, now);
+        let shown = value::cut(&user, 64);
+        if !operations.sign_in(user.clone(), password).await {
+            warn!(user = shown, "refused to sign in on the page");
+            return Err(Refusal::new(
+                StatusCode::FORBIDDEN,
+                "no such user, or another password",
+            ));
+        }
+        let fault = |error| {
+            warn!("cannot read {RANDOM}: {error}");
+            Refusal::new(StatusCode::INTERNAL_SERVER_ERROR, "no random token")
+        };
+        let (token, csrf) = (random().map_err(fault)?, random().map_err(fault)?);
+        let session = {
+            let mut sessions = self.sessions();
+            sessions.succeed(&user);
+            sessions.open(&user, [token.clone(), csrf], now)
+        };
+        info!(user = shown, "signed in on the page");
+        let mut response = json_page(&self.told(Some(&session)));
+        let made = self.cookie(&browser.host, &token, 24 * 3600);
+        set_cookie(&mut response, &made);
+        Ok(response)
+    }
+
+    async fn call(
+        &self,
+        operations: &Arc<dyn Operations>,
+        session: &Session,
+        Call { topic, fields }: Call,
+    ) -> Result<Response<PageBody>, Refusal> {
+        let topic = parse_topic(&topic)?;
+        let known = self.board().calls.get(&topic).cloned();
+        let (call, is_own) = known.ok_or_else(|| {
+            let why = format!("the call {topic} has no executor");
+            Refusal::new(StatusCode::NOT_FOUND, why)
+        })?;
+        if is_own {
+            let why = format!(
+                "{} executes {topic} itself: call it by OPC UA",
+                self.program
+            );
+            return Err(Refusal::new(StatusCode::CONFLICT, why));
+        }
+        let request = encode::request(&call, &fields).map_err(bad_request)?;
+        let user = session.user.clone();
+        let answered = operations.call(user.clone(), topic, request.into()).await;
+        let outcome = outcome(answered.as_ref().err());
+        info!(user, %topic, call = call.name, outcome, "called from the page");
+        let response = answered.map_err(|fault| refusal(fault, &user))?;
+        let names = call.response.iter().map(|field| field.name.clone());
+        let names: Vec<String> = names.collect();
+        let shown = value::fields(&response, &names).unwrap_or_default();
+        Ok(json_page(&json!({ "outcome": outcome, "response": shown })))
+    }
+
+    async fn write(
+        &self,
+        operations: &Arc<dyn Operations>,
+        session: &Session,
+        Write { topic, value }: Write,
+    ) -> Result<Response<PageBody>, Refusal> {
+        let topic = parse_topic(&topic)?;
+        let writable = {
+            let board = self.board();
+            let entry = board.topics.get(&topic);
+            entry.and_then(|entry| entry.writable.clone())
+        };
+        let writable = writable.ok_or_else(|| {
+            let why = format!("{topic} is not written on the page: use an OPC UA client");
+            Refusal::new(StatusCode::CONFLICT, why)
+        })?;
+        let (node, field) = &*writable;
+        let block = encode::value(field, &value).map_err(bad_request)?;
+        let user = session.user.clone();
+        let written = operations.write(user.clone(), node, block.into()).await;
+        let outcome = outcome(written.as_ref().err());
+        info!(user, %topic, %value, outcome, "written from the page");
+        written.map_err(|fault| refusal(fault, &user))?;
+        Ok(json_page(&json!({ "outcome": outcome })))
+    }
+
+    /// Returns the session for the browser.
+    fn told(&self, session: Option<&Session>) -> Value {
+        let operations = self.operations.get();
+        let may_sign_in = operations.is_some_and(|operations| operations.has_users());
+        let user = session.and_then(|session| {
+            let roles = operations?.roles(&session.user)?;
+            Some((session, roles))
+        });
+        let may_operate = user.as_ref().is_some_and(|(session, _)| {
+            operations.is_some_and(|operations| operations.may_operate(&session.user))
+        });
+        json!({
+            "program": self.program,
+            "version": build_info::version(),
+            "may_sign_in": may_sign_in,
+            "must_sign_in": self.proxy.is_some() && user.is_none(),
+            "may_operate": may_operate,
+            "user": user.as_ref().map(|(session, _)| &session.user),
+            "roles": user.as_ref().map(|(_, roles)| roles),
+            "csrf": user.as_ref().map(|(session, _)| &session.csrf),
+        })
+    }
+
+    /// Checks that a request comes from this host and was meant for it, because a page of another
+    /// site can reach loopback by a name that resolves to it. Returns the Host.
+    fn host(&self, headers: &HeaderMap, peer: SocketAddr) -> Result<String, Refusal> {
+        if !peer.ip().to_canonical().is_loopback() {
+            return Err(Refusal::new(
+                StatusCode::FORBIDDEN,
+                "the page is for browsers on this host: use an SSH tunnel, or a reverse proxy with --page-proxy",
+            ));
+        }
+        let host = headers.get(HOST).and_then(|host| host.to_str().ok());
+        let host = host.unwrap_or_default();
+        let is_proxy = self.proxy.as_ref().is_some_and(|proxy| proxy.is_host(host));
+        if is_proxy || is_loopback_name(host) {
+            return Ok(host.to_owned());
+        }
+        Err(Refusal::new(
+            StatusCode::MISDIRECTED_REQUEST,
+            "the page is served on loopback, by 127.0.0.1, [::1] or localhost",
+        ))
+    }
+
+    fn browser(&self, headers: &HeaderMap, host: String) -> Browser {
+        let name = self.cookie_name(&host);
+        let cookies = headers.get(COOKIE).and_then(|value| value.to_str().ok());
+        let token = cookies.and_then(|cookies| cookie(cookies, &name));
+        let token = token.unwrap_or_default().to_owned();
+        let now = self.at().since;
+        let session = self.sessions().find(&token, now);
+        // A removed user has no session.
+        let session = session.filter(|session| {
+            let operations = self.operations.get();
+            operations.is_some_and(|operations| operations.roles(&session.user).is_some())
+        });
+        Browser {
+            host,
+            session,
+            token,
+        }
+    }
+
+    /// Checks that a browser may read: on loopback without a proxy every browser may. Behind a
+    /// proxy the Host does not show where a request comes from, so each user signs in.
+    fn check_reader(&self, browser: &Browser) -> Result<(), Refusal> {
+        match self.proxy.is_none() || browser.session.is_some() {
+            true => Ok(()),
+            false => Err(Refusal::new(StatusCode::UNAUTHORIZED, "sign in first")),
+        }
+    }
+
+    /// Returns the name of the session cookie. Browsers send cookies of loopback to every port, and
+    /// do not accept secure cookies over plain HTTP everywhere, so the name has the port there.
+    fn cookie_name(&self, host: &str) -> String {
+        if self.proxy.is_some() {
+            return "__Host-ua-session".to_owned();
+        }
+        let port = host.rsplit_once(':').map_or("80", |(_, port)| port);
+        format!("ua-session-{port}")
+    }
+
+    fn cookie(&self, host: &str, token: &str, max_age: u32) -> String {
+        let name = self.cookie_name(host);
+        let secure = match self.proxy {
+            Some(_) => "; Secure",
+            None => "",
+        };
+        format!("{name}={token}; Path=/; Max-Age={max_age}; HttpOnly; SameSite=Strict{secure}")
+    }
+}
+
+fn parse_topic(text: &str) -> Result<TopicId, Refusal> {
+    text.parse()
+        .map_err(|_| bad_request("a topic is wanted, as ua_0_7_105".to_owned()))
+}
+
+fn bad_request(why: String) -> Refusal {
+    Refusal(StatusCode::BAD_REQUEST, why)
+}
+
+/// Returns the outcome of a command for the log.
+fn outcome(fault: Option<&OperationFault>) -> &'static str {
+    match fault {
+        None => "done",
+        Some(OperationFault::Denied) => "denied",
+        Some(OperationFault::Refused(_)) => "refused",
+        Some(OperationFault::Failed(_)) => "failed",
+        Some(OperationFault::Unknown(_)) => "unknown",
+    }
+}
+
+fn refusal(fault: OperationFault, user: &str) -> Refusal {
+    match fault {
+        OperationFault::Denied => {
+            let why = format!("{user} has no role that permits it");
+            Refusal(StatusCode::FORBIDDEN, why)
+        }
+        OperationFault::Refused(why) => Refusal(StatusCode::CONFLICT, why),
+        OperationFault::Failed(why) => Refusal(StatusCode::BAD_GATEWAY, why),
+        OperationFault::Unknown(why) => {
+            let why = format!("the outcome is unknown, it may have been executed: {why}");
+            Refusal(StatusCode::GATEWAY_TIMEOUT, why)
+        }
+    }
+}
+
+/// Refuses requests that the page of another site has sent.
+fn check_origin(headers: &HeaderMap, host: &str, proxy: Option<&ProxyUrl>) -> Result<(), Refusal> {
+    let text = |name| {
+        headers
+            .get(name)
+            .and_then(|value: &HeaderValue| value.to_str().ok())
+    };
+    let site = text(HeaderName::from_static("sec-fetch-site"));
+    let origin = text(ORIGIN);
+    let is_own = origin.is_none_or(|origin| match proxy {
+        Some(proxy) => origin == proxy.to_string(),
+        None => origin == format!("http://{host}"),
+    });
+    let is_json = text(CONTENT_TYPE).is_some_and(|media| media.starts_with("application/json"));
+    if site.is_some_and(|site| site != "same-origin") || !is_own || !is_json {
+        return Err(Refusal::new(
+            StatusCode::FORBIDDEN,
+            "only the page itself may send this, as application/json",
+        ));
+    }
+    Ok(())
+}
+
+async fn body<T: for<'d> Deserialize<'d>>(request: Request<Incoming>) -> Result<T, Refusal> {
+    let limited = Limited::new(request.into_body(), LARGEST_BODY);
+    let collected = tokio::time::timeout(BODY_TIME, limited.collect()).await;
+    let bytes: Bytes = match collected {
+        Ok(Ok(body)) => body.to_bytes(),
+        Ok(Err(error)) => {
+            return Err(Refusal::new(
+                StatusCode::PAYLOAD_TOO_LARGE,
+                error.to_string(),
+            ));
+        }
+        Err(_) => {
+            return Err(Refusal::new(
+                StatusCode::REQUEST_TIMEOUT,
+                "the request has not arrived",
+            ));
+        }
+    };
+    serde_json::from_slice(&bytes)
+        .map_err(|error| Refusal::new(StatusCode::BAD_REQUEST, error.to_string()))
+}
+
+fn is_loopback_name(host: &str) -> bool {
+    let name = match host.rsplit_once(':') {
+        Some((name, port)) if port.bytes().all(|byte| byte.is_ascii_digit()) => name,
+        Some(_) | None => host,
+    };
+    let name = name.trim_start_matches('[').trim_end_matches(']');
+    name == "localhost"
+        || name
+            .parse::<IpAddr>()
+            .is_ok_and(|address| address.is_loopback())
+}
+
+/// Returns a random token in hexadecimal.
+fn random() -> std::io::Result<String> {
+    let mut bytes = [0; 32];
+    File::open(RANDOM)?.read_exact(&mut bytes)?;
+    Ok(bytes.iter().map(|byte| format!("{byte:02x}")).collect())
+}
+
+fn set_cookie(response: &mut Response<PageBody>, cookie: &str) {
+    // A token has hexadecimal digits only, so the header is valid.
+    if let Ok(value) = HeaderValue::from_str(cookie) {
+        response.headers_mut().insert(SET_COOKIE, value);
+    }
+}
+
+fn refused(status: StatusCode, why: &str) -> Response<PageBody> {
+    let mut response = json_page(&json!({ "error": why }));
+    *response.status_mut() = status;
+    response
+}
+
+fn json_page(page: &Value) -> Response<PageBody> {
+    with_headers("application/json", full(page.to_string()))
+}
+
+/// Returns a response with the headers that each page has.
+fn with_headers(media: &'static str, body: PageBody) -> Response<PageBody> {
+    let mut response = Response::new(body);
+    let headers = response.headers_mut();
+    headers.insert(CONTENT_TYPE, HeaderValue::from_static(media));
+    for (name, value) in HEADERS {
+        headers.insert(name, HeaderValue::from_static(value));
+    }
+    response
+}
+
+const HEADERS: [(HeaderName, &str); 6] = [
+    (
+        CONTENT_SECURITY_POLICY,
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; \
+         form-action 'self'; frame-ancestors 'none'; base-uri 'none'",
+    ),
+    (X_CONTENT_TYPE_OPTIONS, "nosniff"),
+    (X_FRAME_OPTIONS, "DENY"),
+    (REFERRER_POLICY, "no-referrer"),
+    (CACHE_CONTROL, "no-store"),
+    (
+        HeaderName::from_static("cross-origin-resource-policy"),
+        "same-origin",
+    ),
+];
+
+const SCRIPT: &str = "text/javascript; charset=utf-8";
+
+/// The files of the page by their paths.
+const FILES: [(&str, &str, &str); 12] = [
+    (
+        "/",
+        "text/html; charset=utf-8",
+        include_str!("../page/index.html"),
+    ),
+    (
+        "/page.css",
+        "text/css; charset=utf-8",
+        include_str!("../page/page.css"),
+    ),
+    (
+        "/icon.svg",
+        "image/svg+xml",
+        include_str!("../page/icon.svg"),
+    ),
+    ("/page.js", SCRIPT, include_str!("../page/page.js")),
+    ("/dom.js", SCRIPT, include_str!("../page/dom.js")),
+    ("/session.js", SCRIPT, include_str!("../page/session.js")),
+    ("/programs.js", SCRIPT, include_str!("../page/programs.js")),
+    ("/values.js", SCRIPT, include_str!("../page/values.js")),
+    ("/topic.js", SCRIPT, include_str!("../page/topic.js")),
+    ("/map.js", SCRIPT, include_str!("../page/map.js")),
+    ("/skills.js", SCRIPT, include_str!("../page/skills.js")),
+    (
+        "/processes.js",
+        SCRIPT,
+        include_str!("../page/processes.js"),
+    ),
+];
+
+const RANDOM: &str = "/dev/urandom";
+const LARGEST_BODY: usize = 64 << 10;
+const BODY_TIME: std::time::Duration = std::time::Duration::from_secs(5);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn headers(pairs: &[(&'static str, &'static str)]) -> HeaderMap {
+        let pairs = pairs.iter();
+        pairs
+            .map(|(name, value)| {
+                (
+                    HeaderName::from_static(name),
+                    HeaderValue::from_static(value),
+                )
+            })
+            .collect()
+    }
+
+    fn is_from_page(pairs: &[(&'static str, &'static str)]) -> bool {
+        check_origin(&headers(pairs), "localhost:9100", None).is_ok()
+    }
+
+    #[test]
+    fn only_names_of_loopback_are_answered() {
+        for host in [
+            "localhost",
+            "localhost:80",
+            "127.0.0.1:9100",
+            "[::1]:9100",
+            "127.9.9.9",
+        ] {
+            assert!(is_loopback_name(host), "{host}");
+        }
+        for host in [
+            "evil.example",
+            "localhost.evil.example:80",
+            "10.0.0.1",
+            "",
+            "0.0.0.0",
+        ] {
+            assert!(!is_loopback_name(host), "{host}");
+        }
+    }
+
+    #[test]
+    fn a_request_from_another_site_is_refused() {
+        const JSON: (&str, &str) = ("content-type", "application/json");
+        assert!(is_from_page(&[JSON]));
+        assert!(is_from_page(&[
+            JSON,
+            ("origin", "http://localhost:9100"),
+            ("sec-fetch-site", "same-origin")
+        ]));
+        assert!(!is_from_page(&[JSON, ("origin", "http://evil.example")]));
+        assert!(!is_from_page(&[JSON, ("origin", "null")]));
+        assert!(!is_from_page(&[JSON, ("sec-fetch-site", "same-site")]));
+        assert!(!is_from_page(&[("content-type", "text/plain")]));
+        assert!(!is_from_page(&[]));
+        let proxy: ProxyUrl = "https://cell.example".parse().unwrap();
+        for (origin, is_own) in [
+            ("https://cell.example", true),
+            ("https://evil.example", false),
+        ] {
+            let sent = headers(&[JSON, ("origin", origin)]);
+            // A proxy may pass on another Host.
+            assert_eq!(
+                check_origin(&sent, "127.0.0.1:9100", Some(&proxy)).is_ok(),
+                is_own
+            );
+        }
+    }
+
+    #[test]
+    fn behind_a_proxy_users_sign_in_and_cookies_are_secure() {
+        let peer: SocketAddr = "127.0.0.1:5000".parse().unwrap();
+        let proxied = Page::new(
+            "test",
+            Vec::new(),
+            Some("https://cell.example".parse().unwrap()),
+        );
+        let open = Page::new("test", Vec::new(), None);
+        let of_proxy = headers(&[("host", "cell.example")]);
+        assert!(open.host(&of_proxy, peer).is_err());
+        assert!(
+            open.host(
+                &headers(&[("host", "localhost:9100")]),
+                "10.0.0.1:1".parse().unwrap()
+            )
+            .is_err()
+        );
+        let host = proxied.host(&of_proxy, peer).unwrap_or_default();
+        assert_eq!(host, "cell.example");
+        // A proxy may pass on the name of loopback.
+        for host in ["cell.example", "127.0.0.1:9100"] {
+            let browser = proxied.browser(&HeaderMap::new(), host.to_owned());
+            assert!(proxied.check_reader(&browser).is_err());
+        }
+        let browser = open.browser(&HeaderMap::new(), "127.0.0.1:9100".to_owned());
+        assert!(open.check_reader(&browser).is_ok());
+        let cookie = proxied.cookie("cell.example", "ab", 60);
+        assert!(
+            cookie.starts_with("__Host-ua-session=ab; Path=/;") && cookie.ends_with("; Secure")
+        );
+        let cookie = open.cookie("127.0.0.1:9100", "ab", 60);
+        assert!(
+            cookie.starts_with("ua-session-9100=ab; Path=/;")
+                && cookie.contains("HttpOnly; SameSite=Strict")
+        );
+    }
+
+    #[test]
+    fn the_files_hold_nothing_that_the_policy_forbids() {
+        for (path, _, content) in FILES {
+            // Names of XML namespaces are no addresses.
+            let content = content.replace("http://www.w3.org/2000/svg", "");
+            for forbidden in [
+                " style=\"",
+                " onclick=",
+                "<script>",
+                "https://",
+                "innerHTML",
+                "eval(",
+            ] {
+                assert!(!content.contains(forbidden), "{path}: {forbidden}");
+            }
+        }
+    }
+}

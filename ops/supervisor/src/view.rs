@@ -1,0 +1,649 @@
+//! The views of the page. A browser receives only the view that it shows.
+
+use std::collections::HashMap;
+use std::time::Duration;
+
+use mappings::{SpaceId, TopicId};
+use serde_json::{Map, Value, json};
+
+use crate::board::{Board, Entry, quality};
+use crate::skill;
+use crate::value;
+
+/// The view that a browser shows.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum View {
+    /// The programs.
+    Programs,
+    /// A window of the list of values.
+    Values(Window),
+    /// A single topic.
+    Topic(TopicId),
+    /// The map of the cell.
+    Map,
+    /// The skills.
+    Skills,
+    /// The processes of the MES.
+    Processes,
+}
+
+/// The visible rows of the list of values.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub(crate) struct Window {
+    from: usize,
+    count: usize,
+    /// In lower case.
+    filter: String,
+    only_bad: bool,
+}
+
+/// A browser: its view, and what was sent to it. Intermediate states are never queued: the next
+/// event is made of the state at the time at which the browser takes it.
+#[derive(Debug)]
+pub(crate) struct Viewer {
+    view: View,
+    /// The sent version of each visible row.
+    sent: HashMap<TopicId, u64>,
+    order: Vec<TopicId>,
+    total: usize,
+    last: String,
+    sent_at: Option<Duration>,
+}
+
+impl View {
+    /// Parses the query of the event stream, as `view=values&from=0&count=40`.
+    ///
+    /// # Errors
+    /// Returns the fault as text.
+    pub(crate) fn parse(query: &str) -> Result<Self, String> {
+        let pairs = pairs(query);
+        let get = |key: &str| {
+            let found = pairs.iter().find(|(name, _)| name == key);
+            found.map(|(_, value)| value.as_str())
+        };
+        let number = |key: &str, default: usize| match get(key) {
+            None => Ok(default),
+            Some(text) => text
+                .parse()
+                .map_err(|_| format!("{key}={text}: a number is wanted")),
+        };
+        Ok(match get("view").unwrap_or_default() {
+            "programs" => Self::Programs,
+            "values" => Self::Values(Window {
+                from: number("from", 0)?,
+                count: number("count", 50)?.min(MOST_ROWS),
+                filter: value::cut(get("filter").unwrap_or_default(), 100).to_lowercase(),
+                only_bad: get("only") == Some("bad"),
+            }),
+            "topic" => {
+                let topic = get("topic").unwrap_or_default();
+                let fault = |_| format!("topic={topic}: a topic is wanted, as ua_1_2_10");
+                Self::Topic(topic.parse().map_err(fault)?)
+            }
+            "map" => Self::Map,
+            "skills" => Self::Skills,
+            "processes" => Self::Processes,
+            other => {
+                return Err(format!(
+                    "view={other}: there are programs, values, topic, map, skills and processes"
+                ));
+            }
+        })
+    }
+
+    /// Returns the period of events.
+    pub(crate) const fn period(&self) -> Duration {
+        match self {
+            Self::Programs | Self::Map | Self::Processes => Duration::from_secs(1),
+            Self::Values(_) | Self::Topic(_) | Self::Skills => Duration::from_millis(250),
+        }
+    }
+}
+
+impl Viewer {
+    pub(crate) fn new(view: View) -> Self {
+        Self {
+            view,
+            sent: HashMap::new(),
+            order: Vec::new(),
+            total: 0,
+            last: String::new(),
+            sent_at: None,
+        }
+    }
+
+    /// Returns the next event of the stream; `None` if nothing visible has changed.
+    pub(crate) fn next(&mut self, board: &mut Board, now: Duration) -> Option<String> {
+        let data = match &self.view {
+            View::Values(window) => {
+                let window = window.clone();
+                self.values(&window, board, now)
+            }
+            View::Programs => self.changed(programs(board)),
+            View::Topic(topic) => {
+                let shown = topic_view(board, *topic, now);
+                self.changed(shown)
+            }
+            View::Map => self.changed(map(board, now)),
+            View::Skills => {
+                let shown = json!({ "skills": skill::all(board), "calls": skill::calls(board) });
+                self.changed(shown)
+            }
+            View::Processes => self.changed(processes(board)),
+        };
+        match data {
+            Some(data) => {
+                self.sent_at = Some(now);
+                Some(format!("event: view\ndata: {data}\n\n"))
+            }
+            None => {
+                let is_due = self.sent_at.is_none_or(|sent| now >= sent + ALIVE);
+                is_due.then(|| {
+                    self.sent_at = Some(now);
+                    "event: alive\ndata: {}\n\n".to_owned()
+                })
+            }
+        }
+    }
+
+    /// Returns the JSON unless it was sent last.
+    fn changed(&mut self, shown: Value) -> Option<String> {
+        let text = shown.to_string();
+        if text == self.last {
+            return None;
+        }
+        self.last.clone_from(&text);
+        Some(text)
+    }
+
+    fn values(&mut self, window: &Window, board: &mut Board, now: Duration) -> Option<String> {
+        board.ordered();
+        let all: Vec<TopicId> = board.ordered().to_vec();
+        let matching = all.into_iter().filter(|topic| {
+            board.topics.get(topic).is_some_and(|entry| {
+                let is_bad = !window.only_bad || quality(entry.status, entry.is_silent).0 != "good";
+                is_bad && (window.filter.is_empty() || entry.folded.contains(&window.filter))
+            })
+        });
+        let mut total = 0;
+        let mut visible = Vec::new();
+        for topic in matching {
+            if total >= window.from && visible.len() < window.count {
+                visible.push(topic);
+            }
+            total += 1;
+        }
+        let mut rows = Map::new();
+        for topic in &visible {
+            let Some(entry) = board.topics.get_mut(topic) else {
+                continue;
+            };
+            if self.sent.get(topic) != Some(&entry.version) {
+                self.sent.insert(*topic, entry.version);
+                rows.insert(topic.to_string(), row(*topic, entry, now));
+            }
+        }
+        let is_same = visible == self.order && total == self.total;
+        if is_same && rows.is_empty() && self.sent_at.is_some() {
+            return None;
+        }
+        self.sent.retain(|topic, _| visible.contains(topic));
+        let mut shown = json!({
+            "total": total, "topics": board.topics.len(), "from": window.from, "rows": rows,
+            "left_out": board.left_out,
+        });
+        if !is_same || self.sent_at.is_none() {
+            let order: Vec<String> = visible.iter().map(ToString::to_string).collect();
+            if let Some(shown) = shown.as_object_mut() {
+                shown.insert("order".to_owned(), json!(order));
+            }
+            (self.order, self.total) = (visible, total);
+        }
+        Some(shown.to_string())
+    }
+}
+
+/// Returns a row of the list of values.
+fn row(topic: TopicId, entry: &mut Entry, now: Duration) -> Value {
+    let hz = entry.rate.hz(now);
+    let (severity, text) = quality(entry.status, entry.is_silent);
+    let has_value = entry.count > 0;
+    let line = match has_value {
+        true => value::line(&entry.block, &entry.description.fields),
+        false => "–".to_owned(),
+    };
+    let (severity, text) = match has_value {
+        true => (severity, text),
+        false => ("none", "never received"),
+    };
+    json!({
+        "name": entry.name(topic),
+        "value": line,
+        "unit": entry.unit(),
+        "severity": severity,
+        "quality": text,
+        "age_ms": entry.received.map(|at| millis(now.saturating_sub(at))),
+        "hz": hz,
+        "spark": entry.spark,
+        "ros": ros(entry),
+        "type": entry.description.type_name,
+        "drops": entry.dropped,
+    })
+}
+
+fn ros(entry: &Entry) -> Vec<String> {
+    let all = entry.ros.iter();
+    all.map(|(space, name)| format!("{} {name}", world(*space)))
+        .collect()
+}
+
+/// Returns the name of a space for people.
+pub(crate) fn world(space: SpaceId) -> String {
+    match space {
+        SpaceId::UA => "OPC UA".to_owned(),
+        SpaceId::ROS1 => "ROS 1".to_owned(),
+        SpaceId { .. } if space.get() == 2 => "ROS 2".to_owned(),
+        space => format!("ROS 2 ({space})"),
+    }
+}
+
+fn programs(board: &Board) -> Value {
+    let rows: Vec<Value> = board.programs.iter().map(|program| program.row()).collect();
+    let known: Vec<&str> = board
+        .programs
+        .iter()
+        .filter_map(|program| program.status.as_ref().ok())
+        .filter_map(|status| status.get("program")?.as_str())
+        .collect();
+    // The applications of the group that the other rows do not cover.
+    let mut heard = Map::new();
+    for program in &board.programs {
+        let status = program.status.as_ref().ok();
+        let all = status.and_then(|status| status.get("applications")?.as_array());
+        for application in all.into_iter().flatten() {
+            let text = |key: &str| application.get(key).and_then(Value::as_str);
+            let name = text("name").or_else(|| text("uri")).unwrap_or_default();
+            if !known.iter().any(|known| name.starts_with(known)) {
+                heard.insert(name.to_owned(), application.clone());
+            }
+        }
+    }
+    let heard: Vec<&Value> = heard.values().collect();
+    json!({ "programs": rows, "heard": heard, "topics": board.topics.len(), "calls": board.calls.len() })
+}
+
+fn topic_view(board: &mut Board, topic: TopicId, now: Duration) -> Value {
+    let samples: Vec<Value> = board
+        .watch(topic, now)
+        .iter()
+        .map(|kept| {
+            json!({
+                "ms": i64::try_from(kept.at.unix_nanos() / 1_000_000).unwrap_or_default(),
+                "delay_us": kept.delay_us,
+                "severity": quality(kept.status, false).0,
+                "value": kept.line,
+            })
+        })
+        .collect();
+    let text = topic.to_string();
+    let (mut publishers, mut subscribers) = (Vec::new(), Vec::new());
+    for program in &board.programs {
+        let Some(counts) = program.counts(&text) else {
+            continue;
+        };
+        let known = json!({
+            "program": program.name(), "space": program.space(), "source": program.source,
+            "sent": counts.sent, "delivered": counts.delivered, "dropped": counts.dropped,
+        });
+        if counts.sent > 0 {
+            publishers.push(known.clone());
+        }
+        if counts.delivered > 0 || !counts.dropped.is_empty() {
+            subscribers.push(known);
+        }
+    }
+    let hops: Vec<Value> = board
+        .programs
+        .iter()
+        .filter_map(|program| {
+            let hops = program.hops()?;
+            Some(json!({ "program": program.name(), "space": program.space(), "hops": hops }))
+        })
+        .collect();
+    let why = why(board, topic);
+    let Some(entry) = board.topics.get_mut(&topic) else {
+        return json!({ "topic": text, "known": false, "why": why, "hops": hops });
+    };
+    let fields = match entry.block.is_empty() {
+        true => Vec::new(),
+        false => value::fields(&entry.block, &entry.description.fields).unwrap_or_default(),
+    };
+    let row = row(topic, entry, now);
+    json!({
+        "topic": text,
+        "known": true,
+        "row": row,
+        "about": entry.description.about,
+        "origin": world(topic.space),
+        "from": entry.description.from.map(|from| from.to_string()),
+        "fields": fields,
+        "write": entry.writable.as_deref().map(|(_, field)| skill::field(field)),
+        "samples": samples,
+        "delays": { "classes": entry.delays.classes, "negative": entry.delays.negative, "last_us": entry.delays.last_us },
+        "publishers": publishers,
+        "subscribers": subscribers,
+        "hops": hops,
+        "why": why,
+    })
+}
+
+/// Returns the reasons why a value is missing, most likely first; empty if it is received.
+fn why(board: &Board, topic: TopicId) -> Vec<String> {
+    let entry = board.topics.get(&topic);
+    let is_received = entry
+        .is_some_and(|entry| entry.count > 0 && quality(entry.status, entry.is_silent).0 == "good");
+    let mut reasons = Vec::new();
+    if !is_received {
+        let ros: Vec<&str> = entry
+            .map(|entry| entry.ros.iter().map(|(_, name)| name.as_str()).collect())
+            .unwrap_or_default();
+        for program in &board.programs {
+            for peer in program.waiting_for() {
+                if ros.iter().any(|name| peer.contains(name)) || peer.contains(&topic.to_string()) {
+                    reasons.push(format!("{} waits for {peer}", program.name()));
+                }
+            }
+        }
+        let serves = |program: &&crate::program::Program| {
+            program.space() == Some(u64::from(topic.space.get()))
+        };
+        let mut serving = board.programs.iter().filter(serves).peekable();
+        if serving.peek().is_none() && topic.space != SpaceId::UA {
+            reasons.push(format!(
+                "no status of a program for {} is known: start its bridge, or name its status with --status URL",
+                world(topic.space)
+            ));
+        }
+        for program in serving.filter(|program| !program.is_ready()) {
+            reasons.push(format!("{} is not ready", program.name()));
+        }
+        match entry {
+            None => reasons.push("no message of this topic was received in the group".to_owned()),
+            Some(entry) if entry.count == 0 => {
+                reasons.push("the mapping names it, and no value was received yet".to_owned());
+            }
+            Some(entry) if entry.is_silent => reasons.push(
+                "values were received before, and none within the receive timeout".to_owned(),
+            ),
+            Some(entry) if entry.status != 0 => {
+                reasons.push(format!(
+                    "its publisher sends the status 0x{:04X}0000 ({})",
+                    entry.status,
+                    quality(entry.status, false).1
+                ));
+            }
+            Some(_) => {}
+        }
+    }
+    if let Some(entry) = entry {
+        for (reason, count) in &entry.dropped {
+            reasons.push(format!("{count} samples dropped: {reason}"));
+        }
+    }
+    reasons
+}
+
+/// Returns the map of the cell: the rates from each world to the space and back.
+fn map(board: &mut Board, now: Duration) -> Value {
+    let mut worlds: Map<String, Value> = Map::new();
+    let mut spaces: Vec<SpaceId> = board.topics.keys().map(|topic| topic.space).collect();
+    let served = board.programs.iter().filter_map(|program| {
+        let space = u16::try_from(program.space()?).ok()?;
+        SpaceId::new(space)
+    });
+    spaces.extend(served);
+    spaces.extend([
+        SpaceId::UA,
+        SpaceId::ROS1,
+        SpaceId::new(2).unwrap_or(SpaceId::UA),
+    ]);
+    spaces.sort_unstable();
+    spaces.dedup();
+    for space in spaces {
+        let (mut hz, mut topics, mut silent) = (0.0, 0_usize, 0_usize);
+        let of = board
+            .topics
+            .iter_mut()
+            .filter(|(topic, _)| topic.space == space);
+        for (_, entry) in of {
+            hz += entry.rate.hz(now);
+            topics += 1;
+            // Events may never have been sent.
+            silent += usize::from(entry.count > 0 && entry.is_silent);
+        }
+        let programs: Vec<&crate::program::Program> = board
+            .programs
+            .iter()
+            .filter(|program| program.space() == Some(u64::from(space.get())))
+            .collect();
+        let reasons: Vec<String> = programs
+            .iter()
+            .filter(|program| !program.is_ready())
+            .map(|program| format!("{} is not ready", program.name()))
+            .collect();
+        let names: Vec<&str> = programs.iter().map(|program| program.name()).collect();
+        let delivered: u64 = programs
+            .iter()
+            .map(|program| program.total("delivered"))
+            .sum();
+        let dropped: u64 = board
+            .topics
+            .iter()
+            .filter(|(topic, _)| topic.space == space)
+            .flat_map(|(_, entry)| entry.dropped.values())
+            .sum();
+        worlds.insert(
+            space.to_string(),
+            json!({
+                "label": world(space), "programs": names, "topics": topics, "silent": silent,
+                "hz": (hz * 10.0).round() / 10.0, "delivered": delivered, "dropped": dropped,
+                "problems": reasons,
+            }),
+        );
+    }
+    json!({ "worlds": worlds })
+}
+
+/// Returns the processes and runs of the MES.
+fn processes(board: &Board) -> Value {
+    let mes = board.programs.iter().find_map(|program| {
+        let status = program.status.as_ref().ok()?;
+        status.get("processes").is_some().then_some(status)
+    });
+    match mes {
+        None => json!({ "mes": false }),
+        Some(status) => json!({
+            "mes": true,
+            "processes": status.get("processes"),
+            "runs": status.get("runs"),
+        }),
+    }
+}
+
+/// Splits a query into its decoded pairs.
+pub(crate) fn pairs(query: &str) -> Vec<(String, String)> {
+    let pairs = query.split('&').take(MOST_PAIRS);
+    pairs
+        .filter(|pair| !pair.is_empty())
+        .map(|pair| {
+            let (key, value) = pair.split_once('=').unwrap_or((pair, ""));
+            (decoded(key), decoded(value))
+        })
+        .collect()
+}
+
+/// Decodes `%41` and `+`.
+fn decoded(text: &str) -> String {
+    let mut bytes = text.bytes();
+    let mut out = Vec::with_capacity(text.len());
+    while let Some(byte) = bytes.next() {
+        match byte {
+            b'+' => out.push(b' '),
+            b'%' => {
+                let mut rest = bytes.clone();
+                let digits = [rest.next(), rest.next()]
+                    .map(|digit| char::from(digit.unwrap_or_default()).to_digit(16));
+                match digits {
+                    [Some(high), Some(low)] => {
+                        out.push(u8::try_from(high * 16 + low).unwrap_or_default());
+                        bytes = rest;
+                    }
+                    _ => out.push(byte),
+                }
+            }
+            byte => out.push(byte),
+        }
+    }
+    String::from_utf8_lossy(&out).into_owned()
+}
+
+fn millis(duration: Duration) -> u64 {
+    u64::try_from(duration.as_millis()).unwrap_or(u64::MAX)
+}
+
+/// A browser shows no more rows than this.
+const MOST_ROWS: usize = 200;
+const MOST_PAIRS: usize = 16;
+/// An event is sent at least this often, so that the page notices a lost connection.
+const ALIVE: Duration = Duration::from_secs(5);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::board::tests::{at, take, topic};
+    use crate::program::Program;
+
+    fn data(event: &str) -> Value {
+        let data = event.strip_prefix("event: view\ndata: ").unwrap();
+        serde_json::from_str(data.trim_end()).unwrap()
+    }
+
+    fn filled(count: u16) -> Board {
+        let mut board = Board::default();
+        for id in 1..=count {
+            take(&mut board, TopicId::new(1, 2, id).unwrap(), id.into(), 0);
+        }
+        board
+    }
+
+    #[test]
+    fn the_query_names_the_view() {
+        let window = Window {
+            from: 20,
+            count: 40,
+            filter: "arm a".to_owned(),
+            only_bad: true,
+        };
+        let query = "view=values&from=20&count=40&filter=Arm+%41&only=bad";
+        assert_eq!(View::parse(query), Ok(View::Values(window)));
+        assert_eq!(View::parse("view=skills"), Ok(View::Skills));
+        for wrong in ["", "view=all", "view=values&from=x", "view=topic&topic=x"] {
+            assert!(View::parse(wrong).is_err(), "{wrong}");
+        }
+    }
+
+    #[test]
+    fn only_visible_rows_are_sent_and_only_if_they_have_changed() {
+        let mut board = filled(1000);
+        let view = View::parse("view=values&from=100&count=20").unwrap();
+        let mut viewer = Viewer::new(view);
+        let first = data(&viewer.next(&mut board, at(0).since).unwrap());
+        assert_eq!(first["total"], 1000);
+        assert_eq!(first["rows"].as_object().unwrap().len(), 20);
+        assert_eq!(viewer.next(&mut board, at(250).since), None);
+        let shown = first["order"][3].as_str().unwrap();
+        take(&mut board, topic(shown), 7.5, 300);
+        // Far outside of the window.
+        take(&mut board, topic("ua_1_2_9"), 1.0, 300);
+        let next = data(&viewer.next(&mut board, at(500).since).unwrap());
+        let rows = next["rows"].as_object().unwrap();
+        assert_eq!(rows.keys().collect::<Vec<_>>(), [shown]);
+        assert_eq!(rows[shown]["value"], "7.5");
+        assert!(next.get("order").is_none());
+    }
+
+    #[test]
+    fn a_browser_that_does_not_read_costs_nothing_and_then_gets_the_last_value() {
+        let mut board = filled(1);
+        let mut viewer = Viewer::new(View::parse("view=values&count=10").unwrap());
+        viewer.next(&mut board, at(0).since).unwrap();
+        for millis in 0..1000 {
+            take(&mut board, topic("ua_1_2_1"), 0.5 + f64::from(millis), 1000);
+        }
+        let next = data(&viewer.next(&mut board, at(2000).since).unwrap());
+        assert_eq!(next["rows"]["ua_1_2_1"]["value"], "999.5");
+        assert_eq!(viewer.sent.len(), 1);
+    }
+
+    #[test]
+    fn a_quiet_view_is_kept_alive() {
+        let mut board = Board::default();
+        let mut viewer = Viewer::new(View::Map);
+        assert!(viewer.next(&mut board, at(0).since).is_some());
+        assert_eq!(viewer.next(&mut board, at(1000).since), None);
+        let alive = viewer.next(&mut board, at(6000).since).unwrap();
+        assert!(alive.starts_with("event: alive"), "{alive}");
+    }
+
+    #[test]
+    fn bad_values_can_be_shown_alone() {
+        let mut board = filled(3);
+        board.set_silent(topic("ua_1_2_2"), true);
+        let mut viewer = Viewer::new(View::parse("view=values&only=bad").unwrap());
+        let shown = data(&viewer.next(&mut board, at(0).since).unwrap());
+        assert_eq!(shown["order"], json!(["ua_1_2_2"]));
+        assert_eq!(shown["rows"]["ua_1_2_2"]["quality"], "no data");
+    }
+
+    #[test]
+    fn a_missing_topic_has_reasons() {
+        let mut board = Board::default();
+        board.set_programs(vec![Program {
+            source: "this program".to_owned(),
+            status: Ok(json!({
+                "program": "bridge-ros1", "space": 1, "not_ready": ["no ROS master answers"],
+                "waiting_for": ["topic ua_1_2_10: no publisher"],
+            })),
+        }]);
+        let reasons = why(&board, topic("ua_1_2_10"));
+        assert_eq!(
+            reasons,
+            [
+                "bridge-ros1 waits for topic ua_1_2_10: no publisher",
+                "bridge-ros1 is not ready",
+                "no message of this topic was received in the group",
+            ]
+        );
+        take(&mut board, topic("ua_1_2_10"), 1.0, 0);
+        assert!(why(&board, topic("ua_1_2_10")).is_empty());
+    }
+
+    #[test]
+    fn the_map_shows_rates_and_programs_that_are_not_ready() {
+        let mut board = filled(2);
+        for millis in (1000..7000).step_by(100) {
+            take(&mut board, topic("ua_1_2_1"), 1.0, millis);
+        }
+        board.set_programs(vec![Program {
+            source: String::new(),
+            status: Ok(json!({ "program": "bridge-ros1", "space": 1, "not_ready": ["x"] })),
+        }]);
+        let shown = map(&mut board, at(7000).since);
+        assert_eq!(shown["worlds"]["1"]["hz"], 10.0);
+        assert_eq!(
+            shown["worlds"]["1"]["problems"][0],
+            "bridge-ros1 is not ready"
+        );
+        assert_eq!(shown["worlds"]["2"]["topics"], 0);
+    }
+}
