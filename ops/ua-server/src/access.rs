@@ -3,10 +3,9 @@
 use std::collections::HashMap;
 
 use mappings::{Mapping, Permissions as Said};
-use opcua::server::address_space::AccessLevel;
 use opcua::server::node_manager::RequestContext;
 use opcua::sync::Mutex;
-use opcua::types::{MethodId, NodeId, StatusCode};
+use opcua::types::{MethodId, StatusCode};
 use plant_opcua::certificates::application_uri;
 use plant_opcua::configuration::Configuration;
 use plant_opcua::users::{Anonymous, Permissions, Role, Roles, Rules};
@@ -118,15 +117,6 @@ const SWITCHES: [MethodId; 3] = [
     MethodId::PublishSubscribe_Status_Disable,
     MethodId::PublishSubscribe_Diagnostics_Reset,
 ];
-
-/// Returns true if the client of a request may write the value of a node.
-pub(crate) fn may_write(context: &RequestContext, node: &NodeId) -> bool {
-    let level = AccessLevel::CURRENT_WRITE;
-    let left = context
-        .authenticator
-        .effective_user_access_level(&context.token, level, node);
-    left.contains(level)
-}
 
 fn anonymous(said: mappings::Anonymous) -> Anonymous {
     match said {

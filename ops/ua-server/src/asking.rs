@@ -147,7 +147,23 @@ impl Callable {
         questions: &Questions,
         gone: impl Fn() -> bool,
     ) -> Result<Vec<Variant>, Refused> {
-        let block = self.block(arguments)?;
+        let response = self.ask(self.block(arguments)?, questions, gone).await?;
+        let fields = Fields::parse(&response);
+        let fields = fields.map_err(|_| Refused::Status(StatusCode::BadDecodingError))?;
+        let outputs = fields.map(|field| field.map(|field| value::from_field(&field)));
+        outputs
+            .collect::<Result<_, _>>()
+            .map_err(|_| Refused::Status(StatusCode::BadDecodingError))
+    }
+
+    /// Sends a request with this block of fields and returns the block of the response. See
+    /// [`call`](Self::call).
+    pub(crate) async fn ask(
+        &self,
+        block: Bytes,
+        questions: &Questions,
+        gone: impl Fn() -> bool,
+    ) -> Result<Bytes, Refused> {
         let (answer, answered) = oneshot::channel();
         let question = Question {
             topic: self.topic,
@@ -164,13 +180,7 @@ impl Callable {
             .try_send(question)
             .map_err(|_| Refused::Status(StatusCode::BadTooManyOperations))?;
         let answer = waiting.answer(gone).await.map_err(Refused::Status)?;
-        let response = answer.map_err(Refused::Asked)?;
-        let fields = Fields::parse(&response);
-        let fields = fields.map_err(|_| Refused::Status(StatusCode::BadDecodingError))?;
-        let outputs = fields.map(|field| field.map(|field| value::from_field(&field)));
-        outputs
-            .collect::<Result<_, _>>()
-            .map_err(|_| Refused::Status(StatusCode::BadDecodingError))
+        answer.map_err(Refused::Asked)
     }
 
     /// Encodes the request. All arguments may be omitted together if each of them has a default.

@@ -13,15 +13,23 @@ use tokio::time::{Interval, MissedTickBehavior, interval};
 pub(crate) struct Commander(Box<dyn Fn() -> bool + Send + Sync>);
 
 impl Commander {
-    /// Returns the session of a request.
-    pub(crate) fn of(context: &RequestContext) -> Self {
+    /// Returns the session of a request, for each write of the request.
+    pub(crate) fn of(context: &RequestContext) -> Box<dyn Fn() -> Self + Send + Sync> {
         // The type of the library's sessions has no public name.
         let session = Arc::downgrade(&context.session);
-        Self(Box::new(move || {
-            session
-                .upgrade()
-                .is_some_and(|session| session.read().is_activated())
-        }))
+        Box::new(move || {
+            let session = session.clone();
+            Self(Box::new(move || {
+                session
+                    .upgrade()
+                    .is_some_and(|session| session.read().is_activated())
+            }))
+        })
+    }
+
+    /// Returns a commander that is never lost, for a topic without reaction to the loss.
+    pub(crate) fn lasting() -> Self {
+        Self(Box::new(|| true))
     }
 
     fn lasts(&self) -> bool {

@@ -20,9 +20,9 @@
 //! - The server itself: `port` (the interface to the shell), `endpoint` (endpoints and security),
 //!   `changes` (notifications of reloads), `identity` (BuildInfo and limits), `confirm` and
 //!   `arrivals` (confirmation of writes), `commanders` (sessions that wrote commands), `access`
-//!   (permissions), `auditing` (audit events), `alarms` (alarms and conditions), `sks` (keys of
-//!   secured groups), `pubsub` (the PubSub configuration as nodes), `verbs` (commands for
-//!   certificates and users).
+//!   (permissions), `operations` (operators on the page), `auditing` (audit events), `alarms`
+//!   (alarms and conditions), `sks` (keys of secured groups), `pubsub` (the PubSub configuration
+//!   as nodes), `verbs` (commands for certificates and users).
 
 mod access;
 mod address;
@@ -48,6 +48,7 @@ mod layout;
 mod methods;
 mod nodes;
 mod nodesets;
+mod operations;
 mod others;
 mod port;
 mod presence;
@@ -69,7 +70,8 @@ use std::process::ExitCode;
 use std::sync::{Arc, OnceLock};
 
 use bridge_node::{
-    Arguments, Context, Failure, FailureKind, KeyService, NodeSetReader, Owned, Program,
+    Arguments, Context, Failure, FailureKind, KeyService, NodeSetReader, Observer, Owned, Program,
+    Site,
 };
 use discovery::scan::Range;
 use discovery::{AnnounceSettings, Interface};
@@ -77,6 +79,7 @@ use mappings::{FindSkills, Mapping, SpaceId};
 use plant_opcua::endpoint::EndpointUrl;
 use plant_opcua::enrolment::GdsArguments;
 use plant_opcua::pki::{self, Pki};
+use supervisor::{Page, ProxyUrl, StatusUrl};
 
 use crate::port::{ServerPort, Setup};
 use crate::sks::{ServerKeys, Sks};
@@ -108,9 +111,20 @@ struct UaServer {
     announce: bool,
     #[command(flatten)]
     gds: GdsArguments,
+    /// Show the program with this address of --metrics on the page, as http://127.0.0.1:9101. May
+    /// be repeated
+    #[arg(long, value_name = "URL")]
+    status: Vec<StatusUrl>,
+    /// Let browsers of other hosts reach the page through this reverse proxy, as
+    /// https://cell.example.org: each user signs in
+    #[arg(long, value_name = "URL")]
+    page_proxy: Option<ProxyUrl>,
     /// Made when it is first wanted.
     #[arg(skip)]
     sks: OnceLock<Arc<Sks>>,
+    /// Made when it is first wanted.
+    #[arg(skip)]
+    page: OnceLock<Arc<Page>>,
 }
 
 /// Runs `ua-server` from its command line to its end. `arguments` begin with the name of the
@@ -134,6 +148,11 @@ impl UaServer {
     fn sks(&self) -> Arc<Sks> {
         let made = || Arc::new(Sks::new(self.pki_root().join("private/sks.json")));
         Arc::clone(self.sks.get_or_init(made))
+    }
+
+    fn page(&self) -> Arc<Page> {
+        let made = || Page::new(Self::NAME, self.status.clone(), self.page_proxy.clone());
+        Arc::clone(self.page.get_or_init(made))
     }
 
     /// Returns the settings for announcing the server, or `None` if it is not announced.
@@ -180,6 +199,15 @@ impl Program for UaServer {
 
     fn arguments(&self) -> &Arguments {
         &self.arguments
+    }
+
+    fn observer(&self) -> Option<Arc<dyn Observer>> {
+        let is_served = self.arguments.flags.metrics.is_some();
+        is_served.then(|| self.page() as Arc<dyn Observer>)
+    }
+
+    fn site(&self) -> Result<Option<Arc<dyn Site>>, Failure> {
+        Ok(Some(self.page()))
     }
 
     /// Returns the namespaces of the mapping, of discovered servers and of the server itself.
@@ -234,6 +262,8 @@ impl Program for UaServer {
             gds,
             announce: self.announcement(&context.mapping),
         };
-        ServerPort::start(&context.mapping, setup)
+        let port = ServerPort::start(&context.mapping, setup)?;
+        self.page().operate(Arc::new(port.operations()));
+        Ok(port)
     }
 }

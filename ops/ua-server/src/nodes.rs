@@ -13,6 +13,7 @@ use async_trait::async_trait;
 use bytes::Bytes;
 use mappings::{Mapping, TopicId};
 use opcua::server::address_space::AddressSpace;
+use opcua::server::authenticator::UserToken;
 use opcua::server::diagnostics::NamespaceMetadata;
 use opcua::server::node_manager::memory::{InMemoryNodeManager, InMemoryNodeManagerImpl};
 use opcua::server::node_manager::{
@@ -27,12 +28,12 @@ use opcua::types::{
 };
 use plant_opcua::nodeset::NodeSets;
 use plant_opcua::server::Caller;
-use plant_opcua::users::Access;
+use plant_opcua::users::{Access, Right};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, oneshot};
 use tracing::{info, warn};
 use uadp::Timestamp;
 
-use crate::access::{self, Genuine};
+use crate::access::Genuine;
 use crate::address;
 use crate::alarms::Alarms;
 use crate::arrivals::Awaited;
@@ -120,6 +121,24 @@ pub(crate) struct ClientWrite {
     pub(crate) answer: oneshot::Sender<StatusCode>,
     /// Receives the confirmation of the bridges.
     pub(crate) awaited: Option<Awaited>,
+}
+
+/// The client of a write.
+pub(crate) struct Writer {
+    pub(crate) subscriptions: Arc<SubscriptionCache>,
+    pub(crate) token: UserToken,
+    /// Returns the session that commands a topic by a write.
+    pub(crate) commander: Box<dyn Fn() -> Commander + Send + Sync>,
+}
+
+impl Writer {
+    fn of(context: &RequestContext) -> Self {
+        Self {
+            subscriptions: Arc::clone(&context.subscriptions),
+            token: context.token.clone(),
+            commander: Commander::of(context),
+        }
+    }
 }
 
 /// The pending results of a value that is being sent.
@@ -542,10 +561,11 @@ impl SpaceNodes {
         Some(self.for_item(handle, &view, &mut None).0)
     }
 
-    async fn write_one(
+    /// Writes a value for a client: an OPC UA session, or a user of the page.
+    pub(crate) async fn write_one(
         &self,
         address_space: &RwLock<AddressSpace>,
-        context: &RequestContext,
+        writer: &Writer,
         write: &ParsedWriteValue,
     ) -> Result<StatusCode, StatusCode> {
         let is_value = write.attribute_id == AttributeId::Value;
@@ -561,16 +581,20 @@ impl SpaceNodes {
         if !topic.writable() {
             return Err(StatusCode::BadNotWritable);
         }
-        if !access::may_write(context, &write.node_id) {
+        if !self
+            .exits
+            .access
+            .allows(&writer.token, &write.node_id, Right::Write)
+        {
             return Err(StatusCode::BadUserAccessDenied);
         }
         let place = (&*topic, field);
         if let Some(rule) = self.exits.confirms.of(topic.topic) {
             let send =
-                |register: &dyn Fn(&[Variant])| self.send_written(context, place, write, register);
+                |register: &dyn Fn(&[Variant])| self.send_written(writer, place, write, register);
             let arrived = self.exits.confirms.write(topic.topic, &rule, send).await?;
             // The value has arrived, even if there is not enough memory to show it.
-            let _shown = self.show(&context.subscriptions, &topic, arrived);
+            let _shown = self.show(&writer.subscriptions, &topic, arrived);
             return Ok(StatusCode::Good);
         }
         let arrivals = &self.exits.confirms.arrivals;
@@ -578,7 +602,7 @@ impl SpaceNodes {
         if topic.targeted {
             let (sent, on_its_way) = {
                 let _alone = self.writing.lock();
-                self.send_alone(context, place, write, (&|_| {}, awaited))?
+                self.send_alone(writer, place, write, (&|_| {}, awaited))?
             };
             let answered = on_its_way.left().await?;
             let status = match tokio::time::timeout(LONGEST_WAY_OUT, answered).await {
@@ -590,13 +614,13 @@ impl SpaceNodes {
             if status.is_bad() {
                 return Err(status);
             }
-            let _shown = self.show(&context.subscriptions, &topic, sent);
+            let _shown = self.show(&writer.subscriptions, &topic, sent);
             if let Some(awaiting) = awaiting {
                 awaiting.arrived().await?;
             }
             return Ok(status);
         }
-        let on_its_way = self.write_and_show(context, place, (write, awaited))?;
+        let on_its_way = self.write_and_show(writer, place, (write, awaited))?;
         on_its_way.left().await?;
         if let Some(awaiting) = awaiting {
             awaiting.arrived().await?;
@@ -607,15 +631,15 @@ impl SpaceNodes {
     /// Sends a value and shows it.
     fn write_and_show(
         &self,
-        context: &RequestContext,
+        writer: &Writer,
         place: (&TopicNode, Option<usize>),
         (write, awaited): (&ParsedWriteValue, Option<Awaited>),
     ) -> Result<OnItsWay, StatusCode> {
         // No other write may come between sending and showing, because a write of a single field
         // keeps the current values of the other fields.
         let _alone = self.writing.lock();
-        let (sent, on_its_way) = self.send_alone(context, place, write, (&|_| {}, awaited))?;
-        let _shown = self.show(&context.subscriptions, place.0, sent);
+        let (sent, on_its_way) = self.send_alone(writer, place, write, (&|_| {}, awaited))?;
+        let _shown = self.show(&writer.subscriptions, place.0, sent);
         Ok(on_its_way)
     }
 
@@ -623,13 +647,13 @@ impl SpaceNodes {
     /// the result of sending.
     fn send_written(
         &self,
-        context: &RequestContext,
+        writer: &Writer,
         place: (&TopicNode, Option<usize>),
         write: &ParsedWriteValue,
         register: &dyn Fn(&[Variant]),
     ) -> Result<Shown, StatusCode> {
         let _alone = self.writing.lock();
-        let (sent, _on_its_way) = self.send_alone(context, place, write, (register, None))?;
+        let (sent, _on_its_way) = self.send_alone(writer, place, write, (register, None))?;
         Ok(sent)
     }
 
@@ -637,7 +661,7 @@ impl SpaceNodes {
     /// to show afterwards, and the pending results of sending. The caller holds the write lock.
     fn send_alone(
         &self,
-        context: &RequestContext,
+        writer: &Writer,
         (topic, field): (&TopicNode, Option<usize>),
         write: &ParsedWriteValue,
         (register, awaited): Registration<'_>,
@@ -669,7 +693,7 @@ impl SpaceNodes {
         drop(fields);
         let source = source_of(&write.value);
         let value = (block.clone(), source);
-        let on_its_way = self.send(topic, value, (Commander::of(context), awaited))?;
+        let on_its_way = self.send(topic, value, ((writer.commander)(), awaited))?;
         let stamp = Stamp {
             status: StatusCode::Good,
             source: Some(source),
@@ -1019,8 +1043,9 @@ impl InMemoryNodeManagerImpl for SpaceNodes {
         nodes_to_write: &mut [&mut WriteNode],
     ) -> Result<(), StatusCode> {
         self.genuine.check(context)?;
+        let writer = &Writer::of(context);
         let writes = nodes_to_write.iter_mut().map(|write| async {
-            let result = self.write_one(address_space, context, write.value()).await;
+            let result = self.write_one(address_space, writer, write.value()).await;
             let (Ok(status) | Err(status)) = result;
             write.set_status(status);
         });

@@ -49,6 +49,7 @@ use crate::layout::{Layout, LayoutError};
 use crate::methods::{Methods, Wish};
 use crate::nodes::{ClientWrite, Exits, SpaceManager, SpaceNodes, look_again};
 use crate::nodesets;
+use crate::operations::PageOperations;
 use crate::others::Others;
 use crate::pubsub::{Places, PubSub, Readers, State};
 use crate::sks::Sks;
@@ -218,6 +219,13 @@ impl ServerPort {
 }
 
 impl ServerPort {
+    /// Returns the users and commands of the server for its page.
+    pub(crate) fn operations(&self) -> PageOperations {
+        let subscriptions = Arc::clone(self.handle.subscriptions());
+        let nodes = (Arc::clone(self.space.manager()), subscriptions);
+        PageOperations::new(Arc::clone(&self.access), nodes)
+    }
+
     /// Applies changes of writers and readers that clients enabled or disabled.
     fn switch(&mut self) {
         for (topic, on) in self.pubsub.switched() {

@@ -71,6 +71,11 @@ impl Space {
         }
     }
 
+    /// Returns the node manager.
+    pub(crate) const fn manager(&self) -> &Arc<SpaceManager> {
+        &self.manager
+    }
+
     /// Sets the maximum ages of values and returns the space.
     pub(crate) fn with_ages(mut self, mapping: &Mapping) -> Self {
         self.set_ages(mapping);

@@ -230,6 +230,42 @@ impl Access {
         users.get(&token.0).map_or(Roles::NONE, |user| user.roles)
     }
 
+    /// Returns whether the server has users.
+    #[must_use]
+    pub fn has_users(&self) -> bool {
+        !self.users.read().is_empty()
+    }
+
+    /// Returns the current roles of a user by name; `None` if there is no such user.
+    #[must_use]
+    pub fn roles_of_user(&self, name: &str) -> Option<Roles> {
+        self.users.read().get(name).map(|user| user.roles)
+    }
+
+    /// Checks the password of a user and reports the attempt, as for a session. A wrong password
+    /// takes a second. `endpoint` describes how the user has reached the server.
+    pub async fn sign_in(&self, name: &str, password: String, endpoint: &str) -> bool {
+        let mut login = Login {
+            user: name.chars().take(64).collect(),
+            by: "password",
+            endpoint: endpoint.to_owned(),
+            fault: None,
+        };
+        self.log_in(&mut login, name, &Password::new(password))
+            .await;
+        self.tell(&login);
+        login.fault.is_none()
+    }
+
+    /// Checks a password and notes a fault.
+    async fn log_in(&self, login: &mut Login, name: &str, password: &Password) {
+        if !self.check(name, password).await {
+            login.fault = Some(LoginFault::Password);
+            // Delays repeated attempts; a connection has a single attempt at a time.
+            tokio::time::sleep(AFTER_A_WRONG_ONE).await;
+        }
+    }
+
     /// Returns the roles of the user of a caller.
     #[must_use]
     pub fn roles_of(&self, caller: &Caller) -> Roles {
@@ -353,11 +389,7 @@ impl AuthManager for Access {
     ) -> Result<UserToken, Error> {
         let told: String = username.chars().take(64).collect();
         let mut login = login("password", &told, endpoint);
-        if !self.check(username, password).await {
-            login.fault = Some(LoginFault::Password);
-            // Delays repeated attempts; a connection has a single attempt at a time.
-            tokio::time::sleep(AFTER_A_WRONG_ONE).await;
-        }
+        self.log_in(&mut login, username, password).await;
         self.answered(&login, UserToken(username.to_owned()))
     }
 
@@ -556,6 +588,24 @@ mod tests {
         assert!(access.check("anna", &right).await);
         assert!(!access.check("anna", &wrong).await);
         assert!(!access.check("bert", &right).await);
+        assert!(
+            access
+                .sign_in("anna", "correct horse".to_owned(), "page")
+                .await
+        );
+        assert!(
+            !access
+                .sign_in("anna", "correct house".to_owned(), "page")
+                .await
+        );
+        assert_eq!(
+            access.roles_of_user("anna"),
+            Some(Roles::of(&[Role::Operator]))
+        );
+        assert_eq!(
+            (access.roles_of_user("bert"), access.has_users()),
+            (None, true)
+        );
         std::fs::remove_dir_all(folder).unwrap();
     }
 }

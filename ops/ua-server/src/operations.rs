@@ -1,0 +1,149 @@
+//! The users of the server on the page, and their commands. Permissions are those of OPC UA
+//! clients.
+
+use std::sync::Arc;
+
+use bridge_node::{AskErrorKind, BoxFuture};
+use bytes::Bytes;
+use mappings::{NodeIdText, TopicId};
+use opcua::server::SubscriptionCache;
+use opcua::server::authenticator::UserToken;
+use opcua::server::node_manager::ParsedWriteValue;
+use opcua::types::{AttributeId, DataValue, NumericRange, StatusCode, Variant};
+use plant_opcua::users::{Access, Right, Role, Roles};
+use supervisor::{OperationFault, Operations};
+use uadp::Fields;
+
+use crate::asking::Refused;
+use crate::commanders::Commander;
+use crate::layout::node_id;
+use crate::nodes::{SpaceManager, Writer};
+use crate::value::from_field;
+
+/// The server as operators use it on the page.
+pub(crate) struct PageOperations {
+    access: Arc<Access>,
+    manager: Arc<SpaceManager>,
+    subscriptions: Arc<SubscriptionCache>,
+}
+
+impl PageOperations {
+    pub(crate) fn new(
+        access: Arc<Access>,
+        (manager, subscriptions): (Arc<SpaceManager>, Arc<SubscriptionCache>),
+    ) -> Self {
+        Self {
+            access,
+            manager,
+            subscriptions,
+        }
+    }
+}
+
+impl Operations for PageOperations {
+    fn has_users(&self) -> bool {
+        self.access.has_users()
+    }
+
+    fn sign_in(&self, user: String, password: String) -> BoxFuture<bool> {
+        let access = Arc::clone(&self.access);
+        Box::pin(async move { access.sign_in(&user, password, "page").await })
+    }
+
+    fn roles(&self, user: &str) -> Option<String> {
+        self.access
+            .roles_of_user(user)
+            .map(|roles| roles.to_string())
+    }
+
+    fn may_operate(&self, user: &str) -> bool {
+        let runs = Roles::of(&[Role::Operator, Role::Engineer]);
+        self.access
+            .roles_of_user(user)
+            .is_some_and(|roles| roles.meets(runs))
+    }
+
+    fn call(
+        &self,
+        user: String,
+        topic: TopicId,
+        request: Bytes,
+    ) -> BoxFuture<Result<Bytes, OperationFault>> {
+        let found = {
+            let methods = self.manager.inner().methods().lock();
+            let mut methods = methods.iter();
+            let found = methods.find(|(_, callable)| callable.topic() == topic);
+            found.map(|(node, callable)| (node.clone(), callable.clone()))
+        };
+        let access = Arc::clone(&self.access);
+        let questions = self.manager.inner().questions().clone();
+        Box::pin(async move {
+            let Some((node, callable)) = found else {
+                let why = format!("{topic} is no Method of this server");
+                return Err(OperationFault::Refused(why));
+            };
+            if !access.allows(&UserToken(user), &node, Right::Call) {
+                return Err(OperationFault::Denied);
+            }
+            // The request is abandoned when the browser closes the connection, because the future
+            // is dropped.
+            let answered = callable.ask(request, &questions, || false).await;
+            answered.map_err(fault)
+        })
+    }
+
+    fn write(
+        &self,
+        user: String,
+        node: &NodeIdText,
+        block: Bytes,
+    ) -> BoxFuture<Result<(), OperationFault>> {
+        let manager = Arc::clone(&self.manager);
+        let writer = Writer {
+            subscriptions: Arc::clone(&self.subscriptions),
+            token: UserToken(user),
+            commander: Box::new(Commander::lasting),
+        };
+        let node_id = node_id(node);
+        Box::pin(async move {
+            let fields = Fields::parse(&block);
+            let mut fields = fields.map_err(|error| OperationFault::Refused(error.to_string()))?;
+            let value = fields.next().and_then(Result::ok);
+            let write = ParsedWriteValue {
+                node_id,
+                attribute_id: AttributeId::Value,
+                index_range: NumericRange::None,
+                value: DataValue::new_now(value.map_or(Variant::Empty, |value| from_field(&value))),
+            };
+            let written = manager
+                .inner()
+                .write_one(manager.address_space(), &writer, &write)
+                .await;
+            written.map(drop).map_err(write_fault)
+        })
+    }
+}
+
+/// Returns the fault of a refused write.
+fn write_fault(status: StatusCode) -> OperationFault {
+    if status == StatusCode::BadUserAccessDenied {
+        return OperationFault::Denied;
+    }
+    let text = status.to_string();
+    if status == StatusCode::BadTimeout {
+        return OperationFault::Unknown(text);
+    }
+    OperationFault::Refused(text)
+}
+
+fn fault(refused: Refused) -> OperationFault {
+    match refused {
+        Refused::Arguments(_) => OperationFault::Refused("arguments of the wrong type".to_owned()),
+        Refused::Status(status) => OperationFault::Refused(status.to_string()),
+        Refused::Asked(error) => match error.kind {
+            AskErrorKind::Refused => OperationFault::Refused(error.text),
+            AskErrorKind::Failed => OperationFault::Failed(error.text),
+            AskErrorKind::Unknown => OperationFault::Unknown(error.text),
+        },
+    }
+}
