@@ -14,6 +14,8 @@ use std::path::PathBuf;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use mappings::{Code, SpaceId};
 
+use crate::page::PageArguments;
+
 /// Shows a running space (topics, values, skills and calls), proposes and checks mappings, and
 /// converts datagrams of OPC UA PubSub to JSON and back.
 #[derive(Debug, Parser)]
@@ -143,6 +145,14 @@ pub(crate) enum Verb {
     /// Exit codes: 0 done, 64 usage, 69 a program does not answer, or an interface or group is not
     /// available, 74 the output cannot be written.
     Trace(Trace),
+    /// Serve the page of the cell in a browser, read-only and without a server
+    ///
+    /// The page is at http://127.0.0.1:8090/ unless --metrics names another address. The mapping adds
+    /// names, units and ROS topics.
+    ///
+    /// Exit codes: 0 done, 64 usage, 69 the address or an interface is not available, 78 the mapping
+    /// cannot run.
+    Page(PageArguments),
     /// Query the knowledge of the plant: skills, components, runs
     ///
     /// Exit codes: 0 done, 64 usage, or an unknown question, 65 the query is wrong, 69 no answer in

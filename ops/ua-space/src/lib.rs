@@ -28,6 +28,7 @@ mod messages;
 mod metadata;
 mod node_ids;
 mod packet;
+mod page;
 mod raw_data;
 mod report;
 mod selector;
@@ -51,6 +52,7 @@ use exit::Failure;
 /// program.
 #[must_use]
 pub fn run(arguments: Vec<OsString>) -> ExitCode {
+    let given = arguments.clone();
     let arguments = match Arguments::try_parse_from(arguments) {
         Ok(arguments) => arguments,
         Err(usage) => {
@@ -79,6 +81,7 @@ pub fn run(arguments: Vec<OsString>) -> ExitCode {
         Verb::Skills(arguments) => live::skills(arguments),
         Verb::Call(arguments) => live::call(arguments),
         Verb::Trace(arguments) => live::trace(arguments),
+        Verb::Page(_) => return page::page(given),
         Verb::Ask(arguments) => ask::ask(arguments),
         Verb::Completion(arguments) => completion::script(arguments.shell),
         Verb::Complete(arguments) => completion::complete(&arguments.words),
