@@ -67,6 +67,9 @@ struct PlanArguments {
     /// Of the tool change: the tools are in each other's docks
     #[arg(long)]
     swap_tools: bool,
+    /// Open the page of the cell in a browser
+    #[arg(long)]
+    open: bool,
     /// Print one JSON object on standard output, and the timeline on standard error
     #[arg(long)]
     json: bool,
@@ -164,6 +167,7 @@ fn main() -> ExitCode {
                 conveyor_off_at,
                 manifest,
                 swap_tools,
+                open,
                 json,
             } = arguments.plan;
             let code = match scenario {
@@ -172,6 +176,7 @@ fn main() -> ExitCode {
                         covers,
                         speed,
                         conveyor_off_at,
+                        open,
                         json,
                     };
                     runtime.block_on(Box::pin(orchestra::play(plan)))
@@ -179,6 +184,7 @@ fn main() -> ExitCode {
                 Scenario::PlugAndProduce => {
                     let plan = plug::Plan {
                         speed,
+                        open,
                         json,
                         manifest,
                     };
@@ -188,6 +194,7 @@ fn main() -> ExitCode {
                     let plan = skilled::Plan {
                         covers,
                         speed,
+                        open,
                         json,
                     };
                     runtime.block_on(Box::pin(skilled::play(plan)))
@@ -195,6 +202,7 @@ fn main() -> ExitCode {
                 Scenario::ToolChange => {
                     let plan = tools::Plan {
                         speed,
+                        open,
                         json,
                         swapped: swap_tools,
                     };

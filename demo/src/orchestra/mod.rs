@@ -18,8 +18,8 @@ use crate::event::{Event, MasterEvent};
 use crate::line::{DOMAIN, ENDPOINT};
 use crate::pace::{Speed, overdue_after};
 use crate::stage::{
-    Failure, Hops, Interrupt, LOOPBACK, Program, Programs, Report, Stage, Timeline, Who, find,
-    free_port, must_be_free,
+    Failure, Hops, Interrupt, LOOPBACK, Program, Programs, Report, Stage, Timeline, Who, address,
+    find, free_port, must_be_free, open_when_served, status_of,
 };
 
 /// The options of the scenario.
@@ -29,6 +29,8 @@ pub(crate) struct Plan {
     pub(crate) speed: Speed,
     /// In seconds of the scenario.
     pub(crate) conveyor_off_at: f64,
+    /// Whether the page is opened in a browser.
+    pub(crate) open: bool,
     pub(crate) json: bool,
 }
 
@@ -93,6 +95,7 @@ async fn perform(
         plan,
         binaries,
         programs,
+        ports: [free_port()?, free_port()?, free_port()?],
         reports,
         interrupt,
         timeline,
@@ -124,6 +127,8 @@ struct Director<'a> {
     plan: Plan,
     binaries: Binaries,
     programs: Programs,
+    /// The ports of the status pages of the bridges and of the server.
+    ports: [u16; 3],
     reports: mpsc::Receiver<Report>,
     interrupt: Interrupt,
     timeline: &'a mut Timeline,
@@ -136,7 +141,9 @@ impl Director<'_> {
         self.introduce()?;
         self.start_own("ros-master", &["master"], &[], Stage::Master)?;
         let master_uri = self.master_uri(begin_by).await?;
-        let (ros1_port, ros2_port) = self.start_cell(&master_uri)?;
+        let [ros1_port, ros2_port, page] = self.ports;
+        self.start_cell(&master_uri)?;
+        open_when_served(page, self.plan.open);
 
         self.watch(begin_by, |story| story.began()).await?;
         let overdue = overdue_after(self.plan.covers, self.plan.conveyor_off_at);
@@ -164,8 +171,9 @@ impl Director<'_> {
         let text = format!(
             "The fault-tolerant product assembly line: {covers} covers, conveyor off at second \
              {conveyor_off_at}, speed {}.\nTimes are seconds of the story; the OPC UA server is \
-             at {ENDPOINT}, the logs in {}.\n\n",
+             at {ENDPOINT}, the page of the cell at {}, the logs in {}.\n\n",
             speed.factor(),
+            address(self.ports[2]),
             self.programs.directory().display()
         );
         self.timeline
@@ -182,14 +190,14 @@ impl Director<'_> {
         Err(self.not_begun())
     }
 
-    /// Starts all programs except the master. Returns the ports of the status pages of the bridges.
-    fn start_cell(&mut self, master_uri: &str) -> Result<(u16, u16), Failure> {
+    /// Starts all programs except the master.
+    fn start_cell(&mut self, master_uri: &str) -> Result<(), Failure> {
         let mapping = self.programs.directory().join("assembly-line.yaml");
         fs::write(&mapping, MAPPING).map_err(Failure::io("cannot write the mapping"))?;
         let mapping = mapping.display().to_string();
         let pki = |of: &str| self.programs.directory().join(of).display().to_string();
         let (server_pki, client_pki) = (pki("server-pki"), pki("supervisor-pki"));
-        let (ros1_port, ros2_port) = (free_port()?, free_port()?);
+        let [ros1_port, ros2_port, page] = self.ports;
         let domain = DOMAIN.to_string();
         let ros1 = [
             ("ROS_MASTER_URI", master_uri),
@@ -199,7 +207,11 @@ impl Director<'_> {
 
         let server = self.binaries.server.clone();
         let arguments = [&mapping, "--interface", LOOPBACK, "--endpoint", ENDPOINT];
-        let arguments = [&arguments[..], &["--pki", &server_pki]].concat();
+        let metrics = format!("127.0.0.1:{page}");
+        let own = ["--pki", &server_pki, "--metrics", &metrics];
+        let status = status_of(&[ros1_port, ros2_port]);
+        let status: Vec<&str> = status.iter().map(String::as_str).collect();
+        let arguments = [&arguments[..], &own, &status].concat();
         self.start("ua-server", server, &arguments, &[])?;
         let path = self.binaries.bridge_ros1.clone();
         let metrics = format!("127.0.0.1:{ros1_port}");
@@ -225,8 +237,7 @@ impl Director<'_> {
             &speed,
         ];
         let arguments = [&arguments[..], &["--pki", &client_pki]].concat();
-        self.start_own("supervisor", &arguments, &[], Stage::Robots)?;
-        Ok((ros1_port, ros2_port))
+        self.start_own("supervisor", &arguments, &[], Stage::Robots)
     }
 
     fn start_own(

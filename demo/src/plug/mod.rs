@@ -42,14 +42,16 @@ use crate::event::{Event, MasterEvent};
 use crate::line::DOMAIN;
 use crate::pace::Speed;
 use crate::stage::{
-    Failure, Interrupt, LOOPBACK, Program, Programs, Report, Stage, Timeline, Who, command, find,
-    free_port, must_be_free,
+    Failure, Interrupt, LOOPBACK, Program, Programs, Report, Stage, Timeline, Who, address,
+    command, find, free_port, must_be_free, open_when_served, status_of,
 };
 
 /// The options of the scenario.
 #[derive(Clone, Debug)]
 pub(crate) struct Plan {
     pub(crate) speed: Speed,
+    /// Whether the page is opened in a browser.
+    pub(crate) open: bool,
     pub(crate) json: bool,
     /// The manifest of a module; `None` for the manifest of the example plant.
     pub(crate) manifest: Option<PathBuf>,
@@ -283,7 +285,12 @@ impl Director<'_> {
         let binary = self.binaries.server.clone();
         let arguments = ["--interface", LOOPBACK, "--metrics", &metrics];
         let own = ["--endpoint", &endpoint, "--pki", &pki, "--announce"];
-        self.start("ua-server", binary, &[&arguments[..], &own].concat(), &[])?;
+        let bridges = [free_port()?, free_port()?];
+        let status = status_of(&[bridges[0], bridges[1], self.questions]);
+        let status: Vec<&str> = status.iter().map(String::as_str).collect();
+        let arguments = [&arguments[..], &own, &status].concat();
+        self.start("ua-server", binary, &arguments, &[])?;
+        self.tell_page(port)?;
         self.watchers.page("ua-server", Page::Server, port);
 
         let binary = self.binaries.mes.clone();
@@ -296,11 +303,20 @@ impl Director<'_> {
         let ros1 = [("ROS_MASTER_URI", master), ("ROS_HOSTNAME", LOOPBACK)];
         let domain = DOMAIN.to_string();
         let ros2 = [("ROS_LOCALHOST_ONLY", "1"), ("ROS_DOMAIN_ID", &domain)];
-        for (name, binary, environment) in [
-            ("bridge-ros1", self.binaries.bridge_ros1.clone(), ros1),
-            ("bridge-ros2", self.binaries.bridge_ros2.clone(), ros2),
+        for (name, port, binary, environment) in [
+            (
+                "bridge-ros1",
+                bridges[0],
+                self.binaries.bridge_ros1.clone(),
+                ros1,
+            ),
+            (
+                "bridge-ros2",
+                bridges[1],
+                self.binaries.bridge_ros2.clone(),
+                ros2,
+            ),
         ] {
-            let port = free_port()?;
             let metrics = format!("{LOOPBACK}:{port}");
             let arguments = ["--interface", LOOPBACK, "--metrics", &metrics];
             self.start(name, binary, &arguments, &environment)?;
@@ -313,6 +329,14 @@ impl Director<'_> {
             .map_err(Failure::io("cannot listen in the PubSub group"))?;
         self.watchers.graph(master.to_owned());
         Ok(())
+    }
+
+    /// Prints the address of the page, and opens it if wanted.
+    fn tell_page(&mut self, port: u16) -> Result<(), Failure> {
+        let text = format!("The page of the cell is at {}\n\n", address(port));
+        let printed = self.show.timeline.print_text(&text);
+        open_when_served(port, self.plan.open);
+        printed.map_err(Failure::io("cannot print"))
     }
 
     async fn obey(&mut self, order: Order) -> Result<(), Failure> {

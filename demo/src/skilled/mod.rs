@@ -41,7 +41,7 @@ use crate::line::DOMAIN;
 use crate::pace::Speed;
 use crate::stage::{
     Failure, Hops, Interrupt, LOOPBACK, Program, Programs, Report as Told, Stage, Timeline, Who,
-    fetch, find, free_port, must_be_free,
+    address, fetch, find, free_port, must_be_free, open_when_served, status_of,
 };
 
 /// The options of the scenario.
@@ -49,6 +49,8 @@ use crate::stage::{
 pub(crate) struct Plan {
     pub(crate) covers: u32,
     pub(crate) speed: Speed,
+    /// Whether the page is opened in a browser.
+    pub(crate) open: bool,
     pub(crate) json: bool,
 }
 
@@ -170,8 +172,13 @@ impl Teller for Show {
 }
 
 async fn perform(plan: Plan, show: &Show) -> Result<(), Failure> {
-    let (demo, [lds, component, bridge_ros1, bridge_ros2]) =
-        find(["ua-lds", "ua-component", "bridge-ros1", "bridge-ros2"])?;
+    let (demo, [lds, component, bridge_ros1, bridge_ros2, tool]) = find([
+        "ua-lds",
+        "ua-component",
+        "bridge-ros1",
+        "bridge-ros2",
+        "ua-space",
+    ])?;
     let mut interrupt = Interrupt::listen()?;
     must_be_free(LDS_PORT, "discovery server")?;
     let (programs, reports) =
@@ -186,9 +193,11 @@ async fn perform(plan: Plan, show: &Show) -> Result<(), Failure> {
             component,
             bridge_ros1,
             bridge_ros2,
+            tool,
         },
         programs,
         page: free_port()?,
+        browser: free_port()?,
         bridges: [free_port()?, free_port()?],
         transport,
         world,
@@ -324,6 +333,7 @@ struct Binaries {
     component: PathBuf,
     bridge_ros1: PathBuf,
     bridge_ros2: PathBuf,
+    tool: PathBuf,
 }
 
 struct Story<'a> {
@@ -332,6 +342,8 @@ struct Story<'a> {
     programs: Programs,
     /// The port of the status page of the discovery server.
     page: u16,
+    /// The port of the page of the cell.
+    browser: u16,
     /// The ports of the status pages of the ROS 1 bridge and of the ROS 2 bridge.
     bridges: [u16; 2],
     transport: Duration,
@@ -405,9 +417,10 @@ impl Story<'_> {
     fn introduce(&self) -> Result<(), Failure> {
         let text = format!(
             "The fault-tolerant product assembly line: {} covers, a conveyor that dies, speed {}.\nTimes are seconds since the beginning; the \
-             logs are in {}.\n\n",
+             page of the cell is at {}, the logs are in {}.\n\n",
             self.plan.covers,
             self.plan.speed.factor(),
+            address(self.browser),
             self.programs.directory().display()
         );
         let printed = self.show.timeline.borrow_mut().print_text(&text);
@@ -453,6 +466,22 @@ impl Story<'_> {
         let arguments = ["--endpoint", &endpoint, "--metrics", &metrics];
         let lds = self.binaries.lds.clone();
         self.start(("ua-lds", lds), &arguments, &[], Stage::Bridges)?;
+
+        let metrics = format!("{LOOPBACK}:{}", self.browser);
+        let arguments = [
+            "page",
+            &mapping,
+            "--interface",
+            LOOPBACK,
+            "--metrics",
+            &metrics,
+        ];
+        let status = status_of(&self.bridges);
+        let status: Vec<&str> = status.iter().map(String::as_str).collect();
+        let arguments = [&arguments[..], &status].concat();
+        let tool = self.binaries.tool.clone();
+        self.start(("page", tool), &arguments, &[], Stage::Bridges)?;
+        open_when_served(self.browser, self.plan.open);
 
         let speed = self.plan.speed.factor().to_string();
         let speed = ["--speed", &speed];

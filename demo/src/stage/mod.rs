@@ -1,6 +1,7 @@
 //! Shared parts of the scenarios: child processes, the timeline, status pages, and Ctrl-C.
 
 mod beside;
+mod browser;
 mod failure;
 mod hops;
 mod interrupt;
@@ -9,6 +10,7 @@ mod programs;
 mod timeline;
 
 pub(crate) use beside::{find, free_port, must_be_free};
+pub(crate) use browser::{address, open_when_served, status_of};
 pub(crate) use failure::Failure;
 pub(crate) use hops::{Hop, Hops, delays, micros};
 pub(crate) use interrupt::Interrupt;

@@ -30,14 +30,16 @@ use self::report::{Report, Run};
 use crate::clock::wall_nanos;
 use crate::pace::Speed;
 use crate::stage::{
-    Failure, Interrupt, LOOPBACK, Program, Programs, Report as Told, Stage, Timeline, Who, fetch,
-    find, free_port, must_be_free,
+    Failure, Interrupt, LOOPBACK, Program, Programs, Report as Told, Stage, Timeline, Who, address,
+    fetch, find, free_port, must_be_free, open_when_served,
 };
 
 /// The options of the scenario.
 #[derive(Clone, Debug)]
 pub(crate) struct Plan {
     pub(crate) speed: Speed,
+    /// Whether the page is opened in a browser.
+    pub(crate) open: bool,
     pub(crate) json: bool,
     /// Whether each tool is in the other tool's dock.
     pub(crate) swapped: bool,
@@ -100,7 +102,7 @@ impl Show {
 }
 
 async fn perform(plan: &Plan, show: &mut Show) -> Result<(), Failure> {
-    let (_, [lds, component]) = find(["ua-lds", "ua-component"])?;
+    let (_, [lds, component, tool]) = find(["ua-lds", "ua-component", "ua-space"])?;
     let mut interrupt = Interrupt::listen()?;
     must_be_free(LDS_PORT, "discovery server")?;
     let ports = PARTS.iter().filter_map(|part| part.port);
@@ -113,8 +115,10 @@ async fn perform(plan: &Plan, show: &mut Show) -> Result<(), Failure> {
         plan,
         lds,
         component,
+        tool,
         programs,
         page: free_port()?,
+        browser: free_port()?,
         show,
     };
     let played = tokio::select! {
@@ -164,23 +168,27 @@ struct Story<'a> {
     plan: &'a Plan,
     lds: PathBuf,
     component: PathBuf,
+    tool: PathBuf,
     programs: Programs,
     /// The port of the status page of the discovery server.
     page: u16,
+    /// The port of the page of the cell.
+    browser: u16,
     show: &'a mut Show,
 }
 
 impl Story<'_> {
     async fn play(&mut self) -> Result<(), Stop> {
         let text = format!(
-            "Tool change: a robot, two grippers and a tool changer; speed {}{}.\nTimes are seconds since the beginning; the logs are \
-             in {}.\n\n",
+            "Tool change: a robot, two grippers and a tool changer; speed {}{}.\nTimes are seconds since the beginning; the page \
+             of the cell is at {}, the logs are in {}.\n\n",
             self.plan.speed.factor(),
             if self.plan.swapped {
                 ", the tools in each other's docks"
             } else {
                 ""
             },
+            address(self.browser),
             self.programs.directory().display()
         );
         let printed = self.show.timeline.print_text(&text);
@@ -214,6 +222,10 @@ impl Story<'_> {
         let metrics = format!("{LOOPBACK}:{}", self.page);
         let arguments = ["--endpoint", &endpoint, "--metrics", &metrics].map(str::to_owned);
         self.start("ua-lds", self.lds.clone(), arguments.into(), Stage::Bridges)?;
+        let metrics = format!("{LOOPBACK}:{}", self.browser);
+        let arguments = ["page", "--interface", LOOPBACK, "--metrics", &metrics].map(str::to_owned);
+        self.start("page", self.tool.clone(), arguments.into(), Stage::Bridges)?;
+        open_when_served(self.browser, self.plan.open);
         for (name, arguments) in cell::simulators(self.plan.speed) {
             self.start(name, self.component.clone(), arguments, Stage::Master)?;
         }
