@@ -26,6 +26,7 @@ mod loop_silence;
 mod mes;
 mod metadata;
 mod niryo;
+mod page;
 mod peers;
 mod plug_and_produce;
 mod pure_crates;

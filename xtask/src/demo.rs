@@ -10,6 +10,14 @@ use crate::{
 };
 
 pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
+    build(workspace)?;
+    step("running the demo");
+    let mut demo = Command::new(workspace.target.join("debug/demo"));
+    Ok(status(demo.current_dir(&workspace.root).args(arguments))?.into())
+}
+
+/// Builds the programs that the stories start.
+pub(crate) fn build(workspace: &Workspace) -> anyhow::Result<()> {
     step("building the programs (some minutes the first time)");
     let mut build = vec!["build", "--locked"];
     for package in PACKAGES {
@@ -17,10 +25,7 @@ pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<E
     }
     let patched = Patched::prepare(workspace)?;
     must(&mut patched.cargo(workspace, &build))?;
-    links::make(&workspace.target.join("debug"))?;
-    step("running the demo");
-    let mut demo = Command::new(workspace.target.join("debug/demo"));
-    Ok(status(demo.current_dir(&workspace.root).args(arguments))?.into())
+    links::make(&workspace.target.join("debug"))
 }
 
 /// The packages of the programs that the stories start.

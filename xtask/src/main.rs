@@ -16,6 +16,7 @@ mod links;
 mod lint;
 mod markdown;
 mod namespace;
+mod page;
 mod patches;
 mod peers;
 mod shell;
@@ -31,6 +32,7 @@ cargo xtask <verb>
 
   demo [ARGS]                    build the programs and run the assembly line; ARGS go to it (--help lists them)
   test [--no-install] [FILTER..] install the peers of the tests (apt, pip), then run all tests whose name contains a FILTER
+  page                           drive the page of the cell in Chromium (apt, pip); screenshots are in target/page
   peers [--build]                only install the peers; of those only what the programs are built with
   lint [--dependencies]          formatting, clippy, documentation; or licences, sources and advisories of dependencies, and the
                                  workspace with all crates as published
@@ -70,6 +72,7 @@ fn run(arguments: &[&str]) -> anyhow::Result<Ended> {
         }
         ["demo", rest @ ..] => demo::run(&Workspace::find()?, rest),
         ["test", rest @ ..] => test::run(&Workspace::find()?, rest),
+        ["page"] => page::run(&Workspace::find()?),
         ["peers"] => Ok(peers::run(&Workspace::find()?)),
         ["peers", "--build"] => peers::for_building(),
         ["build"] => dist::build(&Workspace::find()?),

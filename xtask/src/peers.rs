@@ -68,6 +68,38 @@ const LOCK: &str = "package-lock.json";
 /// Packages that are installed if npm is missing.
 const APT_NODE: &[&str] = &["nodejs", "npm"];
 
+/// The browser of the judge of the page; tests do not need it.
+const APT_BROWSER: &[&str] = &["chromium", "chromium-driver"];
+
+/// Installs the browser that judges the page. Returns the Python that drives it, and the script
+/// with the accessibility rules.
+///
+/// # Errors
+/// Returns an error if a package cannot be installed.
+pub(crate) fn browser(workspace: &Workspace) -> anyhow::Result<(PathBuf, PathBuf)> {
+    apt_install(APT_BROWSER)?;
+    venv(workspace, "browser", "page.txt")?;
+    if !succeeds("npm", &["--version"]) {
+        apt_install(APT_NODE)?;
+    }
+    let folder = workspace.peers().join("axe");
+    if !folder.join(AXE_SCRIPT).is_file() {
+        step("installing from npm: axe-core");
+        let mut npm = Command::new("npm");
+        npm.args(["install", "--ignore-scripts", "--no-audit", "--no-fund"])
+            .args(["--loglevel=error", "--prefix"])
+            .arg(&folder)
+            .arg(AXE);
+        must(&mut npm)?;
+    }
+    let python = python_of(&workspace.peers().join("browser"));
+    Ok((python, folder.join(AXE_SCRIPT)))
+}
+
+/// The accessibility rules of the judge of the page.
+const AXE: &str = "axe-core@4.14.0";
+const AXE_SCRIPT: &str = "node_modules/axe-core/axe.min.js";
+
 /// Installs missing peers. Failures are printed; the tests of these peers then skip themselves, or
 /// fail with `CI=true`.
 pub(crate) fn install(workspace: &Workspace) -> Ended {

@@ -1,0 +1,264 @@
+"""Drives the page of the cell in Chromium: every view of a running demo, in both colours and at the
+width of a phone, by the rules of axe-core, and the commands of a signed-in operator. Any console
+message fails."""
+
+import argparse
+import base64
+import json
+import pathlib
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+
+from selenium import webdriver
+from selenium.webdriver.common.by import By
+from selenium.webdriver.common.keys import Keys
+from selenium.webdriver.support.ui import WebDriverWait
+
+WIDE = (1280, 800)
+PHONE = (390, 844)
+PASSWORD = "correct horse battery"
+SOON = 60
+
+
+class Judge:
+    def __init__(self, out, axe):
+        self.axe = axe.read_text()
+        options = webdriver.ChromeOptions()
+        for argument in ["--headless=new", "--no-sandbox", "--disable-gpu", "--hide-scrollbars"]:
+            options.add_argument(argument)
+        options.binary_location = "/usr/bin/chromium"
+        options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+        service = webdriver.ChromeService("/usr/bin/chromedriver")
+        self.driver = webdriver.Chrome(options=options, service=service)
+        self.driver.set_page_load_timeout(SOON)
+        self.out = out
+        self.faults = []
+
+    def look(self, scheme, size):
+        feature = {"name": "prefers-color-scheme", "value": scheme}
+        self.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [feature]})
+        metrics = {"width": size[0], "height": size[1], "deviceScaleFactor": 1, "mobile": size == PHONE}
+        self.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
+
+    def open(self, url, view):
+        self.driver.get(f"{url}#/{view}")
+        self.driver.refresh()
+
+    def wait(self, what, condition):
+        try:
+            return WebDriverWait(self.driver, SOON, 0.2).until(lambda _: condition())
+        except Exception:
+            self.shoot("fault")
+            text = self.driver.find_element(By.TAG_NAME, "body").text
+            raise SystemExit(f"not within {SOON} s: {what}; the page shows:\n{text}") from None
+
+    def text(self, selector="main"):
+        found = self.driver.find_elements(By.CSS_SELECTOR, selector)
+        return found[0].text if found else ""
+
+    def shoot(self, name):
+        shot = self.driver.execute_cdp_cmd("Page.captureScreenshot", {"format": "png"})
+        (self.out / f"{name}.png").write_bytes(base64.b64decode(shot["data"]))
+
+    def overflow(self, name):
+        wide = self.driver.execute_script(
+            "return document.documentElement.scrollWidth - document.documentElement.clientWidth")
+        if wide > 0:
+            self.faults.append(f"{name}: the page is {wide} px wider than the window")
+
+    def accessible(self, name):
+        """Applies the rules of axe-core."""
+        self.driver.execute_script(self.axe)
+        broken = self.driver.execute_async_script(
+            "const done = arguments[arguments.length - 1];"
+            "axe.run(document).then((result) => done(result.violations.map((rule) =>"
+            " [rule.id, rule.impact, rule.nodes[0].html.slice(0, 160)])))")
+        self.faults.extend(f"{name}: {rule}" for rule in broken)
+
+    def console(self):
+        for entry in self.driver.get_log("browser"):
+            self.faults.append(f"console: {entry['level']} {entry['message']}")
+
+
+def page_of(demo):
+    """Returns the address of the page and the folder of the logs, which the demo prints."""
+    for line in demo.stdout:
+        print(line, end="")
+        found = re.search(r"page of the cell (?:is )?at (http://\S+/), the logs (?:are )?in (\S+)\\.", line)
+        if found:
+            return found.groups()
+    raise SystemExit("the demo has not printed the address of its page")
+
+
+def views(judge, url, topic):
+    """Takes every view in both colours and widths."""
+    for scheme in ["light", "dark"]:
+        for size in [WIDE, PHONE]:
+            judge.look(scheme, size)
+            for view in ["programs", "values", f"topic/{topic}", "map", "skills", "processes"]:
+                judge.open(url, view)
+                judge.wait(f"{view} is live", lambda: judge.text("#link") == "live")
+                judge.wait(f"{view} has a title", lambda: judge.text("h1"))
+                # The first events have arrived when a rate can be shown.
+                time.sleep(1.5)
+                name = f"{view.split('/')[0]}-{scheme}-{'phone' if size == PHONE else 'wide'}"
+                judge.shoot(name)
+                judge.overflow(name)
+                judge.accessible(name)
+
+
+def values(judge, url):
+    """Waits for values that move, and returns the topic of one."""
+    judge.look("light", WIDE)
+    judge.open(url, "values")
+    readings = lambda: [one.text for one in judge.driver.find_elements(By.CSS_SELECTOR, "td .reading")]
+    judge.wait("there are values", lambda: any(text not in ("", "–") for text in readings()))
+    first = readings()
+    judge.wait("values move", lambda: readings() != first)
+    search = judge.driver.find_element(By.CSS_SELECTOR, "input[type=search]")
+    search.send_keys("no such topic")
+    judge.wait("a filter without a match says so", lambda: "No values" in judge.text())
+    search.send_keys(Keys.CONTROL, "a")
+    search.send_keys(Keys.DELETE)
+    link = judge.wait("the list is back", lambda: judge.driver.find_elements(By.CSS_SELECTOR, "th.name a"))[0]
+    # The keyboard reaches a topic.
+    link.send_keys(Keys.ENTER)
+    judge.wait("the topic is shown", lambda: "Last samples" in judge.text())
+    topic = judge.driver.current_url.rsplit("/", 1)[-1]
+    judge.driver.back()
+    return topic
+
+
+def add_user(binaries, pki, name, role):
+    add = [binaries / "ua-server", "user", "add", name, "--role", role, "--pki", pki]
+    subprocess.run(add, input=PASSWORD, text=True, check=True, stdout=subprocess.DEVNULL)
+
+
+def sign(judge, name):
+    """Signs in by the dialog."""
+    judge.wait("nobody is signed in", lambda: judge.text("#sign") == "Sign in")
+    judge.driver.find_element(By.ID, "sign").click()
+    for field, text in [("user", name), ("password", PASSWORD)]:
+        box = judge.driver.find_element(By.NAME, field)
+        box.clear()
+        box.send_keys(text)
+    judge.driver.find_element(By.CSS_SELECTOR, "dialog[open] [type=submit]").click()
+    judge.wait(f"{name} is signed in", lambda: name in judge.text("#user"))
+
+
+def switch_off(judge, binaries, url, folder):
+    """Switches the conveyor off, and waits until the robot that replaces it moves."""
+    add_user(binaries, pathlib.Path(folder) / "server-pki", "anna", "operator")
+    judge.look("light", WIDE)
+
+    def may_sign_in():
+        judge.open(url, "skills")
+        return judge.text("#sign") == "Sign in"
+
+    judge.wait("the server knows its user", may_sign_in)
+    sign(judge, "anna")
+    call = judge.wait("the call is there", lambda: judge.driver.find_elements(By.CSS_SELECTOR, "[aria-label*='Conveyor']"))
+    call[0].click()
+    judge.shoot("call-light-wide")
+    judge.driver.find_element(By.CSS_SELECTOR, "dialog[open] [type=submit]").click()
+    judge.wait("the call was answered", lambda: not judge.driver.find_elements(By.CSS_SELECTOR, "dialog[open] [type=submit]"))
+    judge.open(url, "values")
+    row = lambda name: next((one.text for one in judge.driver.find_elements(By.CSS_SELECTOR, "tbody tr") if name in one.text), "")
+    judge.wait("the conveyor stands", lambda: "false" in row("/conveyor/running"))
+    judge.wait("the TurtleBot3 takes over", lambda: "true" in row("/park/busy") + row("/bucket/busy"))
+    judge.shoot("switched-off-light-wide")
+
+
+def operate(judge, binaries, folder, examples):
+    """Signs in, and starts a skill by its form."""
+    pki = folder / "pki"
+    for name, role in [("anna", "operator"), ("otto", "observer")]:
+        add_user(binaries, pki, name, role)
+    address = "127.0.0.1:9151"
+    commands = [
+        [binaries / "ua-server", "--pki", pki, "--interface", "lo", "--metrics", address, "--endpoint", "opc.tcp://127.0.0.1:48401"],
+        [binaries / "ua-component", examples / "parallel-gripper.yaml", "--interface", "lo", "--lds", "none", "--pki", folder / "component"],
+    ]
+    log = (folder / "operate.log").open("w")
+    running = [subprocess.Popen(command, stdout=log, stderr=log) for command in commands]
+    try:
+        time.sleep(2)
+        url = f"http://{address}/"
+        judge.look("dark", WIDE)
+        judge.open(url, "skills")
+        judge.wait("the skill is there", lambda: "Grasp" in judge.text())
+        buttons = lambda: [one.text for one in judge.driver.find_elements(By.CSS_SELECTOR, ".tile .button")]
+        if buttons():
+            judge.faults.append("a stranger has buttons")
+        sign(judge, "otto")
+        if buttons():
+            judge.faults.append("an observer has buttons")
+        judge.driver.find_element(By.ID, "sign").click()
+        sign(judge, "anna")
+        judge.wait("the operator has buttons", buttons)
+        if "Reset" in buttons():
+            judge.driver.find_element(By.CSS_SELECTOR, "[aria-label='Reset parallel-gripper.Grasp']").click()
+        start = "[aria-label='Start parallel-gripper.Grasp']"
+        judge.wait("the skill is ready", lambda: judge.driver.find_elements(By.CSS_SELECTOR, start))[0].click()
+        judge.driver.find_element(By.NAME, "Force").send_keys("12.5")
+        judge.shoot("form-dark-wide")
+        judge.driver.find_element(By.CSS_SELECTOR, "dialog[open] [type=submit]").click()
+        judge.wait("the run has succeeded", lambda: "Succeeded" in judge.text())
+        judge.shoot("operator-dark-wide")
+        judge.console()
+        judge.driver.get("about:blank")
+    finally:
+        for process in running:
+            process.send_signal(signal.SIGTERM)
+        for process in running:
+            process.wait(20)
+        log.close()
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--binaries", type=pathlib.Path, required=True)
+    parser.add_argument("--examples", type=pathlib.Path, required=True)
+    parser.add_argument("--axe", type=pathlib.Path, required=True)
+    parser.add_argument("--out", type=pathlib.Path, required=True)
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    judge = Judge(arguments.out, arguments.axe)
+    for scenario, more in [("line-by-topics", ["--covers", "12", "--conveyor-off-at", "600"]), ("assembly-line", ["--covers", "12"])]:
+        command = [arguments.binaries / "demo", "--scenario", scenario, *more]
+        demo = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        try:
+            url, folder = page_of(demo)
+            judge.out = arguments.out / scenario
+            judge.out.mkdir(exist_ok=True)
+            judge.wait("the page is served", lambda: served(judge, url))
+            views(judge, url, values(judge, url))
+            if scenario == "line-by-topics":
+                switch_off(judge, arguments.binaries, url, folder)
+            judge.console()
+            judge.driver.get("about:blank")
+        finally:
+            demo.send_signal(signal.SIGINT)
+            demo.communicate(timeout=60)
+    judge.out = arguments.out
+    with tempfile.TemporaryDirectory() as folder:
+        operate(judge, arguments.binaries, pathlib.Path(folder), arguments.examples)
+    judge.driver.quit()
+    print(json.dumps({"screenshots": str(arguments.out), "faults": judge.faults}, indent=2))
+    sys.exit(bool(judge.faults))
+
+
+def served(judge, url):
+    try:
+        judge.driver.get(url)
+        return True
+    except Exception:
+        return False
+
+
+if __name__ == "__main__":
+    main()

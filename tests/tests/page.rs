@@ -1,0 +1,273 @@
+//! The page of the cell: values, skills and programs as a browser receives them, and the commands
+//! of signed-in users.
+
+use std::io::Write as _;
+use std::path::Path;
+use std::process::{Command, Stdio};
+use std::time::Duration;
+
+use serde_json::{Value, json};
+use system_tests::{
+    Browser, Cell, Child, METRICS_SERVER, Started, UadpSocket, eventually, http_get, program,
+    resident,
+};
+use uadp::{DataSetHeader, GroupHeader, NetworkHeader, NetworkMessageEncoder, PublisherId, Scalar};
+
+const SOON: Duration = Duration::from_secs(30);
+const PAGE: &str = "127.0.0.1:8090";
+const PASSWORD: &str = "correct horse battery";
+
+/// Returns a datagram with one Double of a ROS 1 topic.
+fn datagram(id: u16, value: f64) -> Vec<u8> {
+    let network = NetworkHeader {
+        publisher_id: Some(PublisherId::UInt16(1)),
+        group: Some(GroupHeader {
+            writer_group_id: Some(2),
+            ..GroupHeader::default()
+        }),
+        ..NetworkHeader::default()
+    };
+    let mut datagram = Vec::new();
+    let mut message = NetworkMessageEncoder::new(&mut datagram, &network, Some(&[id])).unwrap();
+    let mut frame = message.key_frame(&DataSetHeader::default()).unwrap();
+    frame.scalar(Scalar::Double(value)).unwrap();
+    frame.finish().unwrap();
+    message.finish().unwrap();
+    datagram
+}
+
+fn page_of_space(cell: &Cell, args: &[&str]) -> Child {
+    let page = Started::new("ua-space", &program("ua-space"))
+        .args([&["page", "--interface", "lo"], args].concat())
+        .in_folder(cell.folder())
+        .start();
+    eventually("the page is served", SOON, || http_get(PAGE, "/session"));
+    page
+}
+
+#[test]
+fn a_browser_receives_the_visible_values_without_a_server() {
+    let Some(cell) = Cell::with(&[]) else {
+        return;
+    };
+    let page = page_of_space(&cell, &["--status", "http://127.0.0.1:9"]);
+    let browser = Browser::of(PAGE);
+    let start = browser.get("/");
+    assert_eq!(start.code, 200);
+    let policy = start.header("content-security-policy").unwrap_or_default();
+    assert!(policy.starts_with("default-src 'none'"), "{start:?}");
+    let foreign = Browser {
+        host: Some("rebound.example".to_owned()),
+        ..Browser::of(PAGE)
+    };
+    assert_eq!(foreign.get("/").code, 421);
+    assert_eq!(browser.post("/sign-in", &json!({})).code, 403);
+    assert_eq!(browser.get("/events?view=all").code, 400);
+
+    let group = UadpSocket::join();
+    let send = |value: f64| {
+        for id in 1..=60 {
+            group.send(&datagram(id, value));
+        }
+    };
+    send(1.5);
+    let mut values = browser.events("view=values&from=10&count=20");
+    let shown = values.until("the values are there", |view| {
+        (view["total"] == 60).then(|| view.clone())
+    });
+    let order = shown["order"].as_array().unwrap();
+    assert_eq!(order.len(), 20);
+    send(2.5);
+    let topic = order[0].as_str().unwrap().to_owned();
+    values.until("the next value is there", |view| {
+        (view["rows"][&topic]["value"] == "2.5").then_some(())
+    });
+    let mut one = browser.events("view=topic&topic=ua_1_2_5");
+    one.until("the topic is there", |view| {
+        (view["row"]["value"] == "2.5" && view["origin"] == "ROS 1").then_some(())
+    });
+    let mut programs = browser.events("view=programs");
+    programs.until("a program that does not answer is red", |view| {
+        let all = view["programs"].as_array()?;
+        let gone = all
+            .iter()
+            .find(|row| row["source"] == "http://127.0.0.1:9")?;
+        let own = all.iter().find(|row| row["source"] == "this program")?;
+        (gone["state"] == "down" && own["state"] == "ready").then_some(())
+    });
+    drop(page);
+}
+
+#[test]
+fn browsers_that_never_read_cost_bounded_memory() {
+    let Some(cell) = Cell::with(&[]) else {
+        return;
+    };
+    let page = page_of_space(&cell, &[]);
+    let browser = Browser::of(PAGE);
+    let group = UadpSocket::join();
+    let mut sent = 0.0;
+    let mut send_all = || {
+        sent += 1.0;
+        for id in 1..=100 {
+            group.send(&datagram(id, sent));
+        }
+    };
+    send_all();
+    browser
+        .events("view=values&count=100")
+        .until("the values are there", |view| {
+            (view["total"] == 100).then_some(())
+        });
+    let before = resident(page.id());
+    let idle: Vec<_> = (0..100)
+        .map(|_| browser.events("view=values&count=100"))
+        .collect();
+    let mut reader = browser.events("view=values&count=100");
+    // A reader receives new values while the others do not read.
+    for round in 0..20 {
+        send_all();
+        let wanted = f64::from(round + 2).to_string();
+        reader.until("the next values are there", |view| {
+            let rows = view["rows"].as_object()?;
+            rows.values()
+                .any(|row| row["value"] == wanted.as_str())
+                .then_some(())
+        });
+    }
+    let grown = resident(page.id()).saturating_sub(before);
+    assert!(
+        grown < 40 << 20,
+        "{grown} bytes for {} browsers",
+        idle.len()
+    );
+}
+
+/// Adds a user of the server.
+fn add_user(cell: &Cell, name: &str, role: &str) {
+    let mut child = Command::new(program("ua-server"))
+        .args(["user", "add", name, "--role", role, "--pki"])
+        .arg(cell.folder().join("pki"))
+        .stdin(Stdio::piped())
+        .stdout(Stdio::null())
+        .spawn()
+        .unwrap();
+    let mut stdin = child.stdin.take().unwrap();
+    stdin.write_all(PASSWORD.as_bytes()).unwrap();
+    drop(stdin);
+    assert!(child.wait().unwrap().success());
+}
+
+fn signed_in(name: &str) -> Browser {
+    let mut browser = Browser::of(METRICS_SERVER);
+    let answer = browser.post("/sign-in", &json!({ "user": name, "password": PASSWORD }));
+    assert_eq!(answer.code, 200, "{answer:?}");
+    let cookie = answer.header("set-cookie").unwrap();
+    assert!(cookie.contains("HttpOnly; SameSite=Strict"), "{cookie}");
+    browser.cookie = cookie.split(';').next().unwrap().to_owned();
+    browser.csrf = answer.json()["csrf"].as_str().unwrap().to_owned();
+    browser
+}
+
+#[test]
+fn an_operator_writes_a_value_within_its_range() {
+    let Some(cell) = Cell::with(&[]) else {
+        return;
+    };
+    add_user(&cell, "anna", "operator");
+    add_user(&cell, "otto", "observer");
+    let mapping = cell.file(
+        "page.yaml",
+        "
+namespaces:
+  2: urn:ua-bridge:system-tests
+variables:
+  - {node: ns=2;i=30, name: setpoint, type: Double, origin: 0, range: [0, 10], unit: m/s}
+  - {node: ns=2;i=31, name: limit, type: Double, origin: 0, permissions: {write: engineer}}
+",
+    );
+    let _server = cell.ua_server(&[mapping.to_str().unwrap()]);
+    let (anna, otto) = (signed_in("anna"), signed_in("otto"));
+    let write = |topic: &str, value: &str| json!({ "topic": topic, "value": value });
+    let mut shown = anna.events("view=topic&topic=ua_0_2_30");
+    shown.until("the value can be written", |view| {
+        (view["write"]["type"] == "Double" && view["row"]["unit"] == "m/s").then_some(())
+    });
+    assert_eq!(otto.post("/write", &write("ua_0_2_30", "4.5")).code, 403);
+    assert_eq!(anna.post("/write", &write("ua_0_2_31", "4.5")).code, 403);
+    assert_eq!(anna.post("/write", &write("ua_0_2_30", "11")).code, 409);
+    assert_eq!(anna.post("/write", &write("ua_0_2_30", "fast")).code, 400);
+    assert_eq!(anna.post("/write", &write("ua_1_2_30", "1")).code, 409);
+    let written = anna.post("/write", &write("ua_0_2_30", "4.5"));
+    assert_eq!(written.code, 200, "{written:?}");
+    shown.until("the value is shown", |view| {
+        (view["row"]["value"] == "4.5").then_some(())
+    });
+}
+
+#[test]
+fn an_operator_starts_a_skill_and_others_are_refused() {
+    let Some(cell) = Cell::with(&[]) else {
+        return;
+    };
+    add_user(&cell, "anna", "operator");
+    add_user(&cell, "otto", "observer");
+    let server = cell.ua_server(&[]);
+    let yaml =
+        Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples/plant/parallel-gripper.yaml");
+    let _component = Started::new("ua-component", &program("ua-component"))
+        .args([yaml.to_str().unwrap(), "--interface", "lo", "--lds", "none"])
+        .args(["--pki".into(), cell.folder().join("component-pki")])
+        .start();
+    let stranger = Browser::of(METRICS_SERVER);
+    let mut skills = stranger.events("view=skills");
+    let mut grasp = |what: &str, is: &dyn Fn(&Value) -> bool| {
+        skills.until(what, |view| {
+            let all = view["skills"].as_array()?;
+            let grasp = all.iter().find(|skill| skill["skill"] == "Grasp")?;
+            is(grasp).then(|| grasp.clone())
+        })
+    };
+    let tile = grasp("the skill has its calls", &|grasp| {
+        grasp["calls"]["Start"]["topic"].is_string() && grasp["state"].is_string()
+    });
+    assert_eq!(tile["type"], "GraspSkillType");
+    let start = tile["calls"]["Start"]["topic"].as_str().unwrap().to_owned();
+    let call = json!({ "topic": start, "fields": { "Force": "12.5" } });
+    assert_eq!(stranger.post("/call", &call).code, 401);
+    let wrong = json!({ "user": "anna", "password": "x" });
+    assert_eq!(stranger.post("/sign-in", &wrong).code, 403);
+    assert_eq!(signed_in("otto").post("/call", &call).code, 403);
+    let anna = signed_in("anna");
+    assert_eq!(anna.get("/session").json()["may_operate"], true);
+    let forged = Browser {
+        csrf: String::new(),
+        cookie: anna.cookie.clone(),
+        ..Browser::of(METRICS_SERVER)
+    };
+    assert_eq!(forged.post("/call", &call).code, 403);
+    let hard = json!({ "topic": start, "fields": { "Force": "hard" } });
+    assert_eq!(anna.post("/call", &hard).code, 400);
+    if tile["state"] == "Halted" {
+        let reset = tile["calls"]["Reset"]["topic"].clone();
+        let answer = anna.post("/call", &json!({ "topic": reset }));
+        assert_eq!(answer.code, 200, "{answer:?}");
+        grasp("the skill is ready", &|grasp| grasp["state"] == "Ready");
+    }
+    let answer = anna.post("/call", &call);
+    assert_eq!(answer.code, 200, "{answer:?}");
+    let ended = grasp("the run has ended", &|grasp| {
+        grasp["state"] == "Ready" && grasp["result"]["succeeded"] == true
+    });
+    assert_eq!(ended["result"]["results"]["Gripped"], "true");
+    assert_eq!(anna.post("/sign-out", &json!({})).code, 200);
+    assert_eq!(anna.post("/call", &call).code, 401);
+    let log = server.lines().join("\n");
+    for line in [
+        "signed in on the page",
+        "refused to sign in on the page",
+        "called from the page",
+    ] {
+        assert!(log.contains(line), "{line}: {log}");
+    }
+}
