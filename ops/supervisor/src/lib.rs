@@ -7,8 +7,8 @@
 //! Reading order: `board` (the last value of each topic), `announced` (names and units),
 //! `program` (rows of programs), `skill` (tiles of skills), `view` (what a browser is sent),
 //! `stream` (server-sent events), `fetch` (the status of other programs), `page` (state and
-//! events), `session` (signed-in users), `encode` (forms), `operations` (commands), `proxy` and
-//! `site` (requests).
+//! events), `session` (signed-in users), `encode` (forms), `operations` (commands), `proxy`,
+//! `responses` and `site` (requests).
 
 mod announced;
 mod board;
@@ -18,6 +18,7 @@ mod operations;
 mod page;
 mod program;
 mod proxy;
+mod responses;
 mod session;
 mod site;
 mod skill;
