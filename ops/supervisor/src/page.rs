@@ -2,13 +2,14 @@
 
 use std::net::SocketAddr;
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, Weak};
 use std::time::{Duration, Instant};
 
 use bridge_node::{CallDescription, Delivery, Observer, PortEvent, Statuses, now};
 use mappings::{Mapping, SpaceId, TopicId};
 use serde_json::Value;
 use tokio::time::{MissedTickBehavior, interval};
+use tracing::warn;
 use uadp::discovery::{List, Probe};
 use uadp::{PublisherId, SecurityHeader};
 
@@ -19,6 +20,7 @@ use crate::operations::Operations;
 use crate::program::Program;
 use crate::proxy::ProxyUrl;
 use crate::session::Sessions;
+use crate::stream::Worker;
 use crate::view::Viewer;
 
 /// The page of a program.
@@ -35,6 +37,10 @@ pub struct Page {
     /// The locations of the status of other programs.
     others: Vec<StatusUrl>,
     viewers: AtomicUsize,
+    /// Reads the status of this program.
+    statuses: OnceLock<Statuses>,
+    /// Started for the first browser.
+    worker: OnceLock<Option<Worker>>,
 }
 
 impl std::fmt::Debug for Page {
@@ -63,6 +69,8 @@ impl Page {
             started: now().monotonic,
             others,
             viewers: AtomicUsize::new(0),
+            statuses: OnceLock::new(),
+            worker: OnceLock::new(),
         })
     }
 
@@ -70,6 +78,27 @@ impl Page {
     pub fn operate(&self, operations: Arc<dyn Operations>) {
         // A program sets its users once.
         let _first = self.operations.set(operations);
+    }
+
+    /// Notes how the status of this program is read.
+    pub(crate) fn read_by(&self, statuses: Statuses) {
+        // A program has one server of pages.
+        let _first = self.statuses.set(statuses);
+    }
+
+    /// Returns the thread of the page, and starts it for the first browser. Returns `None` if the
+    /// system refuses another thread.
+    pub(crate) fn worker(self: &Arc<Self>) -> Option<&Worker> {
+        let start = || {
+            let worker = Worker::start()
+                .inspect_err(|error| warn!("cannot start the thread of the page: {error}"))
+                .ok()?;
+            if let Some(statuses) = self.statuses.get() {
+                worker.spawn(follow(Arc::downgrade(self), Arc::clone(statuses)));
+            }
+            Some(worker)
+        };
+        self.worker.get_or_init(start).as_ref()
     }
 
     pub(crate) fn sessions(&self) -> MutexGuard<'_, Sessions> {
@@ -103,28 +132,25 @@ impl Page {
         let now = self.at().since;
         viewer.next(&mut self.board(), now)
     }
+}
 
-    /// Reads the status of all programs while browsers are present.
-    pub(crate) async fn follow(self: Arc<Self>, statuses: Statuses) {
-        let mut ticks = interval(LOOK);
-        ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
-        let mut idle = 0_u32;
-        loop {
-            ticks.tick().await;
-            idle = match self.viewers.load(Ordering::Relaxed) {
-                0 => idle.saturating_add(1),
-                _ => 0,
-            };
-            // The status of the first browser is there when it comes.
-            if idle > 0 && idle % IDLE_LOOKS != 1 {
-                continue;
-            }
-            let mut programs = own(statuses().await);
-            for url in &self.others {
-                programs.extend(other(url, url.fetch().await));
-            }
-            self.board().set_programs(programs);
+/// Reads the status of all programs while browsers are present.
+async fn follow(page: Weak<Page>, statuses: Statuses) {
+    let mut ticks = interval(LOOK);
+    ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    loop {
+        ticks.tick().await;
+        let Some(page) = page.upgrade() else {
+            return;
+        };
+        if page.viewers.load(Ordering::Relaxed) == 0 {
+            continue;
         }
+        let mut programs = own(statuses().await);
+        for url in &page.others {
+            programs.extend(other(url, url.fetch().await));
+        }
+        page.board().set_programs(programs);
     }
 }
 
@@ -258,8 +284,6 @@ fn other(url: &StatusUrl, status: Result<Value, String>) -> Vec<Program> {
 
 /// The period in which the status of programs is read.
 const LOOK: Duration = Duration::from_secs(1);
-/// Without browsers, the status is read once in this number of periods.
-const IDLE_LOOKS: u32 = 10;
 
 #[cfg(test)]
 mod tests {

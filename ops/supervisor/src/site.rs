@@ -59,8 +59,8 @@ struct Write {
 }
 
 impl Site for Page {
-    fn run(self: Arc<Self>, statuses: Statuses) -> BoxFuture<()> {
-        Box::pin(self.follow(statuses))
+    fn start(&self, statuses: Statuses) {
+        self.read_by(statuses);
     }
 
     fn answer(
@@ -130,8 +130,12 @@ impl Page {
                 let query = request.uri().query().unwrap_or_default();
                 let view =
                     View::parse(query).map_err(|why| Refusal::new(StatusCode::BAD_REQUEST, why))?;
+                let worker = self.worker().ok_or_else(|| {
+                    let why = "the system refuses another thread";
+                    Refusal::new(StatusCode::SERVICE_UNAVAILABLE, why)
+                })?;
                 visit.keep_open();
-                let events = Events::new(self, view);
+                let events = Events::start(worker, Arc::clone(&self), view);
                 Ok(with_headers("text/event-stream", events.boxed_unsync()))
             }
             _ => Err(Refusal::new(

@@ -1,44 +1,91 @@
-//! Server-sent events: each event is made when the browser takes it.
+//! Server-sent events: each event is made when the browser has taken the event before.
 
 use std::convert::Infallible;
+use std::io;
 use std::pin::Pin;
 use std::sync::Arc;
-use std::task::{Context, Poll, ready};
+use std::task::{Context, Poll};
 
 use bytes::Bytes;
 use hyper::body::{Body, Frame};
-use tokio::time::{Interval, MissedTickBehavior, interval};
+use tokio::runtime::{Builder, Handle};
+use tokio::sync::{mpsc, oneshot};
+use tokio::time::{MissedTickBehavior, interval};
 
 use crate::page::Page;
 use crate::view::{View, Viewer};
 
-/// The event stream of a browser. The connection polls it only while the browser reads, so a
-/// browser that does not read holds one event at most.
-pub(crate) struct Events {
-    page: Arc<Page>,
-    viewer: Viewer,
-    ticks: Interval,
-    is_begun: bool,
+/// The thread that makes events and reads the status of programs, so that browsers do not delay
+/// samples. It ends when this value is dropped.
+#[derive(Debug)]
+pub(crate) struct Worker {
+    handle: Handle,
+    _stop: oneshot::Sender<()>,
 }
+
+impl Worker {
+    /// Starts the thread.
+    ///
+    /// # Errors
+    /// The system refuses another thread.
+    pub(crate) fn start() -> io::Result<Self> {
+        let runtime = Builder::new_current_thread().enable_all().build()?;
+        let handle = runtime.handle().clone();
+        let (stop, stopped) = oneshot::channel::<()>();
+        let run = move || {
+            // The sender is dropped at the end.
+            let _dropped = runtime.block_on(stopped);
+        };
+        drop(
+            std::thread::Builder::new()
+                .name("page".to_owned())
+                .spawn(run)?,
+        );
+        Ok(Self {
+            handle,
+            _stop: stop,
+        })
+    }
+
+    /// Runs a task in the thread.
+    pub(crate) fn spawn(&self, task: impl Future<Output = ()> + Send + 'static) {
+        drop(self.handle.spawn(task));
+    }
+}
+
+/// The event stream of a browser. It holds one event at most, for a browser that does not read.
+pub(crate) struct Events(mpsc::Receiver<Bytes>);
 
 impl Events {
-    pub(crate) fn new(page: Arc<Page>, view: View) -> Self {
-        let mut ticks = interval(view.period());
-        ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
-        page.came();
-        Self {
-            page,
-            viewer: Viewer::new(view),
-            ticks,
-            is_begun: false,
-        }
+    /// Starts the stream of a view.
+    pub(crate) fn start(worker: &Worker, page: Arc<Page>, view: View) -> Self {
+        let (events, taken) = mpsc::channel(1);
+        worker.spawn(make(page, view, events));
+        Self(taken)
     }
 }
 
-impl Drop for Events {
-    fn drop(&mut self) {
-        self.page.left();
+/// Makes events until the browser has left.
+async fn make(page: Arc<Page>, view: View, events: mpsc::Sender<Bytes>) {
+    let mut ticks = interval(view.period());
+    ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let mut viewer = Viewer::new(view);
+    page.came();
+    let retry = Bytes::from_static(b"retry: 2000\n\n");
+    let mut is_there = events.send(retry).await.is_ok();
+    while is_there {
+        ticks.tick().await;
+        is_there = match events.reserve().await {
+            Ok(free) => {
+                if let Some(event) = page.next_event(&mut viewer) {
+                    free.send(event.into());
+                }
+                !events.is_closed()
+            }
+            Err(_) => false,
+        };
     }
+    page.left();
 }
 
 impl Body for Events {
@@ -49,17 +96,7 @@ impl Body for Events {
         self: Pin<&mut Self>,
         cx: &mut Context<'_>,
     ) -> Poll<Option<Result<Frame<Bytes>, Infallible>>> {
-        let this = self.get_mut();
-        if !this.is_begun {
-            this.is_begun = true;
-            let retry = Bytes::from_static(b"retry: 2000\n\n");
-            return Poll::Ready(Some(Ok(Frame::data(retry))));
-        }
-        loop {
-            ready!(this.ticks.poll_tick(cx));
-            if let Some(event) = this.page.next_event(&mut this.viewer) {
-                return Poll::Ready(Some(Ok(Frame::data(event.into()))));
-            }
-        }
+        let next = self.get_mut().0.poll_recv(cx);
+        next.map(|event| event.map(|event| Ok(Frame::data(event))))
     }
 }

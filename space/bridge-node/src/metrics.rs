@@ -18,7 +18,7 @@ use hyper_util::rt::{TokioIo, TokioTimer};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::AbortHandle;
-use tracing::{debug, error, info};
+use tracing::{debug, info};
 
 use crate::clock;
 use crate::exit::{Failure, FailureKind};
@@ -49,11 +49,11 @@ pub type PageBody = UnsyncBoxBody<Bytes, Infallible>;
 /// Requests the status of each run loop, as `/status` has it.
 pub type Statuses = Arc<dyn Fn() -> BoxFuture<Vec<String>> + Send + Sync>;
 
-/// Pages that a program serves beside its status. They are served by a thread of their own, so that
-/// browsers do not delay samples.
+/// Pages that a program serves beside its status. The thread of the run loops serves them, so a page
+/// leaves longer work to a thread of its own.
 pub trait Site: Send + Sync + 'static {
-    /// Works for the pages as long as they are served.
-    fn run(self: Arc<Self>, statuses: Statuses) -> BoxFuture<()>;
+    /// Receives the access to the status of the program, before the first request.
+    fn start(&self, statuses: Statuses);
 
     /// Answers a request for another path than those of the status.
     fn answer(
@@ -131,45 +131,16 @@ pub(crate) async fn serve<T: Told>(
         "metrics at http://{at}/metrics, status at http://{at}/status, readiness at http://{at}/readyz"
     );
     let ask: Ask<T> = ask.into();
-    match site {
-        None => drop(tokio::spawn(accept(listener, Served { ask, site: None }))),
-        Some(site) => {
-            info!("{}", site.describe(at));
-            serve_apart(listener, (ask, site)).map_err(|error| {
-                Failure::new(FailureKind::Io, format!("cannot serve the page: {error}"))
-            })?;
-        }
-    }
-    Ok(requests)
-}
-
-/// Serves the pages in a thread of their own.
-fn serve_apart<T: Told>(
-    listener: TcpListener,
-    (ask, site): (Ask<T>, Arc<dyn Site>),
-) -> std::io::Result<()> {
-    let listener = listener.into_std()?;
-    let runtime = tokio::runtime::Builder::new_current_thread()
-        .enable_all()
-        .build()?;
-    let serve = async move {
-        let listener = match TcpListener::from_std(listener) {
-            Ok(listener) => listener,
-            Err(error) => return error!(%error, "cannot serve the page"),
-        };
+    if let Some(site) = &site {
+        info!("{}", site.describe(at));
         let asked = Arc::clone(&ask);
-        let statuses: Statuses = Arc::new(move || {
+        site.start(Arc::new(move || {
             let ask = Arc::clone(&asked);
             Box::pin(async move { statuses(&ask).await.iter().map(T::json).collect() })
-        });
-        let work = tokio::spawn(Arc::clone(&site).run(statuses));
-        let site = Some(site);
-        accept(listener, Served { ask, site }).await;
-        work.abort();
-    };
-    let thread = std::thread::Builder::new().name("page".to_owned());
-    drop(thread.spawn(move || runtime.block_on(serve))?);
-    Ok(())
+        }));
+    }
+    drop(tokio::spawn(accept(listener, Served { ask, site })));
+    Ok(requests)
 }
 
 /// The sources of the pages.
