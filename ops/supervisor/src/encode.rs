@@ -50,10 +50,10 @@ fn variant(field: &CallField, value: &Value, block: &mut Vec<u8>) -> Result<(), 
         block.push(field.builtin.id());
         return scalar(field.builtin, &text(value), block);
     };
-    let elements: Vec<String> = match value {
-        Value::Array(elements) => elements.iter().map(text).collect(),
-        other => {
-            let all = text(other);
+    let elements: Vec<String> = match value.as_array() {
+        Some(elements) => elements.iter().map(text).collect(),
+        None => {
+            let all = text(value);
             let all = all.trim().trim_start_matches('[').trim_end_matches(']');
             let each = all
                 .split([',', ';'])
@@ -77,9 +77,9 @@ fn variant(field: &CallField, value: &Value, block: &mut Vec<u8>) -> Result<(), 
 
 /// Returns the text of a JSON value, without quotes.
 fn text(value: &Value) -> String {
-    match value {
-        Value::String(text) => text.clone(),
-        other => other.to_string(),
+    match value.as_str() {
+        Some(text) => text.to_owned(),
+        None => value.to_string(),
     }
 }
 
