@@ -3,9 +3,13 @@
 
 use std::fs;
 use std::io;
-use std::path::Path;
+use std::path::{Path, PathBuf};
+
+use plant_opcua::certificates;
+use plant_opcua::pki::Pki;
 
 use crate::pace::Speed;
+use crate::stage::LOOPBACK;
 
 /// A component: its name, its ApplicationUri, its YAML and the port of its endpoint.
 pub(super) struct Part {
@@ -59,6 +63,9 @@ pub(super) const FINGERS: &str = "robotiq-2f85";
 pub(super) const VACUUM: &str = "schmalz-ecbpi";
 pub(super) const CHANGER: &str = "tool-changer";
 pub(super) const HANDLING: &str = "handling";
+pub(super) const LDS: &str = "ua-lds";
+pub(super) const DEMO: &str = "demo";
+pub(super) const DEMO_URI: &str = "urn:example:demo";
 
 /// The ports of the simulators: RTDE, secondary interface, gripper, IO-Link master, converter.
 pub(super) const DEVICE_PORTS: [u16; 5] = [30_004, 30_002, 1502, 8090, 1503];
@@ -88,6 +95,7 @@ pub(super) fn write(directory: &Path, speed: Speed, swapped: bool) -> io::Result
             "{simulated: {",
             &format!("{{simulated: {{time_scale: {}, ", speed.factor()),
         );
+        text = text.replace("security: [None]", "security: [Basic256Sha256]");
         if swapped && part.name == CHANGER {
             text = text
                 .replace("number: 1", "number: X")
@@ -100,6 +108,61 @@ pub(super) fn write(directory: &Path, speed: Speed, swapped: bool) -> io::Result
         fs::write(directory.join(format!("{}.yaml", part.name)), text)?;
     }
     Ok(())
+}
+
+/// Returns the certificate store of a program.
+pub(super) fn store(directory: &Path, name: &str) -> PathBuf {
+    directory.join("pki").join(name)
+}
+
+/// Creates the certificates of the components and of the demo, which trust each other. The
+/// discovery server creates its own certificate, and trusts them.
+///
+/// # Errors
+/// A store cannot be written.
+pub(super) fn trust_each_other(directory: &Path) -> io::Result<()> {
+    let hosts = [LOOPBACK.to_owned()];
+    let parts = PARTS.iter().map(|part| (part.name, part.uri));
+    let programs: Vec<(&str, &str)> = parts.chain([(DEMO, DEMO_URI)]).collect();
+    for (name, uri) in &programs {
+        let store = Pki::open(store(directory, name)).map_err(io::Error::other)?;
+        store.ensure_own_at(uri, &hosts).map_err(io::Error::other)?;
+    }
+    Pki::open(store(directory, LDS)).map_err(io::Error::other)?;
+    for (name, _) in &programs {
+        let own = certificate(directory, name);
+        let others = programs.iter().map(|(other, _)| *other).chain([LDS]);
+        for other in others.filter(|other| other != name) {
+            trust(directory, other, &own)?;
+        }
+    }
+    Ok(())
+}
+
+/// Makes all programs trust the certificate of the discovery server. Returns `false` until the
+/// discovery server has created it.
+///
+/// # Errors
+/// A store cannot be written.
+pub(super) fn trust_discovery(directory: &Path) -> io::Result<bool> {
+    let own = certificate(directory, LDS);
+    if !own.is_file() {
+        return Ok(false);
+    }
+    for part in &PARTS {
+        trust(directory, part.name, &own)?;
+    }
+    Ok(true)
+}
+
+fn certificate(directory: &Path, name: &str) -> PathBuf {
+    store(directory, name).join("own/cert.der")
+}
+
+fn trust(directory: &Path, name: &str, certificate: &Path) -> io::Result<()> {
+    let certificate = certificate.display().to_string();
+    let trusted = certificates::trust(&store(directory, name), &certificate);
+    trusted.map(drop).map_err(io::Error::other)
 }
 
 /// Returns the simulators: the name of each, and its arguments after `simulate`.
@@ -160,9 +223,10 @@ mod tests {
         ] {
             assert!(changer.lines().any(|known| known == line), "{changer}");
         }
+        let handling = include_str!("../../../examples/plant/handling.yaml");
         assert_eq!(
             read(HANDLING),
-            include_str!("../../../examples/plant/handling.yaml")
+            handling.replace("[None]", "[Basic256Sha256]")
         );
         assert!(dock(FINGERS, true)[0] < 0.0 && dock(VACUUM, true)[0] > 0.0);
         fs::remove_dir_all(directory).unwrap();

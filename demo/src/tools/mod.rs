@@ -18,6 +18,7 @@ use std::path::PathBuf;
 use std::process::ExitStatus;
 use std::time::Duration;
 
+use plant_opcua::client::SecurityChoice;
 use serde_json::Value as Json;
 use skills::{
     ClientOptions, Outcome, Runs as _, SkillClient, SkillFault, SkillHandle, TypeName, Value,
@@ -193,7 +194,7 @@ impl Story<'_> {
         );
         let printed = self.show.timeline.print_text(&text);
         printed.map_err(Failure::io("cannot print"))?;
-        self.start_all()?;
+        self.start_all().await?;
         let began = Instant::now();
         for part in &PARTS {
             self.found(part, began).await?;
@@ -214,20 +215,38 @@ impl Story<'_> {
         Ok(())
     }
 
-    fn start_all(&mut self) -> Result<(), Failure> {
+    async fn start_all(&mut self) -> Result<(), Stop> {
         let directory = self.programs.directory().to_owned();
         cell::write(&directory, self.plan.speed, self.plan.swapped)
+            .and_then(|()| cell::trust_each_other(&directory))
             .map_err(Failure::io("cannot write the files of the programs"))?;
         let endpoint = format!("opc.tcp://{LOOPBACK}:{LDS_PORT}");
         let metrics = format!("{LOOPBACK}:{}", self.page);
-        let arguments = ["--endpoint", &endpoint, "--metrics", &metrics].map(str::to_owned);
-        self.start("ua-lds", self.lds.clone(), arguments.into(), Stage::Bridges)?;
+        let store = cell::store(&directory, cell::LDS).display().to_string();
+        let secured = ["--pki", &store, "--secured-only"];
+        let arguments = ["--endpoint", &endpoint, "--metrics", &metrics];
+        let arguments: Vec<String> = arguments
+            .into_iter()
+            .chain(secured)
+            .map(str::to_owned)
+            .collect();
+        self.start(cell::LDS, self.lds.clone(), arguments, Stage::Bridges)?;
         let metrics = format!("{LOOPBACK}:{}", self.browser);
         let arguments = ["page", "--interface", LOOPBACK, "--metrics", &metrics].map(str::to_owned);
         self.start("page", self.tool.clone(), arguments.into(), Stage::Bridges)?;
         open_when_served(self.browser, self.plan.open);
         for (name, arguments) in cell::simulators(self.plan.speed) {
             self.start(name, self.component.clone(), arguments, Stage::Master)?;
+        }
+        let began = Instant::now();
+        while !cell::trust_discovery(&directory)
+            .map_err(Failure::io("cannot trust the discovery server"))?
+        {
+            if began.elapsed() > FOUND {
+                let why = format!("ua-lds has no certificate within {FOUND:?}");
+                return Err(Stop::Broken(why));
+            }
+            sleep(POLL).await;
         }
         for part in &PARTS {
             self.plug_in(part.name)?;
@@ -236,8 +255,10 @@ impl Story<'_> {
     }
 
     fn plug_in(&mut self, name: &'static str) -> Result<(), Failure> {
-        let yaml = self.programs.directory().join(format!("{name}.yaml"));
-        let arguments = [&yaml.display().to_string(), "--interface", LOOPBACK].map(str::to_owned);
+        let directory = self.programs.directory();
+        let yaml = directory.join(format!("{name}.yaml")).display().to_string();
+        let store = cell::store(directory, name).display().to_string();
+        let arguments = [&yaml, "--interface", LOOPBACK, "--pki", &store].map(str::to_owned);
         self.start(
             name,
             self.component.clone(),
@@ -295,7 +316,7 @@ impl Story<'_> {
     }
 
     async fn skills(&self, port: u16) -> Option<usize> {
-        let client = connect(port).await.ok()?;
+        let client = self.connect(port).await.ok()?;
         let skills = client.skills().await.ok().map(|skills| skills.len());
         client.close().await;
         skills
@@ -338,7 +359,7 @@ impl Story<'_> {
 
     /// Kills the vacuum gripper while the robot carries the part, and starts it again.
     async fn lose_and_plug_in(&mut self) -> Result<(), Stop> {
-        let client = connect_to(HANDLING).await?;
+        let client = self.connect_to(HANDLING).await?;
         let handle = handle_of(&client, "PlaceByVacuum").await?;
         let began = Instant::now();
         let mut steps = Steps::default();
@@ -398,7 +419,7 @@ impl Story<'_> {
         what: &str,
         parameters: Vec<(String, Value)>,
     ) -> Result<Run, Stop> {
-        let client = connect_to(component).await?;
+        let client = self.connect_to(component).await?;
         let handle = handle_of(&client, skill).await?;
         let text = format!("{skill} begins: {what}");
         self.show.note(Who(component, "36"), text)?;
@@ -444,6 +465,25 @@ impl Story<'_> {
         Ok(run)
     }
 
+    /// Connects by the certificate of the demo; all channels of the cell are secured.
+    async fn connect(&self, port: u16) -> Result<SkillClient, SkillFault> {
+        let options = ClientOptions {
+            application_uri: cell::DEMO_URI.to_owned(),
+            application_name: cell::DEMO.to_owned(),
+            pki: Some(cell::store(self.programs.directory(), cell::DEMO)),
+            security: SecurityChoice::Basic256Sha256,
+            ..ClientOptions::default()
+        };
+        SkillClient::connect(&format!("opc.tcp://{LOOPBACK}:{port}"), &options).await
+    }
+
+    async fn connect_to(&self, component: &'static str) -> Result<SkillClient, Stop> {
+        let part = PARTS.iter().find(|part| part.name == component);
+        let port = part.and_then(|part| part.port).unwrap_or_default();
+        let connected = self.connect(port).await;
+        connected.map_err(|fault| Stop::Broken(format!("{component}: {fault}")))
+    }
+
     fn failure(&self, stop: Stop) -> Failure {
         let logs = self.programs.directory().to_owned();
         match stop {
@@ -476,22 +516,6 @@ impl Steps {
             self.0.push(state.step);
         }
     }
-}
-
-async fn connect(port: u16) -> Result<SkillClient, SkillFault> {
-    SkillClient::connect(
-        &format!("opc.tcp://{LOOPBACK}:{port}"),
-        &ClientOptions::default(),
-    )
-    .await
-}
-
-async fn connect_to(component: &'static str) -> Result<SkillClient, Stop> {
-    let part = PARTS.iter().find(|part| part.name == component);
-    let port = part.and_then(|part| part.port).unwrap_or_default();
-    connect(port)
-        .await
-        .map_err(|fault| Stop::Broken(format!("{component}: {fault}")))
 }
 
 async fn handle_of(client: &SkillClient, skill: &str) -> Result<SkillHandle, Stop> {

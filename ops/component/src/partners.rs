@@ -1,19 +1,16 @@
 //! Discovers the components on which skills of this component depend.
 
 use discovery::{Found, Interface, WatchSettings, watch};
-use skills::{ClientOptions, Component, Detector};
+use skills::PeerAccess;
 use tokio::task::JoinSet;
 use tracing::warn;
 
 /// Starts to discover other components if a skill needs them, for as long as the tasks are kept.
-pub(crate) fn look(
-    component: &Component,
-    mdns: Option<&Interface>,
-) -> (Option<Detector>, JoinSet<()>) {
+pub(crate) fn look(peers: &PeerAccess, mdns: Option<&Interface>) -> JoinSet<()> {
     let mut tasks = JoinSet::new();
-    if !component.looks_for_others() {
-        return (None, tasks);
-    }
+    let Some(detector) = peers.detector.clone() else {
+        return tasks;
+    };
     let settings = WatchSettings {
         mdns: mdns.cloned(),
         ..WatchSettings::default()
@@ -21,29 +18,23 @@ pub(crate) fn look(
     let mut watcher = match watch(settings) {
         Ok(watcher) => watcher,
         Err(fault) => {
-            warn!("nobody is found by mDNS: {fault}");
-            return (None, tasks);
+            warn!(%fault, "cannot discover other components by mDNS");
+            return tasks;
         }
     };
-    let detector = Detector::new(ClientOptions {
-        application_uri: component.application_uri.clone(),
-        application_name: component.name.clone(),
-        ..ClientOptions::default()
-    });
-    let told = detector.clone();
     tasks.spawn(async move {
         while let Some(found) = watcher.next().await {
             let known = found.known();
             match &found {
-                Found::Gone { .. } => told.gone(&known.name),
+                Found::Gone { .. } => detector.gone(&known.name),
                 Found::Seen(_) | Found::Restarted(_) if known.is_lds() => {}
-                Found::Seen(_) => told.seen(&known.name, &known.url),
+                Found::Seen(_) => detector.seen(&known.name, &known.url),
                 Found::Restarted(_) => {
-                    told.gone(&known.name);
-                    told.seen(&known.name, &known.url);
+                    detector.gone(&known.name);
+                    detector.seen(&known.name, &known.url);
                 }
             }
         }
     });
-    (Some(detector), tasks)
+    tasks
 }

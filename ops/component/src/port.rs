@@ -20,7 +20,7 @@ use plant_opcua::own;
 use plant_opcua::supervision::Supervision;
 use program::{Method, State};
 use skills::server::{ComponentServer, ServeFault, ServeSettings};
-use skills::{Component, Owner, Security, Skill};
+use skills::{Component, Owner, PeerAccess, Security, Skill};
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 use tracing::{info, warn};
@@ -95,9 +95,10 @@ impl ComponentPort {
         };
         let outbox = Outbox::default();
         let mut first = VecDeque::new();
-        let (detector, mut looks) = partners::look(component, options.mdns.as_ref());
+        let peers = PeerAccess::of_component(component, options.pki.as_deref());
+        let mut looks = partners::look(&peers, options.mdns.as_ref());
         let settings = ServeSettings {
-            detector,
+            peers,
             pki: options.pki.clone(),
             trust_any_client: options.trust_any_client,
             first_run: run_number_of_now(),

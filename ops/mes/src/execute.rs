@@ -6,7 +6,10 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use async_trait::async_trait;
-use skills::{Outcome, PartEnd, PickAndPlace, Runs, SkillFault, Teller, Value, run_part};
+use skills::frame::Frame;
+use skills::{
+    GripPoint, Outcome, PartEnd, PickAndPlace, Runs, SkillFault, Teller, Value, run_part,
+};
 use tokio::sync::watch;
 use tracing::{info, warn};
 
@@ -309,6 +312,7 @@ impl Execution<'_> {
             linear,
             grasp,
             release,
+            plate: Frame::IDENTITY,
             within: self.process.within,
         };
         match composite.run(job, self).await {
@@ -526,6 +530,10 @@ impl Watched {
 
 #[async_trait]
 impl Runs for Watched {
+    fn grip_point(&self) -> Option<GripPoint> {
+        self.inner.grip_point()
+    }
+
     fn name(&self) -> String {
         self.inner.name()
     }

@@ -137,7 +137,9 @@ impl UaMes {
             application_uri: settings.application_uri.clone(),
             application_name: format!("{} client", settings.name),
             pki: options.pki.clone(),
+            user: settings.user.clone(),
             within: WITHIN,
+            ..ClientOptions::default()
         };
         let cell = Arc::new(Cell::new(
             Arc::clone(&knowledge),
@@ -337,6 +339,8 @@ fn component(settings: &Settings, driver: ExecuteProcess) -> Component {
         lds: settings.lds.clone(),
         open: settings.open,
         lease: skills::LEASE,
+        user: settings.user.clone(),
+        anonymous: Some(skills::anonymous_by_default()),
         limits: plant_opcua::limits::ClientLimits::default(),
         device: None,
         robot: None,
@@ -346,6 +350,7 @@ fn component(settings: &Settings, driver: ExecuteProcess) -> Component {
             driver: DriverSetup::Given(Arc::new(driver)),
             capabilities: Vec::new(),
             timeout: None,
+            grip_point: None,
             place: Place::START,
         }],
     }

@@ -6,13 +6,14 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use knowledge::is_iri;
+use plant_opcua::client::ClientUser;
 use skills::yaml::{Code, Findings, Kind, Node, Reader, parse};
 use skills::{Lds, Security, TypeName};
 
 use crate::process::{Job, Need, Process, Role, Step};
 
 /// The settings of the MES.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone)]
 pub(crate) struct Settings {
     /// The name of the component.
     pub(crate) name: String,
@@ -23,6 +24,8 @@ pub(crate) struct Settings {
     pub(crate) security: Vec<Security>,
     pub(crate) lds: Lds,
     pub(crate) open: bool,
+    /// The user as which the MES uses components; `None` for anonymous.
+    pub(crate) user: Option<ClientUser>,
     /// The address of the SPARQL endpoint.
     pub(crate) sparql: SocketAddr,
     /// Turtle files.
@@ -87,6 +90,7 @@ impl Reading<'_> {
             "security",
             "lds",
             "open",
+            "user",
             "sparql",
             "knowledge",
             "nodesets",
@@ -101,6 +105,7 @@ impl Reading<'_> {
             security,
             lds,
             open,
+            user,
             sparql,
             knowledge,
             nodesets,
@@ -129,6 +134,10 @@ impl Reading<'_> {
         };
         let lds = lds.map_or(Some(Lds::Local), |node| self.lds(node));
         let open = open.map_or(Some(false), |node| self.reader.boolean(node));
+        let user = match user {
+            Some(node) => Some(skills::read_user(node, self.folder, &mut self.reader)?),
+            None => None,
+        };
         let sparql = sparql.map_or(Some(DEFAULT_SPARQL), |node| self.address(node));
         let knowledge = knowledge.map_or_else(Vec::new, |node| self.files(node));
         let nodesets = nodesets.map_or_else(Vec::new, |node| self.files(node));
@@ -150,6 +159,7 @@ impl Reading<'_> {
             security: security?,
             lds: lds?,
             open: open?,
+            user,
             sparql: sparql?,
             knowledge,
             nodesets,
@@ -318,7 +328,8 @@ impl Reading<'_> {
     }
 
     fn job(&mut self, node: &Node) -> Option<skills::Job> {
-        let [pick, place, approach] = self.reader.map(node, ["pick", "place", "approach"])?;
+        let keys = ["pick", "place", "approach", "shape"];
+        let [pick, place, approach, shape] = self.reader.map(node, keys)?;
         let pick = self
             .reader
             .needed(pick, "pick", node.place)
@@ -330,10 +341,15 @@ impl Reading<'_> {
         let approach = approach.map_or(Some(USUALLY_APPROACH), |node| {
             self.reader.number(node, (0.0, 10.0))
         });
+        let shape = match shape {
+            Some(node) => Some(skills::read_shape(node, &mut self.reader)?),
+            None => None,
+        };
         Some(skills::Job {
             pick: pick?,
             place: place?,
             approach: approach?,
+            shape,
         })
     }
 

@@ -14,8 +14,8 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use skills::{
-    COMPOSITE_HALT_TIMEOUT, ClientOptions, Device, Driver, DriverFault, Parameters, PartEnd,
-    Results, Runs, SkillClient, SkillFault, TypeName, Value, Work, run_part,
+    COMPOSITE_HALT_TIMEOUT, Device, Driver, DriverFault, Parameters, PartEnd, PeerAccess, Results,
+    Runs, SkillClient, SkillFault, TypeName, Value, Work, run_part,
 };
 use tokio::time::{Instant, sleep};
 
@@ -90,6 +90,7 @@ pub struct Changer {
     settings: Arc<Settings>,
     converter: Arc<Modbus>,
     mover: Mover,
+    peers: PeerAccess,
 }
 
 impl Changer {
@@ -101,12 +102,17 @@ impl Changer {
             converter: Arc::new(Modbus::new(at.clone(), *unit)),
             settings: Arc::new(settings),
             mover,
+            peers: PeerAccess::default(),
         }
     }
 }
 
 impl Device for Changer {
-    fn driver(&self, types: &[TypeName]) -> Result<Arc<dyn Driver>, DriverFault> {
+    fn driver(
+        &self,
+        types: &[TypeName],
+        peers: &PeerAccess,
+    ) -> Result<Arc<dyn Driver>, DriverFault> {
         let is = |name: &str| types.contains(&TypeName::own(name));
         let what = if is("ChangeToolSkillType") {
             What::Change
@@ -121,7 +127,10 @@ impl Device for Changer {
                  below them, and this is {own}"
             )));
         };
-        let changer = self.clone();
+        let changer = Self {
+            peers: peers.clone(),
+            ..self.clone()
+        };
         Ok(Arc::new(Change { changer, what }))
     }
 }
@@ -235,7 +244,7 @@ impl Driver for Change {
             (Some(number), What::Change | What::Detach) => Some(self.tool(number)?),
             (None, _) => None,
         };
-        let mover = Connected::open(&self.changer.mover).await?;
+        let mover = Connected::open(&self.changer.mover, &self.changer.peers).await?;
         let moved = self.moved(&mover, &mut look, (put, wanted), &work).await;
         mover.close().await;
         match moved {
@@ -366,7 +375,7 @@ struct Connected {
 }
 
 impl Connected {
-    async fn open(mover: &Mover) -> Result<Self, String> {
+    async fn open(mover: &Mover, peers: &PeerAccess) -> Result<Self, String> {
         let endpoint = match mover {
             Mover::Skills { ptp, linear } => {
                 return Ok(Self {
@@ -378,8 +387,7 @@ impl Connected {
             Mover::Endpoint(endpoint) => endpoint,
         };
         let told = |fault: SkillFault| format!("{endpoint}: {fault}");
-        let client = SkillClient::connect(endpoint, &ClientOptions::default()).await;
-        let client = client.map_err(told)?;
+        let client = peers.connect(endpoint).await?;
         match Self::with(&client).await {
             Ok((ptp, linear)) => Ok(Self {
                 ptp,

@@ -7,6 +7,8 @@
 //! Reading order: [`line`](Line) (the address of a device), `modbus` (the client), [`robotiq`],
 //! [`schmalz`], [`ur`], [`kelvin`] (which moves a robot).
 
+#[cfg(test)]
+mod contact_tests;
 pub mod kelvin;
 mod kinds;
 mod line;

@@ -9,7 +9,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use async_trait::async_trait;
-use skills::{Device, Driver, DriverFault, Parameters, Results, TypeName, Work};
+use skills::{Device, Driver, DriverFault, Parameters, PeerAccess, Results, TypeName, Work};
 use tokio::time::{Instant, sleep};
 
 use crate::line::Line;
@@ -41,7 +41,11 @@ impl Gripper {
 }
 
 impl Device for Gripper {
-    fn driver(&self, types: &[TypeName]) -> Result<Arc<dyn Driver>, DriverFault> {
+    fn driver(
+        &self,
+        types: &[TypeName],
+        _peers: &PeerAccess,
+    ) -> Result<Arc<dyn Driver>, DriverFault> {
         let is = |name: &str| types.contains(&TypeName::own(name));
         let modbus = Arc::clone(&self.modbus);
         let of = |what| -> Arc<dyn Driver> { Arc::new(Motion { modbus, what }) };

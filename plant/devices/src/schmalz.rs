@@ -13,7 +13,7 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use serde_json::{Value, json};
-use skills::{Device, Driver, DriverFault, Results, TypeName, Work};
+use skills::{Device, Driver, DriverFault, PeerAccess, Results, TypeName, Work};
 use tokio::time::{Instant, sleep};
 
 use self::http::Master;
@@ -59,7 +59,11 @@ impl Gripper {
 }
 
 impl Device for Gripper {
-    fn driver(&self, types: &[TypeName]) -> Result<Arc<dyn Driver>, DriverFault> {
+    fn driver(
+        &self,
+        types: &[TypeName],
+        _peers: &PeerAccess,
+    ) -> Result<Arc<dyn Driver>, DriverFault> {
         let is = |name: &str| types.contains(&TypeName::own(name));
         let motion = |holds| -> Arc<dyn Driver> {
             Arc::new(Motion {

@@ -15,7 +15,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use async_trait::async_trait;
-use skills::{Device, Driver, DriverFault, Parameters, Results, TypeName, Work};
+use skills::{Device, Driver, DriverFault, Parameters, PeerAccess, Results, TypeName, Work};
 use tokio::io::AsyncWriteExt as _;
 use tokio::net::TcpStream;
 use tokio::time::{Instant, timeout};
@@ -70,7 +70,11 @@ impl Robot {
 }
 
 impl Device for Robot {
-    fn driver(&self, types: &[TypeName]) -> Result<Arc<dyn Driver>, DriverFault> {
+    fn driver(
+        &self,
+        types: &[TypeName],
+        _peers: &PeerAccess,
+    ) -> Result<Arc<dyn Driver>, DriverFault> {
         let is = |name: &str| types.contains(&TypeName::own(name));
         let settings = Arc::clone(&self.settings);
         let motion = |linear| -> Arc<dyn Driver> { Arc::new(Motion { settings, linear }) };

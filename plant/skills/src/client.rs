@@ -5,28 +5,37 @@
 //! - this module
 //! - `packed`: structures that hold numbers
 //! - `find`: the skills of a server
+//! - `grip`: the grip point of a skill
 //! - `handle`: a skill of a server
 //! - `mirror`: the skills of a server, presented like local skills
 //! - `detector`: the skills of all servers
+//! - `peers`: how the skills of a component reach other components
 //! - `remote`: a composite of the skills of several servers
 
 mod detector;
 mod find;
+mod grip;
 mod handle;
 mod mirror;
 mod packed;
+mod peers;
 mod remote;
+#[cfg(test)]
+mod secured_tests;
 
 use std::path::PathBuf;
 use std::time::Duration;
 
-use plant_opcua::client::{CallError, Client, ClientConfig, ClientError, Link};
+use plant_opcua::client::{
+    CallError, Client, ClientConfig, ClientError, ClientUser, Link, SecurityChoice,
+};
 use plant_opcua::types::StatusCode;
 
 pub use detector::{Detected, Detector};
 pub use find::{FoundParameter, FoundSkill, FoundType};
 pub use handle::{RemoteState, SkillHandle};
 pub use mirror::{Mirror, Mirrors, Watchable};
+pub use peers::PeerAccess;
 pub use remote::Remote;
 
 use crate::parameters::TypeName;
@@ -41,6 +50,10 @@ pub struct ClientOptions {
     pub application_name: String,
     /// The directory of certificates; without it, connections are not secured.
     pub pki: Option<PathBuf>,
+    /// The user; `None` for anonymous.
+    pub user: Option<ClientUser>,
+    /// The required security of an endpoint.
+    pub security: SecurityChoice,
     /// Time limit for a response of the server.
     pub within: Duration,
 }
@@ -51,6 +64,8 @@ impl Default for ClientOptions {
             application_uri: "urn:ua-bridge:skills:client".to_owned(),
             application_name: "skills client".to_owned(),
             pki: None,
+            user: None,
+            security: SecurityChoice::Best,
             within: Duration::from_secs(2),
         }
     }
@@ -71,18 +86,18 @@ impl SkillClient {
     /// Connects to the server at `endpoint`.
     ///
     /// # Errors
-    /// [`SkillFault::Lost`] if the connection is not established in time.
+    /// - [`SkillFault::Refused`] if the certificate of the server is not accepted
+    /// - [`SkillFault::Lost`] if the connection is not established in time
     pub async fn connect(endpoint: &str, options: &ClientOptions) -> Result<Self, SkillFault> {
         let config = ClientConfig {
             pki: options.pki.clone(),
+            user: options.user.clone(),
+            security: options.security,
             timeout: options.within,
             ..ClientConfig::new(&options.application_uri, &options.application_name)
         };
         let client = Client::open(config, endpoint);
-        client
-            .up(options.within)
-            .await
-            .map_err(|error| lost(&error))?;
+        connected(&client, options).await?;
         Ok(Self {
             client,
             endpoint: endpoint.to_owned(),
@@ -168,6 +183,47 @@ impl SkillClient {
     pub async fn close(&self) {
         self.client.close().await;
     }
+}
+
+/// Waits for the first connection. A refused certificate is reported at once, because it stays
+/// refused until an operator trusts it.
+async fn connected(client: &Client, options: &ClientOptions) -> Result<(), SkillFault> {
+    let mut link = client.link();
+    let refused = async {
+        while let Ok(()) = link.changed().await {
+            let now = link.borrow_and_update().clone();
+            if let Link::Down {
+                reason,
+                certificate: Some(status),
+            } = now
+            {
+                return (reason, status);
+            }
+        }
+        std::future::pending().await
+    };
+    tokio::select! {
+        up = client.up(options.within) => up.map_err(|error| not_connected(&error, options)),
+        (reason, status) = refused => Err(self::refused(status, &reason)),
+    }
+}
+
+/// Adds what an operator has to do if the server refuses this client.
+fn not_connected(error: &ClientError, options: &ClientOptions) -> SkillFault {
+    let text = error.to_string();
+    let refuses_user = ["BadIdentityToken", "BadUserAccessDenied"];
+    let hint = if text.contains("BadSecurityChecksFailed") {
+        format!(
+            "; the server has to trust the certificate of {}",
+            options.application_uri
+        )
+    } else if refuses_user.iter().any(|status| text.contains(status)) {
+        let user = options.user.as_ref().map_or("anonymous", |user| &user.name);
+        format!("; the server does not admit the user {user}")
+    } else {
+        return lost(error);
+    };
+    SkillFault::Lost(text + &hint)
 }
 
 fn lost(error: &ClientError) -> SkillFault {
@@ -608,7 +664,11 @@ mod tests {
         ];
         let detector = Detector::new(ClientOptions::default());
         detector.seen("gripper", gripper.url());
-        let driver = Arc::new(Remote::new(partners, Some(detector)));
+        let peers = PeerAccess {
+            detector: Some(detector),
+            ..PeerAccess::default()
+        };
+        let driver = Arc::new(Remote::new(partners, peers));
         let outcome =
             conformance::run_once("PickAndPlaceSkillType", driver.clone(), parameters.clone())
                 .await

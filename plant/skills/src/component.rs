@@ -4,19 +4,26 @@ mod device;
 mod document;
 mod drivers;
 mod space;
+mod world;
 
 use std::fmt;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
+use plant_opcua::client::ClientUser;
 use plant_opcua::limits::ClientLimits;
+use plant_opcua::users::{Role, Roles};
 
 pub use device::{Device, DeviceKinds, NoDevices};
+pub use document::read_user;
 pub use drivers::{DriverFault, Drivers};
 pub use space::{Asked, Form, Part, Source, SpaceWork};
 
+pub use world::{read_numbers, read_shape};
+
 use crate::driver::Driver;
+use crate::grip::GripPoint;
 use crate::parameters::TypeName;
 use crate::yaml::Place;
 
@@ -41,6 +48,10 @@ pub struct Component {
     pub open: bool,
     /// Idle time after which the lease of a session is released.
     pub lease: Duration,
+    /// The user as which its skills use other components; `None` for anonymous.
+    pub user: Option<ClientUser>,
+    /// The roles of anonymous users; `None` if they are refused.
+    pub anonymous: Option<Roles>,
     /// The number of clients that its server serves.
     pub limits: ClientLimits,
     /// The device that does the work of the skills with [`DriverSetup::Device`].
@@ -130,6 +141,8 @@ pub struct SkillSetup {
     pub capabilities: Vec<String>,
     /// Time limit of a run; `None` for no limit.
     pub timeout: Option<Duration>,
+    /// The grip point of a grasp skill.
+    pub grip_point: Option<GripPoint>,
     /// The location of the type in the document.
     pub place: Place,
 }
@@ -219,6 +232,12 @@ impl Component {
             | DriverSetup::Space(_) => false,
         })
     }
+}
+
+/// Returns the default roles of anonymous users: they may run skills while they hold the lease.
+#[must_use]
+pub fn anonymous_by_default() -> Roles {
+    Roles::of(&[Role::Observer, Role::Operator])
 }
 
 /// Default idle time after which the lease of a session is released.

@@ -8,6 +8,8 @@ use async_trait::async_trait;
 use tracing::{debug, warn};
 
 use crate::driver::{Driver, Results, Work};
+use crate::frame::Frame;
+use crate::grip::{Hold, PartShape};
 use crate::parameters::Parameters;
 use crate::part::{PartEnd, run_part};
 use crate::runs::{COMPOSITE_HALT_TIMEOUT, Runs, SkillFault};
@@ -24,6 +26,8 @@ pub struct PickAndPlace {
     pub grasp: Arc<dyn Runs>,
     /// ReleaseSkillType of the same gripper.
     pub release: Arc<dyn Runs>,
+    /// The tool plate of the gripper in the frame of the flange, for example behind a tool changer.
+    pub plate: Frame,
     /// Time limit of each run.
     pub within: Duration,
 }
@@ -31,17 +35,22 @@ pub struct PickAndPlace {
 /// A pick and place job.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Job {
-    /// The pose of the object: m, m, m, rad, rad, rad.
+    /// The pose of the object, whose z axis points up: m, m, m, rad, rad, rad. If the gripper states
+    /// no grip point, it is the pose of the flange.
     pub pick: [f64; 6],
     /// The target pose of the object.
     pub place: [f64; 6],
-    /// Height above both poses at which the straight moves start and end, m.
+    /// Distance from both poses at which the straight moves start and end, along the z axis of the
+    /// tool, m.
     pub approach: f64,
+    /// The shape of the object, if it is known.
+    pub shape: Option<PartShape>,
 }
 
 /// The failure of a job.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{step}: {why}; {}", match retreated {
+    Ok(()) if *step == INIT => "nothing has moved".to_owned(),
     Ok(()) => "the robot has retreated".to_owned(),
     Err(why) => format!("the robot has not retreated: {why}"),
 })]
@@ -150,11 +159,19 @@ impl PickAndPlace {
     /// # Errors
     /// [`Broken`].
     pub async fn run(&self, job: &Job, teller: &dyn Teller) -> Result<(), Broken> {
-        let above = |at: [f64; 6]| {
-            let [x, y, z, a, b, c] = at;
-            [x, y, z + job.approach, a, b, c]
-        };
-        let (over_pick, over_place) = (above(job.pick), above(job.place));
+        teller.step(INIT).await;
+        let grip = self.grasp.grip_point();
+        let hold = Hold::new(grip.as_ref(), &self.plate, job.shape.as_ref()).map_err(|why| {
+            let name = self.grasp.name();
+            Broken {
+                step: INIT,
+                why: format!("{name} does not fit: {why}"),
+                retreated: Ok(()),
+            }
+        })?;
+        let (pick, place) = (hold.at(job.pick), hold.at(job.place));
+        let over_pick = hold.before(job.pick, job.approach);
+        let over_place = hold.before(job.place, job.approach);
         // Name, skill and target of each step, and the retreat from there.
         let at_pick = ("MovePickApproachError", &self.linear, over_pick);
         let between = ("MovePlaceApproachError", &self.ptp, over_place);
@@ -166,7 +183,7 @@ impl PickAndPlace {
                 Some(over_pick),
                 at_pick,
             ),
-            ("MovePick", &self.linear, Some(job.pick), at_pick),
+            ("MovePick", &self.linear, Some(pick), at_pick),
             ("Grasp", &self.grasp, None, at_pick),
             (
                 "MovePickApproachAfter",
@@ -180,7 +197,7 @@ impl PickAndPlace {
                 Some(over_place),
                 between,
             ),
-            ("MovePlace", &self.linear, Some(job.place), at_place),
+            ("MovePlace", &self.linear, Some(place), at_place),
             ("Release", &self.release, None, at_place),
             (
                 "MovePlaceApproachAfter",
@@ -189,7 +206,6 @@ impl PickAndPlace {
                 at_place,
             ),
         ];
-        teller.step("Init").await;
         for (step, skill, target, retreat) in steps {
             teller.step(step).await;
             let fault = match self.part(skill, target, teller).await {
@@ -295,6 +311,9 @@ async fn run<T>(
     }
 }
 
+/// The step before anything moves.
+const INIT: &str = "Init";
+
 /// Why a robot that was told to stop has not retreated.
 const HALTED: &str = "it was halted, and stands still";
 
@@ -334,6 +353,7 @@ pub(crate) fn job(parameters: &Parameters) -> Result<Job, String> {
         approach: parameters
             .number("ApproachOffset")
             .ok_or("ApproachOffset is no number")?,
+        shape: None,
     })
 }
 
@@ -359,6 +379,7 @@ mod tests {
         pick: PICK,
         place: PLACE,
         approach: 0.05,
+        shape: None,
     };
 
     /// A skill of a component that can be lost.
@@ -452,6 +473,7 @@ mod tests {
             )),
             grasp: losable("GraspSkillType", gripper.grasp(None)),
             release: losable("ReleaseSkillType", gripper.release(None)),
+            plate: Frame::IDENTITY,
             within: Duration::from_secs(5),
         };
         Cell {

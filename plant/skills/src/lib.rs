@@ -11,6 +11,8 @@ mod component;
 mod composite;
 pub mod conformance;
 mod driver;
+pub mod frame;
+mod grip;
 pub mod model;
 mod parameters;
 mod part;
@@ -27,15 +29,16 @@ pub mod yaml;
 pub use authority::{Authority, Owner};
 pub use client::{
     ClientOptions, Detected, Detector, FoundParameter, FoundSkill, FoundType, Mirror, Mirrors,
-    RemoteState, SkillClient, SkillHandle, Watchable,
+    PeerAccess, RemoteState, SkillClient, SkillHandle, Watchable,
 };
 pub use component::{
     Asked, Component, Device, DeviceKinds, DriverFault, DriverSetup, Drivers, Form, LEASE, Lds,
     MOST_SKILLS, NoDevices, Part, Partner, Partners, Robot, Security, Simulation, SkillSetup,
-    Source, SpaceWork,
+    Source, SpaceWork, anonymous_by_default, read_numbers, read_shape, read_user,
 };
 pub use composite::{Broken, Job, PickAndPlace, Teller};
 pub use driver::{Driver, Results, Stopped, Work};
+pub use grip::{GripPoint, GripType, PartShape};
 pub use model::NAMESPACE;
 pub use parameters::{NoTypeName, Parameter, Parameters, TypeName};
 pub use part::{PartEnd, run_part};

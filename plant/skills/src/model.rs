@@ -23,6 +23,13 @@ pub const CONTROLLER_TYPE: &str = "ISkillControllerType";
 /// The namespace of OPC 10000-100, which defines the locks of components.
 pub(crate) const DEVICES: &str = "http://opcfoundation.org/UA/DI/";
 
+/// The properties of a grasp skill with a grip point.
+pub const GRIP_POINT_OFFSET: &str = "GripPointOffset";
+/// A value of [`GripType`](crate::GripType).
+pub const GRIP_POINT_TYPE: &str = "GripPointType";
+/// The smallest and the largest width between the fingers.
+pub const GRIP_POINT_OPENING: &str = "GripPointOpening";
+
 /// The reference from a skill to a skill that does part of its work.
 pub const USES_SKILL: &str = "UsesSkill";
 /// The type of the target of that reference.

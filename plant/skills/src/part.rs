@@ -192,6 +192,7 @@ mod tests {
             linear: Scripted::new(Way::Done),
             grasp: Arc::clone(&grasp) as Arc<dyn Runs>,
             release: Scripted::new(Way::Done),
+            plate: crate::frame::Frame::IDENTITY,
             within: Duration::from_secs(60),
         };
         let of = model::find("PickAndPlaceSkillType").unwrap();

@@ -7,6 +7,7 @@ use async_trait::async_trait;
 use program::{Method, State};
 
 use crate::authority::Owner;
+use crate::grip::GripPoint;
 use crate::refusal::{Code, Refusal};
 use crate::shown::Outcome;
 use crate::skill::Skill;
@@ -35,6 +36,11 @@ pub trait Runs: Send + Sync {
     /// # Errors
     /// The reason why the skill may not have stopped.
     async fn halt(&self) -> Result<(), SkillFault>;
+
+    /// Returns the grip point of a grasp skill, if its component states it.
+    fn grip_point(&self) -> Option<GripPoint> {
+        None
+    }
 
     /// Completes with the reason when the component is lost. Pends while the component is
     /// available.

@@ -9,9 +9,11 @@
 //! - `show`: values and events for clients
 //! - `methods`: methods and writes of clients
 //! - `lock`: the lease as a lock of OPC 10000-100
+//! - `grip`: the grip point of a grasp skill
 //! - `robot`: the robot for clients of OPC 40010-1
 //! - `uses`: the skills that composites use
 
+mod grip;
 mod lock;
 mod methods;
 mod place;
@@ -30,7 +32,7 @@ use plant_opcua::server::{
 };
 use plant_opcua::supervision::Supervision;
 use plant_opcua::types::{NodeId, ObjectId, ObjectTypeId, QualifiedName};
-use plant_opcua::users::{Access, Role, Roles};
+use plant_opcua::users::{Access, Anonymous, Roles, Rules};
 use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
 use tokio::time::{Instant, MissedTickBehavior};
@@ -40,7 +42,7 @@ use self::methods::status;
 use self::show::{Nodes, Shower};
 pub(crate) use self::types::OUTCOME;
 use crate::authority::{Authority, Owner};
-use crate::client::Detector;
+use crate::client::PeerAccess;
 use crate::component::{Component, Drivers, Security, SkillSetup};
 use crate::driver::Driver;
 use crate::model::{self, NAMESPACE};
@@ -52,8 +54,8 @@ use crate::yaml::{Code, Finding, Findings};
 /// Settings of the server of a component, beside the component.
 #[derive(Debug, Clone, Default)]
 pub struct ServeSettings {
-    /// Finds the components that composites identify by their ApplicationUris.
-    pub detector: Option<Detector>,
+    /// Reaches the components whose skills the component uses.
+    pub peers: PeerAccess,
     /// The directory of certificates, required for Basic256Sha256.
     pub pki: Option<PathBuf>,
     /// Trusts the certificates of all clients. For tests and demonstrations only.
@@ -101,7 +103,7 @@ impl ComponentServer {
         settings: &ServeSettings,
         mut observers: impl FnMut(u16, &Facts) -> Vec<Box<dyn Observer>>,
     ) -> Result<Self, ServeFault> {
-        let users = users_of(settings)?;
+        let users = users_of(component, settings)?;
         let server = server_of(component, settings, &users)?;
         let mut ids = IdRange::new(OWN, FIRST_FREE_ID);
         let root = root(&server, component, &mut ids)?;
@@ -112,7 +114,7 @@ impl ComponentServer {
             .node("Skills")
             .cloned()
             .ok_or_else(|| ServeFault::Space("it has no folder Skills".to_owned()))?;
-        let mut drivers = Drivers::new(component.device.clone(), settings.detector.clone());
+        let mut drivers = Drivers::new(component.device.clone(), settings.peers.clone());
         let mut findings = Findings::default();
         let mut made = Vec::new();
         for (number, setup) in (1..).zip(&component.skills) {
@@ -214,12 +216,17 @@ impl ComponentServer {
     }
 }
 
-/// Returns the users of the certificate store. Anonymous users may run skills while they hold the
-/// lease.
-fn users_of(settings: &ServeSettings) -> Result<Arc<Access>, ServeFault> {
-    let anonymous = Roles::of(&[Role::Observer, Role::Operator]);
+/// Returns the users of the certificate store.
+fn users_of(component: &Component, settings: &ServeSettings) -> Result<Arc<Access>, ServeFault> {
+    let anonymous = component.anonymous.unwrap_or(Roles::NONE);
     let users = Access::of_store(settings.pki.as_deref(), anonymous);
     let users = users.map_err(|error| ServerError::Configuration(error.to_string()))?;
+    if component.anonymous.is_none() {
+        users.set_rules(Rules {
+            anonymous: Anonymous::Refused,
+            ..Rules::default()
+        });
+    }
     Ok(Arc::new(users))
 }
 
@@ -333,7 +340,9 @@ fn make(
     let first = number * IDS_PER_SKILL;
     let spec = InstanceSpec {
         event_notifier: true,
-        optional: vec!["ProgramDiagnostic".to_owned()],
+        optional: grip::properties(setup.grip_point.as_ref())
+            .chain(["ProgramDiagnostic".to_owned()])
+            .collect(),
         ..InstanceSpec::new(
             type_id,
             NodeId::new(OWN, first),
@@ -354,6 +363,13 @@ fn make(
         let finding = wrong(code, format!("{skill_type} has no instances: {error}"));
         finding.with_help("a subtype that is not abstract has skills")
     })?;
+    if let Some(grip) = &setup.grip_point
+        && !grip::show(server, &instance, grip)
+    {
+        let message =
+            format!("`grip_point` is for skills of GraspSkillType, and this is {skill_type}");
+        return Err(wrong(Code::SkillType, message));
+    }
     let facts = Facts {
         name: name.clone(),
         parameters: types::parameters(server, &instance, "ParameterSet", &types, |of| {

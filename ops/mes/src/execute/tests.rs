@@ -270,6 +270,7 @@ fn process() -> Process {
             pick: [0.0; 6],
             place: [1.0; 6],
             approach: 0.05,
+            shape: None,
         }),
         steps: vec![step("pick", Role::Grasp), step("place", Role::Release)],
         within: Duration::from_secs(5),

@@ -51,7 +51,15 @@ async fn bench() -> Bench {
         reach: ur::REACH,
     });
     let authority = Authority::new();
-    let moves = |of: &str| skill(of, device.driver(&[TypeName::own(of)]).unwrap(), &authority);
+    let moves = |of: &str| {
+        skill(
+            of,
+            device
+                .driver(&[TypeName::own(of)], &PeerAccess::default())
+                .unwrap(),
+            &authority,
+        )
+    };
     let mover = Mover::Skills {
         ptp: moves("PtpMoveSkillType"),
         linear: moves("LinearMoveSkillType"),
@@ -107,7 +115,10 @@ fn given(uri: &str) -> Vec<(String, Value)> {
 
 impl Bench {
     async fn run(&self, of: &str, uri: Option<&str>) -> Result<(bool, String), String> {
-        let driver = self.changer.driver(&[TypeName::own(of)]).unwrap();
+        let driver = self
+            .changer
+            .driver(&[TypeName::own(of)], &PeerAccess::default())
+            .unwrap();
         let given = uri.map(given).unwrap_or_default();
         let outcome = conformance::run_once(of, driver, given).await?;
         Ok((outcome.succeeded, outcome.message))
@@ -137,7 +148,10 @@ async fn tools_are_taken_changed_and_put_back() {
     elsewhere[1].1 = DOCKS[1].into();
     let driver = bench
         .changer
-        .driver(&[TypeName::own("AttachToolSkillType")])
+        .driver(
+            &[TypeName::own("AttachToolSkillType")],
+            &PeerAccess::default(),
+        )
         .unwrap();
     let refused = conformance::run_once("AttachToolSkillType", driver, elsewhere)
         .await
@@ -161,7 +175,10 @@ async fn its_drivers_are_as_drivers_should_be() {
     let bench = bench().await;
     let driver = bench
         .changer
-        .driver(&[TypeName::own("ChangeToolSkillType")])
+        .driver(
+            &[TypeName::own("ChangeToolSkillType")],
+            &PeerAccess::default(),
+        )
         .unwrap();
     let mut uris = URIS;
     let parameters = || {

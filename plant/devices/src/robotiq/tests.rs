@@ -30,7 +30,9 @@ async fn bench(line: &str, object: Option<f64>) -> Bench {
 impl Bench {
     fn driver(&self, of: &str) -> Arc<dyn Driver> {
         let gripper = Gripper::new(self.serving.line().clone(), UNIT);
-        gripper.driver(&[TypeName::own(of)]).unwrap()
+        gripper
+            .driver(&[TypeName::own(of)], &PeerAccess::default())
+            .unwrap()
     }
 
     async fn run(&self, of: &str) -> (bool, String) {
@@ -160,7 +162,8 @@ async fn a_gripper_that_is_not_there_or_refuses_is_told_by_its_line() {
     let bench = bench(LINES[0], None).await;
     let line = bench.serving.line().clone();
     drop(bench);
-    let driver = Gripper::new(line.clone(), UNIT).driver(&[TypeName::own("GraspSkillType")]);
+    let driver = Gripper::new(line.clone(), UNIT)
+        .driver(&[TypeName::own("GraspSkillType")], &PeerAccess::default());
     let outcome = conformance::run_once("GraspSkillType", driver.unwrap(), Vec::new())
         .await
         .unwrap();

@@ -26,7 +26,9 @@ impl Bench {
             release: Duration::from_millis(600),
         };
         let gripper = Gripper::new(&self.serving.address().to_string(), "master1port1", timing);
-        gripper.driver(&[TypeName::own(of)]).unwrap()
+        gripper
+            .driver(&[TypeName::own(of)], &PeerAccess::default())
+            .unwrap()
     }
 
     async fn run(&self, of: &str) -> (bool, String) {

@@ -3,29 +3,7 @@
 //! The space uses rotations about the fixed x, y and z of the base, in sequence. The robot
 //! uses a rotation vector: the axis, with the angle as its length.
 
-/// A unit quaternion: w, x, y, z.
-pub(crate) type Quaternion = [f64; 4];
-
-/// Converts rotations about x, y and z, rad.
-pub(crate) fn of_angles([a, b, c]: [f64; 3]) -> Quaternion {
-    let (sa, ca) = (a / 2.0).sin_cos();
-    let (sb, cb) = (b / 2.0).sin_cos();
-    let (sc, cc) = (c / 2.0).sin_cos();
-    [
-        ca * cb * cc + sa * sb * sc,
-        sa * cb * cc - ca * sb * sc,
-        ca * sb * cc + sa * cb * sc,
-        ca * cb * sc - sa * sb * cc,
-    ]
-}
-
-/// Converts to rotations about x, y and z, rad.
-pub(crate) fn to_angles([w, x, y, z]: Quaternion) -> [f64; 3] {
-    let a = (2.0 * (w * x + y * z)).atan2(1.0 - 2.0 * (x * x + y * y));
-    let b = (2.0 * (w * y - z * x)).clamp(-1.0, 1.0).asin();
-    let c = (2.0 * (w * z + x * y)).atan2(1.0 - 2.0 * (y * y + z * z));
-    [a, b, c]
-}
+pub(crate) use skills::frame::{Quaternion, of_angles, to_angles};
 
 /// Converts a rotation vector, rad.
 pub(crate) fn of_vector([x, y, z]: [f64; 3]) -> Quaternion {

@@ -31,7 +31,9 @@ impl Bench {
             secondary: self.serving.secondary().to_string(),
             reach: REACH,
         };
-        Robot::new(settings).driver(&[TypeName::own(of)]).unwrap()
+        Robot::new(settings)
+            .driver(&[TypeName::own(of)], &PeerAccess::default())
+            .unwrap()
     }
 
     async fn run(&self, of: &str, target: [f64; 6]) -> Outcome {

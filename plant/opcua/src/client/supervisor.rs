@@ -16,7 +16,7 @@ use opcua::client::{
 use opcua::sync::Mutex;
 use opcua::types::{
     DataValue, DateTime, EndpointDescription, MessageSecurityMode, NodeId, ReadValueId, StatusCode,
-    TimestampsToReturn, VariableId, Variant,
+    TimestampsToReturn, UserTokenType, VariableId, Variant,
 };
 use tokio::sync::{Notify, mpsc, oneshot, watch};
 use tokio::task::JoinHandle;
@@ -465,9 +465,26 @@ async fn endpoint(
     let may_be_plain = is_none || is_best && config.user.is_none();
     let chosen = secured.or_else(|| may_be_plain.then(|| has(&is_plain)).flatten());
     let mut chosen = chosen.ok_or_else(|| no_security(shared, &offered))?;
+    admits_user(shared, &chosen)?;
     // The host name in the server's own URL may not resolve here.
     chosen.endpoint_url = shared.url.as_str().into();
     Ok(chosen)
+}
+
+/// Checks that an endpoint admits the kind of user of the client. The library reports only that the
+/// connection was closed. An endpoint without any policy admits anonymous users.
+fn admits_user(shared: &Shared, endpoint: &EndpointDescription) -> Result<(), String> {
+    let (wanted, why) = match &shared.config.user {
+        Some(_) => (UserTokenType::UserName, "does not accept passwords"),
+        None => (UserTokenType::Anonymous, "does not admit anonymous users"),
+    };
+    let policies = endpoint.user_identity_tokens.iter().flatten();
+    let mut offered = policies.map(|policy| policy.token_type).peekable();
+    let admits = offered.peek().is_none() || offered.any(|offered| offered == wanted);
+    match admits {
+        true => Ok(()),
+        false => Err(format!("{} {why} (`user`)", shared.url)),
+    }
 }
 
 /// Returns the error for a server without a suitable endpoint, with the offered and the required

@@ -32,6 +32,8 @@ struct Shared {
     servers: Mutex<BTreeMap<String, Told>>,
     /// Running queries, by the identifier of the server.
     looks: Mutex<HashMap<String, JoinHandle<()>>>,
+    /// Why the skills of a server could not be read yet, by the identifier of the server.
+    faults: Mutex<BTreeMap<String, String>>,
     changes: watch::Sender<u64>,
 }
 
@@ -80,6 +82,7 @@ impl Detector {
                 options,
                 servers: Mutex::default(),
                 looks: Mutex::default(),
+                faults: Mutex::default(),
                 changes: watch::channel(0).0,
             }),
         }
@@ -108,6 +111,7 @@ impl Detector {
         if let Some(look) = lock(&self.shared.looks).remove(server) {
             look.abort();
         }
+        lock(&self.shared.faults).remove(server);
         if lock(&self.shared.servers).remove(server).is_some() {
             self.shared.changed();
         }
@@ -165,6 +169,21 @@ impl Detector {
         })
     }
 
+    /// Returns the servers whose skills cannot be read, with the reasons, as the end of a message.
+    #[must_use]
+    pub fn unreadable(&self) -> String {
+        let faults = lock(&self.shared.faults);
+        let told: Vec<&str> = faults
+            .values()
+            .take(MOST_TOLD)
+            .map(String::as_str)
+            .collect();
+        match told.is_empty() {
+            true => String::new(),
+            false => format!("; not readable: {}", told.join("; ")),
+        }
+    }
+
     /// Connects to the server of a skill to run it. The new session holds the lease of the
     /// component until it is closed.
     pub async fn open(&self, of: &Detected) -> Result<(SkillClient, SkillHandle), SkillFault> {
@@ -210,11 +229,16 @@ async fn look(shared: Arc<Shared>, server: String, endpoint: String) {
                     endpoint,
                     skills,
                 };
+                lock(&shared.faults).remove(&server);
                 lock(&shared.servers).insert(server, told);
                 shared.changed();
                 return;
             }
-            Err(fault) => debug!(endpoint, "a server does not tell its skills: {fault}"),
+            Err(fault) => {
+                debug!(endpoint, %fault, "cannot read the skills of a server");
+                let Some(shared) = weak.upgrade() else { return };
+                lock(&shared.faults).insert(server.clone(), format!("{endpoint}: {fault}"));
+            }
         }
         tokio::time::sleep(again).await;
         again = (again * 2).min(AGAIN_AT_MOST);
@@ -236,3 +260,5 @@ const AGAIN: Duration = Duration::from_millis(100);
 const AGAIN_AT_MOST: Duration = Duration::from_secs(5);
 /// Maximum number of servers; further servers are not queried.
 const MOST_SERVERS: usize = 4_096;
+/// Maximum number of servers in a message.
+const MOST_TOLD: usize = 3;

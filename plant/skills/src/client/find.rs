@@ -9,8 +9,9 @@ use plant_opcua::types::{
     QualifiedName, ReferenceDescription, Variant,
 };
 
-use super::lost;
 use super::packed::Packed;
+use super::{grip, lost};
+use crate::grip::GripPoint;
 use crate::model::{NAMESPACE, SKILL_TYPE, SkillType, alias};
 use crate::parameters::TypeName;
 use crate::runs::SkillFault;
@@ -41,6 +42,8 @@ pub struct FoundSkill {
     pub results: Vec<FoundParameter>,
     /// The IRIs of the capabilities it provides.
     pub capabilities: Vec<String>,
+    /// The grip point of a grasp skill, if its component states it.
+    pub grip_point: Option<GripPoint>,
     /// Parameters and results that cannot be used, with the reasons.
     pub strange: Vec<String>,
     pub(super) nodes: Nodes,
@@ -347,6 +350,12 @@ async fn read(
     let component = component_of(&above).and_then(|(node, _)| shared.components.get(node));
     let (component, namespace) = component.cloned().unwrap_or_default();
     let types = shared.chains.get(&reference.type_definition.node_id);
+    let grasps = TypeName::own("GraspSkillType");
+    let is_grasp = types.is_some_and(|types| types.iter().any(|of| of.name == grasps));
+    let grip_point = match is_grasp {
+        true => grip::read(client, &nodes, &parameters, &above).await?,
+        false => None,
+    };
     let own = skill
         .as_u32()
         .filter(|_| client.namespaces().get(usize::from(skill.namespace)) == Some(&uri(client)));
@@ -363,6 +372,7 @@ async fn read(
         parameters,
         results,
         capabilities,
+        grip_point,
         strange,
         nodes,
     })

@@ -9,6 +9,7 @@ use program::{Method, State};
 
 use super::find::{FoundParameter, FoundSkill};
 use super::{called, lost, refused};
+use crate::grip::GripPoint;
 use crate::model::DEVICES;
 use crate::runs::{HALTS_WITHIN, Runs, SkillFault, goes_on};
 use crate::shown::Outcome;
@@ -427,6 +428,10 @@ impl SkillHandle {
 
 #[async_trait]
 impl Runs for SkillHandle {
+    fn grip_point(&self) -> Option<GripPoint> {
+        self.found.grip_point
+    }
+
     fn name(&self) -> String {
         format!("{}.{}", self.found.component, self.found.name)
     }

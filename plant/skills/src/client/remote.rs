@@ -5,11 +5,11 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 
-use super::{ClientOptions, Detector, SkillClient, SkillHandle};
+use super::{PeerAccess, SkillClient, SkillHandle};
 use crate::component::{Partner, Partners};
 use crate::composite::{self, PickAndPlace};
 use crate::driver::{Driver, Results, Work};
-use crate::model::SKILL_TYPE;
+use crate::frame::Frame;
 use crate::parameters::{Parameters, TypeName};
 use crate::runs::COMPOSITE_HALT_TIMEOUT;
 
@@ -18,15 +18,14 @@ use crate::runs::COMPOSITE_HALT_TIMEOUT;
 #[derive(Debug, Clone)]
 pub struct Remote {
     partners: Partners,
-    detector: Option<Detector>,
+    peers: PeerAccess,
 }
 
 impl Remote {
-    /// Creates a driver for these partners. The detector finds partners that are named by their
-    /// ApplicationUri.
+    /// Creates a driver for these partners.
     #[must_use]
-    pub fn new(partners: Partners, detector: Option<Detector>) -> Self {
-        Self { partners, detector }
+    pub fn new(partners: Partners, peers: PeerAccess) -> Self {
+        Self { partners, peers }
     }
 }
 
@@ -54,14 +53,14 @@ impl Driver for Remote {
     async fn run(&self, work: Work) -> Result<Results, String> {
         let robot_at = self.place(&self.partners.robot, &work).await?;
         let gripper_at = self.place(&self.partners.gripper, &work).await?;
-        let robot = connect(&robot_at).await?;
+        let robot = self.peers.connect(&robot_at).await?;
         if robot_at == gripper_at {
             // A component has one lease, so one session is used for both.
             let done = self.with(&robot, &robot, &work).await;
             robot.close().await;
             return done;
         }
-        let done = match connect(&gripper_at).await {
+        let done = match self.peers.connect(&gripper_at).await {
             Ok(gripper) => {
                 let done = self.with(&robot, &gripper, &work).await;
                 gripper.close().await;
@@ -77,20 +76,14 @@ impl Driver for Remote {
 impl Remote {
     /// Waits for a partner and returns its endpoint.
     async fn place(&self, partner: &Partner, work: &Work) -> Result<String, String> {
-        match (partner, &self.detector) {
-            (Partner::At(endpoint), _) => Ok(endpoint.clone()),
-            (Partner::Called(uri), Some(detector)) => {
-                let any = TypeName::own(SKILL_TYPE);
-                let found = tokio::select! {
-                    found = detector.one(&any, FOUND_WITHIN, |one| one.application_uri == *uri) => found,
-                    () = work.stopped() => return Err("stopped".to_owned()),
-                };
-                let found = found.map_err(|_| format!("{uri} is not there"))?;
-                work.note(format!("{uri} is at {}", found.endpoint)).await;
-                Ok(found.endpoint)
-            }
-            (Partner::Called(uri), None) => Err(format!("nobody looks for {uri}")),
+        let endpoint = tokio::select! {
+            endpoint = self.peers.endpoint(partner) => endpoint?,
+            () = work.stopped() => return Err("stopped".to_owned()),
+        };
+        if let Partner::Called(uri) = partner {
+            work.note(format!("{uri} is at {endpoint}")).await;
         }
+        Ok(endpoint)
     }
 
     async fn with(
@@ -115,6 +108,7 @@ impl Remote {
             linear: Arc::new(one(robot, "LinearMoveSkillType").await?),
             grasp: Arc::new(grasp),
             release: Arc::new(one(gripper, "ReleaseSkillType").await?),
+            plate: Frame::IDENTITY,
             within: self.partners.within,
         };
         let job = composite::job(work.parameters())?;
@@ -124,11 +118,6 @@ impl Remote {
             .map_err(|broken| broken.to_string())?;
         Ok(Vec::new())
     }
-}
-
-async fn connect(endpoint: &str) -> Result<SkillClient, String> {
-    let connected = SkillClient::connect(endpoint, &ClientOptions::default()).await;
-    connected.map_err(|fault| format!("{endpoint}: {fault}"))
 }
 
 /// Returns the first skill of a type.
@@ -144,4 +133,4 @@ async fn one(client: &SkillClient, of: &str) -> Result<SkillHandle, String> {
 }
 
 /// Time limit to find a partner.
-const FOUND_WITHIN: Duration = Duration::from_secs(10);
+pub(super) const FOUND_WITHIN: Duration = Duration::from_secs(10);

@@ -4,6 +4,7 @@ use std::fmt::Debug;
 use std::sync::Arc;
 
 use super::DriverFault;
+use crate::client::PeerAccess;
 use crate::driver::Driver;
 use crate::parameters::TypeName;
 use crate::yaml::{Node, Reader};
@@ -11,11 +12,15 @@ use crate::yaml::{Node, Reader};
 /// A device. Its drivers share the connection to it.
 pub trait Device: Debug + Send + Sync {
     /// Returns the driver of a skill with this type and these supertypes, nearest first. The device
-    /// is not connected before a run.
+    /// is not connected before a run. `peers` reaches the components that the driver uses.
     ///
     /// # Errors
     /// The device cannot do the work of that type.
-    fn driver(&self, types: &[TypeName]) -> Result<Arc<dyn Driver>, DriverFault>;
+    fn driver(
+        &self,
+        types: &[TypeName],
+        peers: &PeerAccess,
+    ) -> Result<Arc<dyn Driver>, DriverFault>;
 }
 
 /// The kinds of devices that the YAML of a component can contain.

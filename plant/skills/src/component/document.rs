@@ -3,11 +3,14 @@
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use plant_opcua::client::ClientUser;
 use plant_opcua::limits::ClientLimits;
+use plant_opcua::users::{Role, Roles};
 
+use super::world::read_grip_point;
 use super::{
     Asked, Component, DeviceKinds, DriverSetup, LEASE, Lds, MOST_SKILLS, NoDevices, Partner,
-    Partners, Robot, Security, Simulation, SkillSetup,
+    Partners, Robot, Security, Simulation, SkillSetup, anonymous_by_default,
 };
 use crate::parameters::{TypeName, shortened};
 use crate::yaml::{Code, Findings, Kind, Node, Place, Reader, parse};
@@ -63,6 +66,8 @@ fn component(
         "lds",
         "open",
         "lease",
+        "user",
+        "anonymous",
         "limits",
         "device",
         "robot",
@@ -78,6 +83,8 @@ fn component(
         lds,
         open,
         lease,
+        user,
+        anonymous,
         limits,
         device,
         robot,
@@ -105,6 +112,11 @@ fn component(
     let lds = lds.map_or(Some(Lds::Local), |node| read_lds(node, reader));
     let open = open.map_or(Some(false), |node| reader.boolean(node));
     let lease = lease.map_or(Some(LEASE), |node| reader.duration(node));
+    let user = user.map(|node| read_user(node, folder, reader));
+    let anonymous = match anonymous {
+        Some(node) => read_anonymous(node, reader),
+        None => Some(Some(anonymous_by_default())),
+    };
     let limits = read_limits(limits, reader);
     let device = device.map(|node| kinds.read(node, reader));
     let robot = robot.map(|node| read_robot(node, reader));
@@ -121,6 +133,8 @@ fn component(
         lds: lds?,
         open: open?,
         lease: lease?,
+        user: whole(user)?,
+        anonymous: anonymous?,
         limits: limits?,
         device: whole(device)?,
         robot: whole(robot)?,
@@ -133,6 +147,85 @@ fn whole<T>(read: Option<Option<T>>) -> Option<Option<T>> {
     match read {
         Some(read) => read.map(Some),
         None => Some(None),
+    }
+}
+
+/// Reads the role of anonymous users.
+fn read_anonymous(node: &Node, reader: &mut Reader<'_>) -> Option<Option<Roles>> {
+    match reader.text(node, "off, observer or operator")? {
+        "off" => Some(None),
+        "observer" => Some(Some(Roles::of(&[Role::Observer]))),
+        "operator" => Some(Some(anonymous_by_default())),
+        other => {
+            let found = shortened(other);
+            let message = format!("expected off, observer or operator, found `{found}`");
+            reader.refuse(node, Code::WrongValue, message)
+        }
+    }
+}
+
+/// Reads the user as which a component uses other components. The file does not contain the
+/// password: it names an environment variable or another file.
+pub fn read_user(node: &Node, folder: &Path, reader: &mut Reader<'_>) -> Option<ClientUser> {
+    let keys = ["name", "password", "password_file"];
+    let [name, password, file] = reader.map(node, keys)?;
+    let name = reader
+        .needed(name, "name", node.place)
+        .and_then(|node| reader.text(node, "the name of a user"))
+        .map(str::to_owned);
+    let password = match (password, file) {
+        (Some(node), None) => read_password(node, reader),
+        (None, Some(node)) => read_password_file(node, folder, reader),
+        (None, None) | (Some(_), Some(_)) => {
+            let message = "a user has either `password` or `password_file`".to_owned();
+            reader.refuse(node, Code::WrongValue, message)
+        }
+    };
+    Some(ClientUser {
+        name: name?,
+        password: password?,
+    })
+}
+
+fn read_password(node: &Node, reader: &mut Reader<'_>) -> Option<String> {
+    let text = reader.text(node, "the name of an environment variable, as ${PASSWORD}")?;
+    let variable = text
+        .strip_prefix("${")
+        .and_then(|rest| rest.strip_suffix('}'));
+    let Some(variable) = variable else {
+        let message = "the file contains a password in plain text";
+        let help = "name an environment variable, as password: \"${PASSWORD}\", or a file, as password_file";
+        reader
+            .findings()
+            .error_with(Code::WrongValue, node.place, message, help);
+        return None;
+    };
+    match std::env::var(variable) {
+        Ok(password) if !password.is_empty() => Some(password),
+        Ok(_) | Err(_) => {
+            let message = format!(
+                "the environment variable {} is not set",
+                shortened(variable)
+            );
+            reader.refuse(node, Code::WrongValue, message)
+        }
+    }
+}
+
+fn read_password_file(node: &Node, folder: &Path, reader: &mut Reader<'_>) -> Option<String> {
+    let path = folder.join(reader.text(node, "the path of a file")?);
+    let cannot = |why: &dyn std::fmt::Display| format!("cannot read {}: {why}", path.display());
+    let read = std::fs::metadata(&path).and_then(|about| match about.len() {
+        0..=LONGEST_PASSWORD_FILE => std::fs::read_to_string(&path),
+        _ => Err(std::io::Error::other("the file is too long for a password")),
+    });
+    let password = match read {
+        Ok(text) => text.lines().next().unwrap_or_default().to_owned(),
+        Err(error) => return reader.refuse(node, Code::WrongValue, cannot(&error)),
+    };
+    match password.is_empty() {
+        true => reader.refuse(node, Code::WrongValue, cannot(&"its first line is empty")),
+        false => Some(password),
     }
 }
 
@@ -354,8 +447,15 @@ fn read_skills(node: &Node, reader: &mut Reader<'_>) -> Vec<SkillSetup> {
 }
 
 fn read_skill(node: &Node, reader: &mut Reader<'_>) -> Option<(SkillSetup, Place)> {
-    let keys = ["name", "type", "driver", "capabilities", "timeout"];
-    let [name, skill_type, driver, capabilities, timeout] = reader.map(node, keys)?;
+    let keys = [
+        "name",
+        "type",
+        "driver",
+        "capabilities",
+        "timeout",
+        "grip_point",
+    ];
+    let [name, skill_type, driver, capabilities, timeout, grip_point] = reader.map(node, keys)?;
     let name_at = name.map_or(node.place, |name| name.place);
     let place = skill_type.map_or(node.place, |skill_type| skill_type.place);
     let name = reader
@@ -377,12 +477,14 @@ fn read_skill(node: &Node, reader: &mut Reader<'_>) -> Option<(SkillSetup, Place
         Some(node) => Some(reader.duration(node)?),
         None => None,
     };
+    let grip_point = grip_point.map(|node| read_grip_point(node, reader));
     let skill = SkillSetup {
         name: name?,
         skill_type: skill_type?,
         driver: driver?,
         capabilities,
         timeout,
+        grip_point: whole(grip_point)?,
         place,
     };
     Some((skill, name_at))
@@ -463,6 +565,7 @@ fn read_partner(node: &Node, reader: &mut Reader<'_>) -> Option<Partner> {
 const DEFAULT_ENDPOINT: &str = "opc.tcp://127.0.0.1:0";
 const USUALLY_WITHIN: Duration = Duration::from_secs(60);
 const LONGEST_NAME: usize = 64;
+const LONGEST_PASSWORD_FILE: u64 = 4096;
 /// MotionDeviceCategoryEnumeration (OPC 40010-1, 7.2.3), by its values.
 const CATEGORIES: [&str; 7] = [
     "other",
@@ -521,6 +624,37 @@ mod tests {
         for expected in ["from 1 to 65535, found `0`", "`connection`", "connections"] {
             assert!(told.contains(expected), "{expected}: {told}");
         }
+    }
+
+    #[test]
+    fn the_password_of_a_user_stands_in_a_file_or_in_the_environment() {
+        let folder = std::env::temp_dir().join(format!("user-{}", std::process::id()));
+        std::fs::create_dir_all(&folder).unwrap();
+        std::fs::write(folder.join("secret"), "a b\nrest\n").unwrap();
+        let read = |user: &str| {
+            let text = format!("{GRIPPER}user: {user}\n");
+            Component::from_yaml(&text, &folder)
+                .map(|component| component.user.unwrap())
+                .map_err(|findings| findings.render("x.yaml", &text))
+        };
+        let user = read("{name: handling, password_file: secret}").unwrap();
+        assert_eq!((&*user.name, &*user.password), ("handling", "a b"));
+        let user = read("{name: handling, password: \"${CARGO_MANIFEST_DIR}\"}").unwrap();
+        assert_eq!(user.password, env!("CARGO_MANIFEST_DIR"));
+        for (user, expected) in [
+            ("{name: a}", "either `password` or `password_file`"),
+            ("{password: \"${NO_SUCH_VARIABLE}\"}", "`name` is missing"),
+            (
+                "{name: a, password: \"${NO_SUCH_VARIABLE}\"}",
+                "NO_SUCH_VARIABLE is not set",
+            ),
+            ("{name: a, password: secret}", "in plain text"),
+            ("{name: a, password_file: nowhere}", "cannot read"),
+        ] {
+            let findings = read(user).unwrap_err();
+            assert!(findings.contains(expected), "{user}: {findings}");
+        }
+        std::fs::remove_dir_all(folder).unwrap();
     }
 
     #[test]

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use super::{Device, DriverSetup, Simulation};
-use crate::client::{Detector, Remote};
+use crate::client::{PeerAccess, Remote};
 use crate::driver::Driver;
 use crate::model::NAMESPACE;
 use crate::parameters::TypeName;
@@ -19,7 +19,7 @@ pub struct Drivers {
     changer: Changer,
     base: Base,
     device: Option<Arc<dyn Device>>,
-    detector: Option<Detector>,
+    peers: PeerAccess,
 }
 
 /// A driver that cannot do the work of a type.
@@ -28,12 +28,13 @@ pub struct Drivers {
 pub struct DriverFault(pub String);
 
 impl Drivers {
-    /// Creates the factory for a component with this device; the detector finds its partners.
+    /// Creates the factory for a component with this device, which reaches its partners by
+    /// `peers`.
     #[must_use]
-    pub fn new(device: Option<Arc<dyn Device>>, detector: Option<Detector>) -> Self {
+    pub fn new(device: Option<Arc<dyn Device>>, peers: PeerAccess) -> Self {
         Self {
             device,
-            detector,
+            peers,
             ..Self::default()
         }
     }
@@ -56,7 +57,7 @@ impl Drivers {
         match setup {
             DriverSetup::Given(driver) => Ok(Arc::clone(driver)),
             DriverSetup::Device => match &self.device {
-                Some(device) => device.driver(types),
+                Some(device) => device.driver(types, &self.peers),
                 None => Err(DriverFault("the component has no `device`".to_owned())),
             },
             DriverSetup::Space(work) => Err(DriverFault(format!(
@@ -64,8 +65,8 @@ impl Drivers {
                 work.topic
             ))),
             DriverSetup::PickAndPlace(partners) if is("PickAndPlaceSkillType") => {
-                let detector = self.detector.clone();
-                Ok(Arc::new(Remote::new(partners.clone(), detector)))
+                let peers = self.peers.clone();
+                Ok(Arc::new(Remote::new(partners.clone(), peers)))
             }
             DriverSetup::PickAndPlace(_) => Err(DriverFault(format!(
                 "`pick_and_place` does the work of PickAndPlaceSkillType, and this is {own}"

@@ -8,7 +8,10 @@ use program::{Method, Rest};
 
 use super::table::{SkillType, Unit, Variable};
 use super::types::TYPES;
-use super::{CONTROLLER_TYPE, EVENT_TYPE, NAMESPACE, SKILL_TYPE, USED_SKILL_TYPE, USES_SKILL};
+use super::{
+    CONTROLLER_TYPE, EVENT_TYPE, GRIP_POINT_OFFSET, GRIP_POINT_OPENING, GRIP_POINT_TYPE, NAMESPACE,
+    SKILL_TYPE, USED_SKILL_TYPE, USES_SKILL,
+};
 use crate::value::{Builtin, Value};
 
 /// Returns the NodeSet of [`NAMESPACE`]. The text is deterministic and requires namespace 0 only.
@@ -177,6 +180,7 @@ impl Nodes {
                 Rule::Mandatory,
             );
         }
+        self.optional_properties(of);
         if of.rests_in == Rest::Halted {
             self.ready_after_success(of.id + 3, of.id, false);
         }
@@ -193,6 +197,24 @@ impl Nodes {
                 properties: of.id + RESULT_PROPERTIES + 2 * place,
             };
             self.variable(result, of.id + FINAL_RESULT_DATA, ids, "1");
+        }
+    }
+
+    /// Adds the properties that only some instances of a type have.
+    fn optional_properties(&mut self, of: &SkillType) {
+        let own = OPTIONAL.iter().filter(|property| property.of == of.name);
+        for property in own {
+            let browse_name = format!("1:{}", property.name);
+            let mut node = Node::new("UAVariable", of.id + property.offset, &browse_name)
+                .about(property.about)
+                .attribute("DataType", property.builtin.name());
+            if let Some(length) = property.length {
+                node = node
+                    .attribute("ValueRank", "1")
+                    .attribute("ArrayDimensions", &length.to_string());
+            }
+            let node = node.forward("HasTypeDefinition", PROPERTY_TYPE);
+            self.add(node.child_of(of.id, "HasProperty", Rule::Optional));
         }
     }
 
@@ -447,6 +469,45 @@ fn escaped(text: &str) -> String {
         .replace('>', "&gt;")
 }
 
+/// An optional property of a type.
+struct OptionalProperty {
+    /// The type.
+    of: &'static str,
+    offset: u32,
+    name: &'static str,
+    builtin: Builtin,
+    /// The number of elements of an array.
+    length: Option<u32>,
+    about: &'static str,
+}
+
+const OPTIONAL: [OptionalProperty; 3] = [
+    OptionalProperty {
+        of: "GraspSkillType",
+        offset: 94,
+        name: GRIP_POINT_OFFSET,
+        builtin: Builtin::Double,
+        length: Some(6),
+        about: "The grip point in the frame of the tool plate: x, y, z in m and the rotations about them in rad. Its z axis points towards the part.",
+    },
+    OptionalProperty {
+        of: "GraspSkillType",
+        offset: 95,
+        name: GRIP_POINT_TYPE,
+        builtin: Builtin::Int32,
+        length: None,
+        about: "0: two fingers that close along the x axis of the grip point; 1: vacuum; 2: several fingers.",
+    },
+    OptionalProperty {
+        of: "GraspSkillType",
+        offset: 96,
+        name: GRIP_POINT_OPENING,
+        builtin: Builtin::Double,
+        length: Some(2),
+        about: "The smallest and the largest width that fits between the fingers, m.",
+    },
+];
+
 /// Offset, BrowseName, type, whether it is an array, whether it is a property, and the description.
 const MEMBERS: [(u32, &str, Builtin, bool, bool, &str); 6] = [
     (
@@ -546,6 +607,7 @@ const HEAD: &str = r#"<?xml version="1.0" encoding="utf-8"?>
   <Aliases>
     <Alias Alias="Boolean">i=1</Alias>
     <Alias Alias="UInt16">i=5</Alias>
+    <Alias Alias="Int32">i=6</Alias>
     <Alias Alias="UInt32">i=7</Alias>
     <Alias Alias="Float">i=10</Alias>
     <Alias Alias="Double">i=11</Alias>

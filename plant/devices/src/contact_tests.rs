@@ -1,0 +1,190 @@
+//! The contact point of grippers of different lengths, with the simulators of the devices.
+
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use async_trait::async_trait;
+use skills::frame::Frame;
+use skills::{
+    Authority, Device, Driver, Facts, GripPoint, GripType, Job, LocalRun, Outcome, Owner,
+    PartShape, PeerAccess, PickAndPlace, Runs, Skill, SkillFault, TypeName, Value, model,
+};
+
+use crate::modbus::server::{Faults, Serving};
+use crate::{robotiq, schmalz, ur};
+
+/// A grasp or release skill that records where the flange is when it runs.
+struct Recording {
+    inner: LocalRun,
+    grip: Option<GripPoint>,
+    robot: ur::simulator::Simulator,
+    flanges: Arc<Mutex<Vec<[f64; 6]>>>,
+}
+
+#[async_trait]
+impl Runs for Recording {
+    fn name(&self) -> String {
+        self.inner.name()
+    }
+
+    fn grip_point(&self) -> Option<GripPoint> {
+        self.grip
+    }
+
+    async fn run(
+        &self,
+        parameters: Vec<(String, Value)>,
+        within: Duration,
+    ) -> Result<Outcome, SkillFault> {
+        let flange = ur::of_robot(self.robot.pose());
+        self.flanges.lock().unwrap().push(flange);
+        self.inner.run(parameters, within).await
+    }
+
+    async fn halt(&self) -> Result<(), SkillFault> {
+        self.inner.halt().await
+    }
+}
+
+fn run_of(name: &str, device: &dyn Device, authority: &Authority) -> LocalRun {
+    let of = model::find(name).unwrap();
+    let driver: Arc<dyn Driver> = device
+        .driver(&[TypeName::own(name)], &PeerAccess::default())
+        .unwrap();
+    let facts = Facts {
+        name: name.to_owned(),
+        types: vec![TypeName::own(name)],
+        parameters: of.parameters(),
+        results: of.results(),
+        capabilities: Vec::new(),
+        timeout: None,
+        rests_in: of.rests_in,
+    };
+    LocalRun {
+        skill: Skill::spawn(facts, driver, authority.clone(), Vec::new()),
+        by: Owner::Local("the test"),
+    }
+}
+
+const PART: PartShape = PartShape::Box([0.04, 0.06, 0.05]);
+const PICK: [f64; 6] = [0.4, 0.2, 0.1, 0.0, 0.0, 0.3];
+const PLACES: [(&str, [f64; 6]); 2] = [
+    ("upright", [0.35, -0.25, 0.12, 0.0, 0.0, 1.2]),
+    ("tilted", [0.35, -0.25, 0.2, 0.35, -0.25, 0.6]),
+];
+/// The changer of the manufacturer.
+const CHANGER: [f64; 3] = [0.0, 0.0, 0.047];
+/// The required accuracy, m.
+const ACCURACY: f64 = 1e-4;
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn grippers_of_two_lengths_touch_the_part_at_the_same_point() {
+    let settings = ur::simulator::Settings {
+        time_scale: 50.0,
+        ..ur::simulator::Settings::default()
+    };
+    let robot = ur::simulator::Simulator::new(settings);
+    let served = ur::simulator::Serving::start(&robot, "127.0.0.1:0", "127.0.0.1:0")
+        .await
+        .unwrap();
+    let arm = ur::Robot::new(ur::Settings {
+        rtde: served.rtde().to_string(),
+        secondary: served.secondary().to_string(),
+        reach: ur::REACH,
+    });
+    let fingers = robotiq::simulator::Simulator::new(robotiq::simulator::Settings {
+        object: Some(0.04),
+        time_scale: 20.0,
+    });
+    let line = "tcp://127.0.0.1:0".parse().unwrap();
+    let modbus = Serving::start(&line, robotiq::UNIT, Arc::new(fingers), Faults::default())
+        .await
+        .unwrap();
+    let cup = schmalz::simulator::Simulator::new(schmalz::simulator::Settings {
+        time_scale: 20.0,
+        ..schmalz::simulator::Settings::default()
+    });
+    let master = schmalz::simulator::Serving::start(&cup, "127.0.0.1:0")
+        .await
+        .unwrap();
+    let address = master.address().to_string();
+    let timing = schmalz::Timing::default();
+    let grippers: [(&str, f64, GripType, f64, Box<dyn Device>); 2] = [
+        (
+            "Robotiq 2F-85",
+            0.2028,
+            GripType::Parallel,
+            0.0,
+            Box::new(robotiq::Gripper::new(
+                modbus.line().clone(),
+                robotiq::UNIT,
+            )),
+        ),
+        (
+            "Schmalz ECBPi",
+            0.1868,
+            GripType::Vacuum,
+            0.025,
+            Box::new(schmalz::Gripper::new(&address, "master1port1", timing)),
+        ),
+    ];
+    println!("| gripper | length | plate | place | error at pick | error at place |");
+    for (name, length, grip_type, above, device) in &grippers {
+        for (plate_name, plate) in [
+            ("flange", Frame::IDENTITY),
+            ("tool changer", Frame::at(CHANGER)),
+        ] {
+            for (place_name, place) in PLACES {
+                let (of_arm, of_gripper) = (Authority::new(), Authority::new());
+                let flanges = Arc::new(Mutex::new(Vec::new()));
+                let recording = |of: &str| {
+                    Arc::new(Recording {
+                        inner: run_of(of, &**device, &of_gripper),
+                        grip: Some(GripPoint {
+                            offset: [0.0, 0.0, *length, 0.0, 0.0, 0.0],
+                            grip_type: Some(*grip_type),
+                            opening: Some((0.0, 0.085)),
+                        }),
+                        robot: robot.clone(),
+                        flanges: Arc::clone(&flanges),
+                    })
+                };
+                let composite = PickAndPlace {
+                    ptp: Arc::new(run_of("PtpMoveSkillType", &arm, &of_arm)),
+                    linear: Arc::new(run_of("LinearMoveSkillType", &arm, &of_arm)),
+                    grasp: recording("GraspSkillType"),
+                    release: recording("ReleaseSkillType"),
+                    plate,
+                    within: Duration::from_secs(60),
+                };
+                let job = Job {
+                    pick: PICK,
+                    place,
+                    approach: 0.05,
+                    shape: Some(PART),
+                };
+                let teller = |_step: &'static str| {};
+                composite.run(&job, &teller).await.unwrap();
+                // The geometry of the machine, not the grip point that the composite reads.
+                let tip = plate.then(&Frame::at([0.0, 0.0, *length]));
+                let contact = |flange: [f64; 6]| Frame::of_pose(flange).then(&tip);
+                let expected = |part: [f64; 6]| {
+                    Frame::of_pose(part).then(&Frame::at([0.0, 0.0, *above]))
+                };
+                let flanges = flanges.lock().unwrap().clone();
+                assert_eq!(flanges.len(), 2);
+                let errors: Vec<f64> = flanges
+                    .iter()
+                    .zip([PICK, place])
+                    .map(|(flange, part)| contact(*flange).distance(&expected(part)))
+                    .collect();
+                println!(
+                    "| {name} | {length} m | {plate_name} | {place_name} | {:.4} mm | {:.4} mm |",
+                    errors[0] * 1e3,
+                    errors[1] * 1e3
+                );
+                assert!(errors.iter().all(|error| *error < ACCURACY), "{errors:?}");
+            }
+        }
+    }
+}
