@@ -51,7 +51,7 @@ fn components_are_found_run_lost_and_replaced_within_the_published_times() {
     for level in ["announced", "registered", "in_graph"] {
         assert!(ms(&loss["lost_ms"][level]) <= 2500.0, "{level}: {loss}");
     }
-    assert_eq!(report["question"]["skills"], 5, "{report}");
+    assert_eq!(report["question"]["skills"], 6, "{report}");
 }
 
 /// Returns whether the steps of a composite are in order; polling may miss short steps.
@@ -96,10 +96,10 @@ fn a_robot_changes_its_tools_and_survives_the_loss_of_one_wherever_they_hang() {
             .collect();
         let expected = [
             ("tool-changer.ChangeTool", "robotiq-2f85", true),
-            ("handling.PlaceByFingers", "a part", true),
+            ("handling.Place", "a part", true),
             ("tool-changer.ChangeTool", "schmalz-ecbpi", true),
-            ("handling.PlaceByVacuum", "a part", false),
-            ("handling.PlaceByVacuum", "a part", true),
+            ("handling.Place", "a part", false),
+            ("handling.Place", "a part", true),
             ("tool-changer.DetachTool", "no tool", true),
         ];
         assert_eq!(ran, expected);
@@ -116,9 +116,11 @@ fn a_robot_changes_its_tools_and_survives_the_loss_of_one_wherever_they_hang() {
             "FrontDoor",
             "WaitForTool",
             "Approach",
+            "WaitForReady",
         ];
         assert!(are_in_order(&runs[0]["steps"], &take), "{}", runs[0]);
         let put = [
+            "PowerOff",
             "Approach",
             "FrontDoor",
             "Start",

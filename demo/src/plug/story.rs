@@ -401,9 +401,9 @@ impl Story {
                 "`ua-space ask what-can-run` has not answered".to_owned(),
             ]);
         };
-        if asked.skills < 5 || asked.services == 0 {
+        if asked.skills < 6 || asked.services == 0 {
             return Err(format!(
-                "what-can-run lists {} skills and {} services; robot, gripper and MES have 5 skills, the manifest some services",
+                "what-can-run lists {} skills and {} services; robot, gripper and MES have 6 skills, the manifest some services",
                 asked.skills, asked.services
             ));
         }

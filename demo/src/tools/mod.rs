@@ -203,10 +203,10 @@ impl Story<'_> {
         self.count_robots().await?;
 
         self.change(FINGERS).await?;
-        self.handle("PlaceByFingers", (PICK, PLACE)).await?;
+        self.handle((PICK, PLACE)).await?;
         self.change(VACUUM).await?;
         self.lose_and_plug_in().await?;
-        self.handle("PlaceByVacuum", (PLACE, PICK)).await?;
+        self.handle((PLACE, PICK)).await?;
         let detached = self
             .run((CHANGER, "DetachTool"), "no tool", Vec::new())
             .await?;
@@ -352,15 +352,18 @@ impl Story<'_> {
         must(&run)
     }
 
-    async fn handle(&mut self, skill: &'static str, way: ([f64; 6], [f64; 6])) -> Result<(), Stop> {
-        let run = self.run((HANDLING, skill), "a part", places(way)).await?;
+    /// Moves the part with the attached tool.
+    async fn handle(&mut self, way: ([f64; 6], [f64; 6])) -> Result<(), Stop> {
+        let run = self
+            .run((HANDLING, PLACE_SKILL), "a part", places(way))
+            .await?;
         must(&run)
     }
 
     /// Kills the vacuum gripper while the robot carries the part, and starts it again.
     async fn lose_and_plug_in(&mut self) -> Result<(), Stop> {
         let client = self.connect_to(HANDLING).await?;
-        let handle = handle_of(&client, "PlaceByVacuum").await?;
+        let handle = handle_of(&client, PLACE_SKILL).await?;
         let began = Instant::now();
         let mut steps = Steps::default();
         let mut killed = None;
@@ -382,12 +385,8 @@ impl Story<'_> {
             }
         };
         client.close().await;
-        let outcome = outcome.map_err(|fault| Stop::Broken(format!("PlaceByVacuum: {fault}")))?;
-        let run = self.ran(
-            (HANDLING, "PlaceByVacuum"),
-            "a part",
-            (outcome, steps.0, began),
-        )?;
+        let outcome = outcome.map_err(|fault| Stop::Broken(format!("{PLACE_SKILL}: {fault}")))?;
+        let run = self.ran((HANDLING, PLACE_SKILL), "a part", (outcome, steps.0, began))?;
         let Some(killed) = killed else {
             return Err(Stop::Broken(
                 "the run was over before the gripper was killed".to_owned(),
@@ -557,6 +556,7 @@ fn millis(nanos: i64) -> f64 {
 }
 
 const LDS_PORT: u16 = 4840;
+const PLACE_SKILL: &str = "Place";
 const PICK: [f64; 6] = [0.4, -0.2, 0.1, 0.0, 0.0, 0.0];
 const PLACE: [f64; 6] = [0.2, -0.45, 0.1, 0.0, 0.0, 0.0];
 const FOUND: Duration = Duration::from_secs(30);

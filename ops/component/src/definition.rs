@@ -116,6 +116,7 @@ fn note(parameter: &Parameter) -> String {
     match &parameter.default {
         Some(Value::Boolean(_)) | None => {}
         Some(default) if is_nothing(default) => {}
+        Some(Value::Array(_, elements)) if elements.iter().all(is_nothing) => {}
         Some(Value::String(text)) => note.push_str(&format!(" \"\" is {text:?}.")),
         Some(Value::Array(..)) => note.push_str(" Has a default, where it is empty."),
         Some(number) => note.push_str(&format!(" 0 is {number}{unit}.")),

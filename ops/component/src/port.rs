@@ -19,7 +19,7 @@ use plant_opcua::enrolment::{Enrolment, Invitation};
 use plant_opcua::own;
 use plant_opcua::supervision::Supervision;
 use program::{Method, State};
-use skills::server::{ComponentServer, ServeFault, ServeSettings};
+use skills::server::{ComponentServer, PowerOff, ServeFault, ServeSettings};
 use skills::{Component, Owner, PeerAccess, Security, Skill};
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
@@ -103,6 +103,7 @@ impl ComponentPort {
             trust_any_client: options.trust_any_client,
             first_run: run_number_of_now(),
             supervision: Supervision::default(),
+            power_off: component.power_off.then(power_off),
         };
         let mut reporters = Vec::new();
         let mut asking = Asking::new();
@@ -406,6 +407,17 @@ fn told_of(component: &Component, url: &str, options: &Options) -> discovery::Se
     }
 }
 
+/// Ends the program after a delay.
+fn power_off() -> PowerOff {
+    PowerOff(Arc::new(|delay| {
+        drop(tokio::spawn(async move {
+            // The response to the request is sent before the program ends.
+            tokio::time::sleep(delay.max(SHORTEST_DELAY)).await;
+            bridge_node::stop();
+        }));
+    }))
+}
+
 /// Renews the certificate of the component at the Global Discovery Server.
 fn enrol(
     tasks: &mut JoinSet<()>,
@@ -486,6 +498,8 @@ fn announce(
 
 /// Interval between two checks of the skills before a restart.
 const IDLE_LOOK: Duration = Duration::from_millis(500);
+/// Shortest delay before a component switches itself off.
+const SHORTEST_DELAY: Duration = Duration::from_millis(50);
 /// Within the limit of 2 s for the shutdown of a port.
 const SHUTDOWN: Duration = Duration::from_millis(1_900);
 /// Largest number of simultaneous calls; more are refused.

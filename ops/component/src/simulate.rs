@@ -3,10 +3,14 @@
 use std::io::{self, Write as _};
 use std::process::ExitCode;
 use std::sync::Arc;
+use std::time::Duration;
 
 use clap::Parser as _;
 use devices::{Faults, Line, Registers, Serving, kelvin, robotiq, schmalz, ur};
+use tokio::process::{Child, Command};
 use tokio::signal::unix::{SignalKind, signal};
+use tokio::task::JoinSet;
+use tokio::time::Instant;
 
 /// The argument that selects the simulation.
 pub(crate) const VERB: &str = "simulate";
@@ -78,6 +82,16 @@ enum Device {
         /// A tool in its dock: its number and x, y, z (m) and the rotations about them (rad) of the flange there
         #[arg(long = "tool", value_name = "N@X,Y,Z,A,B,C", required = true, value_parser = docked, allow_hyphen_values = true)]
         tools: Vec<kelvin::simulator::Docked>,
+        /// An empty dock: x, y, z (m) and the rotations about them (rad) of the flange there
+        #[arg(long = "dock", value_name = "X,Y,Z,A,B,C", value_parser = empty_dock, allow_hyphen_values = true)]
+        docks: Vec<kelvin::simulator::Docked>,
+        /// The program of a tool, as `1=ua-component gripper.yaml`: it is started when the tool is
+        /// locked, and killed when the tool is unlocked, as its supply is switched
+        #[arg(long = "power", value_name = "N=COMMAND", value_parser = powered)]
+        powered: Vec<Powered>,
+        /// The time that a tool needs to boot, s
+        #[arg(long, value_name = "SECONDS", default_value_t = 0.0, value_parser = seconds)]
+        boot_delay: f64,
     },
 }
 
@@ -100,6 +114,90 @@ fn within(text: &str, low: f64, high: f64) -> Option<f64> {
     let number: f64 = text.parse().ok()?;
     (low..=high).contains(&number).then_some(number)
 }
+
+fn seconds(text: &str) -> Result<f64, &'static str> {
+    within(text, 0.0, 600.0).ok_or("a number from 0 to 600")
+}
+
+/// The program of a tool.
+#[derive(Debug, Clone, PartialEq, Eq)]
+struct Powered {
+    number: u8,
+    command: Vec<String>,
+}
+
+fn powered(text: &str) -> Result<Powered, &'static str> {
+    let read = || {
+        let (number, command) = text.split_once('=')?;
+        let number = number.parse().ok();
+        let number = number.filter(|number| (1..=10).contains(number))?;
+        let command: Vec<String> = command.split_whitespace().map(str::to_owned).collect();
+        (!command.is_empty()).then_some(Powered { number, command })
+    };
+    read().ok_or("a number from 1 to 10, =, and a command with its arguments")
+}
+
+fn empty_dock(text: &str) -> Result<kelvin::simulator::Docked, &'static str> {
+    let tool = docked(&format!("1@{text}")).map_err(|_| "six numbers with commas")?;
+    Ok(kelvin::simulator::Docked { number: 0, ..tool })
+}
+
+/// Switches the programs of tools: each runs while its tool is locked.
+async fn supply(changer: kelvin::simulator::Simulator, tools: Vec<Powered>, boot: Duration) {
+    let mut running: Option<(u8, Child)> = None;
+    let mut locked: Option<(u8, Instant)> = None;
+    loop {
+        tokio::time::sleep(SUPPLY_LOOK).await;
+        let now = match changer.reading() {
+            kelvin::Reading::Tool(number) => Some(number),
+            // The contacts are still closed while the ring turns.
+            kelvin::Reading::Intermediate => locked.map(|(number, _)| number),
+            kelvin::Reading::Ready | kelvin::Reading::NoTool => None,
+        };
+        if locked.map(|(number, _)| number) != now {
+            locked = now.map(|number| (number, Instant::now()));
+            if let Some((number, mut child)) = running.take() {
+                // An error means that the program has ended by itself.
+                let _killed = child.kill().await;
+                report(&format!("tool {number} is off"));
+            }
+        }
+        let Some((number, since)) = locked.filter(|_| running.is_none()) else {
+            continue;
+        };
+        let tool = tools.iter().find(|tool| tool.number == number);
+        let Some(tool) = tool.filter(|_| since.elapsed() >= boot) else {
+            continue;
+        };
+        let Some((program, arguments)) = tool.command.split_first() else {
+            continue;
+        };
+        let started = Command::new(program)
+            .args(arguments)
+            .kill_on_drop(true)
+            .spawn();
+        match started {
+            Ok(child) => {
+                report(&format!("tool {number} is on"));
+                running = Some((number, child));
+            }
+            Err(error) => {
+                report(&format!(
+                    "tool {number} cannot be started: {program}: {error}"
+                ));
+                return;
+            }
+        }
+    }
+}
+
+/// Prints a line; an error is ignored, because standard output may be closed.
+fn report(line: &str) {
+    let _printed = told(line);
+}
+
+/// Interval of the checks of the supply of tools.
+const SUPPLY_LOOK: Duration = Duration::from_millis(10);
 
 fn docked(text: &str) -> Result<kelvin::simulator::Docked, &'static str> {
     let read = || {
@@ -199,11 +297,18 @@ async fn simulated(device: Device) -> io::Result<()> {
             unit,
             robot,
             tools,
+            docks,
+            powered,
+            boot_delay,
         } => {
-            let simulator = kelvin::simulator::Simulator::new(tools);
+            let docks = tools.into_iter().chain(docks).collect();
+            let simulator = kelvin::simulator::Simulator::new(docks);
+            let boot = Duration::from_secs_f64(boot_delay);
+            let mut supplying = JoinSet::new();
+            supplying.spawn(supply(simulator.clone(), powered, boot));
             let following = simulator.follow(&robot);
             let serving = modbus("kelvin-tool-changer", &listen, unit, Arc::new(simulator)).await?;
-            Box::new((serving, following))
+            Box::new((serving, following, supplying))
         }
     };
     tokio::select! {

@@ -11,13 +11,14 @@
 //! - `cell`: the current state of the plant
 //! - `follow`: from discovery to the graph
 //! - `import`: from files to the graph
-//! - `execution_skill`: the skill of the MES
+//! - `execution_skill` and `locate_skill`: the skills of the MES
 
 mod cell;
 mod execute;
 mod execution_skill;
 mod follow;
 mod import;
+mod locate_skill;
 mod plan;
 mod process;
 mod record;
@@ -39,14 +40,15 @@ use mappings::{Mapping, SpaceId};
 use plant_opcua::enrolment::GdsArguments;
 use skills::yaml::Place;
 use skills::{
-    ClientOptions, Component, DriverSetup, Lds, LocalRun, Owner, Runs as _, Security, Skill,
-    SkillSetup, TypeName, Value,
+    ClientOptions, Component, Driver, DriverSetup, Lds, LocalRun, Owner, Runs as _, Security,
+    Skill, SkillSetup, TypeName, Value,
 };
 use tracing::{error, info};
 use ua_component::{ComponentPort, Options, made};
 
 use crate::cell::Cell;
 use crate::execution_skill::ExecuteProcess;
+use crate::locate_skill::LocateObject;
 use crate::settings::Settings;
 
 /// The semantic MES: knows the components of the plant, answers questions about them, and runs processes with them.
@@ -160,7 +162,10 @@ impl UaMes {
             cell: Arc::clone(&cell),
             runs: AtomicU64::new(1),
         };
-        let component = component(&settings, driver);
+        let locator = LocateObject {
+            knowledge: Arc::clone(&knowledge),
+        };
+        let component = component(&settings, driver, locator);
         Ok(self.ready.get_or_init(|| Ready {
             settings,
             component,
@@ -328,7 +333,16 @@ impl Program for UaMes {
 }
 
 /// Returns the MES as a component of the plant.
-fn component(settings: &Settings, driver: ExecuteProcess) -> Component {
+fn component(settings: &Settings, driver: ExecuteProcess, locator: LocateObject) -> Component {
+    let skill = |name: &str, driver: Arc<dyn Driver>| SkillSetup {
+        name: name.to_owned(),
+        skill_type: TypeName::own(&format!("{name}SkillType")),
+        driver: DriverSetup::Given(driver),
+        capabilities: Vec::new(),
+        timeout: None,
+        grip_point: None,
+        place: Place::START,
+    };
     Component {
         name: settings.name.clone(),
         application_uri: settings.application_uri.clone(),
@@ -344,15 +358,12 @@ fn component(settings: &Settings, driver: ExecuteProcess) -> Component {
         limits: plant_opcua::limits::ClientLimits::default(),
         device: None,
         robot: None,
-        skills: vec![SkillSetup {
-            name: "ExecuteProcess".to_owned(),
-            skill_type: TypeName::own("ExecuteProcessSkillType"),
-            driver: DriverSetup::Given(Arc::new(driver)),
-            capabilities: Vec::new(),
-            timeout: None,
-            grip_point: None,
-            place: Place::START,
-        }],
+        power_off: false,
+        world: Arc::default(),
+        skills: vec![
+            skill("ExecuteProcess", Arc::new(driver)),
+            skill("LocateObject", Arc::new(locator)),
+        ],
     }
 }
 

@@ -115,10 +115,7 @@ async fn grippers_of_two_lengths_touch_the_part_at_the_same_point() {
             0.2028,
             GripType::Parallel,
             0.0,
-            Box::new(robotiq::Gripper::new(
-                modbus.line().clone(),
-                robotiq::UNIT,
-            )),
+            Box::new(robotiq::Gripper::new(modbus.line().clone(), robotiq::UNIT)),
         ),
         (
             "Schmalz ECBPi",
@@ -168,9 +165,8 @@ async fn grippers_of_two_lengths_touch_the_part_at_the_same_point() {
                 // The geometry of the machine, not the grip point that the composite reads.
                 let tip = plate.then(&Frame::at([0.0, 0.0, *length]));
                 let contact = |flange: [f64; 6]| Frame::of_pose(flange).then(&tip);
-                let expected = |part: [f64; 6]| {
-                    Frame::of_pose(part).then(&Frame::at([0.0, 0.0, *above]))
-                };
+                let expected =
+                    |part: [f64; 6]| Frame::of_pose(part).then(&Frame::at([0.0, 0.0, *above]));
                 let flanges = flanges.lock().unwrap().clone();
                 assert_eq!(flanges.len(), 2);
                 let errors: Vec<f64> = flanges

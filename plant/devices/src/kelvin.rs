@@ -8,16 +8,18 @@
 pub mod simulator;
 mod volts;
 
+use std::collections::BTreeMap;
 use std::fmt;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use async_trait::async_trait;
 use skills::{
-    COMPOSITE_HALT_TIMEOUT, Device, Driver, DriverFault, Parameters, PartEnd, PeerAccess, Results,
-    Runs, SkillClient, SkillFault, TypeName, Value, Work, run_part,
+    COMPOSITE_HALT_TIMEOUT, Device, Driver, DriverFault, Parameters, PartEnd, Partner, PeerAccess,
+    Results, Runs, SkillClient, SkillFault, ToolState, TypeName, Value, Work, run_part,
 };
-use tokio::time::{Instant, sleep};
+use tokio::sync::watch;
+use tokio::time::{Instant, sleep, timeout};
 
 pub use self::volts::{Detector, LEVELS, Reading, volts};
 use crate::line::Line;
@@ -30,9 +32,18 @@ pub struct Settings {
     pub converter: Converter,
     /// The tools and the positions of their docks.
     pub tools: Vec<Tool>,
+    /// The pose of the tool plate in the frame of the flange.
+    pub plate: [f64; 6],
     /// Time limit of each move of the robot.
     pub within: Duration,
+    /// Time limit for the component of a locked tool to become ready.
+    pub ready_within: Duration,
 }
+
+/// The tool plate of the manufacturer's changer.
+pub const PLATE: [f64; 6] = [0.0, 0.0, 0.047, 0.0, 0.0, 0.0];
+/// Default time limit for the component of a locked tool.
+pub const READY_WITHIN: Duration = Duration::from_secs(60);
 
 /// An analog input by Modbus: an input register in mV.
 #[derive(Debug, Clone, PartialEq)]
@@ -57,15 +68,17 @@ pub struct Tool {
     pub number: u8,
     /// The ApplicationUri of its component.
     pub uri: String,
-    /// Pose of the flange when the tool is in its dock, before it is locked: m and rad.
+    /// Pose of the flange when the tool is in its dock, before it is locked: m and rad. It counts
+    /// for requests without a ToolPosition until the tool is put elsewhere.
     pub dock: [f64; 6],
 }
 
 /// The component that moves the flange.
 #[derive(Clone)]
 pub enum Mover {
-    /// A component with PtpMoveSkillType and LinearMoveSkillType.
-    Endpoint(String),
+    /// A component with PtpMoveSkillType and LinearMoveSkillType; `None` for the only one that is
+    /// found.
+    Component(Option<Partner>),
     /// Skills of the same program.
     Skills {
         /// PtpMoveSkillType
@@ -78,7 +91,8 @@ pub enum Mover {
 impl fmt::Debug for Mover {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::Endpoint(endpoint) => f.write_str(endpoint),
+            Self::Component(Some(partner)) => write!(f, "{partner}"),
+            Self::Component(None) => f.write_str("any"),
             Self::Skills { ptp, .. } => f.write_str(&ptp.name()),
         }
     }
@@ -91,6 +105,10 @@ pub struct Changer {
     converter: Arc<Modbus>,
     mover: Mover,
     peers: PeerAccess,
+    /// The state for clients.
+    shown: Arc<watch::Sender<ToolState>>,
+    /// Where each tool was put last, by its number.
+    docks: Arc<Mutex<BTreeMap<u8, [f64; 6]>>>,
 }
 
 impl Changer {
@@ -100,13 +118,63 @@ impl Changer {
         let Converter { at, unit, .. } = &settings.converter;
         Self {
             converter: Arc::new(Modbus::new(at.clone(), *unit)),
+            shown: Arc::new(watch::channel(shown_at_first(&settings, &mover)).0),
+            docks: Arc::default(),
             settings: Arc::new(settings),
             mover,
             peers: PeerAccess::default(),
         }
     }
+
+    /// Shows a reading to clients.
+    fn show(&self, reading: Result<Reading, String>) {
+        let current = match reading {
+            Ok(Reading::Ready | Reading::NoTool) => Some(String::new()),
+            Ok(Reading::Tool(number)) => {
+                let mut tools = self.settings.tools.iter();
+                let known = tools.find(|tool| tool.number == number);
+                known.map(|tool| tool.uri.clone())
+            }
+            // The ring is between open and locked, or the converter does not answer.
+            Ok(Reading::Intermediate) | Err(_) => None,
+        };
+        self.change(|state| state.current = current);
+    }
+
+    fn change(&self, change: impl FnOnce(&mut ToolState)) {
+        self.shown.send_if_modified(|state| {
+            let before = state.clone();
+            change(state);
+            *state != before
+        });
+    }
+
+    /// Returns the dock of a tool: the position that was used last, or its configured dock.
+    fn dock(&self, tool: &Tool) -> [f64; 6] {
+        let docks = self.docks.lock().unwrap_or_else(PoisonError::into_inner);
+        docks.get(&tool.number).copied().unwrap_or(tool.dock)
+    }
+
+    fn remember(&self, tool: &Tool) {
+        let mut docks = self.docks.lock().unwrap_or_else(PoisonError::into_inner);
+        docks.insert(tool.number, tool.dock);
+    }
 }
 
+/// Returns the state before the first measurement.
+fn shown_at_first(settings: &Settings, mover: &Mover) -> ToolState {
+    let mover = match mover {
+        Mover::Component(Some(Partner::At(endpoint))) => endpoint.clone(),
+        Mover::Component(Some(Partner::Called(_)) | None) | Mover::Skills { .. } => String::new(),
+    };
+    ToolState {
+        plate: settings.plate,
+        current: None,
+        mover,
+    }
+}
+
+#[async_trait]
 impl Device for Changer {
     fn driver(
         &self,
@@ -132,6 +200,50 @@ impl Device for Changer {
             ..self.clone()
         };
         Ok(Arc::new(Change { changer, what }))
+    }
+
+    fn looks_for_others(&self) -> bool {
+        matches!(self.mover, Mover::Component(_))
+    }
+
+    fn tool_changer(&self) -> Option<watch::Receiver<ToolState>> {
+        Some(self.shown.subscribe())
+    }
+
+    async fn tend(&self, peers: &PeerAccess) {
+        let measure = async {
+            let mut look = Look {
+                changer: self,
+                detector: Detector::default(),
+            };
+            loop {
+                let reading = look.steady().await;
+                self.show(reading);
+                sleep(SHOWN_EVERY).await;
+            }
+        };
+        let find = async {
+            loop {
+                self.find_robot(peers).await;
+                sleep(SHOWN_EVERY).await;
+            }
+        };
+        tokio::join!(measure, find);
+    }
+}
+
+impl Changer {
+    /// Looks for the robot until it is found, without waiting for it.
+    async fn find_robot(&self, peers: &PeerAccess) {
+        let Mover::Component(partner) = &self.mover else {
+            return;
+        };
+        if !self.shown.borrow().mover.is_empty() {
+            return;
+        }
+        if let Ok((endpoint, _)) = peers.robot(partner.as_ref()).await {
+            self.change(|state| state.mover = endpoint);
+        }
     }
 }
 
@@ -194,22 +306,16 @@ impl Driver for Change {
     fn check(&self, parameters: &Parameters) -> Result<(), String> {
         match self.what {
             What::Detach => Ok(()),
-            What::Attach | What::Change => {
-                let tool = self.wanted(parameters)?;
-                let given = parameters.six("ToolPosition").unwrap_or(tool.dock);
-                let apart = tool
-                    .dock
-                    .iter()
-                    .zip(given)
-                    .any(|(dock, given)| (dock - given).abs() > TOLERANCE);
-                if apart {
-                    let dock = Value::from(tool.dock);
-                    return Err(format!(
-                        "ToolPosition is not where that tool has its dock: {dock}"
-                    ));
-                }
-                Ok(())
-            }
+            What::Attach | What::Change => self.wanted(parameters).map(drop),
+        }
+    }
+
+    fn uses(&self) -> Vec<String> {
+        match &self.changer.mover {
+            Mover::Component(_) => ["PtpMoveSkillType", "LinearMoveSkillType"]
+                .map(|of| format!("{:?} {of}", self.changer.mover))
+                .into(),
+            Mover::Skills { .. } => Vec::new(),
         }
     }
 
@@ -219,10 +325,14 @@ impl Driver for Change {
             detector: Detector::default(),
         };
         let now = look.steady().await?;
+        self.changer.show(Ok(now));
         let wanted = match self.what {
             What::Detach => None,
-            What::Attach | What::Change => Some(self.wanted(work.parameters())?),
+            What::Attach | What::Change => {
+                Some(self.at(self.wanted(work.parameters())?, Some(work.parameters())))
+            }
         };
+        let wanted = wanted.as_ref();
         let attached = match now {
             Reading::Intermediate => {
                 return Err(format!(
@@ -233,6 +343,9 @@ impl Driver for Change {
             Reading::Tool(number) => Some(number),
         };
         if attached == wanted.map(|tool| tool.number) {
+            if let Some(tool) = wanted {
+                self.await_ready(tool, &work).await?;
+            }
             return Ok(attached_tool(wanted));
         }
         let put = match (attached, self.what) {
@@ -241,19 +354,27 @@ impl Driver for Change {
                     "nothing is moved: tool {number} has to be detached first"
                 ));
             }
-            (Some(number), What::Change | What::Detach) => Some(self.tool(number)?),
+            (Some(number), What::Change) => Some(self.at(self.tool(number)?, None)),
+            (Some(number), What::Detach) => {
+                Some(self.at(self.tool(number)?, Some(work.parameters())))
+            }
             (None, _) => None,
         };
-        let mover = Connected::open(&self.changer.mover, &self.changer.peers).await?;
+        let put = put.as_ref();
+        let mover = self.changer.connected(&work).await?;
         let moved = self.moved(&mover, &mut look, (put, wanted), &work).await;
         mover.close().await;
         match moved {
-            Ok(()) => Ok(attached_tool(wanted)),
+            Ok(()) => {
+                if let Some(tool) = wanted {
+                    self.await_ready(tool, &work).await?;
+                }
+                Ok(attached_tool(wanted))
+            }
             Err(why) => {
-                let now = look
-                    .steady()
-                    .await
-                    .map_or_else(|why| why, |now| now.to_string());
+                let now = look.steady().await;
+                self.changer.show(now.clone());
+                let now = now.map_or_else(|why| why, |now| now.to_string());
                 Err(format!("{why}; {now}"))
             }
         }
@@ -278,6 +399,111 @@ impl Change {
         })
     }
 
+    /// Returns a tool at the ToolPosition of a request, or at its dock.
+    fn at(&self, tool: &Tool, parameters: Option<&Parameters>) -> Tool {
+        let given = parameters.and_then(|parameters| parameters.six("ToolPosition"));
+        let given = given.filter(|pose| pose.iter().any(|number| *number != 0.0));
+        Tool {
+            dock: given.unwrap_or_else(|| self.changer.dock(tool)),
+            ..tool.clone()
+        }
+    }
+
+    /// Switches the component of a tool off before the tool loses its supply.
+    async fn power_off(&self, tool: &Tool, work: &Work) -> Result<(), String> {
+        let Some(detector) = &self.changer.peers.detector else {
+            return Ok(());
+        };
+        let all = detector.all();
+        let Some(found) = all.into_iter().find(|one| one.application_uri == tool.uri) else {
+            work.note(format!("{} is not found, and not switched off", tool.uri))
+                .await;
+            return Ok(());
+        };
+        work.step("PowerOff").await;
+        let refused = |why: String| format!("{} is not switched off: {why}", tool.uri);
+        let client = self.changer.peers.connect(&found.endpoint).await;
+        let client = match client {
+            Ok(client) => client,
+            Err(why) => {
+                // The component has lost its supply already, or has never started.
+                work.note(refused(why)).await;
+                return Ok(());
+            }
+        };
+        let handle = client.handle(&found.skill);
+        let off = handle.power_off(Duration::ZERO).await;
+        let note = match &off {
+            Ok(true) => {
+                let gone = timeout(OFF_WITHIN, client.lost()).await;
+                let gone = gone.map_or("does not end", |_| "is switched off");
+                format!("{} {gone}", tool.uri)
+            }
+            Ok(false) => format!("{} has no PowerOffDevice", tool.uri),
+            Err(fault) => refused(fault.to_string()),
+        };
+        client.close().await;
+        work.note(note).await;
+        off.map(drop).map_err(|fault| refused(fault.to_string()))
+    }
+
+    /// Waits until the component of a locked tool is found and its skills have a state.
+    async fn await_ready(&self, tool: &Tool, work: &Work) -> Result<(), String> {
+        let Some(detector) = &self.changer.peers.detector else {
+            return Ok(());
+        };
+        work.step("WaitForReady").await;
+        let began = Instant::now();
+        let limit = self.changer.settings.ready_within;
+        let mut why = "it is not found".to_owned();
+        let any = TypeName::own("SkillType");
+        let ready = async {
+            loop {
+                let found = detector
+                    .one(&any, limit, |one| one.application_uri == tool.uri)
+                    .await;
+                match found {
+                    Ok(found) => match self.is_ready(&found.endpoint).await {
+                        Ok(()) => return,
+                        Err(reason) => why = reason,
+                    },
+                    Err(_) => why = format!("it is not found{}", detector.unreadable()),
+                }
+                sleep(POLL).await;
+            }
+        };
+        let waited = tokio::select! {
+            waited = timeout(limit, ready) => waited.is_ok(),
+            () = work.stopped() => return Err("stopped".to_owned()),
+        };
+        if !waited {
+            return Err(format!(
+                "the tool is locked, and its component {} is not ready within {limit:?}: {why}",
+                tool.uri
+            ));
+        }
+        let took = began.elapsed().as_millis();
+        work.note(format!(
+            "{} is ready {took} ms after it was locked",
+            tool.uri
+        ))
+        .await;
+        Ok(())
+    }
+
+    async fn is_ready(&self, endpoint: &str) -> Result<(), String> {
+        let client = self.changer.peers.connect(endpoint).await?;
+        let ready = async {
+            for skill in client.skills().await? {
+                client.handle(&skill).state().await?;
+            }
+            Ok(())
+        };
+        let ready: Result<(), SkillFault> = ready.await;
+        client.close().await;
+        ready.map_err(|fault| format!("{endpoint}: {fault}"))
+    }
+
     fn tool(&self, number: u8) -> Result<&Tool, String> {
         let mut tools = self.changer.settings.tools.iter();
         tools
@@ -294,14 +520,19 @@ impl Change {
     ) -> Result<(), String> {
         let within = self.changer.settings.within;
         if let Some(tool) = put {
+            self.power_off(tool, work).await?;
             mover.go(&tool.put(), within, work).await?;
             work.step("WaitForRelease").await;
             look.until(Reading::NoTool, work).await?;
+            self.changer.remember(tool);
+            self.changer.show(Ok(Reading::NoTool));
         }
         if let Some(tool) = take {
             mover.go(&tool.take(), within, work).await?;
             work.step("WaitForTool").await;
             look.until(Reading::Tool(tool.number), work).await?;
+            self.changer.remember(tool);
+            self.changer.show(Ok(Reading::Tool(tool.number)));
             let approach = ("Approach", true, tool.beside((FRONT, APPROACH), LOCKED));
             mover.go(&[approach], within, work).await?;
         }
@@ -374,33 +605,40 @@ struct Connected {
     client: Option<SkillClient>,
 }
 
-impl Connected {
-    async fn open(mover: &Mover, peers: &PeerAccess) -> Result<Self, String> {
-        let endpoint = match mover {
+impl Changer {
+    /// Connects to the robot.
+    async fn connected(&self, work: &Work) -> Result<Connected, String> {
+        let partner = match &self.mover {
             Mover::Skills { ptp, linear } => {
-                return Ok(Self {
+                return Ok(Connected {
                     ptp: Arc::clone(ptp),
                     linear: Arc::clone(linear),
                     client: None,
                 });
             }
-            Mover::Endpoint(endpoint) => endpoint,
+            Mover::Component(partner) => partner,
         };
-        let told = |fault: SkillFault| format!("{endpoint}: {fault}");
-        let client = peers.connect(endpoint).await?;
-        match Self::with(&client).await {
-            Ok((ptp, linear)) => Ok(Self {
+        let endpoint = tokio::select! {
+            found = self.peers.robot(partner.as_ref()) => found?.0,
+            () = work.stopped() => return Err("stopped".to_owned()),
+        };
+        self.change(|state| state.mover.clone_from(&endpoint));
+        let client = self.peers.connect(&endpoint).await?;
+        match Connected::with(&client).await {
+            Ok((ptp, linear)) => Ok(Connected {
                 ptp,
                 linear,
                 client: Some(client),
             }),
             Err(fault) => {
                 client.close().await;
-                Err(told(fault))
+                Err(format!("{endpoint}: {fault}"))
             }
         }
     }
+}
 
+impl Connected {
     async fn with(client: &SkillClient) -> Result<(Arc<dyn Runs>, Arc<dyn Runs>), SkillFault> {
         let mut both: Vec<Arc<dyn Runs>> = Vec::new();
         for of in ["PtpMoveSkillType", "LinearMoveSkillType"] {
@@ -459,8 +697,10 @@ const OVERSHOOT: f64 = 0.001;
 const LOCKED: f64 = -63.0;
 const OVERTURN: f64 = 2.0;
 const UNLOCKED: f64 = 4.0;
-/// Tolerance between a position from a client and the dock, in m or rad.
-const TOLERANCE: f64 = 0.005;
+/// Interval of the measurements for clients, beside those of a run.
+const SHOWN_EVERY: Duration = Duration::from_millis(500);
+/// Time limit for the end of a component that is switched off.
+const OFF_WITHIN: Duration = Duration::from_secs(5);
 const POLL: Duration = Duration::from_millis(100);
 const MOST_LOOKS: u32 = 20;
 const SWITCHED: Duration = Duration::from_secs(10);

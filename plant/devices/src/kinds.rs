@@ -91,10 +91,26 @@ fn read_address<'n>(node: &'n Node, reader: &mut Reader<'_>) -> Option<&'n str> 
 }
 
 fn read_changer(node: &Node, reader: &mut Reader<'_>) -> Option<Arc<dyn Device>> {
-    let [at, unit, register, robot, tools, within] = reader.map(
-        node,
-        ["converter", "unit", "register", "robot", "tools", "within"],
-    )?;
+    let keys = [
+        "converter",
+        "unit",
+        "register",
+        "robot",
+        "tools",
+        "plate",
+        "within",
+        "ready_within",
+    ];
+    let [
+        at,
+        unit,
+        register,
+        robot,
+        tools,
+        plate,
+        within,
+        ready_within,
+    ] = reader.map(node, keys)?;
     let at = reader
         .needed(at, "converter", node.place)
         .and_then(|node| read_line(node, reader));
@@ -103,9 +119,12 @@ fn read_changer(node: &Node, reader: &mut Reader<'_>) -> Option<Arc<dyn Device>>
         Some(node) => read_register(node, reader),
         None => Some(0),
     };
-    let robot = reader
-        .needed(robot, "robot", node.place)
-        .and_then(|node| read_endpoint(node, reader));
+    let robot = robot.map(|node| skills::read_partner(node, reader));
+    let plate = plate.map_or(Some(kelvin::PLATE), |node| {
+        skills::read_numbers(node, (-10.0, 10.0), reader)
+    });
+    let ready_within =
+        ready_within.map_or(Some(kelvin::READY_WITHIN), |node| reader.duration(node));
     let within = within.map_or(Some(MOVE_WITHIN), |node| reader.duration(node));
     let tools = reader
         .needed(tools, "tools", node.place)
@@ -118,21 +137,17 @@ fn read_changer(node: &Node, reader: &mut Reader<'_>) -> Option<Arc<dyn Device>>
             divider: kelvin::DIVIDER,
         },
         tools: tools?,
+        plate: plate?,
         within: within?,
+        ready_within: ready_within?,
     };
-    let mover = kelvin::Mover::Endpoint(robot?.to_owned());
+    // `None` for a robot that each run finds.
+    let robot = match robot {
+        Some(partner) => Some(partner?),
+        None => None,
+    };
+    let mover = kelvin::Mover::Component(robot);
     Some(Arc::new(kelvin::Changer::new(settings, mover)))
-}
-
-fn read_endpoint<'n>(node: &'n Node, reader: &mut Reader<'_>) -> Option<&'n str> {
-    let text = reader.text(node, "an endpoint")?;
-    match text.strip_prefix("opc.tcp://") {
-        Some(rest) if !rest.is_empty() => Some(text),
-        _ => {
-            let message = format!("expected an endpoint as opc.tcp://host:port, found `{text}`");
-            reader.refuse(node, Code::Endpoint, message)
-        }
-    }
 }
 
 fn read_register(node: &Node, reader: &mut Reader<'_>) -> Option<u16> {

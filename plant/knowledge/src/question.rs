@@ -88,6 +88,10 @@ pub const QUESTIONS: &[Question] = &[
         sparql: include_str!("../queries/components.rq"),
     },
     Question {
+        name: "objects",
+        sparql: include_str!("../queries/objects.rq"),
+    },
+    Question {
         name: "parameters",
         sparql: include_str!("../queries/parameters.rq"),
     },

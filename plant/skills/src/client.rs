@@ -10,8 +10,12 @@
 //! - `mirror`: the skills of a server, presented like local skills
 //! - `detector`: the skills of all servers
 //! - `peers`: how the skills of a component reach other components
+//! - `choice`: the robot, the tool and the object of a pick and place
 //! - `remote`: a composite of the skills of several servers
 
+mod choice;
+#[cfg(test)]
+mod choice_tests;
 mod detector;
 mod find;
 mod grip;
@@ -31,6 +35,7 @@ use plant_opcua::client::{
 };
 use plant_opcua::types::StatusCode;
 
+pub use choice::ToolState;
 pub use detector::{Detected, Detector};
 pub use find::{FoundParameter, FoundSkill, FoundType};
 pub use handle::{RemoteState, SkillHandle};
@@ -648,8 +653,9 @@ mod tests {
         );
         let gripper = serve("parallel-gripper.yaml", &[("400 ms", "20 ms")]);
         let partners = Partners {
-            robot: Partner::At(robot.url().to_owned()),
-            gripper: Partner::Called("urn:example:gripper".to_owned()),
+            robot: Some(Partner::At(robot.url().to_owned())),
+            gripper: Some(Partner::Called("urn:example:gripper".to_owned())),
+            plate: None,
             within: Duration::from_secs(20),
         };
         let parameters = vec![
@@ -668,7 +674,7 @@ mod tests {
             detector: Some(detector),
             ..PeerAccess::default()
         };
-        let driver = Arc::new(Remote::new(partners, peers));
+        let driver = Arc::new(Remote::new(partners, Arc::default(), peers));
         let outcome =
             conformance::run_once("PickAndPlaceSkillType", driver.clone(), parameters.clone())
                 .await

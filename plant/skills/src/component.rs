@@ -16,11 +16,11 @@ use plant_opcua::limits::ClientLimits;
 use plant_opcua::users::{Role, Roles};
 
 pub use device::{Device, DeviceKinds, NoDevices};
-pub use document::read_user;
+pub use document::{read_partner, read_user};
 pub use drivers::{DriverFault, Drivers};
 pub use space::{Asked, Form, Part, Source, SpaceWork};
 
-pub use world::{read_numbers, read_shape};
+pub use world::{World, WorldObject, read_numbers, read_shape};
 
 use crate::driver::Driver;
 use crate::grip::GripPoint;
@@ -58,6 +58,10 @@ pub struct Component {
     pub device: Option<Arc<dyn Device>>,
     /// The robot description for clients of OPC 40010-1.
     pub robot: Option<Robot>,
+    /// Whether clients may switch the component off (`PowerOffDevice`).
+    pub power_off: bool,
+    /// The objects of the cell by their ObjectIds, for composites.
+    pub world: World,
     /// The skills, by their numbers from 1.
     pub skills: Vec<SkillSetup>,
 }
@@ -192,10 +196,13 @@ pub struct Simulation {
 /// The servers of the skills that a composite runs.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Partners {
-    /// The server of the robot.
-    pub robot: Partner,
-    /// The server of the gripper.
-    pub gripper: Partner,
+    /// The server of the robot; `None` if each run finds it.
+    pub robot: Option<Partner>,
+    /// The server of the gripper; `None` if each run finds it.
+    pub gripper: Option<Partner>,
+    /// The pose of the tool plate in the frame of the flange; `None` for the tool plate of the tool
+    /// changer of the robot, if there is one.
+    pub plate: Option<[f64; 6]>,
     /// Time limit of each run.
     pub within: Duration,
 }
@@ -218,19 +225,18 @@ impl fmt::Display for Partner {
 }
 
 impl Component {
-    /// Returns whether a skill needs partners that have to be discovered.
+    /// Returns whether a skill needs components that have to be discovered.
     #[must_use]
     pub fn looks_for_others(&self) -> bool {
-        self.skills.iter().any(|skill| match &skill.driver {
-            DriverSetup::PickAndPlace(Partners { robot, gripper, .. }) => {
-                let is_called = |partner: &Partner| matches!(partner, Partner::Called(_));
-                is_called(robot) || is_called(gripper)
-            }
+        let has_composite = self.skills.iter().any(|skill| match &skill.driver {
+            DriverSetup::PickAndPlace(_) => true,
             DriverSetup::Given(_)
             | DriverSetup::Simulated(_)
             | DriverSetup::Device
             | DriverSetup::Space(_) => false,
-        })
+        });
+        let device = self.device.as_ref();
+        has_composite || device.is_some_and(|device| device.looks_for_others())
     }
 }
 

@@ -35,8 +35,8 @@ pub struct PickAndPlace {
 /// A pick and place job.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Job {
-    /// The pose of the object, whose z axis points up: m, m, m, rad, rad, rad. If the gripper states
-    /// no grip point, it is the pose of the flange.
+    /// The pose of the object, whose z axis points up: m, m, m, rad, rad, rad. If the gripper
+    /// states no grip point, it is the pose of the flange.
     pub pick: [f64; 6],
     /// The target pose of the object.
     pub place: [f64; 6],

@@ -1,7 +1,7 @@
 //! Frames: positions and orientations, and their composition.
 //!
-//! A pose is six numbers: x, y and z in m, and the rotations about the fixed x, y and z axes in rad,
-//! in this order.
+//! A pose is six numbers: x, y and z in m, and the rotations about the fixed x, y and z axes in
+//! rad, in this order.
 
 /// A unit quaternion: w, x, y, z.
 pub type Quaternion = [f64; 4];

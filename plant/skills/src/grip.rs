@@ -57,7 +57,8 @@ impl fmt::Display for GripType {
 /// The grip point of a grasp skill.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GripPoint {
-    /// The pose of the grip point in the frame of the tool plate. Its z axis points towards the part.
+    /// The pose of the grip point in the frame of the tool plate. Its z axis points towards the
+    /// part.
     pub offset: [f64; 6],
     /// The way of holding, if the gripper states it.
     pub grip_type: Option<GripType>,
@@ -150,13 +151,14 @@ fn from_above() -> Frame {
 /// The poses of the flange for a part.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Hold {
-    /// The flange in the frame of the part; `None` if the pose of the part is the pose of the flange.
+    /// The flange in the frame of the part; `None` if the pose of the part is the pose of the
+    /// flange.
     flange: Option<Frame>,
 }
 
 impl Hold {
-    /// Returns how the flange holds a part by a grip point. `plate` is the tool plate in the frame of
-    /// the flange.
+    /// Returns how the flange holds a part by a grip point. `plate` is the tool plate in the frame
+    /// of the flange.
     ///
     /// # Errors
     /// As [`GripPoint::on`].
@@ -183,7 +185,8 @@ impl Hold {
         }
     }
 
-    /// Returns the pose of the flange at this distance before the part, along the z axis of the tool.
+    /// Returns the pose of the flange at this distance before the part, along the z axis of the
+    /// tool.
     pub(crate) fn before(&self, part: [f64; 6], distance: f64) -> [f64; 6] {
         let [.., a, b, c] = part;
         let above = Frame::of_pose(part).then(&Frame::at([0.0, 0.0, distance]));

@@ -29,12 +29,13 @@ pub mod yaml;
 pub use authority::{Authority, Owner};
 pub use client::{
     ClientOptions, Detected, Detector, FoundParameter, FoundSkill, FoundType, Mirror, Mirrors,
-    PeerAccess, RemoteState, SkillClient, SkillHandle, Watchable,
+    PeerAccess, RemoteState, SkillClient, SkillHandle, ToolState, Watchable,
 };
 pub use component::{
     Asked, Component, Device, DeviceKinds, DriverFault, DriverSetup, Drivers, Form, LEASE, Lds,
     MOST_SKILLS, NoDevices, Part, Partner, Partners, Robot, Security, Simulation, SkillSetup,
-    Source, SpaceWork, anonymous_by_default, read_numbers, read_shape, read_user,
+    Source, SpaceWork, World, WorldObject, anonymous_by_default, read_numbers, read_partner,
+    read_shape, read_user,
 };
 pub use composite::{Broken, Job, PickAndPlace, Teller};
 pub use driver::{Driver, Results, Stopped, Work};

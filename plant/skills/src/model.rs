@@ -23,6 +23,15 @@ pub const CONTROLLER_TYPE: &str = "ISkillControllerType";
 /// The namespace of OPC 10000-100, which defines the locks of components.
 pub(crate) const DEVICES: &str = "http://opcfoundation.org/UA/DI/";
 
+/// The method of a component that switches it off.
+pub const POWER_OFF: &str = "PowerOffDevice";
+/// The properties of the skills of a tool changer: the tool plate in the frame of the flange.
+pub const TOOL_PLATE_OFFSET: &str = "ToolPlateOffset";
+/// The ApplicationUri of the attached tool; empty for none.
+pub const CURRENT_TOOL: &str = "CurrentTool";
+/// The endpoint of the robot that carries the changer.
+pub const MOVER_ENDPOINT: &str = "MoveSkillControllerEndpoint";
+
 /// The properties of a grasp skill with a grip point.
 pub const GRIP_POINT_OFFSET: &str = "GripPointOffset";
 /// A value of [`GripType`](crate::GripType).
@@ -108,6 +117,7 @@ impl Variable {
             }
             Preset::Text(text) => Some(text.into()),
             Preset::Flag(flag) => Some(flag.into()),
+            Preset::Zeros(count) => Some((0..count).map(|_| 0.0).collect::<Vec<f64>>().into()),
         }
     }
 }

@@ -5,20 +5,24 @@
 //!
 //! - this module
 //! - `place`: the location of the component in the plant
+//! - `power`: the end of the program before its device loses its supply
 //! - `types`: the description of a skill from the instance of its type
 //! - `show`: values and events for clients
 //! - `methods`: methods and writes of clients
 //! - `lock`: the lease as a lock of OPC 10000-100
 //! - `grip`: the grip point of a grasp skill
 //! - `robot`: the robot for clients of OPC 40010-1
+//! - `tool`: the state of a tool changer
 //! - `uses`: the skills that composites use
 
 mod grip;
 mod lock;
 mod methods;
 mod place;
+mod power;
 mod robot;
 mod show;
+mod tool;
 mod types;
 mod uses;
 
@@ -39,6 +43,7 @@ use tokio::time::{Instant, MissedTickBehavior};
 
 use self::lock::Lock;
 use self::methods::status;
+pub use self::power::PowerOff;
 use self::show::{Nodes, Shower};
 pub(crate) use self::types::OUTCOME;
 use crate::authority::{Authority, Owner};
@@ -65,6 +70,8 @@ pub struct ServeSettings {
     pub first_run: u32,
     /// The supervisor at which the component is registered.
     pub supervision: Supervision,
+    /// Ends the program for `PowerOffDevice`; `None` for a component without this method.
+    pub power_off: Option<PowerOff>,
 }
 
 /// The reason why a component cannot be served.
@@ -107,14 +114,14 @@ impl ComponentServer {
         let server = server_of(component, settings, &users)?;
         let mut ids = IdRange::new(OWN, FIRST_FREE_ID);
         let root = root(&server, component, &mut ids)?;
-        let configure_by = (settings.supervision.clone(), users);
+        let configure_by = (settings.supervision.clone(), Arc::clone(&users));
         place::configurable(&server, &root.node_id, &mut ids, configure_by)
             .map_err(|error| ServeFault::Space(error.to_string()))?;
         let folder = root
             .node("Skills")
             .cloned()
             .ok_or_else(|| ServeFault::Space("it has no folder Skills".to_owned()))?;
-        let mut drivers = Drivers::new(component.device.clone(), settings.peers.clone());
+        let mut drivers = Drivers::new(component, settings.peers.clone());
         let mut findings = Findings::default();
         let mut made = Vec::new();
         for (number, setup) in (1..).zip(&component.skills) {
@@ -153,7 +160,25 @@ impl ComponentServer {
             served.push((skill, nodes));
         }
         let skills: Vec<Skill> = served.iter().map(|(skill, _)| skill.clone()).collect();
+        if let Some(power_off) = settings.power_off.clone() {
+            power::serve(
+                &server,
+                &root.node_id,
+                &mut ids,
+                &skills,
+                (power_off, users),
+            )
+            .map_err(|error| ServeFault::Space(error.to_string()))?;
+        }
         let mut tasks = JoinSet::new();
+        if let Some(device) = component.device.clone() {
+            if let Some(state) = device.tool_changer() {
+                let nodes = served.iter().map(|(_, nodes)| Arc::clone(nodes)).collect();
+                tasks.spawn(tool::show(server.clone(), nodes, state));
+            }
+            let peers = settings.peers.clone();
+            tasks.spawn(async move { device.tend(&peers).await });
+        }
         let leases = Leases {
             server: server.clone(),
             served,
@@ -337,10 +362,19 @@ fn make(
     let driver = drivers
         .make(&setup.driver, &types)
         .map_err(|fault| wrong(Code::Driver, fault.to_string()))?;
+    let changes_tools =
+        drivers.has_tool_changer() && types.contains(&TypeName::own("ToolSkillType"));
     let first = number * IDS_PER_SKILL;
     let spec = InstanceSpec {
         event_notifier: true,
         optional: grip::properties(setup.grip_point.as_ref())
+            .chain(
+                changes_tools
+                    .then_some(tool::PROPERTIES)
+                    .into_iter()
+                    .flatten()
+                    .map(str::to_owned),
+            )
             .chain(["ProgramDiagnostic".to_owned()])
             .collect(),
         ..InstanceSpec::new(

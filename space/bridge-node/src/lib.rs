@@ -57,7 +57,7 @@ pub use observer::Observer;
 pub use port::{Delivery, Execution, LinkState, Port, PortEvent};
 pub use present::Present;
 pub use program::{Carried, Context, Made, Program, run};
-pub use restart::restart;
+pub use restart::{restart, stop};
 pub use service::{Service, run_service};
 pub use service_manager::ready;
 pub use services::{CallFault, Outcome, Ran, ServiceCall, ServiceGraph, Services};

@@ -32,6 +32,13 @@ pub(crate) fn is_requested() -> bool {
     REQUESTED.load(Ordering::Relaxed)
 }
 
+/// Ends the program in order, as after SIGTERM.
+pub fn stop() {
+    if let Err(error) = kill_process(getpid(), Signal::TERM) {
+        warn!(%error, "the program cannot stop itself");
+    }
+}
+
 /// Executes the program again after [`restart`]; otherwise returns its exit code.
 pub(crate) fn executed_again(ended: ExitCode) -> ExitCode {
     if !is_requested() {

@@ -241,8 +241,8 @@ fn the_question_has_to_list_skills_and_services() {
         sees(&mut story, [(1, Fact::Asked(asked))]);
         story.missing()
     };
-    assert_eq!(asked(5, 1, &[]), Ok(Vec::new()));
-    assert!(asked(5, 0, &[]).is_err());
-    assert!(asked(4, 1, &[]).is_err());
-    assert!(asked(5, 1, &["Dosing"]).is_err());
+    assert_eq!(asked(6, 1, &[]), Ok(Vec::new()));
+    assert!(asked(6, 0, &[]).is_err());
+    assert!(asked(5, 1, &[]).is_err());
+    assert!(asked(6, 1, &["Dosing"]).is_err());
 }

@@ -12,10 +12,10 @@ use super::{DIVIDER, Reading, volts};
 use crate::modbus::server::{Registers, Table};
 use crate::ur::Follower;
 
-/// A tool that is in its dock at first.
+/// A dock, with the tool that is in it at first.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Docked {
-    /// Its number at the changer, from 1 to 10.
+    /// The number of the tool at the changer, from 1 to 10; 0 for an empty dock.
     pub number: u8,
     /// Pose of the flange before the tool is locked: m and rad.
     pub dock: [f64; 6],
@@ -29,7 +29,7 @@ pub struct Simulator {
 
 #[derive(Debug)]
 struct Changer {
-    tools: Vec<Docked>,
+    docks: Vec<Docked>,
     attached: Option<u8>,
     reading: Reading,
     cut: bool,
@@ -44,9 +44,9 @@ pub struct Following {
 impl Simulator {
     /// Creates a changer without an attached tool.
     #[must_use]
-    pub fn new(tools: Vec<Docked>) -> Self {
+    pub fn new(docks: Vec<Docked>) -> Self {
         let changer = Changer {
-            tools,
+            docks,
             attached: None,
             reading: Reading::NoTool,
             cut: false,
@@ -126,32 +126,33 @@ impl Registers for Simulator {
 
 impl Changer {
     fn flange_at(&mut self, [x, y, z, _, _, c]: [f64; 6]) {
-        let near = self.tools.iter().find(|tool| {
-            let [at_x, at_y, at_z, ..] = tool.dock;
+        let near = self.docks.iter_mut().find(|dock| {
+            let [at_x, at_y, at_z, ..] = dock.dock;
             ((x - at_x).powi(2) + (y - at_y).powi(2) + (z - at_z).powi(2)).sqrt() < NEAR
         });
-        let Some(Docked {
-            number,
-            dock: [.., at_c],
-        }) = near.copied()
-        else {
+        let Some(dock) = near else {
             self.reading = self.attached.map_or(Reading::NoTool, Reading::Tool);
             return;
         };
+        let [.., at_c] = dock.dock;
         let turned = (c - at_c).to_degrees();
-        self.reading = match self.attached {
-            None if turned <= LOCKS => {
+        self.reading = match (self.attached, dock.number) {
+            (None, 0) => Reading::NoTool,
+            (None, number) if turned <= LOCKS => {
                 self.attached = Some(number);
+                dock.number = 0;
                 Reading::Tool(number)
             }
-            Some(attached) if attached == number && turned >= UNLOCKS => {
+            (None, _) if turned < UNLOCKS => Reading::Intermediate,
+            (None, _) => Reading::NoTool,
+            // A tool is put into an empty dock only.
+            (Some(attached), 0) if turned >= UNLOCKS => {
                 self.attached = None;
+                dock.number = attached;
                 Reading::NoTool
             }
-            None if turned < UNLOCKS => Reading::Intermediate,
-            Some(attached) if attached == number && turned > LOCKS => Reading::Intermediate,
-            None => Reading::NoTool,
-            Some(attached) => Reading::Tool(attached),
+            (Some(_), 0) if turned > LOCKS => Reading::Intermediate,
+            (Some(attached), _) => Reading::Tool(attached),
         };
     }
 }

@@ -1,4 +1,9 @@
-use skills::{Authority, Facts, LocalRun, Owner, Skill, conformance, model};
+use std::path::Path;
+
+use skills::server::{ComponentServer, PowerOff, ServeSettings};
+use skills::{
+    Authority, ClientOptions, Component, Facts, LocalRun, Owner, Skill, conformance, model,
+};
 
 use super::simulator::{Docked, Following, Simulator};
 use super::*;
@@ -9,6 +14,8 @@ const DOCKS: [[f64; 6]; 2] = [
     [0.3, 0.3, 0.2, 0.0, 0.0, 0.0],
     [-0.3, 0.3, 0.2, 0.0, 0.0, 0.5],
 ];
+/// A dock without a tool.
+const EMPTY: [f64; 6] = [0.0, 0.4, 0.2, 0.0, 0.0, 0.0];
 const URIS: [&str; 2] = ["urn:test:parallel", "urn:test:vacuum"];
 
 struct Bench {
@@ -67,6 +74,10 @@ async fn bench() -> Bench {
     let docked = (1..)
         .zip(DOCKS)
         .map(|(number, dock)| Docked { number, dock })
+        .chain([Docked {
+            number: 0,
+            dock: EMPTY,
+        }])
         .collect();
     let simulator = Simulator::new(docked);
     let following = simulator.follow(&robot_served.rtde().to_string());
@@ -92,6 +103,8 @@ async fn bench() -> Bench {
     let settings = Settings {
         converter,
         tools: tools.collect(),
+        plate: PLATE,
+        ready_within: READY_WITHIN,
         within: Duration::from_secs(20),
     };
     Bench {
@@ -144,22 +157,6 @@ async fn tools_are_taken_changed_and_put_back() {
     assert_eq!(bench.simulator.reading(), Reading::Tool(2));
     assert_eq!(bench.run("DetachToolSkillType", None).await, done);
     assert_eq!(bench.simulator.reading(), Reading::NoTool);
-    let mut elsewhere = given(URIS[0]);
-    elsewhere[1].1 = DOCKS[1].into();
-    let driver = bench
-        .changer
-        .driver(
-            &[TypeName::own("AttachToolSkillType")],
-            &PeerAccess::default(),
-        )
-        .unwrap();
-    let refused = conformance::run_once("AttachToolSkillType", driver, elsewhere)
-        .await
-        .unwrap_err();
-    assert!(
-        refused.starts_with("BadInvalidArgument: ToolPosition is not where"),
-        "{refused}"
-    );
     let unknown = bench
         .run("ChangeToolSkillType", Some("urn:test:hammer"))
         .await
@@ -226,4 +223,108 @@ async fn a_ring_that_is_half_way_is_left_to_people() {
     let expected =
         "nothing is moved: its ring is between open and locked, and somebody has to look at it";
     assert_eq!(told, (false, expected.to_owned()));
+}
+
+#[tokio::test]
+async fn a_tool_is_taken_and_put_where_the_tool_position_says_and_then_where_it_was_put() {
+    let mut bench = bench().await;
+    let mut settings = (*bench.changer.settings).clone();
+    // The YAML has another dock than the cell.
+    settings.tools[0].dock = [0.1, 0.5, 0.3, 0.0, 0.0, 0.0];
+    bench.changer = Changer::new(settings, bench.changer.mover.clone());
+    let run = async |of: &str, given: Vec<(String, Value)>| {
+        let types = [TypeName::own(of)];
+        let driver = bench.changer.driver(&types, &PeerAccess::default());
+        conformance::run_once(of, driver.unwrap(), given)
+            .await
+            .unwrap()
+    };
+    let at = |dock: [f64; 6]| ("ToolPosition".to_owned(), Value::from(dock));
+    let tool = || ("ToolAppUri".to_owned(), Value::from(URIS[0]));
+    let outcome = run("AttachToolSkillType", vec![tool(), at(DOCKS[0])]).await;
+    assert!(outcome.succeeded, "{}", outcome.message);
+    assert_eq!(bench.simulator.reading(), Reading::Tool(1));
+    let shown = bench.changer.shown.borrow().clone();
+    assert_eq!(shown.current.as_deref(), Some(URIS[0]));
+
+    let far = run(
+        "DetachToolSkillType",
+        vec![at([2.0, 0.0, 0.2, 0.0, 0.0, 0.0])],
+    )
+    .await;
+    assert!(
+        !far.succeeded && far.message.contains("the robot reaches 0.85 m"),
+        "{}",
+        far.message
+    );
+    assert_eq!(bench.simulator.reading(), Reading::Tool(1));
+    let outcome = run("DetachToolSkillType", vec![at(EMPTY)]).await;
+    assert!(outcome.succeeded, "{}", outcome.message);
+    assert_eq!(bench.simulator.reading(), Reading::NoTool);
+    let outcome = run("AttachToolSkillType", vec![tool()]).await;
+    assert!(outcome.succeeded, "{}", outcome.message);
+    assert_eq!(bench.simulator.reading(), Reading::Tool(1));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_locked_tool_is_awaited_and_switched_off_before_it_is_put_back() {
+    let mut bench = bench().await;
+    let settings = Settings {
+        ready_within: Duration::from_millis(300),
+        ..(*bench.changer.settings).clone()
+    };
+    bench.changer = Changer::new(settings, bench.changer.mover.clone());
+    let options = ClientOptions {
+        within: Duration::from_secs(10),
+        ..ClientOptions::default()
+    };
+    let peers = PeerAccess {
+        detector: Some(skills::Detector::new(options.clone())),
+        options,
+    };
+    let run = async |changer: &Changer, of: &str, given: Vec<(String, Value)>| {
+        let driver = changer.driver(&[TypeName::own(of)], &peers);
+        conformance::run_once(of, driver.unwrap(), given)
+            .await
+            .unwrap()
+    };
+    let late = run(&bench.changer, "AttachToolSkillType", given(URIS[0])).await;
+    let expected = "is locked, and its component urn:test:parallel is not ready within 300ms";
+    assert!(
+        !late.succeeded && late.message.contains(expected),
+        "{}",
+        late.message
+    );
+
+    let text = format!(
+        "component: fingers\napplication_uri: {}\nnamespace: 9\nskills:\n  - {{name: Grasp, type: GraspSkillType, driver: simulated}}\n",
+        URIS[0]
+    );
+    let component = Component::from_yaml(&text, Path::new("")).unwrap();
+    let readings = Arc::new(Mutex::new(Vec::new()));
+    let (seen, simulator) = (Arc::clone(&readings), bench.simulator.clone());
+    let settings = ServeSettings {
+        power_off: Some(PowerOff(Arc::new(move |_| {
+            seen.lock().unwrap().push(simulator.reading());
+        }))),
+        ..ServeSettings::default()
+    };
+    let server = ComponentServer::build(&component, &settings, |_, _| Vec::new()).unwrap();
+    server.start();
+    let patient = Settings {
+        ready_within: Duration::from_secs(30),
+        ..(*bench.changer.settings).clone()
+    };
+    bench.changer = Changer::new(patient, bench.changer.mover.clone());
+    let detector = peers.detector.clone().unwrap();
+    let attach = run(&bench.changer, "AttachToolSkillType", given(URIS[0]));
+    let (attached, ()) = tokio::join!(attach, async { detector.seen("fingers", server.url()) });
+    assert!(attached.succeeded, "{}", attached.message);
+    let noted = |what: &str| attached.trace.iter().any(|line| line.contains(what));
+    assert!(noted("urn:test:parallel is ready"), "{:?}", attached.trace);
+    let outcome = run(&bench.changer, "DetachToolSkillType", Vec::new()).await;
+    assert!(outcome.succeeded, "{}", outcome.message);
+    assert_eq!(*readings.lock().unwrap(), [Reading::Tool(1)]);
+    assert_eq!(bench.simulator.reading(), Reading::NoTool);
+    server.stop().await;
 }

@@ -9,10 +9,13 @@ use plant_opcua::types::{
     QualifiedName, ReferenceDescription, Variant,
 };
 
+use super::choice::ToolState;
 use super::packed::Packed;
 use super::{grip, lost};
 use crate::grip::GripPoint;
-use crate::model::{NAMESPACE, SKILL_TYPE, SkillType, alias};
+use crate::model::{
+    CURRENT_TOOL, MOVER_ENDPOINT, NAMESPACE, SKILL_TYPE, SkillType, TOOL_PLATE_OFFSET, alias,
+};
 use crate::parameters::TypeName;
 use crate::runs::SkillFault;
 use crate::server::OUTCOME;
@@ -42,6 +45,8 @@ pub struct FoundSkill {
     pub results: Vec<FoundParameter>,
     /// The IRIs of the capabilities it provides.
     pub capabilities: Vec<String>,
+    /// The state of the tool changer of a skill that changes tools, if its component shows it.
+    pub tool_state: Option<ToolState>,
     /// The grip point of a grasp skill, if its component states it.
     pub grip_point: Option<GripPoint>,
     /// Parameters and results that cannot be used, with the reasons.
@@ -356,6 +361,7 @@ async fn read(
         true => grip::read(client, &nodes, &parameters, &above).await?,
         false => None,
     };
+    let tool_state = tool_state(client, &nodes).await?;
     let own = skill
         .as_u32()
         .filter(|_| client.namespaces().get(usize::from(skill.namespace)) == Some(&uri(client)));
@@ -372,10 +378,36 @@ async fn read(
         parameters,
         results,
         capabilities,
+        tool_state,
         grip_point,
         strange,
         nodes,
     })
+}
+
+/// Reads the state of the tool changer of a skill; `None` if the skill has no such properties.
+async fn tool_state(client: &Client, nodes: &Nodes) -> Result<Option<ToolState>, SkillFault> {
+    let Some(plate) = nodes.get(TOOL_PLATE_OFFSET) else {
+        return Ok(None);
+    };
+    let mut texts = [None, None];
+    for (text, name) in texts.iter_mut().zip([CURRENT_TOOL, MOVER_ENDPOINT]) {
+        if let Some(node) = nodes.get(name) {
+            let value = value(client, node).await?;
+            *text = value.and_then(|value| value.as_str().map(str::to_owned));
+        }
+    }
+    let plate = value(client, plate)
+        .await?
+        .and_then(|value| value.as_f64s());
+    let [current, mover] = texts;
+    Ok(Some(ToolState {
+        plate: plate
+            .and_then(|plate| plate.try_into().ok())
+            .unwrap_or_default(),
+        current,
+        mover: mover.unwrap_or_default(),
+    }))
 }
 
 /// Returns the object above the folder Skills, and its name.

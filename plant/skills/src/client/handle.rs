@@ -3,14 +3,14 @@
 use std::time::Duration;
 
 use async_trait::async_trait;
-use plant_opcua::client::{CallError, Client, ClientError, Link, Notice, Watch};
+use plant_opcua::client::{Browse, CallError, Client, ClientError, Link, Notice, Watch};
 use plant_opcua::types::{DataValue, NodeId, QualifiedName, StatusCode, UAString, Variant};
 use program::{Method, State};
 
 use super::find::{FoundParameter, FoundSkill};
 use super::{called, lost, refused};
 use crate::grip::GripPoint;
-use crate::model::DEVICES;
+use crate::model::{DEVICES, POWER_OFF};
 use crate::runs::{HALTS_WITHIN, Runs, SkillFault, goes_on};
 use crate::shown::Outcome;
 use crate::value::Value;
@@ -132,6 +132,27 @@ impl SkillHandle {
                 &format!("InitLock of {}", self.found.component),
             )),
         }
+    }
+
+    /// Switches the component off after a delay (`PowerOffDevice`). Returns whether the component
+    /// has this method.
+    ///
+    /// # Errors
+    /// A refusal, or no response.
+    pub async fn power_off(&self, delay: Duration) -> Result<bool, SkillFault> {
+        let component = &self.found.nodes.component;
+        let below = self.client.browse(component, Browse::hierarchical()).await;
+        let below = below.map_err(|error| lost(&error))?;
+        let mut below = below.into_iter();
+        let method = below.find(|child| child.browse_name.name.as_ref() == POWER_OFF);
+        let Some(method) = method.map(|child| child.node_id.node_id) else {
+            return Ok(false);
+        };
+        let delay = u32::try_from(delay.as_millis()).unwrap_or(u32::MAX);
+        let arguments = vec![Variant::UInt32(delay)];
+        let answer = self.client.call(component, &method, arguments).await;
+        let what = format!("{POWER_OFF} of {}", self.found.component);
+        answer.map(|_| true).map_err(|error| called(&error, &what))
     }
 
     /// Calls a method.

@@ -4,6 +4,7 @@ use std::path::Path;
 
 use plant_opcua::client::SecurityChoice;
 
+use super::remote::FOUND_WITHIN;
 use super::{ClientOptions, Detector, SkillClient};
 use crate::component::{Component, Partner, Security};
 use crate::model::SKILL_TYPE;
@@ -77,9 +78,7 @@ impl PeerAccess {
             }
         };
         let any = TypeName::own(SKILL_TYPE);
-        let found = detector.one(&any, super::remote::FOUND_WITHIN, |one| {
-            one.application_uri == *uri
-        });
+        let found = detector.one(&any, FOUND_WITHIN, |one| one.application_uri == *uri);
         match found.await {
             Ok(found) => Ok(found.endpoint),
             Err(SkillFault::Unexpected(_)) => {

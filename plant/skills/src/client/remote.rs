@@ -1,13 +1,14 @@
-//! Pick and place with the skills of two servers.
+//! Pick and place with the skills of other components.
 
 use std::sync::Arc;
 use std::time::Duration;
 
 use async_trait::async_trait;
 
+use super::choice::fitting_grasp;
 use super::{PeerAccess, SkillClient, SkillHandle};
-use crate::component::{Partner, Partners};
-use crate::composite::{self, PickAndPlace};
+use crate::component::{Partner, Partners, World, WorldObject};
+use crate::composite::{Job, PickAndPlace};
 use crate::driver::{Driver, Results, Work};
 use crate::frame::Frame;
 use crate::parameters::{Parameters, TypeName};
@@ -18,14 +19,20 @@ use crate::runs::COMPOSITE_HALT_TIMEOUT;
 #[derive(Debug, Clone)]
 pub struct Remote {
     partners: Partners,
+    world: World,
     peers: PeerAccess,
 }
 
 impl Remote {
-    /// Creates a driver for these partners.
+    /// Creates a driver. Partners that are not given are found for each run, and objects are looked
+    /// up in `world` first.
     #[must_use]
-    pub fn new(partners: Partners, peers: PeerAccess) -> Self {
-        Self { partners, peers }
+    pub fn new(partners: Partners, world: World, peers: PeerAccess) -> Self {
+        Self {
+            partners,
+            world,
+            peers,
+        }
     }
 }
 
@@ -37,32 +44,51 @@ impl Driver for Remote {
     }
 
     fn check(&self, parameters: &Parameters) -> Result<(), String> {
-        composite::job(parameters).map(drop)
+        numbers(parameters, "PlacePosition")?;
+        for name in [TOOL, MOVER] {
+            named(parameters, name)?;
+        }
+        let id = parameters.text("ObjectId").unwrap_or_default();
+        match pick(parameters) {
+            Some(_) => Ok(()),
+            None if id.is_empty() => {
+                Err("ObjectId or PickPosition must be given: neither says what to pick".to_owned())
+            }
+            None if self.peers.detector.is_none() && !self.world.contains_key(id) => Err(format!(
+                "ObjectId `{id}` is not in the world of this component"
+            )),
+            None => Ok(()),
+        }
     }
 
     fn uses(&self) -> Vec<String> {
         let Partners { robot, gripper, .. } = &self.partners;
-        vec![
-            format!("{robot} PtpMoveSkillType"),
-            format!("{robot} LinearMoveSkillType"),
-            format!("{gripper} GraspSkillType"),
-            format!("{gripper} ReleaseSkillType"),
-        ]
+        let of = |partner: &Option<Partner>, types: [&str; 2]| {
+            let who = partner
+                .as_ref()
+                .map_or_else(|| "any".to_owned(), Partner::to_string);
+            types.map(|of| format!("{who} {of}"))
+        };
+        let moves = of(robot, ["PtpMoveSkillType", "LinearMoveSkillType"]);
+        let grips = of(gripper, ["GraspSkillType", "ReleaseSkillType"]);
+        moves.into_iter().chain(grips).collect()
     }
 
     async fn run(&self, work: Work) -> Result<Results, String> {
-        let robot_at = self.place(&self.partners.robot, &work).await?;
-        let gripper_at = self.place(&self.partners.gripper, &work).await?;
-        let robot = self.peers.connect(&robot_at).await?;
-        if robot_at == gripper_at {
+        let found = tokio::select! {
+            found = self.find(&work) => found?,
+            () = work.stopped() => return Err("stopped".to_owned()),
+        };
+        let robot = self.peers.connect(&found.mover).await?;
+        if found.mover == found.tool {
             // A component has one lease, so one session is used for both.
-            let done = self.with(&robot, &robot, &work).await;
+            let done = self.with(&robot, &robot, &found, &work).await;
             robot.close().await;
             return done;
         }
-        let done = match self.peers.connect(&gripper_at).await {
+        let done = match self.peers.connect(&found.tool).await {
             Ok(gripper) => {
-                let done = self.with(&robot, &gripper, &work).await;
+                let done = self.with(&robot, &gripper, &found, &work).await;
                 gripper.close().await;
                 done
             }
@@ -73,29 +99,85 @@ impl Driver for Remote {
     }
 }
 
+/// The object, the robot and the tool of a run.
+struct Found {
+    job: Job,
+    mover: String,
+    tool: String,
+    plate: Frame,
+}
+
 impl Remote {
-    /// Waits for a partner and returns its endpoint.
-    async fn place(&self, partner: &Partner, work: &Work) -> Result<String, String> {
-        let endpoint = tokio::select! {
-            endpoint = self.peers.endpoint(partner) => endpoint?,
-            () = work.stopped() => return Err("stopped".to_owned()),
+    /// Finds the object, the robot and the tool. Nothing moves before all of them are found.
+    async fn find(&self, work: &Work) -> Result<Found, String> {
+        let parameters = work.parameters();
+        let object = self.object(parameters, work).await?;
+        let given = named(parameters, MOVER)?;
+        let given = given.or_else(|| self.partners.robot.clone());
+        let (mover, why) = self.peers.robot(given.as_ref()).await?;
+        work.note(format!("robot at {mover}: {why}")).await;
+        let given = named(parameters, TOOL)?;
+        let given = given.or_else(|| self.partners.gripper.clone());
+        let tool = self.peers.tool(given.as_ref(), &mover).await?;
+        work.note(format!("tool at {}: {}", tool.endpoint, tool.reason))
+            .await;
+        let plate = self.partners.plate.map_or(tool.plate, Frame::of_pose);
+        let job = Job {
+            pick: object.pose,
+            place: numbers(parameters, "PlacePosition")?,
+            approach: parameters
+                .number("ApproachOffset")
+                .ok_or("ApproachOffset is not a number")?,
+            shape: object.shape,
         };
-        if let Partner::Called(uri) = partner {
-            work.note(format!("{uri} is at {endpoint}")).await;
+        Ok(Found {
+            job,
+            mover,
+            tool: tool.endpoint,
+            plate,
+        })
+    }
+
+    /// Looks up the object: PickPosition, the table of this component, then other components.
+    async fn object(&self, parameters: &Parameters, work: &Work) -> Result<WorldObject, String> {
+        let id = parameters.text("ObjectId").unwrap_or_default();
+        let known = self.world.get(id).cloned();
+        if let Some(pose) = pick(parameters) {
+            let unknown = WorldObject {
+                pose,
+                shape: None,
+                mass: None,
+            };
+            return Ok(WorldObject {
+                pose,
+                ..known.unwrap_or(unknown)
+            });
         }
-        Ok(endpoint)
+        if let Some(object) = known {
+            work.note(format!("object {id}: listed in `world`")).await;
+            return Ok(object);
+        }
+        let located = self.peers.locate(id).await;
+        let object = located.map_err(|why| {
+            format!("ObjectId `{id}` is not in the world of this component, and {why}")
+        })?;
+        work.note(format!("object {id}: located")).await;
+        Ok(object)
     }
 
     async fn with(
         &self,
         robot: &SkillClient,
         gripper: &SkillClient,
+        found: &Found,
         work: &Work,
     ) -> Result<Results, String> {
-        let (ptp, grasp) = (
-            one(robot, "PtpMoveSkillType").await?,
-            one(gripper, "GraspSkillType").await?,
-        );
+        let (grasp, reasons) = fitting_grasp(gripper, found.job.shape.as_ref()).await?;
+        for reason in reasons {
+            work.note(reason).await;
+        }
+        let grasp = gripper.handle(&grasp);
+        let ptp = one(robot, "PtpMoveSkillType").await?;
         // Both components are locked before the work starts, so that a waiting client cannot
         // acquire one of them during the work.
         let apart = robot.endpoint() != gripper.endpoint();
@@ -108,15 +190,39 @@ impl Remote {
             linear: Arc::new(one(robot, "LinearMoveSkillType").await?),
             grasp: Arc::new(grasp),
             release: Arc::new(one(gripper, "ReleaseSkillType").await?),
-            plate: Frame::IDENTITY,
+            plate: found.plate,
             within: self.partners.within,
         };
-        let job = composite::job(work.parameters())?;
         composite
-            .run(&job, work)
+            .run(&found.job, work)
             .await
             .map_err(|broken| broken.to_string())?;
         Ok(Vec::new())
+    }
+}
+
+/// Returns the pose of the object, unless it is left to ObjectId.
+fn pick(parameters: &Parameters) -> Option<[f64; 6]> {
+    let pose = parameters.six("PickPosition")?;
+    pose.iter().any(|number| *number != 0.0).then_some(pose)
+}
+
+fn numbers(parameters: &Parameters, name: &str) -> Result<[f64; 6], String> {
+    parameters
+        .six(name)
+        .ok_or_else(|| format!("{name} has no six numbers"))
+}
+
+/// Returns the component that a parameter names.
+fn named(parameters: &Parameters, name: &str) -> Result<Option<Partner>, String> {
+    match parameters.text(name).unwrap_or_default() {
+        "" => Ok(None),
+        uri if uri.starts_with("urn:") => Ok(Some(Partner::Called(uri.to_owned()))),
+        url if url.starts_with("opc.tcp://") => Ok(Some(Partner::At(url.to_owned()))),
+        other => Err(format!(
+            "{name} is an endpoint, an ApplicationUri or empty, and `{}` was given",
+            crate::parameters::shortened(other)
+        )),
     }
 }
 
@@ -132,5 +238,7 @@ async fn one(client: &SkillClient, of: &str) -> Result<SkillHandle, String> {
     Ok(client.handle(first))
 }
 
+const TOOL: &str = "ToolSkillControllerEndpoint";
+const MOVER: &str = "MoveSkillControllerEndpoint";
 /// Time limit to find a partner.
 pub(super) const FOUND_WITHIN: Duration = Duration::from_secs(10);

@@ -85,7 +85,7 @@ impl Secured {
         let DriverSetup::PickAndPlace(partners) = component.skills[0].driver.clone() else {
             panic!("another driver");
         };
-        let driver = Arc::new(Remote::new(partners, peers));
+        let driver = Arc::new(Remote::new(partners, Arc::default(), peers));
         let pose = |y: f64| Value::from([0.4, y, 0.1, 0.0, 0.0, 0.0]);
         let parameters = vec![
             ("PickPosition".to_owned(), pose(0.2)),

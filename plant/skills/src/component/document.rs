@@ -1,13 +1,15 @@
 //! The YAML of a component.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Duration;
 
 use plant_opcua::client::ClientUser;
 use plant_opcua::limits::ClientLimits;
 use plant_opcua::users::{Role, Roles};
 
-use super::world::read_grip_point;
+use super::world::{read_grip_point, read_numbers, read_world};
 use super::{
     Asked, Component, DeviceKinds, DriverSetup, LEASE, Lds, MOST_SKILLS, NoDevices, Partner,
     Partners, Robot, Security, Simulation, SkillSetup, anonymous_by_default,
@@ -71,6 +73,8 @@ fn component(
         "limits",
         "device",
         "robot",
+        "world",
+        "power_off",
         "skills",
     ];
     let [
@@ -88,6 +92,8 @@ fn component(
         limits,
         device,
         robot,
+        world,
+        power_off,
         skills,
     ] = reader.map(root, keys)?;
     // All values are read, so that all errors are reported.
@@ -120,6 +126,8 @@ fn component(
     let limits = read_limits(limits, reader);
     let device = device.map(|node| kinds.read(node, reader));
     let robot = robot.map(|node| read_robot(node, reader));
+    let power_off = power_off.map_or(Some(false), |node| reader.boolean(node));
+    let world = world.map_or_else(BTreeMap::new, |node| read_world(node, reader));
     let skills = reader
         .needed(skills, "skills", root.place)
         .map(|node| read_skills(node, reader));
@@ -138,6 +146,8 @@ fn component(
         limits: limits?,
         device: whole(device)?,
         robot: whole(robot)?,
+        power_off: power_off?,
+        world: Arc::new(world),
         skills: skills?,
     })
 }
@@ -505,6 +515,14 @@ fn read_driver(node: &Node, reader: &mut Reader<'_>) -> Option<DriverSetup> {
     if matches!(&node.kind, Kind::Scalar(text) if text == "device") {
         return Some(DriverSetup::Device);
     }
+    if matches!(&node.kind, Kind::Scalar(text) if text == "pick_and_place") {
+        return Some(DriverSetup::PickAndPlace(Partners {
+            robot: None,
+            gripper: None,
+            plate: None,
+            within: USUALLY_WITHIN,
+        }));
+    }
     let keys = ["simulated", "pick_and_place", "call", "action"];
     let space = |asked, node, reader: &mut Reader<'_>| {
         let work = super::space::read(asked, node, reader);
@@ -538,23 +556,22 @@ fn read_simulation(node: &Node, reader: &mut Reader<'_>) -> Option<Simulation> {
 }
 
 fn read_partners(node: &Node, reader: &mut Reader<'_>) -> Option<Partners> {
-    let [robot, gripper, within] = reader.map(node, ["robot", "gripper", "within"])?;
-    let robot = reader
-        .needed(robot, "robot", node.place)
-        .and_then(|node| read_partner(node, reader));
-    let gripper = reader
-        .needed(gripper, "gripper", node.place)
-        .and_then(|node| read_partner(node, reader));
+    let [robot, gripper, plate, within] =
+        reader.map(node, ["robot", "gripper", "plate", "within"])?;
+    let robot = robot.map(|node| read_partner(node, reader));
+    let gripper = gripper.map(|node| read_partner(node, reader));
+    let plate = plate.map(|node| read_numbers(node, (-10.0, 10.0), reader));
     let within = within.map_or(Some(USUALLY_WITHIN), |node| reader.duration(node));
     Some(Partners {
-        robot: robot?,
-        gripper: gripper?,
+        robot: whole(robot)?,
+        gripper: whole(gripper)?,
+        plate: whole(plate)?,
         within: within?,
     })
 }
 
 /// Reads an endpoint, or the ApplicationUri of a server that is discovered.
-fn read_partner(node: &Node, reader: &mut Reader<'_>) -> Option<Partner> {
+pub fn read_partner(node: &Node, reader: &mut Reader<'_>) -> Option<Partner> {
     let is_uri = matches!(&node.kind, Kind::Scalar(text) if text.starts_with("urn:"));
     match is_uri {
         true => read_uri(node, Code::Uri, reader).map(Partner::Called),

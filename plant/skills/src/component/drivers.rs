@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use super::{Device, DriverSetup, Simulation};
+use super::{Component, Device, DriverSetup, Simulation, World};
 use crate::client::{PeerAccess, Remote};
 use crate::driver::Driver;
 use crate::model::NAMESPACE;
@@ -20,6 +20,7 @@ pub struct Drivers {
     base: Base,
     device: Option<Arc<dyn Device>>,
     peers: PeerAccess,
+    world: World,
 }
 
 /// A driver that cannot do the work of a type.
@@ -28,15 +29,22 @@ pub struct Drivers {
 pub struct DriverFault(pub String);
 
 impl Drivers {
-    /// Creates the factory for a component with this device, which reaches its partners by
-    /// `peers`.
+    /// Creates the factory for a component, which reaches others by `peers`.
     #[must_use]
-    pub fn new(device: Option<Arc<dyn Device>>, peers: PeerAccess) -> Self {
+    pub fn new(component: &Component, peers: PeerAccess) -> Self {
         Self {
-            device,
+            device: component.device.clone(),
+            world: Arc::clone(&component.world),
             peers,
             ..Self::default()
         }
+    }
+
+    /// Returns whether the component has a tool changer.
+    #[must_use]
+    pub fn has_tool_changer(&self) -> bool {
+        let device = self.device.as_ref();
+        device.is_some_and(|device| device.tool_changer().is_some())
     }
 
     /// Returns the driver of a skill with this type and these supertypes, nearest first.
@@ -66,7 +74,8 @@ impl Drivers {
             ))),
             DriverSetup::PickAndPlace(partners) if is("PickAndPlaceSkillType") => {
                 let peers = self.peers.clone();
-                Ok(Arc::new(Remote::new(partners.clone(), peers)))
+                let world = Arc::clone(&self.world);
+                Ok(Arc::new(Remote::new(partners.clone(), world, peers)))
             }
             DriverSetup::PickAndPlace(_) => Err(DriverFault(format!(
                 "`pick_and_place` does the work of PickAndPlaceSkillType, and this is {own}"

@@ -1,8 +1,64 @@
 //! The objects of the cell that the YAML of a component lists, and grip points.
 
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
 use crate::grip::{GripPoint, GripType, PartShape};
 use crate::parameters::shortened;
-use crate::yaml::{Code, Node, Reader};
+use crate::yaml::{Code, Kind, Node, Reader};
+
+/// An object of the cell.
+#[derive(Debug, Clone, PartialEq)]
+pub struct WorldObject {
+    /// The pose of its centre in the frame of the robot's base; its z axis points up.
+    pub pose: [f64; 6],
+    /// Its shape, if it is known.
+    pub shape: Option<PartShape>,
+    /// Its mass, kg.
+    pub mass: Option<f64>,
+}
+
+/// The objects of the cell by their ObjectIds.
+pub type World = Arc<BTreeMap<String, WorldObject>>;
+
+/// Reads the table `world`: objects by their ObjectId.
+pub(super) fn read_world(node: &Node, reader: &mut Reader<'_>) -> BTreeMap<String, WorldObject> {
+    let Kind::Map(pairs) = &node.kind else {
+        reader.wrong(node, "a map from ObjectIds to objects");
+        return BTreeMap::new();
+    };
+    let mut world = BTreeMap::new();
+    for (key, value) in pairs {
+        let Some(id) = reader.text(key, "an ObjectId").map(str::to_owned) else {
+            continue;
+        };
+        let Some(object) = read_object(value, reader) else {
+            continue;
+        };
+        if world.insert(id, object).is_some() {
+            let message = "the object is listed twice".to_owned();
+            reader.refuse::<()>(key, Code::DuplicateKey, message);
+        }
+    }
+    world
+}
+
+fn read_object(node: &Node, reader: &mut Reader<'_>) -> Option<WorldObject> {
+    let keys = ["pose", "box", "cylinder", "sphere", "mass"];
+    let [pose, cuboid, cylinder, sphere, mass] = reader.map(node, keys)?;
+    let pose = reader.needed(pose, "pose", node.place)?;
+    let pose = read_numbers(pose, (-1000.0, 1000.0), reader);
+    let shape = shape(node, [cuboid, cylinder, sphere], reader);
+    let mass = match mass {
+        Some(node) => Some(reader.number(node, (0.0, 10_000.0))?),
+        None => None,
+    };
+    Some(WorldObject {
+        pose: pose?,
+        shape: shape?,
+        mass,
+    })
+}
 
 /// Reads the shape of a part: `{box: [x, y, z]}`, `{cylinder: [diameter, height]}` or
 /// `{sphere: diameter}`, in m.

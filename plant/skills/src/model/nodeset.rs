@@ -9,8 +9,9 @@ use program::{Method, Rest};
 use super::table::{SkillType, Unit, Variable};
 use super::types::TYPES;
 use super::{
-    CONTROLLER_TYPE, EVENT_TYPE, GRIP_POINT_OFFSET, GRIP_POINT_OPENING, GRIP_POINT_TYPE, NAMESPACE,
-    SKILL_TYPE, USED_SKILL_TYPE, USES_SKILL,
+    CONTROLLER_TYPE, CURRENT_TOOL, EVENT_TYPE, GRIP_POINT_OFFSET, GRIP_POINT_OPENING,
+    GRIP_POINT_TYPE, MOVER_ENDPOINT, NAMESPACE, SKILL_TYPE, TOOL_PLATE_OFFSET, USED_SKILL_TYPE,
+    USES_SKILL,
 };
 use crate::value::{Builtin, Value};
 
@@ -481,7 +482,7 @@ struct OptionalProperty {
     about: &'static str,
 }
 
-const OPTIONAL: [OptionalProperty; 3] = [
+const OPTIONAL: [OptionalProperty; 6] = [
     OptionalProperty {
         of: "GraspSkillType",
         offset: 94,
@@ -505,6 +506,30 @@ const OPTIONAL: [OptionalProperty; 3] = [
         builtin: Builtin::Double,
         length: Some(2),
         about: "The smallest and the largest width that fits between the fingers, m.",
+    },
+    OptionalProperty {
+        of: "ToolSkillType",
+        offset: 94,
+        name: TOOL_PLATE_OFFSET,
+        builtin: Builtin::Double,
+        length: Some(6),
+        about: "The tool plate in the frame of the flange: x, y, z in m and the rotations about them in rad.",
+    },
+    OptionalProperty {
+        of: "ToolSkillType",
+        offset: 95,
+        name: CURRENT_TOOL,
+        builtin: Builtin::String,
+        length: None,
+        about: "The ApplicationUri of the attached tool; empty for none, and bad while it is unknown.",
+    },
+    OptionalProperty {
+        of: "ToolSkillType",
+        offset: 96,
+        name: MOVER_ENDPOINT,
+        builtin: Builtin::String,
+        length: None,
+        about: "The endpoint of the robot that carries the changer; empty until it is found.",
     },
 ];
 

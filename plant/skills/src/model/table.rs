@@ -57,6 +57,8 @@ pub enum Preset {
     Text(&'static str),
     /// A Boolean.
     Flag(bool),
+    /// So many zeros: an array that is not given.
+    Zeros(u32),
 }
 
 /// A unit of UNECE Recommendation 20.

@@ -26,6 +26,12 @@ const ACCELERATION: Unit = Unit {
     id: code(b"MSK"),
 };
 
+const KILOGRAM: Unit = Unit {
+    symbol: "kg",
+    name: "kilogram",
+    id: code(b"KGM"),
+};
+
 const RADIAN: Unit = Unit {
     symbol: "rad",
     name: "radian",
@@ -96,6 +102,14 @@ const fn position(name: &'static str, about: &'static str) -> Variable {
     }
 }
 
+/// An optional parameter: a position; six zeros if it is not given.
+const fn optional_position(name: &'static str, about: &'static str) -> Variable {
+    Variable {
+        preset: Preset::Zeros(6),
+        ..position(name, about)
+    }
+}
+
 /// A mandatory parameter: an array of numbers.
 const fn numbers(
     name: &'static str,
@@ -143,9 +157,9 @@ const fn flag(name: &'static str, about: &'static str) -> Variable {
     }
 }
 
-const TOOL_POSITION: Variable = position(
+const TOOL_POSITION: Variable = optional_position(
     "ToolPosition",
-    "Where the tool hangs in its place, as TargetPosition of a move.",
+    "The pose of the flange at the dock of the tool, as TargetPosition of a move. Zeros: the dock that was used last.",
 );
 const TOOL_APP_URI: Variable = text(
     "ToolAppUri",
@@ -154,7 +168,7 @@ const TOOL_APP_URI: Variable = text(
 );
 
 /// All skill types, supertypes before their subtypes.
-pub static TYPES: [SkillType; 22] = [
+pub static TYPES: [SkillType; 23] = [
     SkillType {
         name: "SkillType",
         id: 1000,
@@ -283,19 +297,36 @@ pub static TYPES: [SkillType; 22] = [
         is_abstract: false,
         about: "Takes a thing from one place to another, by the skills of a robot and a gripper.",
         parameters: &[
-            position(
+            optional_position(
                 "PickPosition",
-                "Where the thing is, as TargetPosition of a move.",
+                "The pose of the object, as TargetPosition of a move: its centre, with its z axis up. Zeros: the pose of ObjectId.",
             ),
-            position("PlacePosition", "Where it is to be, likewise."),
+            position(
+                "PlacePosition",
+                "The target pose of the object, as PickPosition.",
+            ),
             number(
                 "ApproachOffset",
                 0.05,
                 Some(&METRE),
                 (0.0, 1.0),
-                "How far above both positions moves begin and end.",
+                "Distance from both poses at which moves start and end, along the z axis of the tool.",
             ),
-            text("ObjectId", Preset::Text(""), "Which thing, for the record."),
+            text(
+                "ObjectId",
+                Preset::Text(""),
+                "The object, which is looked up in the world of the component, in ua-mes, and by skills that locate objects.",
+            ),
+            text(
+                "ToolSkillControllerEndpoint",
+                Preset::Text(""),
+                "The endpoint or ApplicationUri of the tool; empty for the tool that is attached.",
+            ),
+            text(
+                "MoveSkillControllerEndpoint",
+                Preset::Text(""),
+                "The endpoint or ApplicationUri of the robot; empty for the robot that is found by its skills.",
+            ),
         ],
         results: &[],
         rests_in: Rest::Ready,
@@ -473,8 +504,8 @@ pub static TYPES: [SkillType; 22] = [
         id: 3100,
         base: Some("ToolSkillType"),
         is_abstract: false,
-        about: "Brings the tool that is attached back to its place, if one is.",
-        parameters: &[],
+        about: "Brings the tool that is attached to a dock, if one is.",
+        parameters: &[TOOL_POSITION],
         results: &[],
         rests_in: Rest::Ready,
     },
@@ -527,6 +558,34 @@ pub static TYPES: [SkillType; 22] = [
             about: "Whether it is to run.",
         }],
         results: &[],
+        rests_in: Rest::Ready,
+    },
+    SkillType {
+        name: "LocateObjectSkillType",
+        id: 3500,
+        base: Some("SkillType"),
+        is_abstract: false,
+        about: "Finds an object, and fails if it is not there.",
+        parameters: &[text("ObjectId", Preset::None, "The object.")],
+        results: &[
+            position(
+                "Pose",
+                "The centre of the object with its z axis up, as TargetPosition of a move.",
+            ),
+            numbers(
+                "Box",
+                Some(3),
+                Some(&METRE),
+                "The lengths of a box along its x, y and z axes; zeros if it is not a box.",
+            ),
+            numbers(
+                "Cylinder",
+                Some(2),
+                Some(&METRE),
+                "The diameter and the height of an upright cylinder; zeros if it is not a cylinder.",
+            ),
+            measured("Mass", Some(&KILOGRAM), "Its mass; 0 if it is unknown."),
+        ],
         rests_in: Rest::Ready,
     },
 ];

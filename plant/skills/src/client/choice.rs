@@ -1,0 +1,355 @@
+//! The robot, the tool and the object of a pick and place, looked up for each run.
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use tokio::time::timeout;
+
+use super::find::FoundSkill;
+use super::{Detected, Detector, PeerAccess, SkillClient};
+use crate::component::{Partner, WorldObject};
+use crate::frame::Frame;
+use crate::grip::PartShape;
+use crate::parameters::TypeName;
+use crate::runs::Runs as _;
+use crate::shown::Outcome;
+use crate::value::Value;
+
+/// The state of a tool changer, as its component shows it.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct ToolState {
+    /// The pose of the tool plate in the frame of the flange.
+    pub plate: [f64; 6],
+    /// The ApplicationUri of the attached tool; empty for none, `None` if it is unknown.
+    pub current: Option<String>,
+    /// The endpoint of the robot that carries the changer; empty if it is unknown.
+    pub mover: String,
+}
+
+/// A component that can do a part of the work.
+#[derive(Debug, Clone, PartialEq, Eq)]
+struct Candidate {
+    endpoint: String,
+    application_uri: String,
+}
+
+/// The tool of a pick and place.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct ChosenTool {
+    pub(super) endpoint: String,
+    /// The tool plate in the frame of the flange.
+    pub(super) plate: Frame,
+    /// Why this tool was chosen, for the trace.
+    pub(super) reason: String,
+}
+
+/// Compares URLs of endpoints, which may end with a slash.
+fn is_same_endpoint(a: &str, b: &str) -> bool {
+    a.trim_end_matches('/') == b.trim_end_matches('/')
+}
+
+impl PeerAccess {
+    fn searching(&self) -> Result<&Detector, String> {
+        let detector = self.detector.as_ref();
+        detector.ok_or_else(|| "discovery is not running".to_owned())
+    }
+
+    /// Returns the endpoint of the robot, and why it was chosen.
+    ///
+    /// # Errors
+    /// There is no robot, or several are found.
+    pub async fn robot(&self, given: Option<&Partner>) -> Result<(String, String), String> {
+        if let Some(partner) = given {
+            let endpoint = self.endpoint(partner).await?;
+            return Ok((endpoint, "named".to_owned()));
+        }
+        let wrong = |why: String| format!("MoveSkillControllerEndpoint: {why}");
+        let detector = self.searching().map_err(&wrong)?;
+        let moves = ["PtpMoveSkillType", "LinearMoveSkillType"];
+        let robots = candidates(detector, &moves).await;
+        match robots.as_slice() {
+            [] => Err(wrong(format!(
+                "no robot with {} is found{}",
+                moves.join(" and "),
+                detector.unreadable()
+            ))),
+            [one] => Ok((one.endpoint.clone(), "the only robot".to_owned())),
+            several => {
+                let mut carrying = Vec::new();
+                for (_, state) in self.changers(detector).await {
+                    let has_tool = state.current.as_ref().is_some_and(|tool| !tool.is_empty());
+                    let robot = several.iter().find(|one| is_at(one, &state.mover));
+                    carrying.extend(robot.filter(|_| has_tool));
+                }
+                match carrying.as_slice() {
+                    [one] => Ok((
+                        one.endpoint.clone(),
+                        "the only robot with a tool".to_owned(),
+                    )),
+                    _ => Err(wrong(format!(
+                        "several robots are found, give one of {}",
+                        list(several)
+                    ))),
+                }
+            }
+        }
+    }
+
+    /// Returns the tool at the flange of a robot.
+    pub(super) async fn tool(
+        &self,
+        given: Option<&Partner>,
+        mover: &str,
+    ) -> Result<ChosenTool, String> {
+        let wrong = |why: String| format!("ToolSkillControllerEndpoint: {why}");
+        let Some(detector) = &self.detector else {
+            let partner = given.ok_or_else(|| wrong("discovery is not running".to_owned()))?;
+            return Ok(ChosenTool {
+                endpoint: self.endpoint(partner).await?,
+                plate: Frame::IDENTITY,
+                reason: "named".to_owned(),
+            });
+        };
+        let mounted = self.mounted(detector, mover).await;
+        let named = match given {
+            Some(partner) => Some(self.endpoint(partner).await?),
+            None => None,
+        };
+        if let Some((changer, state)) = mounted {
+            let Some(current) = &state.current else {
+                return Err(wrong(format!("the tool at {changer} is unknown")));
+            };
+            if current.is_empty() {
+                return Err(wrong(format!("no tool is attached to {changer}")));
+            }
+            let attached = self.endpoint(&Partner::Called(current.clone())).await?;
+            if let Some(named) = named.filter(|named| !is_same_endpoint(named, &attached)) {
+                return Err(wrong(format!(
+                    "{named} is not attached to {changer}, which has {current}"
+                )));
+            }
+            return Ok(ChosenTool {
+                endpoint: attached,
+                plate: Frame::of_pose(state.plate),
+                reason: format!("{current} is attached to {changer}"),
+            });
+        }
+        let at_flange = |endpoint: String, reason: &str| ChosenTool {
+            endpoint,
+            plate: Frame::IDENTITY,
+            reason: reason.to_owned(),
+        };
+        if let Some(named) = named {
+            return Ok(at_flange(named, "named"));
+        }
+        let grippers = candidates(detector, &["GraspSkillType", "ReleaseSkillType"]).await;
+        if let Some(own) = grippers.iter().find(|one| is_at(one, mover)) {
+            return Ok(at_flange(own.endpoint.clone(), "the gripper of the robot"));
+        }
+        match grippers.as_slice() {
+            [] => Err(wrong(format!(
+                "no gripper is found{}",
+                detector.unreadable()
+            ))),
+            [one] => Ok(at_flange(one.endpoint.clone(), "the only gripper")),
+            several => Err(wrong(format!(
+                "several grippers are found, give one of {}",
+                list(several)
+            ))),
+        }
+    }
+
+    /// Returns the tool changer on a robot with its current state, and its name.
+    async fn mounted(&self, detector: &Detector, mover: &str) -> Option<(String, ToolState)> {
+        let uri = uri_at(detector, mover);
+        let changers = self.changers(detector).await;
+        changers.into_iter().find(|(_, state)| {
+            is_same_endpoint(&state.mover, mover) || (!uri.is_empty() && state.mover == uri)
+        })
+    }
+
+    /// Reads the state of all tool changers.
+    async fn changers(&self, detector: &Detector) -> Vec<(String, ToolState)> {
+        let of = TypeName::own("ToolSkillType");
+        let mut endpoints: BTreeMap<String, String> = BTreeMap::new();
+        for found in detector.of_type(&of) {
+            if found.skill.tool_state.is_some() {
+                endpoints.insert(found.endpoint, found.application_uri);
+            }
+        }
+        let mut states = Vec::new();
+        for (endpoint, application_uri) in endpoints {
+            // The state may be newer than discovery. A changer that does not answer moves nothing.
+            let state = timeout(READ_WITHIN, self.tool_state(&endpoint)).await;
+            let state = state.ok().flatten().unwrap_or_default();
+            states.push((application_uri, state));
+        }
+        states
+    }
+
+    async fn tool_state(&self, endpoint: &str) -> Option<ToolState> {
+        let client = self.connect(endpoint).await.ok()?;
+        let found = client.skills_of(&TypeName::own("ToolSkillType")).await;
+        client.close().await;
+        found.ok()?.into_iter().find_map(|skill| skill.tool_state)
+    }
+
+    /// Finds an object by the skills of other components that locate objects. `ua-mes`, which knows
+    /// the graph of the plant, is asked first.
+    pub(super) async fn locate(&self, id: &str) -> Result<WorldObject, String> {
+        let detector = self.searching()?;
+        let of = TypeName::own("LocateObjectSkillType");
+        let some = detector.one(&of, FOUND_WITHIN, |_| true).await;
+        some.map_err(|_| "no component with a skill that locates objects is found".to_owned())?;
+        let mut locators = detector.of_type(&of);
+        let executes = TypeName::own("ExecuteProcessSkillType");
+        let executors = detector.of_type(&executes);
+        locators.sort_by_key(|one| !executors.iter().any(|of| of.endpoint == one.endpoint));
+        let mut reasons = Vec::new();
+        for locator in locators {
+            match self.located(&locator, id).await {
+                Ok(object) => return Ok(object),
+                Err(why) => reasons.push(format!("{}: {why}", name_of(&locator))),
+            }
+        }
+        Err(reasons.join("; "))
+    }
+
+    async fn located(&self, locator: &Detected, id: &str) -> Result<WorldObject, String> {
+        let client = self.connect(&locator.endpoint).await?;
+        let handle = client.handle(&locator.skill);
+        let given = vec![("ObjectId".to_owned(), Value::from(id))];
+        let ran = handle.run(given, LOCATED_WITHIN).await;
+        client.close().await;
+        let outcome = ran.map_err(|fault| fault.to_string())?;
+        match outcome.succeeded {
+            true => object_of(&outcome).ok_or_else(|| "the result has no Pose".to_owned()),
+            false => Err(outcome.message),
+        }
+    }
+}
+
+/// Returns the object in the results of a skill that locates objects. Zeros are unknown lengths.
+fn object_of(outcome: &Outcome) -> Option<WorldObject> {
+    let numbers = |name: &str| {
+        let mut results = outcome.results.iter();
+        let found = results.find(|(known, _)| known == name);
+        found.and_then(|(_, value)| value.as_f64s())
+    };
+    let known = |numbers: Vec<f64>| Some(numbers).filter(|all| all.iter().all(|one| *one > 0.0));
+    let cuboid: Option<[f64; 3]> = numbers("Box")
+        .and_then(known)
+        .and_then(|all| all.try_into().ok());
+    let cylinder: Option<[f64; 2]> = numbers("Cylinder")
+        .and_then(known)
+        .and_then(|all| all.try_into().ok());
+    let shape = cuboid.map(PartShape::Box);
+    let mass = outcome.results.iter().find(|(name, _)| name == "Mass");
+    Some(WorldObject {
+        pose: numbers("Pose")?.try_into().ok()?,
+        shape: shape
+            .or(cylinder.map(|[diameter, height]| PartShape::Cylinder { diameter, height })),
+        mass: mass
+            .and_then(|(_, mass)| mass.as_f64())
+            .filter(|mass| *mass > 0.0),
+    })
+}
+
+fn name_of(found: &Detected) -> String {
+    format!("{}.{}", found.skill.component, found.skill.name)
+}
+
+fn is_at(one: &Candidate, place: &str) -> bool {
+    is_same_endpoint(&one.endpoint, place) || one.application_uri == place
+}
+
+fn uri_at(detector: &Detector, endpoint: &str) -> String {
+    let all = detector.all();
+    let found = all
+        .into_iter()
+        .find(|one| is_same_endpoint(&one.endpoint, endpoint));
+    found.map(|one| one.application_uri).unwrap_or_default()
+}
+
+fn list(candidates: &[Candidate]) -> String {
+    let each = candidates
+        .iter()
+        .map(|one| format!("{} at {}", one.application_uri, one.endpoint));
+    each.collect::<Vec<_>>().join(", ")
+}
+
+/// Returns the components that have skills of all these types. Waits until there is one.
+async fn candidates(detector: &Detector, types: &[&str]) -> Vec<Candidate> {
+    let mut changes = detector.changes();
+    let find = async {
+        loop {
+            changes.borrow_and_update();
+            let found = having(&detector.all(), types);
+            if !found.is_empty() {
+                return found;
+            }
+            // The sender is owned by the detector.
+            let _changed = changes.changed().await;
+        }
+    };
+    timeout(FOUND_WITHIN, find).await.unwrap_or_default()
+}
+
+fn having(all: &[Detected], types: &[&str]) -> Vec<Candidate> {
+    let mut components: BTreeMap<&str, (&str, Vec<&FoundSkill>)> = BTreeMap::new();
+    for one in all {
+        let entry = components.entry(&one.endpoint);
+        let (_, skills) = entry.or_insert((&one.application_uri, Vec::new()));
+        skills.push(&one.skill);
+    }
+    let has_all = |skills: &[&FoundSkill]| {
+        let has = |name: &&str| skills.iter().any(|skill| skill.is_of(&TypeName::own(name)));
+        types.iter().all(has)
+    };
+    let found = components
+        .into_iter()
+        .filter(|(_, (_, skills))| has_all(skills));
+    found
+        .map(|(endpoint, (application_uri, _))| Candidate {
+            endpoint: endpoint.to_owned(),
+            application_uri: application_uri.to_owned(),
+        })
+        .collect()
+}
+
+/// Opens the grasp skill of a tool that fits a part. Returns it with the reasons against others.
+pub(super) async fn fitting_grasp(
+    client: &SkillClient,
+    shape: Option<&PartShape>,
+) -> Result<(FoundSkill, Vec<String>), String> {
+    let of = TypeName::own("GraspSkillType");
+    let found = client.skills_of(&of).await;
+    let found = found.map_err(|fault| format!("{}: {fault}", client.endpoint()))?;
+    if found.is_empty() {
+        return Err(format!(
+            "{} has no skill of GraspSkillType",
+            client.endpoint()
+        ));
+    }
+    let mut reasons = Vec::new();
+    for skill in found {
+        let fits = skill
+            .grip_point
+            .map_or(Ok(()), |grip| grip.on(shape).map(drop));
+        match fits {
+            Ok(()) => return Ok((skill, reasons)),
+            Err(why) => reasons.push(format!(
+                "{}.{} does not fit: {why}",
+                skill.component, skill.name
+            )),
+        }
+    }
+    Err(reasons.join("; "))
+}
+
+/// Time limit to find a component.
+const FOUND_WITHIN: Duration = Duration::from_secs(10);
+/// Time limit to read the state of a tool changer.
+const READ_WITHIN: Duration = Duration::from_secs(5);
+/// Time limit for the run of a skill that locates an object.
+const LOCATED_WITHIN: Duration = Duration::from_secs(30);

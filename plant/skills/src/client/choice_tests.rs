@@ -1,0 +1,290 @@
+//! Pick and place with the tool that is attached, and with objects that others know.
+
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Duration;
+
+use async_trait::async_trait;
+use tokio::sync::watch;
+
+use super::{ClientOptions, Detector, PeerAccess, Remote, SkillClient, ToolState};
+use crate::component::{Component, Device, DriverFault, DriverSetup};
+use crate::conformance;
+use crate::driver::{Driver, Results, Work};
+use crate::parameters::TypeName;
+use crate::server::{ComponentServer, ServeSettings};
+use crate::shown::Outcome;
+use crate::value::Value;
+
+const ROBOT: &str = include_str!("../../../../examples/plant/robot.yaml");
+const FINGERS: &str = include_str!("../../../../examples/plant/parallel-gripper.yaml");
+const CHANGER: &str = "component: changer
+application_uri: urn:test:changer
+namespace: 30
+skills:
+  - {name: Attach, type: AttachToolSkillType, driver: simulated}
+";
+const CUP: &str = "component: cup
+application_uri: urn:test:cup
+namespace: 31
+skills:
+  - name: Grasp
+    type: GraspSkillType
+    driver: {simulated: {duration: 10 ms}}
+    grip_point: {offset: [0, 0, 0.1868, 0, 0, 0], type: vacuum}
+  - {name: Release, type: ReleaseSkillType, driver: {simulated: {duration: 10 ms}}}
+";
+const CAMERA: &str = "component: camera
+application_uri: urn:test:camera
+namespace: 32
+skills:
+  - {name: Locate, type: LocateObjectSkillType, driver: device}
+";
+const HANDLING: &str = "component: handling
+application_uri: urn:test:handling
+namespace: 33
+world:
+  box: {pose: [0.4, 0.2, 0.1, 0, 0, 0], box: [0.04, 0.06, 0.05], mass: 0.2}
+  ball: {pose: [0.4, 0.2, 0.1, 0, 0, 0], sphere: 0.03}
+skills:
+  - {name: Place, type: PickAndPlaceSkillType, driver: pick_and_place}
+";
+
+const SOON: Duration = Duration::from_secs(60);
+/// The number of skills of all components.
+const SKILLS: usize = 8;
+
+/// A tool changer that the test switches.
+#[derive(Debug)]
+struct Switched(watch::Receiver<ToolState>);
+
+impl Device for Switched {
+    fn driver(&self, _: &[TypeName], _: &PeerAccess) -> Result<Arc<dyn Driver>, DriverFault> {
+        Err(DriverFault("the test changes no tools".to_owned()))
+    }
+
+    fn tool_changer(&self) -> Option<watch::Receiver<ToolState>> {
+        Some(self.0.clone())
+    }
+}
+
+/// A camera that sees a bolt.
+#[derive(Debug, Clone)]
+struct Camera;
+
+impl Device for Camera {
+    fn driver(&self, _: &[TypeName], _: &PeerAccess) -> Result<Arc<dyn Driver>, DriverFault> {
+        Ok(Arc::new(Self))
+    }
+}
+
+#[async_trait]
+impl Driver for Camera {
+    async fn run(&self, work: Work) -> Result<Results, String> {
+        match work.parameters().text("ObjectId") {
+            Some("bolt") => Ok(vec![
+                ("Pose".to_owned(), [0.3, 0.3, 0.1, 0.0, 0.0, 0.0].into()),
+                ("Box".to_owned(), vec![0.0; 3].into()),
+                ("Cylinder".to_owned(), vec![0.01, 0.04].into()),
+                ("Mass".to_owned(), 0.01.into()),
+            ]),
+            other => Err(format!("no {} is seen", other.unwrap_or_default())),
+        }
+    }
+}
+
+fn serve(text: &str, device: Option<Arc<dyn Device>>) -> ComponentServer {
+    let component = Component::from_yaml(text, Path::new(""))
+        .unwrap_or_else(|findings| panic!("{}", findings.render("x", text)));
+    let component = Component {
+        device,
+        ..component
+    };
+    let settings = ServeSettings::default();
+    let server = ComponentServer::build(&component, &settings, |_, _| Vec::new()).unwrap();
+    server.start();
+    server
+}
+
+struct Cell {
+    robot: ComponentServer,
+    fingers: ComponentServer,
+    cup: ComponentServer,
+    others: Vec<ComponentServer>,
+    tool: watch::Sender<ToolState>,
+    driver: Arc<dyn Driver>,
+    options: ClientOptions,
+}
+
+impl Cell {
+    async fn new() -> Self {
+        let options = ClientOptions {
+            within: Duration::from_secs(10),
+            ..ClientOptions::default()
+        };
+        let detector = Detector::new(options.clone());
+        let fast = ROBOT.replace("{reach: 1.3}", "{reach: 1.3, time_scale: 20}");
+        let robot = serve(&fast, None);
+        let fingers = serve(&FINGERS.replace("400 ms", "10 ms"), None);
+        let cup = serve(CUP, None);
+        let (tool, shown) = watch::channel(ToolState {
+            plate: [0.0, 0.0, 0.047, 0.0, 0.0, 0.0],
+            current: None,
+            mover: robot.url().to_owned(),
+        });
+        let others = vec![
+            serve(CHANGER, Some(Arc::new(Switched(shown)))),
+            serve(CAMERA, Some(Arc::new(Camera))),
+        ];
+        let all = [&robot, &fingers, &cup].into_iter().chain(&others);
+        for server in all {
+            detector.seen(server.url(), server.url());
+        }
+        let handling = Component::from_yaml(HANDLING, Path::new(""))
+            .unwrap_or_else(|findings| panic!("{}", findings.render("x", HANDLING)));
+        assert!(handling.looks_for_others());
+        let DriverSetup::PickAndPlace(partners) = handling.skills[0].driver.clone() else {
+            panic!("another driver");
+        };
+        let peers = PeerAccess {
+            options: options.clone(),
+            detector: Some(detector.clone()),
+        };
+        let mut changes = detector.changes();
+        let complete = async {
+            while detector.all().len() < SKILLS {
+                changes.changed().await.unwrap();
+            }
+        };
+        tokio::time::timeout(SOON, complete).await.unwrap();
+        Self {
+            robot,
+            fingers,
+            cup,
+            others,
+            tool,
+            driver: Arc::new(Remote::new(partners, handling.world, peers)),
+            options,
+        }
+    }
+
+    /// Attaches a tool, and waits until the changer shows it.
+    async fn attach(&self, tool: Option<&str>) {
+        let current = tool.map(str::to_owned);
+        self.tool
+            .send_modify(|state| state.current.clone_from(&current));
+        let changer = self.others[0].url();
+        let client = SkillClient::connect(changer, &self.options).await.unwrap();
+        let shown = async {
+            loop {
+                let found = client.skills().await.unwrap();
+                let state = found[0].tool_state.clone().unwrap();
+                if state.current == current {
+                    return;
+                }
+                tokio::time::sleep(Duration::from_millis(10)).await;
+            }
+        };
+        tokio::time::timeout(SOON, shown).await.unwrap();
+        client.close().await;
+    }
+
+    async fn run(&self, given: &[(&str, &str)]) -> Result<Outcome, String> {
+        let place = Value::from([0.4, -0.2, 0.1, 0.0, 0.0, 0.0]);
+        let mut parameters = vec![("PlacePosition".to_owned(), place)];
+        let texts = given
+            .iter()
+            .map(|(name, value)| ((*name).to_owned(), Value::from(*value)));
+        parameters.extend(texts);
+        let driver = Arc::clone(&self.driver);
+        let ran = conformance::run_once("PickAndPlaceSkillType", driver, parameters);
+        tokio::time::timeout(Duration::from_secs(120), ran)
+            .await
+            .unwrap()
+    }
+
+    /// Returns the numbers of the last runs: the robot, the fingers, the cup.
+    fn runs(&self) -> [u32; 3] {
+        [&self.robot, &self.fingers, &self.cup].map(|server| {
+            let runs = server.skills().iter().map(|skill| skill.shown().run);
+            runs.max().unwrap_or_default()
+        })
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_skill_uses_the_tool_that_is_attached_for_objects_that_are_listed_or_located() {
+    let cell = Cell::new().await;
+    let object = |id: &'static str| [("ObjectId", id)];
+    cell.attach(Some("urn:test:cup")).await;
+    let outcome = cell.run(&object("box")).await.unwrap();
+    assert!(outcome.succeeded, "{}", outcome.message);
+    assert_eq!(cell.runs()[1..], [0, 1]);
+    let noted = |what: &str| outcome.trace.iter().any(|line| line.contains(what));
+    assert!(
+        noted("urn:test:cup is attached to urn:test:changer") && noted("the only robot"),
+        "{:?}",
+        outcome.trace
+    );
+    // The flange is above the top of the box by the plate and the cup.
+    let robot = cell.robot.skills()[1].shown();
+    let target = robot.parameters.six("TargetPosition").unwrap();
+    let above = 0.1 + 0.025 + 0.1868 + 0.047 + 0.05;
+    assert!((target[2] - above).abs() < 1e-9, "{target:?}");
+
+    cell.attach(Some("urn:example:gripper")).await;
+    let outcome = cell.run(&object("bolt")).await.unwrap();
+    assert!(outcome.succeeded, "{}", outcome.message);
+    assert_eq!(cell.runs()[1..], [1, 1]);
+    for server in cell.others {
+        server.stop().await;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn nothing_moves_without_the_object_a_tool_or_a_fitting_grasp() {
+    let cell = Cell::new().await;
+    cell.attach(Some("urn:test:cup")).await;
+    let none = cell.run(&[]).await.unwrap_err();
+    assert!(none.starts_with("BadInvalidArgument: ObjectId"), "{none}");
+    let wrong = [("ToolSkillControllerEndpoint", "cup"), ("ObjectId", "box")];
+    let wrong = cell.run(&wrong).await.unwrap_err();
+    assert!(wrong.contains("an endpoint, an ApplicationUri"), "{wrong}");
+    let unknown = [("ObjectId", "nut")];
+    let other = [
+        ("ObjectId", "box"),
+        ("ToolSkillControllerEndpoint", "urn:example:gripper"),
+    ];
+    let cases: [(&[(&str, &str)], Option<&str>, &str); 5] = [
+        (
+            &unknown,
+            Some("urn:test:cup"),
+            "camera.Locate: no nut is seen",
+        ),
+        (&[("ObjectId", "ball")], Some("urn:test:cup"), "no flat top"),
+        (&[("ObjectId", "box")], Some(""), "no tool is attached"),
+        (
+            &[("ObjectId", "box")],
+            None,
+            "the tool at urn:test:changer is unknown",
+        ),
+        (
+            &other,
+            Some("urn:test:cup"),
+            "is not attached to urn:test:changer",
+        ),
+    ];
+    for (given, tool, expected) in cases {
+        cell.attach(tool).await;
+        let outcome = cell.run(given).await.unwrap();
+        assert!(
+            !outcome.succeeded && outcome.message.contains(expected),
+            "{expected}: {}",
+            outcome.message
+        );
+    }
+    assert_eq!(cell.runs(), [0, 0, 0]);
+    for server in cell.others {
+        server.stop().await;
+    }
+}

@@ -1,0 +1,70 @@
+//! The method `PowerOffDevice`, which ends the program of a component before its device loses its
+//! supply.
+
+use std::fmt;
+use std::sync::Arc;
+use std::time::Duration;
+
+use plant_opcua::server::{
+    IdRange, InstanceError, MethodRequest, MethodSpec, Refusal, Server, method,
+};
+use plant_opcua::types::{
+    Argument, DataTypeId, LocalizedText, NodeId, QualifiedName, StatusCode, Variant,
+};
+use plant_opcua::users::{Access, Role, Roles};
+use program::State;
+
+use crate::model::POWER_OFF;
+use crate::skill::Skill;
+
+/// Ends the program after a delay.
+#[derive(Clone)]
+pub struct PowerOff(pub Arc<dyn Fn(Duration) + Send + Sync>);
+
+impl fmt::Debug for PowerOff {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("PowerOff")
+    }
+}
+
+/// Adds the method to the object of a component. It is refused while a skill runs.
+pub(super) fn serve(
+    server: &Server,
+    object: &NodeId,
+    ids: &mut IdRange,
+    skills: &[Skill],
+    (power_off, users): (PowerOff, Arc<Access>),
+) -> Result<(), InstanceError> {
+    let spec = MethodSpec {
+        node_id: ids.next(),
+        browse_name: QualifiedName::new(object.namespace, POWER_OFF),
+        object: object.clone(),
+        arguments: (ids.next(), ids.next()),
+        takes: vec![Argument {
+            name: "DelayMs".into(),
+            data_type: DataTypeId::UInt32.into(),
+            value_rank: -1,
+            array_dimensions: None,
+            description: LocalizedText::new("en", "The time until the program ends, ms."),
+        }],
+        gives: Vec::new(),
+    };
+    let skills = skills.to_vec();
+    let handler = method(move |request: MethodRequest| {
+        let may = Roles::of(&[Role::Operator, Role::Engineer]);
+        if !users.roles_of(&request.caller).meets(may) {
+            return Err(Refusal::from(StatusCode::BadUserAccessDenied));
+        }
+        let runs = |skill: &Skill| matches!(skill.shown().state, State::Running | State::Suspended);
+        if skills.iter().any(runs) {
+            return Err(Refusal::from(StatusCode::BadInvalidState));
+        }
+        let [Variant::UInt32(delay)] = request.arguments.as_slice() else {
+            return Err(Refusal::from(StatusCode::BadInvalidArgument));
+        };
+        tracing::info!(delay, application = ?request.caller.application_uri, "switched off");
+        (power_off.0)(Duration::from_millis((*delay).into()));
+        Ok(Vec::new())
+    });
+    server.add_method(spec, handler)
+}
