@@ -9,6 +9,7 @@ mod asking;
 pub mod definition;
 #[cfg(feature = "devices")]
 pub mod entry;
+mod exec;
 mod executor;
 mod fields;
 mod goals;

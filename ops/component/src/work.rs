@@ -25,7 +25,7 @@ use crate::fields;
 
 /// Returns the component with drivers for the skills that other participants of the space execute.
 pub(crate) fn with_drivers(component: &Component, asking: &mut Asking) -> Component {
-    let mut component = component.clone();
+    let mut component = crate::exec::with_programs(component.clone());
     for skill in &mut component.skills {
         if let DriverSetup::Space(work) = &skill.driver
             && let Ok(topic) = work.topic.parse()

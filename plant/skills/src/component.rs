@@ -164,6 +164,21 @@ pub enum DriverSetup {
     Device,
     /// A call or action of the space, which the program that runs the component sends.
     Space(Box<SpaceWork>),
+    /// A program of the user, which the program that runs the component starts.
+    Exec(Box<ExecWork>),
+}
+
+/// A program of the user that executes a skill.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ExecWork {
+    /// The program and its arguments.
+    pub command: Vec<String>,
+    /// The command that stops the machine after the program was killed.
+    pub stop: Option<Vec<String>>,
+    /// The working directory: the folder of the YAML file.
+    pub folder: PathBuf,
+    /// Time from Halt until the program is killed.
+    pub halt_timeout: Duration,
 }
 
 impl fmt::Debug for DriverSetup {
@@ -174,6 +189,7 @@ impl fmt::Debug for DriverSetup {
             Self::PickAndPlace(partners) => partners.fmt(f),
             Self::Device => f.write_str("Device"),
             Self::Space(work) => work.fmt(f),
+            Self::Exec(work) => work.fmt(f),
         }
     }
 }
@@ -233,7 +249,8 @@ impl Component {
             DriverSetup::Given(_)
             | DriverSetup::Simulated(_)
             | DriverSetup::Device
-            | DriverSetup::Space(_) => false,
+            | DriverSetup::Space(_)
+            | DriverSetup::Exec(_) => false,
         });
         let device = self.device.as_ref();
         has_composite || device.is_some_and(|device| device.looks_for_others())

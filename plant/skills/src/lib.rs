@@ -32,10 +32,10 @@ pub use client::{
     PeerAccess, RemoteState, SkillClient, SkillHandle, ToolState, Watchable,
 };
 pub use component::{
-    Asked, Component, Device, DeviceKinds, DriverFault, DriverSetup, Drivers, Form, LEASE, Lds,
-    MOST_SKILLS, NoDevices, Part, Partner, Partners, Robot, Security, Simulation, SkillSetup,
-    Source, SpaceWork, World, WorldObject, anonymous_by_default, read_numbers, read_partner,
-    read_shape, read_user,
+    Asked, Component, Device, DeviceKinds, DriverFault, DriverSetup, Drivers, ExecWork, Form,
+    LEASE, Lds, MOST_SKILLS, NoDevices, Part, Partner, Partners, Robot, Security, Simulation,
+    SkillSetup, Source, SpaceWork, World, WorldObject, anonymous_by_default, read_numbers,
+    read_partner, read_shape, read_user,
 };
 pub use composite::{Broken, Job, PickAndPlace, Teller};
 pub use driver::{Driver, Results, Stopped, Work};

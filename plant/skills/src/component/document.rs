@@ -11,8 +11,8 @@ use plant_opcua::users::{Role, Roles};
 
 use super::world::{read_grip_point, read_numbers, read_world};
 use super::{
-    Asked, Component, DeviceKinds, DriverSetup, LEASE, Lds, MOST_SKILLS, NoDevices, Partner,
-    Partners, Robot, Security, Simulation, SkillSetup, anonymous_by_default,
+    Asked, Component, DeviceKinds, DriverSetup, ExecWork, LEASE, Lds, MOST_SKILLS, NoDevices,
+    Partner, Partners, Robot, Security, Simulation, SkillSetup, anonymous_by_default,
 };
 use crate::parameters::{TypeName, shortened};
 use crate::yaml::{Code, Findings, Kind, Node, Place, Reader, parse};
@@ -130,7 +130,7 @@ fn component(
     let world = world.map_or_else(BTreeMap::new, |node| read_world(node, reader));
     let skills = reader
         .needed(skills, "skills", root.place)
-        .map(|node| read_skills(node, reader));
+        .map(|node| read_skills(node, folder, reader));
     Some(Component {
         name: name?,
         application_uri: uri?,
@@ -429,7 +429,7 @@ fn read_security(node: &Node, reader: &mut Reader<'_>) -> Vec<Security> {
     policies
 }
 
-fn read_skills(node: &Node, reader: &mut Reader<'_>) -> Vec<SkillSetup> {
+fn read_skills(node: &Node, folder: &Path, reader: &mut Reader<'_>) -> Vec<SkillSetup> {
     let nodes = reader.list(node);
     if nodes.is_empty() || nodes.len() > MOST_SKILLS {
         let message = format!(
@@ -440,7 +440,7 @@ fn read_skills(node: &Node, reader: &mut Reader<'_>) -> Vec<SkillSetup> {
     }
     let mut skills: Vec<SkillSetup> = Vec::new();
     for node in nodes.iter().take(MOST_SKILLS) {
-        let Some((skill, name_at)) = read_skill(node, reader) else {
+        let Some((skill, name_at)) = read_skill(node, folder, reader) else {
             continue;
         };
         // Names are compared without case, because people do not distinguish them by case.
@@ -456,7 +456,7 @@ fn read_skills(node: &Node, reader: &mut Reader<'_>) -> Vec<SkillSetup> {
     skills
 }
 
-fn read_skill(node: &Node, reader: &mut Reader<'_>) -> Option<(SkillSetup, Place)> {
+fn read_skill(node: &Node, folder: &Path, reader: &mut Reader<'_>) -> Option<(SkillSetup, Place)> {
     let keys = [
         "name",
         "type",
@@ -476,7 +476,7 @@ fn read_skill(node: &Node, reader: &mut Reader<'_>) -> Option<(SkillSetup, Place
         .and_then(|node| read_type(node, reader));
     let driver = reader
         .needed(driver, "driver", node.place)
-        .and_then(|node| read_driver(node, reader));
+        .and_then(|node| read_driver(node, folder, reader));
     let capabilities = capabilities
         .map(|node| reader.list(node))
         .unwrap_or_default()
@@ -508,7 +508,7 @@ fn read_type(node: &Node, reader: &mut Reader<'_>) -> Option<TypeName> {
     }
 }
 
-fn read_driver(node: &Node, reader: &mut Reader<'_>) -> Option<DriverSetup> {
+fn read_driver(node: &Node, folder: &Path, reader: &mut Reader<'_>) -> Option<DriverSetup> {
     if matches!(&node.kind, Kind::Scalar(text) if text == "simulated") {
         return Some(DriverSetup::Simulated(Simulation::default()));
     }
@@ -523,22 +523,70 @@ fn read_driver(node: &Node, reader: &mut Reader<'_>) -> Option<DriverSetup> {
             within: USUALLY_WITHIN,
         }));
     }
-    let keys = ["simulated", "pick_and_place", "call", "action"];
+    let keys = ["simulated", "pick_and_place", "call", "action", "exec"];
     let space = |asked, node, reader: &mut Reader<'_>| {
         let work = super::space::read(asked, node, reader);
         work.map(|work| DriverSetup::Space(Box::new(work)))
     };
     match reader.map(node, keys)? {
-        [Some(node), None, None, None] => read_simulation(node, reader).map(DriverSetup::Simulated),
-        [None, Some(node), None, None] => {
+        [Some(node), None, None, None, None] => {
+            read_simulation(node, reader).map(DriverSetup::Simulated)
+        }
+        [None, Some(node), None, None, None] => {
             read_partners(node, reader).map(DriverSetup::PickAndPlace)
         }
-        [None, None, Some(node), None] => space(Asked::Call, node, reader),
-        [None, None, None, Some(node)] => space(Asked::Action, node, reader),
+        [None, None, Some(node), None, None] => space(Asked::Call, node, reader),
+        [None, None, None, Some(node), None] => space(Asked::Action, node, reader),
+        [None, None, None, None, Some(node)] => {
+            read_exec(node, folder, reader).map(|work| DriverSetup::Exec(Box::new(work)))
+        }
         _ => {
-            let message = "a driver is exactly one of `simulated`, `device`, `pick_and_place`, `call` and `action`";
+            let message = "a driver is exactly one of `simulated`, `device`, `pick_and_place`, `call`, `action` and `exec`";
             reader.findings().error(Code::Driver, node.place, message);
             None
+        }
+    }
+}
+
+fn read_exec(node: &Node, folder: &Path, reader: &mut Reader<'_>) -> Option<ExecWork> {
+    let [command, stop, halt_timeout] = reader.map(node, ["command", "stop", "halt_timeout"])?;
+    let command = reader
+        .needed(command, "command", node.place)
+        .and_then(|node| read_command(node, reader));
+    let stop = stop.map(|node| read_command(node, reader));
+    let halt_timeout = halt_timeout.map_or(Some(USUAL_HALT), |node| reader.duration(node));
+    // The working directory of an empty path would be invalid.
+    let folder = match folder.as_os_str().is_empty() {
+        true => PathBuf::from("."),
+        false => folder.to_owned(),
+    };
+    Some(ExecWork {
+        command: command?,
+        stop: whole(stop)?,
+        folder,
+        halt_timeout: halt_timeout?,
+    })
+}
+
+/// Reads a program and its arguments.
+fn read_command(node: &Node, reader: &mut Reader<'_>) -> Option<Vec<String>> {
+    let nodes = reader.list(node);
+    let words: Vec<String> = nodes
+        .iter()
+        .filter_map(|node| {
+            reader
+                .text(node, "a program or an argument")
+                .map(str::to_owned)
+        })
+        .collect();
+    if words.len() < nodes.len() {
+        return None;
+    }
+    match words.first() {
+        Some(program) if !program.is_empty() => Some(words),
+        _ => {
+            let message = "a command is a list: the program, then its arguments".to_owned();
+            reader.refuse(node, Code::WrongValue, message)
         }
     }
 }
@@ -581,6 +629,8 @@ pub fn read_partner(node: &Node, reader: &mut Reader<'_>) -> Option<Partner> {
 
 const DEFAULT_ENDPOINT: &str = "opc.tcp://127.0.0.1:0";
 const USUALLY_WITHIN: Duration = Duration::from_secs(60);
+/// Default time from Halt until a program is killed.
+const USUAL_HALT: Duration = Duration::from_secs(5);
 const LONGEST_NAME: usize = 64;
 const LONGEST_PASSWORD_FILE: u64 = 4096;
 /// MotionDeviceCategoryEnumeration (OPC 40010-1, 7.2.3), by its values.

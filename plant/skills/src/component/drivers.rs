@@ -72,6 +72,10 @@ impl Drivers {
                 "this program asks nobody in the space for {}",
                 work.topic
             ))),
+            DriverSetup::Exec(work) => Err(DriverFault(format!(
+                "this program does not start `{}`",
+                work.command.join(" ")
+            ))),
             DriverSetup::PickAndPlace(partners) if is("PickAndPlaceSkillType") => {
                 let peers = self.peers.clone();
                 let world = Arc::clone(&self.world);

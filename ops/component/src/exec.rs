@@ -1,0 +1,367 @@
+//! A skill that a program of the user executes: one process for each run, one JSON object a line.
+//!
+//! The process is the only member of its process group. A program that does not obey is killed with
+//! its group. Then the state of its machine is unknown: the `stop` command runs, and the skill needs
+//! a Reset.
+
+use std::process::Stdio;
+use std::time::Duration;
+
+use async_trait::async_trait;
+use rustix::process::{Pid, Signal, kill_process_group};
+use serde_json::{Value as Json, json};
+use skills::{Component, Driver, DriverSetup, ExecWork, Results, Value, Work};
+use tokio::io::{
+    AsyncBufRead, AsyncBufReadExt as _, AsyncReadExt as _, AsyncWriteExt as _, BufReader,
+};
+use tokio::process::{Child, ChildStdin, Command};
+use tokio::time::{Instant, sleep_until, timeout};
+use tracing::{info, warn};
+
+/// Replaces the description of programs by drivers that run them.
+pub(crate) fn with_programs(mut component: Component) -> Component {
+    for skill in &mut component.skills {
+        if let DriverSetup::Exec(work) = &skill.driver {
+            let driver = Program {
+                skill: skill.name.clone(),
+                work: ExecWork::clone(work),
+            };
+            skill.driver = DriverSetup::Given(std::sync::Arc::new(driver));
+        }
+    }
+    component
+}
+
+#[derive(Debug)]
+struct Program {
+    skill: String,
+    work: ExecWork,
+}
+
+/// The end of a program.
+enum Ended {
+    /// The program has reported the results, or why the work is not done.
+    Told(Result<Results, String>),
+    /// The program has not obeyed, or has ended without a result: the state of the machine is unknown.
+    Unknown(String),
+}
+
+#[async_trait]
+impl Driver for Program {
+    /// Halt waits for the program, and for the `stop` command.
+    fn halt_timeout(&self) -> Option<Duration> {
+        Some(self.work.halt_timeout + STOP_WITHIN + ENDS_WITHIN)
+    }
+
+    async fn run(&self, work: Work) -> Result<Results, String> {
+        let mut child = self.start(&self.work.command)?;
+        let group = child
+            .id()
+            .and_then(|id| i32::try_from(id).ok())
+            .and_then(Pid::from_raw);
+        let _group = KilledGroup(group);
+        let ended = self.follow(&mut child, &work).await;
+        match ended {
+            Ended::Told(result) => {
+                // The result counts; a program that stays is killed with its group.
+                let _ended = timeout(ENDS_WITHIN, child.wait()).await;
+                result
+            }
+            Ended::Unknown(why) => {
+                kill(group);
+                let stopped = self.stop().await;
+                let why = format!("{why}; {stopped}");
+                work.unknown(&why).await;
+                Err(why)
+            }
+        }
+    }
+}
+
+impl Program {
+    /// Starts a command without the environment of this program, which may contain secrets.
+    fn start(&self, command: &[String]) -> Result<Child, String> {
+        let (program, arguments) = command.split_first().ok_or("no program is named")?;
+        let kept = KEPT_VARIABLES.iter();
+        let kept = kept.filter_map(|name| Some((*name, std::env::var_os(name)?)));
+        let started = Command::new(program)
+            .args(arguments)
+            .current_dir(&self.work.folder)
+            .env_clear()
+            .envs(kept)
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .process_group(0)
+            .kill_on_drop(true)
+            .spawn();
+        started.map_err(|error| format!("cannot start {program}: {error}"))
+    }
+
+    /// Follows a run to its end.
+    async fn follow(&self, child: &mut Child, work: &Work) -> Ended {
+        let unknown = |why: &str| Ended::Unknown(format!("{}: {why}", self.name()));
+        let (Some(mut input), Some(output)) = (child.stdin.take(), child.stdout.take()) else {
+            return unknown("its input and output are not connected");
+        };
+        let errors = child.stderr.take();
+        let skill = self.skill.clone();
+        let logging = async move {
+            if let Some(errors) = errors {
+                log(&skill, BufReader::new(errors)).await;
+            }
+            std::future::pending::<()>().await;
+        };
+        let mut output = BufReader::new(output);
+        let parameters = work.parameters().all().iter();
+        let parameters: serde_json::Map<String, Json> = parameters
+            .map(|(name, value)| (name.clone(), value.to_json()))
+            .collect();
+        let start =
+            json!({"start": {"skill": self.skill, "run": work.run(), "parameters": parameters}});
+        if let Err(why) = send(&mut input, &start).await {
+            return unknown(&why);
+        }
+        work.step("Run").await;
+        let mut until: Option<Instant> = None;
+        tokio::pin!(logging);
+        let mut line = Vec::new();
+        loop {
+            tokio::select! {
+                read = next_line(&mut output, &mut line) => {
+                    let told = match read {
+                        Ok(Some(text)) => reported(&text),
+                        Ok(None) => return unknown("it has ended without a result"),
+                        Err(why) => Err(why),
+                    };
+                    match told {
+                        Ok(Report::Ended(result)) => return Ended::Told(result),
+                        Ok(Report::Progress { progress, step, note }) => {
+                            if let Some(progress) = progress {
+                                work.progress(progress);
+                            }
+                            if let Some(step) = step {
+                                work.step(step).await;
+                            }
+                            if let Some(note) = note {
+                                work.note(note).await;
+                            }
+                        }
+                        Err(why) => return unknown(&why),
+                    }
+                }
+                () = work.stopped(), if until.is_none() => {
+                    until = Some(Instant::now() + self.work.halt_timeout);
+                    work.pending(format!("{} is asked to halt", self.name())).await;
+                    if let Err(why) = send(&mut input, &json!({"halt": {"run": work.run()}})).await {
+                        return unknown(&why);
+                    }
+                }
+                () = at(until) => {
+                    let limit = self.work.halt_timeout;
+                    return unknown(&format!("it has not halted within {limit:?} and was killed"));
+                }
+                () = &mut logging => {}
+            }
+        }
+    }
+
+    /// Runs the command that stops the machine. Returns what happened.
+    async fn stop(&self) -> String {
+        let Some(command) = &self.work.stop else {
+            return "there is no `stop` command".to_owned();
+        };
+        let mut child = match self.start(command) {
+            Ok(child) => child,
+            Err(why) => return format!("the `stop` command has failed: {why}"),
+        };
+        drop((child.stdin.take(), child.stdout.take(), child.stderr.take()));
+        let group = child
+            .id()
+            .and_then(|id| i32::try_from(id).ok())
+            .and_then(Pid::from_raw);
+        let _group = KilledGroup(group);
+        match timeout(STOP_WITHIN, child.wait()).await {
+            Ok(Ok(status)) if status.success() => "the `stop` command is done".to_owned(),
+            Ok(Ok(status)) => format!("the `stop` command has failed: {status}"),
+            Ok(Err(error)) => format!("the `stop` command has failed: {error}"),
+            Err(_) => format!("the `stop` command has not ended within {STOP_WITHIN:?}"),
+        }
+    }
+
+    fn name(&self) -> &str {
+        self.work.command.first().map_or("", String::as_str)
+    }
+}
+
+/// Kills a process group when it is dropped, so that no descendant outlives its run.
+struct KilledGroup(Option<Pid>);
+
+impl Drop for KilledGroup {
+    fn drop(&mut self) {
+        kill(self.0);
+    }
+}
+
+fn kill(group: Option<Pid>) {
+    if let Some(group) = group {
+        // An error means that no process of the group is left.
+        let _killed = kill_process_group(group, Signal::KILL);
+    }
+}
+
+async fn at(until: Option<Instant>) {
+    match until {
+        Some(until) => sleep_until(until).await,
+        None => std::future::pending().await,
+    }
+}
+
+async fn send(input: &mut ChildStdin, message: &Json) -> Result<(), String> {
+    let line = format!("{message}\n");
+    let written = async {
+        input.write_all(line.as_bytes()).await?;
+        input.flush().await
+    };
+    match timeout(SENT_WITHIN, written).await {
+        Ok(Ok(())) => Ok(()),
+        Ok(Err(error)) => Err(format!("it reads no messages: {error}")),
+        Err(_) => Err(format!("it reads no messages within {SENT_WITHIN:?}")),
+    }
+}
+
+/// Returns the next line without its end; `None` at the end of the output. Cancel safe: an incomplete
+/// line stays in `line`.
+async fn next_line(
+    output: &mut (impl AsyncBufRead + Unpin),
+    line: &mut Vec<u8>,
+) -> Result<Option<String>, String> {
+    loop {
+        let room = LONGEST_LINE.saturating_sub(u64::try_from(line.len()).unwrap_or(u64::MAX));
+        let read = (&mut *output).take(room).read_until(b'\n', line).await;
+        let count = read.map_err(|error| format!("its output cannot be read: {error}"))?;
+        if line.last() == Some(&b'\n') {
+            let text = String::from_utf8_lossy(line).trim().to_owned();
+            line.clear();
+            if text.is_empty() {
+                continue;
+            }
+            return Ok(Some(text));
+        }
+        if room == 0 {
+            return Err(format!(
+                "it has written a line of more than {LONGEST_LINE} bytes"
+            ));
+        }
+        if count == 0 {
+            return Ok(None);
+        }
+    }
+}
+
+/// Logs the standard error of a program.
+async fn log(skill: &str, mut errors: impl AsyncBufRead + Unpin) {
+    let mut line = Vec::new();
+    while let Ok(Some(text)) = next_line(&mut errors, &mut line).await {
+        info!(skill, "{}", text.escape_debug());
+    }
+    warn_of_long_line(skill, &line);
+}
+
+fn warn_of_long_line(skill: &str, line: &[u8]) {
+    if !line.is_empty() {
+        warn!(
+            skill,
+            bytes = line.len(),
+            "stopped reading the standard error of the program"
+        );
+    }
+}
+
+/// A line of a program.
+#[derive(Debug, PartialEq)]
+enum Report {
+    Progress {
+        progress: Option<f32>,
+        step: Option<String>,
+        note: Option<String>,
+    },
+    Ended(Result<Results, String>),
+}
+
+fn reported(text: &str) -> Result<Report, String> {
+    let shown: String = text.chars().take(80).collect();
+    let wrong = |why: &str| format!("its line `{shown}` {why}");
+    let Ok(Json::Object(line)) = serde_json::from_str(text) else {
+        return Err(wrong("is not a JSON object"));
+    };
+    let known = ["progress", "step", "note", "result", "failed"];
+    if let Some(other) = line.keys().find(|key| !known.contains(&key.as_str())) {
+        let known = known.join(", ");
+        return Err(wrong(&format!("has the key `{other}`; known are {known}")));
+    }
+    let text_of = |key: &str| match line.get(key) {
+        None => Ok(None),
+        Some(Json::String(text)) => Ok(Some(text.clone())),
+        Some(_) => Err(wrong(&format!("has a `{key}` that is not a text"))),
+    };
+    if let Some(why) = text_of("failed")? {
+        return Ok(Report::Ended(Err(why)));
+    }
+    match line.get("result") {
+        Some(Json::Object(results)) => {
+            let results = results.iter().map(|(name, value)| {
+                let value = value_of(value);
+                let value = value
+                    .ok_or_else(|| wrong(&format!("has a result `{name}` of a wrong type")))?;
+                Ok((name.clone(), value))
+            });
+            return results
+                .collect::<Result<_, String>>()
+                .map(|results| Report::Ended(Ok(results)));
+        }
+        Some(_) => return Err(wrong("has a `result` that is not an object")),
+        None => {}
+    }
+    let progress = match line.get("progress") {
+        None => None,
+        #[expect(clippy::cast_possible_truncation, reason = "a fraction from 0 to 1")]
+        Some(number) => match number.as_f64() {
+            Some(number) if (0.0..=1.0).contains(&number) => Some(number as f32),
+            Some(_) | None => return Err(wrong("has a `progress` that is not from 0 to 1")),
+        },
+    };
+    Ok(Report::Progress {
+        progress,
+        step: text_of("step")?,
+        note: text_of("note")?,
+    })
+}
+
+/// Converts a result; the skill converts numbers to the declared type.
+fn value_of(json: &Json) -> Option<Value> {
+    match json {
+        Json::Bool(value) => Some(Value::from(*value)),
+        Json::Number(number) => number.as_f64().map(Value::from),
+        Json::String(text) => Some(Value::from(text.as_str())),
+        Json::Array(elements) => {
+            let numbers: Option<Vec<f64>> = elements.iter().map(Json::as_f64).collect();
+            numbers.map(Value::from)
+        }
+        Json::Null | Json::Object(_) => None,
+    }
+}
+
+/// The environment variables that a program keeps.
+const KEPT_VARIABLES: [&str; 5] = ["PATH", "HOME", "LANG", "TZ", "PYTHONPATH"];
+/// Longest line of a program, in bytes.
+const LONGEST_LINE: u64 = 64 << 10;
+/// Time limit for the `stop` command.
+const STOP_WITHIN: Duration = Duration::from_secs(5);
+/// Time after its result in which a program ends by itself.
+const ENDS_WITHIN: Duration = Duration::from_secs(1);
+/// Time limit for a program to read a message.
+const SENT_WITHIN: Duration = Duration::from_secs(2);
+
+#[cfg(test)]
+mod tests;
