@@ -25,7 +25,7 @@ use plant_opcua::enrolment::Invitation;
 use plant_opcua::nodeset::NodeSets;
 use plant_opcua::own;
 use plant_opcua::pki::Pki;
-use plant_opcua::server::{CoreMethod, Security, core_of, core_with};
+use plant_opcua::server::{Security, core_of, core_with};
 use plant_opcua::users::{self, Access, UserFault};
 use tokio::runtime::Runtime;
 use tokio::sync::{Semaphore, mpsc, oneshot};
@@ -130,10 +130,9 @@ impl ServerPort {
     /// # Errors
     /// Returns an error if the mapping cannot be served, if the address cannot be bound, or if the
     /// certificate store cannot be used.
-    pub(crate) fn start(mapping: &Arc<Mapping>, setup: Setup) -> Result<Self, Failure> {
+    pub(crate) fn start(mapping: &Arc<Mapping>, mut setup: Setup) -> Result<Self, Failure> {
         let configuration = |error: String| Failure::new(FailureKind::Configuration, error);
-        let mut types = setup.types;
-        let (layout, (sets, nodesets)) = laid_out(mapping, &mut types)?;
+        let (layout, (sets, nodesets)) = laid_out(mapping, &mut setup.types)?;
         let described = mapping.server();
         setup.sks.follow(mapping)?;
         let (listener, (address, security)) = listen(&setup.pki, &setup.url, described)?;
@@ -142,8 +141,7 @@ impl ServerPort {
         access.set_rules(access::rules(mapping, &layout));
         let pubsub = Arc::new(PubSub::new());
         let (exits, (writes, created_items, asked)) = exits(mapping, &access, &pubsub);
-        let (confirms, layout) = (Arc::clone(&exits.confirms), Arc::new(layout));
-        let alarms = Arc::clone(&exits.alarms);
+        let (confirms, alarms) = (Arc::clone(&exits.confirms), Arc::clone(&exits.alarms));
         let nodes = NodesBuilder {
             layout: Arc::clone(&layout),
             sets,
@@ -151,8 +149,11 @@ impl ServerPort {
         };
         let certificates = Configuration::new(setup.pki.root(), &described.application_uri);
         let mdns = matches!(&setup.announce, Some(to) if to.mdns.is_some());
-        let methods = [setup.sks.methods(), pubsub.methods(), alarms.methods()].concat();
-        let core = core(methods, (&certificates, mdns), described);
+        let core = core(
+            (&setup.sks, &pubsub, &alarms),
+            (&certificates, mdns),
+            described,
+        );
         let builder = endpoint::server(described, (&setup.url, port), &security);
         let (door, listener, builder) = endpoint::door(
             &setup.pki,
@@ -167,8 +168,7 @@ impl ServerPort {
             .build()
             .map_err(configuration)?;
         let manager = manager(&handle, &layout).map_err(configuration)?;
-        show_limits(mapping, &layout, (&handle, &manager), &pubsub);
-        alarms.stand(Arc::clone(&manager), &handle, mapping);
+        show_limits(mapping, &layout, (&handle, &manager), (&pubsub, &alarms));
         let (runtime, listener) = endpoint::threads(listener)?;
         let serving = runtime.spawn(server.run_with(listener));
         endpoint::stand(&runtime, door)?;
@@ -195,7 +195,7 @@ impl ServerPort {
             serving: Some(serving),
             writes,
             live: live(&layout),
-            types,
+            types: setup.types,
             pki: setup.pki,
             sks: setup.sks,
             access,
@@ -294,17 +294,9 @@ impl Port for ServerPort {
                     self.live.extend(taken_back.map(|topic| (topic, false)));
                 }
                 () = at(self.space.due()) => self.space.grow_old(),
-                () = self.alarms.elapsed() => {
-                    for (topic, block) in self.alarms.elapse() {
-                        let taken = bridge_node::now().utc;
-                        let status = StatusCode::Good;
-                        let event = self.sourced(Sourced { topic, block, taken, status });
-                        self.events.push_back(event);
-                    }
-                    if let Some(event) = self.events.pop_front() {
-                        return event;
-                    }
-                }
+                () = self.alarms.elapsed() => if let Some(event) = self.report_conditions() {
+                    return event;
+                },
                 () = self.certificates.applied() => bridge_node::restart(),
                 _ = self.look.tick() => {
                     self.pki.report_rejected();
@@ -489,6 +481,23 @@ impl Port for ServerPort {
 }
 
 impl ServerPort {
+    /// Shows and sends the values that report the conditions, if they are due. Returns the first
+    /// event.
+    fn report_conditions(&mut self) -> Option<PortEvent> {
+        for (topic, block) in self.alarms.elapse() {
+            let taken = bridge_node::now().utc;
+            let status = StatusCode::Good;
+            let event = self.sourced(Sourced {
+                topic,
+                block,
+                taken,
+                status,
+            });
+            self.events.push_back(event);
+        }
+        self.events.pop_front()
+    }
+
     /// Shows a value of another server and sends it.
     fn sourced(&mut self, sourced: Sourced) -> PortEvent {
         let Sourced {
@@ -565,14 +574,14 @@ fn users(pki: &Pki, address: SocketAddr) -> Result<Arc<Access>, Failure> {
 type Loading = (NodeSets, nodesets::Running);
 
 /// Returns the nodes of the mapping and the NodeSets.
-fn laid_out(mapping: &Mapping, types: &mut Types) -> Result<(Layout, Loading), Failure> {
+fn laid_out(mapping: &Mapping, types: &mut Types) -> Result<(Arc<Layout>, Loading), Failure> {
     let configuration =
         |error: LayoutError| Failure::new(FailureKind::Configuration, error.to_string());
     let mut layout = Layout::of(mapping, types).map_err(configuration)?;
     let sets = nodesets::read(mapping)?;
     nodesets::add_namespaces(&sets, &mut layout.namespaces);
     let running = nodesets::Running::new(mapping, &sets);
-    Ok((layout, (sets, running)))
+    Ok((Arc::new(layout), (sets, running)))
 }
 
 /// Creates the certificate if it is missing, and listens.
@@ -624,11 +633,17 @@ fn audit(access: &Access, handle: &ServerHandle) {
 
 /// Builds the core namespace with its methods and values.
 fn core(
-    methods: Vec<CoreMethod>,
+    (sks, pubsub, alarms): (&Arc<Sks>, &Arc<PubSub>, &Arc<Alarms>),
     (configuration, is_announced): (&Arc<Configuration>, bool),
     described: &Server,
 ) -> impl NodeManagerBuilder + use<> {
-    let methods = [methods, configuration.methods()].concat();
+    let methods = [
+        sks.methods(),
+        pubsub.methods(),
+        alarms.methods(),
+        configuration.methods(),
+    ];
+    let methods = methods.concat();
     let values = [capabilities(described), Configuration::values(is_announced)].concat();
     core_with(methods, values, prepared)
 }
@@ -643,16 +658,18 @@ fn prepared(core: &mut AddressSpace) {
     }
 }
 
-/// Sets the limits of the node manager, and shows the PubSub configuration in the address space.
+/// Sets the limits of the node manager, and shows the PubSub configuration and the conditions in
+/// the address space.
 fn show_limits(
     mapping: &Mapping,
     layout: &Layout,
     (handle, manager): (&ServerHandle, &Arc<SpaceManager>),
-    pubsub: &PubSub,
+    (pubsub, alarms): (&PubSub, &Alarms),
 ) {
     limit(manager.inner(), mapping);
     pubsub.stand(places(handle, manager));
     pubsub.show(mapping, layout);
+    alarms.stand(Arc::clone(manager), handle, mapping);
 }
 
 fn places(handle: &ServerHandle, manager: &Arc<SpaceManager>) -> Places {

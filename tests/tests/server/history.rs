@@ -166,6 +166,12 @@ fn past_values_are_read_in_either_direction_with_bounds_and_in_parts() {
     );
 }
 
+/// Returns the request of an aggregate for intervals, in milliseconds.
+fn of(aggregate: &str, (start, end, interval): (i32, i32, u32)) -> Value {
+    let node = TEMPERATURE_NODE;
+    json!({"node": node, "aggregate": aggregate, "start": start, "end": end, "interval": interval})
+}
+
 #[test]
 fn aggregates_of_past_values_are_worked_out_for_each_interval() {
     let Some(cell) = Cell::with(&[Peer::Python, Peer::NodeOpcua]) else {
@@ -173,10 +179,6 @@ fn aggregates_of_past_values_are_worked_out_for_each_interval() {
     };
     let _server = server(&cell);
     five_values(&cell);
-    let of = |aggregate: &str, (start, end, interval): (i32, i32, u32)| {
-        let node = TEMPERATURE_NODE;
-        json!({"node": node, "aggregate": aggregate, "start": start, "end": end, "interval": interval})
-    };
     let halves = (0, 4000, 2000);
     let with_the_bad_one = json!([
         [0, 3.0, CALCULATED],
@@ -217,6 +219,30 @@ fn aggregates_of_past_values_are_worked_out_for_each_interval() {
                 good(1, &[(0, 1.0, 0), (1500, 4.0, INTERPOLATED)]),
             ),
             (
+                of("NumberOfTransitions", halves),
+                refused("BadAggregateNotSupported"),
+            ),
+        ],
+    );
+    let at = json!([{"node": TEMPERATURE_NODE, "at": [500, 2000]}]);
+    assert_eq!(
+        asyncua(&cell, &at)[..],
+        [good(1, &[(500, 3.0, INTERPOLATED), (2000, 3.0, 0)])]
+    );
+}
+
+#[test]
+fn differences_ends_and_times_of_past_values_are_aggregates() {
+    let Some(cell) = Cell::with(&[Peer::Python, Peer::NodeOpcua]) else {
+        return;
+    };
+    let _server = server(&cell);
+    five_values(&cell);
+    let halves = (0, 4000, 2000);
+    assert_answers(
+        &cell,
+        &[
+            (
                 of("Range", halves),
                 good(1, &[(0, 4.0, CALCULATED), (2000, 6.0, CALCULATED)]),
             ),
@@ -240,16 +266,7 @@ fn aggregates_of_past_values_are_worked_out_for_each_interval() {
                 of("DurationGood", (0, 6000, 3000)),
                 good(1, &[(0, 3000.0, CALCULATED), (3000, 1000.0, CALCULATED)]),
             ),
-            (
-                of("NumberOfTransitions", halves),
-                refused("BadAggregateNotSupported"),
-            ),
         ],
-    );
-    let at = json!([{"node": TEMPERATURE_NODE, "at": [500, 2000]}]);
-    assert_eq!(
-        asyncua(&cell, &at)[..],
-        [good(1, &[(500, 3.0, INTERPOLATED), (2000, 3.0, 0)])]
     );
 }
 

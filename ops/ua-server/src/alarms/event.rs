@@ -242,7 +242,7 @@ impl ConditionEvent {
                     at: state.event.time,
                 };
                 match below {
-                    [] => Some(english(if on.on { *level } else { "Inactive" })),
+                    [] => Some(english(if on.on { level } else { "Inactive" })),
                     ["Id"] => Some(on.on.into()),
                     _ => None,
                 }
